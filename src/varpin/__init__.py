@@ -1,0 +1,35 @@
+"""varpin: variational integrators on Pinocchio.
+
+Load an arm, integrate it variationally, replay it:
+
+    import varpin as vp
+
+    robot = vp.load_robot("finger")
+    scene = vp.Scene(robot, gravity=False)
+    trajectory = vp.simulate(scene, q0=[0.5, 0.3, 0.2], v0=[0, 0, 1], dt=1e-3, steps=1000)
+    vp.replay(robot, trajectory, html="finger.html")
+"""
+
+from varpin._version import __version__ as __version__
+from varpin.errors import ControlError as ControlError
+from varpin.errors import FileError as FileError
+from varpin.errors import InputError as InputError
+from varpin.errors import RobotError as RobotError
+from varpin.errors import RobotNotFound as RobotNotFound
+from varpin.errors import SingularMassMatrix as SingularMassMatrix
+from varpin.errors import StepFailure as StepFailure
+from varpin.errors import UnknownJoint as UnknownJoint
+from varpin.errors import UnsupportedJoint as UnsupportedJoint
+from varpin.errors import VarpinError as VarpinError
+from varpin.integrators import Midpoint as Midpoint
+from varpin.lagrangian import DiscreteLagrangian as DiscreteLagrangian
+from varpin.lagrangian import LagrangianJet as LagrangianJet
+from varpin.lagrangian import discrete_lagrangian as discrete_lagrangian
+from varpin.lagrangian import lagrangian_jet as lagrangian_jet
+from varpin.robot import Robot as Robot
+from varpin.robot import load_robot as load_robot
+from varpin.robot import planar_chain as planar_chain
+from varpin.scene import Scene as Scene
+from varpin.simulation import Interrupted as Interrupted
+from varpin.simulation import simulate as simulate
+from varpin.trajectory import Trajectory as Trajectory

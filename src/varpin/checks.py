@@ -1,0 +1,117 @@
+"""Validators of user input. Each returns the value it checked, ready to compute with."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.errors import FileError, InputError
+
+Floats = NDArray[np.float64]
+
+
+def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
+    """``value`` as a new C-contiguous float array of exactly ``shape``.
+
+    Raises:
+        InputError: Not numbers, another shape (both are named), or an entry that is NaN or infinite.
+    """
+    array = as_floats(name, value)
+    if array.shape != shape:
+        raise InputError(f"{name} must have shape {shape}, got {array.shape}")
+    return require_finite(name, array)
+
+
+def broadcast_array(name: str, value: ArrayLike, size: int) -> Floats:
+    """``value``, one number or (size,), as a new float array (size,).
+
+    Raises:
+        InputError: As for :func:`finite_array`.
+    """
+    array = as_floats(name, value)
+    if array.shape not in ((), (size,)):
+        raise InputError(f"{name} must be one number or have shape ({size},), got {array.shape}")
+    return require_finite(name, np.array(np.broadcast_to(array, (size,))))
+
+
+def as_floats(name: str, value: ArrayLike) -> Floats:
+    """``value`` as a new float array, or an InputError that names it."""
+    try:
+        return np.array(value, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be an array of real numbers: {error}") from None
+
+
+def require_finite(name: str, array: Floats) -> Floats:
+    """``array`` itself if all of it is finite.
+
+    Raises:
+        InputError: Naming the first entry that is not.
+    """
+    if not np.isfinite(array).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        entry = f"{name}[{', '.join(map(str, where))}]" if where else name
+        raise InputError(f"{entry} is {array[where]}; it must be finite")
+    return array
+
+
+def positive(name: str, value: Any, unit: str) -> float:
+    """``value`` as a float > 0 and finite.
+
+    Raises:
+        InputError: Naming the value and its unit.
+    """
+    number = real(name, value)
+    if not (math.isfinite(number) and number > 0.0):
+        raise InputError(f"{name} must be positive and finite [{unit}], got {value}")
+    return number
+
+
+def real(name: str, value: Any) -> float:
+    """``value`` as a float, or an InputError that names it."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be a number, got {value!r}") from None
+
+
+def fraction(name: str, value: float) -> float:
+    """``value`` as a float in [0, 1], or an InputError that names it."""
+    number = real(name, value)
+    if not 0.0 <= number <= 1.0:
+        raise InputError(f"{name} must be in [0, 1], got {value}")
+    return number
+
+
+def count(name: str, value: Any, least: int = 0) -> int:
+    """``value`` as an int >= ``least``.
+
+    Raises:
+        InputError: Not an integer, or too small.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise InputError(f"{name} must be an integer, got {value!r}")
+    if value < least:
+        raise InputError(f"{name} must be at least {least}, got {value}")
+    return int(value)
+
+
+def writable(path: str | os.PathLike[str]) -> Path:
+    """``path``, if a file can be written there: said before the work, not after it.
+
+    Raises:
+        FileError: Naming the folder that is missing or cannot be written.
+    """
+    target = Path(path).expanduser()
+    if target.is_dir():
+        raise FileError(f"cannot write {target}: it is a folder")
+    if not target.parent.is_dir():
+        raise FileError(f"cannot write {target}: there is no folder {target.parent}")
+    if not os.access(target if target.exists() else target.parent, os.W_OK):
+        raise FileError(f"cannot write {target}: permission denied")
+    return target

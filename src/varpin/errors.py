@@ -1,0 +1,137 @@
+"""Every error varpin raises on purpose. Each keeps its data as attributes and says what is allowed."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from varpin.integrators.base import Failure
+    from varpin.trajectory import Trajectory
+
+
+class VarpinError(Exception):
+    """Base of every error that varpin raises on purpose."""
+
+
+class RobotError(VarpinError, ValueError):
+    """A robot description cannot be used."""
+
+
+class RobotNotFound(RobotError):
+    """No robot of that name, or no file at that path.
+
+    Attributes:
+        name: What was asked for.
+        matches: Names that come close.
+    """
+
+    def __init__(self, name: str, known: Iterable[str], note: str = "") -> None:
+        self.name = name
+        known = sorted(known)
+        self.matches = difflib.get_close_matches(name, known, n=5, cutoff=0.5)
+        hint = f"close matches: {', '.join(self.matches)}" if self.matches else f"known names: {', '.join(known)}"
+        super().__init__(f"no robot or URDF file {name!r}{note}; {hint}")
+
+
+class UnknownJoint(RobotError):
+    """A joint name that the robot does not have.
+
+    Attributes:
+        joint: The name given.
+        joints: The names there are.
+        matches: Those that come close.
+    """
+
+    def __init__(self, joint: str, joints: Iterable[str], where: str) -> None:
+        self.joint = joint
+        self.joints = tuple(joints)
+        self.matches = difflib.get_close_matches(joint, self.joints, n=3, cutoff=0.4)
+        hint = f"did you mean {' or '.join(map(repr, self.matches))}? " if self.matches else ""
+        super().__init__(f"{where}: the robot has no joint {joint!r}; {hint}joints: {', '.join(self.joints)}")
+
+
+class UnsupportedJoint(RobotError):
+    """A joint type outside generalized coordinates in R^n.
+
+    Attributes:
+        joint: Its name.
+        kind: Its Pinocchio type.
+    """
+
+    def __init__(self, joint: str, kind: str) -> None:
+        self.joint = joint
+        self.kind = kind
+        super().__init__(
+            f"joint {joint!r} is a {kind}, which has no single coordinate in R; varpin takes revolute, prismatic, "
+            f"continuous, fixed and mimic joints: fix it to the base with lock={{{joint!r}: ...}}, "
+            "or describe it as a chain of one-axis joints"
+        )
+
+
+class SingularMassMatrix(RobotError):
+    """The mass matrix is not positive definite: a moving part has no inertia.
+
+    Attributes:
+        joints: The joints whose motion carries no inertia.
+    """
+
+    def __init__(self, joints: Iterable[str], q: object) -> None:
+        self.joints = tuple(joints)
+        super().__init__(
+            f"the mass matrix is singular at q = {q}: motion of {', '.join(map(repr, self.joints))} carries no inertia; "
+            "give the links it moves mass and inertia, add armature to the joint, or lock it"
+        )
+
+
+class InputError(VarpinError, ValueError):
+    """An argument has a wrong shape, type or value."""
+
+
+class FileError(VarpinError, OSError):
+    """A file cannot be read, or not be written."""
+
+
+class ControlError(VarpinError, ValueError):
+    """A control function raised, or returned something that is no control.
+
+    Attributes:
+        step: Index of the step it was called for.
+        time: The time it was called with [s].
+        trajectory: What was computed before.
+    """
+
+    def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory) -> None:
+        self.step = step
+        self.time = time
+        self.trajectory = trajectory
+        super().__init__(f"step {step} (t = {time:.6g} s): {problem}; the steps before it are in error.trajectory")
+
+
+class StepFailure(VarpinError, RuntimeError):
+    """The step equation could not be solved on its principal branch.
+
+    Attributes:
+        step: Index of the step that failed.
+        time: Its start [s].
+        residual: The last residual, in units of the rounding error of its terms.
+        reason: What stopped the last attempt.
+        q: Configuration at the start of the step (n,) [rad or m].
+        v: Velocity there (n,).
+        p: Momentum there (n,).
+        trajectory: What was computed before.
+    """
+
+    def __init__(self, step: int, time: float, failure: Failure, trajectory: Trajectory) -> None:
+        self.step = step
+        self.time = float(time)
+        self.residual = failure.residual
+        self.reason = failure.reason
+        self.q, self.v, self.p = trajectory.q[-1], trajectory.v[-1], trajectory.p[-1]
+        self.trajectory = trajectory
+        super().__init__(
+            f"step {step} (t = {time:.6g} s) cannot be trusted: {failure.reason}; last residual {failure.residual:.3g} "
+            f"rounding units, at q = {self.q}, v = {self.v}. The {step} steps before it are in error.trajectory; "
+            "a smaller dt may go further"
+        )

@@ -1,0 +1,100 @@
+"""The decorator of every compiled kernel, and its disk cache.
+
+numba stores compiled code beside the source and looks only at the file of the function itself to see whether
+it is stale. A kernel that inlines a kernel of another file would then survive an edit of that file. Here the
+cache is keyed on the contents of every kernel source together.
+"""
+
+import contextlib
+import hashlib
+import logging
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.event import Event, Listener, install_listener
+
+logger = logging.getLogger(__name__)
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def sources_digest(folder: Path = Path(__file__).parent) -> str:
+    """SHA-256 over the names and contents of all kernel sources in ``folder``."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.glob("*.py")):
+        digest.update(path.name.encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+_DIGEST = sources_digest()
+
+
+class _StampedLocator:
+    """A numba cache locator whose source stamp covers all kernel sources."""
+
+    def __init__(self, locator: Any) -> None:
+        self._locator = locator
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._locator, name)
+
+    def get_source_stamp(self) -> str:
+        return _DIGEST
+
+
+class _KernelCacheImpl(CompileResultCacheImpl):
+    @property
+    def locator(self) -> _StampedLocator:
+        return _StampedLocator(self._locator)
+
+
+class _KernelCache(FunctionCache):
+    _impl_class = _KernelCacheImpl
+
+
+# No reference counting (_nrt): no kernel allocates, and counting references to the arrays of a scene takes longer
+# than a sweep. Division by zero gives inf, which the callers test for (error_model).
+_OPTIONS = {"error_model": "numpy", "nogil": True, "_nrt": False}
+
+
+def inlined(function: _Function) -> _Function:
+    """Compile ``function`` into its callers: what passing so many arrays to it costs would exceed its work."""
+    return numba.njit(forceinline=True, **_OPTIONS)(function)
+
+
+def kernel(function: _Function) -> _Function:
+    """Compile ``function`` with numba (strict IEEE arithmetic, no GIL) and cache the result on disk."""
+    dispatcher = numba.njit(**_OPTIONS)(function)
+    if numba.config.DISABLE_JIT:
+        return function
+    try:
+        dispatcher._cache = _KernelCache(dispatcher.py_func)
+    except RuntimeError:  # no writable place for a cache: compile anew in each process
+        pass
+    return dispatcher
+
+
+class _Announcer(Listener):
+    """Says once that numba is compiling, so that the first call's delay does not look like a hang."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    def on_start(self, event: Event) -> None:
+        if not self._said:
+            logger.warning("compiling varpin's kernels; this happens once and takes up to half a minute")
+            self._said = True
+
+    def on_end(self, event: Event) -> None:
+        pass
+
+
+@contextlib.contextmanager
+def announced_compilation() -> Iterator[None]:
+    """Within this context a compilation that the disk cache does not save is announced in the log."""
+    with install_listener("numba:compile", _Announcer()):
+        yield

@@ -1,0 +1,89 @@
+"""Small dense factorisations, written out: at the size of an arm a LAPACK call costs more than its work."""
+
+from varpin.kernels._compile import inlined
+from varpin.kernels.tree import Floats
+
+
+@inlined
+def factor_lu(a: Floats) -> bool:
+    """LU of ``a`` (n, n) in place, without pivoting; False at a pivot that is not positive.
+
+    For a matrix whose symmetric part is positive definite every pivot is positive and none grows without bound.
+    """
+    n = a.shape[0]
+    for k in range(n):
+        pivot = a[k, k]
+        if not pivot > 0.0:
+            return False
+        inverse = 1.0 / pivot
+        for i in range(k + 1, n):
+            factor = a[i, k] * inverse
+            a[i, k] = factor
+            for j in range(k + 1, n):
+                a[i, j] -= factor * a[k, j]
+    return True
+
+
+@inlined
+def solve_lu(lu: Floats, b: Floats, x: Floats) -> None:
+    """X with L U x = b."""
+    n = lu.shape[0]
+    for i in range(n):
+        total = b[i]
+        for j in range(i):
+            total -= lu[i, j] * x[j]
+        x[i] = total
+    for i in range(n - 1, -1, -1):
+        total = x[i]
+        for j in range(i + 1, n):
+            total -= lu[i, j] * x[j]
+        x[i] = total / lu[i, i]
+
+
+@inlined
+def factor_ldl(a: Floats) -> bool:
+    """L D L' of the symmetric ``a`` (n, n) in place: pivots on the diagonal, unit L below it.
+
+    Reads the lower triangle; False at a pivot that is not positive.
+    """
+    n = a.shape[0]
+    for k in range(n):
+        pivot = a[k, k]
+        if not pivot > 0.0:
+            return False
+        inverse = 1.0 / pivot
+        for i in range(k + 1, n):
+            factor = a[i, k] * inverse
+            for j in range(k + 1, i + 1):
+                a[i, j] -= factor * a[j, k]
+        for i in range(k + 1, n):
+            a[i, k] *= inverse
+    return True
+
+
+@inlined
+def solve_ldl(ldl: Floats, b: Floats, x: Floats) -> None:
+    """X with L D L' x = b."""
+    n = ldl.shape[0]
+    for i in range(n):
+        total = b[i]
+        for j in range(i):
+            total -= ldl[i, j] * x[j]
+        x[i] = total
+    for i in range(n - 1, -1, -1):
+        total = x[i] / ldl[i, i]
+        for j in range(i + 1, n):
+            total -= ldl[j, i] * x[j]
+        x[i] = total
+
+
+@inlined
+def quadratic_form(a: Floats, x: Floats) -> float:
+    """X' a x."""
+    total = 0.0
+    for i in range(x.size):
+        row = 0.0
+        for j in range(x.size):
+            row += a[i, j] * x[j]
+        total += x[i] * row
+    return total

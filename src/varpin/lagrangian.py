@@ -1,0 +1,188 @@
+"""The Lagrangian L(q, v) = 1/2 v' M(q) v - V(q) of a scene, its derivatives, and the discrete Lagrangian's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import finite_array, fraction, positive
+from varpin.errors import InputError
+from varpin.kernels.jet import lagrangian_sweep
+from varpin.kernels.tree import new_sweep
+from varpin.scene import Scene
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LagrangianJet:
+    """A Lagrangian and its derivatives up to second order at one (q, v).
+
+    Attributes:
+        L: Lagrangian [J].
+        Lq: dL/dq (n,) [N m or N].
+        Lv: dL/dv = M v (n,), the momentum [N m s or N s].
+        Lqq: d2L/dq2 (n, n), symmetric.
+        Lvq: d2L/dv dq (n, n): ``Lvq[i, j]`` = d Lv[i] / d q[j]; its transpose is d Lq / dv.
+        Lvv: d2L/dv2 = M (n, n), symmetric, armature included.
+    """
+
+    L: float
+    Lq: Floats
+    Lv: Floats
+    Lqq: Floats
+    Lvq: Floats
+    Lvv: Floats
+
+
+def lagrangian_jet(
+    scene: Scene, q: ArrayLike, v: ArrayLike, *, backend: Literal["compiled", "pinocchio"] = "compiled"
+) -> LagrangianJet:
+    """L and all its derivatives up to second order; gravity, springs and armature of the scene included.
+
+    Args:
+        scene: The scene.
+        q: Configuration (n,) [rad or m].
+        v: Velocity (n,) [rad/s or m/s].
+        backend: ``"compiled"`` takes one sweep over the tree (see ``docs/mathematics.md``); ``"pinocchio"`` puts
+            the same together from Pinocchio's algorithms, slowly, as a reference.
+
+    Raises:
+        InputError: Wrong shapes, values that are not finite, or an unknown backend.
+    """
+    n = scene.robot.dof
+    q, v = finite_array("q", q, (n,)), finite_array("v", v, (n,))
+    if backend == "compiled":
+        return _compiled(scene, q, v)
+    if backend == "pinocchio":
+        return _from_pinocchio(scene, q, v)
+    raise InputError(f"backend must be 'compiled' or 'pinocchio', got {backend!r}")
+
+
+def _compiled(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
+    w = new_sweep(scene.robot.tree.parent.size, scene.robot.dof)
+    kinetic, potential = lagrangian_sweep(scene.mechanism, q, v, w)
+    return LagrangianJet(kinetic - potential, w.Lq, w.Lv, w.Lqq, w.A, w.M)
+
+
+def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
+    robot = scene.robot
+    model = robot.free_model.copy()
+    model.gravity = pin.Motion(scene.gravity, np.zeros(3))
+    data = model.createData()
+    full_q, full_v = robot.free_positions(q), robot.free_velocities(v)
+    # Columns of G: how the free joints move with each coordinate. Mimic joints make it more than a permutation.
+    G = robot.free_velocities(np.eye(robot.dof)).T
+
+    own_armature = model.armature.copy()
+    model.armature = np.zeros(model.nv)
+    M = pin.crba(model, data, full_q).copy()
+    M = np.triu(M) + np.triu(M, 1).T
+    pin.computeRNEADerivatives(model, data, full_q, np.zeros(model.nv), full_v)
+    A = data.dtau_dq.copy() - pin.computeGeneralizedGravityDerivatives(model, model.createData(), full_q)
+    C = pin.computeCoriolisMatrix(model, data, full_q, full_v).copy()
+    gravity = pin.computeGeneralizedGravity(model, data, full_q).copy()
+    M += np.diag(own_armature)
+
+    deflection = q - scene.rest
+    Lvv = G.T @ M @ G
+    Lq = G.T @ (C.T @ full_v - gravity) - scene.stiffness * deflection
+    Lqq = G.T @ _curvature(model, full_q, full_v, scene.gravity) @ G - np.diag(scene.stiffness)
+    potential = pin.computePotentialEnergy(model, data, full_q) + 0.5 * scene.stiffness @ deflection**2
+    return LagrangianJet(float(0.5 * v @ Lvv @ v - potential), Lq, Lvv @ v, Lqq, G.T @ A @ G, Lvv)
+
+
+def _curvature(model: pin.Model, q: Floats, v: Floats, gravity: Floats) -> Floats:
+    """L_qq (nv, nv) of gravity and motion from Pinocchio's world-frame Jacobian and its rate.
+
+    Pinocchio's Python bindings have no second derivatives of RNEA; see :mod:`varpin.kernels.jet` for the formula
+    L_qq[i, j] = W_i . B_j - F_j . (S_i x g), i an ancestor of j or j itself.
+    """
+    data = model.createData()
+    pin.computeJointJacobiansTimeVariation(model, data, q, v)
+    S, W = data.J.copy(), data.dJ.copy()
+    inertia = [np.zeros((6, 6)) for _ in range(model.njoints)]
+    momentum = [np.zeros(6) for _ in range(model.njoints)]
+    for joint in range(1, model.njoints):
+        inertia[joint] = data.oMi[joint].act(model.inertias[joint]).matrix()
+        velocity = data.oMi[joint].act(pin.getVelocity(model, data, joint)).vector
+        momentum[joint] = inertia[joint] @ velocity
+    for joint in range(model.njoints - 1, 0, -1):
+        inertia[model.parents[joint]] += inertia[joint]
+        momentum[model.parents[joint]] += momentum[joint]
+    field = pin.Motion(gravity, np.zeros(3))
+    curvature = np.zeros((model.nv, model.nv))
+    for below in range(1, model.njoints):
+        j = model.joints[below].idx_v
+        F = inertia[below] @ S[:, j]
+        B = inertia[below] @ W[:, j] + pin.Motion(S[:, j]).cross(pin.Force(momentum[below])).vector
+        above = below
+        while above > 0:
+            i = model.joints[above].idx_v
+            curvature[i, j] = W[:, i] @ B - F @ pin.Motion(S[:, i]).cross(field).vector
+            curvature[j, i] = curvature[i, j]
+            above = model.parents[above]
+    return curvature
+
+
+@dataclass(frozen=True, eq=False)
+class DiscreteLagrangian:
+    """The discrete Lagrangian of one step and its slot derivatives.
+
+    Attributes:
+        Ld: Discrete Lagrangian [J s].
+        D1: Derivative in q0 (n,); -D1 is the momentum at the start of the step.
+        D2: Derivative in q1 (n,), the momentum at its end [N m s or N s].
+        D1D1: Second derivative in q0 (n, n), symmetric.
+        D2D1: Derivative of D1 in q1 (n, n).
+        D1D2: Derivative of D2 in q0 (n, n), the transpose of D2D1.
+        D2D2: Second derivative in q1 (n, n), symmetric.
+    """
+
+    Ld: float
+    D1: Floats
+    D2: Floats
+    D1D1: Floats
+    D2D1: Floats
+    D1D2: Floats
+    D2D2: Floats
+
+
+def discrete_lagrangian(
+    scene: Scene, q0: ArrayLike, q1: ArrayLike, dt: float, *, alpha: float = 0.5
+) -> DiscreteLagrangian:
+    """L_d(q0, q1) = dt L((1 - alpha) q0 + alpha q1, (q1 - q0) / dt) and its slot derivatives.
+
+    The generalized midpoint rule (Marsden and West 2001, Johnson and Murphey 2009). Friction and controls are no
+    part of it.
+
+    Args:
+        scene: The scene.
+        q0: Configuration (n,) at the start [rad or m].
+        q1: Configuration (n,) at the end [rad or m].
+        dt: Time step [s].
+        alpha: Where between q0 and q1 the Lagrangian is taken, in [0, 1]; 1/2 is of second order.
+
+    Raises:
+        InputError: Wrong shapes, values that are not finite, dt <= 0, alpha outside [0, 1].
+    """
+    n = scene.robot.dof
+    q0, q1 = finite_array("q0", q0, (n,)), finite_array("q1", q1, (n,))
+    h, a = positive("dt", dt, "s"), fraction("alpha", alpha)
+    jet = lagrangian_jet(scene, (1.0 - a) * q0 + a * q1, (q1 - q0) / h)
+    b = 1.0 - a
+    Lqv = jet.Lvq.T
+    D2D1 = h * a * b * jet.Lqq + b * Lqv - a * jet.Lvq - jet.Lvv / h
+    return DiscreteLagrangian(
+        Ld=h * jet.L,
+        D1=h * b * jet.Lq - jet.Lv,
+        D2=h * a * jet.Lq + jet.Lv,
+        D1D1=h * b * b * jet.Lqq - b * (Lqv + jet.Lvq) + jet.Lvv / h,
+        D2D1=D2D1,
+        D1D2=D2D1.T.copy(),
+        D2D2=h * a * a * jet.Lqq + a * (Lqv + jet.Lvq) + jet.Lvv / h,
+    )

@@ -1,0 +1,10 @@
+"""Robots: found, parsed, locked and laid out as the flat tree that the kernels run on."""
+
+from varpin.robot.chain import planar_chain as planar_chain
+from varpin.robot.model import Robot as Robot
+from varpin.robot.model import build_robot as build_robot
+from varpin.robot.model import check_inertia as check_inertia
+from varpin.robot.model import geometry as geometry
+from varpin.robot.model import load_robot as load_robot
+from varpin.robot.model import mass_matrix as mass_matrix
+from varpin.robot.sources import bundled_robots as bundled_robots

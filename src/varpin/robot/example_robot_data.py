@@ -1,0 +1,119 @@
+"""Where the example-robot-data package keeps its robots.
+
+Its 6.x wheels carry the data alone, so the files are found through the installed distribution's metadata.
+"""
+
+from importlib import metadata
+from pathlib import Path
+
+from varpin.errors import RobotError
+
+DISTRIBUTION = "example-robot-data"
+
+# Names as in example_robot_data.load; paths below share/example-robot-data/robots.
+FIXED_BASE: dict[str, str] = {
+    "alex_nub_hands": "alex_description/urdf/alex_nub_hands.urdf",
+    "alex_psyonic_hands": "alex_description/urdf/alex_psyonic_hands.urdf",
+    "alex_sake_hands": "alex_description/urdf/alex_sake_hands.urdf",
+    "allegro_left_hand": "allegro_hand_description/urdf/allegro_left_hand.urdf",
+    "allegro_right_hand": "allegro_hand_description/urdf/allegro_right_hand.urdf",
+    "asr_twodof": "asr_twodof_description/urdf/TwoDofs.urdf",
+    "baxter": "baxter_description/urdf/baxter.urdf",
+    "bravo7_gripper": "bravo7_description/urdf/bravo7_gripper.urdf",
+    "bravo7_no_ee": "bravo7_description/urdf/bravo7_no_ee.urdf",
+    "double_pendulum": "double_pendulum_description/urdf/double_pendulum.urdf",
+    "double_pendulum_continuous": "double_pendulum_description/urdf/double_pendulum_continuous.urdf",
+    "double_pendulum_simple": "double_pendulum_description/urdf/double_pendulum_simple.urdf",
+    "finger_edu": "finger_edu_description/robots/finger_edu.urdf",
+    "kinova": "kinova_description/robots/kinova.urdf",
+    "panda": "panda_description/urdf/panda.urdf",
+    "panda_collision": "panda_description/urdf/panda_collision.urdf",
+    "so100": "so_arm_description/urdf/so100.urdf",
+    "so101": "so_arm_description/urdf/so101.urdf",
+    "talos_arm": "talos_data/robots/talos_left_arm.urdf",
+    "tiago": "tiago_description/robots/tiago.urdf",
+    "tiago_dual": "tiago_description/robots/tiago_dual.urdf",
+    "tiago_no_hand": "tiago_description/robots/tiago_no_hand.urdf",
+    "tiago_pro": "tiago_pro_description/robots/tiago_pro.urdf",
+    "ur3": "ur_description/urdf/ur3_robot.urdf",
+    "ur3_gripper": "ur_description/urdf/ur3_gripper.urdf",
+    "ur3_limited": "ur_description/urdf/ur3_joint_limited_robot.urdf",
+    "ur5": "ur_description/urdf/ur5_robot.urdf",
+    "ur5_gripper": "ur_description/urdf/ur5_gripper.urdf",
+    "ur5_limited": "ur_description/urdf/ur5_joint_limited_robot.urdf",
+    "ur10": "ur_description/urdf/ur10_robot.urdf",
+    "ur10_limited": "ur_description/urdf/ur10_joint_limited_robot.urdf",
+    "xarm7": "xarm_description/urdf/xarm7.urdf",
+    "z1": "z1_description/urdf/z1.urdf",
+}
+
+# SRDF files that give a robot's rotor inertias and gear ratios, from which the armature follows.
+ROTORS: dict[str, str] = {"talos_arm": "talos_data/srdf/talos.srdf"}
+
+# Robots that walk, fly or swim: example-robot-data gives them a free-flyer.
+FLOATING_BASE = frozenset(
+    [
+        "a1",
+        "alexander",
+        "anymal",
+        "anymal_c",
+        "anymal_kinova",
+        "b1",
+        "b1_z1",
+        "bluevolta_bravo7_gripper",
+        "bluevolta_bravo7_no_ee",
+        "bolt",
+        "borinot",
+        "cassie",
+        "centauro",
+        "falcon_bravo7_gripper",
+        "falcon_bravo7_no_ee",
+        "g1",
+        "g1_with_hands",
+        "go1",
+        "go2",
+        "hector",
+        "hextilt",
+        "human",
+        "hyq",
+        "icub",
+        "icub_reduced",
+        "iris",
+        "laikago",
+        "pr2",
+        "quadruped",
+        "romeo",
+        "simple_humanoid",
+        "simple_humanoid_classical",
+        "solo12",
+        "solo8",
+        "talos",
+        "talos_box",
+        "talos_full",
+        "talos_full_box",
+        "talos_legs",
+    ]
+)
+
+
+def locate(relative: str) -> Path:
+    """The installed file at ``relative`` below the robots folder.
+
+    Raises:
+        RobotError: example-robot-data is not installed, or its version does not hold the file.
+    """
+    try:
+        files = metadata.files(DISTRIBUTION) or []
+    except metadata.PackageNotFoundError:
+        raise RobotError(
+            f"{relative} belongs to {DISTRIBUTION}, which is not installed: pip install {DISTRIBUTION}"
+        ) from None
+    for file in files:
+        if file.as_posix().endswith(f"example-robot-data/robots/{relative}"):
+            return Path(str(file.locate())).resolve()
+    raise RobotError(f"the installed {DISTRIBUTION} {metadata.version(DISTRIBUTION)} does not hold {relative}")
+
+
+def package_dir(urdf: Path) -> Path:
+    """The folder below which ``package://example-robot-data/...`` paths of ``urdf`` are found."""
+    return next(parent.parent for parent in urdf.parents if parent.name == "example-robot-data")

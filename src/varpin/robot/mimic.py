@@ -1,0 +1,193 @@
+"""Mimic joints: which joint follows which, and Pinocchio models with and without the tie.
+
+Pinocchio computes no RNEA derivatives on a model with mimic joints, so varpin keeps the model in which every
+joint stands on its own beside the one in which followers are tied to their leaders.
+"""
+
+import logging
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from varpin.errors import RobotError
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Tie:
+    """Joint ``follower`` stands at ratio * (position of joint ``leader``) + offset. Joints by Pinocchio index."""
+
+    follower: int
+    leader: int
+    ratio: float
+    offset: float
+
+
+def joint_index(model: pin.Model) -> dict[str, int]:
+    """Index of each joint by name, the universe left out."""
+    return {name: i for i, name in enumerate(model.names) if i > 0}
+
+
+def ties_of_urdf(text: str, model: pin.Model) -> tuple[Tie, ...]:
+    """The ties that a URDF's ``<mimic>`` elements ask for.
+
+    A follower whose leader is not in the robot stays free, with a warning in the log: some published models
+    name leaders that do not exist. A leader that is itself a follower is followed to its own leader.
+
+    Raises:
+        RobotError: A mimic element has no number for its multiplier or offset, or joints follow each other in a loop.
+    """
+    index = joint_index(model)
+    ties: dict[int, Tie] = {}
+    for joint in ET.fromstring(text).iter("joint"):
+        mimic = joint.find("mimic")
+        name = joint.get("name", "")
+        if mimic is None or name not in index:
+            continue
+        leader = mimic.get("joint", "")
+        if leader not in index:
+            logger.warning("joint %r mimics %r, which is not a moving joint of the robot: it stays free", name, leader)
+            continue
+        try:
+            ratio, offset = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
+        except ValueError as error:
+            raise RobotError(f"joint {name!r}: its mimic element has {error}") from None
+        if not np.isfinite([ratio, offset]).all():
+            raise RobotError(f"joint {name!r}: its mimic multiplier and offset must be finite")
+        ties[index[name]] = Tie(index[name], index[leader], ratio, offset)
+    return tuple(_to_the_end(tie, ties, model) for tie in ties.values())
+
+
+def _to_the_end(tie: Tie, ties: dict[int, Tie], model: pin.Model) -> Tie:
+    """The tie to the free joint at the end of a chain of leaders."""
+    for _ in range(len(ties) + 1):
+        if tie.leader not in ties:
+            return tie
+        after = ties[tie.leader]
+        tie = Tie(tie.follower, after.leader, tie.ratio * after.ratio, tie.ratio * after.offset + tie.offset)
+    raise RobotError(f"joint {model.names[tie.follower]!r} mimics itself through a loop of mimic joints")
+
+
+def tied_model(model: pin.Model, ties: Sequence[Tie]) -> pin.Model:
+    """``model`` with its followers as Pinocchio mimic joints.
+
+    Raises:
+        RobotError: A leader comes after its follower, which Pinocchio cannot express.
+    """
+    for tie in ties:
+        model = pin.transformJointIntoMimic(model, tie.leader, tie.follower, tie.ratio, tie.offset)
+    return model
+
+
+def leaders_first(model: pin.Model, ties: Sequence[Tie]) -> pin.Model:
+    """``model`` with sibling branches reordered so that leaders come before their followers.
+
+    Raises:
+        RobotError: A follower carries its own leader.
+    """
+    if all(tie.leader < tie.follower for tie in ties):
+        return model
+    parents = list(model.parents)
+
+    def ancestors(joint: int) -> list[int]:
+        path = [joint]
+        while path[-1] > 0:
+            path.append(parents[path[-1]])
+        return path
+
+    before: dict[int, set[int]] = {}
+    for tie in ties:
+        leaders, followers = ancestors(tie.leader), ancestors(tie.follower)
+        if tie.follower in leaders:
+            raise RobotError(
+                f"joint {model.names[tie.follower]!r} carries the joint it mimics, {model.names[tie.leader]!r}: "
+                "Pinocchio cannot tie them; load with mimic='free' and lock one of them"
+            )
+        if tie.leader in followers:
+            continue
+        fork = next(joint for joint in leaders if joint in followers)
+        first, then = leaders[leaders.index(fork) - 1], followers[followers.index(fork) - 1]
+        before.setdefault(then, set()).add(first)
+
+    order: list[int] = []
+
+    def visit(joint: int) -> None:
+        order.append(joint)
+        waiting = [child for child in range(1, model.njoints) if parents[child] == joint]
+        while waiting:
+            ready = [child for child in waiting if not before.get(child, set()) & set(waiting)]
+            if not ready:
+                raise RobotError(f"mimic joints below {model.names[joint]!r} follow each other across branches")
+            waiting.remove(ready[0])
+            visit(ready[0])
+
+    visit(0)
+    return rebuild(model, order[1:], lambda joint: model.joints[joint])
+
+
+def untied_model(model: pin.Model) -> tuple[pin.Model, tuple[Tie, ...]]:
+    """A model without mimic joints, and the ties that ``model`` had."""
+    ties = []
+    mimics = [j for j in range(1, model.njoints) if model.joints[j].nv == 0 and "Mimic" in model.joints[j].shortname()]
+    if not mimics:
+        return model, ()
+    leaders = dict(zip(model.mimicking_joints, model.mimicked_joints, strict=True))
+
+    def free_joint(joint: int) -> pin.JointModel:
+        if joint not in mimics:
+            return model.joints[joint]
+        follower = model.joints[joint].extract()
+        data = model.joints[joint].createData()
+        model.joints[joint].calc(data, pin.neutral(model))
+        subspace = np.asarray(data.S, dtype=float).reshape(6)
+        slides = bool(subspace[:3].any())
+        axis = (subspace[:3] if slides else subspace[3:]) / follower.scaling
+        ties.append(Tie(joint, leaders[joint], float(follower.scaling), float(follower.offset)))
+        return pin.JointModelPrismaticUnaligned(axis) if slides else pin.JointModelRevoluteUnaligned(axis)
+
+    return rebuild(model, range(1, model.njoints), free_joint), tuple(ties)
+
+
+def rebuild(model: pin.Model, order: Sequence[int], joint_of: Callable[[int], pin.JointModel]) -> pin.Model:
+    """``model`` with its joints added again in ``order``, each as ``joint_of`` gives it.
+
+    Links, frames, limits and armature go along. The universe is not in ``order``.
+    """
+    new = pin.Model()
+    new.name = model.name
+    new.gravity = model.gravity
+    place = {0: 0}
+    for joint in order:
+        source = joint_of(joint)
+        place[joint] = new.addJoint(
+            place[model.parents[joint]], source, model.jointPlacements[joint], model.names[joint]
+        )
+        new.appendBodyToJoint(place[joint], model.inertias[joint], pin.SE3.Identity())
+        old, copy = model.joints[joint], new.joints[place[joint]]
+        if old.nv == copy.nv:
+            for limits in ("lowerPositionLimit", "upperPositionLimit"):
+                getattr(new, limits)[copy.idx_q : copy.idx_q + copy.nq] = getattr(model, limits)[
+                    old.idx_q : old.idx_q + old.nq
+                ]
+            for limits in ("velocityLimit", "effortLimit", "armature", "rotorInertia", "rotorGearRatio"):
+                getattr(new, limits)[copy.idx_v : copy.idx_v + copy.nv] = getattr(model, limits)[
+                    old.idx_v : old.idx_v + old.nv
+                ]
+    frames = {0: 0}
+    for index, frame in list(enumerate(model.frames))[1:]:
+        frames[index] = new.addFrame(
+            pin.Frame(
+                frame.name,
+                place[frame.parentJoint],
+                frames[frame.parentFrame],
+                frame.placement,
+                frame.type,
+                pin.Inertia.Zero(),
+            ),
+            False,
+        )
+    return new

@@ -1,0 +1,319 @@
+"""The robot: a Pinocchio model, its generalized coordinates, and the tree the kernels run on."""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint
+from varpin.kernels.tree import Tree
+from varpin.robot.mimic import Tie, joint_index, tied_model
+from varpin.robot.sources import Description, describe
+from varpin.robot.tree import flatten, is_unbounded, to_pinocchio
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """An arm in generalized coordinates. Made by :func:`load_robot`.
+
+    The n coordinates are the positions of the joints that are neither locked, fixed nor mimicking, in
+    Pinocchio's order: an angle [rad] for a revolute or continuous joint, a displacement [m] for a prismatic one.
+
+    Attributes:
+        name: Where it came from, in a word.
+        model: The Pinocchio model, mimic joints tied to their leaders; ``model.nv == dof``. A continuous joint
+            takes two entries of Pinocchio's configuration: see :meth:`configuration`.
+        joint_names: The joints that are coordinates, in order.
+        free_model: The same with mimic joints on their own, on which Pinocchio computes every derivative.
+        ties: The mimic joints, by index in ``free_model``.
+        tree: Flat arrays for the kernels.
+        locked: Joints that were locked, and where.
+        urdf: The file the robot was read from, or None.
+        package_dirs: Where its meshes are looked up.
+        visuals: Geometry that came with a RobotWrapper, locked like the model, or None.
+    """
+
+    name: str
+    model: pin.Model
+    joint_names: tuple[str, ...]
+    free_model: pin.Model = field(repr=False)
+    ties: tuple[Tie, ...] = field(repr=False)
+    tree: Tree = field(repr=False)
+    locked: Mapping[str, float | tuple[float, ...]] = field(default_factory=lambda: MappingProxyType({}))
+    urdf: Path | None = None
+    package_dirs: tuple[str, ...] = field(default=(), repr=False)
+    visuals: pin.GeometryModel | None = field(default=None, repr=False)
+
+    @property
+    def dof(self) -> int:
+        """n, the number of generalized coordinates."""
+        return len(self.joint_names)
+
+    def coordinate(self, joint: str) -> int:
+        """Index of a joint among the coordinates.
+
+        Raises:
+            UnknownJoint: The robot has no such coordinate.
+        """
+        if joint not in self.joint_names:
+            raise UnknownJoint(joint, self.joint_names, f"robot {self.name!r}")
+        return self.joint_names.index(joint)
+
+    def configuration(self, q: ArrayLike) -> Floats:
+        """``q`` (..., n) as Pinocchio configurations (..., model.nq) of ``model``."""
+        return self._spread(self.model, np.asarray(q, dtype=float))
+
+    def free_positions(self, q: ArrayLike) -> Floats:
+        """``q`` (..., n) as configurations (..., free_model.nq) of ``free_model``."""
+        q = np.asarray(q, dtype=float)
+        positions = q[..., self.tree.coordinate] * self.tree.ratio + self.tree.offset
+        return to_pinocchio(self.free_model, positions)
+
+    def free_velocities(self, v: ArrayLike) -> Floats:
+        """``v`` (..., n) as velocities (..., free_model.nv) of ``free_model``: linear in v."""
+        return np.asarray(v, dtype=float)[..., self.tree.coordinate] * self.tree.ratio
+
+    @property
+    def unbounded(self) -> NDArray[np.bool_]:
+        """Which coordinates (n,) are continuous joints."""
+        index = joint_index(self.model)
+        return np.array([is_unbounded(self.model, index[name]) for name in self.joint_names], dtype=bool)
+
+    @property
+    def position_limits(self) -> tuple[Floats, Floats]:
+        """Lower and upper bounds (n,), (n,) [rad or m]; infinite where there are none."""
+        lower, upper = np.full(self.dof, -np.inf), np.full(self.dof, np.inf)
+        index = joint_index(self.model)
+        for c, name in enumerate(self.joint_names):
+            joint = self.model.joints[index[name]]
+            if joint.nq == 1:
+                lower[c], upper[c] = (
+                    self.model.lowerPositionLimit[joint.idx_q],
+                    self.model.upperPositionLimit[joint.idx_q],
+                )
+        # Pinocchio writes the absence of a limit as the largest double.
+        lower[lower <= -1e300], upper[upper >= 1e300] = -np.inf, np.inf
+        return lower, upper
+
+    @property
+    def velocity_limit(self) -> Floats:
+        """Bound (n,) [rad/s or m/s]; infinite where there is none."""
+        return self._limit("velocityLimit")
+
+    @property
+    def effort_limit(self) -> Floats:
+        """Bound (n,) [N m or N]; infinite where there is none."""
+        return self._limit("effortLimit")
+
+    def _limit(self, attribute: str) -> Floats:
+        index = joint_index(self.model)
+        values = np.asarray(getattr(self.model, attribute), dtype=float)
+        limit = np.array([values[self.model.joints[index[name]].idx_v] for name in self.joint_names])
+        return np.where(limit >= 1e300, np.inf, limit)
+
+    def _spread(self, model: pin.Model, q: Floats) -> Floats:
+        configuration = np.empty((*q.shape[:-1], model.nq))
+        index = joint_index(model)
+        for c, name in enumerate(self.joint_names):
+            joint = model.joints[index[name]]
+            if joint.nq == 2:
+                configuration[..., joint.idx_q], configuration[..., joint.idx_q + 1] = (
+                    np.cos(q[..., c]),
+                    np.sin(q[..., c]),
+                )
+            else:
+                configuration[..., joint.idx_q] = q[..., c]
+        return configuration
+
+
+def load_robot(
+    source: "str | os.PathLike[str] | pin.Model | pin.RobotWrapper",
+    *,
+    package_dirs: Sequence[str | os.PathLike[str]] | None = None,
+    lock: Mapping[str, ArrayLike] | None = None,
+    mimic: Literal["tied", "free"] = "tied",
+) -> Robot:
+    """Load an arm.
+
+    Main args:
+        source: Path of a URDF file; name of a bundled robot (``"finger"``); name of a fixed-base robot of
+            example-robot-data (``"ur5"``); a ``pin.Model``; or a ``RobotWrapper``.
+        lock: Joints to hold still, by name, and where: ``{"panda_finger_joint1": 0.02}`` [rad or m]. They are
+            removed before anything is computed. A joint that is not one-axis (a free-flyer, say) takes its
+            Pinocchio configuration.
+
+    Other Args:
+        package_dirs: Where ``package://`` mesh paths are looked up; the URDF's own folder is always searched.
+        mimic: ``"tied"`` moves a mimic joint with its leader; ``"free"`` makes it a coordinate of its own.
+
+    Returns:
+        The robot, its geometry not yet read.
+
+    Raises:
+        RobotNotFound: No such file or name; close matches are listed.
+        RobotError: The file is not a URDF, its XML is broken, or a link's inertia is not finite.
+        UnsupportedJoint: A joint has no single axis (free-flyer, spherical, planar, screw).
+        UnknownJoint: ``lock`` names a joint that is not there.
+        SingularMassMatrix: A joint moves no inertia.
+    """
+    robot = build_robot(source, package_dirs=package_dirs, lock=lock, mimic=mimic)
+    check_inertia(robot)
+    return robot
+
+
+def build_robot(
+    source: object,
+    *,
+    package_dirs: Sequence[str | os.PathLike[str]] | None = None,
+    lock: Mapping[str, ArrayLike] | None = None,
+    mimic: Literal["tied", "free"] = "tied",
+) -> Robot:
+    """:func:`load_robot` without the check that every joint moves inertia, for looking into faulty models."""
+    if mimic not in ("tied", "free"):
+        raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
+    description = describe(source, package_dirs, mimic=mimic == "tied")
+    if mimic == "free":
+        description = Description(**{**vars(description), "ties": ()})
+    model, ties, visuals, locked = _lock(description, lock or {})
+    followers = {tie.follower for tie in ties}
+    coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
+    if not coordinates:
+        raise RobotError(f"robot {description.name!r} has no joint that moves")
+    tree = flatten(model, ties, coordinates)
+    return Robot(
+        name=description.name,
+        model=tied_model(model, ties),
+        joint_names=tuple(model.names[joint] for joint in coordinates),
+        free_model=model,
+        ties=ties,
+        tree=tree,
+        locked=MappingProxyType(locked),
+        urdf=description.urdf,
+        package_dirs=description.package_dirs,
+        visuals=visuals,
+    )
+
+
+def _lock(
+    description: Description, lock: Mapping[str, ArrayLike]
+) -> tuple[pin.Model, tuple[Tie, ...], pin.GeometryModel | None, dict[str, float | tuple[float, ...]]]:
+    """Remove the locked joints, and the followers of locked leaders, from model, ties and geometry."""
+    model, visuals = description.model, description.visuals
+    index = joint_index(model)
+    leaders = {tie.follower: tie for tie in description.ties}
+    reference = pin.neutral(model)
+    locked: dict[str, float | tuple[float, ...]] = {}
+    positions: dict[int, Floats] = {}
+    for name, value in lock.items():
+        if name not in index:
+            raise UnknownJoint(name, index, f"lock of robot {description.name!r}")
+        joint = index[name]
+        if joint in leaders:
+            leader = model.names[leaders[joint].leader]
+            raise InputError(f"lock: joint {name!r} mimics {leader!r}; lock {leader!r}, and it is locked along")
+        positions[joint] = _locked_position(model, joint, value)
+        locked[name] = float(positions[joint][0]) if positions[joint].size == 1 else tuple(positions[joint].tolist())
+    for tie in description.ties:
+        if tie.leader in positions:
+            positions[tie.follower] = tie.ratio * positions[tie.leader] + tie.offset
+            locked[model.names[tie.follower]] = float(positions[tie.follower][0])
+    if not positions:
+        return model, description.ties, visuals, {}
+    for joint, position in positions.items():
+        kind = model.joints[joint]
+        if kind.nv == 1 and kind.nq == 2:
+            position = np.array([np.cos(position[0]), np.sin(position[0])])
+        reference[kind.idx_q : kind.idx_q + kind.nq] = position
+    joints = sorted(positions)
+    if visuals is None:
+        reduced = pin.buildReducedModel(model, joints, reference)
+    else:
+        reduced, visuals = pin.buildReducedModel(model, visuals, joints, reference)
+    reduced.gravity = model.gravity
+    left = joint_index(reduced)
+    ties = tuple(
+        Tie(left[model.names[tie.follower]], left[model.names[tie.leader]], tie.ratio, tie.offset)
+        for tie in description.ties
+        if tie.follower not in positions
+    )
+    return reduced, ties, visuals, locked
+
+
+def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
+    kind = model.joints[joint]
+    size = 1 if kind.nv == 1 else kind.nq
+    position = np.atleast_1d(np.asarray(value, dtype=float))
+    if position.shape != (size,):
+        raise InputError(f"lock[{model.names[joint]!r}] must have {size} value(s), got shape {position.shape}")
+    if not np.isfinite(position).all():
+        raise InputError(f"lock[{model.names[joint]!r}] must be finite, got {value}")
+    return position
+
+
+def geometry(robot: Robot) -> pin.GeometryModel:
+    """The robot's visual geometry, read from its meshes now; empty where the source gives none.
+
+    Raises:
+        RobotError: A mesh is missing or cannot be read; the message names it.
+    """
+    if robot.visuals is not None:
+        return robot.visuals
+    if robot.urdf is None:
+        return pin.GeometryModel()
+    full = pin.buildModelFromUrdf(str(robot.urdf))
+    try:
+        visuals = pin.buildGeomFromUrdf(full, str(robot.urdf), pin.GeometryType.VISUAL, None, list(robot.package_dirs))
+    except (ValueError, RuntimeError) as error:
+        raise RobotError(f"the meshes of robot {robot.name!r} cannot be read: {error}") from None
+    # Attach to the joints of the model the robot moves with: by name, and locked joints through their frame.
+    for shape in visuals.geometryObjects:
+        frame = robot.free_model.getFrameId(full.frames[shape.parentFrame].name)
+        old_joint = full.joints[shape.parentJoint].id
+        name = full.names[old_joint]
+        if name in joint_index(robot.free_model):
+            shape.parentJoint = joint_index(robot.free_model)[name]
+        else:
+            moved = robot.free_model.frames[robot.free_model.getFrameId(name)]
+            shape.placement = moved.placement * shape.placement
+            shape.parentJoint = moved.parentJoint
+        shape.parentFrame = frame
+    return visuals
+
+
+def check_inertia(robot: Robot) -> None:
+    """Refuse a robot whose mass matrix is singular at rest or at a few seeded random configurations.
+
+    Raises:
+        SingularMassMatrix: Naming the joints whose motion carries no inertia.
+    """
+    rng = np.random.default_rng(0)
+    data = robot.free_model.createData()
+    for q in [np.zeros(robot.dof), *rng.uniform(-np.pi, np.pi, (3, robot.dof))]:
+        M = mass_matrix(robot, q, data)
+        scale = np.sqrt(np.diag(M))
+        if not (np.diag(M) > 0.0).all():
+            raise SingularMassMatrix(
+                [name for name, m in zip(robot.joint_names, np.diag(M), strict=True) if not m > 0.0], q
+            )
+        values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
+        if values[0] <= robot.dof * np.finfo(float).eps:
+            worst = np.abs(vectors[:, 0])
+            raise SingularMassMatrix(
+                [name for name, x in zip(robot.joint_names, worst, strict=True) if x >= 0.5 * worst.max()], q
+            )
+
+
+def mass_matrix(robot: Robot, q: ArrayLike, data: pin.Data) -> Floats:
+    """M(q) (n, n) by Pinocchio's composite rigid body algorithm, armature included [kg m^2, kg m or kg]."""
+    full = pin.crba(robot.free_model, data, robot.free_positions(q))
+    full = np.triu(full) + np.triu(full, 1).T
+    G = robot.free_velocities(np.eye(robot.dof)).T
+    return np.asarray(G.T @ full @ G)

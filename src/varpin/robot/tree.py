@@ -1,0 +1,133 @@
+"""From a Pinocchio model to flat arrays: every joint turned so that it moves about or along its own z axis."""
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from varpin.errors import InputError, RobotError, UnsupportedJoint
+from varpin.kernels.tree import Tree
+from varpin.robot.mimic import Tie
+
+Floats = NDArray[np.float64]
+
+
+def joint_axis(model: pin.Model, joint: int) -> tuple[bool, Floats]:
+    """Whether a one-axis joint is prismatic, and its unit axis (3,) in the joint's frame.
+
+    Raises:
+        UnsupportedJoint: The joint has another number of degrees of freedom, or screws.
+    """
+    kind = model.joints[joint]
+    name = model.names[joint]
+    if kind.nv != 1 or kind.nq > 2:
+        raise UnsupportedJoint(name, kind.shortname())
+    data = kind.createData()
+    kind.calc(data, pin.neutral(model))
+    subspace = np.asarray(data.S, dtype=float).reshape(6)
+    linear, angular = subspace[:3], subspace[3:]
+    if linear.any() and angular.any():
+        raise UnsupportedJoint(name, kind.shortname())
+    axis = angular if angular.any() else linear
+    return bool(linear.any()), axis / np.linalg.norm(axis)
+
+
+def is_unbounded(model: pin.Model, joint: int) -> bool:
+    """Whether Pinocchio keeps the joint's angle as a (cos, sin) pair."""
+    return bool(model.joints[joint].nv == 1 and model.joints[joint].nq == 2)
+
+
+def z_to(axis: Floats) -> Floats:
+    """A rotation matrix (3, 3) whose third column is ``axis``, exact for the coordinate axes."""
+    helper = np.eye(3)[np.argmin(np.abs(axis))]
+    x = np.cross(helper, axis)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(axis, x), axis])
+
+
+def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...]) -> Tree:
+    """The tree of a model whose joints all have one axis.
+
+    Args:
+        model: Every joint on its own, mimic or not.
+        ties: Which joints follow which.
+        coordinates: Indices of the joints that are generalized coordinates, in their order.
+
+    Raises:
+        UnsupportedJoint: A joint has no single axis.
+        RobotError: A link's mass, centre or inertia is NaN or infinite, or its mass is negative.
+    """
+    bodies = model.njoints - 1
+    tied = {tie.follower: tie for tie in ties}
+    index = {joint: c for c, joint in enumerate(coordinates)}
+    turn = [np.eye(3)]
+    prismatic = np.zeros(bodies, dtype=np.int64)
+    rotation = np.zeros((bodies, 3, 3))
+    translation = np.zeros((bodies, 3))
+    mass = np.zeros(bodies)
+    center = np.zeros((bodies, 3))
+    inertia = np.zeros((bodies, 6))
+    coordinate = np.zeros(bodies, dtype=np.int64)
+    ratio = np.ones(bodies)
+    offset = np.zeros(bodies)
+    for body in range(bodies):
+        joint = body + 1
+        slides, axis = joint_axis(model, joint)
+        turn.append(z_to(axis))
+        before = turn[model.parents[joint]]
+        placement = model.jointPlacements[joint]
+        prismatic[body] = slides
+        rotation[body] = before.T @ placement.rotation @ turn[joint]
+        translation[body] = before.T @ placement.translation
+        link = model.inertias[joint]
+        mass[body] = link.mass
+        center[body] = turn[joint].T @ link.lever
+        about_center = turn[joint].T @ link.inertia @ turn[joint]
+        inertia[body] = about_center[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]
+        if not (np.isfinite(mass[body]) and np.isfinite(center[body]).all() and np.isfinite(inertia[body]).all()):
+            raise RobotError(f"the link moved by joint {model.names[joint]!r} has a mass or inertia that is not finite")
+        if mass[body] < 0.0:
+            raise RobotError(f"the link moved by joint {model.names[joint]!r} has mass {mass[body]} < 0 [kg]")
+        if joint in tied:
+            tie = tied[joint]
+            coordinate[body], ratio[body], offset[body] = index[tie.leader], tie.ratio, tie.offset
+        else:
+            coordinate[body] = index[joint]
+    return Tree(
+        parent=np.array([model.parents[j] - 1 for j in range(1, model.njoints)], dtype=np.int64),
+        prismatic=prismatic,
+        rotation=rotation,
+        translation=translation,
+        mass=mass,
+        center=center,
+        inertia=inertia,
+        coordinate=coordinate,
+        ratio=ratio,
+        offset=offset,
+        armature=coordinate_armature(model, ties, coordinates),
+    )
+
+
+def coordinate_armature(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...]) -> Floats:
+    """Armature (n,) seen by each coordinate: its own and its followers', by the square of their ratios."""
+    own = np.asarray(model.armature, dtype=float)
+    armature = np.array([own[model.joints[joint].idx_v] for joint in coordinates])
+    for tie in ties:
+        armature[coordinates.index(tie.leader)] += tie.ratio**2 * own[model.joints[tie.follower].idx_v]
+    if not (np.isfinite(armature).all() and (armature >= 0.0).all()):
+        raise InputError(f"armature must be finite and >= 0, got {armature}")
+    return armature
+
+
+def to_pinocchio(model: pin.Model, positions: Floats) -> Floats:
+    """Joint positions (..., k), one a joint, as configurations (..., model.nq) of a model without mimic joints.
+
+    A continuous joint's angle becomes Pinocchio's (cos, sin).
+    """
+    configuration = np.empty((*positions.shape[:-1], model.nq))
+    for k, joint in enumerate(model.joints[1:]):
+        if joint.nq == 2:
+            configuration[..., joint.idx_q] = np.cos(positions[..., k])
+            configuration[..., joint.idx_q + 1] = np.sin(positions[..., k])
+        else:
+            configuration[..., joint.idx_q] = positions[..., k]
+    return configuration

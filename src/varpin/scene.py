@@ -1,0 +1,122 @@
+"""A scene: a robot and only what it needs around it. Gravity, dampers, springs, actuation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import broadcast_array, finite_array
+from varpin.errors import InputError
+from varpin.kernels.tree import Mechanism
+from varpin.robot import Robot
+
+Floats = NDArray[np.float64]
+
+EARTH = (0.0, 0.0, -9.81)
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Scene:
+    """A robot in its surroundings.
+
+    Attributes:
+        robot: The arm.
+        gravity: Gravity (3,) [m/s^2] in world axes.
+        damping: Viscous damping (n,) [N m s/rad or N s/m]: the force -damping * v.
+        stiffness: Joint springs (n,) [N m/rad or N/m]; they are part of the potential energy.
+        rest: Configuration (n,) at which the springs are slack [rad or m].
+        actuation: Matrix (n, m) from controls to generalized forces [N m or N per unit of control].
+    """
+
+    robot: Robot
+    gravity: Floats
+    damping: Floats
+    stiffness: Floats
+    rest: Floats
+    actuation: Floats = field(repr=False)
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        gravity: ArrayLike | bool = True,
+        damping: ArrayLike = 0.0,
+        stiffness: ArrayLike = 0.0,
+        rest: ArrayLike = 0.0,
+        actuation: ArrayLike | Sequence[str] | None = None,
+    ) -> None:
+        """Describe a scene.
+
+        Main args:
+            robot: From :func:`varpin.load_robot`.
+            gravity: ``True`` for (0, 0, -9.81), ``False`` for none, or any vector (3,) [m/s^2].
+            damping: One number or (n,), >= 0 [N m s/rad or N s/m].
+            stiffness: One number or (n,), >= 0 [N m/rad or N/m].
+
+        Other Args:
+            rest: One number or (n,) [rad or m].
+            actuation: A matrix (n, m); or the names of the m actuated joints; every joint if left out.
+
+        Raises:
+            InputError: A wrong shape, a value that is not finite, negative damping or stiffness.
+            UnknownJoint: ``actuation`` names a joint that is no coordinate of the robot.
+        """
+        if not isinstance(robot, Robot):
+            raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
+        n = robot.dof
+        if isinstance(gravity, bool | np.bool_):
+            gravity = EARTH if gravity else (0.0, 0.0, 0.0)
+        values = {
+            "robot": robot,
+            "gravity": finite_array("gravity", gravity, (3,)),
+            "damping": _not_negative("damping", broadcast_array("damping", damping, n)),
+            "stiffness": _not_negative("stiffness", broadcast_array("stiffness", stiffness, n)),
+            "rest": broadcast_array("rest", rest, n),
+            "actuation": _actuation(robot, actuation),
+        }
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    @property
+    def controls(self) -> int:
+        """m, the number of controls."""
+        return int(self.actuation.shape[1])
+
+    @cached_property
+    def mechanism(self) -> Mechanism:
+        """The scene as flat arrays for the kernels."""
+        return Mechanism(
+            tree=self.robot.tree,
+            gravity=self.gravity,
+            damping=self.damping,
+            stiffness=self.stiffness,
+            rest=self.rest,
+            actuation=self.actuation,
+        )
+
+
+def _not_negative(name: str, values: Floats) -> Floats:
+    if (values < 0.0).any():
+        c = int(np.argmax(values < 0.0))
+        raise InputError(f"{name}[{c}] is {values[c]}; it must be >= 0")
+    return values
+
+
+def _actuation(robot: Robot, actuation: ArrayLike | Sequence[str] | None) -> Floats:
+    n = robot.dof
+    if actuation is None:
+        return np.eye(n)
+    if isinstance(actuation, str):
+        actuation = [actuation]
+    if isinstance(actuation, Sequence) and all(isinstance(name, str) for name in actuation):
+        return np.eye(n)[:, [robot.coordinate(str(name)) for name in actuation]].copy()
+    matrix = np.asarray(actuation)
+    if matrix.ndim != 2:
+        raise InputError(f"actuation must be a matrix with {n} rows, or joint names, got shape {matrix.shape}")
+    return finite_array("actuation", actuation, (n, matrix.shape[1]))

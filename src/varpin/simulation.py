@@ -1,0 +1,185 @@
+"""From initial state and controls to a trajectory."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import as_floats, count, finite_array, positive, require_finite
+from varpin.errors import ControlError, InputError, StepFailure
+from varpin.integrators import Integrator, Midpoint, Segment
+from varpin.kernels._compile import announced_compilation
+from varpin.scene import Scene
+from varpin.trajectory import StepStatistics, Trajectory
+
+Floats = NDArray[np.float64]
+ControlLaw = Callable[[float, Floats, Floats], ArrayLike]
+Progress = Callable[[int, int], None]
+
+logger = logging.getLogger(__name__)
+
+# Work between two looks at the progress callback and at Ctrl-C, in steps of one joint: some tens of milliseconds.
+_CHUNK = 30_000
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during a simulation.
+
+    Attributes:
+        trajectory: What was computed before it.
+    """
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.trajectory = trajectory
+        super().__init__(f"interrupted after {trajectory.steps} steps; they are in .trajectory")
+
+
+class _Record:
+    """Nodes, controls and statistics of the steps done so far; a trajectory can be made of it at any time."""
+
+    def __init__(self, scene: Scene, integrator: Integrator, dt: float, steps: int, first: Segment) -> None:
+        self.scene, self.integrator, self.dt = scene, integrator, dt
+        self.steps = 0
+        n = scene.robot.dof
+        self.nodes = {name: np.empty((steps + 1, n)) for name in ("q", "v", "p")} | {"energy": np.empty(steps + 1)}
+        self.u = np.empty((steps, scene.controls))
+        self.statistics = {
+            item.name: np.empty(steps, dtype=getattr(first.statistics, item.name).dtype)
+            for item in fields(StepStatistics)
+        }
+        for name, array in self.nodes.items():
+            array[0] = getattr(first, name)[0]
+
+    def add(self, segment: Segment, controls: Floats) -> None:
+        now = slice(self.steps, self.steps + len(segment.q))
+        for name, array in self.nodes.items():
+            array[now.start + 1 : now.stop + 1] = getattr(segment, name)
+        for name, array in self.statistics.items():
+            array[now] = getattr(segment.statistics, name)
+        self.u[now] = controls[: len(segment.q)]
+        self.steps = now.stop
+
+    def trajectory(self) -> Trajectory:
+        return Trajectory(
+            t=np.arange(self.steps + 1) * self.dt,
+            u=self.u[: self.steps],
+            **{name: array[: self.steps + 1] for name, array in self.nodes.items()},
+            dt=self.dt,
+            integrator=str(self.integrator),
+            robot=self.scene.robot.name,
+            joint_names=self.scene.robot.joint_names,
+            statistics=StepStatistics(**{name: array[: self.steps] for name, array in self.statistics.items()}),
+        )
+
+
+def simulate(
+    scene: Scene,
+    q0: ArrayLike,
+    v0: ArrayLike,
+    *,
+    dt: float,
+    steps: int,
+    controls: ArrayLike | ControlLaw | None = None,
+    integrator: Integrator | None = None,
+    sampling: Literal["midpoint", "start"] = "midpoint",
+    progress: Progress | None = None,
+) -> Trajectory:
+    """Integrate a scene in time.
+
+    Main args:
+        scene: The scene.
+        q0: Initial configuration (n,) [rad or m].
+        v0: Initial velocity (n,) [rad/s or m/s].
+        dt: Time step [s].
+        steps: N, their number.
+        controls: None for none; an array (N, m), one row a step; one row (m,) for all steps; or a function of
+            (t [s], q (n,), v (n,)) that returns (m,). Controls are constant over each step.
+        integrator: :class:`Midpoint` with alpha = 1/2 if left out.
+
+    Other Args:
+        sampling: Where a control function is evaluated, once a step. ``"midpoint"``: at the step's midpoint, at the
+            state expected there, which keeps second order. ``"start"``: at the node where the step begins, as a
+            digital controller with a zero-order hold would, at the price of first order.
+        progress: Called now and then with (steps done, steps in all).
+
+    Returns:
+        The trajectory, frozen.
+
+    Raises:
+        InputError: Wrong shapes, values that are not finite, dt <= 0, steps < 0.
+        ControlError: The control function returned something unusable; holds the trajectory so far.
+        StepFailure: A step has no trustworthy solution; holds the trajectory so far.
+        SingularMassMatrix: M(q0) is not positive definite.
+        Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt.
+    """
+    n = scene.robot.dof
+    q0, v0 = finite_array("q0", q0, (n,)), finite_array("v0", v0, (n,))
+    dt, steps = positive("dt", dt, "s"), count("steps", steps)
+    if sampling not in ("midpoint", "start"):
+        raise InputError(f"sampling must be 'midpoint' or 'start', got {sampling!r}")
+    integrator = Midpoint() if integrator is None else integrator
+    if not isinstance(integrator, Integrator):
+        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
+    rows = None if callable(controls) else control_rows(scene, controls, steps)
+    with announced_compilation():
+        state, first = integrator.start(scene, q0, v0)
+        record = _Record(scene, integrator, dt, steps, first)
+        chunk = max(1, _CHUNK // n)
+        try:
+            while record.steps < steps:
+                if rows is None:
+                    block = _sample(controls, sampling, integrator, state, record)
+                else:
+                    block = rows[record.steps : record.steps + chunk]
+                segment = integrator.rollout(scene, state, block, dt)
+                record.add(segment, block)
+                if segment.failure is not None:
+                    node = record.trajectory()
+                    raise StepFailure(node.steps, node.t[-1], segment.failure, node)
+                if progress is not None and (record.steps % chunk == 0 or record.steps == steps):
+                    progress(record.steps, steps)
+        except KeyboardInterrupt:
+            raise Interrupted(record.trajectory()) from None
+    trajectory = record.trajectory()
+    split = trajectory.statistics.split_steps
+    if split:
+        most = trajectory.statistics.substeps.max()
+        logger.warning("%d of %d steps were taken in up to %d parts: dt = %g s is coarse here", split, steps, most, dt)
+    return trajectory
+
+
+def control_rows(scene: Scene, controls: ArrayLike | None, steps: int) -> Floats:
+    """Controls as one row a step, (steps, m).
+
+    Raises:
+        InputError: The array is neither (steps, m) nor (m,), or not finite.
+    """
+    shape = (steps, scene.controls)
+    if controls is None:
+        return np.zeros(shape)
+    array = as_floats("controls", controls)
+    if array.shape != shape and array.shape != shape[1:]:
+        raise InputError(f"controls must have shape {shape}, one row a step, or {shape[1:]}, got {array.shape}")
+    return np.ascontiguousarray(np.broadcast_to(require_finite("controls", array), shape))
+
+
+def _sample(law: ControlLaw, sampling: str, integrator: Integrator, state: Any, record: _Record) -> Floats:
+    """The control of the next step, (1, m), from a control function."""
+    k, dt = record.steps, record.dt
+    if sampling == "start":
+        time, q, v = k * dt, record.nodes["q"][k].copy(), record.nodes["v"][k].copy()
+    else:
+        time, (q, v) = (k + 0.5) * dt, integrator.predict(state, dt)
+    try:
+        value = law(time, q, v)
+    except Exception as error:
+        raise ControlError(k, time, f"raised {error!r}", record.trajectory()) from error
+    try:
+        return finite_array("controls(t, q, v)", value, (record.scene.controls,))[None]
+    except InputError as error:
+        raise ControlError(k, time, str(error), record.trajectory()) from None

@@ -1,0 +1,218 @@
+"""A simulated motion: a frozen record, saved as npz without pickle."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin._version import __version__
+from varpin.checks import writable
+from varpin.errors import FileError
+from varpin.robot import Robot
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+FORMAT = "varpin.trajectory/1"
+
+
+@dataclass(frozen=True, eq=False)
+class StepStatistics:
+    """What each of N steps took, and how sound its solution is. Zeros where an integrator has no such thing.
+
+    Attributes:
+        newton_iterations: (N,).
+        jets: Evaluations of the whole jet (N,).
+        sweeps: Evaluations of its first derivatives alone (N,).
+        substeps: Parts the step was taken in (N,); more than 1 where a guard refused the whole step, and there the
+            map is not the integrator's own.
+        residual: Residual of the step equation (N,), in units of the rounding error of its terms.
+        branch_margin: Distance from the fold of the step equation's solutions (N,): 1 as dt -> 0, refused at 0.
+    """
+
+    newton_iterations: Integers
+    jets: Integers
+    sweeps: Integers
+    substeps: Integers
+    residual: Floats
+    branch_margin: Floats
+
+    @property
+    def split_steps(self) -> int:
+        """How many steps were taken in more than one part."""
+        return int((self.substeps > 1).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A motion over N steps and N + 1 nodes.
+
+    Attributes:
+        t: Times (N + 1,) [s].
+        q: Configurations (N + 1, n) [rad or m].
+        v: Velocities (N + 1, n) [rad/s or m/s]; M(q)^-1 p for variational integrators.
+        p: Momenta (N + 1, n) [N m s or N s].
+        u: Controls (N, m), constant over each step.
+        energy: Kinetic and potential energy together (N + 1,) [J]; springs included.
+        dt: Time step [s].
+        integrator: What made it, as text.
+        robot: The robot's name.
+        joint_names: Names of the coordinates.
+        statistics: What each step took.
+        version: The varpin that made it.
+    """
+
+    t: Floats
+    q: Floats
+    v: Floats
+    p: Floats
+    u: Floats
+    energy: Floats
+    dt: float
+    integrator: str
+    robot: str
+    joint_names: tuple[str, ...]
+    statistics: StepStatistics
+    version: str = __version__
+
+    def __post_init__(self) -> None:
+        for record in (self, self.statistics):
+            for item in fields(record):
+                value = getattr(record, item.name)
+                if isinstance(value, np.ndarray):
+                    value.setflags(write=False)
+
+    @property
+    def steps(self) -> int:
+        """N."""
+        return len(self.t) - 1
+
+    @property
+    def duration(self) -> float:
+        """Time from the first node to the last [s]."""
+        return float(self.t[-1] - self.t[0])
+
+    def __repr__(self) -> str:
+        split = self.statistics.split_steps
+        flag = f", {split} steps split by the guards" if split else ""
+        return (
+            f"Trajectory({self.robot}: {len(self.joint_names)} joints, {self.steps} steps of {self.dt:g} s, "
+            f"{self.integrator}{flag})"
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the trajectory as a compressed npz file without pickle; returns its path.
+
+        A file that is there is replaced only once the new one is whole.
+
+        Raises:
+            FileError: The path cannot be written.
+        """
+        arrays = {name: getattr(self, name) for name in ("t", "q", "v", "p", "u", "energy")}
+        arrays |= {f"statistics.{item.name}": getattr(self.statistics, item.name) for item in fields(StepStatistics)}
+        text = {"format": FORMAT, "version": self.version, "integrator": self.integrator, "robot": self.robot}
+        with atomic_file(path) as stream:
+            np.savez_compressed(
+                stream,
+                allow_pickle=False,
+                **arrays,
+                **text,
+                dt=self.dt,
+                joint_names=np.array(self.joint_names, dtype=str),
+            )
+        return Path(path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], robot: Robot | None = None) -> Trajectory:
+        """Read a trajectory that :meth:`save` wrote.
+
+        Args:
+            path: The npz file.
+            robot: If given, the trajectory must be of a robot with the same joints.
+
+        Raises:
+            FileError: The file is missing, truncated, no npz, written by something else, holds pickled objects,
+                arrays that do not fit together or are not finite, or is of another robot.
+        """
+        source = Path(path)
+        members = _read_members(source)
+        if str(members.get("format")) != FORMAT:
+            raise FileError(
+                f"{source} is not a varpin trajectory: its format is {members.get('format')}, not {FORMAT!r}"
+            )
+        names = tuple(str(name) for name in members["joint_names"])
+        steps, n = len(members["t"]) - 1, len(names)
+        shapes = {"t": (steps + 1,), "energy": (steps + 1,), "u": (steps, -1)} | dict.fromkeys("qvp", (steps + 1, n))
+        shapes |= {f"statistics.{item.name}": (steps,) for item in fields(StepStatistics)}
+        for name, shape in shapes.items():
+            array = members[name]
+            if array.ndim != len(shape) or any(b not in (-1, a) for a, b in zip(array.shape, shape, strict=True)):
+                raise FileError(f"{source}: {name} has shape {array.shape}, where {shape} belongs")
+            if array.dtype.kind not in "fi" or not np.isfinite(array).all():
+                raise FileError(f"{source}: {name} holds values that are not finite numbers")
+        if robot is not None and names != robot.joint_names:
+            raise FileError(
+                f"{source} is of robot {members['robot']!s} with joints {', '.join(names)}; "
+                f"{robot.name!r} has joints {', '.join(robot.joint_names)}"
+            )
+        statistics = StepStatistics(**{x.name: members[f"statistics.{x.name}"] for x in fields(StepStatistics)})
+        return cls(
+            **{name: members[name] for name in ("t", "q", "v", "p", "u", "energy")},
+            dt=float(members["dt"]),
+            integrator=str(members["integrator"]),
+            robot=str(members["robot"]),
+            joint_names=names,
+            statistics=statistics,
+            version=str(members["version"]),
+        )
+
+
+def _read_members(source: Path) -> dict[str, NDArray[np.generic]]:
+    """All arrays of an npz file, or a FileError that says what is wrong with it."""
+    expected = {"t", "q", "v", "p", "u", "energy", "dt", "format", "version", "integrator", "robot", "joint_names"}
+    expected |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
+    if not source.is_file():
+        raise FileError(f"there is no file {source}")
+    if not zipfile.is_zipfile(source):
+        raise FileError(f"{source} is not an npz file, or it is truncated")
+    try:
+        with np.load(source, allow_pickle=False) as archive:
+            missing = sorted(expected - set(archive.files))
+            if missing:
+                raise FileError(f"{source} is not a varpin trajectory: it has no {', '.join(missing)}")
+            return {name: archive[name] for name in expected}
+    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+        raise FileError(f"{source} is truncated or damaged: {error}") from None
+    except ValueError as error:
+        raise FileError(f"{source} cannot be read without unpickling objects, which is not done: {error}") from None
+
+
+@contextlib.contextmanager
+def atomic_file(path: str | os.PathLike[str]) -> Iterator[object]:
+    """A binary stream whose contents take the place of ``path`` when the block ends well, and vanish if not.
+
+    Raises:
+        FileError: The path cannot be written.
+    """
+    target = writable(path)
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            yield stream
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(name, 0o666 & ~mask)
+        os.replace(name, target)
+    except BaseException:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(name)
+        raise
