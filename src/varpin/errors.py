@@ -80,8 +80,8 @@ class SingularMassMatrix(RobotError):
     def __init__(self, joints: Iterable[str], q: object) -> None:
         self.joints = tuple(joints)
         super().__init__(
-            f"the mass matrix is singular at q = {q}: motion of {', '.join(map(repr, self.joints))} carries no inertia; "
-            "give the links it moves mass and inertia, add armature to the joint, or lock it"
+            f"the mass matrix is singular at q = {q}: motion of {', '.join(map(repr, self.joints))} carries no "
+            "inertia; give the links it moves mass and inertia, add armature to the joint, or lock it"
         )
 
 

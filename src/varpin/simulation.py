@@ -65,10 +65,14 @@ class _Record:
         self.steps = now.stop
 
     def trajectory(self) -> Trajectory:
+        nodes = {name: array[: self.steps + 1] for name, array in self.nodes.items()}
         return Trajectory(
-            t=np.arange(self.steps + 1) * self.dt,
+            t=np.arange(self.steps + 1, dtype=np.float64) * self.dt,
+            q=nodes["q"],
+            v=nodes["v"],
+            p=nodes["p"],
             u=self.u[: self.steps],
-            **{name: array[: self.steps + 1] for name, array in self.nodes.items()},
+            energy=nodes["energy"],
             dt=self.dt,
             integrator=str(self.integrator),
             robot=self.scene.robot.name,
@@ -125,15 +129,16 @@ def simulate(
     integrator = Midpoint() if integrator is None else integrator
     if not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
-    rows = None if callable(controls) else control_rows(scene, controls, steps)
+    law = controls if callable(controls) else None
+    rows = np.empty((0, 0)) if callable(controls) else control_rows(scene, controls, steps)
     with announced_compilation():
         state, first = integrator.start(scene, q0, v0)
         record = _Record(scene, integrator, dt, steps, first)
         chunk = max(1, _CHUNK // n)
         try:
             while record.steps < steps:
-                if rows is None:
-                    block = _sample(controls, sampling, integrator, state, record)
+                if law is not None:
+                    block = _sample(law, sampling, integrator, state, record)
                 else:
                     block = rows[record.steps : record.steps + chunk]
                 segment = integrator.rollout(scene, state, block, dt)

@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -176,7 +177,7 @@ class Trajectory:
         )
 
 
-def _read_members(source: Path) -> dict[str, NDArray[np.generic]]:
+def _read_members(source: Path) -> dict[str, NDArray[Any]]:
     """All arrays of an npz file, or a FileError that says what is wrong with it."""
     expected = {"t", "q", "v", "p", "u", "energy", "dt", "format", "version", "integrator", "robot", "joint_names"}
     expected |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
@@ -197,7 +198,7 @@ def _read_members(source: Path) -> dict[str, NDArray[np.generic]]:
 
 
 @contextlib.contextmanager
-def atomic_file(path: str | os.PathLike[str]) -> Iterator[object]:
+def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """A binary stream whose contents take the place of ``path`` when the block ends well, and vanish if not.
 
     Raises:
@@ -210,9 +211,8 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[object]:
             yield stream
         mask = os.umask(0)
         os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)
-        os.replace(name, target)
+        Path(name).chmod(0o666 & ~mask)
+        Path(name).replace(target)
     except BaseException:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(name)
+        Path(name).unlink(missing_ok=True)
         raise

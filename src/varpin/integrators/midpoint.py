@@ -49,7 +49,7 @@ class Midpoint(Integrator):
         alpha: Where in the step the Lagrangian is taken, in [0, 1].
 
     Other Args:
-        tolerance: On the residual, in units of the rounding error of its terms; 8 plus one a body if None.
+        tolerance: On the residual, in units of the rounding error of the terms that cancel in it.
         branch_margin: How far from the fold of solutions a root must stay: the destabilising term of the step
             equation's Jacobian is exaggerated by 1 / (1 - branch_margin), in [0, 1).
         energy_balance: Largest error in the energy balance of a substep, in units of the energy it turns over.
@@ -59,7 +59,7 @@ class Midpoint(Integrator):
     """
 
     alpha: float = 0.5
-    tolerance: float | None = None
+    tolerance: float = 0.5
     branch_margin: float = 0.5
     energy_balance: float = 0.05
     energy_budget: float = 0.05
@@ -69,8 +69,7 @@ class Midpoint(Integrator):
 
     def __post_init__(self) -> None:
         fraction("alpha", self.alpha)
-        if self.tolerance is not None:
-            positive("tolerance", self.tolerance, "rounding units")
+        positive("tolerance", self.tolerance, "rounding units")
         if fraction("branch_margin", self.branch_margin) == 1.0:
             raise InputError("branch_margin must be in [0, 1), got 1")
         positive("energy_balance", self.energy_balance, "1")
@@ -81,11 +80,10 @@ class Midpoint(Integrator):
     def __str__(self) -> str:
         return f"Midpoint(alpha={self.alpha:g})"
 
-    def _options(self, bodies: int) -> kernels.Options:
-        tolerance = 8.0 + bodies if self.tolerance is None else float(self.tolerance)
+    def _options(self) -> kernels.Options:
         return kernels.Options(
             float(self.alpha),
-            tolerance,
+            float(self.tolerance),
             float(self.branch_margin),
             float(self.energy_balance),
             float(self.energy_budget),
@@ -93,6 +91,7 @@ class Midpoint(Integrator):
         )
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[MidpointState, Segment]:
+        """See :meth:`Integrator.start`; p0 = M(q0) v0."""
         robot = scene.robot
         run = MidpointState(kernels.new_state(robot.dof), kernels.new_work(robot.tree.parent.size, robot.dof))
         if not kernels.begin(scene.mechanism, q0, v0, run.state, run.work):
@@ -103,11 +102,12 @@ class Midpoint(Integrator):
         return run, Segment(state.q[None].copy(), state.p[None].copy(), state.v[None].copy(), energy, nothing)
 
     def rollout(self, scene: Scene, state: MidpointState, controls: Floats, dt: float) -> Segment:
+        """See :meth:`Integrator.rollout`."""
         steps, n = controls.shape[0], scene.robot.dof
         q, p, v = np.empty((steps, n)), np.empty((steps, n)), np.empty((steps, n))
         energy = np.empty(steps)
         tally, quality = np.empty((steps, 4), dtype=np.int64), np.empty((steps, 2))
-        options = self._options(scene.robot.tree.parent.size)
+        options = self._options()
         outcome, done = kernels.rollout(
             scene.mechanism, options, dt, controls, state.state, state.work, q, p, v, energy, tally, quality
         )
@@ -117,6 +117,7 @@ class Midpoint(Integrator):
         return Segment(q[:done], p[:done], v[:done], energy[:done], _statistics(tally[:done], quality[:done]), failure)
 
     def predict(self, state: MidpointState, dt: float) -> tuple[Floats, Floats]:
+        """See :meth:`Integrator.predict`; the velocity goes on from the last midpoint through the node."""
         now = state.state
         velocity = now.v.copy()
         if now.counters[0] > 0:

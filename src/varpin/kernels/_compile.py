@@ -71,10 +71,9 @@ def kernel(function: _Function) -> _Function:
     dispatcher = numba.njit(**_OPTIONS)(function)
     if numba.config.DISABLE_JIT:
         return function
-    try:
+    # Without a writable place for the cache every process compiles anew.
+    with contextlib.suppress(RuntimeError):
         dispatcher._cache = _KernelCache(dispatcher.py_func)
-    except RuntimeError:  # no writable place for a cache: compile anew in each process
-        pass
     return dispatcher
 
 
@@ -84,7 +83,7 @@ class _Announcer(Listener):
     def __init__(self) -> None:
         self._said = False
 
-    def on_start(self, event: Event) -> None:
+    def on_start(self, event: Event) -> None:  # noqa: ARG002
         if not self._said:
             logger.warning("compiling varpin's kernels; this happens once and takes up to half a minute")
             self._said = True

@@ -209,20 +209,42 @@ def project(mechanism: Mechanism, j: int, w: Sweep) -> None:
     weight = m * (S[j, 0] * gx + S[j, 1] * gy + S[j, 2] * gz)
     weight += S[j, 3] * (hy * gz - hz * gy) + S[j, 4] * (hz * gx - hx * gz) + S[j, 5] * (hx * gy - hy * gx)
     Lq = dot6(W, j, H, j) + weight
-    # Magnitudes of whole vectors and not of products of entries: an exact zero of one entry, by an axis that
-    # points along a coordinate, would hide the rounding of the others.
-    linear, angular = abs(H[j, 0]) + abs(H[j, 1]) + abs(H[j, 2]), abs(H[j, 3]) + abs(H[j, 4]) + abs(H[j, 5])
+    X = w.magnitude
+    k = tree.parent[j]
+    above, turning_above = (X[k, 0], X[k, 1]) if k >= 0 else (0.0, 0.0)
     shift, turn = abs(S[j, 0]) + abs(S[j, 1]) + abs(S[j, 2]), abs(S[j, 3]) + abs(S[j, 4]) + abs(S[j, 5])
-    Lv_scale = shift * linear + turn * angular
-    Lq_scale = (abs(gx) + abs(gy) + abs(gz)) * (m * shift + turn * (abs(hx) + abs(hy) + abs(hz)))
-    shift, turn = abs(W[j, 0]) + abs(W[j, 1]) + abs(W[j, 2]), abs(W[j, 3]) + abs(W[j, 4]) + abs(W[j, 5])
-    Lq_scale += shift * linear + turn * angular
+    Lv_scale = shift * X[j, 2] + turn * X[j, 3]
+    Lq_scale = (turning_above * shift + above * turn) * X[j, 2] + turning_above * turn * X[j, 3]
+    Lq_scale += (abs(gx) + abs(gy) + abs(gz)) * (m * shift + turn * X[j, 4])
     c = tree.coordinate[j]
     ratio = tree.ratio[j]
     w.Lv[c] += ratio * Lv
     w.Lq[c] += ratio * Lq
     w.Lv_scale[c] += abs(ratio) * Lv_scale
     w.Lq_scale[c] += abs(ratio) * Lq_scale
+
+
+@inlined
+def measure(tree: Tree, j: int, rate: float, w: Sweep) -> None:
+    """Magnitudes of the terms that make up body ``j``'s velocity, momentum and first moment.
+
+    Sums of norms, in which nothing cancels: rounding errors are in proportion to them and not to the results, which
+    may be small by cancellation of large terms.
+    """
+    S, X, Y = w.axis, w.magnitude, w.inertia
+    k = tree.parent[j]
+    shift, turn = abs(S[j, 0]) + abs(S[j, 1]) + abs(S[j, 2]), abs(S[j, 3]) + abs(S[j, 4]) + abs(S[j, 5])
+    velocity, turning = shift * abs(rate), turn * abs(rate)
+    if k >= 0:
+        velocity += X[k, 0]
+        turning += X[k, 1]
+    moment = abs(Y[j, 1]) + abs(Y[j, 2]) + abs(Y[j, 3])
+    m = tree.mass[j]
+    momentum = m * velocity + turning * moment
+    X[j, 0], X[j, 1], X[j, 2], X[j, 4] = velocity, turning, momentum, moment
+    X[j, 3] = (tree.inertia[j, 0] + tree.inertia[j, 2] + tree.inertia[j, 5]) * turning
+    if m > 0.0:
+        X[j, 3] += moment / m * momentum
 
 
 @inlined
@@ -273,12 +295,15 @@ def first_order(mechanism: Mechanism, q: Floats, v: Floats, w: Sweep) -> tuple[f
         H[j, 3] = r00 * lx + r01 * ly + r02 * lz + cy * fz - cz * fy
         H[j, 4] = r10 * lx + r11 * ly + r12 * lz + cz * fx - cx * fz
         H[j, 5] = r20 * lx + r21 * ly + r22 * lz + cx * fy - cy * fx
+        measure(tree, j, tree.ratio[j] * v[tree.coordinate[j]], w)
     for j in range(bodies - 1, -1, -1):
         project(mechanism, j, w)
         k = tree.parent[j]
         if k >= 0:
             for i in range(6):
                 H[k, i] += H[j, i]
+            for i in range(2, 5):
+                w.magnitude[k, i] += w.magnitude[j, i]
             for i in range(4):
                 Y[k, i] += Y[j, i]
         else:
@@ -308,6 +333,7 @@ def second_order(mechanism: Mechanism, q: Floats, v: Floats, w: Sweep) -> tuple[
         move_body(tree, j, v, w)
         body_inertia(tree, j, w)
         times_inertia(Y, j, V, H)
+        measure(tree, j, tree.ratio[j] * v[tree.coordinate[j]], w)
     for j in range(bodies - 1, -1, -1):
         project(mechanism, j, w)
         times_inertia(Y, j, S, F)
@@ -344,6 +370,8 @@ def second_order(mechanism: Mechanism, q: Floats, v: Floats, w: Sweep) -> tuple[
         if k >= 0:
             for i in range(6):
                 H[k, i] += H[j, i]
+            for i in range(2, 5):
+                w.magnitude[k, i] += w.magnitude[j, i]
             for i in range(10):
                 Y[k, i] += Y[j, i]
         else:

@@ -53,6 +53,7 @@ class Sweep(NamedTuple):
     momentum: Floats  # (b, 6) H
     dual_axis: Floats  # (b, 6) F = Y S
     dual_rate: Floats  # (b, 6) B = Y W + S x* H
+    magnitude: Floats  # (b, 5) magnitudes that add up to V, V, H, H (linear, angular each) and the first moment
     M: Floats  # (n, n) L_vv
     A: Floats  # (n, n) L_vq
     Lqq: Floats  # (n, n)
@@ -76,6 +77,7 @@ def new_sweep(bodies: int, dof: int) -> Sweep:
         momentum=spatial[3],
         dual_axis=spatial[4],
         dual_rate=spatial[5],
+        magnitude=np.zeros((bodies, 5)),
         M=np.zeros((dof, dof)),
         A=np.zeros((dof, dof)),
         Lqq=np.zeros((dof, dof)),
