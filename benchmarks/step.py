@@ -1,0 +1,112 @@
+"""One whole Midpoint step inside ``simulate`` against one Python call of Pinocchio and of MuJoCo.
+
+Everything is measured in one run, interleaved, and reported as ratios: times on shared machines differ between
+runs, their ratios far less. MuJoCo takes part where it is installed (``pip install "varpin[peers]"``).
+
+    python benchmarks/step.py
+"""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pinocchio as pin
+
+import varpin as vp
+
+ROUNDS = 25
+STEPS = 20_000
+
+
+def simulate(scene: vp.Scene, q0: np.ndarray, dt: float) -> Callable[[], float]:
+    """Seconds per step of one simulate call: solver, guards, node velocities, energy and recording included."""
+
+    def run() -> float:
+        start = time.perf_counter()
+        vp.simulate(scene, q0, np.zeros_like(q0), dt=dt, steps=STEPS)
+        return (time.perf_counter() - start) / STEPS
+
+    return run
+
+
+def rnea_derivatives(robot: vp.Robot, q0: np.ndarray) -> Callable[[], float]:
+    """Seconds per Python call of pin.computeRNEADerivatives."""
+    model = robot.model
+    data, q, v = model.createData(), robot.configuration(q0), np.zeros(model.nv)
+
+    def run() -> float:
+        start = time.perf_counter()
+        for _ in range(STEPS):
+            pin.computeRNEADerivatives(model, data, q, v, v)
+        return (time.perf_counter() - start) / STEPS
+
+    return run
+
+
+def mujoco_step(links: int, dt: float) -> Callable[[], float] | None:
+    """Seconds per Python call of mujoco.mj_step (Euler) on a planar chain, or None without MuJoCo."""
+    try:
+        import mujoco  # noqa: PLC0415
+    except ImportError:
+        return None
+    body = ""
+    for k in range(links):
+        body += (
+            f'<body pos="{1.0 if k else 0.0} 0 0"><joint type="hinge" axis="0 1 0"/>'
+            '<inertial pos="0.5 0 0" mass="1" diaginertia="1e-9 0.083333333 0.083333333"/>'
+        )
+    xml = (
+        f'<mujoco><compiler boundinertia="0" balanceinertia="true"/><option timestep="{dt}" integrator="Euler">'
+        '<flag contact="disable" constraint="disable"/></option>'
+        f"<worldbody>{body}{'</body>' * links}</worldbody></mujoco>"
+    )
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+
+    def run() -> float:
+        mujoco.mj_resetData(model, data)
+        start = time.perf_counter()
+        for _ in range(STEPS):
+            mujoco.mj_step(model, data)
+        return (time.perf_counter() - start) / STEPS
+
+    return run
+
+
+def best(runs: dict[str, Callable[[], float]]) -> dict[str, float]:
+    """The fastest of ROUNDS interleaved rounds of each, in microseconds."""
+    seconds = {name: np.inf for name in runs}
+    for _ in range(ROUNDS):
+        for name, run in runs.items():
+            seconds[name] = min(seconds[name], run())
+    return {name: 1e6 * value for name, value in seconds.items()}
+
+
+def main() -> None:
+    print(f"{'robot':12} {'n':>2} {'dt [s]':>7} {'step [us]':>10} {'its':>5} {'RNEA derivatives [us]':>22} {'ratio':>6}")
+    for name, q0 in (("finger", [0.5, 0.3, 0.2]), ("ur5", [0.1] * 6), ("xarm7", [0.1] * 7), ("talos_arm", [0.1] * 7)):
+        robot = vp.load_robot(name)
+        scene, start = vp.Scene(robot, gravity=(0.0, -9.81, 0.0) if name == "finger" else True), np.array(q0)
+        for dt in (1e-3,):
+            motion = vp.simulate(scene, start, np.zeros(robot.dof), dt=dt, steps=STEPS)
+            times = best({"step": simulate(scene, start, dt), "rnea": rnea_derivatives(robot, start)})
+            iterations = motion.statistics.newton_iterations.mean()
+            ratio = times["step"] / times["rnea"]
+            print(
+                f"{name:12} {robot.dof:2d} {dt:7.0e} {times['step']:10.2f} {iterations:5.2f} {times['rnea']:22.2f} {ratio:6.2f}"
+            )
+    for links in (3, 7):
+        run = mujoco_step(links, 1e-3)
+        if run is None:
+            print("MuJoCo is not installed")
+            return
+        scene = vp.Scene(vp.planar_chain(links))
+        times = best({"step": simulate(scene, np.zeros(links), 1e-3), "mujoco": run})
+        print(
+            f"chain of {links}: step {times['step']:.2f} us, mj_step (Euler) {times['mujoco']:.2f} us, "
+            f"ratio {times['step'] / times['mujoco']:.2f}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,351 @@
+"""The midpoint integrator against exact solutions, a plain version of itself, and what its structure promises."""
+
+import logging
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import scipy.linalg
+from scipy.integrate import solve_ivp
+from scipy.optimize import root
+from scipy.special import ellipj, ellipk
+
+import varpin as vp
+from varpin.robot.example_robot_data import FIXED_BASE
+
+GRAVITY = 9.81
+
+
+def reference(scene, q0, v0, duration, law=None):
+    """q(duration) by DOP853 on Pinocchio's forward dynamics."""
+    robot = scene.robot
+    model = robot.model.copy()
+    model.gravity = pin.Motion(scene.gravity, np.zeros(3))
+    data = model.createData()
+    n = robot.dof
+
+    def rate(t, x):
+        q, v = x[:n], x[n:]
+        force = -scene.damping * v - scene.stiffness * (q - scene.rest)
+        if law is not None:
+            force = force + scene.actuation @ law(t, q, v)
+        return np.concatenate([v, pin.aba(model, data, robot.configuration(q), v, force)])
+
+    x0 = np.concatenate([np.asarray(q0, dtype=float), v0])
+    return solve_ivp(rate, (0.0, duration), x0, method="DOP853", rtol=1e-13, atol=1e-13).y[:n, -1]
+
+
+def slopes(errors, factor=2.0):
+    return np.log(np.asarray(errors[:-1]) / np.asarray(errors[1:])) / np.log(factor)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.3, 0.5, 1.0])
+def test_one_step_solves_the_discrete_euler_lagrange_equations(alpha):
+    """Against a plain solver: unknown q1, Pinocchio's derivatives, SciPy's root finder."""
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.7, stiffness=3.0, rest=0.2)
+    q0, v0, u = np.random.default_rng(3).normal(size=(3, 6))
+    dt = 5e-3
+    p0 = vp.lagrangian_jet(scene, q0, v0, backend="pinocchio").Lv
+
+    def slots(q1):
+        jet = vp.lagrangian_jet(scene, (1 - alpha) * q0 + alpha * q1, (q1 - q0) / dt, backend="pinocchio")
+        impulse = 0.5 * dt * (u - scene.damping * (q1 - q0) / dt)
+        return dt * (1 - alpha) * jet.Lq - jet.Lv + impulse, dt * alpha * jet.Lq + jet.Lv + impulse
+
+    solution = root(lambda q1: p0 + slots(q1)[0], q0 + dt * v0, tol=1e-13)
+    end = vp.simulate(scene, q0, v0, dt=dt, steps=1, controls=u, integrator=vp.Midpoint(alpha=alpha))
+    np.testing.assert_allclose(end.q[1], solution.x, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(end.p[1], slots(solution.x)[1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(end.p[0], p0, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["finger", "ur5", "xarm7"])
+@pytest.mark.parametrize("forced", [False, True])
+def test_order_two(name, forced):
+    robot = vp.load_robot(name)
+    n = robot.dof
+    # Feedback sampled once a step must be slow on the lightest link: a fingertip, the last wrist of the xArm7.
+    size = {"finger": 1e-5, "ur5": 1.0, "xarm7": 1e-2}[name]
+    q0, v0 = np.linspace(0.2, 0.6, n), np.linspace(1.0, -1.0, n) * 0.5
+    law = None
+    scene = vp.Scene(robot)
+    if forced:
+        scene = vp.Scene(robot, damping=0.5 * size, stiffness=8.0 * size, rest=0.1)
+
+        def law(t, q, v):
+            return size * (4.0 * np.cos(5.0 * t) - 2.0 * q - 0.5 * v)
+
+    duration = 0.25
+    exact = reference(scene, q0, v0, duration, law)
+    errors = []
+    for steps in (128, 256, 512, 1024):
+        end = vp.simulate(scene, q0, v0, dt=duration / steps, steps=steps, controls=law)
+        assert end.statistics.split_steps == 0
+        errors.append(np.abs(end.q[-1] - exact).max())
+    assert ((slopes(errors) > 1.95) & (slopes(errors) < 2.05)).all(), errors
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.25, 1.0])
+def test_order_one_off_the_middle(alpha):
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.5)
+    q0, v0 = np.linspace(0.2, 0.6, 6), np.zeros(6)
+    exact = reference(scene, q0, v0, 0.25)
+    errors = []
+    for steps in (256, 512, 1024):
+        end = vp.simulate(scene, q0, v0, dt=0.25 / steps, steps=steps, integrator=vp.Midpoint(alpha=alpha))
+        errors.append(np.abs(end.q[-1] - exact).max())
+    assert ((slopes(errors) > 0.9) & (slopes(errors) < 1.1)).all(), errors
+
+
+def test_zero_order_hold_sampling_is_first_order():
+    """Sampled at the start of the step a control law costs an order; the default does not."""
+    scene = vp.Scene(vp.load_robot("ur5"), gravity=False)
+
+    def law(t, q, v):
+        return 3.0 * np.sin(4.0 * t) - 2.0 * v
+
+    q0, v0 = np.zeros(6), np.zeros(6)
+    exact = reference(scene, q0, v0, 0.5, law)
+    errors = [
+        np.abs(vp.simulate(scene, q0, v0, dt=0.5 / k, steps=k, controls=law, sampling="start").q[-1] - exact).max()
+        for k in (400, 800, 1600)
+    ]
+    assert ((slopes(errors) > 0.9) & (slopes(errors) < 1.1)).all(), errors
+
+
+def test_pendulum_against_the_elliptic_solution():
+    """A rod of 1 m on a hinge, let go at rest: sin(theta/2) = k sn(K - w t, k), w^2 = 3 g / (2 l)."""
+    scene = vp.Scene(vp.planar_chain(1))
+    amplitude = 2.0
+    w, k = np.sqrt(1.5 * GRAVITY), np.sin(0.5 * amplitude)
+    errors = []
+    for steps in (1000, 2000, 4000):
+        motion = vp.simulate(scene, [0.5 * np.pi - amplitude], [0.0], dt=5.0 / steps, steps=steps)
+        sn, _, _, _ = ellipj(ellipk(k**2) - w * motion.t, k**2)
+        errors.append(np.abs((0.5 * np.pi - motion.q[:, 0]) - 2.0 * np.arcsin(k * sn)).max())
+    assert ((slopes(errors) > 1.95) & (slopes(errors) < 2.05)).all(), errors
+    assert errors[-1] < 1e-4
+
+
+@pytest.mark.parametrize("name", ["ur5", "z1", "talos_arm", "finger"])
+@pytest.mark.parametrize("alpha", [0.0, 0.5, 0.8])
+def test_symplectic(name, alpha):
+    """A'JA = J for the one-step map (q, p) -> (q', p'), its derivative by eighth-order differences."""
+    robot = vp.load_robot(name)
+    n = robot.dof
+    scene = vp.Scene(robot, stiffness=1e-4 if name == "finger" else 1.0)
+    q, v = np.random.default_rng(1).normal(size=(2, n))
+    p = vp.lagrangian_jet(scene, q, v).Lv
+    # Coordinates of like size: a finger's momenta are 1e-6 of its angles.
+    size = np.concatenate([np.ones(n), np.full(n, np.abs(p).max())])
+    x = np.concatenate([q, p]) / size
+
+    def step(x):
+        q, p = x[:n], x[n:] * size[n:]
+        v = np.linalg.solve(vp.lagrangian_jet(scene, q, np.zeros(n)).Lvv, p)
+        end = vp.simulate(scene, q, v, dt=1e-3, steps=1, integrator=vp.Midpoint(alpha=alpha))
+        assert end.statistics.split_steps == 0
+        return np.concatenate([end.q[1], end.p[1]]) / size
+
+    eps = 1e-2
+    weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+    A = np.zeros((2 * n, 2 * n))
+    for j in range(2 * n):
+        e = np.zeros(2 * n)
+        e[j] = eps
+        A[:, j] = sum(c * (step(x + k * e) - step(x - k * e)) for k, c in weights.items()) / eps
+    J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(n))
+    assert np.abs(A.T @ J @ A - J).max() / max(1.0, np.abs(A).max() ** 2) < 1e-10
+
+
+def test_momentum_about_a_vertical_axis_is_conserved_to_rounding():
+    """Gravity does not see the first joint of an arm that stands upright."""
+    scene = vp.Scene(vp.load_robot("ur5"))
+    motion = vp.simulate(scene, [0.3, -1.0, 0.8, 0.2, 0.4, 0.1], [2.0, 0.5, 0, 1, 0, 3], dt=2e-3, steps=20_000)
+    about_axis = motion.p[:, 0]
+    assert np.ptp(motion.p[:, 1]) > 1.0
+    assert np.abs(about_axis - about_axis[0]).max() <= 4.0 * np.spacing(abs(about_axis[0]))
+
+
+def test_reversible():
+    """Turned round, a conservative motion runs back to where it came from."""
+    scene = vp.Scene(vp.load_robot("ur5"))
+    q0, v0 = np.linspace(0.1, 0.6, 6), np.linspace(1.0, -1.0, 6)
+    there = vp.simulate(scene, q0, v0, dt=5e-3, steps=200)
+    back = vp.simulate(scene, there.q[-1], -there.v[-1], dt=5e-3, steps=200)
+    assert there.statistics.split_steps == back.statistics.split_steps == 0
+    np.testing.assert_allclose(back.q[-1], q0, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(-back.v[-1], v0, rtol=0, atol=1e-10)
+
+
+def fitted_slope(t, error, blocks=20):
+    """Slope of a straight line through block means, and its standard error, their correlation allowed for."""
+    whole = len(error) // blocks * blocks
+    means = error[:whole].reshape(blocks, -1).mean(axis=1)
+    times = t[:whole].reshape(blocks, -1).mean(axis=1)
+    design = np.column_stack([np.ones(blocks), times])
+    fit, *_ = np.linalg.lstsq(design, means, rcond=None)
+    residual = means - design @ fit
+    lag = np.clip(residual[1:] @ residual[:-1] / (residual @ residual), 0.0, 0.99)
+    variance = residual @ residual / (blocks - 2) * (1.0 + lag) / (1.0 - lag)
+    return fit[1], np.sqrt(variance * np.linalg.inv(design.T @ design)[1, 1])
+
+
+def test_energy_of_a_long_run_has_no_trend():
+    """Three links of 1 m and 1 kg from horizontal rest, 1000 s at 1e-2; unit of energy m g n^2 / 2."""
+    motion = vp.simulate(vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=1e-2, steps=100_000)
+    error = (motion.energy - motion.energy[0]) / (GRAVITY * 9 / 2)
+    slope, deviation = fitted_slope(motion.t[:-1], error[:-1])
+    assert abs(slope) < 2.0 * deviation
+    assert abs(error.mean()) < 5e-3
+    assert np.abs(error).max() < 0.1
+    assert motion.statistics.split_steps < 100
+
+
+def test_energy_round_off_walks_at_random():
+    """A mass on a spring: the midpoint rule conserves its energy exactly, so what is left is rounding."""
+    model = pin.Model()
+    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slide")
+    model.appendBodyToJoint(joint, pin.Inertia.FromSphere(1.0, 0.1), pin.SE3.Identity())
+    scene = vp.Scene(vp.load_robot(model), stiffness=3.0, gravity=False)
+    motion = vp.simulate(scene, [1.0], [0.3], dt=1e-2, steps=1_000_000)
+    error = np.abs(motion.energy / motion.energy[0] - 1.0)
+    assert error.max() < 50 * np.finfo(float).eps
+
+
+@pytest.mark.slow
+def test_energy_of_a_million_small_steps_does_not_drift():
+    """The three links at 1e-4 for 100 s: once the method's own oscillation is quiet, only rounding is left."""
+    motion = vp.simulate(vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=1e-4, steps=1_000_000)
+    assert motion.statistics.split_steps == 0
+    error = (motion.energy - motion.energy[0]) / (GRAVITY * 9 / 2)
+    slope, deviation = fitted_slope(motion.t[:-1], error[:-1])
+    assert abs(slope) < 2.0 * deviation
+    quiet = np.abs(error[1:]).reshape(100, -1).min(axis=1)
+    assert quiet[-10:].max() < 1e-9
+
+
+@pytest.mark.parametrize("links", [16, 32, pytest.param(100, marks=pytest.mark.slow)])
+def test_long_chains_fall_for_ten_seconds(links):
+    motion = vp.simulate(vp.Scene(vp.planar_chain(links)), np.zeros(links), np.zeros(links), dt=1e-2, steps=1000)
+    evaluations = motion.statistics.jets.sum() + motion.statistics.sweeps.sum()
+    assert evaluations / motion.statistics.substeps.sum() <= 6.0
+    assert np.abs(motion.energy - motion.energy[0]).max() < 0.05 * GRAVITY * links**2 / 2
+
+
+@pytest.mark.parametrize("links", [2, 3, 5])
+@pytest.mark.parametrize("dt", [0.05, 0.1, 0.2, 0.5])
+def test_no_silent_energy_jump_at_coarse_steps(links, dt):
+    steps = int(200 / dt)
+    motion = vp.simulate(vp.Scene(vp.planar_chain(links)), np.zeros(links), np.zeros(links), dt=dt, steps=steps)
+    assert motion.statistics.split_steps > 0
+    assert motion.statistics.jets.sum() / motion.statistics.substeps.sum() <= 6.0
+    assert np.abs(motion.energy - motion.energy[0]).max() < 0.2 * GRAVITY * links**2 / 2
+
+
+def test_without_the_energy_guard_there_are_silent_jumps():
+    """What the guard is for: without it the same runs jump to other branches of solutions."""
+    unguarded = vp.Midpoint(energy_balance=1e12, energy_budget=1e12)
+    scene = vp.Scene(vp.planar_chain(2))
+    try:
+        motion = vp.simulate(scene, np.zeros(2), np.zeros(2), dt=0.1, steps=2000, integrator=unguarded)
+    except vp.StepFailure as failure:
+        motion = failure.trajectory
+    assert np.abs(motion.energy - motion.energy[0]).max() > 20.0 * GRAVITY * 4 / 2
+
+
+@pytest.mark.parametrize("name", [*(name for name in FIXED_BASE if not name.startswith("bravo7")), "finger"])
+def test_few_iterations_from_rest_under_gravity(name):
+    robot = vp.load_robot(name)
+    motion = vp.simulate(vp.Scene(robot), np.zeros(robot.dof), np.zeros(robot.dof), dt=1e-3, steps=1000)
+    assert motion.statistics.newton_iterations.mean() <= 3.0
+    assert motion.statistics.residual.max() < 100.0
+
+
+@pytest.mark.parametrize("stiffness", [1e-2, 1.0, 1e2, 1e4])
+@pytest.mark.parametrize("damping", [0.0, 1e-2, 1.0, 1e4])
+def test_stiff_springs_and_dampers(stiffness, damping):
+    """Springs and dampers far faster than the step: finite, bounded, and dissipating what they should."""
+    scene = vp.Scene(vp.load_robot("finger"), gravity=False, stiffness=stiffness, damping=damping)
+    motion = vp.simulate(scene, [0.1, 0.1, 0.1], np.zeros(3), dt=1e-2, steps=500)
+    assert np.isfinite(motion.q).all()
+    if damping == 0.0:
+        assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 0.1
+    else:
+        assert motion.energy[-1] < motion.energy[0]
+        assert motion.energy.max() <= motion.energy[0] * (1.0 + 1e-9)
+
+
+def test_failure_keeps_what_was_done():
+    scene = vp.Scene(vp.planar_chain(3))
+    with pytest.raises(vp.StepFailure, match="smaller dt may go further") as caught:
+        vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-2, steps=1000, controls=np.full(3, 1e6))
+    error = caught.value
+    assert error.trajectory.steps == error.step > 0
+    assert error.time == pytest.approx(error.step * 1e-2)
+    np.testing.assert_array_equal(error.q, error.trajectory.q[-1])
+    np.testing.assert_array_equal(error.p, error.trajectory.p[-1])
+    assert np.isfinite(error.trajectory.energy).all()
+    assert str(error.step) in str(error)
+    assert error.reason in str(error)
+
+
+def test_split_steps_are_reported(caplog):
+    with caplog.at_level(logging.WARNING, logger="varpin"):
+        motion = vp.simulate(vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=0.1, steps=100)
+    assert motion.statistics.split_steps > 0
+    assert f"{motion.statistics.split_steps} of 100 steps were taken in up to" in caplog.text
+    assert "split by the guards" in repr(motion)
+
+
+def test_branch_margin_bounds_the_smallest_eigenvalue():
+    """The recorded margin against dense eigenvalues of M^-1 (M - h^2/4 L_qq / (1 - 1/2)) at the root."""
+    scene = vp.Scene(vp.planar_chain(3))
+    unguarded = vp.Midpoint(energy_balance=1e12, energy_budget=1e12)
+    rng = np.random.default_rng(0)
+    margins = []
+    for _ in range(40):
+        q, v, dt = rng.uniform(-2, 2, 3), rng.normal(size=3) * 10, rng.uniform(1e-2, 0.1)
+        motion = vp.simulate(scene, q, v, dt=dt, steps=1, integrator=unguarded)
+        if motion.statistics.split_steps:
+            continue
+        jet = vp.lagrangian_jet(scene, 0.5 * (motion.q[0] + motion.q[1]), (motion.q[1] - motion.q[0]) / dt)
+        smallest = scipy.linalg.eigh(jet.Lvv - dt**2 / 2 * jet.Lqq, jet.Lvv, eigvals_only=True)[0]
+        assert 0.0 < smallest <= motion.statistics.branch_margin[0] * (1.0 + 1e-2)
+        margins.append(smallest)
+    assert min(margins) < 0.5
+    assert len(margins) > 20
+
+
+def test_a_function_and_an_array_of_controls_do_the_same():
+    scene = vp.Scene(vp.load_robot("finger"), gravity=False, damping=1e-3)
+    u = np.random.default_rng(0).normal(size=(50, 3)) * 1e-3
+    start = np.zeros(3), np.zeros(3)
+    by_array = vp.simulate(scene, *start, dt=1e-3, steps=50, controls=u)
+    by_law = vp.simulate(scene, *start, dt=1e-3, steps=50, controls=lambda t, q, v: u[int(t / 1e-3)])
+    np.testing.assert_array_equal(by_array.q, by_law.q)
+    np.testing.assert_array_equal(by_law.u, u)
+
+
+def test_interruption_keeps_what_was_done():
+    scene = vp.Scene(vp.planar_chain(3))
+
+    def stop(done, total):
+        if done > 20_000:
+            raise KeyboardInterrupt
+
+    with pytest.raises(vp.Interrupted) as caught:
+        vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=100_000, progress=stop)
+    done = caught.value.trajectory
+    assert 20_000 < done.steps < 100_000
+    whole = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=done.steps)
+    np.testing.assert_array_equal(done.q, whole.q)
+
+
+def test_velocity_and_energy_at_nodes_are_those_of_the_momentum():
+    scene = vp.Scene(vp.load_robot("ur5"), damping=1.0, stiffness=2.0)
+    motion = vp.simulate(scene, np.full(6, 0.3), np.zeros(6), dt=1e-2, steps=20)
+    for k in (0, 7, 20):
+        jet = vp.lagrangian_jet(scene, motion.q[k], motion.v[k], backend="pinocchio")
+        np.testing.assert_allclose(jet.Lv, motion.p[k], rtol=1e-11, atol=1e-13)
+        assert jet.Lv @ motion.v[k] - jet.L == pytest.approx(motion.energy[k], rel=1e-12)
