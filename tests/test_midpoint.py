@@ -178,28 +178,22 @@ def test_reversible():
     np.testing.assert_allclose(-back.v[-1], v0, rtol=0, atol=1e-10)
 
 
-def fitted_slope(t, error, blocks=20):
-    """Slope of a straight line through block means, and its standard error, their correlation allowed for."""
-    whole = len(error) // blocks * blocks
-    means = error[:whole].reshape(blocks, -1).mean(axis=1)
-    times = t[:whole].reshape(blocks, -1).mean(axis=1)
-    design = np.column_stack([np.ones(blocks), times])
-    fit, *_ = np.linalg.lstsq(design, means, rcond=None)
-    residual = means - design @ fit
-    lag = np.clip(residual[1:] @ residual[:-1] / (residual @ residual), 0.0, 0.99)
-    variance = residual @ residual / (blocks - 2) * (1.0 + lag) / (1.0 - lag)
-    return fit[1], np.sqrt(variance * np.linalg.inv(design.T @ design)[1, 1])
+def energy_errors(dt, steps, starts):
+    """Energy errors (len(starts), steps + 1) of three 1 m, 1 kg links from horizontal rest, in m g n^2 / 2."""
+    scene = vp.Scene(vp.planar_chain(3))
+    runs = [vp.simulate(scene, np.full(3, tilt), np.zeros(3), dt=dt, steps=steps) for tilt in starts]
+    assert sum(run.statistics.split_steps for run in runs) <= 1e-2 * steps * len(runs)
+    return np.array([run.energy - run.energy[0] for run in runs]) / (GRAVITY * 9 / 2)
 
 
 def test_energy_of_a_long_run_has_no_trend():
-    """Three links of 1 m and 1 kg from horizontal rest, 1000 s at 1e-2; unit of energy m g n^2 / 2."""
-    motion = vp.simulate(vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=1e-2, steps=100_000)
-    error = (motion.energy - motion.energy[0]) / (GRAVITY * 9 / 2)
-    slope, deviation = fitted_slope(motion.t[:-1], error[:-1])
-    assert abs(slope) < 2.0 * deviation
-    assert abs(error.mean()) < 5e-3
-    assert np.abs(error).max() < 0.1
-    assert motion.statistics.split_steps < 100
+    """1000 s at 1e-2: chaotic, so eight starts within 1e-6 rad are eight independent runs."""
+    errors = energy_errors(1e-2, 100_000, np.arange(8) * 1e-7)
+    blocks = errors[:, 1:].reshape(8, 20, -1).mean(axis=2)
+    slopes_ = np.polyfit(np.arange(20.0), blocks.T, 1)[0]
+    assert abs(slopes_.mean()) < 3.5 * slopes_.std(ddof=1) / np.sqrt(8)
+    assert np.abs(errors.mean(axis=1)).max() < 5e-3
+    assert np.abs(errors).max() < 5e-2
 
 
 def test_energy_round_off_walks_at_random():
@@ -216,13 +210,11 @@ def test_energy_round_off_walks_at_random():
 @pytest.mark.slow
 def test_energy_of_a_million_small_steps_does_not_drift():
     """The three links at 1e-4 for 100 s: once the method's own oscillation is quiet, only rounding is left."""
-    motion = vp.simulate(vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=1e-4, steps=1_000_000)
-    assert motion.statistics.split_steps == 0
-    error = (motion.energy - motion.energy[0]) / (GRAVITY * 9 / 2)
-    slope, deviation = fitted_slope(motion.t[:-1], error[:-1])
-    assert abs(slope) < 2.0 * deviation
-    quiet = np.abs(error[1:]).reshape(100, -1).min(axis=1)
-    assert quiet[-10:].max() < 1e-9
+    errors = np.abs(energy_errors(1e-4, 1_000_000, [0.0])[0])
+    quiet = errors[1:].reshape(100, -1).min(axis=1)
+    assert quiet.max() < 1e-9
+    # Seconds in which nothing fast happens return to the same energy at the end as at the start.
+    assert np.median(errors[-100_000:]) < 10.0 * np.median(errors[100_000:200_000])
 
 
 @pytest.mark.parametrize("links", [16, 32, pytest.param(100, marks=pytest.mark.slow)])
@@ -240,7 +232,7 @@ def test_no_silent_energy_jump_at_coarse_steps(links, dt):
     motion = vp.simulate(vp.Scene(vp.planar_chain(links)), np.zeros(links), np.zeros(links), dt=dt, steps=steps)
     assert motion.statistics.split_steps > 0
     assert motion.statistics.jets.sum() / motion.statistics.substeps.sum() <= 6.0
-    assert np.abs(motion.energy - motion.energy[0]).max() < 0.2 * GRAVITY * links**2 / 2
+    assert np.abs(motion.energy - motion.energy[0]).max() < 0.05 * GRAVITY * links**2 / 2
 
 
 def test_without_the_energy_guard_there_are_silent_jumps():

@@ -61,7 +61,7 @@ class Midpoint(Integrator):
     alpha: float = 0.5
     tolerance: float = 0.5
     branch_margin: float = 0.5
-    energy_balance: float = 0.05
+    energy_balance: float = 0.005
     energy_budget: float = 0.05
     max_halvings: int = 12
 

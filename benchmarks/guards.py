@@ -1,0 +1,48 @@
+"""Energy errors of undamped planar chains at coarse steps, and what the guards of the midpoint step cost.
+
+Writes the table of ``docs/mathematics.md`` between its markers.
+
+    python benchmarks/guards.py
+"""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+import varpin as vp
+
+DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "mathematics.md"
+DURATION = 1000.0
+
+
+def row(links: int, dt: float) -> str:
+    """One chain at one step, as a row of a Markdown table."""
+    steps = round(DURATION / dt)
+    motion = vp.simulate(vp.Scene(vp.planar_chain(links)), np.zeros(links), np.zeros(links), dt=dt, steps=steps)
+    error = (motion.energy - motion.energy[0]) / (9.81 * links**2 / 2)
+    work = motion.statistics
+    evaluations = (work.jets.sum() + work.sweeps.sum()) / work.substeps.sum()
+    return (
+        f"| {links} | {dt:g} | {np.abs(error).max():.3f} | {error.mean():+.4f} | {100 * work.split_steps / steps:.1f}% "
+        f"| {work.substeps.mean():.2f} | {work.jets.sum() / work.substeps.sum():.2f} | {evaluations:.2f} |"
+    )
+
+
+def main() -> None:
+    logging.getLogger("varpin").setLevel(logging.ERROR)
+    table = [
+        "| links | dt [s] | largest error | mean error | steps split | substeps a step | jets a substep | with sweeps |",
+        "|---|---|---|---|---|---|---|---|",
+        *(row(links, dt) for links in (2, 3, 5) for dt in (0.01, 0.05, 0.1, 0.2, 0.5)),
+    ]
+    print("\n".join(table))
+    text = DOCUMENT.read_text(encoding="utf-8")
+    begin, end = "<!-- guards:begin -->\n", "<!-- guards:end -->"
+    before, rest = text.split(begin)
+    _, after = rest.split(end)
+    DOCUMENT.write_text(before + begin + "\n".join(table) + "\n" + end + after, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
