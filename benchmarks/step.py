@@ -83,7 +83,9 @@ def best(runs: dict[str, Callable[[], float]]) -> dict[str, float]:
 
 
 def main() -> None:
-    print(f"{'robot':12} {'n':>2} {'dt [s]':>7} {'step [us]':>10} {'its':>5} {'RNEA derivatives [us]':>22} {'ratio':>6}")
+    print(
+        f"{'robot':12} {'n':>2} {'dt [s]':>7} {'step [us]':>10} {'its':>5} {'RNEA derivatives [us]':>22} {'ratio':>6}"
+    )
     for name, q0 in (("finger", [0.5, 0.3, 0.2]), ("ur5", [0.1] * 6), ("xarm7", [0.1] * 7), ("talos_arm", [0.1] * 7)):
         robot = vp.load_robot(name)
         scene, start = vp.Scene(robot, gravity=(0.0, -9.81, 0.0) if name == "finger" else True), np.array(q0)

@@ -21,6 +21,8 @@ from varpin.errors import StepFailure as StepFailure
 from varpin.errors import UnknownJoint as UnknownJoint
 from varpin.errors import UnsupportedJoint as UnsupportedJoint
 from varpin.errors import VarpinError as VarpinError
+from varpin.inspection import RobotReport as RobotReport
+from varpin.inspection import inspect_robot as inspect_robot
 from varpin.integrators import Midpoint as Midpoint
 from varpin.lagrangian import DiscreteLagrangian as DiscreteLagrangian
 from varpin.lagrangian import LagrangianJet as LagrangianJet

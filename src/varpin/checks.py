@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import reprlib
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -42,9 +44,13 @@ def broadcast_array(name: str, value: ArrayLike, size: int) -> Floats:
 def as_floats(name: str, value: ArrayLike) -> Floats:
     """``value`` as a new float array, or an InputError that names it."""
     try:
-        return np.array(value, dtype=np.float64, order="C")
-    except (TypeError, ValueError) as error:
+        array = np.asarray(value)
+        numbers = array.dtype.kind in "biuf" or all(isinstance(entry, Real) for entry in array.flat)
+        if numbers:
+            return np.array(array, dtype=np.float64, order="C")
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name} must be an array of real numbers: {error}") from None
+    raise InputError(f"{name} must be an array of real numbers, got {reprlib.repr(value)}")
 
 
 def require_finite(name: str, array: Floats) -> Floats:
@@ -74,10 +80,14 @@ def positive(name: str, value: Any, unit: str) -> float:
 
 def real(name: str, value: Any) -> float:
     """``value`` as a float, or an InputError that names it."""
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise InputError(f"{name} must be a number, got {reprlib.repr(value)}")
     try:
         return float(value)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be a number, got {value!r}") from None
+    except OverflowError:
+        raise InputError(f"{name} is beyond the range of floating-point numbers") from None
 
 
 def fraction(name: str, value: float) -> float:

@@ -190,7 +190,7 @@ def inspect_robot(
 
 
 def _condition_numbers(M: Floats) -> tuple[float, float]:
-    """Condition number of M as it is, and with a unit diagonal; both infinite where M is singular in double precision."""
+    """Condition number of M, and of M with a unit diagonal; both infinite where M is singular in double precision."""
     if not (np.diag(M) > 0.0).all():
         return np.inf, np.inf
     scale = np.sqrt(np.diag(M))
@@ -201,7 +201,7 @@ def _condition_numbers(M: Floats) -> tuple[float, float]:
 
 
 def _largest_step(M: Floats, Lqq: Floats, margin: float) -> float:
-    """h at which M - h^2 / (4 (1 - margin)) L_qq ceases to be positive definite [s]."""
+    """The h at which M - h^2 / (4 (1 - margin)) L_qq ceases to be positive definite [s]."""
     n = len(M)
     fastest = eigh(Lqq, M, eigvals_only=True, subset_by_index=[n - 1, n - 1])[0]
     return 2.0 * float(np.sqrt((1.0 - margin) / fastest)) if fastest > 0.0 else np.inf
@@ -364,7 +364,7 @@ def _reach(robot: Robot) -> float:
 
 def _against_reach(robot: Robot) -> str:
     reach = _reach(robot)
-    return f"with joints no farther than {reach:.3g} m apart" if reach > 0.0 else "longer than any arm"
+    return f"where the arm's joints span {reach:.3g} m" if reach > 0.0 else "longer than any arm"
 
 
 def _ratio_warnings(robot: Robot) -> Iterator[str]:
@@ -373,7 +373,7 @@ def _ratio_warnings(robot: Robot) -> Iterator[str]:
     for body, parent in enumerate(tree.parent):
         if parent < 0:
             continue
-        pair = f"{_body_name(robot, parent + 1)!r} and {_body_name(robot, body + 1)!r}"
+        pair = f"{_body_name(robot, int(parent) + 1)!r} and {_body_name(robot, body + 1)!r}"
         for what, unit, values, most in (
             ("masses", "kg", tree.mass, MASS_RATIO),
             ("moments of inertia", "kg m^2", moments, INERTIA_RATIO),

@@ -13,7 +13,7 @@ from varpin.checks import finite_array, fraction, positive
 from varpin.errors import InputError
 from varpin.kernels.jet import lagrangian_sweep
 from varpin.kernels.tree import new_sweep
-from varpin.scene import Scene
+from varpin.scene import Scene, require_scene
 
 Floats = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def lagrangian_jet(
     Raises:
         InputError: Wrong shapes, values that are not finite, or an unknown backend.
     """
-    n = scene.robot.dof
+    n = require_scene(scene).robot.dof
     q, v = finite_array("q", q, (n,)), finite_array("v", v, (n,))
     if backend == "compiled":
         return _compiled(scene, q, v)
@@ -104,7 +104,8 @@ def _curvature(model: pin.Model, q: Floats, v: Floats, gravity: Floats) -> Float
     """
     data = model.createData()
     pin.computeJointJacobiansTimeVariation(model, data, q, v)
-    S, W = data.J.copy(), data.dJ.copy()
+    # With one joint the bindings drop an axis.
+    S, W = data.J.reshape(6, model.nv), data.dJ.reshape(6, model.nv)
     inertia = [np.zeros((6, 6)) for _ in range(model.njoints)]
     momentum = [np.zeros(6) for _ in range(model.njoints)]
     for joint in range(1, model.njoints):
@@ -170,7 +171,7 @@ def discrete_lagrangian(
     Raises:
         InputError: Wrong shapes, values that are not finite, dt <= 0, alpha outside [0, 1].
     """
-    n = scene.robot.dof
+    n = require_scene(scene).robot.dof
     q0, q1 = finite_array("q0", q0, (n,)), finite_array("q1", q1, (n,))
     h, a = positive("dt", dt, "s"), fraction("alpha", alpha)
     jet = lagrangian_jet(scene, (1.0 - a) * q0 + a * q1, (q1 - q0) / h)

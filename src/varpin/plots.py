@@ -116,7 +116,7 @@ def plot_energy_error(
         raise InputError("the initial energy is 0 J, so nothing is relative to it: plot with relative=False")
     figure, axes = _axes(axes)
     change = (trajectory.energy - start) / (abs(start) if relative else 1.0)
-    label = "(E(t) − E(0)) / |E(0)| [1]" if relative else "E(t) − E(0) [J]"
+    label = "(E(t) - E(0)) / |E(0)| [1]" if relative else "E(t) - E(0) [J]"
     axes.axhline(0.0, color="0.75", linewidth=0.8, zorder=1)
     axes.plot(*_thin(trajectory.t, change), label="energy", color=COLORS[0], linewidth=1.2)
     _finish(axes, trajectory, label, 1)
@@ -156,13 +156,20 @@ def plot_trajectory(
     plot_velocities(trajectory, panels[1], robot=robot)
     plot_controls(trajectory, panels[2], robot=robot, labels=labels)
     plot_energy_error(trajectory, panels[3])
-    # The same joints have the same colours in all panels, so the uppermost legend serves the others too.
+    # The same joints have the same colours in all panels, so one legend serves them.
+    handles, names = panels[0].get_legend_handles_labels()
     for panel in panels[1:3]:
-        names = (panel.get_legend_handles_labels()[1], panels[0].get_legend_handles_labels()[1])
-        if panel.get_legend() is not None and (panel is panels[1] or labels is None and len(names[0]) == len(names[1])):
+        same = len(panel.get_legend_handles_labels()[1]) == len(names)
+        if panel.get_legend() is not None and (panel is panels[1] or (same and labels is None)):
             panel.get_legend().remove()
+    if axes is None and panels[0].get_legend() is not None:
+        # The figure's legend takes its room beside all panels; that of one panel would push the others apart.
+        panels[0].get_legend().remove()
+        new.legend(handles, names, loc="outside right upper", frameon=False, fontsize="small")
     for panel in panels[:3]:
         panel.set_xlabel("")
+    if axes is None:
+        new.align_ylabels()
     return panels[0].figure, panels
 
 

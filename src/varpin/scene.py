@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import broadcast_array, finite_array
+from varpin.checks import as_floats, broadcast_array, finite_array
 from varpin.errors import InputError
 from varpin.kernels.tree import Mechanism
 from varpin.robot import Robot
@@ -101,6 +101,13 @@ class Scene:
         )
 
 
+def require_scene(scene: object) -> Scene:
+    """``scene`` itself, or an InputError that says what it is instead."""
+    if not isinstance(scene, Scene):
+        raise InputError(f"scene must be a varpin.Scene, got {type(scene).__name__}")
+    return scene
+
+
 def _not_negative(name: str, values: Floats) -> Floats:
     if (values < 0.0).any():
         c = int(np.argmax(values < 0.0))
@@ -115,8 +122,10 @@ def _actuation(robot: Robot, actuation: ArrayLike | Sequence[str] | None) -> Flo
     if isinstance(actuation, str):
         actuation = [actuation]
     if isinstance(actuation, Sequence) and all(isinstance(name, str) for name in actuation):
+        if twice := sorted({str(name) for name in actuation if actuation.count(name) > 1}):
+            raise InputError(f"actuation names {', '.join(map(repr, twice))} more than once")
         return np.eye(n)[:, [robot.coordinate(str(name)) for name in actuation]].copy()
-    matrix = np.asarray(actuation)
+    matrix = as_floats("actuation", actuation)
     if matrix.ndim != 2:
         raise InputError(f"actuation must be a matrix with {n} rows, or joint names, got shape {matrix.shape}")
-    return finite_array("actuation", actuation, (n, matrix.shape[1]))
+    return finite_array("actuation", matrix, (n, matrix.shape[1]))

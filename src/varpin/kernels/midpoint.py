@@ -286,12 +286,12 @@ def attempt(mechanism: Mechanism, options: Options, h: float, state: State, k: W
     if not regular:
         return SINGULAR
     # To first order the method conserves H - (1/2 - a) h L_q . v: nothing at a = 1/2.
-    middle = 0.0
+    start = 0.0
     end = 0.0
     for i in range(n):
-        middle += k.sweep.Lq[i] * k.v[i]
+        start += k.sweep.Lq[i] * state.v[i]
         end += k.sweep.Lq[i] * v[i]
-    most = max(state.energy[5], abs(middle), abs(end))
+    most = max(state.energy[5], abs(start), abs(end))
     slack = 2.0 * h * abs(1.0 - 2.0 * options.alpha) * most
     if not balanced(options, state.energy, kinetic, potential, k.sweep.V_scale[0], work, slack):
         return ENERGY

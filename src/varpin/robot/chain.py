@@ -3,7 +3,7 @@
 import numpy as np
 import pinocchio as pin
 
-from varpin.errors import InputError
+from varpin.checks import count, positive
 from varpin.robot.model import Robot, load_robot
 
 
@@ -21,11 +21,8 @@ def planar_chain(links: int, *, length: float = 1.0, mass: float = 1.0) -> Robot
     Raises:
         InputError: ``links`` < 1, or ``length`` or ``mass`` not positive and finite.
     """
-    if links < 1:
-        raise InputError(f"links must be at least 1, got {links}")
-    for name, value in (("length", length), ("mass", mass)):
-        if not (np.isfinite(value) and value > 0.0):
-            raise InputError(f"{name} must be positive and finite, got {value}")
+    links = count("links", links, 1)
+    length, mass = positive("length", length, "m"), positive("mass", mass, "kg")
     model = pin.Model()
     model.name = f"chain{links}"
     across = mass * length**2 / 12.0

@@ -5,14 +5,14 @@ joint stands on its own beside the one in which followers are tied to their lead
 """
 
 import logging
-import xml.etree.ElementTree as ET
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
 from varpin.errors import RobotError
+from varpin.robot.urdf import Mimic
 
 logger = logging.getLogger(__name__)
 
@@ -32,33 +32,26 @@ def joint_index(model: pin.Model) -> dict[str, int]:
     return {name: i for i, name in enumerate(model.names) if i > 0}
 
 
-def ties_of_urdf(text: str, model: pin.Model) -> tuple[Tie, ...]:
-    """The ties that a URDF's ``<mimic>`` elements ask for.
+def ties_of(mimics: Mapping[str, Mimic], model: pin.Model) -> tuple[Tie, ...]:
+    """The ties that a URDF's mimic elements ask for.
 
     A follower whose leader is not in the robot stays free, with a warning in the log: some published models
     name leaders that do not exist. A leader that is itself a follower is followed to its own leader.
 
     Raises:
-        RobotError: A mimic element has no number for its multiplier or offset, or joints follow each other in a loop.
+        RobotError: Joints follow each other in a loop.
     """
     index = joint_index(model)
     ties: dict[int, Tie] = {}
-    for joint in ET.fromstring(text).iter("joint"):
-        mimic = joint.find("mimic")
-        name = joint.get("name", "")
-        if mimic is None or name not in index:
+    for name, mimic in mimics.items():
+        if name not in index:
             continue
-        leader = mimic.get("joint", "")
-        if leader not in index:
-            logger.warning("joint %r mimics %r, which is not a moving joint of the robot: it stays free", name, leader)
+        if mimic.leader not in index:
+            logger.warning(
+                "joint %r mimics %r, which is not a moving joint of the robot: it stays free", name, mimic.leader
+            )
             continue
-        try:
-            ratio, offset = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
-        except ValueError as error:
-            raise RobotError(f"joint {name!r}: its mimic element has {error}") from None
-        if not np.isfinite([ratio, offset]).all():
-            raise RobotError(f"joint {name!r}: its mimic multiplier and offset must be finite")
-        ties[index[name]] = Tie(index[name], index[leader], ratio, offset)
+        ties[index[name]] = Tie(index[name], index[mimic.leader], mimic.ratio, mimic.offset)
     return tuple(_to_the_end(tie, ties, model) for tie in ties.values())
 
 
@@ -83,14 +76,14 @@ def tied_model(model: pin.Model, ties: Sequence[Tie]) -> pin.Model:
     return model
 
 
-def leaders_first(model: pin.Model, ties: Sequence[Tie]) -> pin.Model:
-    """``model`` with sibling branches reordered so that leaders come before their followers.
+def depth_first(model: pin.Model, ties: Sequence[Tie]) -> list[int]:
+    """The joints in an order that Pinocchio's algorithms can take: every subtree together, leaders before followers.
+
+    It is the order they have wherever that will do.
 
     Raises:
-        RobotError: A follower carries its own leader.
+        RobotError: A follower carries its own leader, or branches follow each other crosswise.
     """
-    if all(tie.leader < tie.follower for tie in ties):
-        return model
     parents = list(model.parents)
 
     def ancestors(joint: int) -> list[int]:
@@ -126,7 +119,14 @@ def leaders_first(model: pin.Model, ties: Sequence[Tie]) -> pin.Model:
             visit(ready[0])
 
     visit(0)
-    return rebuild(model, order[1:], lambda joint: model.joints[joint])
+    return order[1:]
+
+
+def reordered(model: pin.Model, ties: Sequence[Tie], order: Sequence[int]) -> tuple[pin.Model, tuple[Tie, ...]]:
+    """``model`` and ``ties`` with the joints in another order."""
+    place = {joint: k + 1 for k, joint in enumerate(order)}
+    moved = tuple(Tie(place[tie.follower], place[tie.leader], tie.ratio, tie.offset) for tie in ties)
+    return rebuild(model, order, lambda joint: model.joints[joint]), moved
 
 
 def untied_model(model: pin.Model) -> tuple[pin.Model, tuple[Tie, ...]]:
@@ -141,6 +141,11 @@ def untied_model(model: pin.Model) -> tuple[pin.Model, tuple[Tie, ...]]:
         if joint not in mimics:
             return model.joints[joint]
         follower = model.joints[joint].extract()
+        if follower.scaling == 0.0:
+            raise RobotError(
+                f"joint {model.names[joint]!r} mimics {model.names[leaders[joint]]!r} with multiplier 0, and Pinocchio "
+                "then keeps no axis of it: make it a fixed joint, or load the URDF file by path"
+            )
         data = model.joints[joint].createData()
         model.joints[joint].calc(data, pin.neutral(model))
         subspace = np.asarray(data.S, dtype=float).reshape(6)
@@ -168,11 +173,12 @@ def rebuild(model: pin.Model, order: Sequence[int], joint_of: Callable[[int], pi
         )
         new.appendBodyToJoint(place[joint], model.inertias[joint], pin.SE3.Identity())
         old, copy = model.joints[joint], new.joints[place[joint]]
-        if old.nv == copy.nv:
+        if old.nq == copy.nq:
             for limits in ("lowerPositionLimit", "upperPositionLimit"):
                 getattr(new, limits)[copy.idx_q : copy.idx_q + copy.nq] = getattr(model, limits)[
                     old.idx_q : old.idx_q + old.nq
                 ]
+        if old.nv == copy.nv:
             for limits in ("velocityLimit", "effortLimit", "armature", "rotorInertia", "rotorGearRatio"):
                 getattr(new, limits)[copy.idx_v : copy.idx_v + copy.nv] = getattr(model, limits)[
                     old.idx_v : old.idx_v + old.nv

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
@@ -11,11 +11,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from varpin.checks import as_floats, require_finite
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint
 from varpin.kernels.tree import Tree
-from varpin.robot.mimic import Tie, joint_index, tied_model
-from varpin.robot.sources import Description, describe
-from varpin.robot.tree import flatten, is_unbounded, to_pinocchio
+from varpin.robot.mimic import Tie, joint_index, rebuild, tied_model
+from varpin.robot.sources import Description, describe, frame_shapes
+from varpin.robot.tree import flatten, is_unbounded, joint_axis, to_pinocchio
 
 Floats = NDArray[np.float64]
 
@@ -68,8 +69,15 @@ class Robot:
         return self.joint_names.index(joint)
 
     def configuration(self, q: ArrayLike) -> Floats:
-        """``q`` (..., n) as Pinocchio configurations (..., model.nq) of ``model``."""
-        return self._spread(self.model, np.asarray(q, dtype=float))
+        """``q`` (..., n) as Pinocchio configurations (..., model.nq) of ``model``.
+
+        Raises:
+            InputError: The last dimension of ``q`` is not n.
+        """
+        q = as_floats("q", q)
+        if q.shape[-1:] != (self.dof,):
+            raise InputError(f"q must have shape (..., {self.dof}), got {q.shape}")
+        return self._spread(self.model, q)
 
     def free_positions(self, q: ArrayLike) -> Floats:
         """``q`` (..., n) as configurations (..., free_model.nq) of ``free_model``."""
@@ -83,9 +91,11 @@ class Robot:
 
     @property
     def unbounded(self) -> NDArray[np.bool_]:
-        """Which coordinates (n,) are continuous joints."""
+        """Which coordinates (n,) are angles without limits."""
         index = joint_index(self.model)
-        return np.array([is_unbounded(self.model, index[name]) for name in self.joint_names], dtype=bool)
+        slides = np.array([joint_axis(self.model, index[name])[0] for name in self.joint_names])
+        lower, upper = self.position_limits
+        return ~slides & np.isinf(lower) & np.isinf(upper)
 
     @property
     def position_limits(self) -> tuple[Floats, Floats]:
@@ -180,9 +190,13 @@ def build_robot(
     if mimic not in ("tied", "free"):
         raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
     description = describe(source, package_dirs, mimic=mimic == "tied")
+    names = list(description.model.names)
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise RobotError(f"robot {description.name!r} has several joints named {', '.join(map(repr, twice))}")
     if mimic == "free":
-        description = Description(**{**vars(description), "ties": ()})
-    model, ties, visuals, locked = _lock(description, lock or {})
+        description = replace(description, ties=())
+    model, ties, visuals, locked = _lock(description, lock)
+    model = _unwound(model, ties)
     followers = {tie.follower for tie in ties}
     coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
     if not coordinates:
@@ -203,18 +217,20 @@ def build_robot(
 
 
 def _lock(
-    description: Description, lock: Mapping[str, ArrayLike]
+    description: Description, lock: Mapping[str, ArrayLike] | None
 ) -> tuple[pin.Model, tuple[Tie, ...], pin.GeometryModel | None, dict[str, float | tuple[float, ...]]]:
     """Remove the locked joints, and the followers of locked leaders, from model, ties and geometry."""
     model, visuals = description.model, description.visuals
     index = joint_index(model)
     leaders = {tie.follower: tie for tie in description.ties}
+    if not isinstance(lock or {}, Mapping):
+        raise InputError(f"lock must map joint names to positions, as in {{'elbow': 0.5}}, got {lock!r}")
     reference = pin.neutral(model)
     locked: dict[str, float | tuple[float, ...]] = {}
     positions: dict[int, Floats] = {}
-    for name, value in lock.items():
+    for name, value in (lock or {}).items():
         if name not in index:
-            raise UnknownJoint(name, index, f"lock of robot {description.name!r}")
+            raise UnknownJoint(str(name), index, f"lock of robot {description.name!r}")
         joint = index[name]
         if joint in leaders:
             leader = model.names[leaders[joint].leader]
@@ -229,14 +245,16 @@ def _lock(
         return model, description.ties, visuals, {}
     for joint, position in positions.items():
         kind = model.joints[joint]
-        if kind.nv == 1 and kind.nq == 2:
-            position = np.array([np.cos(position[0]), np.sin(position[0])])
-        reference[kind.idx_q : kind.idx_q + kind.nq] = position
+        if is_unbounded(model, joint):
+            reference[kind.idx_q : kind.idx_q + 2] = np.cos(position[0]), np.sin(position[0])
+        else:
+            reference[kind.idx_q : kind.idx_q + kind.nq] = position
     joints = sorted(positions)
     if visuals is None:
         reduced = pin.buildReducedModel(model, joints, reference)
     else:
         reduced, visuals = pin.buildReducedModel(model, visuals, joints, reference)
+        frame_shapes(reduced, visuals)
     reduced.gravity = model.gravity
     left = joint_index(reduced)
     ties = tuple(
@@ -247,14 +265,40 @@ def _lock(
     return reduced, ties, visuals, locked
 
 
+def _unwound(model: pin.Model, ties: tuple[Tie, ...]) -> pin.Model:
+    """``model`` with the continuous joints among leaders and followers as plain revolute ones without limits.
+
+    A (cos, sin) pair forgets whole turns, which a gear does not; and Pinocchio ties no such joint to one of another
+    kind.
+    """
+    geared = {joint for tie in ties for joint in (tie.leader, tie.follower) if is_unbounded(model, joint)}
+    if not geared:
+        return model
+
+    def joint_of(joint: int) -> pin.JointModel:
+        if joint in geared:
+            return pin.JointModelRevoluteUnaligned(joint_axis(model, joint)[1])
+        return model.joints[joint]
+
+    return rebuild(model, range(1, model.njoints), joint_of)
+
+
 def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
-    kind = model.joints[joint]
+    kind, name = model.joints[joint], f"lock[{model.names[joint]!r}]"
     size = 1 if kind.nv == 1 else kind.nq
-    position = np.atleast_1d(np.asarray(value, dtype=float))
+    position = np.atleast_1d(as_floats(name, value))
     if position.shape != (size,):
-        raise InputError(f"lock[{model.names[joint]!r}] must have {size} value(s), got shape {position.shape}")
-    if not np.isfinite(position).all():
-        raise InputError(f"lock[{model.names[joint]!r}] must be finite, got {value}")
+        raise InputError(f"{name} must have {size} value(s), got shape {position.shape}")
+    require_finite(name, position)
+    if kind.nv > 1:
+        reference = pin.neutral(model)
+        reference[kind.idx_q : kind.idx_q + kind.nq] = position
+        if not pin.isNormalized(model, reference, 1e-6):
+            raise InputError(
+                f"{name} must be a configuration of a {kind.shortname()}, its quaternion or (cos, sin) of "
+                f"length 1, got {position}"
+            )
+        position = pin.normalize(model, reference)[kind.idx_q : kind.idx_q + kind.nq]
     return position
 
 
@@ -274,14 +318,15 @@ def geometry(robot: Robot) -> pin.GeometryModel:
     except (ValueError, RuntimeError) as error:
         raise RobotError(f"the meshes of robot {robot.name!r} cannot be read: {error}") from None
     # Attach to the joints of the model the robot moves with: by name, and locked joints through their frame.
+    index = joint_index(robot.free_model)
     for shape in visuals.geometryObjects:
-        frame = robot.free_model.getFrameId(full.frames[shape.parentFrame].name)
-        old_joint = full.joints[shape.parentJoint].id
-        name = full.names[old_joint]
-        if name in joint_index(robot.free_model):
-            shape.parentJoint = joint_index(robot.free_model)[name]
-        else:
-            moved = robot.free_model.frames[robot.free_model.getFrameId(name)]
+        link = full.frames[shape.parentFrame]
+        frame = robot.free_model.getFrameId(link.name, link.type)
+        name = full.names[shape.parentJoint]
+        if name in index:
+            shape.parentJoint = index[name]
+        elif shape.parentJoint:
+            moved = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.FIXED_JOINT)]
             shape.placement = moved.placement * shape.placement
             shape.parentJoint = moved.parentJoint
         shape.parentFrame = frame

@@ -1,11 +1,8 @@
 """From what a user names to a Pinocchio model: files, bundled robots, example-robot-data, models in memory."""
 
-import contextlib
+import logging
 import os
-import sys
-import tempfile
-import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +11,10 @@ import pinocchio as pin
 
 from varpin.errors import FileError, InputError, RobotError, RobotNotFound
 from varpin.robot import example_robot_data
-from varpin.robot.mimic import Tie, leaders_first, ties_of_urdf, untied_model
+from varpin.robot.mimic import Tie, depth_first, reordered, ties_of, untied_model
+from varpin.robot.urdf import read_urdf
 
-Source = "str | os.PathLike[str] | pin.Model | pin.RobotWrapper"
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -56,19 +54,20 @@ def bundled_robots() -> dict[str, Path]:
 
 def describe(source: object, package_dirs: Sequence[str | os.PathLike[str]] | None, *, mimic: bool) -> Description:
     """Find and parse ``source``; see :func:`varpin.load_robot`."""
-    folders = tuple(os.fspath(folder) for folder in package_dirs or ())
+    folders = _folders(package_dirs)
     if isinstance(source, pin.Model):
         return _of_model(source, source.name or "model", None)
     if isinstance(source, pin.RobotWrapper):
         return _of_model(source.model, source.model.name or "robot", source.visual_model)
     if not isinstance(source, str | os.PathLike):
         raise InputError(
-            f"source must be a URDF path, a robot's name, a pin.Model or a pin.RobotWrapper, got {type(source).__name__}"
+            "source must be a URDF path, a robot's name, a pin.Model or a pin.RobotWrapper, "
+            f"got {type(source).__name__}"
         )
     text = os.fspath(source)
     path = Path(text).expanduser()
     is_path = isinstance(source, os.PathLike) or path.suffix or os.sep in text
-    if is_path and path.is_file():
+    if is_path and _is_file(path):
         return _of_urdf(path.resolve(), path.stem, folders, mimic=mimic)
     bundled = bundled_robots()
     if text in bundled:
@@ -80,13 +79,64 @@ def describe(source: object, package_dirs: Sequence[str | os.PathLike[str]] | No
             f"{text!r} stands on a free-flyer in example-robot-data, and varpin models fixed bases; "
             "to pin its base to the world, load its URDF file by path"
         )
+    if is_path and path.is_dir():
+        raise RobotError(f"{path} is a folder, not a URDF file; it holds {_urdf_files(path)}")
     note = "" if path.suffix != ".urdf" else f" (looked in {path.absolute().parent})"
     raise RobotNotFound(text, [*bundled, *example_robot_data.FIXED_BASE], note)
 
 
+def _folders(package_dirs: Sequence[str | os.PathLike[str]] | str | os.PathLike[str] | None) -> tuple[str, ...]:
+    if isinstance(package_dirs, str | os.PathLike):
+        package_dirs = [package_dirs]
+    try:
+        return tuple(os.fspath(folder) for folder in package_dirs or ())
+    except TypeError:
+        raise InputError(f"package_dirs must be a list of folders, got {package_dirs!r}") from None
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError as error:
+        raise FileError(f"cannot read the URDF file: {error.strerror}: {str(path)[:80]!r}") from None
+
+
+def _urdf_files(folder: Path) -> str:
+    return ", ".join(sorted(file.name for file in folder.glob("*.urdf"))) or "no URDF file"
+
+
 def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) -> Description:
-    free, ties = untied_model(model)
-    return Description(name, free, ties, visuals=visuals)
+    # Copies: what the user does to the model afterwards must not reach the robot.
+    free, ties = untied_model(model.copy())
+    shapes = visuals.copy() if visuals is not None else None
+    for shape in shapes.geometryObjects if shapes is not None else ():
+        if shape.parentJoint >= free.njoints:
+            raise RobotError(f"shape {shape.name!r} hangs on joint {shape.parentJoint}, which model {name!r} has not")
+    order = depth_first(free, ties)
+    if order != sorted(order):
+        # Pinocchio lets joints be added in any order, and then computes another mass matrix without a word.
+        free, ties = reordered(free, ties, order)
+        logger.warning(
+            "the joints of model %r were not added subtree by subtree, as Pinocchio's algorithms need: reordered to %s",
+            name,
+            ", ".join(list(free.names)[1:]),
+        )
+        for shape in shapes.geometryObjects if shapes is not None else ():
+            shape.parentJoint = [0, *order].index(shape.parentJoint)
+    # Joints without a frame, and shapes on none, make pin.buildReducedModel read beyond its arrays.
+    for joint in range(1, free.njoints):
+        if not free.existFrame(free.names[joint], pin.FrameType.JOINT):
+            free.addJointFrame(joint)
+    if shapes is not None:
+        frame_shapes(free, shapes)
+    return Description(name, free, ties, visuals=shapes)
+
+
+def frame_shapes(model: pin.Model, shapes: pin.GeometryModel) -> None:
+    """Hang shapes that have no frame of ``model`` on the frame of their joint."""
+    for shape in shapes.geometryObjects:
+        if shape.parentFrame >= model.nframes:
+            shape.parentFrame = model.getFrameId(model.names[shape.parentJoint]) if shape.parentJoint else 0
 
 
 def _of_example(name: str, folders: tuple[str, ...], *, mimic: bool) -> Description:
@@ -101,52 +151,11 @@ def _of_example(name: str, folders: tuple[str, ...], *, mimic: bool) -> Descript
 
 
 def _of_urdf(path: Path, name: str, folders: tuple[str, ...], *, mimic: bool) -> Description:
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise FileError(f"cannot read {path}: {error.strerror}") from None
-    _check_urdf(text, path)
-    with _captured_stderr() as complaint:
-        try:
-            model = pin.buildModelFromUrdf(str(path))
-        except (ValueError, RuntimeError) as error:
-            detail = " ".join([*complaint(), str(error)])
-            raise RobotError(f"{path} is not a URDF that Pinocchio can read: {detail}") from None
+    model, mimics = read_urdf(path)
     ties: tuple[Tie, ...] = ()
     if mimic:
-        ties = ties_of_urdf(text, model)
-        ordered = leaders_first(model, ties)
-        if ordered is not model:
-            model, ties = ordered, ties_of_urdf(text, ordered)
+        ties = ties_of(mimics, model)
+        order = depth_first(model, ties)
+        if order != sorted(order):
+            model, ties = reordered(model, ties, order)
     return Description(name, model, ties, path, (*folders, str(path.parent)))
-
-
-def _check_urdf(text: str, path: Path) -> None:
-    """Say in words what Pinocchio's parser would say in part or not at all."""
-    try:
-        root = ET.fromstring(text)
-    except ET.ParseError as error:
-        raise RobotError(f"{path} is not well-formed XML: {error}") from None
-    if root.tag != "robot":
-        raise RobotError(f"{path} is not a URDF: its root element is <{root.tag}>, not <robot>")
-    if root.find("link") is None:
-        raise RobotError(f"{path} describes no link")
-
-
-@contextlib.contextmanager
-def _captured_stderr() -> "Iterator[object]":
-    """Catch what Pinocchio's C++ parser writes to the process's stderr; yields a function that returns its lines."""
-    sys.stderr.flush()
-    saved = os.dup(2)
-    with tempfile.TemporaryFile() as sink:
-        os.dup2(sink.fileno(), 2)
-
-        def lines() -> list[str]:
-            sink.seek(0)
-            return [line.strip() for line in sink.read().decode(errors="replace").splitlines() if line.strip()]
-
-        try:
-            yield lines
-        finally:
-            os.dup2(saved, 2)
-            os.close(saved)

@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from varpin.errors import InputError, RobotError, UnsupportedJoint
+from varpin.errors import RobotError, UnsupportedJoint
 from varpin.kernels.tree import Tree
 from varpin.robot.mimic import Tie
 
@@ -15,7 +15,9 @@ def joint_axis(model: pin.Model, joint: int) -> tuple[bool, Floats]:
     """Whether a one-axis joint is prismatic, and its unit axis (3,) in the joint's frame.
 
     Raises:
-        UnsupportedJoint: The joint has another number of degrees of freedom, or screws.
+        UnsupportedJoint: The joint has another number of degrees of freedom, screws, or is a composite with a
+            placement of its own.
+        RobotError: Its axis is zero.
     """
     kind = model.joints[joint]
     name = model.names[joint]
@@ -25,9 +27,12 @@ def joint_axis(model: pin.Model, joint: int) -> tuple[bool, Floats]:
     kind.calc(data, pin.neutral(model))
     subspace = np.asarray(data.S, dtype=float).reshape(6)
     linear, angular = subspace[:3], subspace[3:]
-    if linear.any() and angular.any():
+    at_zero = pin.SE3(data.M)
+    if (linear.any() and angular.any()) or not at_zero.isIdentity(1e-12):
         raise UnsupportedJoint(name, kind.shortname())
     axis = angular if angular.any() else linear
+    if not (np.isfinite(axis).all() and axis.any()):
+        raise RobotError(f"joint {name!r} has no axis: its direction is zero or not finite")
     return bool(linear.any()), axis / np.linalg.norm(axis)
 
 
@@ -44,6 +49,13 @@ def z_to(axis: Floats) -> Floats:
     return np.column_stack([x, np.cross(axis, x), axis])
 
 
+def _is_rigid(placement: pin.SE3) -> bool:
+    R = placement.rotation
+    if not np.isfinite(placement.homogeneous).all():
+        return False
+    return bool(np.abs(R.T @ R - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0.0)
+
+
 def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...]) -> Tree:
     """The tree of a model whose joints all have one axis.
 
@@ -54,7 +66,8 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
 
     Raises:
         UnsupportedJoint: A joint has no single axis.
-        RobotError: A link's mass, centre or inertia is NaN or infinite, or its mass is negative.
+        RobotError: A link's mass, centre or inertia is NaN or infinite, its mass is negative, or a joint's placement
+            is no rotation and translation.
     """
     bodies = model.njoints - 1
     tied = {tie.follower: tie for tie in ties}
@@ -75,6 +88,8 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
         turn.append(z_to(axis))
         before = turn[model.parents[joint]]
         placement = model.jointPlacements[joint]
+        if not _is_rigid(placement):
+            raise RobotError(f"the placement of joint {model.names[joint]!r} is no finite rotation and translation")
         prismatic[body] = slides
         rotation[body] = before.T @ placement.rotation @ turn[joint]
         translation[body] = before.T @ placement.translation
@@ -114,7 +129,7 @@ def coordinate_armature(model: pin.Model, ties: tuple[Tie, ...], coordinates: tu
     for tie in ties:
         armature[coordinates.index(tie.leader)] += tie.ratio**2 * own[model.joints[tie.follower].idx_v]
     if not (np.isfinite(armature).all() and (armature >= 0.0).all()):
-        raise InputError(f"armature must be finite and >= 0, got {armature}")
+        raise RobotError(f"armature must be finite and >= 0, got {armature}")
     return armature
 
 

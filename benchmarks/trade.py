@@ -1,0 +1,180 @@
+"""The trade of speed for accuracy, measured: the table and the figure of the README.
+
+Three links of 1 m and 1 kg fall from horizontal rest. Left: error in q after one second against the time that one
+simulated second takes, for steps and tolerances of each method. Right: energy over 1000 s at one step, 1e-2 s.
+SciPy's DOP853 runs on Pinocchio's forward dynamics; MuJoCo takes part where it is installed.
+
+    python benchmarks/trade.py
+"""
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy.integrate import solve_ivp
+
+import varpin as vp
+
+ROOT = Path(__file__).resolve().parents[1]
+LINKS = 3
+REPEATS = 7
+UNIT = 9.81 * LINKS**2 / 2
+
+
+@dataclass(frozen=True)
+class Point:
+    """One run: a method at one setting, its error in q after 1 s [rad], and time a simulated second [us]."""
+
+    method: str
+    setting: str
+    error: float
+    microseconds: float
+
+
+def timed(run: Callable[[], np.ndarray]) -> tuple[np.ndarray, float]:
+    """Result and best time [us] of several runs."""
+    best = np.inf
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        result = run()
+        best = min(best, time.perf_counter() - start)
+    return result, 1e6 * best
+
+
+def forward_dynamics(robot: vp.Robot, rtol: float, duration: float = 1.0) -> np.ndarray:
+    """q after ``duration`` by SciPy's DOP853 on pin.aba."""
+    model, data, n = robot.model, robot.model.createData(), robot.dof
+    torque = np.zeros(n)
+
+    def rate(_: float, x: np.ndarray) -> np.ndarray:
+        return np.concatenate([x[n:], pin.aba(model, data, x[:n], x[n:], torque)])
+
+    return solve_ivp(rate, (0.0, duration), np.zeros(2 * n), method="DOP853", rtol=rtol, atol=rtol).y[:n, -1]
+
+
+def mujoco_chain(dt: float, integrator: str) -> Callable[[int], tuple[np.ndarray, np.ndarray]] | None:
+    """A function of the number of steps that gives the last q and the energies; None without MuJoCo."""
+    try:
+        import mujoco  # noqa: PLC0415
+    except ImportError:
+        return None
+    body = "".join(
+        f'<body pos="{1.0 if k else 0.0} 0 0"><joint type="hinge" axis="0 1 0"/>'
+        '<inertial pos="0.5 0 0" mass="1" diaginertia="1e-9 0.08333333333333333 0.08333333333333333"/>'
+        for k in range(LINKS)
+    )
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><compiler boundinertia="0" balanceinertia="true"/><option timestep="{dt}" integrator="{integrator}">'
+        '<flag contact="disable" constraint="disable" energy="enable"/></option>'
+        f"<worldbody>{body}{'</body>' * LINKS}</worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+
+    def run(steps: int) -> tuple[np.ndarray, np.ndarray]:
+        mujoco.mj_resetData(model, data)
+        energy = np.empty(steps)
+        for k in range(steps):
+            mujoco.mj_step(model, data)
+            energy[k] = data.energy[0] + data.energy[1]
+        return data.qpos.copy(), energy
+
+    return run
+
+
+def work_precision(robot: vp.Robot) -> list[Point]:
+    """All methods at all settings."""
+    scene, rest = vp.Scene(robot), np.zeros(LINKS)
+    exact = forward_dynamics(robot, 1e-13)
+    points = []
+    for dt in (2e-2, 1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4):
+        q, cost = timed(lambda dt=dt: vp.simulate(scene, rest, rest, dt=dt, steps=round(1.0 / dt)).q[-1])
+        points.append(Point("varpin Midpoint", f"{dt:g} s", np.abs(q - exact).max(), cost))
+    for rtol in (1e-3, 1e-5, 1e-7, 1e-9):
+        q, cost = timed(lambda rtol=rtol: forward_dynamics(robot, rtol))
+        points.append(Point("SciPy DOP853 on pin.aba", f"rtol {rtol:g}", np.abs(q - exact).max(), cost))
+    for name in ("Euler", "RK4"):
+        for dt in (1e-2, 5e-3, 2e-3, 1e-3, 5e-4):
+            run = mujoco_chain(dt, name)
+            if run is not None:
+                q, cost = timed(lambda run=run, dt=dt: run(round(1.0 / dt))[0])
+                points.append(Point(f"MuJoCo {name}", f"{dt:g} s", np.abs(q - exact).max(), cost))
+    return points
+
+
+def long_run(robot: vp.Robot, dt: float = 1e-2, duration: float = 1000.0) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Energy errors over a long run at one step, in m g n^2 / 2, by method."""
+    steps, rest = round(duration / dt), np.zeros(LINKS)
+    motion = vp.simulate(vp.Scene(robot), rest, rest, dt=dt, steps=steps)
+    curves = {"varpin Midpoint": (motion.t, (motion.energy - motion.energy[0]) / UNIT)}
+    for name in ("Euler", "RK4"):
+        run = mujoco_chain(dt, name)
+        if run is not None:
+            energy = run(steps)[1]
+            curves[f"MuJoCo {name}"] = (np.arange(steps) * dt, (energy - energy[0]) / UNIT)
+    return curves
+
+
+def draw(points: list[Point], curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+    """The README's figure."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    style = {
+        "varpin Midpoint": ("#0072b2", "o"),
+        "SciPy DOP853 on pin.aba": ("#009e73", "s"),
+        "MuJoCo Euler": ("#d55e00", "^"),
+        "MuJoCo RK4": ("#cc79a7", "v"),
+    }
+    for method, (colour, marker) in style.items():
+        own = [point for point in points if point.method == method]
+        if own:
+            left.loglog(
+                [p.microseconds for p in own], [p.error for p in own], color=colour, marker=marker, label=method
+            )
+        if method in curves:
+            t, error = curves[method]
+            stride = max(1, len(t) // 2000)
+            right.plot(t[::stride], error[::stride], color=colour, label=method, linewidth=0.8)
+    left.set(xlabel="time for one simulated second [us]", ylabel="error in q after 1 s [rad]", title="Short and exact")
+    right.set(xlabel="t [s]", ylabel="energy error [m g n²/2]", title="Long: energy at dt = 0.01 s", ylim=(-1.5, 1.5))
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+    return figure
+
+
+def table(points: list[Point], curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> str:
+    """The README's table."""
+    lines = ["| method | setting | error in q after 1 s [rad] | time for 1 s [us] |", "|---|---|---|---|"]
+    chosen = {"2e-2 s", "0.02 s", "0.01 s", "0.001 s", "0.0001 s", "rtol 1e-05", "rtol 1e-09"}
+    lines += [
+        f"| {p.method} | {p.setting} | {p.error:.1e} | {p.microseconds:.0f} |" for p in points if p.setting in chosen
+    ]
+    lines += ["", "| 1000 s at 0.01 s | largest energy error [m g n^2 / 2] | at the end |", "|---|---|---|"]
+    lines += [
+        f"| {name} | {np.abs(error).max():.3g} | {error[-1]:+.3g} |"
+        for name, (_, error) in sorted(curves.items(), reverse=True)
+    ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    logging.getLogger("varpin").setLevel(logging.ERROR)
+    robot = vp.planar_chain(LINKS)
+    points, curves = work_precision(robot), long_run(robot)
+    text = table(points, curves)
+    print(text)
+    FigureCanvasAgg(draw(points, curves)).print_png(ROOT / "docs" / "images" / "trade.png")
+    readme = ROOT / "README.md"
+    begin, end = "<!-- trade:begin -->\n", "<!-- trade:end -->"
+    before, rest = readme.read_text(encoding="utf-8").split(begin)
+    readme.write_text(before + begin + text + "\n" + end + rest.split(end)[1], encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,7 @@
+"""``python -m varpin`` is the ``varpin`` command."""
+
+import sys
+
+from varpin.cli import main
+
+sys.exit(main())

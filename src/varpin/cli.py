@@ -1,0 +1,541 @@
+"""The ``varpin`` command: simulate a robot, or look into its description.
+
+Exit status: 0 done, 2 a mistake in the request, 3 a step that could not be solved, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import logging
+import math
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import ArrayLike
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from varpin._version import __version__
+from varpin.checks import count, positive, writable
+from varpin.errors import InputError, StepFailure, VarpinError
+from varpin.inspection import JointReport, RobotReport, inspect_robot
+from varpin.integrators import Midpoint
+from varpin.robot import Robot, load_robot
+from varpin.scene import Scene
+from varpin.simulation import Interrupted, simulate
+from varpin.trajectory import Trajectory, atomic_file
+
+MISTAKE, STEP_FAILED, INTERRUPTED = 2, 3, 130
+
+PLOT_FORMATS = (".png", ".pdf", ".svg")
+# More steps than anyone can hold in memory, said before NumPy says it in its own words.
+MOST_STEPS = 10**9
+# Width of tables in a pipe or a file, which have none of their own.
+_WIDTH = 140
+
+_EXAMPLES = """\
+examples:
+  varpin simulate finger --q0 0.5 0.3 0.2 --v0 0 0 1 --no-gravity --html finger.html
+  varpin simulate panda --lock panda_finger_joint1=0.02 --q0 -0.5 --duration 5 --save fall.npz --plot fall.png
+  varpin simulate arm.urdf --dt 5e-4 --steps 4000 --damping 0.1 --torque 1 -2.5e-1
+  varpin inspect ur5 --q 0 -1.2 1 0 0 0
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line ``arguments``, those of the process if left out, and return the exit status."""
+    words = sys.argv[1:] if arguments is None else arguments
+    request = _parser().parse_args([_shielded(word) for word in words])
+    errors = Console(stderr=True)
+    run: Callable[[argparse.Namespace, Console], int] = request.run
+    try:
+        with _logged(errors, request.log_level):
+            return run(request, errors)
+    except VarpinError as error:
+        _complain(errors, error)
+        return MISTAKE
+    except MemoryError as error:
+        _complain(errors, f"out of memory: {error}; take fewer steps" if str(error) else "out of memory")
+        return MISTAKE
+    except KeyboardInterrupt:
+        _say(errors, "interrupted")
+        return INTERRUPTED
+
+
+def _shielded(word: str) -> str:
+    """``word`` such that argparse takes it for no option: it knows -1 for a number, but not -1e-3 or -inf."""
+    try:
+        float(word)
+    except ValueError:
+        return word
+    return f" {word}" if word.startswith("-") else word
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="varpin",
+        description="Variational integrators on Pinocchio.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"varpin {__version__}")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    _add_simulate(commands.add_parser("simulate", help="integrate a robot in time", allow_abbrev=False))
+    _add_inspect(commands.add_parser("inspect", help="look into a robot description", allow_abbrev=False))
+    return parser
+
+
+def _add_simulate(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Integrate a robot in time with the midpoint variational integrator. Of numbers that belong to joints, one "
+        "alone is taken for all of them. Ctrl-C and a failed step keep what was computed before."
+    )
+    parser.set_defaults(run=_simulate, log_level=logging.WARNING)
+    _add_robot(parser)
+    parser.add_argument("--dt", type=float, default=1e-3, metavar="S", help="time step [s]; default: %(default)g")
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument(
+        "--duration", type=float, metavar="S", help="time to simulate [s], rounded to whole steps; default: 2"
+    )
+    length.add_argument("--steps", type=int, metavar="N", help="the number of steps instead")
+    parser.add_argument(
+        "--alpha", type=float, default=0.5, help="of the midpoint rule, in [0, 1]; default: %(default)g"
+    )
+    start = parser.add_argument_group("start")
+    _add_vector(start, "q0", "initial configuration [rad or m]; default: 0")
+    _add_vector(start, "v0", "initial velocity [rad/s or m/s]; default: 0")
+    surroundings = parser.add_argument_group("surroundings")
+    _add_gravity(surroundings)
+    _add_vector(surroundings, "damping", "viscous damping [N m s/rad or N s/m]; default: 0")
+    _add_vector(surroundings, "stiffness", "joint springs, slack at 0 [N m/rad or N/m]; default: 0")
+    _add_vector(surroundings, "torque", "constant generalized forces [N m or N]; default: 0")
+    outputs = parser.add_argument_group("outputs")
+    outputs.add_argument("--save", type=Path, metavar="NPZ", help="write the trajectory, for Trajectory.load")
+    outputs.add_argument("--plot", type=Path, metavar="PNG", help="draw an overview, as png, pdf or svg")
+    outputs.add_argument("--html", type=Path, metavar="HTML", help="write a replay that any browser opens")
+    outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
+
+
+def _add_inspect(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Print a robot's joints, links and masses, how well its mass matrix is conditioned, the largest step the "
+        "midpoint integrator's branch guard accepts, and whatever looks wrong. Takes robots that simulate refuses."
+    )
+    # What loading warns of is among the report's own warnings.
+    parser.set_defaults(run=_inspect, log_level=logging.ERROR)
+    _add_robot(parser)
+    _add_vector(parser, "q", "configuration to look at [rad or m]; default: 0")
+    _add_vector(parser, "v", "velocity there [rad/s or m/s]; default: 0")
+    _add_gravity(parser)
+
+
+def _add_robot(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "robot", metavar="ROBOT", help="path of a URDF file, or name of a robot of varpin or of example-robot-data"
+    )
+    parser.add_argument(
+        "--lock",
+        type=_lock,
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="JOINT=VALUE",
+        help="hold joints still [rad or m]",
+    )
+    parser.add_argument(
+        "--package-dir",
+        action="append",
+        metavar="DIR",
+        help="where package:// paths of meshes are looked up; repeatable",
+    )
+
+
+def _add_vector(group: argparse._ActionsContainer, name: str, text: str) -> None:
+    group.add_argument(f"--{name}", type=float, nargs="+", metavar="X", help=text)
+
+
+def _add_gravity(group: argparse._ActionsContainer) -> None:
+    gravity = group.add_mutually_exclusive_group()
+    gravity.add_argument(
+        "--gravity",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        default=True,
+        help="in world axes [m/s^2]; default: 0 0 -9.81",
+    )
+    gravity.add_argument("--no-gravity", dest="gravity", action="store_false", help="none")
+
+
+def _lock(word: str) -> tuple[str, ArrayLike]:
+    name, equals, value = word.strip().rpartition("=")
+    try:
+        numbers = [float(part) for part in value.split(",")]
+    except ValueError:
+        numbers = []
+    if not (equals and name and numbers):
+        raise argparse.ArgumentTypeError(f"{word!r} is not of the form JOINT=VALUE, for example elbow=0.5")
+    return name, numbers[0] if len(numbers) == 1 else numbers
+
+
+def _vector(option: str, numbers: Sequence[float] | None, robot: Robot) -> ArrayLike:
+    """The numbers of an option: none for 0, one for all joints, or (n,)."""
+    if numbers is None:
+        return 0.0
+    if len(numbers) not in (1, robot.dof):
+        raise InputError(
+            f"--{option} takes one number for all joints or {robot.dof}, for {', '.join(robot.joint_names)}; "
+            f"got {len(numbers)}"
+        )
+    return numbers[0] if len(numbers) == 1 else list(numbers)
+
+
+@dataclass(frozen=True)
+class _Output:
+    """A file to make of the trajectory."""
+
+    path: Path
+    write: Callable[[Robot, Trajectory], None]
+
+
+def _outputs(request: argparse.Namespace) -> list[_Output]:
+    """The files asked for, in the order of their worth; what writes them is imported now and not after the run.
+
+    Raises:
+        FileError: One of them cannot be written.
+        InputError: Two are the same file, or a figure's format is unknown.
+    """
+    outputs = []
+    if request.save is not None:
+        outputs.append(_record(writable(request.save)))
+    if request.plot is not None:
+        outputs.append(_figure(writable(request.plot)))
+    if request.html is not None:
+        outputs.append(_replay(writable(request.html)))
+    paths = [output.path.resolve() for output in outputs]
+    for path in paths:
+        if paths.count(path) > 1:
+            raise InputError(f"two outputs cannot be one file: {path}")
+    return outputs
+
+
+def _record(path: Path) -> _Output:
+    def write(_robot: Robot, trajectory: Trajectory) -> None:
+        trajectory.save(path)
+
+    return _Output(path, write)
+
+
+def _figure(path: Path) -> _Output:
+    if path.suffix.lower() not in PLOT_FORMATS:
+        raise InputError(f"--plot must end in {', '.join(PLOT_FORMATS)}, got {path.name!r}")
+    from varpin.plots import plot_trajectory  # noqa: PLC0415 - matplotlib is slow to import
+
+    def write(robot: Robot, trajectory: Trajectory) -> None:
+        figure, _ = plot_trajectory(trajectory, robot=robot)
+        with atomic_file(path) as stream:
+            figure.savefig(stream, format=path.suffix[1:].lower(), dpi=150)  # type: ignore[union-attr]
+
+    return _Output(path, write)
+
+
+def _replay(path: Path) -> _Output:
+    from varpin.replay import replay  # noqa: PLC0415 - meshcat is slow to import
+
+    def write(robot: Robot, trajectory: Trajectory) -> None:
+        replay(robot, trajectory, html=path)
+
+    return _Output(path, write)
+
+
+def _simulate(request: argparse.Namespace, errors: Console) -> int:
+    outputs = _outputs(request)
+    steps = _steps(request)
+    robot = load_robot(request.robot, package_dirs=request.package_dir, lock=dict(request.lock))
+    scene = Scene(
+        robot,
+        gravity=request.gravity,
+        damping=_vector("damping", request.damping, robot),
+        stiffness=_vector("stiffness", request.stiffness, robot),
+    )
+    q0, v0, torque = (
+        np.broadcast_to(_vector(name, getattr(request, name), robot), (robot.dof,)) for name in ("q0", "v0", "torque")
+    )
+    status, complaint, begin = 0, "", time.perf_counter()
+    try:
+        with _progress(errors, steps, quiet=request.quiet) as progress:
+            trajectory = simulate(
+                scene,
+                q0,
+                v0,
+                dt=request.dt,
+                steps=steps,
+                controls=torque if torque.any() else None,
+                integrator=Midpoint(alpha=request.alpha),
+                progress=progress,
+            )
+    except Interrupted as interruption:
+        trajectory, status = interruption.trajectory, INTERRUPTED
+        complaint = f"interrupted after {trajectory.steps} of {steps} steps, which are kept"
+    except StepFailure as failure:
+        trajectory, status = failure.trajectory, STEP_FAILED
+        complaint = str(failure).replace("are in error.trajectory", "are kept")
+    wall_time = time.perf_counter() - begin
+
+    written = []
+    for output in outputs:
+        try:
+            output.write(robot, trajectory)
+        except (VarpinError, OSError) as error:
+            _complain(errors, f"{output.path} was not written: {error}")
+            status = status or MISTAKE
+        else:
+            written.append(output.path)
+    if not request.quiet:
+        driven = bool(scene.damping.any() or torque.any())
+        tables = Console() if sys.stdout.isatty() else Console(width=_WIDTH)
+        tables.print(_summary(trajectory, steps, wall_time, driven, written))
+    if status == INTERRUPTED:
+        _say(errors, complaint)
+    elif complaint:
+        _complain(errors, complaint)
+    return status
+
+
+def _steps(request: argparse.Namespace) -> int:
+    dt = positive("--dt", request.dt, "s")
+    if request.steps is None:
+        ratio = positive("--duration", 2.0 if request.duration is None else request.duration, "s") / dt
+        if ratio < 0.5:
+            raise InputError(f"--duration {request.duration:g} s is less than one step of {dt:g} s")
+        steps = round(ratio) if math.isfinite(ratio) else MOST_STEPS + 1
+    else:
+        steps = count("--steps", request.steps, 1)
+    if steps > MOST_STEPS:
+        raise InputError(f"{steps} steps or more are asked for; a run has {MOST_STEPS} at most")
+    return steps
+
+
+def _summary(trajectory: Trajectory, asked: int, wall_time: float, driven: bool, files: Iterable[Path]) -> Table:
+    """What a run was, took and made."""
+    table = _facts(f"{trajectory.robot}: {trajectory.integrator}")
+    statistics, steps = trajectory.statistics, trajectory.steps
+    of = f" of {asked}" if steps < asked else ""
+    _row(table, "steps", f"{steps}{of}, {trajectory.dt:g} s each, {trajectory.duration:g} s in all")
+    _row(table, "wall time", f"{wall_time:.3g} s, loading of kernels included")
+    if steps:
+        newton, split = statistics.newton_iterations, statistics.split_steps
+        _row(table, "Newton iterations", f"{newton.mean():.2f} a step, {newton.max()} at most")
+        if split:
+            _row(
+                table,
+                "split steps",
+                f"{split} of {steps}, into up to {statistics.substeps.max()} parts: a smaller dt keeps the structure",
+                style="bold yellow",
+            )
+        else:
+            _row(table, "split steps", "none")
+        _row(table, "worst residual", f"{statistics.residual.max():.3g} rounding units")
+        _row(table, "smallest branch margin", f"{statistics.branch_margin.min():.3g} (1 for dt -> 0, refused at 0)")
+    drift = np.abs(trajectory.energy - trajectory.energy[0]).max()
+    kinetic = 0.5 * (trajectory.p * trajectory.v).sum(axis=1).max()
+    share = f", {drift / kinetic:.2g} of the largest kinetic energy" if kinetic > 0.0 else ""
+    _row(table, "energy change" if driven else "energy error", f"{drift:.3g} J at most{share}")
+    names = "q at the end [rad or m]", "v at the end [rad/s or m/s]"
+    for name, values in zip(names, (trajectory.q[-1], trajectory.v[-1]), strict=True):
+        _row(table, name, "  ".join(f"{value:.6g}" for value in values))
+    for path in files:
+        _row(table, "written", f"{path} ({_size(path.stat().st_size)})")
+    return table
+
+
+def _table(title: str, columns: Sequence[str]) -> Table:
+    table = Table(title=Text(title), title_justify="left")
+    for column in columns:
+        table.add_column(Text(column), overflow="fold")
+    return table
+
+
+def _facts(title: str) -> Table:
+    """A table of two columns, names and values."""
+    table = Table(title=Text(title), title_justify="left", show_header=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    return table
+
+
+def _row(table: Table, *cells: str, style: str = "") -> None:
+    # As Text: rich takes what stands in brackets for markup, and units stand in brackets.
+    table.add_row(*(Text(cell) for cell in cells), style=style)
+
+
+def _size(size: int) -> str:
+    if size < 1000:
+        return f"{size} B"
+    return f"{size / 1e3:.1f} kB" if size < 1e6 else f"{size / 1e6:.1f} MB"
+
+
+def _inspect(request: argparse.Namespace, _errors: Console) -> int:
+    arguments = {"package_dirs": request.package_dir, "lock": dict(request.lock), "gravity": request.gravity}
+    report = inspect_robot(request.robot, q=_one_or_all(request.q), v=_one_or_all(request.v), **arguments)
+    console = Console() if sys.stdout.isatty() else Console(width=_WIDTH)
+    console.print(_joint_table(report))
+    console.print(_link_table(report))
+    console.print(_report_table(report))
+    for warning in report.warnings:
+        _say(console, warning, prefix="warning", style="yellow")
+    if not report.warnings:
+        _say(console, "nothing looks wrong", prefix="")
+    return 0
+
+
+def _one_or_all(numbers: Sequence[float] | None) -> ArrayLike | None:
+    return numbers[0] if numbers is not None and len(numbers) == 1 else numbers
+
+
+def _joint_table(report: RobotReport) -> Table:
+    columns = "#", "joint", "kind", "axis", "position", "velocity", "effort"
+    table = _table(f"{report.robot.name}: joints", columns)
+    number = iter(range(len(report.joints)))
+    for joint in report.joints:
+        slides = joint.unit == "m"
+        kind = joint.kind if joint.kind != "mimic" else f"mimic: {joint.follows}"
+        _row(
+            table,
+            "" if joint.kind == "mimic" else str(next(number)),
+            joint.name,
+            kind,
+            _axis(joint),
+            "free" if joint.kind == "continuous" else f"{joint.lower:g} .. {joint.upper:g} {joint.unit}",
+            _bound(joint.velocity, "m/s" if slides else "rad/s"),
+            _bound(joint.effort, "N" if slides else "N m"),
+        )
+    for name, at in report.locked.items():
+        _row(table, "", name, f"locked at {at}", "", "", "", "", style="dim")
+    return table
+
+
+def _axis(joint: JointReport) -> str:
+    for letter, component in zip("xyz", joint.axis, strict=True):
+        if abs(abs(component) - 1.0) < 1e-9:
+            return f"{'+' if component > 0.0 else '-'}{letter}"
+    return "(" + ", ".join(f"{component:.3g}" for component in joint.axis) + ")"
+
+
+def _bound(value: float, unit: str) -> str:
+    return "none" if math.isinf(value) else f"{value:g} {unit}"
+
+
+def _link_table(report: RobotReport) -> Table:
+    columns = "link", "moved by", "mass [kg]", "centre of mass [m]", "principal moments [kg m^2]"
+    table = _table(f"{report.robot.name}: links", columns)
+    for link in report.links:
+        _row(
+            table,
+            link.name,
+            link.joint or "the base",
+            f"{link.mass:.4g}",
+            "  ".join(f"{x:.3g}" for x in link.center),
+            "  ".join(f"{x:.3g}" for x in link.moments),
+            style="" if link.joint else "dim",
+        )
+    return table
+
+
+def _report_table(report: RobotReport) -> Table:
+    table = _facts(f"{report.robot.name}: as a whole")
+    _row(table, "degrees of freedom", str(report.robot.dof))
+    _row(table, "mass of what moves", f"{report.total_mass:.5g} kg")
+    _row(table, "at q [rad or m]", "  ".join(f"{x:g}" for x in report.q))
+    _row(table, "condition of M(q)", f"{report.condition:.3g}; {report.scaled_condition:.3g} with a unit diagonal")
+    step = "undefined: the mass matrix is singular"
+    if report.largest_step is not None:
+        step = (
+            "any: no direction is unstable here" if math.isinf(report.largest_step) else f"{report.largest_step:.3g} s"
+        )
+    _row(table, "largest step accepted", f"{step} (branch margin {report.branch_margin:g}; says nothing of accuracy)")
+    return table
+
+
+class _Bar:
+    """A progress callback that draws a bar on a terminal and writes a line now and then elsewhere."""
+
+    PATIENCE = 10.0  # [s] between lines
+
+    def __init__(self, console: Console, steps: int) -> None:
+        self._console = console
+        self._bar: Progress | None = None
+        self._task: TaskID | None = None
+        self._said = time.monotonic()
+        if console.is_terminal:
+            columns = (TextColumn("simulating"), BarColumn(), TextColumn("{task.completed}/{task.total} steps"))
+            self._bar = Progress(*columns, TimeRemainingColumn(), console=console, transient=True)
+            self._task = self._bar.add_task("", total=steps)
+
+    def __enter__(self) -> _Bar:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, done: int, steps: int) -> None:
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=done)
+        elif time.monotonic() - self._said >= self.PATIENCE:
+            self._said = time.monotonic()
+            _say(self._console, f"{done} of {steps} steps")
+
+
+@contextlib.contextmanager
+def _progress(console: Console, steps: int, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    if quiet:
+        yield lambda _done, _steps: None
+        return
+    with _Bar(console, steps) as bar:
+        yield bar
+
+
+class _ConsoleHandler(logging.Handler):
+    """Log records as one readable line each, above a progress bar if there is one."""
+
+    def __init__(self, console: Console, level: int) -> None:
+        super().__init__(level)
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        _say(self._console, record.getMessage(), prefix=f"varpin: {record.levelname.lower()}", style="yellow")
+
+
+@contextlib.contextmanager
+def _logged(console: Console, level: int) -> Iterator[None]:
+    """The library's log from ``level`` on, on ``console`` within this context."""
+    logger, handler = logging.getLogger("varpin"), _ConsoleHandler(console, level)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+def _complain(console: Console, error: object) -> None:
+    # NumPy breaks the lines of long arrays, and an error is one line.
+    _say(console, " ".join(str(error).split()), prefix="varpin: error", style="red")
+
+
+def _say(console: Console, message: str, *, prefix: str = "varpin", style: str | None = None) -> None:
+    text = f"{prefix}: {message}" if prefix else message
+    console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)

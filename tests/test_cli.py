@@ -1,0 +1,381 @@
+"""The ``varpin`` command: what it prints, writes and returns."""
+
+import io
+import logging
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import varpin as vp
+from varpin import cli
+from varpin.cli import main
+from varpin.robot import load_robot
+
+ROD = '<mass value="1"/><origin xyz="0.5 0 0"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.083" iyz="0" izz="0.083"/>'
+
+
+@pytest.fixture
+def arm(tmp_path):
+    """A URDF of two rods on joints about y."""
+    text = '<link name="base"/>'
+    for name, parent, child, x in (("shoulder", "base", "upper", 0), ("elbow", "upper", "lower", 1)):
+        text += f'<link name="{child}"><inertial>{ROD}</inertial></link><joint name="{name}" type="continuous">'
+        text += f'<parent link="{parent}"/><child link="{child}"/><origin xyz="{x} 0 0"/><axis xyz="0 1 0"/></joint>'
+    path = tmp_path / "arm.urdf"
+    path.write_text(f'<robot name="arm">{text}</robot>')
+    return str(path)
+
+
+def error_of(capsys):
+    """The one line on stderr, and nothing on stdout."""
+    out, err = capsys.readouterr()
+    assert out == ""
+    (line,) = err.splitlines()
+    return line
+
+
+def usage_error(arguments, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+def test_plain_run_prints_a_summary_and_writes_nothing(arm, tmp_path, capsys):
+    assert main(["simulate", arm, "--dt", "0.01", "--steps", "50", "--q0", "-0.3", "0.2"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    for words in (
+        "arm: Midpoint(alpha=0.5)",
+        "50, 0.01 s each, 0.5 s in all",
+        "Newton iterations",
+        "split steps                 │ none",
+        "worst residual",
+        "smallest branch margin",
+        "energy error",
+        "q at the end [rad or m]",
+    ):
+        assert words in out
+    assert [path.name for path in tmp_path.iterdir()] == ["arm.urdf"]
+
+
+def test_trajectory_is_what_the_options_say(arm, tmp_path):
+    path = tmp_path / "motion.npz"
+    options = (
+        "--q0 -0.5 2e-1 --v0 1 --gravity 0 -1e-1 -5 --damping 0.1 0.2 --stiffness 3 --torque -1e-2 0.5 --alpha 0.25"
+    )
+    options += f" --dt 5e-3 --duration 0.5 --quiet --save {path}"
+    assert main(["simulate", arm, *options.split()]) == 0
+    saved = vp.Trajectory.load(path)
+    scene = vp.Scene(load_robot(arm), gravity=[0.0, -0.1, -5.0], damping=[0.1, 0.2], stiffness=3.0)
+    again = vp.simulate(
+        scene, [-0.5, 0.2], [1.0, 1.0], dt=5e-3, steps=100, controls=[-0.01, 0.5], integrator=vp.Midpoint(alpha=0.25)
+    )
+    for name in ("t", "q", "v", "p", "u", "energy"):
+        np.testing.assert_array_equal(getattr(saved, name), getattr(again, name))
+
+
+def test_start_is_at_rest_at_zero_under_earths_gravity_for_two_seconds(arm, tmp_path):
+    path = tmp_path / "motion.npz"
+    assert main(["simulate", arm, "--quiet", "--save", str(path)]) == 0
+    saved = vp.Trajectory.load(path)
+    assert (saved.steps, saved.dt) == (2000, 1e-3)
+    assert not saved.q[0].any()
+    assert not saved.v[0].any()
+    again = vp.simulate(vp.Scene(load_robot(arm)), [0, 0], [0, 0], dt=1e-3, steps=2000)
+    np.testing.assert_array_equal(saved.q, again.q)
+
+
+def test_no_gravity_and_lock(arm, tmp_path):
+    path = tmp_path / "motion.npz"
+    options = ["--lock", "elbow=-1.5e-1", "--no-gravity", "--v0", "1", "--dt", "0.1", "--steps", "10"]
+    assert main(["simulate", arm, *options, "--quiet", "--save", str(path)]) == 0
+    saved = vp.Trajectory.load(path)
+    assert saved.joint_names == ("shoulder",)
+    np.testing.assert_allclose(saved.q[:, 0], saved.t, atol=1e-14)
+
+
+def test_outputs_are_written_and_listed(arm, tmp_path, capsys):
+    npz, png, html = (tmp_path / name for name in ("a.npz", "a.png", "a.html"))
+    options = ["--steps", "30", "--dt", "0.01", "--save", str(npz), "--plot", str(png), "--html", str(html)]
+    assert main(["simulate", arm, *options]) == 0
+    out = capsys.readouterr().out
+    assert vp.Trajectory.load(npz).steps == 30
+    assert png.read_bytes().startswith(b"\x89PNG")
+    assert b"<html" in html.read_bytes()[:500].lower()
+    sizes = re.findall(r"(\d[\d.]* (?:B|kB|MB))\)", out.replace("\n", ""))
+    assert len(sizes) == 3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.html", "a.npz", "a.png", "arm.urdf"]
+
+
+@pytest.mark.parametrize("kind", ["pdf", "svg"])
+def test_plot_takes_its_format_from_the_name(arm, tmp_path, kind):
+    path = tmp_path / f"a.{kind}"
+    assert main(["simulate", arm, "--steps", "10", "--quiet", "--plot", str(path)]) == 0
+    assert path.read_bytes()[:5] == {"pdf": b"%PDF-", "svg": b"<?xml"}[kind]
+
+
+def test_quiet_run_prints_nothing(arm, capsys):
+    assert main(["simulate", arm, "--steps", "10", "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_split_steps_are_flagged_in_the_table_and_warned_of(arm, capsys):
+    assert main(["simulate", arm, "--dt", "0.3", "--steps", "20", "--v0", "5", "0"]) == 0
+    out, err = capsys.readouterr()
+    assert re.search(r"split steps +│ \d+ of 20, into up to \d+ parts: a smaller dt keeps the structure", out)
+    assert re.search(
+        r"^varpin: warning: \d+ of 20 steps were taken in up to \d+ parts: dt = 0.3 s is coarse here$", err
+    )
+
+
+def test_forced_motion_has_an_energy_change_and_no_error(arm, capsys):
+    assert main(["simulate", arm, "--steps", "10", "--torque", "1"]) == 0
+    out = capsys.readouterr().out
+    assert "energy change" in out
+    assert "energy error" not in out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--q0", "1", "2", "3"], "--q0 takes one number for all joints or 2, for shoulder, elbow; got 3"),
+        (["--damping", "1", "2", "3"], "--damping takes one number for all joints or 2, for shoulder, elbow; got 3"),
+        (["--damping", "-1"], "damping[0] is -1.0; it must be >= 0"),
+        (["--q0", "nan"], "q0[0] is nan; it must be finite"),
+        (["--v0", "0", "-inf"], "v0[1] is -inf; it must be finite"),
+        (["--dt", "0"], "--dt must be positive and finite [s], got 0.0"),
+        (["--dt", "-1e-3"], "--dt must be positive and finite [s], got -0.001"),
+        (["--duration", "-2"], "--duration must be positive and finite [s], got -2.0"),
+        (["--duration", "1e-5"], "--duration 1e-05 s is less than one step of 0.001 s"),
+        (["--duration", "1e300", "--dt", "1e-300"], "1000000001 steps or more are asked for; a run has 1000000000"),
+        (["--steps", "0"], "--steps must be at least 1, got 0"),
+        (["--steps", "-3"], "--steps must be at least 1, got -3"),
+        (["--alpha", "1.5"], "alpha must be in [0, 1], got 1.5"),
+        (["--lock", "elbo=1"], "the robot has no joint 'elbo'; did you mean 'elbow'?"),
+        (["--save", "/nowhere/a.npz"], "cannot write /nowhere/a.npz: there is no folder /nowhere"),
+        (["--plot", "a.gif"], "--plot must end in .png, .pdf, .svg, got 'a.gif'"),
+    ],
+)
+def test_mistakes_are_one_line_and_status_2(arm, capsys, options, message):
+    assert main(["simulate", arm, *options]) == 2
+    line = error_of(capsys)
+    assert line.startswith("varpin: error: ")
+    assert message in line
+
+
+@pytest.mark.parametrize("command", ["simulate", "inspect"])
+def test_unknown_robot_gets_close_matches(capsys, command):
+    assert main([command, "ur55"]) == 2
+    assert error_of(capsys) == "varpin: error: no robot or URDF file 'ur55'; close matches: ur5, ur3, ur10"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "varpin: error: the following arguments are required: COMMAND"),
+        (["simulate"], "varpin simulate: error: the following arguments are required: ROBOT"),
+        (["simulate", "finger", "--q0", "a"], "argument --q0: invalid float value: 'a'"),
+        (["simulate", "finger", "--lock", "elbow"], "'elbow' is not of the form JOINT=VALUE, for example elbow=0.5"),
+        (["simulate", "finger", "--lock", "elbow=x"], "'elbow=x' is not of the form JOINT=VALUE"),
+        (["simulate", "finger", "--steps", "1.5"], "argument --steps: invalid int value: '1.5'"),
+        (["simulate", "finger", "--steps", "1", "--duration", "1"], "not allowed with argument --steps"),
+        (["simulate", "finger", "--no-gravity", "--gravity", "0", "0", "-1"], "not allowed with argument"),
+        (["simulate", "finger", "--dur", "1"], "unrecognized arguments: --dur"),
+    ],
+)
+def test_usage_errors_are_argparses_and_status_2(capsys, arguments, message):
+    assert message in usage_error(arguments, capsys)
+
+
+def test_outputs_are_checked_before_the_run(arm, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "simulate", lambda *_, **__: pytest.fail("the run must not start"))
+    kept = str(tmp_path / "kept.npz")
+    for option, path in (("--html", "/nowhere/a.html"), ("--plot", "/nowhere/a.png"), ("--save", str(tmp_path))):
+        assert main(["simulate", arm, "--html", kept, option, path]) == 2
+        assert f"cannot write {path}" in error_of(capsys)
+    assert main(["simulate", arm, "--save", kept, "--html", kept]) == 2
+    assert "two outputs cannot be one file" in error_of(capsys)
+
+
+def test_output_that_fails_after_the_run_leaves_the_others(arm, tmp_path, capsys, monkeypatch):
+    def full(self, path):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(vp.Trajectory, "save", full)
+    npz, png = tmp_path / "a.npz", tmp_path / "a.png"
+    assert main(["simulate", arm, "--steps", "5", "--save", str(npz), "--plot", str(png)]) == 2
+    out, err = capsys.readouterr()
+    assert err.startswith(f"varpin: error: {npz} was not written: ")
+    assert "No space left on device" in err
+    assert png.exists()
+    assert "a.png" in out
+    assert "a.npz" not in out
+
+
+def test_failed_step_keeps_what_was_before_it(arm, tmp_path, capsys, monkeypatch):
+    whole = vp.simulate
+
+    def failing(*arguments, **options):
+        part = whole(*arguments, **{**options, "steps": 7})
+        failure = type("Failure", (), {"reason": "the step is at a fold", "residual": 3.5})
+        raise vp.StepFailure(part.steps, part.t[-1], failure, part)
+
+    monkeypatch.setattr(cli, "simulate", failing)
+    path = tmp_path / "a.npz"
+    assert main(["simulate", arm, "--steps", "20", "--save", str(path)]) == 3
+    out, err = capsys.readouterr()
+    (line,) = err.splitlines()
+    assert line.startswith("varpin: error: step 7 (t = 0.007 s) cannot be trusted: the step is at a fold")
+    assert "The 7 steps before it are kept; a smaller dt may go further" in line
+    assert "7 of 20, 0.001 s each" in out
+    assert vp.Trajectory.load(path).steps == 7
+
+
+def test_hopeless_step_is_status_3(arm, tmp_path, capsys):
+    path = tmp_path / "a.npz"
+    assert main(["simulate", arm, "--dt", "1e4", "--steps", "3", "--v0", "1e3", "--quiet", "--save", str(path)]) == 3
+    assert error_of(capsys).startswith("varpin: error: step 0 (t = 0 s) cannot be trusted")
+    assert vp.Trajectory.load(path).steps == 0
+
+
+def test_interrupted_run_keeps_its_data(arm, tmp_path, capsys, monkeypatch):
+    def interrupt(self, done, steps):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli._Bar, "__call__", interrupt)
+    path = tmp_path / "a.npz"
+    assert main(["simulate", arm, "--dt", "1e-4", "--steps", "40000", "--save", str(path)]) == 130
+    out, err = capsys.readouterr()
+    saved = vp.Trajectory.load(path)
+    assert 0 < saved.steps < 40000
+    assert err == f"varpin: interrupted after {saved.steps} of 40000 steps, which are kept\n"
+    assert f"{saved.steps} of 40000, 0.0001 s each" in out
+    assert "a.npz" in out
+
+
+def test_interruption_outside_the_run_is_status_130(arm, capsys, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "load_robot", interrupt)
+    assert main(["simulate", arm]) == 130
+    assert error_of(capsys) == "varpin: interrupted"
+
+
+def test_lack_of_memory_is_no_traceback(arm, capsys, monkeypatch):
+    def exhausted(*_, **__):
+        raise MemoryError("Unable to allocate 7 TiB")
+
+    monkeypatch.setattr(cli, "simulate", exhausted)
+    assert main(["simulate", arm]) == 2
+    assert error_of(capsys) == "varpin: error: out of memory: Unable to allocate 7 TiB; take fewer steps"
+
+
+def test_long_run_without_a_terminal_says_how_far_it_is(arm, capsys, monkeypatch):
+    monkeypatch.setattr(cli._Bar, "PATIENCE", 0.0)
+    assert main(["simulate", arm, "--dt", "1e-4", "--steps", "40000"]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert "varpin: 15000 of 40000 steps" in lines
+
+
+def test_progress_bar_on_a_terminal_vanishes_without_hiding_warnings():
+    stream = io.StringIO()
+    console = Console(file=stream, force_terminal=True, width=80)
+    with cli._progress(console, 10, quiet=False) as progress, cli._logged(console, logging.WARNING):
+        progress(5, 10)
+        logging.getLogger("varpin.simulation").warning("something [bold] happened")
+    assert "varpin: warning: something [bold] happened" in stream.getvalue()
+    assert "simulating" in stream.getvalue()
+
+
+def test_logging_is_as_it_was_after_the_command(arm):
+    before = list(logging.getLogger("varpin").handlers)
+    main(["simulate", arm, "--steps", "2", "--quiet"])
+    assert logging.getLogger("varpin").handlers == before
+
+
+def test_inspect_prints_tables_and_then_warnings(capsys):
+    assert main(["inspect", "panda", "--lock", "panda_joint7=0.5", "panda_joint6=-1", "--q", "-0.1"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    for words in (
+        "panda: joints",
+        "mimic: 1 * panda_finger_joint1",
+        "locked at -1.0",
+        "panda: links",
+        "mass [kg]",
+        "degrees of freedom",
+        "condition of M(q)",
+        "largest step accepted",
+    ):
+        assert words in out
+    lines = out.splitlines()
+    first = next(k for k, line in enumerate(lines) if line.startswith("warning: "))
+    assert all(line.startswith("warning: ") for line in lines[first:])
+    assert "warning: joint 'panda_joint7' is locked at 0.5" in lines
+
+
+def test_inspect_takes_what_simulate_refuses(tmp_path, capsys):
+    path = tmp_path / "empty.urdf"
+    path.write_text(
+        '<robot name="empty"><link name="base"/><link name="ghost"/><joint name="hinge" type="continuous">'
+        '<parent link="base"/><child link="ghost"/><axis xyz="0 0 1"/></joint></robot>'
+    )
+    assert main(["simulate", str(path)]) == 2
+    assert "motion of 'hinge' carries no inertia" in error_of(capsys)
+    assert main(["inspect", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert "undefined: the mass matrix is singular" in out
+    assert "warning: link 'ghost' is massless, yet joint 'hinge' moves it; and it carries nothing" in out
+
+
+def test_inspect_refuses_a_wrong_configuration(arm, capsys):
+    assert main(["inspect", arm, "--q", "1", "2", "3"]) == 2
+    assert error_of(capsys) == "varpin: error: q must be one number or have shape (2,), got (3,)"
+
+
+def test_version_and_help(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"varpin {vp.__version__}\n"
+    for arguments in (["--help"], ["simulate", "--help"], ["inspect", "--help"]):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert stop.value.code == 0
+        assert "usage: varpin" in capsys.readouterr().out
+
+
+def python_m_varpin(*arguments):
+    command = [sys.executable, "-m", "varpin", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+
+
+def test_process_simulates_and_saves(arm, tmp_path):
+    path = tmp_path / "a.npz"
+    done = python_m_varpin("simulate", arm, "--q0", "-5e-1", "0.2", "--steps", "100", "--save", str(path))
+    assert done.returncode == 0, done.stderr
+    assert "100, 0.001 s each" in done.stdout
+    assert vp.Trajectory.load(path).q[0].tolist() == [-0.5, 0.2]
+
+
+def test_process_reports_a_mistake_without_a_traceback():
+    done = python_m_varpin("simulate", "nobody.urdf")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("varpin: error: no robot or URDF file 'nobody.urdf' (looked in ")
+    assert "Traceback" not in done.stderr
+
+
+def test_plain_run_imports_neither_matplotlib_nor_meshcat(arm):
+    code = (
+        "import sys; from varpin.cli import main; "
+        f"status = main(['simulate', {arm!r}, '--steps', '2', '--quiet']); "
+        "sys.exit(status or 'matplotlib' in sys.modules or 'meshcat' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=300).returncode == 0

@@ -1,0 +1,243 @@
+"""What inspection says of sound and of faulty robots."""
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.linalg import eigh
+
+import varpin as vp
+from varpin.inspection import inspect_robot
+
+ROD = '<mass value="1"/><origin xyz="0.5 0 0"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.083" iyz="0" izz="0.083"/>'
+LIMIT = '<limit lower="-1" upper="2" effort="10" velocity="3"/>'
+
+
+def inertial(mass: float, ixx: float, iyy: float, izz: float, x: float = 0.5) -> str:
+    return (
+        f'<mass value="{mass}"/><origin xyz="{x} 0 0"/>'
+        f'<inertia ixx="{ixx}" ixy="0" ixz="0" iyy="{iyy}" iyz="0" izz="{izz}"/>'
+    )
+
+
+def write_arm(folder: Path, *links: str | None, extra: str = "", joint: str = LIMIT) -> Path:
+    """A URDF of links link1, link2, ... in a row, 1 m apart on joints joint1, joint2, ... about y."""
+    text = '<link name="base"/>'
+    for k, link in enumerate(links, start=1):
+        body = "" if link is None else f"<inertial>{link}</inertial>"
+        text += f'<link name="link{k}">{body}</link><joint name="joint{k}" type="revolute">'
+        text += f'<parent link="{"base" if k == 1 else f"link{k - 1}"}"/><child link="link{k}"/>'
+        text += f'<origin xyz="{0 if k == 1 else 1} 0 0"/><axis xyz="0 1 0"/>{joint}</joint>'
+    path = folder / "arm.urdf"
+    path.write_text(f'<robot name="arm">{text}{extra}</robot>')
+    return path
+
+
+def test_sound_arm_gives_no_warning_and_its_figures(tmp_path):
+    report = inspect_robot(write_arm(tmp_path, ROD, ROD))
+    assert report.warnings == ()
+    assert report.total_mass == pytest.approx(2.0)
+    first = report.joints[0]
+    assert (first.name, first.kind, first.unit) == ("joint1", "revolute", "rad")
+    assert (first.lower, first.upper, first.effort, first.velocity) == (-1.0, 2.0, 10.0, 3.0)
+    np.testing.assert_allclose(first.axis, [0.0, 1.0, 0.0])
+    link = report.links[1]
+    assert (link.name, link.joint, link.mass) == ("link2", "joint2", 1.0)
+    np.testing.assert_allclose(link.center, [0.5, 0.0, 0.0])
+    np.testing.assert_allclose(link.moments, [0.001, 0.083, 0.083])
+
+
+def test_report_and_its_joints_are_frozen(tmp_path):
+    report = inspect_robot(write_arm(tmp_path, ROD))
+    with pytest.raises(AttributeError):
+        report.total_mass = 3.0
+    with pytest.raises(AttributeError):
+        report.joints[0].name = "other"
+
+
+@pytest.mark.parametrize(
+    ("links", "warning"),
+    [
+        ((ROD, None), "link 'link2' is massless, yet joint 'joint2' moves it; and it carries nothing"),
+        ((None, ROD), "link 'link1' is massless, yet joint 'joint1' moves it; only what it carries gives the joint"),
+        ((ROD, inertial(1, 0, 0, 0)), "link 'link2' has a mass of 1 kg and no rotational inertia: a point mass"),
+        (
+            (ROD, inertial(1, -0.02, 0.08, 0.08)),
+            "link 'link2' has a non-physical inertia: it is not positive definite (principal moments -0.02, 0.08, 0.08",
+        ),
+        (
+            (ROD, inertial(1, 0.01, 0.02, 0.08)),
+            "link 'link2' has a non-physical inertia: its principal moments 0.01, 0.02, 0.08 kg m^2 violate the "
+            "triangle inequality, 0.08 > 0.01 + 0.02",
+        ),
+        (
+            (ROD, inertial(5e-4, 1e-6, 1e-6, 1e-6)),
+            "the masses of neighbouring links 'link1' and 'link2' differ by a factor of 2e+03: 1 and 0.0005 kg",
+        ),
+        (
+            (ROD, inertial(1e-2, 1e-8, 1e-8, 1e-8)),
+            "the moments of inertia of neighbouring links 'link1' and 'link2' differ by a factor of 8e+06",
+        ),
+        (
+            (ROD, inertial(1, 0.08, 0.08, 0.08, x=500)),
+            "link 'link2' has its centre of mass 500 m away from its frame, where the arm's joints span 1 m",
+        ),
+        (
+            (ROD, inertial(1, 80, 80, 80)),
+            "link 'link2' has an implausibly large inertia: its radius of gyration is 8.94 m",
+        ),
+        ((ROD, inertial(1, 1e-7, 1e-7, 1e-7)), "link 'link2' has an implausibly small inertia: 1 kg with principal"),
+    ],
+)
+def test_faulty_link_is_named(tmp_path, links, warning):
+    report = inspect_robot(write_arm(tmp_path, *links))
+    assert any(text.startswith(warning) for text in report.warnings), report.warnings
+
+
+def test_faulty_link_is_found_where_pinocchio_merges_it_into_a_sound_one(tmp_path):
+    tool = f'<link name="tool"><inertial>{inertial(0.1, 1e-4, 1e-4, 9e-4)}</inertial></link>'
+    tool += '<joint name="weld" type="fixed"><parent link="link1"/><child link="tool"/></joint>'
+    report = inspect_robot(write_arm(tmp_path, ROD, extra=tool))
+    (warning,) = report.warnings
+    assert warning.startswith("link 'tool' has a non-physical inertia")
+
+
+def test_rod_without_thickness_is_no_fault():
+    assert not [text for text in inspect_robot(vp.planar_chain(3)).warnings if "inertia" in text]
+
+
+def test_singular_mass_matrix_names_the_joint_and_has_no_largest_step(tmp_path):
+    report = inspect_robot(write_arm(tmp_path, ROD, None))
+    assert any(text.startswith("the mass matrix is singular") and "'joint2'" in text for text in report.warnings)
+    assert report.condition == np.inf
+    assert report.scaled_condition == np.inf
+    assert report.largest_step is None
+    with pytest.raises(vp.SingularMassMatrix):
+        vp.load_robot(tmp_path / "arm.urdf")
+
+
+def test_condition_numbers_are_those_of_the_mass_matrix():
+    q = [0.1, -0.4, 0.8, 0.2, 0.5, -0.3, 0.0]
+    report = inspect_robot("z1", q=q)
+    model = pin.Model(report.robot.model)
+    M = pin.crba(model, model.createData(), np.array(q))
+    M = np.triu(M) + np.triu(M, 1).T
+    assert report.condition == pytest.approx(np.linalg.cond(M))
+    scale = np.diag(np.diag(M) ** -0.5)
+    assert report.scaled_condition == pytest.approx(np.linalg.cond(scale @ M @ scale))
+
+
+def test_ill_conditioned_mass_matrix_is_said(tmp_path):
+    # Two joints on one axis: only the first link's own inertia tells them apart.
+    text = f'<link name="base"/><link name="disc"><inertial>{inertial(1e-3, 1e-7, 1e-7, 1e-7, x=0)}</inertial></link>'
+    text += f'<link name="arm"><inertial>{inertial(1, 0.01, 0.5, 0.5)}</inertial></link>'
+    for name, parent, child in (("lower", "base", "disc"), ("upper", "disc", "arm")):
+        text += f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+        text += f'<axis xyz="0 1 0"/>{LIMIT}</joint>'
+    path = tmp_path / "coaxial.urdf"
+    path.write_text(f'<robot name="coaxial">{text}</robot>')
+    report = inspect_robot(path)
+    assert any("the mass matrix is ill-conditioned" in text for text in report.warnings)
+    # M = [[I + e, I], [I, I]] with I = 0.75 and e = 1e-7.
+    assert report.scaled_condition == pytest.approx(4 * 0.75 / 1e-7, rel=1e-5)
+
+
+def test_limits_that_are_missing_or_leave_no_room(tmp_path):
+    bare = inspect_robot(write_arm(tmp_path, ROD, ROD, joint='<limit lower="0" upper="0" effort="0" velocity="0"/>'))
+    assert "no velocity limit, or one of 0: 'joint1', 'joint2'" in bare.warnings
+    assert "no effort limit, or one of 0: 'joint1', 'joint2'" in bare.warnings
+    assert "joint 'joint1' has no room to move: limits 0 and 0 rad" in bare.warnings
+    chain = inspect_robot(vp.planar_chain(2))
+    assert "no position limit, or one of 0: 'joint1', 'joint2'" in chain.warnings
+
+
+def test_configuration_outside_the_limits_is_said_where_one_is_given(tmp_path):
+    path = write_arm(tmp_path, ROD, ROD)
+    assert "q puts joint 'joint2' at 3, outside its limits -1 and 2" in inspect_robot(path, q=[0.0, 3.0]).warnings
+
+
+def test_mimic_joints_locked_joints_and_damping_are_said():
+    report = inspect_robot("panda", lock={"panda_joint7": 0.5})
+    mimic = next(joint for joint in report.joints if joint.kind == "mimic")
+    assert (mimic.name, mimic.follows, mimic.unit) == ("panda_finger_joint2", "1 * panda_finger_joint1", "m")
+    assert "joint 'panda_joint7' is locked at 0.5" in report.warnings
+    assert any(text.startswith("mimic joint 'panda_finger_joint2' is tied to its leader") for text in report.warnings)
+    assert any("takes only as damping=" in text and "'panda_joint1' 0.003" in text for text in report.warnings)
+    free = inspect_robot("panda", mimic="free")
+    assert free.robot.dof == 9
+    assert any("mimics 'panda_finger_joint1', but was asked to be free" in text for text in free.warnings)
+
+
+def test_mimic_leader_that_does_not_exist_is_named(tmp_path):
+    follower = f'<link name="tip"><inertial>{ROD}</inertial></link>'
+    follower += '<joint name="follower" type="revolute"><parent link="link1"/><child link="tip"/><axis xyz="0 1 0"/>'
+    follower += f'<origin xyz="1 0 0"/><mimic joint="nobody"/>{LIMIT}</joint>'
+    report = inspect_robot(write_arm(tmp_path, ROD, extra=follower))
+    assert report.robot.dof == 2
+    assert (
+        "joint 'follower' mimics 'nobody', which is not a moving joint of the robot: it stays free" in report.warnings
+    )
+
+
+def test_continuous_and_prismatic_joints_are_told_apart(tmp_path):
+    text = '<link name="base"/>'
+    for name, kind, parent in (("wheel", "continuous", "base"), ("slider", "prismatic", "wheel_link")):
+        text += f'<link name="{name}_link"><inertial>{ROD}</inertial></link><joint name="{name}" type="{kind}">'
+        text += f'<parent link="{parent}"/><child link="{name}_link"/><axis xyz="1 0 0"/>{LIMIT}</joint>'
+    path = tmp_path / "mixed.urdf"
+    path.write_text(f'<robot name="mixed">{text}</robot>')
+    wheel, slider = inspect_robot(path).joints
+    assert (wheel.kind, wheel.unit, wheel.lower, wheel.upper) == ("continuous", "rad", -np.inf, np.inf)
+    assert (slider.kind, slider.unit, slider.lower, slider.upper) == ("prismatic", "m", -1.0, 2.0)
+
+
+def test_largest_step_of_a_pendulum_standing_up_and_hanging_down(tmp_path):
+    path = write_arm(tmp_path, inertial(2.0, 0.01, 0.3, 0.3, x=0.7))
+    up = inspect_robot(path, q=-np.pi / 2)
+    # Upright, M = I + m l^2 and L_qq = m g l.
+    expected = 2.0 * np.sqrt((1.0 - up.branch_margin) * (0.3 + 2.0 * 0.7**2) / (2.0 * 9.81 * 0.7))
+    assert up.branch_margin == vp.Midpoint().branch_margin
+    assert up.largest_step == pytest.approx(expected, rel=1e-12)
+    assert inspect_robot(path, q=np.pi / 2).largest_step == np.inf
+    assert inspect_robot(path, q=-np.pi / 2, gravity=False).largest_step == np.inf
+
+
+def test_largest_step_agrees_with_differences_of_pinocchios_energy():
+    q, v = np.array([0.3, -1.2, 1.0, 0.4, 0.2, 0.1]), np.array([1.0, -0.5, 2.0, 0.3, 1.0, -2.0])
+    report = inspect_robot("ur5", q=q, v=v)
+    model = pin.Model(report.robot.model)
+    model.gravity.linear = np.array([0.0, 0.0, -9.81])
+    data, eps = model.createData(), 1e-5
+
+    def lagrangian_gradient(at):
+        pin.computeCoriolisMatrix(model, data, at, v)
+        return data.C.T @ v - pin.computeGeneralizedGravity(model, data, at)
+
+    columns = [lagrangian_gradient(q + eps * e) - lagrangian_gradient(q - eps * e) for e in np.eye(6)]
+    Lqq = np.array(columns) / (2 * eps)
+    M = pin.crba(model, data, q)
+    M = np.triu(M) + np.triu(M, 1).T
+    fastest = eigh(0.5 * (Lqq + Lqq.T), M, eigvals_only=True)[-1]
+    assert report.largest_step == pytest.approx(2.0 * np.sqrt((1.0 - report.branch_margin) / fastest), rel=1e-6)
+
+
+def test_loaded_robot_is_taken_and_not_loaded_otherwise():
+    robot = vp.planar_chain(2)
+    assert inspect_robot(robot).robot is robot
+    with pytest.raises(vp.InputError, match="lock, package_dirs and mimic belong to loading"):
+        inspect_robot(robot, lock={"joint1": 0.0})
+
+
+def test_wrong_configuration_is_refused_in_words():
+    with pytest.raises(vp.InputError, match=r"q must be one number or have shape \(2,\), got \(3,\)"):
+        inspect_robot(vp.planar_chain(2), q=[0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(("entry", "value"), [("xyz", "0.5 0"), ("rpy", "0 0")])
+def test_malformed_centre_of_mass_is_refused_by_name(tmp_path, entry, value):
+    link = f'<mass value="1"/><origin {entry}="{value}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+    with pytest.raises(
+        vp.RobotError, match=f"'link1': the {entry} of its <inertial> must be three numbers, got '{value}'"
+    ):
+        inspect_robot(write_arm(tmp_path, link))

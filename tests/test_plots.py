@@ -1,0 +1,213 @@
+"""Figures: what is on them, and that making them leaves matplotlib's global state alone."""
+
+import io
+import sys
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import varpin as vp
+from varpin import plots
+
+SINGLE = {
+    "position [rad or m]": plots.plot_joints,
+    "velocity [rad/s or m/s]": plots.plot_velocities,
+    "control [N m or N]": plots.plot_controls,
+    "E(t) - E(0) [J]": plots.plot_energy_error,
+}
+
+
+def swing(links=3, steps=40, controls=None):
+    robot = vp.planar_chain(links)
+    return robot, vp.simulate(
+        vp.Scene(robot), np.full(links, 0.3), np.zeros(links), dt=0.01, steps=steps, controls=controls
+    )
+
+
+def drawn(axes):
+    """The lines that stand for data, by label."""
+    return {line.get_label(): line for line in axes.lines if not line.get_label().startswith("_")}
+
+
+@pytest.mark.parametrize("label", SINGLE)
+def test_single_figures_have_units_and_return_figure_and_axes(label):
+    _, trajectory = swing()
+    figure, axes = SINGLE[label](trajectory)
+    assert isinstance(figure, Figure)
+    assert axes.figure is figure
+    assert axes.get_ylabel() == label
+    assert axes.get_xlabel() == "time [s]"
+    assert axes.get_xlim() == (0.0, trajectory.t[-1])
+
+
+@pytest.mark.parametrize("draw", SINGLE.values())
+def test_axes_given_are_drawn_on(draw):
+    _, trajectory = swing()
+    mine = Figure()
+    axes = mine.subplots()
+    assert draw(trajectory, axes=axes) == (mine, axes)
+    assert axes.lines
+
+
+def test_lines_hold_the_data_under_the_joints_names():
+    robot, trajectory = swing()
+    for draw, values, unit in (
+        (plots.plot_joints, trajectory.q, "position [rad]"),
+        (plots.plot_velocities, trajectory.v, "velocity [rad/s]"),
+    ):
+        _, axes = draw(trajectory, robot=robot)
+        lines = drawn(axes)
+        assert tuple(lines) == trajectory.joint_names
+        assert [text.get_text() for text in axes.get_legend().get_texts()] == list(trajectory.joint_names)
+        assert axes.get_ylabel() == unit
+        for line, column in zip(lines.values(), values.T, strict=True):
+            np.testing.assert_array_equal(line.get_ydata(), column)
+            np.testing.assert_array_equal(line.get_xdata(), trajectory.t)
+
+
+def test_one_joint_needs_no_legend():
+    _, axes = plots.plot_joints(swing(links=1)[1])
+    assert axes.get_legend() is None
+
+
+def test_prismatic_joints_are_in_metres_and_mixed_ones_say_which():
+    robot = vp.load_robot("panda")
+    trajectory = vp.simulate(vp.Scene(robot, gravity=False), np.zeros(8), np.full(8, 0.01), dt=1e-3, steps=5)
+    _, axes = plots.plot_joints(trajectory, robot=robot)
+    assert axes.get_ylabel() == "position [rad, m]"
+    names = list(drawn(axes))
+    assert names[-1] == "panda_finger_joint1 [m]"
+    assert names[0] == "panda_joint1"
+    _, axes = plots.plot_controls(trajectory, robot=robot)
+    assert axes.get_ylabel() == "control [N m, N]"
+
+    fingers = vp.load_robot("panda", lock={f"panda_joint{k}": 0.0 for k in range(1, 8)})
+    slide = vp.simulate(vp.Scene(fingers), [0.0], [0.1], dt=1e-3, steps=5)
+    assert plots.plot_joints(slide, robot=fingers)[1].get_ylabel() == "position [m]"
+    assert plots.plot_velocities(slide, robot=fingers)[1].get_ylabel() == "velocity [m/s]"
+    assert plots.plot_controls(slide, robot=fingers)[1].get_ylabel() == "control [N]"
+
+
+def test_controls_are_steps_held_to_the_end_of_the_last_interval():
+    controls = np.array([[1.0, 0.0], [1.0, 0.0], [-2.0, 0.0], [0.5, 0.0]])
+    _, trajectory = swing(links=2, steps=4, controls=controls)
+    _, axes = plots.plot_controls(trajectory)
+    line = drawn(axes)["joint1"]
+    assert line.get_drawstyle() == "steps-post"
+    np.testing.assert_allclose(line.get_xdata(), [0.0, 0.02, 0.03, 0.04])
+    np.testing.assert_array_equal(line.get_ydata(), [1.0, -2.0, 0.5, 0.5])
+
+
+def test_controls_that_are_no_joints_have_their_own_names():
+    robot = vp.planar_chain(3)
+    scene = vp.Scene(robot, actuation=["joint1", "joint3"])
+    trajectory = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=0.01, steps=3, controls=[1.0, 2.0])
+    _, axes = plots.plot_controls(trajectory, robot=robot)
+    assert list(drawn(axes)) == ["u1", "u2"]
+    assert axes.get_ylabel() == "control [units of each]"
+    _, axes = plots.plot_controls(trajectory, labels=["shoulder", "wrist"])
+    assert list(drawn(axes)) == ["shoulder", "wrist"]
+    with pytest.raises(vp.InputError, match="labels must be 2, one a control, got 3"):
+        plots.plot_controls(trajectory, labels=["a", "b", "c"])
+
+
+def test_energy_error_in_joules_or_relative_to_the_initial_energy():
+    _, trajectory = swing()
+    _, axes = plots.plot_energy_error(trajectory)
+    np.testing.assert_array_equal(drawn(axes)["energy"].get_ydata(), trajectory.energy - trajectory.energy[0])
+    _, axes = plots.plot_energy_error(trajectory, relative=True)
+    assert axes.get_ylabel() == "(E(t) - E(0)) / |E(0)| [1]"
+    expected = (trajectory.energy - trajectory.energy[0]) / abs(trajectory.energy[0])
+    np.testing.assert_array_equal(drawn(axes)["energy"].get_ydata(), expected)
+
+
+def test_nothing_is_relative_to_no_energy():
+    robot = vp.planar_chain(1)
+    still = vp.simulate(vp.Scene(robot, gravity=False), [0.0], [0.0], dt=0.01, steps=2)
+    with pytest.raises(vp.InputError, match="the initial energy is 0 J"):
+        plots.plot_energy_error(still, relative=True)
+
+
+@pytest.mark.parametrize("links", [1, 3, 19])
+def test_overview_has_everything_once(links):
+    robot, trajectory = swing(links=links)
+    figure, axes = plots.plot_trajectory(trajectory, robot=robot)
+    assert isinstance(figure, Figure)
+    assert [panel.get_ylabel() for panel in axes] == [
+        "position [rad]",
+        "velocity [rad/s]",
+        "control [N m]",
+        "E(t) - E(0) [J]",
+    ]
+    assert [panel.get_xlabel() for panel in axes] == ["", "", "", "time [s]"]
+    assert [panel.get_legend() for panel in axes] == [None] * 4
+    names = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    assert names == (list(trajectory.joint_names) if links > 1 else [])
+    styles = {(line.get_color(), line.get_linestyle()) for line in drawn(axes[0]).values()}
+    assert len(styles) == links
+    figure.canvas.draw()
+    heights = [panel.get_position().height for panel in axes]
+    assert max(heights) < 1.02 * min(heights), "a long legend must not push panels apart"
+    right = max(panel.get_window_extent().x1 for panel in axes)
+    assert all(legend.get_window_extent().x0 >= right for legend in figure.legends)
+
+
+def test_overview_on_axes_given():
+    robot, trajectory = swing()
+    mine = Figure()
+    grid = mine.subplots(2, 2)
+    figure, axes = plots.plot_trajectory(trajectory, axes=grid, robot=robot)
+    assert figure is mine
+    assert list(axes) == list(grid.ravel())
+    assert axes[0].get_legend() is not None
+    assert not mine.legends
+    with pytest.raises(vp.InputError, match=r"axes must be 4 .* got 3"):
+        plots.plot_trajectory(trajectory, axes=list(grid.ravel()[:3]))
+
+
+def test_robot_of_another_motion_is_refused():
+    _, trajectory = swing(links=2)
+    with pytest.raises(vp.InputError, match="has joints joint1, joint2, joint3; the trajectory has joint1, joint2"):
+        plots.plot_joints(trajectory, robot=vp.planar_chain(3))
+
+
+def test_global_state_is_left_alone():
+    before = dict(mpl.rcParams)
+    had_pyplot = "matplotlib.pyplot" in sys.modules
+    _, trajectory = swing()
+    for draw in (*SINGLE.values(), plots.plot_trajectory):
+        figure, _ = draw(trajectory)
+        figure.savefig(io.BytesIO(), format="png", dpi=40)
+    assert dict(mpl.rcParams) == before
+    assert ("matplotlib.pyplot" in sys.modules) == had_pyplot
+    from matplotlib import pyplot  # noqa: PLC0415 - the figures above are made without it
+
+    assert pyplot.get_fignums() == []
+
+
+@pytest.mark.parametrize("kind", ["png", "pdf", "svg"])
+def test_overview_is_written_in_each_format(tmp_path, kind):
+    figure, _ = plots.plot_trajectory(swing()[1])
+    path = tmp_path / f"motion.{kind}"
+    figure.savefig(path)
+    assert path.stat().st_size > 5000
+
+
+def test_long_lines_are_thinned_to_their_extremes():
+    rng = np.random.default_rng(0)
+    t, values = np.arange(1_000_001) * 1e-3, rng.normal(size=1_000_001)
+    values[123_456], values[765_432] = 50.0, -60.0
+    thin_t, thin = plots._thin(t, values)
+    assert len(thin) <= 2 * plots._POINTS
+    assert (np.diff(thin_t) > 0.0).all()
+    assert (thin_t[0], thin_t[-1]) == (t[0], t[-1])
+    assert (thin.max(), thin.min()) == (50.0, -60.0)
+    assert set(thin) <= set(values)
+
+
+def test_start_without_steps_is_drawn():
+    figure, axes = plots.plot_trajectory(swing(steps=0)[1])
+    figure.canvas.draw()
+    assert len(axes) == 4
