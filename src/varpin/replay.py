@@ -11,6 +11,7 @@ import io
 import logging
 import math
 import os
+import re
 import warnings
 import webbrowser
 from collections.abc import Sequence
@@ -136,7 +137,7 @@ def _keyframes(robot: Robot, t: Floats, q: Floats, fps: float, max_frames: int) 
     """
     frames = min(math.ceil(t[-1] * fps), max_frames - 1)
     if frames < len(t) - 1:
-        times = np.linspace(0.0, t[-1], max(frames, 1) + 1)
+        times = np.linspace(0.0, t[-1], frames + 1)
         q = np.column_stack([np.interp(times, t, column) for column in q.T])
     else:
         times = t
@@ -178,6 +179,7 @@ class _Page:
 
 
 # The commands go to the viewer one after the other, for a property or an animation needs the object it speaks of.
+# A mesh that three.js cannot take is left out; the rest plays.
 _PLAYER = """
 var viewer;
 async function play() {
@@ -190,7 +192,11 @@ async function play() {
     const view = new DataView(data);
     for (let at = 0; at < data.byteLength;) {
         const size = view.getUint32(at, true);
-        viewer.handle_command_bytearray(new Uint8Array(data.slice(at + 4, at + 4 + size)));
+        try {
+            viewer.handle_command_bytearray(new Uint8Array(data.slice(at + 4, at + 4 + size)));
+        } catch (error) {
+            console.error(error);
+        }
         at += 4 + size;
     }
     document.documentElement.dataset.loaded = "true";
@@ -353,6 +359,8 @@ class _ShapeLoader(MeshcatVisualizer):
         mesh = super().loadMeshFromFile(geometry_object)
         if self.collada is not None:
             mesh.dae_raw = self.collada
+        elif isinstance(mesh, meshcat.geometry.MeshGeometry) and mesh.mesh_format == "obj":
+            mesh.contents = _plain_obj(mesh.contents)
         return mesh
 
     def load(self, shape: pin.GeometryObject, placement: pin.SE3, node: str) -> None:
@@ -385,15 +393,20 @@ _PRIMITIVES = frozenset(["lines", "linestrips", "polygons", "polylist", "triangl
 def _collada_parts(path: str) -> list[str | None]:
     """A Collada file as texts with one mesh each, where meshcat needs that; else [None], to be taken whole.
 
-    meshcat merges the meshes of a file and keeps one material a mesh: of a mesh in several colours beside another,
-    it draws nothing. A mesh alone keeps its colours.
+    meshcat merges the meshes of a file and keeps one material a mesh: of a mesh in several colours beside another
+    it draws nothing, and on meshes with different kinds of vertices it stops. A mesh alone keeps its colours.
     """
-    root = ElementTree.parse(path).getroot()
+    try:
+        root = ElementTree.parse(path).getroot()
+    except (OSError, ElementTree.ParseError):
+        # Pinocchio's loader will say so in its own words.
+        return [None]
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
     instances = list(root.iter("instance_geometry"))
-    colors = (sum(child.tag in _PRIMITIVES for child in mesh) for mesh in root.iter("mesh"))
-    if len(instances) < 2 or max(colors, default=0) < 2:
+    meshes = [[child for child in mesh if child.tag in _PRIMITIVES] for mesh in root.iter("mesh")]
+    kinds = {frozenset(x.get("semantic") for x in child.iter("input")) for mesh in meshes for child in mesh}
+    if len(instances) < 2 or (len(kinds) < 2 and max(map(len, meshes)) < 2):
         return [None]
     parts: list[str | None] = []
     for kept in range(len(instances)):
@@ -410,6 +423,15 @@ def _collada_parts(path: str) -> list[str | None]:
                     library.remove(mesh)
         parts.append(ElementTree.tostring(part, encoding="unicode"))
     return parts
+
+
+def _plain_obj(text: str) -> str:
+    """A Wavefront file's vertices, normals and faces alone, as one mesh.
+
+    meshcat gives it one colour without texture anyway, and stops on parts of which only some have texture coordinates.
+    """
+    lines = (line for line in text.splitlines() if line.startswith(("v ", "vn ", "f ")))
+    return "\n".join(re.sub(r"(\d+)/-?\d*(/?)", r"\1\2\2", line) if line[0] == "f" else line for line in lines)
 
 
 def _hex(color: ArrayLike) -> int:
@@ -515,7 +537,9 @@ def _view_direction(R: Floats) -> Floats:
     joint_axes = R[..., 2].reshape(-1, 3)
     weights, directions = np.linalg.eigh(joint_axes.T @ joint_axes)
     if weights[-1] > 0.98 * weights.sum():
-        normal = directions[:, -1] * np.sign(directions[:, -1] @ [0.1, -0.2, 1.0])
+        normal = directions[:, -1]
+        if normal @ [0.1, -0.2, 1.0] < 0.0:
+            normal = -normal
         side = [0.0, -0.75, 0.0] if normal[2] > 0.7 else [0.0, 0.0, 0.25]
         toward = normal + side
     else:

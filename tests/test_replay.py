@@ -1,0 +1,417 @@
+"""Replays in real, headless Chromium, cut off from the network."""
+
+import base64
+import gzip
+import importlib
+import io
+import logging
+import os
+import re
+import shutil
+import time
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import umsgpack
+from PIL import Image
+from selenium import webdriver
+from selenium.webdriver.chrome.service import Service
+
+import varpin as vp
+from varpin.replay import replay
+from varpin.robot import geometry
+
+# By name the module is hidden behind the function of the same name.
+MODULE = importlib.import_module("varpin.replay")
+
+CHROMIUM_FLAGS = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-dev-shm-usage",
+    "--window-size=800,600",
+]
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if not (chromium and driver):
+        reason = "needs chromium and chromedriver on the PATH"
+        pytest.fail(reason) if os.environ.get("CI") else pytest.skip(reason)
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for flag in [*CHROMIUM_FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"]:
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    session = webdriver.Chrome(options=options, service=Service(driver))
+    session.set_script_timeout(60)
+    yield session
+    session.quit()
+
+
+@pytest.fixture(scope="module")
+def finger():
+    return vp.load_robot("finger")
+
+
+@pytest.fixture(scope="module")
+def motion(finger):
+    scene = vp.Scene(finger, gravity=False, stiffness=[0.54, 0.28, 0.12], damping=[3.1e-3, 2.2e-3, 0.9e-3])
+    return vp.simulate(scene, q0=[0.9, 1.2, 0.8], v0=[0.0, 0.0, 0.0], dt=1e-3, steps=500)
+
+
+def wait_until(condition, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "the page did not get there"
+        time.sleep(0.05)
+
+
+def visit(browser, path):
+    """Load a page offline; returns once every command has reached the viewer."""
+    browser.get_log("browser")
+    browser.execute_cdp_cmd("Network.enable", {})
+    offline = {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+    browser.execute_cdp_cmd("Network.emulateNetworkConditions", offline)
+    browser.get(path.as_uri())
+    wait_until(lambda: browser.execute_script("return document.documentElement.dataset.loaded"))
+
+
+def seek(browser, seconds):
+    """Stop the animation at a time; returns once that is on the screen."""
+    browser.execute_async_script(
+        "viewer.animator.pause(); viewer.animator.seek(arguments[0]);"
+        "requestAnimationFrame(() => requestAnimationFrame(() => requestAnimationFrame(arguments[1])));",
+        seconds,
+    )
+
+
+def picture(browser):
+    """The screen (height, width, 3), without the strip that holds meshcat's controls."""
+    image = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
+    return np.asarray(image, dtype=float)[40:]
+
+
+def shape_poses(browser):
+    """World transforms (4, 4) of the shapes on the page, in the robot's own world, by index."""
+    poses = browser.execute_script(
+        """
+        const root = viewer.scene_tree.find(["meshcat"]).object, poses = {};
+        root.updateMatrixWorld(true);
+        const inverse = root.matrixWorld.clone().invert();
+        root.traverse(node => {
+            if (node.parent && node.parent.name == "shapes")
+                poses[node.name.split(" ")[0]] = inverse.clone().multiply(node.matrixWorld).toArray();
+        });
+        return poses;"""
+    )
+    return {int(k): np.array(pose).reshape(4, 4).T for k, pose in poses.items()}
+
+
+def commands(path):
+    """What a page tells the viewer, read without a browser."""
+    packed = re.search(r'<script id="commands" type="text/plain">([^<]*)</script>', path.read_text()).group(1)
+    stream = gzip.decompress(base64.b64decode(packed))
+    found = []
+    while stream:
+        size = int.from_bytes(stream[:4], "little")
+        found.append(umsgpack.unpackb(stream[4 : 4 + size]))
+        stream = stream[4 + size :]
+    return found
+
+
+def animation(path):
+    """Times and values by joint node, and the options."""
+    (command,) = [command for command in commands(path) if command["type"] == "set_animation"]
+    tracks = {}
+    for part in command["animations"]:
+        (track,) = part["clip"]["tracks"]
+        keys = track["keys"]
+        assert part["clip"]["fps"] == 1
+        tracks[part["path"], track["name"]] = [[key["time"] for key in keys], [key["value"] for key in keys]]
+    return tracks, command["options"]
+
+
+def test_page_plays_offline_and_shows_the_finger_large(browser, finger, motion, tmp_path):
+    visit(browser, replay(finger, motion, html=tmp_path / "finger.html"))
+    assert browser.execute_script("return viewer.animator.playing")
+
+    seek(browser, 0.0)
+    first, again = picture(browser), picture(browser)
+    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 500
+    skin = (first[..., 0] > first[..., 2] + 30.0).mean()
+    assert 0.04 < skin < 0.6
+    seek(browser, 0.5)
+    last = picture(browser)
+    changed = (np.abs(last - first).max(axis=-1) > 40.0).mean()
+    noise = (np.abs(again - first).max(axis=-1) > 40.0).mean()
+    assert noise < 1e-4
+    assert changed > 0.01
+
+    errors = [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+    assert errors == []
+    fetched = browser.execute_script("return performance.getEntriesByType('resource').map(entry => entry.name)")
+    assert [url for url in fetched if not url.startswith(("data:", "blob:"))] == []
+
+
+@pytest.mark.parametrize("name", ["finger", "ur5", "panda", "kinova"])
+def test_page_poses_every_shape_as_pinocchio_does(browser, tmp_path, name):
+    robot = vp.load_robot(name)
+    rng = np.random.default_rng(5)
+    q = rng.uniform(-1.0, 1.0, (4, robot.dof)) * np.where(robot.unbounded, 8.0, 1.0)
+    visit(browser, replay(robot, q, dt=0.5, html=tmp_path / "poses.html"))
+    model, shapes = robot.free_model, geometry(robot)
+    data, placements = model.createData(), shapes.createData()
+    for seconds, expected in [(0.0, q[0]), (0.75, 0.5 * (q[1] + q[2])), (1.5, q[3])]:
+        seek(browser, seconds)
+        poses = shape_poses(browser)
+        pin.updateGeometryPlacements(model, data, shapes, placements, robot.free_positions(expected))
+        assert sorted(poses) == list(range(shapes.ngeoms))
+        for k, shape in enumerate(shapes.geometryObjects):
+            scale = np.diag([*shape.meshScale, 1.0]) if shape.meshPath.endswith(".dae") else np.eye(4)
+            np.testing.assert_allclose(poses[k], placements.oMg[k].homogeneous @ scale, atol=2e-5)
+
+
+def test_meshes_keep_their_colours(browser, tmp_path):
+    # meshcat alone drops the parts of the UR5 that are a mesh in several colours beside another mesh.
+    robot = vp.load_robot("ur5")
+    visit(browser, replay(robot, np.zeros((1, 6)), dt=1.0, html=tmp_path / "ur5.html"))
+    materials = browser.execute_script(
+        """
+        const kinds = [];
+        viewer.scene_tree.find(["meshcat"]).object.traverse(node => {
+            if (node.material) for (const material of [node.material].flat()) kinds.push(material.type || "none");
+        });
+        return kinds;"""
+    )
+    assert "none" not in materials
+    assert len(materials) > 2 * geometry(robot).ngeoms
+
+
+@pytest.mark.parametrize(("dt", "steps"), [(1e-4, 3000), (1e-4, 7), (2e-2, 40), (0.7, 3)])
+def test_duration_is_the_motions(browser, finger, tmp_path, dt, steps):
+    q = np.linspace([0.0, 0.0, 0.0], [1.0, 0.5, 0.2], steps + 1)
+    path = replay(finger, q, dt=dt, html=tmp_path / "speed.html")
+    visit(browser, path)
+    assert browser.execute_script("return viewer.animator.duration") == pytest.approx(steps * dt, rel=1e-6)
+    tracks, _ = animation(path)
+    for times, values in tracks.values():
+        assert times[0] == 0.0
+        assert times[-1] == pytest.approx(steps * dt, rel=1e-6)
+        assert len(times) == len(values) <= min(steps, max(1, np.ceil(30 * steps * dt))) + 1
+    assert [values[-1] for _, values in tracks.values()] == pytest.approx([1.0, 0.5, 0.2], rel=1e-6)
+
+
+def test_wavefront_faces_lose_texture_coordinates_only():
+    text = """
+mtllib a.mtl
+o part
+v 0 0 0
+vt 0 1
+vn 0 0 1
+usemtl red
+f 1/2/3 4/5/6 -7/-8/-9
+f 1//3 2//3 4//3
+f 1/2 2/2 3/2
+f 1 2 3"""
+    expected = ["v 0 0 0", "vn 0 0 1", "f 1//3 4//6 -7//-9", "f 1//3 2//3 4//3", "f 1 2 3", "f 1 2 3"]
+    assert MODULE._plain_obj(text).splitlines() == expected
+
+
+def test_plays_in_real_time(browser, finger, tmp_path):
+    visit(browser, replay(finger, np.zeros((201, 3)), dt=0.05, html=tmp_path / "clock.html"))
+    look = "return [viewer.animator.time, performance.now() / 1000]"
+    wait_until(lambda: browser.execute_script(look)[0] > 0.2)
+    start, before = browser.execute_script(look)
+    time.sleep(1.5)
+    end, after = browser.execute_script(look)
+    assert end - start == pytest.approx(after - before, abs=0.3)
+
+
+def test_speed_and_loop(finger, tmp_path):
+    q = np.zeros((11, 3))
+    slow = replay(finger, q, dt=0.1, speed=0.1, loop=False, html=tmp_path / "slow.html")
+    tracks, options = animation(slow)
+    assert {times[-1] for times, _ in tracks.values()} == {10.0}
+    assert options == {"play": True, "repetitions": 1}
+    _, options = animation(replay(finger, q, dt=0.1, html=tmp_path / "loop.html"))
+    assert options["repetitions"] == float("inf")
+
+
+def test_trajectory_and_its_array_give_the_same_animation(finger, motion, tmp_path):
+    whole = animation(replay(finger, motion, html=tmp_path / "trajectory.html"))
+    array = animation(replay(finger, motion.q, dt=motion.dt, html=tmp_path / "array.html"))
+    assert whole == array
+
+
+def test_size_stays_sane_for_a_long_motion(finger, tmp_path):
+    t = np.arange(1_000_001) * 1e-3
+    q = np.column_stack([np.sin(t), 1.0 + np.cos(0.7 * t), 0.5 + 0.5 * np.sin(1.3 * t)])
+    path = replay(finger, q, dt=1e-3, html=tmp_path / "long.html")
+    assert path.stat().st_size < 2_000_000
+    tracks, _ = animation(path)
+    for (times, values), column in zip(tracks.values(), q.T, strict=True):
+        assert len(times) == 10_000
+        assert times[-1] == 1000.0
+        np.testing.assert_allclose(np.interp(t, times, values), column, atol=3e-3)
+
+
+def test_a_single_row_shows_a_pose(browser, finger, tmp_path):
+    path = replay(finger, [[0.3, 0.6, 0.9]], dt=1.0, html=tmp_path / "pose.html")
+    visit(browser, path)
+    assert all(command["type"] != "set_animation" for command in commands(path))
+    data, shapes = finger.model.createData(), geometry(finger)
+    placements = shapes.createData()
+    pin.updateGeometryPlacements(finger.model, data, shapes, placements, np.array([0.3, 0.6, 0.9]))
+    for k, pose in shape_poses(browser).items():
+        np.testing.assert_allclose(pose, placements.oMg[k].homogeneous, atol=1e-6)
+
+
+def test_a_model_without_geometry_gets_a_skeleton(browser, tmp_path, caplog):
+    chain = vp.planar_chain(3)
+    with caplog.at_level(logging.WARNING, logger="varpin.replay"):
+        path = replay(chain, np.zeros((2, 3)), dt=1.0, html=tmp_path / "chain.html")
+    assert "robot 'chain3' comes without visual geometry; drawing a skeleton" in caplog.text
+    visit(browser, path)
+    poses = shape_poses(browser)
+    for joint in range(3):
+        assert any(np.allclose(pose[:3, 3], [joint, 0.0, 0.0], atol=1e-6) for pose in poses.values())
+        assert any(np.allclose(pose[:3, 3], [joint + 0.5, 0.0, 0.0], atol=1e-6) for pose in poses.values())
+
+
+def test_a_missing_mesh_falls_back_with_a_warning_that_names_it(tmp_path, caplog):
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(
+        """<robot name="arm">
+        <link name="base"/>
+        <link name="rod">
+          <inertial><mass value="1"/><origin xyz="0.5 0 0"/>
+            <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
+          <visual><geometry><mesh filename="no_such_mesh.stl"/></geometry></visual>
+        </link>
+        <joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/></joint>
+        </robot>"""
+    )
+    robot = vp.load_robot(urdf)
+    with caplog.at_level(logging.WARNING, logger="varpin.replay"):
+        path = replay(robot, [[0.0], [1.0]], dt=0.1, html=tmp_path / "arm.html")
+    assert "no_such_mesh.stl" in caplog.text
+    assert "drawing a skeleton of its joints and centres of mass instead" in caplog.text
+    assert any("skeleton" in command.get("path", "") for command in commands(path))
+
+
+def test_a_mesh_pinocchio_cannot_send_is_drawn_in_one_colour(tmp_path, caplog, monkeypatch):
+    def broken(loader, shape):
+        raise UserWarning("Texture 'skin.png' not found.")
+
+    monkeypatch.setattr(MODULE.MeshcatVisualizer, "loadMeshFromFile", broken)
+    with caplog.at_level(logging.WARNING, logger="varpin.replay"):
+        path = replay(vp.load_robot("ur5"), np.zeros((1, 6)), dt=1.0, html=tmp_path / "ur5.html")
+    assert "Texture 'skin.png' not found." in caplog.text
+    assert "it is drawn in one colour" in caplog.text
+    drawn = [command for command in commands(path) if command["type"] == "set_object" and "shapes" in command["path"]]
+    assert {command["object"]["geometries"][0]["type"] for command in drawn} == {"BufferGeometry"}
+
+
+def test_a_mesh_the_page_cannot_take_is_left_out(browser, tmp_path, monkeypatch):
+    monkeypatch.setattr(MODULE, "_collada_parts", lambda path: ["<COLLADA/>"])
+    visit(browser, replay(vp.load_robot("ur5"), np.zeros((11, 6)), dt=0.1, html=tmp_path / "ur5.html"))
+    assert any(entry["level"] == "SEVERE" for entry in browser.get_log("browser"))
+    assert browser.execute_script("return viewer.animator.playing && viewer.animator.duration") == 1.0
+
+
+def test_live_window(browser, finger, motion, monkeypatch, capfd):
+    opened = []
+    monkeypatch.setattr(MODULE.webbrowser, "open", lambda url, new=0: opened.append(url) or True)
+    viewer = replay(finger, motion, open=True)
+    try:
+        assert opened == [viewer.url()]
+        assert capfd.readouterr().out == ""
+        online = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+        browser.execute_cdp_cmd("Network.emulateNetworkConditions", online)
+        browser.get(viewer.url())
+        wait_until(lambda: browser.execute_script("return viewer.animator.duration") == 0.5)
+        assert len(shape_poses(browser)) == geometry(finger).ngeoms
+    finally:
+        browser.get("about:blank")
+        viewer.window.server_proc.kill()
+        viewer.window.server_proc.wait()
+
+
+def test_says_where_to_look_when_no_browser_opens(finger, motion, monkeypatch, caplog):
+    monkeypatch.setattr(MODULE.webbrowser, "open", lambda url, new=0: False)
+    viewer = replay(finger, motion, open=True)
+    viewer.window.server_proc.kill()
+    viewer.window.server_proc.wait()
+    assert f"no web browser could be started; open {viewer.url()} in one" in caplog.text
+
+
+def refused(call, error, message):
+    with pytest.raises(error, match=re.escape(message)) as caught:
+        call()
+    assert isinstance(caught.value, vp.VarpinError)
+
+
+def test_refuses_what_it_cannot_show(finger, motion, tmp_path):
+    page = tmp_path / "page.html"
+    q = np.zeros((3, 3))
+    either = "give either html=path, for a file, or open=True, for a window"
+    refused(lambda: replay(finger, motion), vp.InputError, either)
+    refused(lambda: replay(finger, motion, html=page, open=True), vp.InputError, either)
+    refused(lambda: replay(finger.model, motion, html=page), vp.InputError, "robot must come from load_robot")
+    refused(lambda: replay(finger, q, html=page), vp.InputError, "an array of configurations needs dt")
+    refused(lambda: replay(finger, motion, dt=0.1, html=page), vp.InputError, "this trajectory has its own, 0.001 s")
+    refused(lambda: replay(finger, q, dt=0.0, html=page), vp.InputError, "dt must be positive and finite [s], got 0.0")
+    shape = "motion must have shape (N + 1, 3), one row a node, got "
+    refused(lambda: replay(finger, np.zeros((3, 2)), dt=0.1, html=page), vp.InputError, shape + "(3, 2)")
+    refused(lambda: replay(finger, np.zeros(3), dt=0.1, html=page), vp.InputError, shape + "(3,)")
+    refused(lambda: replay(finger, np.zeros((0, 3)), dt=0.1, html=page), vp.InputError, shape + "(0, 3)")
+    refused(lambda: replay(finger, "still", dt=0.1, html=page), vp.InputError, "motion must be an array of real")
+    q[1, 2] = np.nan
+    refused(lambda: replay(finger, q, dt=0.1, html=page), vp.InputError, "motion[1, 2] is nan; it must be finite")
+    refused(lambda: replay(finger, motion, speed=0, html=page), vp.InputError, "speed must be positive and finite")
+    refused(lambda: replay(finger, motion, fps=-1, html=page), vp.InputError, "fps must be positive and finite")
+    refused(lambda: replay(finger, motion, max_frames=1, html=page), vp.InputError, "max_frames must be at least 2")
+    refused(
+        lambda: replay(vp.planar_chain(3), motion, html=page),
+        vp.InputError,
+        "the trajectory is of robot 'finger' with joints mcp, pip, dip; 'chain3' has joints joint1, joint2, joint3",
+    )
+    assert not page.exists()
+
+
+def test_refuses_an_unwritable_path_before_the_work(finger, motion, tmp_path, monkeypatch):
+    def work(robot):
+        raise AssertionError("worked first")
+
+    monkeypatch.setattr(MODULE._Picture, "of", work)
+    nowhere = tmp_path / "missing" / "page.html"
+    refused(lambda: replay(finger, motion, html=nowhere), vp.FileError, f"there is no folder {nowhere.parent}")
+    refused(lambda: replay(finger, motion, html=tmp_path), vp.FileError, f"cannot write {tmp_path}: it is a folder")
+
+
+def test_a_failure_leaves_the_old_page_alone(finger, motion, tmp_path, monkeypatch):
+    page = tmp_path / "page.html"
+    page.write_text("old")
+    monkeypatch.setattr(MODULE.gzip, "compress", lambda *args, **options: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        replay(finger, motion, html=page)
+    assert page.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [page]
+
+
+def test_titles_are_escaped(tmp_path):
+    model = vp.planar_chain(1).model
+    model.name = "<b>arm</b>"
+    page = replay(vp.load_robot(model), [[0.0]], dt=1.0, html=tmp_path / "page.html").read_text()
+    assert "<title>&lt;b&gt;arm&lt;/b&gt; - varpin</title>" in page
