@@ -32,7 +32,7 @@ def row(links: int, dt: float) -> str:
 def main() -> None:
     logging.getLogger("varpin").setLevel(logging.ERROR)
     table = [
-        "| links | dt [s] | largest error | mean error | steps split | substeps a step | jets a substep | with sweeps |",
+        "| links | dt [s] | largest error | mean error | split | substeps a step | jets a substep | with sweeps |",
         "|---|---|---|---|---|---|---|---|",
         *(row(links, dt) for links in (2, 3, 5) for dt in (0.01, 0.05, 0.1, 0.2, 0.5)),
     ]

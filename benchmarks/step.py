@@ -75,7 +75,7 @@ def mujoco_step(links: int, dt: float) -> Callable[[], float] | None:
 
 def best(runs: dict[str, Callable[[], float]]) -> dict[str, float]:
     """The fastest of ROUNDS interleaved rounds of each, in microseconds."""
-    seconds = {name: np.inf for name in runs}
+    seconds = dict.fromkeys(runs, np.inf)
     for _ in range(ROUNDS):
         for name, run in runs.items():
             seconds[name] = min(seconds[name], run())
@@ -94,9 +94,8 @@ def main() -> None:
             times = best({"step": simulate(scene, start, dt), "rnea": rnea_derivatives(robot, start)})
             iterations = motion.statistics.newton_iterations.mean()
             ratio = times["step"] / times["rnea"]
-            print(
-                f"{name:12} {robot.dof:2d} {dt:7.0e} {times['step']:10.2f} {iterations:5.2f} {times['rnea']:22.2f} {ratio:6.2f}"
-            )
+            print(f"{name:12} {robot.dof:2d} {dt:7.0e} {times['step']:10.2f} {iterations:5.2f}", end="")
+            print(f" {times['rnea']:22.2f} {ratio:6.2f}")
     for links in (3, 7):
         run = mujoco_step(links, 1e-3)
         if run is None:

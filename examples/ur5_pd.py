@@ -16,7 +16,7 @@ stiffness = np.array([400.0, 400.0, 200.0, 40.0, 20.0, 4.0])  # [N m/rad]
 damping = np.array([80.0, 80.0, 30.0, 4.0, 2.0, 0.2])  # [N m s/rad]
 
 
-def control(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+def control(_: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Torques [N m]: the static part of L_q is gravity's torque."""
     gravity = vp.lagrangian_jet(scene, q, np.zeros(robot.dof)).Lq
     return -gravity - stiffness * (q - goal) - damping * v

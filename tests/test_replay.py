@@ -23,7 +23,7 @@ from varpin.replay import replay
 from varpin.robot import geometry
 
 # By name the module is hidden behind the function of the same name.
-MODULE = importlib.import_module("varpin.replay")
+MODULE = importlib.import_module("varpin.replay.viewer")
 
 CHROMIUM_FLAGS = [
     "--headless",

@@ -28,6 +28,7 @@ from varpin.lagrangian import DiscreteLagrangian as DiscreteLagrangian
 from varpin.lagrangian import LagrangianJet as LagrangianJet
 from varpin.lagrangian import discrete_lagrangian as discrete_lagrangian
 from varpin.lagrangian import lagrangian_jet as lagrangian_jet
+from varpin.replay import replay as replay
 from varpin.robot import Robot as Robot
 from varpin.robot import load_robot as load_robot
 from varpin.robot import planar_chain as planar_chain

@@ -28,6 +28,7 @@ from varpin.checks import count, positive, writable
 from varpin.errors import InputError, StepFailure, VarpinError
 from varpin.inspection import JointReport, RobotReport, inspect_robot
 from varpin.integrators import Midpoint
+from varpin.replay import replay
 from varpin.robot import Robot, load_robot
 from varpin.scene import Scene
 from varpin.simulation import Interrupted, simulate
@@ -249,8 +250,6 @@ def _figure(path: Path) -> _Output:
 
 
 def _replay(path: Path) -> _Output:
-    from varpin.replay import replay  # noqa: PLC0415 - meshcat is slow to import
-
     def write(robot: Robot, trajectory: Trajectory) -> None:
         replay(robot, trajectory, html=path)
 

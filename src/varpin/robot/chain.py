@@ -32,4 +32,6 @@ def planar_chain(links: int, *, length: float = 1.0, mass: float = 1.0) -> Robot
         placement = pin.SE3(np.eye(3), np.array([length if k else 0.0, 0.0, 0.0]))
         joint = model.addJoint(joint, pin.JointModelRY(), placement, f"joint{k + 1}")
         model.appendBodyToJoint(joint, rod, pin.SE3.Identity())
+    tip = pin.SE3(np.eye(3), np.array([length, 0.0, 0.0]))
+    model.addFrame(pin.Frame("tip", joint, 0, tip, pin.FrameType.OP_FRAME))
     return load_robot(model)

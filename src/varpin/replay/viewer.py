@@ -10,7 +10,6 @@ import html as markup
 import io
 import logging
 import math
-import os
 import re
 import warnings
 import webbrowser
@@ -28,11 +27,10 @@ from meshcat.animation import Animation, AnimationClip, AnimationTrack
 from numpy.typing import ArrayLike, NDArray
 from pinocchio.visualize.meshcat_visualizer import MeshcatVisualizer, hasMeshFileInfo, loadMesh
 
-from varpin.checks import as_floats, count, positive, require_finite, writable
-from varpin.errors import InputError, RobotError
+from varpin.errors import RobotError
 from varpin.robot import Robot, geometry
 from varpin.robot.tree import joint_axis, z_to
-from varpin.trajectory import Trajectory, atomic_file
+from varpin.trajectory import atomic_file
 
 Floats = NDArray[np.float64]
 
@@ -47,102 +45,33 @@ _GRID_CELL = 0.5
 _ROD, _JOINT, _CENTER = (0.45, 0.52, 0.6, 1.0), (0.85, 0.45, 0.15, 1.0), (0.15, 0.35, 0.65, 1.0)
 
 
-def replay(
-    robot: Robot,
-    motion: Trajectory | ArrayLike,
-    *,
-    html: str | os.PathLike[str] | None = None,
-    open: bool = False,
-    dt: float | None = None,
-    speed: float = 1.0,
-    loop: bool = True,
-    fps: float = 30.0,
-    max_frames: int = 10_000,
-) -> Path | meshcat.Visualizer:
-    """Show a motion in meshcat, in the time it took.
+def write_page(path: Path, robot: Robot, times: Floats, positions: Floats, loop: bool) -> Path:
+    """Write keyframes as one self-contained HTML file.
 
-    Main args:
-        robot: The arm that moved.
-        motion: A trajectory, or configurations (N + 1, n) [rad or m] with ``dt``. A single row shows a pose.
-        html: Write one self-contained HTML file here. It plays by itself, with neither server nor network.
-        open: Open a live window instead.
-
-    Other Args:
-        dt: Time between the rows of an array [s].
-        speed: Playback speed; 1 is true speed, 0.1 ten times slower.
-        loop: Start again at the end; otherwise stop there.
-        fps: Keyframes a second of playback. Between them the page interpolates q linearly, and draws at the
-            screen's own rate.
-        max_frames: Most keyframes; a longer motion gets fewer a second and keeps its speed.
-
-    The meshes are the robot's own. Where one is missing, or the source has none, a skeleton stands in, and the log
-    says why.
-
-    The live window's server belongs to this process and ends with it; ``.wait()`` on the returned visualizer blocks
-    until a browser has connected. The server listens on every network interface of the machine, as meshcat's always
-    does.
-
-    Returns:
-        The path of the file, or the ``meshcat.Visualizer`` of the window.
-
-    Raises:
-        InputError: Neither or both of ``html`` and ``open``; a motion of another shape or another robot, or not
-            finite; ``dt`` missing or out of place.
-        FileError: The file cannot be written.
+    Args:
+        path: Of the file.
+        robot: The arm.
+        times: Of the keyframes (K,) [s of playback].
+        positions: Of every joint of the tree (K, b) [rad or m].
+        loop: Start again at the end.
     """
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
-    if (html is None) != bool(open):
-        raise InputError("give either html=path, for a file, or open=True, for a window")
-    t, q = _motion(robot, motion, dt)
-    speed, fps = positive("speed", speed, "1"), positive("fps", fps, "1/s")
-    max_frames = count("max_frames", max_frames, least=2)
-    path = None if html is None else writable(html)
-
-    times, positions = _keyframes(robot, t / speed, q, fps, max_frames)
-    picture = _Picture.of(robot)
-    if path is None:
-        return _show(picture, times, positions, loop)
     page = _Page()
-    _draw(meshcat.Visualizer(window=page), picture, times, positions, loop)
+    _draw(meshcat.Visualizer(window=page), _Picture.of(robot), times, positions, loop)
     with atomic_file(path) as stream:
         stream.write(page.html(robot.name).encode())
     return path
 
 
-def _motion(robot: Robot, motion: Trajectory | ArrayLike, dt: float | None) -> tuple[Floats, Floats]:
-    """Times (N + 1,) from 0 [s] and configurations (N + 1, n)."""
-    if isinstance(motion, Trajectory):
-        if dt is not None:
-            raise InputError(f"dt belongs to an array of configurations; this trajectory has its own, {motion.dt:g} s")
-        if motion.joint_names != robot.joint_names:
-            raise InputError(
-                f"the trajectory is of robot {motion.robot!r} with joints {', '.join(motion.joint_names)}; "
-                f"{robot.name!r} has joints {', '.join(robot.joint_names)}"
-            )
-        return motion.t - motion.t[0], require_finite("motion.q", motion.q)
-    q = as_floats("motion", motion)
-    if q.ndim != 2 or q.shape[1] != robot.dof or not len(q):
-        raise InputError(f"motion must have shape (N + 1, {robot.dof}), one row a node, got {q.shape}")
-    require_finite("motion", q)
-    if dt is None:
-        raise InputError("an array of configurations needs dt, the time between its rows [s]")
-    return np.arange(len(q), dtype=np.float64) * positive("dt", dt, "s"), q
-
-
-def _keyframes(robot: Robot, t: Floats, q: Floats, fps: float, max_frames: int) -> tuple[Floats, Floats]:
-    """Keyframe times (K,) [s] and joint positions (K, b) [rad or m] of every joint of the tree, mimic ones too.
-
-    The page interpolates linearly between keyframes, so the nodes themselves are enough where they are sparse.
-    """
-    frames = min(math.ceil(t[-1] * fps), max_frames - 1)
-    if frames < len(t) - 1:
-        times = np.linspace(0.0, t[-1], frames + 1)
-        q = np.column_stack([np.interp(times, t, column) for column in q.T])
-    else:
-        times = t
-    tree = robot.tree
-    return times, q[:, tree.coordinate] * tree.ratio + tree.offset
+def show(robot: Robot, times: Floats, positions: Floats, loop: bool) -> meshcat.Visualizer:
+    """Draw keyframes, as :func:`write_page` takes them, in a new meshcat server; point a web browser to it."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        viewer = meshcat.Visualizer()
+    _draw(viewer, _Picture.of(robot), times, positions, loop)
+    url = viewer.url()
+    logger.info("meshcat serves the motion at %s", url)
+    if not webbrowser.open(url, new=2):
+        logger.warning("no web browser could be started; open %s in one", url)
+    return viewer
 
 
 class _Page:
@@ -206,18 +135,6 @@ play().catch(error => {
     document.getElementById("meshcat-pane").textContent = "This motion cannot be shown here: " + error.message;
 });
 """
-
-
-def _show(picture: _Picture, times: Floats, positions: Floats, loop: bool) -> meshcat.Visualizer:
-    """Draw in a new meshcat server and point a web browser to it."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        viewer = meshcat.Visualizer()
-    _draw(viewer, picture, times, positions, loop)
-    url = viewer.url()
-    logger.info("meshcat serves the motion at %s", url)
-    if not webbrowser.open(url, new=2):
-        logger.warning("no web browser could be started; open %s in one", url)
-    return viewer
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,116 @@
+"""A motion as keyframes in time, to be shown by meshcat."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import as_floats, count, positive, require_finite, writable
+from varpin.errors import InputError
+from varpin.robot import Robot
+from varpin.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    import meshcat
+
+Floats = NDArray[np.float64]
+
+
+def replay(
+    robot: Robot,
+    motion: Trajectory | ArrayLike,
+    *,
+    html: str | os.PathLike[str] | None = None,
+    open: bool = False,
+    dt: float | None = None,
+    speed: float = 1.0,
+    loop: bool = True,
+    fps: float = 30.0,
+    max_frames: int = 10_000,
+) -> Path | meshcat.Visualizer:
+    """Show a motion in meshcat, in the time it took.
+
+    Main args:
+        robot: The arm that moved.
+        motion: A trajectory, or configurations (N + 1, n) [rad or m] with ``dt``. A single row shows a pose.
+        html: Write one self-contained HTML file here. It plays by itself, with neither server nor network.
+        open: Open a live window instead.
+
+    Other Args:
+        dt: Time between the rows of an array [s].
+        speed: Playback speed; 1 is true speed, 0.1 ten times slower.
+        loop: Start again at the end; otherwise stop there.
+        fps: Keyframes a second of playback. Between them the page interpolates q linearly, and draws at the
+            screen's own rate.
+        max_frames: Most keyframes; a longer motion gets fewer a second and keeps its speed.
+
+    The meshes are the robot's own. Where one is missing, or the source has none, a skeleton stands in, and the log
+    says why.
+
+    The live window's server belongs to this process and ends with it; ``.wait()`` on the returned visualizer blocks
+    until a browser has connected. The server listens on every network interface of the machine, as meshcat's always
+    does.
+
+    Returns:
+        The path of the file, or the ``meshcat.Visualizer`` of the window.
+
+    Raises:
+        InputError: Neither or both of ``html`` and ``open``; a motion of another shape or another robot, or not
+            finite; ``dt`` missing or out of place.
+        FileError: The file cannot be written.
+    """
+    if not isinstance(robot, Robot):
+        raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
+    if (html is None) != bool(open):
+        raise InputError("give either html=path, for a file, or open=True, for a window")
+    t, q = _motion(robot, motion, dt)
+    speed, fps = positive("speed", speed, "1"), positive("fps", fps, "1/s")
+    max_frames = count("max_frames", max_frames, least=2)
+    path = None if html is None else writable(html)
+
+    times, positions = _keyframes(robot, t / speed, q, fps, max_frames)
+    from varpin.replay import viewer  # noqa: PLC0415 - meshcat is slow to import, and few runs show anything
+
+    if path is None:
+        return viewer.show(robot, times, positions, loop)
+    return viewer.write_page(path, robot, times, positions, loop)
+
+
+def _motion(robot: Robot, motion: Trajectory | ArrayLike, dt: float | None) -> tuple[Floats, Floats]:
+    """Times (N + 1,) from 0 [s] and configurations (N + 1, n)."""
+    if isinstance(motion, Trajectory):
+        if dt is not None:
+            raise InputError(f"dt belongs to an array of configurations; this trajectory has its own, {motion.dt:g} s")
+        if motion.joint_names != robot.joint_names:
+            raise InputError(
+                f"the trajectory is of robot {motion.robot!r} with joints {', '.join(motion.joint_names)}; "
+                f"{robot.name!r} has joints {', '.join(robot.joint_names)}"
+            )
+        return motion.t - motion.t[0], require_finite("motion.q", motion.q)
+    q = as_floats("motion", motion)
+    if q.ndim != 2 or q.shape[1] != robot.dof or not len(q):
+        raise InputError(f"motion must have shape (N + 1, {robot.dof}), one row a node, got {q.shape}")
+    require_finite("motion", q)
+    if dt is None:
+        raise InputError("an array of configurations needs dt, the time between its rows [s]")
+    return np.arange(len(q), dtype=np.float64) * positive("dt", dt, "s"), q
+
+
+def _keyframes(robot: Robot, t: Floats, q: Floats, fps: float, max_frames: int) -> tuple[Floats, Floats]:
+    """Keyframe times (K,) [s] and joint positions (K, b) [rad or m] of every joint of the tree, mimic ones too.
+
+    The page interpolates linearly between keyframes, so the nodes themselves are enough where they are sparse.
+    """
+    frames = min(math.ceil(t[-1] * fps), max_frames - 1)
+    if frames < len(t) - 1:
+        times = np.linspace(0.0, t[-1], frames + 1)
+        q = np.column_stack([np.interp(times, t, column) for column in q.T])
+    else:
+        times = t
+    tree = robot.tree
+    return times, q[:, tree.coordinate] * tree.ratio + tree.offset

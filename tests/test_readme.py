@@ -1,0 +1,63 @@
+"""Every code block of the README runs."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", (ROOT / "README.md").read_text(encoding="utf-8"), re.M | re.S)
+
+
+def blocks(language):
+    return [text for kind, text in BLOCKS if kind == language]
+
+
+def test_there_are_only_blocks_that_are_run():
+    assert {kind for kind, _ in BLOCKS} == {"python", "bash"}
+    assert len(blocks("bash")) == 2
+
+
+@pytest.mark.parametrize("number", range(len(blocks("python"))))
+def test_python_block(number, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", blocks("python")[number]], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    if "replay" in blocks("python")[number]:
+        assert list(tmp_path.glob("*.html"))
+
+
+def test_main_command(tmp_path):
+    """The first command's own work, with this interpreter for the one it installs; .ci/run runs it whole."""
+    install, run = blocks("bash")[0].replace("\\\n", " ").split("&& .venv/bin/varpin ")
+    assert install.split() == ["python3", "-m", "venv", ".venv", "&&", ".venv/bin/pip", "install", "-q", "."]
+    done = subprocess.run(
+        [sys.executable, "-m", "varpin", *run.split()], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {"finger.html", "finger.npz", "finger.png"}
+
+
+def test_the_second_command_runs_these_tests():
+    assert blocks("bash")[1].strip().endswith(".venv/bin/python -m pytest -q")
+
+
+def test_links_lead_somewhere():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#]+)\)", text):
+        assert (ROOT / target).exists(), target
+
+
+def test_ci_takes_the_commands_from_the_readme():
+    bash = shutil.which("bash")
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    function = re.search(r"^readme_command\(\) \{.*?^\}$", script, re.M | re.S).group()
+    for number in (1, 2):
+        done = subprocess.run(
+            [bash, "-c", f"{function}\nreadme_command {number}"], cwd=ROOT, capture_output=True, text=True, check=True
+        )
+        assert done.stdout == blocks("bash")[number - 1]
