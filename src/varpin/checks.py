@@ -112,14 +112,16 @@ def count(name: str, value: Any, least: int = 0) -> int:
 
 
 def writable(path: str | os.PathLike[str]) -> Path:
-    """``path``, if a file can be written there: said before the work, not after it.
+    """``path`` with links followed, if a file can be written there: said before the work, not after it.
 
     Raises:
         FileError: Naming the folder that is missing or cannot be written.
     """
-    target = Path(path).expanduser()
+    target = Path(path).expanduser().resolve()
     if target.is_dir():
         raise FileError(f"cannot write {target}: it is a folder")
+    if target.exists() and not target.is_file():
+        raise FileError(f"cannot write {target}: it is a device or pipe")
     if not target.parent.is_dir():
         raise FileError(f"cannot write {target}: there is no folder {target.parent}")
     if not os.access(target if target.exists() else target.parent, os.W_OK):

@@ -60,12 +60,13 @@ class UnsupportedJoint(RobotError):
         kind: Its Pinocchio type.
     """
 
-    def __init__(self, joint: str, kind: str) -> None:
+    def __init__(self, joint: str, kind: str, numbers: int) -> None:
         self.joint = joint
         self.kind = kind
+        value = "position" if numbers == 1 else f"[{numbers} numbers]"
         super().__init__(
             f"joint {joint!r} is a {kind}, which has no single coordinate in R; varpin takes revolute, prismatic, "
-            f"continuous, fixed and mimic joints: fix it to the base with lock={{{joint!r}: ...}}, "
+            f"continuous, fixed and mimic joints: fix it to the base with lock={{{joint!r}: {value}}}, "
             "or describe it as a chain of one-axis joints"
         )
 

@@ -122,9 +122,10 @@ def _actuation(robot: Robot, actuation: ArrayLike | Sequence[str] | None) -> Flo
     if isinstance(actuation, str):
         actuation = [actuation]
     if isinstance(actuation, Sequence) and all(isinstance(name, str) for name in actuation):
-        if twice := sorted({str(name) for name in actuation if actuation.count(name) > 1}):
+        names = [str(name) for name in actuation]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
             raise InputError(f"actuation names {', '.join(map(repr, twice))} more than once")
-        return np.eye(n)[:, [robot.coordinate(str(name)) for name in actuation]].copy()
+        return np.eye(n)[:, [robot.coordinate(name) for name in names]].copy()
     matrix = as_floats("actuation", actuation)
     if matrix.ndim != 2:
         raise InputError(f"actuation must be a matrix with {n} rows, or joint names, got shape {matrix.shape}")

@@ -14,7 +14,7 @@ from varpin.checks import as_floats, count, finite_array, positive, require_fini
 from varpin.errors import ControlError, InputError, StepFailure
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.kernels._compile import announced_compilation
-from varpin.scene import Scene
+from varpin.scene import Scene, require_scene
 from varpin.trajectory import StepStatistics, Trajectory
 
 Floats = NDArray[np.float64]
@@ -121,7 +121,7 @@ def simulate(
         SingularMassMatrix: M(q0) is not positive definite.
         Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt.
     """
-    n = scene.robot.dof
+    n = require_scene(scene).robot.dof
     q0, v0 = finite_array("q0", q0, (n,)), finite_array("v0", v0, (n,))
     dt, steps = positive("dt", dt, "s"), count("steps", steps)
     if sampling not in ("midpoint", "start"):
@@ -130,6 +130,7 @@ def simulate(
     if not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
     law = controls if callable(controls) else None
+    _require_memory(scene, steps)
     rows = np.empty((0, 0)) if callable(controls) else control_rows(scene, controls, steps)
     with announced_compilation():
         state, first = integrator.start(scene, q0, v0)
@@ -156,6 +157,15 @@ def simulate(
         most = trajectory.statistics.substeps.max()
         logger.warning("%d of %d steps were taken in up to %d parts: dt = %g s is coarse here", split, steps, most, dt)
     return trajectory
+
+
+def _require_memory(scene: Scene, steps: int) -> None:
+    """Refuse a number of steps whose record cannot be held, before anything runs."""
+    columns = 3 * scene.robot.dof + 2 * scene.controls + len(fields(StepStatistics)) + 2
+    try:
+        np.empty((steps + 1, columns))
+    except (MemoryError, ValueError, OverflowError):
+        raise InputError(f"steps = {steps} needs more memory than there is: {columns * 8} bytes a step") from None
 
 
 def control_rows(scene: Scene, controls: ArrayLike | None, steps: int) -> Floats:

@@ -6,7 +6,6 @@ import contextlib
 import os
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -144,22 +143,29 @@ class Trajectory:
             FileError: The file is missing, truncated, no npz, written by something else, holds pickled objects,
                 arrays that do not fit together or are not finite, or is of another robot.
         """
-        source = Path(path)
+        source = Path(path).expanduser()
         members = _read_members(source)
-        if str(members.get("format")) != FORMAT:
-            raise FileError(
-                f"{source} is not a varpin trajectory: its format is {members.get('format')}, not {FORMAT!r}"
-            )
-        names = tuple(str(name) for name in members["joint_names"])
-        steps, n = len(members["t"]) - 1, len(names)
-        shapes = {"t": (steps + 1,), "energy": (steps + 1,), "u": (steps, -1)} | dict.fromkeys("qvp", (steps + 1, n))
+        found = members["format"]
+        if found.shape != () or str(found) != FORMAT:
+            raise FileError(f"{source} is not a varpin trajectory: its format is {found}, not {FORMAT!r}")
+        steps, n = members["t"].size - 1, members["joint_names"].size
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys("qvp", (steps + 1, n)) | dict.fromkeys(
+            ("t", "energy"), (steps + 1,)
+        )
+        shapes |= {"u": (steps, -1), "dt": (), "joint_names": (-1,)}
         shapes |= {f"statistics.{item.name}": (steps,) for item in fields(StepStatistics)}
+        shapes |= dict.fromkeys(("version", "integrator", "robot"), ())
         for name, shape in shapes.items():
             array = members[name]
             if array.ndim != len(shape) or any(b not in (-1, a) for a, b in zip(array.shape, shape, strict=True)):
                 raise FileError(f"{source}: {name} has shape {array.shape}, where {shape} belongs")
+            if name in ("joint_names", "version", "integrator", "robot"):
+                continue
             if array.dtype.kind not in "fi" or not np.isfinite(array).all():
                 raise FileError(f"{source}: {name} holds values that are not finite numbers")
+        if steps < 0 or not members["dt"] > 0.0:
+            raise FileError(f"{source}: it has {steps + 1} nodes and dt = {members['dt']} s")
+        names = tuple(str(name) for name in members["joint_names"])
         if robot is not None and names != robot.joint_names:
             raise FileError(
                 f"{source} is of robot {members['robot']!s} with joints {', '.join(names)}; "
@@ -181,20 +187,29 @@ def _read_members(source: Path) -> dict[str, NDArray[Any]]:
     """All arrays of an npz file, or a FileError that says what is wrong with it."""
     expected = {"t", "q", "v", "p", "u", "energy", "dt", "format", "version", "integrator", "robot", "joint_names"}
     expected |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
+    if source.is_dir():
+        raise FileError(f"{source} is a folder, not a trajectory")
     if not source.is_file():
         raise FileError(f"there is no file {source}")
-    if not zipfile.is_zipfile(source):
-        raise FileError(f"{source} is not an npz file, or it is truncated")
     try:
+        with source.open("rb") as stream:
+            whole = zipfile.is_zipfile(stream)
+        if not whole:
+            raise FileError(f"{source} is not an npz file, or it is truncated")
         with np.load(source, allow_pickle=False) as archive:
             missing = sorted(expected - set(archive.files))
             if missing:
                 raise FileError(f"{source} is not a varpin trajectory: it has no {', '.join(missing)}")
             return {name: archive[name] for name in expected}
-    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(f"cannot read {source}: {error.strerror or error}") from None
+    # A damaged archive raises whatever zipfile, zlib and numpy stumble over: there is no list of it.
+    except Exception as error:
+        if "allow_pickle" in str(error):
+            raise FileError(f"{source} cannot be read without unpickling objects, which is not done") from None
         raise FileError(f"{source} is truncated or damaged: {error}") from None
-    except ValueError as error:
-        raise FileError(f"{source} cannot be read without unpickling objects, which is not done: {error}") from None
 
 
 @contextlib.contextmanager
@@ -205,14 +220,18 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         FileError: The path cannot be written.
     """
     target = writable(path)
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+    name = None
     try:
+        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
         with os.fdopen(handle, "wb") as stream:
             yield stream
         mask = os.umask(0)
         os.umask(mask)
         Path(name).chmod(0o666 & ~mask)
         Path(name).replace(target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
+    except BaseException as error:
+        if name is not None:
+            Path(name).unlink(missing_ok=True)
+        if isinstance(error, OSError) and not isinstance(error, FileError):
+            raise FileError(f"cannot write {target}: {error.strerror or error}") from None
         raise

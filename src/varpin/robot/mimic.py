@@ -157,6 +157,15 @@ def untied_model(model: pin.Model) -> tuple[pin.Model, tuple[Tie, ...]]:
     return rebuild(model, range(1, model.njoints), free_joint), tuple(ties)
 
 
+def joint_frames(model: pin.Model) -> list[int]:
+    """Indices of the frames that are joints' own."""
+    return [
+        index
+        for index, frame in enumerate(model.frames)
+        if frame.parentJoint and frame.type == pin.FrameType.JOINT and frame.name == model.names[frame.parentJoint]
+    ]
+
+
 def rebuild(model: pin.Model, order: Sequence[int], joint_of: Callable[[int], pin.JointModel]) -> pin.Model:
     """``model`` with its joints added again in ``order``, each as ``joint_of`` gives it.
 
@@ -179,21 +188,50 @@ def rebuild(model: pin.Model, order: Sequence[int], joint_of: Callable[[int], pi
                     old.idx_q : old.idx_q + old.nq
                 ]
         if old.nv == copy.nv:
-            for limits in ("velocityLimit", "effortLimit", "armature", "rotorInertia", "rotorGearRatio"):
+            for limits in (
+                "lowerVelocityLimit",
+                "upperVelocityLimit",
+                "lowerEffortLimit",
+                "upperEffortLimit",
+                "lowerDryFrictionLimit",
+                "upperDryFrictionLimit",
+                "armature",
+                "rotorInertia",
+                "rotorGearRatio",
+                "damping",
+            ):
                 getattr(new, limits)[copy.idx_v : copy.idx_v + copy.nv] = getattr(model, limits)[
                     old.idx_v : old.idx_v + old.nv
                 ]
-    frames = {0: 0}
-    for index, frame in list(enumerate(model.frames))[1:]:
-        frames[index] = new.addFrame(
-            pin.Frame(
-                frame.name,
-                place[frame.parentJoint],
-                frames[frame.parentFrame],
-                frame.placement,
-                frame.type,
-                pin.Inertia.Zero(),
-            ),
-            False,
-        )
+    # Joint frames first: pin.buildReducedModel looks for a frame's joint among the frames before it.
+    old_frames = {model.frames[index].parentJoint: index for index in joint_frames(model)}
+    new_frames, frames = {0: 0}, {0: 0}
+    for joint in order:
+        new_frames[joint] = new.addJointFrame(place[joint], new_frames[model.parents[joint]])
+        if joint in old_frames:
+            frames[old_frames[joint]] = new_frames[joint]
+    for index, frame in enumerate(model.frames):
+        if index not in frames:
+            frames[index] = new.addFrame(
+                pin.Frame(
+                    frame.name,
+                    place[frame.parentJoint],
+                    frames.get(frame.parentFrame, 0),
+                    frame.placement,
+                    frame.type,
+                    pin.Inertia.Zero(),
+                ),
+                False,
+            )
+    repair_velocity_limits(new)
     return new
+
+
+def repair_velocity_limits(model: pin.Model) -> None:
+    """Put -upper for a lower velocity limit above the upper one.
+
+    Pinocchio's addJoint sets the lower one to the largest double of the wrong sign, and its buildReducedModel then
+    refuses the model.
+    """
+    lower, upper = np.array(model.lowerVelocityLimit), np.array(model.upperVelocityLimit)
+    model.lowerVelocityLimit = np.where(lower > upper, -upper, lower)

@@ -15,7 +15,7 @@ from varpin.checks import as_floats, require_finite
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint
 from varpin.kernels.tree import Tree
 from varpin.robot.mimic import Tie, joint_index, rebuild, tied_model
-from varpin.robot.sources import Description, describe, frame_shapes
+from varpin.robot.sources import Description, describe, hang_shapes
 from varpin.robot.tree import flatten, is_unbounded, joint_axis, to_pinocchio
 
 Floats = NDArray[np.float64]
@@ -196,7 +196,10 @@ def build_robot(
     if mimic == "free":
         description = replace(description, ties=())
     model, ties, visuals, locked = _lock(description, lock)
-    model = _unwound(model, ties)
+    unwound = _unwound(model, ties)
+    if visuals is not None:
+        hang_shapes(visuals, model, unwound)
+    model = unwound
     followers = {tie.follower for tie in ties}
     coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
     if not coordinates:
@@ -254,7 +257,7 @@ def _lock(
         reduced = pin.buildReducedModel(model, joints, reference)
     else:
         reduced, visuals = pin.buildReducedModel(model, visuals, joints, reference)
-        frame_shapes(reduced, visuals)
+        hang_shapes(visuals, reduced, reduced)
     reduced.gravity = model.gravity
     left = joint_index(reduced)
     ties = tuple(

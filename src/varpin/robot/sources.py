@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from varpin.errors import FileError, InputError, RobotError, RobotNotFound
 from varpin.robot import example_robot_data
-from varpin.robot.mimic import Tie, depth_first, reordered, ties_of, untied_model
+from varpin.robot.mimic import Tie, depth_first, joint_frames, reordered, repair_velocity_limits, ties_of, untied_model
 from varpin.robot.urdf import read_urdf
 
 logger = logging.getLogger(__name__)
@@ -113,30 +113,45 @@ def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) ->
         if shape.parentJoint >= free.njoints:
             raise RobotError(f"shape {shape.name!r} hangs on joint {shape.parentJoint}, which model {name!r} has not")
     order = depth_first(free, ties)
-    if order != sorted(order):
-        # Pinocchio lets joints be added in any order, and then computes another mass matrix without a word.
+    in_order = order == sorted(order)
+    if not (in_order and _has_joint_frames(free)):
         free, ties = reordered(free, ties, order)
+        for shape in shapes.geometryObjects if shapes is not None else ():
+            shape.parentJoint = [0, *order].index(shape.parentJoint)
+    if not in_order:
+        # Pinocchio lets joints be added in any order, and then computes another mass matrix without a word.
         logger.warning(
             "the joints of model %r were not added subtree by subtree, as Pinocchio's algorithms need: reordered to %s",
             name,
             ", ".join(list(free.names)[1:]),
         )
-        for shape in shapes.geometryObjects if shapes is not None else ():
-            shape.parentJoint = [0, *order].index(shape.parentJoint)
-    # Joints without a frame, and shapes on none, make pin.buildReducedModel read beyond its arrays.
-    for joint in range(1, free.njoints):
-        if not free.existFrame(free.names[joint], pin.FrameType.JOINT):
-            free.addJointFrame(joint)
+    repair_velocity_limits(free)
     if shapes is not None:
-        frame_shapes(free, shapes)
+        hang_shapes(shapes, model, free)
     return Description(name, free, ties, visuals=shapes)
 
 
-def frame_shapes(model: pin.Model, shapes: pin.GeometryModel) -> None:
-    """Hang shapes that have no frame of ``model`` on the frame of their joint."""
+def _has_joint_frames(model: pin.Model) -> bool:
+    """Whether every joint has its frame, and it comes before what hangs on it, as pin.buildReducedModel needs.
+
+    It reads beyond its arrays where one is missing.
+    """
+    frame_of = {model.frames[index].parentJoint: index for index in joint_frames(model)}
+    if len(frame_of) < model.njoints - 1:
+        return False
+    return all(frame_of.get(frame.parentJoint, 0) <= index for index, frame in enumerate(model.frames))
+
+
+def hang_shapes(shapes: pin.GeometryModel, old: pin.Model, new: pin.Model) -> None:
+    """Hang shapes from the frames of ``old`` on those of ``new``, and where there is none on their joint's."""
     for shape in shapes.geometryObjects:
-        if shape.parentFrame >= model.nframes:
-            shape.parentFrame = model.getFrameId(model.names[shape.parentJoint]) if shape.parentJoint else 0
+        frame = new.nframes
+        if shape.parentFrame < old.nframes:
+            link = old.frames[shape.parentFrame]
+            frame = new.getFrameId(link.name, link.type)
+        if frame >= new.nframes:
+            frame = new.getFrameId(new.names[shape.parentJoint], pin.FrameType.JOINT) if shape.parentJoint else 0
+        shape.parentFrame = frame
 
 
 def _of_example(name: str, folders: tuple[str, ...], *, mimic: bool) -> Description:

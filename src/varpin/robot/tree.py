@@ -22,14 +22,14 @@ def joint_axis(model: pin.Model, joint: int) -> tuple[bool, Floats]:
     kind = model.joints[joint]
     name = model.names[joint]
     if kind.nv != 1 or kind.nq > 2:
-        raise UnsupportedJoint(name, kind.shortname())
+        raise UnsupportedJoint(name, kind.shortname(), kind.nq)
     data = kind.createData()
     kind.calc(data, pin.neutral(model))
     subspace = np.asarray(data.S, dtype=float).reshape(6)
     linear, angular = subspace[:3], subspace[3:]
     at_zero = pin.SE3(data.M)
     if (linear.any() and angular.any()) or not at_zero.isIdentity(1e-12):
-        raise UnsupportedJoint(name, kind.shortname())
+        raise UnsupportedJoint(name, kind.shortname(), kind.nq)
     axis = angular if angular.any() else linear
     if not (np.isfinite(axis).all() and axis.any()):
         raise RobotError(f"joint {name!r} has no axis: its direction is zero or not finite")
@@ -94,12 +94,12 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
         rotation[body] = before.T @ placement.rotation @ turn[joint]
         translation[body] = before.T @ placement.translation
         link = model.inertias[joint]
+        if not (np.isfinite(link.mass) and np.isfinite(link.lever).all() and np.isfinite(link.inertia).all()):
+            raise RobotError(f"the link moved by joint {model.names[joint]!r} has a mass or inertia that is not finite")
         mass[body] = link.mass
         center[body] = turn[joint].T @ link.lever
         about_center = turn[joint].T @ link.inertia @ turn[joint]
         inertia[body] = about_center[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]
-        if not (np.isfinite(mass[body]) and np.isfinite(center[body]).all() and np.isfinite(inertia[body]).all()):
-            raise RobotError(f"the link moved by joint {model.names[joint]!r} has a mass or inertia that is not finite")
         if mass[body] < 0.0:
             raise RobotError(f"the link moved by joint {model.names[joint]!r} has mass {mass[body]} < 0 [kg]")
         if joint in tied:

@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import functools
+
+import pytest
+
+import varpin as vp
+from varpin.robot.example_robot_data import FIXED_BASE
+
+# example-robot-data 6.0.0 dropped the Bravo 7 that 5.0.0 has.
+ROBOTS = [name for name in FIXED_BASE if not name.startswith("bravo7_")] + ["finger"]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--slow", action="store_true", help="run the tests marked slow, too")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--slow"):
+        return
+    for item in items:
+        if "slow" in item.keywords:
+            item.add_marker(pytest.mark.skip(reason="slow: give --slow to run it"))
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "robot_name" in metafunc.fixturenames:
+        metafunc.parametrize("robot_name", ROBOTS)
+
+
+load_once = functools.cache(vp.load_robot)
+
+
+@pytest.fixture
+def robot(robot_name: str) -> vp.Robot:
+    """Each fixed-base robot in turn. Robots are frozen, so one copy serves all tests."""
+    return load_once(robot_name)
+
+
+@pytest.fixture
+def load():
+    """``varpin.load_robot`` for names, each loaded once a session."""
+    return load_once

@@ -1,0 +1,82 @@
+"""Robots made up for tests: random trees in Pinocchio, and URDF texts put together from links and joints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+INERTIAL = (
+    '<inertial><origin xyz="0.02 0.05 0.1" rpy="0.3 0.2 0.1"/><mass value="1.3"/>'
+    '<inertia ixx="0.02" iyy="0.03" izz="0.025" ixy="0.001" ixz="0.002" iyz="0.003"/></inertial>'
+)
+
+
+def link(name: str, inertial: str = INERTIAL, extra: str = "") -> str:
+    return f'<link name="{name}">{inertial}{extra}</link>\n'
+
+
+def joint(name: str, parent: str, child: str, kind: str = "revolute", axis: str = "0 1 0", inside: str = "") -> str:
+    return (
+        f'<joint name="{name}" type="{kind}"><origin xyz="0.1 0.02 0.2" rpy="0.1 0.2 0.3"/><parent link="{parent}"/>'
+        f'<child link="{child}"/><axis xyz="{axis}"/><limit effort="9" velocity="8" lower="-1" upper="1"/>{inside}'
+        "</joint>\n"
+    )
+
+
+def mimic(leader: str, ratio: object = 1, offset: object = 0) -> str:
+    return f'<mimic joint="{leader}" multiplier="{ratio}" offset="{offset}"/>'
+
+
+def write_urdf(folder: Path, *parts: str, name: str = "made_up", base: str = '<link name="base"/>') -> Path:
+    path = folder / f"{name}.urdf"
+    path.write_text(f'<?xml version="1.0"?>\n<robot name="{name}">\n{base}\n{"".join(parts)}</robot>\n')
+    return path
+
+
+def arm(folder: Path, inertial: str = INERTIAL, **joint_arguments: str) -> Path:
+    """A robot of one joint ``j1`` that moves link ``l1``."""
+    return write_urdf(folder, link("l1", inertial), joint("j1", "base", "l1", **joint_arguments))
+
+
+def random_inertia(rng: np.random.Generator) -> pin.Inertia:
+    """Mass, centre and inertia of a cloud of points, so that a body could have them."""
+    points, masses = rng.normal(0.0, 0.1, (8, 3)), rng.uniform(0.05, 0.5, 8)
+    center = masses @ points / masses.sum()
+    r = points - center
+    moments = np.einsum(
+        "i,ijk->jk", masses, np.einsum("ij,ij->i", r, r)[:, None, None] * np.eye(3) - r[:, :, None] * r[:, None, :]
+    )
+    return pin.Inertia(masses.sum(), center, moments)
+
+
+def random_rotation(rng: np.random.Generator) -> np.ndarray:
+    return pin.Quaternion(rng.normal(size=4)).normalized().matrix()
+
+
+def random_axis(rng: np.random.Generator) -> np.ndarray:
+    axis = rng.normal(size=3)
+    return axis / np.linalg.norm(axis)
+
+
+def random_tree(seed: int, bodies: int = 7, *, branching: bool = True, armature: bool = True) -> pin.Model:
+    """A tree of every one-axis joint Pinocchio can make in Python: all but continuous ones about oblique axes."""
+    rng = np.random.default_rng(seed)
+    aligned = [pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ, pin.JointModelPX, pin.JointModelPY]
+    aligned += [pin.JointModelPZ, pin.JointModelRUBX, pin.JointModelRUBY, pin.JointModelRUBZ]
+    oblique = [pin.JointModelRevoluteUnaligned, pin.JointModelPrismaticUnaligned]
+    model = pin.Model()
+    model.name = f"tree{seed}"
+    for k in range(bodies):
+        parent = int(rng.integers(0, k + 1)) if branching else k
+        if rng.random() < 0.5:
+            kind = aligned[rng.integers(len(aligned))]()
+        else:
+            kind = oblique[rng.integers(len(oblique))](random_axis(rng))
+        placement = pin.SE3(random_rotation(rng), rng.normal(0.0, 0.3, 3))
+        new = model.addJoint(parent, kind, placement, f"joint{k}")
+        model.appendBodyToJoint(new, random_inertia(rng), pin.SE3.Identity())
+    if armature:
+        model.armature = rng.uniform(0.0, 0.1, model.nv)
+    return model

@@ -1,0 +1,116 @@
+"""The Lagrangian the slow and plain way: forward kinematics body by body, for complex q and v, in batches.
+
+It reads joint axes off Pinocchio's joint types and shares no code with the library. The complex step gives its
+gradient to rounding, and an eighth-order central difference of the gradient the second derivatives to about 1e-12.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+import varpin as vp
+
+AXES = {"X": np.eye(3)[0], "Y": np.eye(3)[1], "Z": np.eye(3)[2]}
+# Coefficients of the eighth-order central difference, and its step in units of the coordinate.
+DIFFERENCE = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+STEP = 0.02
+
+
+def joint_axis(model: pin.Model, joint: int) -> tuple[bool, np.ndarray]:
+    """(prismatic, axis) of a joint, from its type's name."""
+    kind = model.joints[joint].shortname().removeprefix("JointModel")
+    if kind == "RevoluteUnboundedUnaligned":
+        # Its Python class does not tell the axis; a turn by 1 rad does.
+        q = pin.neutral(model)
+        q[model.joints[joint].idx_q : model.joints[joint].idx_q + 2] = np.cos(1.0), np.sin(1.0)
+        data = model.createData()
+        pin.forwardKinematics(model, data, q)
+        return False, pin.log3((model.jointPlacements[joint].inverse() * data.liMi[joint]).rotation)
+    if kind.endswith("Unaligned"):
+        return kind.startswith("P"), np.array(model.joints[joint].extract().axis)
+    return kind.startswith("P"), AXES[kind[-1]]
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.stack(
+        [
+            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
+            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
+            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
+        ],
+        axis=-1,
+    )
+
+
+def rotation(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Rodrigues' formula, (..., 3, 3)."""
+    K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + np.sin(angle)[..., None, None] * K + (1 - np.cos(angle))[..., None, None] * (K @ K)
+
+
+def energies(model: pin.Model, positions, rates, gravity) -> tuple[np.ndarray, np.ndarray]:
+    """Kinetic and potential energy at joint positions and rates (..., joints), every joint on its own."""
+    shape = np.broadcast_shapes(positions.shape, rates.shape)[:-1]
+    R = [np.broadcast_to(np.eye(3), (*shape, 3, 3))]
+    origin, omega, speed = ([np.zeros((*shape, 3))] for _ in range(3))
+    kinetic = potential = 0.0
+    for joint in range(1, model.njoints):
+        up, s, rate = model.parents[joint], positions[..., joint - 1], rates[..., joint - 1][..., None]
+        placement, link = model.jointPlacements[joint], model.inertias[joint]
+        prismatic, axis = joint_axis(model, joint)
+        offset = R[up] @ placement.translation
+        base = R[up] @ placement.rotation
+        along = base @ axis
+        if prismatic:
+            offset = offset + along * s[..., None]
+            R.append(base)
+            omega.append(omega[up])
+            speed.append(speed[up] + cross(omega[up], offset) + along * rate)
+        else:
+            R.append(base @ rotation(axis, s))
+            omega.append(omega[up] + along * rate)
+            speed.append(speed[up] + cross(omega[up], offset))
+        origin.append(origin[up] + offset)
+        lever = R[joint] @ link.lever
+        at_center = speed[joint] + cross(omega[joint], lever)
+        spin = np.einsum("...ji,...j->...i", R[joint], omega[joint])
+        kinetic = kinetic + 0.5 * link.mass * (at_center**2).sum(-1) + 0.5 * (spin * (spin @ link.inertia)).sum(-1)
+        potential = potential - link.mass * ((origin[joint] + lever) @ gravity)
+    return kinetic, potential
+
+
+def lagrangian(scene: vp.Scene, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """L of a scene at q, v (..., n)."""
+    model, names = scene.robot.free_model, list(scene.robot.joint_names)
+    ties = {tie.follower: tie for tie in scene.robot.ties}
+    positions, rates = [], []
+    for joint in range(1, model.njoints):
+        tie = ties.get(joint)
+        c = names.index(model.names[tie.leader if tie else joint])
+        ratio, offset = (tie.ratio, tie.offset) if tie else (1.0, 0.0)
+        positions.append(ratio * q[..., c] + offset)
+        rates.append(ratio * v[..., c])
+    kinetic, potential = energies(model, np.stack(positions, -1), np.stack(rates, -1), scene.gravity)
+    own = np.array([model.armature[model.joints[model.getJointId(name)].idx_v] for name in names])
+    kinetic = kinetic + 0.5 * (own * v**2).sum(-1)
+    return kinetic - potential - 0.5 * (scene.stiffness * (q - scene.rest) ** 2).sum(-1)
+
+
+def gradient(f, x: np.ndarray) -> np.ndarray:
+    """Complex-step gradient (..., k) of f: (..., k) -> (...) at real x."""
+    step = 1e-30
+    return f(x[..., None, :] + 1j * step * np.eye(x.shape[-1])).imag / step
+
+
+def directional(g, x: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """d g(x + s d) / ds at s = 0 for each row d of ``directions`` (r, k): (r, ...)."""
+    total = 0.0
+    for k, c in DIFFERENCE.items():
+        total = total + c * (g(x + k * STEP * directions) - g(x - k * STEP * directions))
+    return total / STEP
+
+
+def hessian(f, x: np.ndarray) -> np.ndarray:
+    """Second derivatives (k, k) of f at real x (k,)."""
+    return directional(lambda y: gradient(f, y), x, np.eye(x.size))

@@ -1,0 +1,225 @@
+from __future__ import annotations
+
+import naive
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mechanisms import random_inertia, random_tree
+
+import varpin as vp
+
+NAMES = ("Lq", "Lv", "Lqq", "Lvq", "Lvv")
+
+
+def busy_scene(robot: vp.Robot, rng: np.random.Generator) -> vp.Scene:
+    """Gravity in no special direction, a spring at every joint."""
+    n = robot.dof
+    return vp.Scene(
+        robot, gravity=rng.normal(0.0, 6.0, 3), stiffness=rng.uniform(0.0, 3.0, n), rest=rng.uniform(-1.0, 1.0, n)
+    )
+
+
+def assert_close(actual: np.ndarray, expected: np.ndarray, rtol: float, what: str, scale: float = 0.0) -> None:
+    """Agreement to ``rtol`` of the largest entry, or of ``scale`` where everything might vanish."""
+    scale = max(scale, np.abs(expected).max())
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=rtol * scale, err_msg=what)
+
+
+def naive_first(scene: vp.Scene, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """L_q and L_v at q, v (..., n) by complex step."""
+    n = scene.robot.dof
+    x = np.concatenate(np.broadcast_arrays(q, v), axis=-1)
+    g = naive.gradient(lambda y: naive.lagrangian(scene, y[..., :n], y[..., n:]), x)
+    return g[..., :n], g[..., n:]
+
+
+def check_against_naive(scene: vp.Scene, q: np.ndarray, v: np.ndarray, directions: np.ndarray, backend: str) -> None:
+    """Everything in the jet; the second derivatives along ``directions`` (r, n)."""
+    jet = vp.lagrangian_jet(scene, q, v, backend=backend)
+    kinetic = 0.5 * v @ jet.Lvv @ v
+    L = naive.lagrangian(scene, q, v)
+    assert abs(jet.L - L) <= 1e-13 * (abs(kinetic) + abs(kinetic - L)) * scene.robot.dof
+    Lq, Lv = naive_first(scene, q, v)
+    assert_close(jet.Lq, Lq, 1e-12, "Lq")
+    assert_close(jet.Lv, Lv, 1e-12, "Lv")
+    in_q = naive.directional(lambda x: np.stack(naive_first(scene, x, v), axis=1), q, directions)
+    in_v = naive.directional(lambda x: naive_first(scene, q, x)[1], v, directions)
+    # Two single joints side by side have no L_vq at all; differences then leave rounding of L_v.
+    momentum = np.abs(Lv).max()
+    assert_close(directions @ jet.Lqq, in_q[:, 0], 2e-11, "Lqq", momentum)
+    assert_close(directions @ jet.Lvq.T, in_q[:, 1], 2e-11, "Lvq", momentum)
+    assert_close(directions @ jet.Lvv, in_v, 2e-11, "Lvv")
+
+
+class TestEveryRobot:
+    @pytest.mark.parametrize("seed", range(3))
+    def test_compiled_is_what_pinocchio_computes(self, robot, seed):
+        rng = np.random.default_rng(seed)
+        scene = busy_scene(robot, rng)
+        q, v = rng.uniform(-3.0, 3.0, robot.dof), rng.normal(0.0, 2.0, robot.dof)
+        compiled = vp.lagrangian_jet(scene, q, v)
+        reference = vp.lagrangian_jet(scene, q, v, backend="pinocchio")
+        for name in NAMES:
+            assert_close(getattr(compiled, name), getattr(reference, name), 1e-12, name)
+        kinetic = 0.5 * v @ reference.Lvv @ v
+        assert abs(compiled.L - reference.L) <= 1e-12 * (kinetic + abs(kinetic - reference.L))
+
+    @pytest.mark.parametrize("backend", ["compiled", "pinocchio"])
+    def test_is_the_derivative_of_a_plain_lagrangian(self, robot, backend):
+        rng = np.random.default_rng(11)
+        n = robot.dof
+        scene = busy_scene(robot, rng)
+        q, v = rng.uniform(-3.0, 3.0, n), rng.normal(0.0, 2.0, n)
+        directions = np.eye(n) if n <= 9 else rng.normal(size=(2, n)) / np.sqrt(n)
+        check_against_naive(scene, q, v, directions, backend)
+
+    def test_value_is_pinocchio_s_energies(self, robot):
+        rng = np.random.default_rng(4)
+        q, v = rng.uniform(-3.0, 3.0, robot.dof), rng.normal(size=robot.dof)
+        model = robot.free_model.copy()
+        model.gravity = pin.Motion(np.array([1.0, -2.0, -9.0]), np.zeros(3))
+        data, full_q, full_v = model.createData(), robot.free_positions(q), robot.free_velocities(v)
+        kinetic = pin.computeKineticEnergy(model, data, full_q, full_v)
+        potential = pin.computePotentialEnergy(model, data, full_q)
+        jet = vp.lagrangian_jet(vp.Scene(robot, gravity=(1.0, -2.0, -9.0)), q, v)
+        assert abs(jet.L - (kinetic - potential)) <= 1e-12 * (kinetic + abs(potential))
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 10**6), bodies=st.integers(1, 9), branching=st.booleans())
+@pytest.mark.parametrize("backend", ["compiled", "pinocchio"])
+def test_random_trees(backend, seed, bodies, branching):
+    robot = vp.load_robot(random_tree(seed, bodies, branching=branching))
+    rng = np.random.default_rng(seed)
+    q, v = rng.uniform(-3.0, 3.0, bodies), rng.normal(0.0, 2.0, bodies)
+    check_against_naive(busy_scene(robot, rng), q, v, np.eye(bodies), backend)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 10**6))
+def test_symmetries_are_exact_and_mass_is_positive(seed):
+    robot = vp.load_robot(random_tree(seed, 8))
+    rng = np.random.default_rng(seed)
+    jet = vp.lagrangian_jet(busy_scene(robot, rng), rng.normal(size=8), rng.normal(size=8))
+    assert np.array_equal(jet.Lvv, jet.Lvv.T)
+    assert np.array_equal(jet.Lqq, jet.Lqq.T)
+    assert np.linalg.eigvalsh(jet.Lvv)[0] > 0.0
+
+
+@pytest.mark.parametrize("links", [30, 100])
+def test_long_chains(links):
+    robot = vp.planar_chain(links)
+    rng = np.random.default_rng(links)
+    q, v = rng.uniform(-0.3, 0.3, links), rng.normal(0.0, 0.3, links)
+    check_against_naive(vp.Scene(robot), q, v, rng.normal(size=(2, links)) / np.sqrt(links), "compiled")
+
+
+def test_results_are_the_caller_s_own():
+    scene = vp.Scene(vp.planar_chain(2))
+    first = vp.lagrangian_jet(scene, [0.1, 0.2], [1.0, 2.0])
+    kept = {name: getattr(first, name).copy() for name in NAMES}
+    vp.lagrangian_jet(scene, [1.1, -0.2], [3.0, -2.0])
+    for name in NAMES:
+        assert np.array_equal(getattr(first, name), kept[name])
+
+
+class TestPrecision:
+    """Digits that a jet in world coordinates would lose."""
+
+    def moved(self, model: pin.Model, by: np.ndarray) -> pin.Model:
+        far = model.copy()
+        for joint in range(1, far.njoints):
+            if far.parents[joint] == 0:
+                placement = far.jointPlacements[joint]
+                far.jointPlacements[joint] = pin.SE3(placement.rotation, placement.translation + by)
+        return far
+
+    @pytest.mark.parametrize("name", ["ur5", "panda", "allegro_left_hand"])
+    def test_of_a_base_ten_kilometres_away(self, load, name):
+        near = load(name)
+        far = vp.load_robot(self.moved(near.model, np.array([1e4, -1e4, 3e3])))
+        q, v = np.random.default_rng(0).normal(size=(2, near.dof))
+        here, there = vp.lagrangian_jet(vp.Scene(near), q, v), vp.lagrangian_jet(vp.Scene(far), q, v)
+        for entry in NAMES:
+            assert_close(getattr(there, entry), getattr(here, entry), 1e-12, entry)
+
+    def gantry(self, axes: int) -> vp.Robot:
+        """An oblique arm that hangs on sliders along x, y, z."""
+        rng = np.random.default_rng(8)
+        model = pin.Model()
+        joint = 0
+        for kind in (pin.JointModelPX, pin.JointModelPY, pin.JointModelPZ)[:axes]:
+            joint = model.addJoint(joint, kind(), pin.SE3.Identity(), f"slider{joint}")
+            model.appendBodyToJoint(joint, random_inertia(rng), pin.SE3.Identity())
+        arm = random_tree(8, 4, branching=False)
+        for k in range(1, arm.njoints):
+            joint = model.addJoint(joint, arm.joints[k], arm.jointPlacements[k], arm.names[k])
+            model.appendBodyToJoint(joint, arm.inertias[k], pin.SE3.Identity())
+        return vp.load_robot(model)
+
+    def test_of_an_arm_on_a_slider_a_kilometre_out(self):
+        # Nothing but the potential energy depends on where a slider stands.
+        robot = self.gantry(1)
+        scene = vp.Scene(robot)
+        q, v = np.random.default_rng(1).normal(size=(2, robot.dof))
+        out = q.copy()
+        out[0] = 1e3
+        here, there = vp.lagrangian_jet(scene, q, v), vp.lagrangian_jet(scene, out, v)
+        for entry in NAMES:
+            assert_close(getattr(there, entry), getattr(here, entry), 1e-12, entry)
+
+    # Positions count from the first slider, and moments of inertia square them: eps (1e3 m)^2 is what is left.
+    @pytest.mark.parametrize("axes", [2, 3])
+    def test_of_an_arm_on_stacked_sliders_a_kilometre_out(self, axes):
+        robot = self.gantry(axes)
+        scene = vp.Scene(robot)
+        q, v = np.random.default_rng(1).normal(size=(2, robot.dof))
+        out = q.copy()
+        out[:axes] = 1e3
+        here, there = vp.lagrangian_jet(scene, q, v), vp.lagrangian_jet(scene, out, v)
+        for entry in NAMES:
+            assert_close(getattr(there, entry), getattr(here, entry), 1e-9, entry)
+
+
+class TestExactZeros:
+    def test_between_branches(self):
+        filled = dict.fromkeys(("Lqq", "Lvq", "Lvv"), 0)
+        for seed in range(20):
+            robot = vp.load_robot(random_tree(seed, 8))
+            parent = robot.tree.parent
+
+            def line(j, parent=parent):
+                return {j} | (line(parent[j]) if parent[j] >= 0 else set())
+
+            apart = np.array([[i not in line(j) and j not in line(i) for j in range(8)] for i in range(8)])
+            rng = np.random.default_rng(seed)
+            jet = vp.lagrangian_jet(busy_scene(robot, rng), rng.normal(size=8), rng.normal(size=8))
+            for name in filled:
+                assert not getattr(jet, name)[apart].any()
+                filled[name] += np.count_nonzero(getattr(jet, name)[~apart])
+        assert min(filled.values()) > 200
+
+    @pytest.mark.parametrize("name", ["ur5", "panda", "z1", "xarm7"])
+    def test_of_a_first_joint_about_the_vertical(self, load, name):
+        # L does not depend on its angle, so its momentum is conserved.
+        scene = vp.Scene(load(name))
+        for q, v in np.random.default_rng(0).normal(size=(5, 2, scene.robot.dof)):
+            jet = vp.lagrangian_jet(scene, q, v)
+            assert jet.Lq[0] == 0.0
+            assert not jet.Lqq[0].any()
+            assert not jet.Lvq[:, 0].any()
+
+    def test_of_a_horizontal_slider(self):
+        model = pin.Model()
+        slider = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slider")
+        model.appendBodyToJoint(slider, random_inertia(np.random.default_rng(0)), pin.SE3.Identity())
+        pole = model.addJoint(slider, pin.JointModelRY(), pin.SE3.Identity(), "pole")
+        model.appendBodyToJoint(pole, random_inertia(np.random.default_rng(1)), pin.SE3.Identity())
+        scene = vp.Scene(vp.load_robot(model))
+        for q, v in np.random.default_rng(0).normal(size=(5, 2, 2)):
+            jet = vp.lagrangian_jet(scene, q, v)
+            assert jet.Lq[0] == 0.0
+            assert not jet.Lqq[0].any()
+            assert not jet.Lvq[:, 0].any()

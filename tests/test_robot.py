@@ -1,0 +1,605 @@
+from __future__ import annotations
+
+import logging
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import naive
+import numpy as np
+import pinocchio as pin
+import pytest
+from mechanisms import arm, joint, link, mimic, random_inertia, random_tree, write_urdf
+
+import varpin as vp
+from varpin.robot import bundled_robots, example_robot_data, geometry
+from varpin.robot.mimic import Tie
+from varpin.robot.tree import coordinate_armature
+
+MOVING = ("revolute", "continuous", "prismatic")
+
+
+def mimics_of(urdf: Path) -> dict[str, tuple[str, float, float]]:
+    """Follower: (leader, ratio, offset), for leaders that move."""
+    joints = {j.get("name"): j for j in ET.parse(urdf).getroot().findall("joint") if j.get("type") in MOVING}
+    found = {}
+    for name, element in joints.items():
+        tie = element.find("mimic")
+        if tie is not None and tie.get("joint") in joints:
+            found[name] = (tie.get("joint"), float(tie.get("multiplier", 1)), float(tie.get("offset", 0)))
+    return found
+
+
+def tie_matrix(model: pin.Model, names: tuple[str, ...], mimics: dict[str, tuple[str, float, float]]):
+    """G (nv, n) and g (nv,): joint positions of ``model`` are G q + g. Leaders are no followers here."""
+    G, g = np.zeros((model.nv, len(names))), np.zeros(model.nv)
+    for k, name in enumerate(list(model.names)[1:]):
+        leader, ratio, offset = mimics.get(name, (name, 1.0, 0.0))
+        G[k, names.index(leader)], g[k] = ratio, offset
+    return G, g
+
+
+def configuration(model: pin.Model, positions: np.ndarray) -> np.ndarray:
+    q = pin.neutral(model)
+    for k in range(model.njoints - 1):
+        entry = model.joints[k + 1]
+        q[entry.idx_q : entry.idx_q + entry.nq] = (
+            positions[k] if entry.nq == 1 else (np.cos(positions[k]), np.sin(positions[k]))
+        )
+    return q
+
+
+def full_crba(model: pin.Model, q: np.ndarray) -> np.ndarray:
+    M = np.triu(pin.crba(model, model.createData(), q))
+    return M + np.triu(M, 1).T
+
+
+def jet_at(robot: vp.Robot, q, v) -> vp.LagrangianJet:
+    return vp.lagrangian_jet(vp.Scene(robot, gravity=(0.7, -1.1, -9.5)), q, v)
+
+
+def assert_same_jet(a: vp.LagrangianJet, b: vp.LagrangianJet, keep=slice(None), rtol: float = 1e-12) -> None:
+    """Jet ``a`` is jet ``b`` on the coordinates ``keep`` of ``b``."""
+    for name in ("Lq", "Lv", "Lqq", "Lvq", "Lvv"):
+        whole = getattr(b, name)
+        part = whole[keep] if whole.ndim == 1 else whole[keep][:, keep]
+        np.testing.assert_allclose(getattr(a, name), part, rtol=0, atol=rtol * np.abs(whole).max(), err_msg=name)
+
+
+class TestEveryRobot:
+    def test_has_its_urdf_s_moving_joints_in_order(self, robot, robot_name):
+        mimics = mimics_of(robot.urdf)
+        model = pin.buildModelFromUrdf(str(robot.urdf))
+        joints = [name for name in list(model.names)[1:] if name not in mimics]
+        assert sorted(robot.joint_names) == sorted(joints)
+        if all(model.getJointId(leader) < model.getJointId(f) for f, (leader, _, _) in mimics.items()):
+            assert list(robot.joint_names) == joints
+        assert robot.dof == len(joints) == robot.model.nv
+        assert robot.name == robot_name
+        assert {robot.free_model.names[tie.follower] for tie in robot.ties} == set(mimics)
+
+    def test_tied_mass_matrix_and_gravity_are_projections_of_the_free_ones(self, robot):
+        model = pin.buildModelFromUrdf(str(robot.urdf))
+        armature = {name: a for name, a in zip(robot.joint_names, robot.tree.armature, strict=True) if a}
+        model.armature = np.array([armature.get(name, 0.0) for name in list(model.names)[1:]])
+        G, g = tie_matrix(model, robot.joint_names, mimics_of(robot.urdf))
+        rng = np.random.default_rng(7)
+        for q in rng.uniform(-2.0, 2.0, (3, robot.dof)):
+            full_q = configuration(model, G @ q + g)
+            jet = vp.lagrangian_jet(vp.Scene(robot), q, np.zeros(robot.dof))
+            expected = G.T @ full_crba(model, full_q) @ G
+            np.testing.assert_allclose(jet.Lvv, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+            weight = G.T @ pin.computeGeneralizedGravity(model, model.createData(), full_q)
+            scale = np.abs(G).T @ np.abs(pin.computeGeneralizedGravity(model, model.createData(), full_q))
+            np.testing.assert_allclose(-jet.Lq, weight, rtol=0, atol=1e-12 * max(scale.max(), 1e-3))
+
+    def test_configuration_is_that_of_its_model(self, robot):
+        q = np.random.default_rng(1).uniform(-3.0, 3.0, robot.dof)
+        tied, free = robot.model, pin.buildModelFromUrdf(str(robot.urdf))
+        G, g = tie_matrix(free, robot.joint_names, mimics_of(robot.urdf))
+        tied_data, free_data = tied.createData(), free.createData()
+        pin.forwardKinematics(tied, tied_data, robot.configuration(q))
+        pin.forwardKinematics(free, free_data, configuration(free, G @ q + g))
+        for name in list(free.names)[1:]:
+            a, b = tied_data.oMi[tied.getJointId(name)], free_data.oMi[free.getJointId(name)]
+            assert np.abs(a.homogeneous - b.homogeneous).max() < 1e-12, name
+
+
+def test_only_the_bravo7_is_not_installed():
+    missing = []
+    for name, path in example_robot_data.FIXED_BASE.items():
+        try:
+            example_robot_data.locate(path)
+        except vp.RobotError:
+            missing.append(name)
+    assert all(name.startswith("bravo7_") for name in missing)
+
+
+# Denavit-Hartenberg a2 and a3 of Universal Robots' data sheets [m].
+@pytest.mark.parametrize(("name", "upper_arm", "forearm"), [("ur3", 0.24365, 0.21325), ("ur5", 0.425, 0.39225)])
+def test_ur_arms_are_as_long_as_their_data_sheets_say(load, name, upper_arm, forearm):
+    model = load(name).model
+    lengths = [model.jointPlacements[model.getJointId(j)].translation for j in ("elbow_joint", "wrist_1_joint")]
+    # The elbow is also moved along its own axis, y.
+    assert [np.hypot(x[0], x[2]) for x in lengths] == pytest.approx([upper_arm, forearm], abs=1e-5)
+
+
+class TestSources:
+    def test_path_text_and_name_give_the_same_robot(self, load):
+        named = load("xarm7")
+        q, v = np.random.default_rng(2).normal(size=(2, 7))
+        for source in (named.urdf, str(named.urdf)):
+            robot = vp.load_robot(source)
+            assert robot.joint_names == named.joint_names
+            assert_same_jet(jet_at(robot, q, v), jet_at(named, q, v), rtol=0)
+
+    def test_relative_path_and_home(self, tmp_path, monkeypatch):
+        arm(tmp_path)
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("HOME", str(tmp_path))
+        for source in ("made_up.urdf", "./made_up.urdf", Path("made_up.urdf"), "~/made_up.urdf"):
+            assert vp.load_robot(source).urdf == tmp_path / "made_up.urdf"
+
+    def test_a_robot_s_name_goes_before_a_folder_of_that_name(self, tmp_path, monkeypatch):
+        (tmp_path / "ur5").mkdir()
+        monkeypatch.chdir(tmp_path)
+        assert vp.load_robot("ur5").dof == 6
+
+    def test_bundled_robots_load(self, load):
+        assert "finger" in bundled_robots()
+        for name, path in bundled_robots().items():
+            robot = load(name)
+            assert (robot.name, robot.urdf) == (name, path)
+
+    @pytest.mark.parametrize("name", ["panda", "baxter", "tiago_pro", "kinova"])
+    def test_models_with_mimic_joints(self, load, name):
+        named = load(name)
+        model = pin.buildModelFromUrdf(str(named.urdf), mimic=True)
+        q, v = np.random.default_rng(3).uniform(-4.0, 4.0, (2, named.dof))
+        for source in (model, pin.RobotWrapper(model)):
+            robot = vp.load_robot(source)
+            order = [robot.joint_names.index(joint_name) for joint_name in named.joint_names]
+            back = np.argsort(order)
+            assert_same_jet(jet_at(named, q, v), jet_at(robot, q[back], v[back]), keep=order)
+            assert len(robot.ties) == len(named.ties)
+
+    @pytest.mark.parametrize("frames", [True, False])
+    def test_the_robot_keeps_no_hold_of_the_user_s_model(self, load, frames):
+        model = pin.buildModelFromUrdf(str(load("xarm7").urdf)) if frames else random_tree(0, branching=False)
+        shapes = pin.GeometryModel()
+        robot = vp.load_robot(pin.RobotWrapper(model, pin.GeometryModel(), shapes))
+        scene = vp.Scene(robot)
+        q, v = np.ones(7), np.arange(7.0)
+        before = vp.lagrangian_jet(scene, q, v, backend="pinocchio")
+        model.armature = np.full(7, 9.0)
+        model.inertias[3] = random_inertia(np.random.default_rng(1))
+        model.jointPlacements[2] = pin.SE3.Identity()
+        shapes.addGeometryObject(pin.GeometryObject("late", 1, pin.SE3.Identity(), pin.hppfcl.Sphere(0.1)))
+        assert_same_jet(vp.lagrangian_jet(scene, q, v, backend="pinocchio"), before, rtol=0)
+        assert geometry(robot).ngeoms == 0
+
+    def test_gravity_of_a_model_is_not_the_scene_s(self):
+        model = random_tree(0, branching=False)
+        model.gravity = pin.Motion(np.array([0.0, 0.0, -100.0]), np.zeros(3))
+        robot = vp.load_robot(model)
+        for backend in ("compiled", "pinocchio"):
+            jet = vp.lagrangian_jet(vp.Scene(robot, gravity=False), np.ones(7), np.zeros(7), backend=backend)
+            assert np.abs(jet.Lq).max() == 0.0
+
+    def test_joints_added_out_of_order_are_reordered(self, caplog):
+        # Pinocchio computes another mass matrix, without a word, unless every subtree is contiguous.
+        rng = np.random.default_rng(5)
+        model = pin.Model()
+        parents = {"left": 0, "right": 0, "left_tip": 1, "right_tip": 2}
+        for name, parent in parents.items():
+            k = model.addJoint(parent, pin.JointModelRY(), pin.SE3.Random(), name)
+            model.appendBodyToJoint(k, random_inertia(rng), pin.SE3.Identity())
+        shapes = pin.GeometryModel()
+        for k, name in enumerate(parents):
+            shapes.addGeometryObject(pin.GeometryObject(name, k + 1, pin.SE3.Identity(), pin.hppfcl.Sphere(0.1)))
+        with caplog.at_level(logging.WARNING):
+            robot = vp.load_robot(pin.RobotWrapper(model, shapes, shapes))
+        assert robot.joint_names == ("left", "left_tip", "right", "right_tip")
+        assert "reordered to left, left_tip, right, right_tip" in caplog.text
+        assert [robot.model.names[shape.parentJoint] for shape in geometry(robot).geometryObjects] == list(parents)
+        q, v = rng.normal(size=(2, 4))
+        scene = vp.Scene(robot)
+        expected = naive.lagrangian(scene, q, v)
+        for backend in ("compiled", "pinocchio"):
+            assert pytest.approx(expected, rel=1e-13) == vp.lagrangian_jet(scene, q, v, backend=backend).L
+
+
+class TestGeometry:
+    def test_is_not_read_at_load(self, tmp_path):
+        mesh = '<visual><geometry><mesh filename="package://nowhere/missing.dae"/></geometry></visual>'
+        robot = vp.load_robot(write_urdf(tmp_path, link("l1", extra=mesh), joint("j1", "base", "l1")))
+        assert robot.dof == 1
+        with pytest.raises(vp.RobotError, match=r"missing\.dae"):
+            geometry(robot)
+
+    @pytest.mark.parametrize("lock", [{}, {"joint1": 0.4}, {"joint0": -0.3, "joint5": 1.2}])
+    def test_of_a_wrapper_moves_as_in_the_unlocked_model(self, lock):
+        model = random_tree(11, branching=False)
+        rng = np.random.default_rng(0)
+        shapes = pin.GeometryModel()
+        for k in range(1, model.njoints):
+            placement = pin.SE3(pin.Quaternion(rng.normal(size=4)).normalized().matrix(), rng.normal(size=3))
+            shapes.addGeometryObject(pin.GeometryObject(f"shape{k}", k, placement, pin.hppfcl.Sphere(0.1)))
+        robot = vp.load_robot(pin.RobotWrapper(model, pin.GeometryModel(), shapes), lock=lock)
+        visuals = geometry(robot)
+        assert all(shape.parentFrame < robot.model.nframes for shape in visuals.geometryObjects)
+        q = rng.uniform(-2.0, 2.0, robot.dof)
+        positions = dict(zip(robot.joint_names, q, strict=True)) | lock
+        full_q = configuration(model, np.array([positions[name] for name in list(model.names)[1:]]))
+        ours, theirs = visuals.createData(), shapes.createData()
+        pin.updateGeometryPlacements(robot.model, robot.model.createData(), visuals, ours, robot.configuration(q))
+        pin.updateGeometryPlacements(model, model.createData(), shapes, theirs, full_q)
+        assert visuals.ngeoms == shapes.ngeoms
+        for k, shape in enumerate(shapes.geometryObjects):
+            mine = ours.oMg[visuals.getGeometryId(shape.name)]
+            assert np.abs(mine.homogeneous - theirs.oMg[k].homogeneous).max() < 1e-12
+
+    @pytest.mark.parametrize("kind", ["revolute", "continuous"])
+    def test_of_a_wrapper_with_mimic_joints_keeps_its_links(self, tmp_path, kind):
+        ball = '<visual><geometry><sphere radius="0.1"/></geometry></visual>'
+        path = write_urdf(
+            tmp_path,
+            *(link(name, extra=ball) for name in ("a", "b", "c")),
+            joint("j1", "base", "a", kind),
+            joint("j2", "a", "b", kind, inside=mimic("j1", 2)),
+            joint("j3", "b", "c"),
+        )
+        model = pin.buildModelFromUrdf(str(path), mimic=True)
+        shapes = pin.buildGeomFromUrdf(model, str(path), pin.GeometryType.VISUAL)
+        for lock in ({}, {"j3": 0.2}):
+            robot = vp.load_robot(pin.RobotWrapper(model, pin.GeometryModel(), shapes), lock=lock)
+            for shape in geometry(robot).geometryObjects:
+                assert robot.free_model.frames[shape.parentFrame].name == shape.name[0]
+
+    def test_of_a_wrapper_must_hang_on_its_joints(self):
+        shapes = pin.GeometryModel()
+        shapes.addGeometryObject(pin.GeometryObject("ball", 9, pin.SE3.Identity(), pin.hppfcl.Sphere(0.1)))
+        with pytest.raises(vp.RobotError, match="shape 'ball' hangs on joint 9"):
+            vp.load_robot(pin.RobotWrapper(random_tree(0), pin.GeometryModel(), shapes))
+
+
+class TestLocking:
+    @pytest.mark.parametrize(
+        ("name", "lock"),
+        [
+            ("ur5", {"elbow_joint": 0.9}),
+            ("ur5", {"wrist_3_joint": -2.0, "shoulder_pan_joint": 1.1}),
+            ("kinova", {"j2s6s200_joint_1": 2.5}),
+            ("kinova", {"j2s6s200_joint_4": 7.9, "j2s6s200_joint_2": 3.0}),
+            ("panda", {"panda_joint4": -1.4}),
+            ("panda", {"panda_finger_joint1": 0.03}),
+            ("talos_arm", {"arm_left_3_joint": 0.5}),
+            ("tiago_pro", {"torso_lift_joint": 0.2, "gripper_left_finger_joint": 0.3}),
+        ],
+    )
+    def test_is_the_unlocked_robot_held_there(self, load, name, lock):
+        whole = load(name)
+        robot = vp.load_robot(name, lock=lock)
+        keep = [c for c, joint_name in enumerate(whole.joint_names) if joint_name not in lock]
+        assert robot.joint_names == tuple(whole.joint_names[c] for c in keep)
+        assert lock.items() <= robot.locked.items()
+        rng = np.random.default_rng(0)
+        q, v = rng.uniform(-1.0, 1.0, (2, whole.dof))
+        for joint_name, position in lock.items():
+            q[whole.coordinate(joint_name)], v[whole.coordinate(joint_name)] = position, 0.0
+        locked, unlocked = jet_at(robot, q[keep], v[keep]), jet_at(whole, q, v)
+        assert_same_jet(locked, unlocked, keep)
+        elsewhere = q.copy()
+        elsewhere[keep] = rng.uniform(-1.0, 1.0, len(keep))
+        # What hangs on the world for good adds a constant to the potential energy.
+        shift = locked.L - unlocked.L
+        assert (
+            pytest.approx(shift, abs=1e-11) == jet_at(robot, elsewhere[keep], v[keep]).L - jet_at(whole, elsewhere, v).L
+        )
+
+    def test_of_a_leader_locks_its_followers(self, load):
+        robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.03})
+        assert dict(robot.locked) == {"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.03}
+        assert robot.ties == ()
+        baxter = load("baxter")
+        (follower, leader) = next((t.follower, t.leader) for t in baxter.ties)
+        names = baxter.free_model.names
+        locked = vp.load_robot("baxter", lock={names[leader]: 0.01}).locked
+        ratio, offset = mimics_of(baxter.urdf)[names[follower]][1:]
+        assert locked[names[follower]] == ratio * 0.01 + offset
+
+    def test_in_a_model_with_velocity_limits(self):
+        # pin.Model.addJoint leaves lower limits that pin.buildReducedModel refuses.
+        model = vp.planar_chain(2).model.copy()
+        model.velocityLimit = np.array([3.0, 5.0])
+        robot = vp.load_robot(model, lock={"joint1": 0.1})
+        assert robot.velocity_limit.tolist() == [5.0]
+
+    @pytest.mark.parametrize("frames", ["none", "some", "late"])
+    def test_in_a_model_without_proper_joint_frames(self, frames):
+        # pin.buildReducedModel crashes the interpreter, or refuses, unless every joint's frame is there and early.
+        whole = vp.planar_chain(3)
+        model, joint_id = pin.Model(), 0
+        for k in range(1, 4):
+            source = whole.free_model
+            joint_id = model.addJoint(joint_id, source.joints[k], source.jointPlacements[k], source.names[k])
+            model.appendBodyToJoint(joint_id, source.inertias[k], pin.SE3.Identity())
+        tip = pin.SE3(np.eye(3), np.array([1.0, 0.0, 0.0]))
+        if frames == "some":
+            model.addJointFrame(1)
+        model.addFrame(pin.Frame("tip", 3, tip, pin.FrameType.OP_FRAME))
+        if frames == "late":
+            for k in range(1, 4):
+                model.addJointFrame(k)
+        shapes = pin.GeometryModel()
+        tip_frame = model.getFrameId("tip")
+        shapes.addGeometryObject(pin.GeometryObject("ball", 3, tip_frame, tip, pin.hppfcl.Sphere(0.1)))
+        robot = vp.load_robot(pin.RobotWrapper(model, shapes, shapes), lock={"joint2": 0.5})
+        locked, unlocked = jet_at(robot, [0.1, 0.2], [1, 2]), jet_at(whole, [0.1, 0.5, 0.2], [1, 0, 2])
+        assert_same_jet(locked, unlocked, [0, 2])
+        data, visuals = robot.model.createData(), geometry(robot)
+        pin.framesForwardKinematics(robot.model, data, np.array([0.1, 0.2]))
+        placed = visuals.createData()
+        pin.updateGeometryPlacements(robot.model, data, visuals, placed)
+        angles = np.cumsum([0.1, 0.5, 0.2])
+        expected = [np.cos(angles).sum(), 0.0, -np.sin(angles).sum()]
+        np.testing.assert_allclose(data.oMf[robot.model.getFrameId("tip")].translation, expected, atol=1e-14)
+        np.testing.assert_allclose(placed.oMg[0].translation, expected, atol=1e-14)
+
+    @pytest.mark.parametrize(
+        ("kind", "position"),
+        [
+            (
+                pin.JointModelFreeFlyer(),
+                [0.1, 0.2, 0.3, *pin.Quaternion(np.array([0.1, 0.2, 0.3, 0.9])).normalized().coeffs()],
+            ),
+            (pin.JointModelSpherical(), pin.Quaternion(np.array([0.5, 0.2, -0.3, 0.9])).normalized().coeffs()),
+            (pin.JointModelPlanar(), [0.4, 0.5, np.cos(0.6), np.sin(0.6)]),
+            (pin.JointModelHX(0.2), 1.3),
+            (pin.JointModelTranslation(), [1.0, 2.0, 3.0]),
+        ],
+        ids=lambda value: value.shortname() if hasattr(value, "shortname") else "",
+    )
+    def test_the_advice_against_an_unsupported_joint_works(self, kind, position):
+        rng = np.random.default_rng(3)
+        model = pin.Model()
+        base = model.addJoint(0, kind, pin.SE3.Identity(), "root")
+        model.appendBodyToJoint(base, random_inertia(rng), pin.SE3.Identity())
+        elbow = model.addJoint(base, pin.JointModelRY(), pin.SE3(np.eye(3), np.array([0.1, 0.2, 0.3])), "elbow")
+        model.appendBodyToJoint(elbow, random_inertia(rng), pin.SE3.Identity())
+        with pytest.raises(vp.UnsupportedJoint, match=rf"'root' is a {kind.shortname()}.*lock=\{{'root': "):
+            vp.load_robot(model)
+        robot = vp.load_robot(model, lock={"root": position})
+        assert robot.joint_names == ("elbow",)
+        q = pin.neutral(model)
+        q[: model.joints[base].nq] = position
+        for angle in (0.3, -1.2):
+            q[model.joints[elbow].idx_q] = angle
+            jet = vp.lagrangian_jet(vp.Scene(robot), [angle], [0.0])
+            weight = pin.computeGeneralizedGravity(model, model.createData(), q)[model.joints[elbow].idx_v]
+            assert -jet.Lq[0] == pytest.approx(weight, rel=1e-12)
+            assert jet.Lvv[0, 0] == pytest.approx(full_crba(model, q)[-1, -1], rel=1e-12)
+
+    def test_takes_no_unnormalized_quaternion(self):
+        model = pin.Model()
+        base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root")
+        model.addJoint(base, pin.JointModelRY(), pin.SE3.Identity(), "elbow")
+        for quaternion in ([0, 0, 0, 2], [0, 0, 0, 0]):
+            with pytest.raises(vp.InputError, match=r"lock\['root'\].*length 1"):
+                vp.load_robot(model, lock={"root": [0, 0, 0, *quaternion]})
+        with pytest.raises(vp.InputError, match=r"lock\['root'\] must have 7 value\(s\), got shape \(1,\)"):
+            vp.load_robot(model, lock={"root": 0.0})
+
+
+class TestMimic:
+    """Positions of all joints are worked out by hand and given to the naive Lagrangian."""
+
+    @staticmethod
+    def expected(robot: vp.Robot, place: dict[str, tuple[float, float]]) -> float:
+        """L with each joint at its (position, rate)."""
+        model = robot.free_model
+        positions, rates = np.array([place[name] for name in list(model.names)[1:]]).T
+        kinetic, potential = naive.energies(model, positions, rates, np.array([0.0, 0.0, -9.81]))
+        return float(kinetic - potential)
+
+    def check(self, robot: vp.Robot, q, v, place) -> None:
+        expected = self.expected(robot, place)
+        for backend in ("compiled", "pinocchio"):
+            jet = vp.lagrangian_jet(vp.Scene(robot), q, v, backend=backend)
+            assert pytest.approx(expected, rel=1e-12) == jet.L, backend
+        # robot.model has the ties of Pinocchio itself.
+        M = full_crba(robot.model, robot.configuration(q))
+        np.testing.assert_allclose(jet.Lvv, M, rtol=0, atol=1e-12 * np.abs(M).max())
+
+    @pytest.mark.parametrize("q", [0.7, 3.9, -12.0])
+    @pytest.mark.parametrize("axis", ["0 0 1", "0.6 0 0.8"])
+    @pytest.mark.parametrize("follower", MOVING)
+    @pytest.mark.parametrize("leader", MOVING)
+    def test_ties_joints_of_every_kind_however_far_they_turn(self, tmp_path, leader, follower, axis, q):
+        path = write_urdf(
+            tmp_path,
+            link("a"),
+            link("b"),
+            joint("j1", "base", "a", leader, axis),
+            joint("j2", "a", "b", follower, axis, mimic("j1", 2.5, 0.3)),
+        )
+        robot = vp.load_robot(path)
+        assert robot.joint_names == ("j1",)
+        self.check(robot, [q], [0.6], {"j1": (q, 0.6), "j2": (2.5 * q + 0.3, 1.5)})
+
+    def test_ratio_zero_holds_the_follower(self, tmp_path):
+        path = write_urdf(
+            tmp_path, link("a"), link("b"), joint("j1", "base", "a"), joint("j2", "a", "b", inside=mimic("j1", 0, 0.3))
+        )
+        self.check(vp.load_robot(path), [0.5], [2.0], {"j1": (0.5, 2.0), "j2": (0.3, 0.0)})
+        with pytest.raises(vp.RobotError, match="'j2' mimics 'j1' with multiplier 0"):
+            vp.load_robot(pin.buildModelFromUrdf(str(path), mimic=True))
+
+    def test_leader_in_a_later_branch(self, tmp_path):
+        # Pinocchio orders siblings by name, so the leader comes last.
+        path = write_urdf(
+            tmp_path,
+            *(link(name) for name in ("a", "b", "c", "d")),
+            joint("j_a", "base", "a", inside=mimic("j_d", -0.5, 0.1)),
+            joint("j_b", "a", "b"),
+            joint("j_c", "base", "c"),
+            joint("j_d", "c", "d"),
+        )
+        robot = vp.load_robot(path)
+        assert robot.joint_names == ("j_c", "j_d", "j_b")
+        place = {"j_c": (0.2, 1.0), "j_d": (0.4, 2.0), "j_b": (0.6, 3.0), "j_a": (-0.1, -1.0)}
+        self.check(robot, [0.2, 0.4, 0.6], [1.0, 2.0, 3.0], place)
+        assert robot.velocity_limit.tolist() == [8.0] * 3
+        assert robot.effort_limit.tolist() == [9.0] * 3
+        locked = vp.load_robot(path, lock={"j_b": 0.6})
+        assert_same_jet(jet_at(locked, [0.2, 0.4], [1.0, 2.0]), jet_at(robot, [0.2, 0.4, 0.6], [1.0, 2.0, 0.0]), [0, 1])
+        assert locked.velocity_limit.tolist() == [8.0] * 2
+
+    def test_chain_of_mimics_ends_at_the_free_joint(self, tmp_path):
+        path = write_urdf(
+            tmp_path,
+            *(link(name) for name in ("a", "b", "c")),
+            joint("j1", "base", "a"),
+            joint("j2", "a", "b", inside=mimic("j1", 2, 0.5)),
+            joint("j3", "b", "c", inside=mimic("j2", -3, 0.25)),
+        )
+        place = {"j1": (0.3, 1.0), "j2": (1.1, 2.0), "j3": (-3.05, -6.0)}
+        self.check(vp.load_robot(path), [0.3], [1.0], place)
+
+    def test_of_a_leader_that_is_not_there_stays_free(self, tmp_path, caplog):
+        path = arm(tmp_path, inside=mimic("thumb"))
+        assert vp.load_robot(path).joint_names == ("j1",)
+        assert "'j1' mimics 'thumb', which is not a moving joint" in caplog.text
+
+    def test_free_makes_followers_coordinates(self, load):
+        robot = vp.load_robot("panda", mimic="free")
+        assert robot.joint_names[-2:] == ("panda_finger_joint1", "panda_finger_joint2")
+        tied = load("panda")
+        q, v = np.random.default_rng(0).normal(size=(2, 8))
+        G = np.vstack([np.eye(8), np.eye(8)[-1]])
+        free = jet_at(robot, G @ q, G @ v)
+        np.testing.assert_allclose(jet_at(tied, q, v).Lqq, G.T @ free.Lqq @ G, rtol=0, atol=1e-12)
+
+    def test_a_follower_that_carries_its_leader_is_refused(self, tmp_path):
+        path = write_urdf(
+            tmp_path, link("a"), link("b"), joint("j1", "base", "a", inside=mimic("j2")), joint("j2", "a", "b")
+        )
+        with pytest.raises(vp.RobotError, match=r"'j1' carries the joint it mimics, 'j2'.*mimic='free'"):
+            vp.load_robot(path)
+        assert vp.load_robot(path, mimic="free").dof == 2
+
+    def test_crosswise_mimics_of_branches_are_refused(self, tmp_path):
+        path = write_urdf(
+            tmp_path,
+            *(link(name) for name in ("a", "b", "c", "d")),
+            joint("a1", "base", "a", inside=mimic("b2")),
+            joint("a2", "a", "b"),
+            joint("b1", "base", "c", inside=mimic("a2")),
+            joint("b2", "c", "d"),
+        )
+        with pytest.raises(vp.RobotError, match="follow each other across branches"):
+            vp.load_robot(path)
+
+
+class TestJoints:
+    @pytest.mark.parametrize(
+        ("kind", "axis"), [("continuous", "0 0 1"), ("continuous", "0.6 0 0.8"), ("prismatic", "1 2 2")]
+    )
+    def test_oblique_and_continuous(self, tmp_path, kind, axis):
+        robot = vp.load_robot(arm(tmp_path, kind=kind, axis=axis))
+        direction = np.array([float(x) for x in axis.split()])
+        direction /= np.linalg.norm(direction)
+        placement, body = robot.model.jointPlacements[1], robot.model.inertias[1]
+        jet = vp.lagrangian_jet(vp.Scene(robot, gravity=(1.0, 2.0, -3.0)), [0.0], [0.0])
+        if kind == "prismatic":
+            mass = body.mass
+            force = body.mass * (placement.rotation @ direction) @ [1.0, 2.0, -3.0]
+        else:
+            offset = np.cross(direction, body.lever)
+            mass = direction @ body.inertia @ direction + body.mass * offset @ offset
+            force = body.mass * (placement.rotation @ offset) @ [1.0, 2.0, -3.0]
+        assert jet.Lvv[0, 0] == pytest.approx(mass, rel=1e-13)
+        assert jet.Lq[0] == pytest.approx(force, rel=1e-13)
+        assert robot.unbounded[0] == (kind == "continuous")
+        assert robot.position_limits[1][0] == (np.inf if kind == "continuous" else 1.0)
+
+    def test_limits_are_the_urdf_s(self, load):
+        robot = load("kinova")
+        limits = {j.get("name"): j for j in ET.parse(robot.urdf).getroot().findall("joint")}
+        lower, upper = robot.position_limits
+        for c, name in enumerate(robot.joint_names):
+            entry = limits[name].find("limit")
+            assert robot.velocity_limit[c] == float(entry.get("velocity"))
+            assert robot.effort_limit[c] == float(entry.get("effort"))
+            if limits[name].get("type") == "continuous":
+                assert (lower[c], upper[c]) == (-np.inf, np.inf)
+            else:
+                assert (lower[c], upper[c]) == (float(entry.get("lower")), float(entry.get("upper")))
+
+    def test_a_composite_of_one_joint_is_that_joint_unless_displaced(self):
+        def of(placement: pin.SE3) -> pin.Model:
+            model = pin.Model()
+            k = model.addJoint(0, pin.JointModelComposite(pin.JointModelRY(), placement), pin.SE3.Identity(), "shell")
+            model.appendBodyToJoint(k, random_inertia(np.random.default_rng(0)), pin.SE3.Identity())
+            return model
+
+        robot = vp.load_robot(of(pin.SE3.Identity()))
+        scene = vp.Scene(robot)
+        jets = [vp.lagrangian_jet(scene, [0.4], [1.3], backend=b) for b in ("compiled", "pinocchio")]
+        assert pytest.approx(jets[1].L, rel=1e-13) == jets[0].L
+        with pytest.raises(vp.UnsupportedJoint, match="'shell' is a JointModelComposite"):
+            vp.load_robot(of(pin.SE3(np.eye(3), np.array([0.1, 0.0, 0.0]))))
+
+    @pytest.mark.parametrize(("kind", "shown"), [("floating", "JointModelFreeFlyer"), ("planar", "JointModelPlanar")])
+    def test_unsupported_in_a_urdf(self, tmp_path, kind, shown):
+        path = write_urdf(tmp_path, link("a"), link("b"), joint("root", "base", "a", kind), joint("elbow", "a", "b"))
+        with pytest.raises(vp.UnsupportedJoint, match=f"'root' is a {shown}") as info:
+            vp.load_robot(path)
+        assert (info.value.joint, info.value.kind) == ("root", shown)
+        position = [0.0] * 6 + [1.0] if kind == "floating" else [0.0, 0.0, 1.0, 0.0]
+        assert vp.load_robot(path, lock={"root": position}).joint_names == ("elbow",)
+
+
+class TestArmature:
+    def test_adds_to_the_diagonal_and_is_not_counted_twice(self):
+        model = random_tree(4, branching=False, armature=False)
+        bare = vp.load_robot(model)
+        model.armature = np.arange(1.0, 8.0)
+        robot = vp.load_robot(model)
+        q, v = np.random.default_rng(0).normal(size=(2, 7))
+        for backend in ("compiled", "pinocchio"):
+            with_it = vp.lagrangian_jet(vp.Scene(robot), q, v, backend=backend)
+            without = vp.lagrangian_jet(vp.Scene(bare), q, v, backend=backend)
+            np.testing.assert_allclose(with_it.Lvv - without.Lvv, np.diag(model.armature), atol=1e-13)
+            np.testing.assert_allclose(with_it.Lv - without.Lv, model.armature * v, atol=1e-13)
+            assert pytest.approx(0.5 * model.armature @ v**2, rel=1e-12) == with_it.L - without.L
+        # crba is Pinocchio's own mass matrix, armature and all.
+        np.testing.assert_allclose(with_it.Lvv, full_crba(model, robot.configuration(q)), rtol=0, atol=1e-13)
+
+    def test_of_talos_is_its_rotors_through_its_gears(self, load):
+        robot = load("talos_arm")
+        srdf = ET.parse(example_robot_data.locate(example_robot_data.ROTORS["talos_arm"])).getroot()
+        rotors = {j.get("name"): j for j in srdf.find("rotor_params").findall("joint")}
+        felt = {name: float(j.get("mass")) * float(j.get("gear_ratio")) ** 2 for name, j in rotors.items()}
+        expected = [felt.get(name, 0.0) for name in robot.joint_names]
+        assert np.count_nonzero(expected) == sum(name.startswith("arm_left") for name in robot.joint_names) > 0
+        np.testing.assert_allclose(robot.tree.armature, expected, rtol=1e-15)
+
+    def test_of_followers_is_felt_by_their_leaders(self):
+        model = random_tree(6, bodies=3, branching=False)
+        ties = (Tie(follower=3, leader=1, ratio=-2.0, offset=0.1),)
+        own = model.armature
+        assert coordinate_armature(model, ties, (1, 2)) == pytest.approx([own[0] + 4.0 * own[2], own[1]])
+
+
+def test_planar_chain_is_rods_in_the_vertical_plane():
+    length, mass = 0.7, 1.4
+    scene = vp.Scene(vp.planar_chain(2, length=length, mass=mass))
+    q, v = np.array([0.3, 0.5]), np.array([1.2, -0.4])
+    angles, rates = np.cumsum(q), np.cumsum(v)
+    tips = np.cumsum(length * np.column_stack([np.cos(angles), -np.sin(angles)]), axis=0)
+    centers = tips - 0.5 * length * np.column_stack([np.cos(angles), -np.sin(angles)])
+    swing = length * rates[:, None] * np.column_stack([-np.sin(angles), -np.cos(angles)])
+    speeds = np.cumsum(swing, axis=0) - 0.5 * swing
+    kinetic = 0.5 * mass * (speeds**2).sum() + 0.5 * mass * length**2 / 12 * (rates**2).sum()
+    potential = mass * 9.81 * centers[:, 1].sum()
+    assert pytest.approx(kinetic - potential, rel=1e-14) == vp.lagrangian_jet(scene, q, v).L

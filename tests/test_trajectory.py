@@ -1,0 +1,287 @@
+from __future__ import annotations
+
+import dataclasses
+import os
+import pickle
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin.trajectory import FORMAT
+
+NODES = ("t", "q", "v", "p", "energy")
+
+
+@pytest.fixture(scope="module")
+def trajectory() -> vp.Trajectory:
+    scene = vp.Scene(vp.planar_chain(2), damping=0.1, actuation=["joint2"])
+    return vp.simulate(scene, [0.1, 0.2], [1.0, -1.0], dt=0.01, steps=20, controls=lambda t, q, v: [np.sin(t)])
+
+
+@pytest.fixture
+def saved(trajectory, tmp_path) -> Path:
+    return trajectory.save(tmp_path / "run.npz")
+
+
+def arrays_of(record: object) -> dict[str, np.ndarray]:
+    values = {item.name: getattr(record, item.name) for item in dataclasses.fields(record)}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+def tampered(source: Path, **changes: object) -> Path:
+    """A copy of an npz file with some members replaced, or left out where None is given."""
+    with np.load(source) as archive:
+        members = {name: archive[name] for name in archive.files}
+    members |= changes
+    target = source.with_name("tampered.npz")
+    np.savez(target, **{name: value for name, value in members.items() if value is not None})
+    return target
+
+
+class TestRoundTrip:
+    def test_is_bit_identical(self, trajectory, saved):
+        loaded = vp.Trajectory.load(saved)
+        for a, b in ((trajectory, loaded), (trajectory.statistics, loaded.statistics)):
+            assert arrays_of(a).keys() == arrays_of(b).keys()
+            for name, array in arrays_of(a).items():
+                other = arrays_of(b)[name]
+                assert (other.dtype, other.shape) == (array.dtype, array.shape)
+                assert other.tobytes() == array.tobytes(), name
+        for name in ("dt", "integrator", "robot", "joint_names", "version"):
+            assert getattr(loaded, name) == getattr(trajectory, name)
+            assert type(getattr(loaded, name)) is type(getattr(trajectory, name))
+        assert repr(loaded) == repr(trajectory)
+
+    def test_holds_for_no_steps_and_no_controls(self, tmp_path):
+        scene = vp.Scene(vp.planar_chain(1), actuation=[])
+        still = vp.simulate(scene, [0.3], [0.0], dt=0.01, steps=0)
+        loaded = vp.Trajectory.load(still.save(tmp_path / "still"))
+        assert (loaded.steps, loaded.u.shape, loaded.q.shape) == (0, (0, 0), (1, 1))
+
+    def test_holds_for_names_beyond_ascii(self, trajectory, tmp_path):
+        named = dataclasses.replace(trajectory, robot="Häßlich 臂", joint_names=("épaule", "肘"))
+        loaded = vp.Trajectory.load(named.save(tmp_path / "ünï.npz"))
+        assert (loaded.robot, loaded.joint_names) == (named.robot, named.joint_names)
+
+    def test_returns_the_path_as_given(self, trajectory, tmp_path):
+        path = tmp_path / "no_suffix"
+        assert trajectory.save(str(path)) == path
+        assert path.is_file()
+
+    def test_of_a_path_below_home(self, trajectory, tmp_path, monkeypatch):
+        monkeypatch.setenv("HOME", str(tmp_path))
+        trajectory.save("~/run.npz")
+        assert (tmp_path / "run.npz").is_file()
+        assert vp.Trajectory.load("~/run.npz").steps == trajectory.steps
+
+    def test_checks_the_robot(self, saved):
+        assert vp.Trajectory.load(saved, vp.planar_chain(2)).steps == 20
+        with pytest.raises(vp.FileError, match="is of robot chain2 with joints joint1, joint2; 'chain3' has joints"):
+            vp.Trajectory.load(saved, vp.planar_chain(3))
+
+
+def test_arrays_are_read_only(trajectory, saved):
+    for record in (trajectory, vp.Trajectory.load(saved)):
+        for owner in (record, record.statistics):
+            for name, array in arrays_of(owner).items():
+                with pytest.raises(ValueError, match="read-only"):
+                    array[...] = 0
+                assert not array.flags.writeable, name
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            record.dt = 1.0
+
+
+class TestSaving:
+    def test_that_fails_leaves_the_old_file(self, trajectory, saved, monkeypatch):
+        before = saved.read_bytes()
+
+        def fail(stream, **members):
+            stream.write(b"half a file")
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(np, "savez_compressed", fail)
+        with pytest.raises(vp.FileError, match="No space left on device"):
+            trajectory.save(saved)
+        assert saved.read_bytes() == before
+        assert [path.name for path in saved.parent.iterdir()] == [saved.name]
+
+    def test_to_a_pipe(self, trajectory, tmp_path):
+        # Replacing what is there would turn /dev/null into a file.
+        pipe = tmp_path / "pipe"
+        os.mkfifo(pipe)
+        with pytest.raises(vp.FileError, match="it is a device or pipe"):
+            trajectory.save(pipe)
+        assert pipe.is_fifo()
+
+    def test_replaces_and_keeps_the_umask(self, trajectory, saved):
+        old = os.umask(0o027)
+        try:
+            trajectory.save(saved)
+        finally:
+            os.umask(old)
+        assert saved.stat().st_mode & 0o777 == 0o640
+
+    def test_through_a_link_writes_what_it_points_to(self, trajectory, tmp_path):
+        real, link = tmp_path / "real.npz", tmp_path / "link.npz"
+        real.write_bytes(b"old")
+        link.symlink_to(real)
+        trajectory.save(link)
+        assert link.is_symlink()
+        assert vp.Trajectory.load(real).steps == 20
+
+    def test_to_a_folder(self, trajectory, tmp_path):
+        with pytest.raises(vp.FileError, match=f"cannot write {tmp_path}: it is a folder"):
+            trajectory.save(tmp_path)
+
+    def test_to_a_folder_that_is_not_there(self, trajectory, tmp_path):
+        with pytest.raises(vp.FileError, match=r"there is no folder .*nowhere"):
+            trajectory.save(tmp_path / "nowhere" / "run.npz")
+
+    def test_to_where_nothing_can_be_written(self, trajectory):
+        with pytest.raises(vp.FileError, match=r"cannot write /proc/run\.npz"):
+            trajectory.save("/proc/run.npz")
+
+
+class TestLoading:
+    def test_missing(self, tmp_path):
+        with pytest.raises(vp.FileError, match=r"there is no file .*run\.npz"):
+            vp.Trajectory.load(tmp_path / "run.npz")
+
+    def test_folder(self, tmp_path):
+        with pytest.raises(vp.FileError, match=f"{tmp_path} is a folder"):
+            vp.Trajectory.load(tmp_path)
+
+    def test_unreadable(self):
+        # A regular file whose every read fails, even for root.
+        with pytest.raises(vp.FileError, match="/proc/self/mem"):
+            vp.Trajectory.load("/proc/self/mem")
+
+    @pytest.mark.parametrize("content", [b"", b"hello", b"\x93NUMPY", os.urandom(1000)])
+    def test_no_npz(self, tmp_path, content):
+        path = tmp_path / "run.npz"
+        path.write_bytes(content)
+        with pytest.raises(vp.FileError, match="is not an npz file, or it is truncated"):
+            vp.Trajectory.load(path)
+
+    def test_npy_is_no_npz(self, tmp_path):
+        np.save(tmp_path / "run.npy", np.zeros(3))
+        with pytest.raises(vp.FileError, match="is not an npz file"):
+            vp.Trajectory.load(tmp_path / "run.npy")
+
+    @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.5, 0.9, 0.99, 0.999])
+    def test_truncated(self, saved, share):
+        whole = saved.read_bytes()
+        saved.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(vp.FileError, match=r"truncated"):
+            vp.Trajectory.load(saved)
+
+    def test_any_damaged_byte_is_an_error_or_harmless(self, trajectory, saved):
+        whole = saved.read_bytes()
+        rng = np.random.default_rng(0)
+        refused = 0
+        for place in rng.choice(len(whole), 400, replace=False):
+            damaged = bytearray(whole)
+            damaged[place] ^= 1 << int(rng.integers(8))
+            saved.write_bytes(damaged)
+            try:
+                loaded = vp.Trajectory.load(saved)
+            except vp.FileError:
+                refused += 1
+            else:
+                for name in NODES:
+                    assert np.array_equal(getattr(loaded, name), getattr(trajectory, name)), (place, name)
+        assert refused > 200
+
+    def test_other_zip(self, tmp_path):
+        path = tmp_path / "run.npz"
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("q.npy", "no array at all")
+        with pytest.raises(vp.FileError, match="is not a varpin trajectory: it has no"):
+            vp.Trajectory.load(path)
+
+    def test_foreign_npz(self, tmp_path):
+        np.savez(tmp_path / "run.npz", q=np.zeros((3, 2)), t=np.zeros(3))
+        with pytest.raises(vp.FileError, match=r"is not a varpin trajectory: it has no .*energy"):
+            vp.Trajectory.load(tmp_path / "run.npz")
+
+    @pytest.mark.parametrize("name", ["q", "format", "joint_names", "statistics.residual"])
+    def test_missing_member(self, saved, name):
+        with pytest.raises(vp.FileError, match=f"it has no {name}$"):
+            vp.Trajectory.load(tampered(saved, **{name: None}))
+
+    @pytest.mark.parametrize("name", ["q", "format", "joint_names"])
+    def test_pickles_are_not_opened(self, saved, name, tmp_path):
+        witness = tmp_path / "witness"
+
+        class Trap:
+            def __reduce__(self):
+                return (Path.touch, (witness,))
+
+        path = tampered(saved, **{name: np.array([Trap()], dtype=object)})
+        with pytest.raises(vp.FileError, match="unpickling"):
+            vp.Trajectory.load(path)
+        assert not witness.exists()
+        # The trap is live.
+        with np.load(path, allow_pickle=True) as archive:
+            archive[name]
+        assert witness.exists()
+
+    def test_a_bare_pickle_is_not_opened(self, tmp_path):
+        path = tmp_path / "run.npz"
+        path.write_bytes(pickle.dumps({"q": 1}))
+        with pytest.raises(vp.FileError, match="is not an npz file"):
+            vp.Trajectory.load(path)
+
+    @pytest.mark.parametrize("other", ["varpin.trajectory/2", "varpin.trajectory/0", "something"])
+    def test_another_format(self, saved, other):
+        with pytest.raises(vp.FileError, match=f"its format is {other}, not '{FORMAT}'"):
+            vp.Trajectory.load(tampered(saved, format=other))
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("q", np.zeros((21, 3))),
+            ("q", np.zeros((20, 2))),
+            ("q", np.zeros(21)),
+            ("v", np.zeros((21, 2, 1))),
+            ("u", np.zeros((21, 1))),
+            ("u", np.zeros(20)),
+            ("energy", np.zeros(20)),
+            ("t", np.zeros(20)),
+            ("t", np.zeros(())),
+            ("t", np.zeros(0)),
+            ("t", np.zeros((21, 1))),
+            ("dt", np.zeros(2)),
+            ("joint_names", np.array("joint1")),
+            ("joint_names", np.array(["joint1"])),
+            ("joint_names", np.array([["joint1", "joint2"]])),
+            ("statistics.substeps", np.zeros(21, dtype=int)),
+            ("robot", np.array(["a", "b"])),
+        ],
+    )
+    def test_shapes_that_do_not_fit(self, saved, name, value):
+        with pytest.raises(vp.FileError, match=r" has shape \("):
+            vp.Trajectory.load(tampered(saved, **{name: value}))
+
+    @pytest.mark.parametrize("name", ["t", "q", "v", "p", "u", "energy", "statistics.residual", "dt"])
+    @pytest.mark.parametrize("value", [np.nan, np.inf])
+    def test_values_that_are_not_finite(self, saved, name, value):
+        with np.load(saved) as archive:
+            array = archive[name].astype(float)
+        array[(-1,) * array.ndim] = value
+        with pytest.raises(vp.FileError, match=f"{name} holds values that are not finite numbers"):
+            vp.Trajectory.load(tampered(saved, **{name: array}))
+
+    @pytest.mark.parametrize("value", ["text", np.zeros((21, 2), dtype=complex), np.zeros((21, 2), dtype="M8[s]")])
+    def test_values_that_are_no_numbers(self, saved, value):
+        array = np.full((21, 2), value) if isinstance(value, str) else value
+        with pytest.raises(vp.FileError, match="q holds values that are not finite numbers"):
+            vp.Trajectory.load(tampered(saved, q=array))
+
+    @pytest.mark.parametrize("dt", [0.0, -0.01])
+    def test_a_time_step_that_is_not_positive(self, saved, dt):
+        with pytest.raises(vp.FileError, match="dt"):
+            vp.Trajectory.load(tampered(saved, dt=dt))
