@@ -231,7 +231,7 @@ def test_failed_step_keeps_what_was_before_it(arm, tmp_path, capsys, monkeypatch
     out, err = capsys.readouterr()
     (line,) = err.splitlines()
     assert line.startswith("varpin: error: step 7 (t = 0.007 s) cannot be trusted: the step is at a fold")
-    assert "The 7 steps before it are kept; a smaller dt may go further" in line
+    assert "What came before is kept; a smaller dt may go further" in line
     assert "7 of 20, 0.001 s each" in out
     assert vp.Trajectory.load(path).steps == 7
 

@@ -109,7 +109,10 @@ def _add_simulate(parser: argparse.ArgumentParser) -> None:
     )
     length.add_argument("--steps", type=int, metavar="N", help="the number of steps instead")
     parser.add_argument(
-        "--alpha", type=float, default=0.5, help="of the midpoint rule, in [0, 1]; default: %(default)g"
+        "--alpha",
+        type=float,
+        default=0.5,
+        help="of the midpoint rule, in [0, 1]; second order at 0.5, first elsewhere; default: %(default)g",
     )
     start = parser.add_argument_group("start")
     _add_vector(start, "q0", "initial configuration [rad or m]; default: 0")
@@ -117,12 +120,20 @@ def _add_simulate(parser: argparse.ArgumentParser) -> None:
     surroundings = parser.add_argument_group("surroundings")
     _add_gravity(surroundings)
     _add_vector(surroundings, "damping", "viscous damping [N m s/rad or N s/m]; default: 0")
-    _add_vector(surroundings, "stiffness", "joint springs, slack at 0 [N m/rad or N/m]; default: 0")
+    _add_vector(surroundings, "stiffness", "joint springs [N m/rad or N/m]; default: 0")
+    _add_vector(surroundings, "rest", "where the springs are slack [rad or m]; default: 0")
     _add_vector(surroundings, "torque", "constant generalized forces [N m or N]; default: 0")
     outputs = parser.add_argument_group("outputs")
     outputs.add_argument("--save", type=Path, metavar="NPZ", help="write the trajectory, for Trajectory.load")
     outputs.add_argument("--plot", type=Path, metavar="PNG", help="draw an overview, as png, pdf or svg")
     outputs.add_argument("--html", type=Path, metavar="HTML", help="write a replay that any browser opens")
+    outputs.add_argument(
+        "--speed",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="of the replay; 0.1 is ten times slower; default: true speed",
+    )
     outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
 
 
@@ -221,7 +232,7 @@ def _outputs(request: argparse.Namespace) -> list[_Output]:
     if request.plot is not None:
         outputs.append(_figure(writable(request.plot)))
     if request.html is not None:
-        outputs.append(_replay(writable(request.html)))
+        outputs.append(_replay(writable(request.html), positive("--speed", request.speed, "1")))
     paths = [output.path.resolve() for output in outputs]
     for path in paths:
         if paths.count(path) > 1:
@@ -249,9 +260,9 @@ def _figure(path: Path) -> _Output:
     return _Output(path, write)
 
 
-def _replay(path: Path) -> _Output:
+def _replay(path: Path, speed: float) -> _Output:
     def write(robot: Robot, trajectory: Trajectory) -> None:
-        replay(robot, trajectory, html=path)
+        replay(robot, trajectory, html=path, speed=speed)
 
     return _Output(path, write)
 
@@ -265,6 +276,7 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
         gravity=request.gravity,
         damping=_vector("damping", request.damping, robot),
         stiffness=_vector("stiffness", request.stiffness, robot),
+        rest=_vector("rest", request.rest, robot),
     )
     q0, v0, torque = (
         np.broadcast_to(_vector(name, getattr(request, name), robot), (robot.dof,)) for name in ("q0", "v0", "torque")
@@ -287,7 +299,7 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
         complaint = f"interrupted after {trajectory.steps} of {steps} steps, which are kept"
     except StepFailure as failure:
         trajectory, status = failure.trajectory, STEP_FAILED
-        complaint = str(failure).replace("are in error.trajectory", "are kept")
+        complaint = str(failure).replace("is in error.trajectory", "is kept")
     wall_time = time.perf_counter() - begin
 
     written = []
@@ -302,7 +314,7 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
     if not request.quiet:
         driven = bool(scene.damping.any() or torque.any())
         tables = Console() if sys.stdout.isatty() else Console(width=_WIDTH)
-        tables.print(_summary(trajectory, steps, wall_time, driven, written))
+        tables.print(_summary(robot, trajectory, steps, wall_time, driven, written))
     if status == INTERRUPTED:
         _say(errors, complaint)
     elif complaint:
@@ -324,7 +336,9 @@ def _steps(request: argparse.Namespace) -> int:
     return steps
 
 
-def _summary(trajectory: Trajectory, asked: int, wall_time: float, driven: bool, files: Iterable[Path]) -> Table:
+def _summary(
+    robot: Robot, trajectory: Trajectory, asked: int, wall_time: float, driven: bool, files: Iterable[Path]
+) -> Table:
     """What a run was, took and made."""
     table = _facts(f"{trajectory.robot}: {trajectory.integrator}")
     statistics, steps = trajectory.statistics, trajectory.steps
@@ -349,6 +363,11 @@ def _summary(trajectory: Trajectory, asked: int, wall_time: float, driven: bool,
     kinetic = 0.5 * (trajectory.p * trajectory.v).sum(axis=1).max()
     share = f", {drift / kinetic:.2g} of the largest kinetic energy" if kinetic > 0.0 else ""
     _row(table, "energy change" if driven else "energy error", f"{drift:.3g} J at most{share}")
+    lower, upper = robot.position_limits
+    outside = np.any((trajectory.q < lower) | (trajectory.q > upper), axis=0)
+    if outside.any():
+        joints = ", ".join(name for name, out in zip(robot.joint_names, outside, strict=True) if out)
+        _row(table, "beyond their limits", f"{joints} (limits are not modelled)")
     names = "q at the end [rad or m]", "v at the end [rad/s or m/s]"
     for name, values in zip(names, (trajectory.q[-1], trajectory.v[-1]), strict=True):
         _row(table, name, "  ".join(f"{value:.6g}" for value in values))
@@ -459,7 +478,9 @@ def _report_table(report: RobotReport) -> Table:
     step = "undefined: the mass matrix is singular"
     if report.largest_step is not None:
         step = (
-            "any: no direction is unstable here" if math.isinf(report.largest_step) else f"{report.largest_step:.3g} s"
+            "any: no direction is unstable here"
+            if math.isinf(report.largest_step)
+            else f"{report.largest_step:.3g} s at this q"
         )
     _row(table, "largest step accepted", f"{step} (branch margin {report.branch_margin:g}; says nothing of accuracy)")
     return table

@@ -6,6 +6,9 @@ import difflib
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 if TYPE_CHECKING:
     from varpin.integrators.base import Failure
     from varpin.trajectory import Trajectory
@@ -30,7 +33,7 @@ class RobotNotFound(RobotError):
     def __init__(self, name: str, known: Iterable[str], note: str = "") -> None:
         self.name = name
         known = sorted(known)
-        self.matches = difflib.get_close_matches(name, known, n=5, cutoff=0.5)
+        self.matches = difflib.get_close_matches(name.lower(), known, n=5, cutoff=0.5)
         hint = f"close matches: {', '.join(self.matches)}" if self.matches else f"known names: {', '.join(known)}"
         super().__init__(f"no robot or URDF file {name!r}{note}; {hint}")
 
@@ -107,7 +110,7 @@ class ControlError(VarpinError, ValueError):
         self.step = step
         self.time = time
         self.trajectory = trajectory
-        super().__init__(f"step {step} (t = {time:.6g} s): {problem}; the steps before it are in error.trajectory")
+        super().__init__(f"step {step} (t = {time:.6g} s): {problem}; what came before is in error.trajectory")
 
 
 class StepFailure(VarpinError, RuntimeError):
@@ -133,6 +136,11 @@ class StepFailure(VarpinError, RuntimeError):
         self.trajectory = trajectory
         super().__init__(
             f"step {step} (t = {time:.6g} s) cannot be trusted: {failure.reason}; last residual {failure.residual:.3g} "
-            f"rounding units, at q = {self.q}, v = {self.v}. The {step} steps before it are in error.trajectory; "
+            f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}. What came before is in error.trajectory; "
             "a smaller dt may go further"
         )
+
+
+def _row(values: NDArray[np.float64]) -> str:
+    """A vector on one line, whatever its length."""
+    return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"

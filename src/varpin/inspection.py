@@ -204,7 +204,9 @@ def _largest_step(M: Floats, Lqq: Floats, margin: float) -> float:
     """The h at which M - h^2 / (4 (1 - margin)) L_qq ceases to be positive definite [s]."""
     n = len(M)
     fastest = eigh(Lqq, M, eigvals_only=True, subset_by_index=[n - 1, n - 1])[0]
-    return 2.0 * float(np.sqrt((1.0 - margin) / fastest)) if fastest > 0.0 else np.inf
+    # Of a direction without curvature rounding leaves a tiny one, of either sign.
+    rounding = 1e-12 * float(np.abs(eigh(Lqq, M, eigvals_only=True)).max())
+    return 2.0 * float(np.sqrt((1.0 - margin) / fastest)) if fastest > rounding else np.inf
 
 
 def _joints(robot: Robot) -> tuple[JointReport, ...]:

@@ -83,6 +83,11 @@ class Scene:
                 value.setflags(write=False)
             object.__setattr__(self, name, value)
 
+    def __repr__(self) -> str:
+        parts = [f"gravity {self.gravity.tolist()}" if self.gravity.any() else "no gravity"]
+        parts += [name for name in ("damping", "stiffness") if getattr(self, name).any()]
+        return f"Scene({self.robot.name}: {', '.join(parts)}, {self.controls} controls)"
+
     @property
     def controls(self) -> int:
         """m, the number of controls."""

@@ -193,7 +193,7 @@ def _sample(law: ControlLaw, sampling: str, integrator: Integrator, state: Any, 
     try:
         value = law(time, q, v)
     except Exception as error:
-        raise ControlError(k, time, f"raised {error!r}", record.trajectory()) from error
+        raise ControlError(k, time, f"controls(t, q, v) raised {error!r}", record.trajectory()) from error
     try:
         return finite_array("controls(t, q, v)", value, (record.scene.controls,))[None]
     except InputError as error:

@@ -46,6 +46,15 @@ class StepStatistics:
     residual: Floats
     branch_margin: Floats
 
+    def __repr__(self) -> str:
+        if not len(self.substeps):
+            return "StepStatistics(no steps)"
+        return (
+            f"StepStatistics({len(self.substeps)} steps: {self.newton_iterations.mean():.2f} Newton iterations a step, "
+            f"{self.split_steps} split, worst residual {self.residual.max():.3g}, "
+            f"smallest branch margin {self.branch_margin.min():.3g})"
+        )
+
     @property
     def split_steps(self) -> int:
         """How many steps were taken in more than one part."""

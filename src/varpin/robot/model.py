@@ -53,6 +53,10 @@ class Robot:
     package_dirs: tuple[str, ...] = field(default=(), repr=False)
     visuals: pin.GeometryModel | None = field(default=None, repr=False)
 
+    def __repr__(self) -> str:
+        held = f", {len(self.locked)} locked" if self.locked else ""
+        return f"Robot({self.name}: {', '.join(self.joint_names)}{held})"
+
     @property
     def dof(self) -> int:
         """n, the number of generalized coordinates."""
