@@ -341,3 +341,69 @@ def test_velocity_and_energy_at_nodes_are_those_of_the_momentum():
         jet = vp.lagrangian_jet(scene, motion.q[k], motion.v[k], backend="pinocchio")
         np.testing.assert_allclose(jet.Lv, motion.p[k], rtol=1e-11, atol=1e-13)
         assert jet.Lv @ motion.v[k] - jet.L == pytest.approx(motion.energy[k], rel=1e-12)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.25, 0.45, 0.75, 1.0])
+@pytest.mark.parametrize("dt", [0.01, 0.05, 0.2])
+def test_no_silent_energy_jump_off_the_middle(alpha, dt):
+    scene = vp.Scene(vp.planar_chain(3))
+    motion = vp.simulate(
+        scene, np.zeros(3), np.zeros(3), dt=dt, steps=int(100 / dt), integrator=vp.Midpoint(alpha=alpha)
+    )
+    assert np.abs(motion.energy - motion.energy[0]).max() < 0.2 * GRAVITY * 9 / 2
+
+
+def test_a_heavy_part_does_not_hide_a_light_one():
+    """A slider of 1000 kg falls beside three links of 1 kg: the links' own energy is kept as if they were alone."""
+    chain = vp.planar_chain(3)
+    model = chain.free_model.copy()
+    joint = model.addJoint(0, pin.JointModelPZ(), pin.SE3.Identity(), "slide")
+    model.appendBodyToJoint(joint, pin.Inertia.FromSphere(1000.0, 0.1), pin.SE3.Identity())
+    both = vp.Scene(vp.load_robot(model))
+    assert both.robot.joint_names[-1] == "slide"
+    motion = vp.simulate(both, np.zeros(4), np.zeros(4), dt=0.1, steps=200)
+    alone = vp.Scene(chain)
+    jets = [vp.lagrangian_jet(alone, q[:3], v[:3]) for q, v in zip(motion.q, motion.v, strict=True)]
+    energy = np.array([jet.Lv @ v[:3] - jet.L for jet, v in zip(jets, motion.v, strict=True)])
+    assert np.abs(energy - energy[0]).max() < 0.05 * GRAVITY * 9 / 2
+
+
+@pytest.mark.parametrize("dt", [0.05, 0.2])
+def test_a_constant_torque_is_guarded_like_a_potential(dt):
+    """The same physics twice: springs slack at 1.5 rad, and springs slack at 0 and a torque."""
+    chain, start = vp.planar_chain(3), (np.zeros(3), np.zeros(3))
+    steps = int(200 / dt)
+    spring = vp.simulate(vp.Scene(chain, stiffness=20.0, rest=1.5), *start, dt=dt, steps=steps)
+    torque = vp.simulate(vp.Scene(chain, stiffness=20.0), *start, dt=dt, steps=steps, controls=np.full(3, 30.0))
+    for energy in (spring.energy, torque.energy - 30.0 * torque.q.sum(axis=1)):
+        assert np.abs(energy - energy[0]).max() < 0.1 * GRAVITY * 9 / 2
+    errors = np.abs(torque.energy - 30.0 * torque.q.sum(axis=1) - torque.energy[0])
+    np.testing.assert_allclose(torque.statistics.energy_defect, errors[1:], rtol=0, atol=1e-9)
+
+
+def test_dampers_faster_than_the_step_are_reported(caplog):
+    with caplog.at_level(logging.WARNING, logger="varpin"):
+        motion = vp.simulate(vp.Scene(vp.planar_chain(1), damping=100.0), [0.0], [1.0], dt=0.1, steps=5)
+    assert "damping is faster than the step" in caplog.text
+    assert (np.diff(np.sign(motion.v[:, 0])) != 0).all()
+    caplog.clear()
+    vp.simulate(vp.Scene(vp.planar_chain(1), damping=1.0), [0.0], [1.0], dt=0.1, steps=5)
+    assert not caplog.text
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ({"alpha": 1.5}, r"alpha must be in \[0, 1\], got 1.5"),
+        ({"tolerance": 0.0}, r"tolerance must be positive and finite \[rounding units\], got 0.0"),
+        ({"branch_margin": 1.0}, r"branch_margin must be in \[0, 1\), got 1"),
+        ({"energy_balance": -1.0}, r"energy_balance must be positive and finite \[1\], got -1.0"),
+        ({"energy_budget": np.nan}, r"energy_budget must be positive and finite \[1\], got nan"),
+        ({"max_halvings": 31}, "max_halvings must be at most 30, got 31"),
+        ({"max_halvings": 1.5}, "max_halvings must be an integer, got 1.5"),
+        ({"kick": "right"}, "kick must be 'left' or 'split', got 'right'"),
+    ],
+)
+def test_options_out_of_range(option, words):
+    with pytest.raises(vp.InputError, match=words):
+        vp.Midpoint(**option)

@@ -285,3 +285,32 @@ class TestLoading:
     def test_a_time_step_that_is_not_positive(self, saved, dt):
         with pytest.raises(vp.FileError, match="dt"):
             vp.Trajectory.load(tampered(saved, dt=dt))
+
+
+def test_robots_with_joints_of_the_same_names_are_told_apart(tmp_path):
+    """The UR arms share their joint names; their links weigh differently."""
+    small = vp.load_robot("ur5")
+    path = vp.simulate(vp.Scene(small), np.zeros(6), np.zeros(6), dt=1e-3, steps=3).save(tmp_path / "a.npz")
+    assert vp.Trajectory.load(path, small).steps == 3
+    with pytest.raises(
+        vp.FileError, match=r"is of robot ur5, whose links weigh .* kg in all; 'ur10' has joints of the"
+    ):
+        vp.Trajectory.load(path, vp.load_robot("ur10"))
+
+
+def test_times_that_are_not_dt_apart(tmp_path):
+    path = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.0], [0.0], dt=1e-3, steps=3).save(tmp_path / "a.npz")
+    members = dict(np.load(path))
+    np.savez(path, **{**members, "t": members["t"][::-1]})
+    with pytest.raises(vp.FileError, match=r"its times t are not dt = 0\.001 s apart"):
+        vp.Trajectory.load(path)
+
+
+@pytest.mark.parametrize("path", [3, None, "a\0b", b"a"])
+def test_what_is_no_path(path):
+    motion = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.0], [0.0], dt=1e-3, steps=1)
+    for call in (motion.save, vp.Trajectory.load):
+        with pytest.raises(vp.InputError, match="path must be a path, got"):
+            call(path)
+    with pytest.raises(vp.InputError, match="robot must come from load_robot, got str"):
+        vp.Trajectory.load("a.npz", "finger")

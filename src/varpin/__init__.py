@@ -11,9 +11,13 @@ Load an arm, integrate it variationally, replay it:
 """
 
 from varpin._version import __version__ as __version__
+from varpin.ensemble import Ensemble as Ensemble
+from varpin.ensemble import EnsembleInterrupted as EnsembleInterrupted
+from varpin.ensemble import simulate_ensemble as simulate_ensemble
 from varpin.errors import ControlError as ControlError
 from varpin.errors import FileError as FileError
 from varpin.errors import InputError as InputError
+from varpin.errors import LinearizationError as LinearizationError
 from varpin.errors import RobotError as RobotError
 from varpin.errors import RobotNotFound as RobotNotFound
 from varpin.errors import SingularMassMatrix as SingularMassMatrix
@@ -28,6 +32,15 @@ from varpin.lagrangian import DiscreteLagrangian as DiscreteLagrangian
 from varpin.lagrangian import LagrangianJet as LagrangianJet
 from varpin.lagrangian import discrete_lagrangian as discrete_lagrangian
 from varpin.lagrangian import lagrangian_jet as lagrangian_jet
+from varpin.linearization import Linearization as Linearization
+from varpin.linearization import Moments as Moments
+from varpin.linearization import linearize as linearize
+from varpin.linearization import propagate_moments as propagate_moments
+from varpin.noise import AdditiveNoise as AdditiveNoise
+from varpin.noise import ControlNoise as ControlNoise
+from varpin.noise import CustomNoise as CustomNoise
+from varpin.noise import StateNoise as StateNoise
+from varpin.policy import LinearPolicy as LinearPolicy
 from varpin.replay import replay as replay
 from varpin.robot import Robot as Robot
 from varpin.robot import load_robot as load_robot

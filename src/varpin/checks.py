@@ -111,13 +111,25 @@ def count(name: str, value: Any, least: int = 0) -> int:
     return int(value)
 
 
+def path_like(name: str, path: Any) -> Path:
+    """``path`` as a Path, its ~ expanded.
+
+    Raises:
+        InputError: Not a path.
+    """
+    if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
+        raise InputError(f"{name} must be a path, got {path!r}")
+    return Path(path).expanduser()
+
+
 def writable(path: str | os.PathLike[str]) -> Path:
     """``path`` with links followed, if a file can be written there: said before the work, not after it.
 
     Raises:
         FileError: Naming the folder that is missing or cannot be written.
+        InputError: Not a path.
     """
-    target = Path(path).expanduser().resolve()
+    target = path_like("path", path).resolve()
     if target.is_dir():
         raise FileError(f"cannot write {target}: it is a folder")
     if target.exists() and not target.is_file():

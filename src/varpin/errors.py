@@ -144,3 +144,19 @@ class StepFailure(VarpinError, RuntimeError):
 def _row(values: NDArray[np.float64]) -> str:
     """A vector on one line, whatever its length."""
     return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"
+
+
+class LinearizationError(VarpinError, RuntimeError):
+    """A step of a trajectory has no solution at zero noise, so it has no derivative.
+
+    Attributes:
+        step: Index of the step.
+        time: Its start [s].
+        reason: What stopped the solver.
+    """
+
+    def __init__(self, step: int, time: float, reason: str) -> None:
+        self.step = step
+        self.time = time
+        self.reason = reason
+        super().__init__(f"step {step} (t = {time:.6g} s) cannot be linearized: {reason}; a smaller dt may help")

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, broadcast_array, finite_array
 from varpin.errors import InputError
-from varpin.kernels.tree import Mechanism
+from varpin.kernels.tree import Diffusion, Mechanism
+from varpin.noise import BoundNoise, Noise, bind
 from varpin.robot import Robot
 
 Floats = NDArray[np.float64]
@@ -30,6 +32,7 @@ class Scene:
         stiffness: Joint springs (n,) [N m/rad or N/m]; they are part of the potential energy.
         rest: Configuration (n,) at which the springs are slack [rad or m].
         actuation: Matrix (n, m) from controls to generalized forces [N m or N per unit of control].
+        noise: The diffusion fields of the noise models, if any.
     """
 
     robot: Robot
@@ -38,6 +41,7 @@ class Scene:
     stiffness: Floats
     rest: Floats
     actuation: Floats = field(repr=False)
+    noise: BoundNoise = field(repr=False)
 
     def __init__(
         self,
@@ -48,6 +52,7 @@ class Scene:
         stiffness: ArrayLike = 0.0,
         rest: ArrayLike = 0.0,
         actuation: ArrayLike | Sequence[str] | None = None,
+        noise: Noise | Sequence[Noise] | None = None,
     ) -> None:
         """Describe a scene.
 
@@ -60,6 +65,7 @@ class Scene:
         Other Args:
             rest: One number or (n,) [rad or m].
             actuation: A matrix (n, m); or the names of the m actuated joints; every joint if left out.
+            noise: A noise model, several of them, or their sum; see :mod:`varpin.noise`.
 
         Raises:
             InputError: A wrong shape, a value that is not finite, negative damping or stiffness.
@@ -70,14 +76,15 @@ class Scene:
         n = robot.dof
         if isinstance(gravity, bool | np.bool_):
             gravity = EARTH if gravity else (0.0, 0.0, 0.0)
-        values = {
+        values: dict[str, Any] = {
             "robot": robot,
             "gravity": finite_array("gravity", gravity, (3,)),
             "damping": _not_negative("damping", broadcast_array("damping", damping, n)),
             "stiffness": _not_negative("stiffness", broadcast_array("stiffness", stiffness, n)),
             "rest": broadcast_array("rest", rest, n),
-            "actuation": _actuation(robot, actuation),
         }
+        values["actuation"] = _actuation(robot, actuation)
+        values["noise"] = bind(noise, values["actuation"])
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
@@ -93,9 +100,16 @@ class Scene:
         """m, the number of controls."""
         return int(self.actuation.shape[1])
 
+    @property
+    def processes(self) -> int:
+        """k, the number of Wiener processes."""
+        return self.noise.processes
+
     @cached_property
     def mechanism(self) -> Mechanism:
-        """The scene as flat arrays for the kernels."""
+        """The scene as flat arrays for the kernels; without fields that only Python can evaluate."""
+        n, m = self.actuation.shape
+        nothing = Diffusion(np.zeros((n, 0)), np.zeros((n, 0, m)), np.zeros((n, 0)), np.zeros((n, 0)))
         return Mechanism(
             tree=self.robot.tree,
             gravity=self.gravity,
@@ -103,6 +117,7 @@ class Scene:
             stiffness=self.stiffness,
             rest=self.rest,
             actuation=self.actuation,
+            diffusion=self.noise.diffusion or nothing,
         )
 
 

@@ -13,9 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import as_floats, count, finite_array, positive, require_finite
 from varpin.errors import ControlError, InputError, StepFailure
 from varpin.integrators import Integrator, Midpoint, Segment
+from varpin.integrators.base import open_loop
 from varpin.kernels._compile import announced_compilation
+from varpin.kernels.tree import Commands
+from varpin.lagrangian import lagrangian_jet
+from varpin.policy import LinearPolicy
 from varpin.scene import Scene, require_scene
 from varpin.trajectory import StepStatistics, Trajectory
+from varpin.wiener import wiener_increments
 
 Floats = NDArray[np.float64]
 ControlLaw = Callable[[float, Floats, Floats], ArrayLike]
@@ -42,9 +47,10 @@ class Interrupted(KeyboardInterrupt):
 class _Record:
     """Nodes, controls and statistics of the steps done so far; a trajectory can be made of it at any time."""
 
-    def __init__(self, scene: Scene, integrator: Integrator, dt: float, steps: int, first: Segment) -> None:
+    def __init__(self, scene: Scene, integrator: Integrator, dt: float, steps: int, dw: Floats, first: Segment) -> None:
         self.scene, self.integrator, self.dt = scene, integrator, dt
         self.steps = 0
+        self.dw = dw if len(dw) else np.zeros((steps, scene.processes))
         n = scene.robot.dof
         self.nodes = {name: np.empty((steps + 1, n)) for name in ("q", "v", "p")} | {"energy": np.empty(steps + 1)}
         self.u = np.empty((steps, scene.controls))
@@ -55,13 +61,13 @@ class _Record:
         for name, array in self.nodes.items():
             array[0] = getattr(first, name)[0]
 
-    def add(self, segment: Segment, controls: Floats) -> None:
+    def add(self, segment: Segment) -> None:
         now = slice(self.steps, self.steps + len(segment.q))
         for name, array in self.nodes.items():
             array[now.start + 1 : now.stop + 1] = getattr(segment, name)
         for name, array in self.statistics.items():
             array[now] = getattr(segment.statistics, name)
-        self.u[now] = controls[: len(segment.q)]
+        self.u[now] = segment.u
         self.steps = now.stop
 
     def trajectory(self) -> Trajectory:
@@ -72,7 +78,9 @@ class _Record:
             v=nodes["v"],
             p=nodes["p"],
             u=self.u[: self.steps],
+            dw=self.dw[: self.steps],
             energy=nodes["energy"],
+            masses=self.scene.robot.tree.mass.copy(),
             dt=self.dt,
             integrator=str(self.integrator),
             robot=self.scene.robot.name,
@@ -88,8 +96,10 @@ def simulate(
     *,
     dt: float,
     steps: int,
-    controls: ArrayLike | ControlLaw | None = None,
+    controls: ArrayLike | ControlLaw | LinearPolicy | None = None,
     integrator: Integrator | None = None,
+    rng: np.random.Generator | int | None = None,
+    increments: ArrayLike | None = None,
     sampling: Literal["midpoint", "start"] = "midpoint",
     progress: Progress | None = None,
 ) -> Trajectory:
@@ -101,11 +111,14 @@ def simulate(
         v0: Initial velocity (n,) [rad/s or m/s].
         dt: Time step [s].
         steps: N, their number.
-        controls: None for none; an array (N, m), one row a step; one row (m,) for all steps; or a function of
-            (t [s], q (n,), v (n,)) that returns (m,). Controls are constant over each step.
+        controls: None for none; an array (N, m), one row a step; one row (m,) for all steps; a
+            :class:`varpin.LinearPolicy`; or a function of (t [s], q (n,), v (n,)) that returns (m,).
+            Controls are constant over each step.
         integrator: :class:`Midpoint` with alpha = 1/2 if left out.
 
     Other Args:
+        rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero.
+        increments: The increments themselves, (N, k) [s^0.5], to replay or refine a path; see :mod:`varpin.wiener`.
         sampling: Where a control function is evaluated, once a step. ``"midpoint"``: at the step's midpoint, at the
             state expected there, which keeps second order. ``"start"``: at the node where the step begins, as a
             digital controller with a zero-order hold would, at the price of first order.
@@ -131,19 +144,22 @@ def simulate(
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
     law = controls if callable(controls) else None
     _require_memory(scene, steps)
-    rows = np.empty((0, 0)) if callable(controls) else control_rows(scene, controls, steps)
+    commands = commands_of(scene, None if callable(controls) else controls, 0 if callable(controls) else steps)
+    dw = wiener_increments(scene.processes, dt, steps, rng, increments)
+    _warn_of_ringing(scene, q0, dt)
     with announced_compilation():
-        state, first = integrator.start(scene, q0, v0)
-        record = _Record(scene, integrator, dt, steps, first)
+        state, (first,) = integrator.start(scene, q0[None], v0[None])
+        record = _Record(scene, integrator, dt, steps, dw, first)
         chunk = max(1, _CHUNK // n)
         try:
             while record.steps < steps:
                 if law is not None:
-                    block = _sample(law, sampling, integrator, state, record)
+                    block = open_loop(_sample(law, sampling, integrator, state, record))
                 else:
-                    block = rows[record.steps : record.steps + chunk]
-                segment = integrator.rollout(scene, state, block, dt)
-                record.add(segment, block)
+                    block = Commands(*(array[record.steps : record.steps + chunk] for array in commands))
+                drawn = dw[None, record.steps : record.steps + len(block.u)] if len(dw) else dw[None, :0][:0]
+                (segment,) = integrator.rollout(scene, state, block, drawn, dt)
+                record.add(segment)
                 if segment.failure is not None:
                     node = record.trajectory()
                     raise StepFailure(node.steps, node.t[-1], segment.failure, node)
@@ -166,6 +182,28 @@ def _require_memory(scene: Scene, steps: int) -> None:
         np.empty((steps + 1, columns))
     except (MemoryError, ValueError, OverflowError):
         raise InputError(f"steps = {steps} needs more memory than there is: {columns * 8} bytes a step") from None
+
+
+def _warn_of_ringing(scene: Scene, q0: Floats, dt: float) -> None:
+    """Say that dampers are too fast for the step: the midpoint rule keeps stable, but turns velocities round."""
+    if not scene.damping.any():
+        return
+    rate = np.linalg.solve(lagrangian_jet(scene, q0, np.zeros_like(q0)).Lvv, np.diag(scene.damping))
+    fastest = float(np.abs(np.linalg.eigvals(rate)).max())
+    if 0.5 * dt * fastest > 1.0:
+        logger.warning(
+            "damping is faster than the step (dt * %.3g/s > 2): velocities that it should stop will ring; "
+            "dt below %.3g s resolves it",
+            fastest,
+            2.0 / fastest,
+        )
+
+
+def commands_of(scene: Scene, controls: ArrayLike | LinearPolicy | None, steps: int) -> Commands:
+    """Controls of ``steps`` steps as kernels take them: None, (steps, m), (m,) or a policy."""
+    if isinstance(controls, LinearPolicy):
+        return controls.commands(steps, scene.controls, scene.robot.dof)
+    return open_loop(control_rows(scene, controls, steps))
 
 
 def control_rows(scene: Scene, controls: ArrayLike | None, steps: int) -> Floats:

@@ -15,14 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin._version import __version__
-from varpin.checks import writable
-from varpin.errors import FileError
+from varpin.checks import path_like, writable
+from varpin.errors import FileError, InputError
 from varpin.robot import Robot
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 FORMAT = "varpin.trajectory/1"
+
+_ARRAYS = ("t", "q", "v", "p", "u", "dw", "energy", "masses")
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +38,8 @@ class StepStatistics:
         substeps: Parts the step was taken in (N,); more than 1 where a guard refused the whole step, and there the
             map is not the integrator's own.
         residual: Residual of the step equation (N,), in units of the rounding error of its terms.
+        energy_defect: Errors of the energy balances so far (N,) [J], added up over the mechanically independent groups
+            of joints: what the energy is off by, of what no force accounts for.
         branch_margin: Distance from the fold of the step equation's solutions (N,): 1 as dt -> 0, refused at 0.
     """
 
@@ -45,6 +49,7 @@ class StepStatistics:
     substeps: Integers
     residual: Floats
     branch_margin: Floats
+    energy_defect: Floats
 
     def __repr__(self) -> str:
         if not len(self.substeps):
@@ -71,7 +76,9 @@ class Trajectory:
         v: Velocities (N + 1, n) [rad/s or m/s]; M(q)^-1 p for variational integrators.
         p: Momenta (N + 1, n) [N m s or N s].
         u: Controls (N, m), constant over each step.
+        dw: Wiener increments (N, k) [s^0.5]; zeros where no noise was drawn.
         energy: Kinetic and potential energy together (N + 1,) [J]; springs included.
+        masses: Of the robot's bodies (b,) [kg]; they tell robots apart whose joints have the same names.
         dt: Time step [s].
         integrator: What made it, as text.
         robot: The robot's name.
@@ -85,7 +92,9 @@ class Trajectory:
     v: Floats
     p: Floats
     u: Floats
+    dw: Floats
     energy: Floats
+    masses: Floats
     dt: float
     integrator: str
     robot: str
@@ -126,18 +135,12 @@ class Trajectory:
         Raises:
             FileError: The path cannot be written.
         """
-        arrays = {name: getattr(self, name) for name in ("t", "q", "v", "p", "u", "energy")}
-        arrays |= {f"statistics.{item.name}": getattr(self.statistics, item.name) for item in fields(StepStatistics)}
-        text = {"format": FORMAT, "version": self.version, "integrator": self.integrator, "robot": self.robot}
+        members: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
+        members |= {f"statistics.{item.name}": getattr(self.statistics, item.name) for item in fields(StepStatistics)}
+        members |= {"format": FORMAT, "version": self.version, "integrator": self.integrator, "robot": self.robot}
+        members |= {"dt": self.dt, "joint_names": np.array(self.joint_names, dtype=str)}
         with atomic_file(path) as stream:
-            np.savez_compressed(
-                stream,
-                allow_pickle=False,
-                **arrays,
-                **text,
-                dt=self.dt,
-                joint_names=np.array(self.joint_names, dtype=str),
-            )
+            np.savez_compressed(stream, **members)
         return Path(path)
 
     @classmethod
@@ -152,7 +155,9 @@ class Trajectory:
             FileError: The file is missing, truncated, no npz, written by something else, holds pickled objects,
                 arrays that do not fit together or are not finite, or is of another robot.
         """
-        source = Path(path).expanduser()
+        source = path_like("path", path)
+        if robot is not None and not isinstance(robot, Robot):
+            raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
         members = _read_members(source)
         found = members["format"]
         if found.shape != () or str(found) != FORMAT:
@@ -161,7 +166,7 @@ class Trajectory:
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys("qvp", (steps + 1, n)) | dict.fromkeys(
             ("t", "energy"), (steps + 1,)
         )
-        shapes |= {"u": (steps, -1), "dt": (), "joint_names": (-1,)}
+        shapes |= {"masses": (-1,), "u": (steps, -1), "dw": (steps, -1), "dt": (), "joint_names": (-1,)}
         shapes |= {f"statistics.{item.name}": (steps,) for item in fields(StepStatistics)}
         shapes |= dict.fromkeys(("version", "integrator", "robot"), ())
         for name, shape in shapes.items():
@@ -174,15 +179,26 @@ class Trajectory:
                 raise FileError(f"{source}: {name} holds values that are not finite numbers")
         if steps < 0 or not members["dt"] > 0.0:
             raise FileError(f"{source}: it has {steps + 1} nodes and dt = {members['dt']} s")
+        expected = members["t"][0] + np.arange(steps + 1) * members["dt"]
+        if not np.allclose(members["t"], expected, rtol=1e-9, atol=1e-9 * float(members["dt"])):
+            raise FileError(f"{source}: its times t are not dt = {members['dt']} s apart")
         names = tuple(str(name) for name in members["joint_names"])
         if robot is not None and names != robot.joint_names:
             raise FileError(
                 f"{source} is of robot {members['robot']!s} with joints {', '.join(names)}; "
                 f"{robot.name!r} has joints {', '.join(robot.joint_names)}"
             )
+        masses = members["masses"]
+        if robot is not None and (
+            masses.shape != robot.tree.mass.shape or not np.allclose(masses, robot.tree.mass, rtol=1e-6)
+        ):
+            raise FileError(
+                f"{source} is of robot {members['robot']!s}, whose links weigh {masses.sum():.6g} kg in all; "
+                f"{robot.name!r} has joints of the same names, but its links weigh {robot.tree.mass.sum():.6g} kg"
+            )
         statistics = StepStatistics(**{x.name: members[f"statistics.{x.name}"] for x in fields(StepStatistics)})
         return cls(
-            **{name: members[name] for name in ("t", "q", "v", "p", "u", "energy")},
+            **{name: members[name] for name in _ARRAYS},
             dt=float(members["dt"]),
             integrator=str(members["integrator"]),
             robot=str(members["robot"]),
@@ -194,7 +210,7 @@ class Trajectory:
 
 def _read_members(source: Path) -> dict[str, NDArray[Any]]:
     """All arrays of an npz file, or a FileError that says what is wrong with it."""
-    expected = {"t", "q", "v", "p", "u", "energy", "dt", "format", "version", "integrator", "robot", "joint_names"}
+    expected = {*_ARRAYS, "dt", "format", "version", "integrator", "robot", "joint_names"}
     expected |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
     if source.is_dir():
         raise FileError(f"{source} is a folder, not a trajectory")

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.kernels.tree import Commands, Nodes
+from varpin.lagrangian import lagrangian_jet
 from varpin.scene import Scene
-from varpin.trajectory import StepStatistics
+from varpin.trajectory import StepStatistics, Trajectory
 
 Floats = NDArray[np.float64]
 
@@ -36,6 +39,7 @@ class Segment:
         q: Configurations (k, n) [rad or m].
         p: Momenta (k, n).
         v: Velocities (k, n) [rad/s or m/s].
+        u: Controls applied (k, m).
         energy: (k,) [J].
         statistics: Of the k steps.
         failure: Why the step after them failed, or None.
@@ -44,6 +48,7 @@ class Segment:
     q: Floats
     p: Floats
     v: Floats
+    u: Floats
     energy: Floats
     statistics: StepStatistics
     failure: Failure | None = None
@@ -57,23 +62,110 @@ class Integrator(ABC):
     1. ``start``, which makes the state of a rollout at (q0, v0) and returns it with the first node;
     2. ``rollout``, which moves a state through one step for each row of controls;
     3. ``predict``, the state to expect half a step ahead, to second order, at which feedback is evaluated;
-    4. ``variational``, which says whether it maps (q, p) or (q, v).
+    4. ``linearize``, the derivatives of its steps;
+    5. ``variational``, which says whether it maps (q, p) or (q, v).
     """
 
     variational: bool
 
+    @property
+    def left(self) -> float:
+        """The part of a step's kick that comes before the step; the rest comes after it."""
+        return 1.0
+
     @abstractmethod
-    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Any, Segment]:
-        """The state of a rollout at (q0, v0), each (n,), and a segment of that one node.
+    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Any, list[Segment]]:
+        """The state of a rollout of P paths at (q0, v0), each (P, n), and a segment of the first node of each.
 
         Raises:
             SingularMassMatrix: M(q0) is not positive definite.
         """
 
     @abstractmethod
-    def rollout(self, scene: Scene, state: Any, controls: Floats, dt: float) -> Segment:
-        """One step of length ``dt`` [s] from ``state`` for each row of ``controls`` (k, m); ``state`` moves along."""
+    def rollout(self, scene: Scene, state: Any, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
+        """One step of length ``dt`` [s] from ``state`` for each row of the commands; ``state`` moves along.
+
+        ``increments`` are those of the Wiener processes (P, N, k) [s^0.5], or (0, 0, k) for none. Returns a segment for
+        each path.
+        """
+
+    @abstractmethod
+    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
+        """Derivatives of each step at dw = 0: in the state (N, 2n, 2n), and in a constant force (N, 2n, n).
+
+        Raises:
+            LinearizationError: A step has no solution at dw = 0.
+        """
 
     @abstractmethod
     def predict(self, state: Any, dt: float) -> tuple[Floats, Floats]:
         """Q (n,) and v (n,) expected in the middle of the next step."""
+
+
+def join(segments: Sequence[Segment]) -> Segment:
+    """Segments that follow each other as one."""
+    statistics = StepStatistics(
+        **{
+            item.name: np.concatenate([getattr(s.statistics, item.name) for s in segments])
+            for item in fields(StepStatistics)
+        }
+    )
+    nodes = {name: np.concatenate([getattr(s, name) for s in segments]) for name in ("q", "p", "v", "u", "energy")}
+    return Segment(**nodes, statistics=statistics, failure=segments[-1].failure)
+
+
+def diffusion_and_drift(scene: Scene, q: Floats, v: Floats, u: Floats, start: Floats) -> tuple[Floats, Floats]:
+    """Diffusion fields F (n, k) at one state, and the drift (n,) that takes them from Stratonovich to Ito.
+
+    The drift is (1/2) sum_i (dF_i/dv) M^-1 F_i [N m or N]: it vanishes where no field depends on the velocity.
+    """
+    own = scene.noise.fields(q[None], v[None], u[None], start)
+    F = own.F[0]
+    if own.Fv is None:
+        return F, np.zeros_like(q)
+    M = lagrangian_jet(scene, q, v).Lvv
+    return F, 0.5 * np.einsum("ikj,jk->i", own.Fv[0], np.linalg.solve(M, F))
+
+
+def drifts(scene: Scene, trajectory: Trajectory) -> Floats:
+    """The drift of :func:`diffusion_and_drift` at the start of every step (N, n)."""
+    if not scene.noise.velocity_dependent:
+        return np.zeros((trajectory.steps, scene.robot.dof))
+    nodes = zip(trajectory.q[:-1], trajectory.v[:-1], trajectory.u, strict=True)
+    return np.array([diffusion_and_drift(scene, q, v, u, trajectory.q[0])[1] for q, v, u in nodes])
+
+
+def segments_of(nodes: Nodes, reasons: Mapping[int, str]) -> list[Segment]:
+    """What a kernel wrote, path by path, without copies."""
+    segments = []
+    for i, done in enumerate(nodes.done):
+        tally, quality = nodes.tally[i], nodes.quality[i]
+        statistics = StepStatistics(
+            newton_iterations=tally[:done, 0],
+            jets=tally[:done, 1],
+            sweeps=tally[:done, 2],
+            substeps=tally[:done, 3],
+            residual=quality[:done, 0],
+            branch_margin=quality[:done, 1],
+            energy_defect=quality[:done, 2],
+        )
+        failure = None
+        if int(nodes.ended[i]) in reasons:
+            failure = Failure(reasons[int(nodes.ended[i])], float(quality[done, 0]))
+        segments.append(
+            Segment(
+                q=nodes.q[i, :done],
+                p=nodes.p[i, :done],
+                v=nodes.v[i, :done],
+                u=nodes.u[i, :done],
+                energy=nodes.energy[i, :done],
+                statistics=statistics,
+                failure=failure,
+            )
+        )
+    return segments
+
+
+def open_loop(u: Floats) -> Commands:
+    """Controls (N, m) without feedback."""
+    return Commands(np.ascontiguousarray(u), np.zeros((0, u.shape[1], 0)), np.zeros((0, 0)))

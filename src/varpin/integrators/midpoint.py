@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from varpin.checks import count, fraction, positive
-from varpin.errors import InputError, SingularMassMatrix
-from varpin.integrators.base import Failure, Integrator, Segment
+from varpin.errors import InputError, LinearizationError, SingularMassMatrix
+from varpin.integrators.base import Integrator, Segment, diffusion_and_drift, drifts, join, open_loop, segments_of
 from varpin.kernels import midpoint as kernels
+from varpin.kernels import midpoint_equation as equation
+from varpin.kernels.midpoint_linearize import linearize
+from varpin.kernels.tree import Commands, new_nodes
 from varpin.scene import Scene
-from varpin.trajectory import StepStatistics
+from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
 REASONS = {
-    kernels.DIVERGED: "Newton's iteration does not contract, however small the substep",
-    kernels.NOT_FINITE: "the step equation gives values that are not finite",
-    kernels.FOLD: "the step is at a fold of the step equation's solutions (its branch margin is not positive)",
-    kernels.ENERGY: "the energy balance of the step does not close",
-    kernels.SINGULAR: "the mass matrix at the end of the step is not positive definite",
+    equation.DIVERGED: "Newton's iteration does not contract, however small the substep",
+    equation.NOT_FINITE: "the step equation gives values that are not finite",
+    equation.FOLD: "the step is at a fold of the step equation's solutions (its branch margin is not positive)",
+    equation.ENERGY: "the energy balance of the step does not close",
+    equation.SINGULAR: "the mass matrix at the end of the step is not positive definite",
 }
 
 
@@ -29,8 +33,9 @@ REASONS = {
 class MidpointState:
     """Where a rollout stands, with its work arrays."""
 
-    state: kernels.State
-    work: kernels.Work
+    state: equation.State
+    work: equation.Work
+    start: Floats
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,9 @@ class Midpoint(Integrator):
         energy_budget: The errors of all substeps together, in units of the largest kinetic energy so far (plus
             the work done by forces); a fuller ledger leaves less room for errors of its own sign.
         max_halvings: A step is never cut into more than 2**max_halvings parts.
+        kick: When noise kicks the momentum: ``"left"``, before the step (the paper's scheme); or ``"split"``, half
+            of it before and half after, at the state then reached, which for constant mass and additive noise is of
+            weak order 2 instead of 1.
     """
 
     alpha: float = 0.5
@@ -65,6 +73,7 @@ class Midpoint(Integrator):
     energy_balance: float = 0.005
     energy_budget: float = 0.05
     max_halvings: int = 12
+    kick: Literal["left", "split"] = "left"
 
     variational = True
 
@@ -75,63 +84,128 @@ class Midpoint(Integrator):
             raise InputError("branch_margin must be in [0, 1), got 1")
         positive("energy_balance", self.energy_balance, "1")
         positive("energy_budget", self.energy_budget, "1")
+        if self.kick not in ("left", "split"):
+            raise InputError(f"kick must be 'left' or 'split', got {self.kick!r}")
         if count("max_halvings", self.max_halvings) > 30:
             raise InputError(f"max_halvings must be at most 30, got {self.max_halvings}")
 
     def __str__(self) -> str:
         return f"Midpoint(alpha={self.alpha:g})"
 
-    def _options(self) -> kernels.Options:
-        return kernels.Options(
+    @property
+    def left(self) -> float:
+        """The part of a step's kick that comes before the step."""
+        return 1.0 if self.kick == "left" else 0.5
+
+    def _options(self) -> equation.Options:
+        return equation.Options(
             float(self.alpha),
             float(self.tolerance),
             float(self.branch_margin),
             float(self.energy_balance),
             float(self.energy_budget),
             int(self.max_halvings),
+            self.left,
         )
 
-    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[MidpointState, Segment]:
+    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[MidpointState, list[Segment]]:
         """See :meth:`Integrator.start`; p0 = M(q0) v0."""
         robot = scene.robot
-        run = MidpointState(kernels.new_state(robot.dof), kernels.new_work(robot.tree.parent.size, robot.dof))
-        if not kernels.begin(scene.mechanism, q0, v0, run.state, run.work):
-            raise SingularMassMatrix(robot.joint_names, q0)
-        state = run.state
-        energy = state.energy[:1] + state.energy[1:2]
-        nothing = _statistics(np.zeros((0, 4), dtype=np.int64), np.zeros((0, 2)))
-        return run, Segment(state.q[None].copy(), state.p[None].copy(), state.v[None].copy(), energy, nothing)
-
-    def rollout(self, scene: Scene, state: MidpointState, controls: Floats, dt: float) -> Segment:
-        """See :meth:`Integrator.rollout`."""
-        steps, n = controls.shape[0], scene.robot.dof
-        q, p, v = np.empty((steps, n)), np.empty((steps, n)), np.empty((steps, n))
-        energy = np.empty(steps)
-        tally, quality = np.empty((steps, 4), dtype=np.int64), np.empty((steps, 2))
-        options = self._options()
-        outcome, done = kernels.rollout(
-            scene.mechanism, options, dt, controls, state.state, state.work, q, p, v, energy, tally, quality
+        paths, n = q0.shape
+        run = MidpointState(
+            equation.new_state(paths, n, scene.mechanism.diffusion.constant.shape[1]),
+            equation.new_work(robot.tree.parent.size, n),
+            q0.copy(),
         )
-        failure = None
-        if outcome != kernels.SOLVED:
-            failure = Failure(REASONS[outcome], float(state.work.quality[0]))
-        return Segment(q[:done], p[:done], v[:done], energy[:done], _statistics(tally[:done], quality[:done]), failure)
+        if not kernels.begin_paths(scene.mechanism, q0, v0, run.state, run.work):
+            raise SingularMassMatrix(robot.joint_names, q0)
+        nodes = new_nodes(paths, 1, n, scene.controls)
+        nodes.q[:, 0], nodes.p[:, 0], nodes.v[:, 0] = run.state.q, run.state.p, run.state.v
+        nodes.energy[:, 0] = run.state.energy[:, :, :2].sum(axis=(1, 2))
+        nodes.done[:] = 1
+        return run, segments_of(nodes, REASONS)
+
+    def rollout(
+        self, scene: Scene, state: MidpointState, commands: Commands, increments: Floats, dt: float
+    ) -> list[Segment]:
+        """See :meth:`Integrator.rollout`."""
+        if scene.noise.diffusion is not None:
+            return self._compiled(scene, state, commands, increments, np.zeros((0, 0, scene.robot.dof)), dt)
+        segments = []
+        for j in range(len(commands.u)):
+            row = Commands(*(array[j : j + 1] for array in commands))
+            segments.append(self._in_python(scene, state, row, increments[:, j : j + 1], dt))
+            if segments[-1].failure is not None:
+                break
+        return [join(segments)]
+
+    def _in_python(
+        self, scene: Scene, state: MidpointState, command: Commands, increment: Floats, dt: float
+    ) -> Segment:
+        """One step of one path with diffusion fields that are evaluated in Python."""
+        now = state.state
+        control = command.u[0]
+        if len(command.gains):
+            control = control + command.gains[0] @ (np.concatenate([now.q[0], now.p[0]]) - command.reference[0])
+        F, drift = diffusion_and_drift(scene, now.q[0], now.v[0], control, state.start[0])
+        if len(increment):
+            kernels.apply_impulse(scene.mechanism, self.left * (F @ increment[0, 0]), now, state.work)
+        nothing = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
+        (segment,) = self._compiled(scene, state, open_loop(control[None]), nothing, drift[None, None], dt)
+        if len(increment) and self.left < 1.0 and segment.failure is None:
+            F, _ = diffusion_and_drift(scene, now.q[0], now.v[0], control, state.start[0])
+            kernels.apply_impulse(scene.mechanism, (1.0 - self.left) * (F @ increment[0, 0]), now, state.work)
+            segment.p[-1], segment.v[-1], segment.energy[-1] = now.p[0], now.v[0], now.energy[0, :, :2].sum()
+        return segment
+
+    def _compiled(
+        self,
+        scene: Scene,
+        state: MidpointState,
+        commands: Commands,
+        increments: Floats,
+        drift: Floats,
+        dt: float,
+    ) -> list[Segment]:
+        nodes = new_nodes(len(state.state.q), len(commands.u), scene.robot.dof, scene.controls)
+        kernels.rollout(
+            scene.mechanism, self._options(), dt, commands, increments, drift, state.state, state.work, nodes
+        )
+        return segments_of(nodes, REASONS)
+
+    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
+        """See :meth:`Integrator.linearize`; the state is (q, p).
+
+        A step that was taken in parts is taken in parts again, and their derivatives are chained.
+        """
+        steps, n = trajectory.steps, scene.robot.dof
+        q, p, v = (np.ascontiguousarray(getattr(trajectory, name)[:-1]) for name in ("q", "p", "v"))
+        # Without noise the root is known; with it the step at dw = 0 starts from another momentum.
+        guess = v if trajectory.dw.any() else np.diff(trajectory.q, axis=0) / trajectory.dt
+        force = trajectory.u @ scene.actuation.T + drifts(scene, trajectory)
+        Jx, Jf = np.empty((steps, 2 * n, 2 * n)), np.empty((steps, 2 * n, n))
+        outcome, done = linearize(
+            scene.mechanism,
+            self._options(),
+            trajectory.dt,
+            q,
+            p,
+            guess,
+            force,
+            trajectory.statistics.substeps,
+            equation.new_state(1, n, scene.mechanism.diffusion.constant.shape[1]),
+            equation.new_work(scene.robot.tree.parent.size, n, derivatives=True),
+            Jx,
+            Jf,
+        )
+        if outcome != equation.SOLVED:
+            raise LinearizationError(done, done * trajectory.dt, REASONS[outcome])
+        return Jx, Jf
 
     def predict(self, state: MidpointState, dt: float) -> tuple[Floats, Floats]:
         """See :meth:`Integrator.predict`; the velocity goes on from the last midpoint through the node."""
         now = state.state
-        velocity = now.v.copy()
-        if now.counters[0] > 0:
-            velocity += now.v - now.past[0]
-        return now.q + 0.5 * dt * now.v, velocity
-
-
-def _statistics(tally: NDArray[np.int64], quality: Floats) -> StepStatistics:
-    return StepStatistics(
-        newton_iterations=tally[:, 0].copy(),
-        jets=tally[:, 1].copy(),
-        sweeps=tally[:, 2].copy(),
-        substeps=tally[:, 3].copy(),
-        residual=quality[:, 0].copy(),
-        branch_margin=quality[:, 1].copy(),
-    )
+        velocity = now.v[0].copy()
+        if now.counters[0, 0] > 0:
+            velocity += now.v[0] - now.past[0, 0]
+        return now.q[0] + 0.5 * dt * now.v[0], velocity

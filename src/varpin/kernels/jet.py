@@ -161,8 +161,10 @@ def dot6(a: Floats, i: int, b: Floats, j: int) -> float:
 
 @inlined
 def branch_potential(mechanism: Mechanism, j: int, angle: float, w: Sweep) -> float:
-    """Gravity's potential energy of the branch whose root is body ``j`` [J]; adds to its scale."""
+    """Gravity's potential energy of the branch whose root is body ``j`` [J]; adds it, and its scale, to its group's."""
     tree, g = mechanism.tree, mechanism.gravity
+    group = tree.group[tree.coordinate[j]]
+    strength = abs(g[0]) + abs(g[1]) + abs(g[2])
     Y = w.inertia
     potential = 0.0
     for i in range(3):
@@ -170,7 +172,8 @@ def branch_potential(mechanism: Mechanism, j: int, angle: float, w: Sweep) -> fl
         if tree.prismatic[j]:
             root += w.axis[j, i] * angle
         potential -= g[i] * (Y[j, 0] * root + Y[j, i + 1])
-        w.V_scale[0] += abs(g[i]) * (Y[j, 0] * abs(root) + abs(Y[j, i + 1]))
+        w.V_scale[group] += strength * (Y[j, 0] * abs(root) + abs(Y[j, i + 1]))
+    w.V[group] += potential
     return potential
 
 
@@ -182,7 +185,10 @@ def add_springs(mechanism: Mechanism, q: Floats, w: Sweep) -> float:
         force = -mechanism.stiffness[c] * (q[c] - mechanism.rest[c])
         w.Lq[c] += force
         w.Lq_scale[c] += abs(mechanism.stiffness[c]) * (abs(q[c]) + abs(mechanism.rest[c]))
-        potential -= 0.5 * force * (q[c] - mechanism.rest[c])
+        spring = -0.5 * force * (q[c] - mechanism.rest[c])
+        potential += spring
+        w.V[mechanism.tree.group[c]] += spring
+        w.V_scale[mechanism.tree.group[c]] += spring
     return potential
 
 
@@ -250,8 +256,9 @@ def measure(tree: Tree, j: int, rate: float, w: Sweep) -> None:
 @inlined
 def clear_first(w: Sweep) -> None:
     """Zero what the first-order sweep adds up."""
-    w.V_scale[0] = 0.0
     for c in range(w.Lq.size):
+        w.V[c] = 0.0
+        w.V_scale[c] = 0.0
         w.Lq[c] = 0.0
         w.Lv[c] = 0.0
         w.Lq_scale[c] = 0.0
@@ -391,8 +398,9 @@ def mass_matrix(mechanism: Mechanism, q: Floats, w: Sweep) -> float:
     bodies = tree.parent.size
     S, Y, F, M = w.axis, w.inertia, w.dual_axis, w.M
     potential = 0.0
-    w.V_scale[0] = 0.0
     for j in range(q.size):
+        w.V[j] = 0.0
+        w.V_scale[j] = 0.0
         for c in range(q.size):
             M[j, c] = 0.0
     for j in range(bodies):
@@ -419,8 +427,10 @@ def mass_matrix(mechanism: Mechanism, q: Floats, w: Sweep) -> float:
     for c in range(q.size):
         M[c, c] += tree.armature[c]
         deflection = q[c] - mechanism.rest[c]
-        potential += 0.5 * mechanism.stiffness[c] * deflection * deflection
-        w.V_scale[0] += 0.5 * mechanism.stiffness[c] * deflection * deflection
+        spring = 0.5 * mechanism.stiffness[c] * deflection * deflection
+        potential += spring
+        w.V[tree.group[c]] += spring
+        w.V_scale[tree.group[c]] += spring
     return potential
 
 
@@ -428,3 +438,14 @@ def mass_matrix(mechanism: Mechanism, q: Floats, w: Sweep) -> float:
 def lagrangian_sweep(mechanism: Mechanism, q: Floats, v: Floats, w: Sweep) -> tuple[float, float]:
     """:func:`second_order` for callers in Python."""
     return second_order(mechanism, q, v, w)
+
+
+@kernel
+def jets(mechanism: Mechanism, q: Floats, v: Floats, w: Sweep, M: Floats, A: Floats) -> None:
+    """M and L_vq at each row of q and v (N, n), written into M and A (N, n, n)."""
+    for s in range(q.shape[0]):
+        second_order(mechanism, q[s], v[s], w)
+        for i in range(q.shape[1]):
+            for j in range(q.shape[1]):
+                M[s, i, j] = w.M[i, j]
+                A[s, i, j] = w.A[i, j]

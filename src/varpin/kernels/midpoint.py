@@ -1,187 +1,31 @@
 """The midpoint integrator: one forced discrete Euler-Lagrange step after another, in position-momentum form.
 
-With qm = q0 + a h v and L the Lagrangian, the step solves for its velocity v
-
-    r(v) = p0 + (h/2) F(v) + h (1-a) L_q(qm, v) - L_v(qm, v) = 0,      F(v) = B u - D v
-
-and ends in q1 = q0 + h v, p1 = p0 + h (L_q + F), which is the discrete Legendre transform with r = 0 put in.
+A step is accepted only on the principal branch of its equation's solutions and with its energy balance closed; else
+it is taken in halves, and halves of halves. Noise kicks the momentum before the step, or half before and half after.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 
 from varpin.kernels._compile import inlined, kernel
-from varpin.kernels.jet import first_order, mass_matrix, second_order
-from varpin.kernels.linalg import factor_ldl, factor_lu, quadratic_form, solve_ldl, solve_lu
-from varpin.kernels.tree import Floats, Integers, Mechanism, Sweep, new_sweep
+from varpin.kernels.jet import mass_matrix, second_order
+from varpin.kernels.linalg import factor_ldl, solve_ldl
+from varpin.kernels.midpoint_equation import (
+    ENERGY,
+    FOLD,
+    HISTORY,
+    SINGULAR,
+    SOLVED,
+    Options,
+    State,
+    Work,
+    newton,
+    set_midpoint,
+)
+from varpin.kernels.midpoint_jacobian import add_substep
+from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes
 
-# What an attempt at a step ends in.
-SOLVED = 0
-DIVERGED = 1  # a correction exceeded half of the one before
-NOT_FINITE = 2
-FOLD = 3  # M - h^2/4 L_qq and its kin lost definiteness: another branch of solutions
-ENERGY = 4  # the energy balance of the step does not close
-SINGULAR = 5  # the mass matrix at the new node is singular
-
-EPS = float(np.finfo(np.float64).eps)
-ITERATIONS = 12
-ROUNDING = 100.0  # rounding units: a residual below may stagnate; without rounding's own scatter it would be 1
-ENERGY_ROUNDING = 1e-12  # of the magnitudes that make up an energy
-HISTORY = 3
 FLOOR = 0.02  # of the energy guard's limit is always left, or a full ledger could never be worked off
-
-
-class State(NamedTuple):
-    """Where a rollout stands. Low parts carry what rounding took from q and p (compensated sums)."""
-
-    q: Floats  # (n,)
-    q_low: Floats  # (n,)
-    p: Floats  # (n,)
-    p_low: Floats  # (n,)
-    v: Floats  # (n,) M(q)^-1 p
-    past: Floats  # (HISTORY, n) velocities of the last whole steps, newest first
-    energy: Floats  # (6,) kinetic, potential, errors added up, largest kinetic, work turned over [J], power [W]
-    counters: Integers  # (2,) how many rows of past are set; halvings of the last step
-
-
-class Work(NamedTuple):
-    """Work arrays of a step."""
-
-    sweep: Sweep
-    lu: Floats  # (n, n)
-    ldl: Floats  # (n, n)
-    v: Floats  # (n,)
-    qm: Floats  # (n,)
-    force: Floats  # (n,) B u
-    residual: Floats  # (n,)
-    delta: Floats  # (n,)
-    trial: Floats  # (5, n): q, q_low, p, p_low, v of the node that is tried
-    tally: Integers  # (4,) of one step: Newton iterations, jets, first-order sweeps, substeps
-    quality: Floats  # (2,) of one step: worst scaled residual, smallest branch margin
-
-
-class Options(NamedTuple):
-    """How a step is solved."""
-
-    alpha: float
-    tolerance: float  # on the residual, in rounding units of the terms that cancel in it
-    margin: float  # of the branch guard
-    balance: float  # largest energy error of a substep, in units of the energy it turns over
-    budget: float  # of the energy errors added up, in units of the largest kinetic energy so far
-    halvings: int  # at most
-
-
-def new_state(dof: int) -> State:
-    """A state to be filled in."""
-    return State(
-        q=np.zeros(dof),
-        q_low=np.zeros(dof),
-        p=np.zeros(dof),
-        p_low=np.zeros(dof),
-        v=np.zeros(dof),
-        past=np.zeros((HISTORY, dof)),
-        energy=np.zeros(6),
-        counters=np.zeros(2, dtype=np.int64),
-    )
-
-
-def new_work(bodies: int, dof: int) -> Work:
-    """Allocate the work arrays of a step."""
-    return Work(
-        sweep=new_sweep(bodies, dof),
-        lu=np.zeros((dof, dof)),
-        ldl=np.zeros((dof, dof)),
-        v=np.zeros(dof),
-        qm=np.zeros(dof),
-        force=np.zeros(dof),
-        residual=np.zeros(dof),
-        delta=np.zeros(dof),
-        trial=np.zeros((5, dof)),
-        tally=np.zeros(4, dtype=np.int64),
-        quality=np.zeros(2),
-    )
-
-
-@inlined
-def residual(mechanism: Mechanism, a: float, h: float, state: State, k: Work) -> float:
-    """r(v) from the L_q and L_v in the sweep; returns its largest entry in rounding units of its terms."""
-    w = k.sweep
-    worst = 0.0
-    for i in range(k.v.size):
-        drag = mechanism.damping[i] * k.v[i]
-        small = state.p_low[i] + 0.5 * h * (k.force[i] - drag) + h * (1.0 - a) * w.Lq[i]
-        r = (state.p[i] - w.Lv[i]) + small
-        k.residual[i] = r
-        scale = abs(state.p[i]) + w.Lv_scale[i]
-        scale += 0.5 * h * (abs(k.force[i]) + abs(drag)) + h * (1.0 - a) * w.Lq_scale[i]
-        if scale > 0.0:
-            r = abs(r) / (EPS * scale)
-        if not r <= worst:  # NaN ends up in worst
-            worst = r
-    return worst
-
-
-@inlined
-def set_midpoint(a: float, h: float, state: State, k: Work) -> None:
-    """Qm = q0 + a h v."""
-    for i in range(k.v.size):
-        k.qm[i] = state.q[i] + (state.q_low[i] + a * h * k.v[i])
-
-
-@inlined
-def factor_newton(mechanism: Mechanism, a: float, h: float, k: Work) -> bool:
-    """Factor -dr/dv from the jet in the sweep."""
-    w = k.sweep
-    n = k.v.size
-    for i in range(n):
-        for j in range(n):
-            k.lu[i, j] = w.M[i, j] + h * (a * w.A[i, j] - (1.0 - a) * w.A[j, i] - h * a * (1.0 - a) * w.Lqq[i, j])
-        k.lu[i, i] += 0.5 * h * mechanism.damping[i]
-    return factor_lu(k.lu)
-
-
-@inlined
-def newton(mechanism: Mechanism, options: Options, h: float, state: State, k: Work) -> int:
-    """Solve the step equation from the guess in ``k.v``; returns how it ended.
-
-    Newton with the factorisation kept while the corrections shrink fast. Gives up when a correction exceeds half
-    of the one before (natural monotonicity, Deuflhard), unless the residual is down at its rounding floor.
-    """
-    a = options.alpha
-    before = np.inf
-    fresh = True
-    worst = np.inf
-    for _ in range(ITERATIONS + 1):
-        set_midpoint(a, h, state, k)
-        if fresh:
-            second_order(mechanism, k.qm, k.v, k.sweep)
-            k.tally[1] += 1
-        else:
-            first_order(mechanism, k.qm, k.v, k.sweep)
-            k.tally[2] += 1
-        worst = residual(mechanism, a, h, state, k)
-        if worst <= options.tolerance:
-            break
-        if not worst < np.inf:
-            return NOT_FINITE
-        if fresh and not factor_newton(mechanism, a, h, k):
-            return FOLD
-        solve_lu(k.lu, k.residual, k.delta)
-        size = quadratic_form(k.sweep.M, k.delta)
-        if not size <= 0.25 * before:
-            break
-        for i in range(k.v.size):
-            k.v[i] += k.delta[i]
-        k.tally[0] += 1
-        # The squared contraction to expect: seen, or guessed from the size of the first correction.
-        shrink = size / (quadratic_form(k.sweep.M, k.v) if before == np.inf else before)
-        fresh = not worst * shrink <= options.tolerance
-        before = size
-    if not worst <= ROUNDING:
-        return DIVERGED
-    k.quality[0] = max(k.quality[0], worst)
-    return SOLVED
+ENERGY_ROUNDING = 1e-12  # of the magnitudes that make up an energy
 
 
 @inlined
@@ -218,51 +62,63 @@ def add(high: float, low: float, increment: float) -> tuple[float, float]:
 
 
 @inlined
-def node_energy(mechanism: Mechanism, q: Floats, p: Floats, v: Floats, k: Work) -> tuple[bool, float, float]:
-    """V = M(q)^-1 p, whether M was positive definite, and kinetic and potential energy [J]."""
-    potential = mass_matrix(mechanism, q, k.sweep)
+def node_energy(mechanism: Mechanism, q: Floats, p: Floats, v: Floats, k: Work) -> bool:
+    """The velocity v = M(q)^-1 p of a node; whether M was positive definite.
+
+    Leaves the factors of M in ``k.ldl``, and of each group the kinetic energy in ``k.balance[:, 0]`` and the potential
+    energy in ``k.sweep.V``.
+    """
+    mass_matrix(mechanism, q, k.sweep)
     n = q.size
     for i in range(n):
+        k.balance[i, 0] = 0.0
         for j in range(i + 1):
             k.ldl[i, j] = k.sweep.M[i, j]
     if not factor_ldl(k.ldl):
-        return False, np.nan, potential
+        return False
     solve_ldl(k.ldl, p, v)
-    kinetic = 0.0
     for i in range(n):
-        kinetic += 0.5 * p[i] * v[i]
-    return True, kinetic, potential
+        k.balance[mechanism.tree.group[i], 0] += 0.5 * p[i] * v[i]
+    return True
 
 
 @inlined
-def balanced(
-    options: Options,
-    ledger: Floats,
-    kinetic: float,
-    potential: float,
-    potential_scale: float,
-    work: float,
-    slack: float,
-) -> bool:
-    """Whether the energy balance of a substep closes; enters it into the ledger if it does.
+def energy_error(state: State, k: Work, r: int) -> float:
+    """How much the energy of group ``r`` has changed between the nodes that no force accounts for [J]."""
+    ledger, new = state.energy[r], k.balance[r]
+    return (new[0] - ledger[0]) + (k.sweep.V[r] - ledger[1]) - new[1]
+
+
+@inlined
+def balanced(options: Options, state: State, k: Work, r: int) -> bool:
+    """Whether the energy balance of group ``r`` closes over a substep.
 
     The error must be a small part of the energy turned over. An error that adds to those before it has less room
-    the fuller the ledger is, so they do not wander off however often substeps break the structure. ``slack`` is what
-    the method itself owes at nodes: its energy differs from the modified one that it nearly conserves.
+    the fuller the ledger is, so they do not wander off however often substeps break the structure. Off the middle the
+    method is of first order and its energy errors with it, from rest on: there they have more room.
     """
-    before, height, defect, largest, throughput = ledger[0], ledger[1], ledger[2], ledger[3], ledger[4]
-    error = (kinetic - before) + (potential - height) - work
-    exchanged = abs(potential - height) + abs(work)
-    limit = options.balance * (max(kinetic, before) + exchanged) + slack
+    ledger, new = state.energy[r], k.balance[r]
+    error, defect = energy_error(state, k, r), ledger[2]
+    off_middle = abs(1.0 - 2.0 * options.alpha)
+    exchanged = abs(k.sweep.V[r] - ledger[1]) + abs(new[1])
+    limit = options.balance * (1.0 + 9.0 * off_middle) * (max(new[0], ledger[0]) + exchanged)
     if abs(defect + error) > abs(defect):
-        room = options.budget * (max(largest, exchanged) + throughput) + slack
+        room = options.budget * max(ledger[3], exchanged)
         if room > 0.0:
             limit *= max(FLOOR, 1.0 - abs(defect) / room)
-    if not abs(error) <= limit + ENERGY_ROUNDING * (potential_scale + kinetic):
-        return False
-    ledger[0], ledger[1], ledger[2] = kinetic, potential, defect + error
-    ledger[3], ledger[4] = max(largest, kinetic), throughput + abs(work)
-    return True
+    scale = k.sweep.V_scale[r]
+    return abs(error) <= limit + ENERGY_ROUNDING * (scale + new[0]) + 1e-3 * off_middle * scale
+
+
+@inlined
+def enter(state: State, k: Work, r: int) -> None:
+    """Enter an accepted substep into the ledger of group ``r``. What friction takes, it takes of the errors too."""
+    ledger, new = state.energy[r], k.balance[r]
+    defect = ledger[2] + energy_error(state, k, r)
+    if new[2] > 0.0:
+        defect *= max(0.0, 1.0 - new[2] / (new[2] + max(new[0], ledger[0])))
+    ledger[0], ledger[1], ledger[2] = new[0], k.sweep.V[r], defect
+    ledger[3] = max(ledger[3], new[0])
 
 
 @inlined
@@ -275,27 +131,29 @@ def attempt(mechanism: Mechanism, options: Options, h: float, state: State, k: W
     if not margin > 0.0:
         return FOLD
     n = k.v.size
+    group, groups = mechanism.tree.group, mechanism.tree.groups
     q, q_low, p, p_low, v = k.trial[0], k.trial[1], k.trial[2], k.trial[3], k.trial[4]
-    work = 0.0
+    for r in range(groups):
+        k.balance[r, 1] = 0.0
+        k.balance[r, 2] = 0.0
     for i in range(n):
-        force = k.force[i] - mechanism.damping[i] * k.v[i]
-        work += h * force * k.v[i]
+        drag = mechanism.damping[i] * k.v[i]
+        force = k.force[i] - drag
+        k.balance[group[i], 1] += h * force * k.v[i]
+        k.balance[group[i], 2] += h * drag * k.v[i]
         q[i], q_low[i] = add(state.q[i], state.q_low[i], h * k.v[i])
         p[i], p_low[i] = add(state.p[i], state.p_low[i], h * (k.sweep.Lq[i] + force))
-    regular, kinetic, potential = node_energy(mechanism, q, p, v, k)
-    if not regular:
+    if not node_energy(mechanism, q, p, v, k):
         return SINGULAR
-    # To first order the method conserves H - (1/2 - a) h L_q . v: nothing at a = 1/2.
-    start = 0.0
-    end = 0.0
-    for i in range(n):
-        start += k.sweep.Lq[i] * state.v[i]
-        end += k.sweep.Lq[i] * v[i]
-    most = max(state.energy[5], abs(start), abs(end))
-    slack = 2.0 * h * abs(1.0 - 2.0 * options.alpha) * most
-    if not balanced(options, state.energy, kinetic, potential, k.sweep.V_scale[0], work, slack):
-        return ENERGY
-    state.energy[5] = most
+    for r in range(groups):
+        if not balanced(options, state, k, r):
+            return ENERGY
+    for r in range(groups):
+        enter(state, k, r)
+    if k.Jx.shape[0] > 0:
+        set_midpoint(options.alpha, h, state, k)
+        second_order(mechanism, k.qm, k.v, k.sweep)
+        add_substep(mechanism, options, h, k)
     k.quality[1] = min(k.quality[1], margin)
     k.tally[3] += 1
     for i in range(n):
@@ -306,9 +164,15 @@ def attempt(mechanism: Mechanism, options: Options, h: float, state: State, k: W
 
 @inlined
 def predict(state: State, k: Work) -> None:
-    """Extrapolate the velocities of the last whole steps, two or three of them, into ``k.v``."""
+    """Extrapolate the velocities of the last whole steps, two or three of them, into ``k.v``.
+
+    Kicks make them jump; then the current velocity goes on by as much as in the last step.
+    """
     past = state.past
     for i in range(k.v.size):
+        if state.center.shape[1] > 0:
+            k.v[i] = state.v[i] + state.lead[i]
+            continue
         k.v[i] = 2.0 * past[0, i] - past[1, i]
         if state.counters[0] > 2:
             k.v[i] += past[0, i] - 2.0 * past[1, i] + past[2, i]
@@ -326,7 +190,9 @@ def step(mechanism: Mechanism, options: Options, h: float, state: State, k: Work
     k.quality[0] = 0.0
     k.quality[1] = np.inf
     level = max(state.counters[1] - 1, 0)
-    extrapolate = level == 0 and state.counters[0] > 1
+    extrapolate = level == 0 and (state.counters[0] > 1 or state.center.shape[1] > 0)
+    for i in range(n):
+        k.start[i] = state.v[i]
     deepest = level
     place = 0  # in units of h / 2^level
     while place < 1 << level:
@@ -351,6 +217,8 @@ def step(mechanism: Mechanism, options: Options, h: float, state: State, k: Work
             place *= 2
             deepest = max(deepest, level)
     state.counters[1] = deepest
+    for i in range(n):
+        state.lead[i] = k.v[i] - k.start[i] if deepest == 0 else 0.0
     if deepest > 0:
         state.counters[0] = 0
         return SOLVED
@@ -364,23 +232,116 @@ def step(mechanism: Mechanism, options: Options, h: float, state: State, k: Work
     return SOLVED
 
 
+@inlined
+def path(states: State, i: int) -> State:
+    """The state of one path of several."""
+    return State(
+        states.q[i],
+        states.q_low[i],
+        states.p[i],
+        states.p_low[i],
+        states.v[i],
+        states.past[i],
+        states.energy[i],
+        states.lead[i],
+        states.center[i],
+        states.counters[i],
+    )
+
+
+@inlined
+def apply_policy(commands: Commands, s: int, state: State, u: Floats) -> None:
+    """U = u_s + gains_s (x - x_s), x = (q, p); without gains u = u_s."""
+    n = state.q.size
+    for c in range(u.size):
+        total = commands.u[s, c]
+        if commands.gains.shape[0] > 0:
+            for j in range(n):
+                total += commands.gains[s, c, j] * (state.q[j] - commands.reference[s, j])
+                total += commands.gains[s, c, n + j] * (state.p[j] - commands.reference[s, n + j])
+        u[c] = total
+
+
+@inlined
+def kick(mechanism: Mechanism, part: float, controls: Floats, increments: Floats, state: State, k: Work) -> None:
+    """Add ``part`` of the noise's impulse sum_i F_i(q, u) dw_i to the momentum.
+
+    ``k.ldl`` holds the factors of M(q). What the kick does to the energy is entered as work: it is no error.
+    """
+    fields = mechanism.diffusion
+    n = k.v.size
+    for i in range(n):
+        impulse = 0.0
+        for w in range(increments.size):
+            offset = state.q[i] - state.center[i, w]
+            field = fields.constant[i, w] + fields.quadratic[i, w] * offset * offset
+            for c in range(controls.size):
+                field += fields.control[i, w, c] * controls[c]
+            impulse += field * increments[w]
+        k.delta[i] = part * impulse
+    add_impulse(mechanism, k.delta, state, k)
+
+
+@inlined
+def add_impulse(mechanism: Mechanism, impulse: Floats, state: State, k: Work) -> None:
+    """Add to the momentum and bring velocity and kinetic energy along; ``k.ldl`` holds the factors of M(q)."""
+    for i in range(impulse.size):
+        state.p[i], state.p_low[i] = add(state.p[i], state.p_low[i], impulse[i])
+    solve_ldl(k.ldl, state.p, state.v)
+    for r in range(mechanism.tree.groups):
+        k.balance[r, 0] = 0.0
+    for i in range(impulse.size):
+        k.balance[mechanism.tree.group[i], 0] += 0.5 * state.p[i] * state.v[i]
+    for r in range(mechanism.tree.groups):
+        state.energy[r, 0] = k.balance[r, 0]
+        state.energy[r, 3] = max(state.energy[r, 3], k.balance[r, 0])
+
+
 @kernel
-def begin(mechanism: Mechanism, q: Floats, v: Floats, state: State, k: Work) -> bool:
-    """Put the state at (q, v), with nothing known of the past; False where M(q) is not positive definite."""
-    n = q.size
-    mass_matrix(mechanism, q, k.sweep)
-    for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += k.sweep.M[i, j] * v[j]
-        state.q[i], state.q_low[i], state.p[i], state.p_low[i] = q[i], 0.0, total, 0.0
-    regular, kinetic, potential = node_energy(mechanism, state.q, state.p, state.v, k)
-    state.energy[:] = 0.0
-    state.energy[0], state.energy[1], state.energy[3] = kinetic, potential, kinetic
-    state.counters[:] = 0
-    for i in range(n):
-        state.v[i] = v[i]
+def apply_impulse(mechanism: Mechanism, impulse: Floats, states: State, k: Work) -> bool:
+    """:func:`add_impulse` to the one path there is, for fields that are evaluated in Python."""
+    state = path(states, 0)
+    regular = node_energy(mechanism, state.q, state.p, state.v, k)
+    add_impulse(mechanism, impulse, state, k)
     return regular
+
+
+@inlined
+def begin_at(mechanism: Mechanism, q: Floats, p: Floats, state: State, k: Work) -> bool:
+    """Put the state at (q, p), with nothing known of the past; False where M(q) is not positive definite."""
+    n = q.size
+    for i in range(n):
+        state.q[i], state.q_low[i], state.p[i], state.p_low[i] = q[i], 0.0, p[i], 0.0
+        state.lead[i] = 0.0
+        for w in range(state.center.shape[1]):
+            center = mechanism.diffusion.center[i, w]
+            state.center[i, w] = q[i] if np.isnan(center) else center
+    regular = node_energy(mechanism, state.q, state.p, state.v, k)
+    for r in range(n):
+        kinetic = k.balance[r, 0]
+        state.energy[r, 0], state.energy[r, 1], state.energy[r, 2] = kinetic, k.sweep.V[r], 0.0
+        state.energy[r, 3] = kinetic
+    state.counters[:] = 0
+    return regular
+
+
+@kernel
+def begin_paths(mechanism: Mechanism, q: Floats, v: Floats, states: State, k: Work) -> bool:
+    """Put each path at its row of q and v (P, n); False where an M(q) is not positive definite."""
+    n = q.shape[1]
+    for i in range(q.shape[0]):
+        state = path(states, i)
+        mass_matrix(mechanism, q[i], k.sweep)
+        for r in range(n):
+            total = 0.0
+            for c in range(n):
+                total += k.sweep.M[r, c] * v[i, c]
+            k.delta[r] = total
+        if not begin_at(mechanism, q[i], k.delta, state, k):
+            return False
+        for r in range(n):
+            state.v[r] = v[i, r]
+    return True
 
 
 @kernel
@@ -388,36 +349,53 @@ def rollout(
     mechanism: Mechanism,
     options: Options,
     h: float,
-    controls: Floats,
-    state: State,
+    commands: Commands,
+    increments: Floats,
+    drift: Floats,
+    states: State,
     k: Work,
-    q: Floats,
-    p: Floats,
-    v: Floats,
-    energy: Floats,
-    tally: Integers,
-    quality: Floats,
-) -> tuple[int, int]:
-    """Steps from ``state``, one for each row of ``controls`` (N, m).
+    nodes: Nodes,
+) -> None:
+    """Steps of P paths from ``states``, one for each row of the commands.
 
-    Writes the nodes after each step into q, p, v (N, n) and energy (N,), and what each step took into
-    tally (N, 4) and quality (N, 2). Returns how it ended and how many steps were completed.
+    ``increments`` are those of the Wiener processes, (P, N, k), or (0, 0, k) for none; ``drift`` is a force besides
+    the controls', (P, N, n), or (0, 0, n) for none. Writes into ``nodes`` the node after each step, what was applied in
+    it and what it took. A path that fails stops there; ``nodes.ended`` and ``nodes.done`` say how and where.
     """
     n = k.v.size
-    for s in range(controls.shape[0]):
-        for i in range(n):
-            total = 0.0
-            for c in range(controls.shape[1]):
-                total += mechanism.actuation[i, c] * controls[s, c]
-            k.force[i] = total
-        outcome = step(mechanism, options, h, state, k)
-        for i in range(4):
-            tally[s, i] = k.tally[i]
-        for i in range(2):
-            quality[s, i] = k.quality[i]
-        if outcome != SOLVED:
-            return outcome, s
-        for i in range(n):
-            q[s, i], p[s, i], v[s, i] = state.q[i], state.p[i], state.v[i]
-        energy[s] = state.energy[0] + state.energy[1]
-    return SOLVED, controls.shape[0]
+    noisy = increments.shape[0] > 0 and increments.shape[2] > 0
+    for i in range(states.q.shape[0]):
+        state = path(states, i)
+        if noisy:
+            node_energy(mechanism, state.q, state.p, state.v, k)
+        nodes.ended[i] = SOLVED
+        nodes.done[i] = 0
+        for s in range(commands.u.shape[0]):
+            apply_policy(commands, s, state, nodes.u[i, s])
+            if noisy:
+                kick(mechanism, options.left, nodes.u[i, s], increments[i, s], state, k)
+            for r in range(n):
+                total = 0.0
+                if drift.shape[0] > 0:
+                    total = drift[i, s, r]
+                for c in range(nodes.u.shape[2]):
+                    total += mechanism.actuation[r, c] * nodes.u[i, s, c]
+                k.force[r] = total
+            outcome = step(mechanism, options, h, state, k)
+            for c in range(4):
+                nodes.tally[i, s, c] = k.tally[c]
+            for c in range(2):
+                nodes.quality[i, s, c] = k.quality[c]
+            if outcome != SOLVED:
+                nodes.ended[i] = outcome
+                break
+            if noisy and options.left < 1.0:
+                kick(mechanism, 1.0 - options.left, nodes.u[i, s], increments[i, s], state, k)
+            for r in range(n):
+                nodes.q[i, s, r], nodes.p[i, s, r], nodes.v[i, s, r] = state.q[r], state.p[r], state.v[r]
+            nodes.energy[i, s] = 0.0
+            nodes.quality[i, s, 2] = 0.0
+            for r in range(mechanism.tree.groups):
+                nodes.energy[i, s] += state.energy[r, 0] + state.energy[r, 1]
+                nodes.quality[i, s, 2] += abs(state.energy[r, 2])
+            nodes.done[i] = s + 1

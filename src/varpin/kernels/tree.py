@@ -28,10 +28,24 @@ class Tree(NamedTuple):
     ratio: Floats  # (b,)
     offset: Floats  # (b,) [rad or m]
     armature: Floats  # (n,) [kg m^2 or kg]
+    group: Integers  # (n,) which of r mechanically independent groups a coordinate belongs to, from 0
+    groups: int  # r; coordinates of different groups share neither inertia nor a mimic joint
+
+
+class Diffusion(NamedTuple):
+    """Fields F_i of k Wiener processes that a kernel can evaluate.
+
+    F[:, i] = constant[:, i] + control[:, i] u + quadratic[:, i] (q - center[:, i])^2, entry by entry.
+    """
+
+    constant: Floats  # (n, k) generalized force per square root of time
+    control: Floats  # (n, k, m)
+    quadratic: Floats  # (n, k)
+    center: Floats  # (n, k) [rad or m]; NaN stands for the configuration at which a rollout starts
 
 
 class Mechanism(NamedTuple):
-    """A tree with what a scene adds: gravity, dampers, springs, actuation."""
+    """A tree with what a scene adds: gravity, dampers, springs, actuation, noise."""
 
     tree: Tree
     gravity: Floats  # (3,) [m/s^2]
@@ -39,6 +53,44 @@ class Mechanism(NamedTuple):
     stiffness: Floats  # (n,) [N m/rad or N/m]
     rest: Floats  # (n,) the springs' rest configuration [rad or m]
     actuation: Floats  # (n, m) generalized force per control
+    diffusion: Diffusion
+
+
+class Commands(NamedTuple):
+    """Controls of N steps: u, or u + gains (x - reference) with x = (q, p) or (q, v)."""
+
+    u: Floats  # (N, m)
+    gains: Floats  # (N, m, 2n), or (0, m, 2n) for none
+    reference: Floats  # (N, 2n), or (0, 2n)
+
+
+class Nodes(NamedTuple):
+    """What a rollout of P paths over N steps writes: the node after each step, and what the step took."""
+
+    q: Floats  # (P, N, n)
+    p: Floats  # (P, N, n)
+    v: Floats  # (P, N, n)
+    energy: Floats  # (P, N)
+    u: Floats  # (P, N, m) controls applied
+    tally: Integers  # (P, N, 4) Newton iterations, jets, first-order sweeps, substeps
+    quality: Floats  # (P, N, 3) worst scaled residual, smallest branch margin, energy error so far [J]
+    ended: Integers  # (P,) how
+    done: Integers  # (P,) steps
+
+
+def new_nodes(paths: int, steps: int, dof: int, controls: int) -> Nodes:
+    """Room for the nodes of a rollout."""
+    return Nodes(
+        q=np.empty((paths, steps, dof)),
+        p=np.empty((paths, steps, dof)),
+        v=np.empty((paths, steps, dof)),
+        energy=np.empty((paths, steps)),
+        u=np.empty((paths, steps, controls)),
+        tally=np.zeros((paths, steps, 4), dtype=np.int64),
+        quality=np.zeros((paths, steps, 3)),
+        ended=np.zeros(paths, dtype=np.int64),
+        done=np.zeros(paths, dtype=np.int64),
+    )
 
 
 class Sweep(NamedTuple):
@@ -61,7 +113,8 @@ class Sweep(NamedTuple):
     Lv: Floats  # (n,)
     Lv_scale: Floats  # (n,) sum of the magnitudes that make up Lv
     Lq_scale: Floats  # (n,) the same for Lq
-    V_scale: Floats  # (1,) the same for the potential energy [J]
+    V: Floats  # (n,) potential energy of each group; the first r count [J]
+    V_scale: Floats  # (n,) the same for V
 
 
 def new_sweep(bodies: int, dof: int) -> Sweep:
@@ -85,5 +138,6 @@ def new_sweep(bodies: int, dof: int) -> Sweep:
         Lv=np.zeros(dof),
         Lv_scale=np.zeros(dof),
         Lq_scale=np.zeros(dof),
-        V_scale=np.zeros(1),
+        V=np.zeros(dof),
+        V_scale=np.zeros(dof),
     )

@@ -3,12 +3,15 @@
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from varpin.errors import RobotError, UnsupportedJoint
 from varpin.kernels.tree import Tree
 from varpin.robot.mimic import Tie
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 
 def joint_axis(model: pin.Model, joint: int) -> tuple[bool, Floats]:
@@ -107,8 +110,10 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
             coordinate[body], ratio[body], offset[body] = index[tie.leader], tie.ratio, tie.offset
         else:
             coordinate[body] = index[joint]
+    parent = np.array([model.parents[j] - 1 for j in range(1, model.njoints)], dtype=np.int64)
+    group = independent_groups(parent, coordinate, len(coordinates))
     return Tree(
-        parent=np.array([model.parents[j] - 1 for j in range(1, model.njoints)], dtype=np.int64),
+        parent=parent,
         prismatic=prismatic,
         rotation=rotation,
         translation=translation,
@@ -119,6 +124,8 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
         ratio=ratio,
         offset=offset,
         armature=coordinate_armature(model, ties, coordinates),
+        group=group,
+        groups=int(group.max()) + 1,
     )
 
 
@@ -146,3 +153,17 @@ def to_pinocchio(model: pin.Model, positions: Floats) -> Floats:
         else:
             configuration[..., joint.idx_q] = positions[..., k]
     return configuration
+
+
+def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Integers:
+    """Which coordinates (n,) move each other: labels from 0 of the groups that inertia or mimic joints tie together.
+
+    Args:
+        parent: Of each body (b,), -1 at a root.
+        coordinate: Of each body (b,).
+        dof: n.
+    """
+    tied = parent >= 0
+    links = coo_array((np.ones(tied.sum()), (coordinate[tied], coordinate[parent[tied]])), shape=(dof, dof))
+    _, label = connected_components(links, directed=False)
+    return np.asarray(label, dtype=np.int64)

@@ -1,0 +1,98 @@
+"""The derivative of the midpoint step, by implicit differentiation of its equation at the root.
+
+With N = -dr/dv, its inverse Vp, and everything taken at the midpoint
+
+    dr/dq0 = h(1-a) L_qq - A,    dr/dp0 = 1,    dr/df = h/2    (f: a force that is constant over the step)
+
+the root moves by dv = Vp (dr/dq0 dq0 + dp0 + (h/2) df), and then
+
+    dq1 = dq0 + h dv,    dp1 = dp0 + h (L_qq (dq0 + a h dv) + A' dv - D dv + df).
+
+One factorisation, no finite difference. The same as the slot formulas with D1D1, D2D1 and D2D2 of the discrete
+Lagrangian, but without their 1/h, so small steps lose no digits.
+"""
+
+from varpin.kernels._compile import inlined
+from varpin.kernels.linalg import solve_lu
+from varpin.kernels.midpoint_equation import Options, Work, factor_newton
+from varpin.kernels.tree import Floats, Mechanism
+
+
+@inlined
+def substep_jacobian(mechanism: Mechanism, options: Options, h: float, k: Work, Jx: Floats, Jf: Floats) -> None:
+    """d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) at the root in ``k.v`` and the jet in the sweep."""
+    w = k.sweep
+    a = options.alpha
+    n = k.v.size
+    factor_newton(mechanism, a, h, k)
+    # Columns of dv: of q0 into Jx[:n, :n], of p0 into Jx[:n, n:].
+    for c in range(n):
+        for i in range(n):
+            k.residual[i] = h * (1.0 - a) * w.Lqq[i, c] - w.A[i, c]
+        solve_lu(k.lu, k.residual, k.delta)
+        for i in range(n):
+            Jx[i, c] = k.delta[i]
+            k.residual[i] = 1.0 if i == c else 0.0
+        solve_lu(k.lu, k.residual, k.delta)
+        for i in range(n):
+            Jx[i, n + c] = k.delta[i]
+    for c in range(2 * n):
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += (a * h * w.Lqq[i, j] + w.A[j, i]) * Jx[j, c]
+            total -= mechanism.damping[i] * Jx[i, c]
+            if c < n:
+                total += w.Lqq[i, c]
+            total *= h
+            if c == n + i:
+                total += 1.0
+            Jx[n + i, c] = total
+    for c in range(n):
+        for i in range(n):
+            # dp1 = dp0 + W dv + h df with dv = (h/2) Vp df; W Vp is what Jx[n:, n:] holds besides the identity.
+            Jf[i, c] = 0.5 * h * h * Jx[i, n + c]
+            Jf[n + i, c] = 0.5 * h * (Jx[n + i, n + c] + (1.0 if i == c else 0.0))
+    for c in range(2 * n):
+        for i in range(n):
+            Jx[i, c] *= h
+            if c == i:
+                Jx[i, c] += 1.0
+
+
+@inlined
+def identity(k: Work) -> None:
+    """The derivatives of no step at all."""
+    n = k.v.size
+    for i in range(2 * n):
+        for j in range(2 * n):
+            k.Jx[i, j] = 1.0 if i == j else 0.0
+        for j in range(n):
+            k.Jf[i, j] = 0.0
+
+
+@inlined
+def add_substep(mechanism: Mechanism, options: Options, h: float, k: Work) -> None:
+    """Let the substep at the root in ``k.v``, its jet in the sweep, follow those before: chain rule."""
+    n = k.v.size
+    Jx, Jf, product = k.part[: 2 * n], k.part[2 * n :, :n], k.part[2 * n :, n:]
+    substep_jacobian(mechanism, options, h, k, Jx, Jf)
+    for half in range(2):
+        for i in range(2 * n):
+            for j in range(n):
+                total = 0.0
+                for c in range(2 * n):
+                    total += Jx[i, c] * k.Jx[c, half * n + j]
+                product[i, j] = total
+        for i in range(2 * n):
+            for j in range(n):
+                k.Jx[i, half * n + j] = product[i, j]
+    for i in range(2 * n):
+        for j in range(n):
+            total = Jf[i, j]
+            for c in range(2 * n):
+                total += Jx[i, c] * k.Jf[c, j]
+            product[i, j] = total
+    for i in range(2 * n):
+        for j in range(n):
+            k.Jf[i, j] = product[i, j]

@@ -1,0 +1,222 @@
+"""The structured linearization of a stochastic discrete map, and what it says of means and covariances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import finite_array
+from varpin.errors import InputError
+from varpin.integrators import Integrator, Midpoint
+from varpin.integrators.base import diffusion_and_drift
+from varpin.kernels.jet import jets
+from varpin.kernels.tree import new_sweep
+from varpin.scene import Scene, require_scene
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """First-order model of N steps around a trajectory, exactly affine in the Wiener increments.
+
+        dx[j+1] = (A + sum_i Gx_i dw_i) dx + (B + sum_i Gu_i dw_i) du + G dw
+
+    with every derivative taken at dw = 0 (the paper's choice; the exact second derivative in x and dw differs by
+    O(dt)). x is (q, p) for variational integrators and (q, v) for the others.
+
+    Attributes:
+        A: dx1/dx0 (N, 2n, 2n); symplectic where nothing is forced or damped.
+        B: dx1/du (N, 2n, m).
+        K: dx1/dp0 (N, 2n, n): what a kick of the momentum at the start of the step does.
+        F: Diffusion fields (N, n, k).
+        G: dx1/dw (N, 2n, k); K F where the whole kick comes before the step.
+        Gx: Derivative of G in x0 through the fields (N, 2n, k, 2n).
+        Gu: The same in u (N, 2n, k, m).
+        dt: Time step [s].
+        variational: Whether x is (q, p) rather than (q, v).
+    """
+
+    A: Floats
+    B: Floats
+    K: Floats
+    F: Floats
+    G: Floats
+    Gx: Floats
+    Gu: Floats
+    dt: float
+    variational: bool
+
+    @property
+    def steps(self) -> int:
+        """N."""
+        return len(self.A)
+
+    def step(self, j: int, dx: ArrayLike, du: ArrayLike, dw: ArrayLike) -> Floats:
+        """Dx (..., 2n) one step on, from deviations dx (..., 2n), du (..., m) and increments dw (..., k)."""
+        x, u, w = (np.asarray(value, dtype=float) for value in (dx, du, dw))
+        noise = self.G[j] + np.einsum("aib,...b->...ai", self.Gx[j], x) + np.einsum("aib,...b->...ai", self.Gu[j], u)
+        moved: Floats = x @ self.A[j].T + u @ self.B[j].T + np.einsum("...ai,...i->...a", noise, w)
+        return moved
+
+
+def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | None = None) -> Linearization:
+    """Linearize every step of a trajectory.
+
+    Main args:
+        scene: The scene in which it was made.
+        trajectory: From :func:`varpin.simulate`.
+
+    Other Args:
+        integrator: What made it; ``Midpoint()`` if left out. Must print as ``trajectory.integrator`` does.
+
+    Raises:
+        InputError: The trajectory is of another robot, another number of controls or processes, or another integrator.
+        LinearizationError: A step has no solution at dw = 0.
+    """
+    require_scene(scene)
+    integrator = Midpoint() if integrator is None else integrator
+    _require_match(scene, trajectory, integrator)
+    n, steps = scene.robot.dof, trajectory.steps
+    Jx, Jf = integrator.linearize(scene, trajectory)
+    q, v = trajectory.q, trajectory.v
+    start = scene.noise.fields(q[:-1], v[:-1], trajectory.u, q[0])
+    M, A_node = node_jets(scene, q, v)
+    B = Jf @ scene.actuation
+    A = Jx
+    # dv at fixed q is M^-1 dp; dv at fixed p is -M^-1 L_vq dq.
+    Fx = _in_state(start.Fq, start.Fv, M[:-1], A_node[:-1])
+    if start.Fv is not None:
+        drift_x, drift_u = _drift_derivatives(scene, trajectory)
+        A = A + Jf @ drift_x
+        B = B + Jf @ drift_u
+    K = Jx[:, :, n:]
+    left = integrator.left
+    G = left * (K @ start.F)
+    Gx = left * np.einsum("Nab,Nbic->Naic", K, Fx)
+    Gu = left * np.einsum("Nab,Nbic->Naic", K, start.Fu)
+    if left < 1.0:
+        end = scene.noise.fields(q[1:], v[1:], trajectory.u, q[0])
+        Ex = _in_state(end.Fq, end.Fv, M[1:], A_node[1:])
+        G[:, n:] += (1.0 - left) * end.F
+        Gx[:, n:] += (1.0 - left) * np.einsum("Naib,Nbc->Naic", Ex, A)
+        Gu[:, n:] += (1.0 - left) * (end.Fu + np.einsum("Naib,Nbc->Naic", Ex, B))
+    return Linearization(
+        A=A,
+        B=B,
+        K=K,
+        F=np.broadcast_to(start.F, (steps, n, scene.processes)),
+        G=G,
+        Gx=Gx,
+        Gu=Gu,
+        dt=trajectory.dt,
+        variational=integrator.variational,
+    )
+
+
+def node_jets(scene: Scene, q: Floats, v: Floats) -> tuple[Floats, Floats]:
+    """M and L_vq at many (q, v): each (N, n, n)."""
+    N, n = q.shape
+    M, A = np.empty((N, n, n)), np.empty((N, n, n))
+    jets(scene.mechanism, q, v, new_sweep(scene.robot.tree.parent.size, n), M, A)
+    return M, A
+
+
+def _in_state(Fq: Floats, Fv: Floats | None, M: Floats, A: Floats) -> Floats:
+    """dF/d(q, p) (N, n, k, 2n) from dF/dq and dF/dv."""
+    N, n, k, _ = Fq.shape
+    Fx = np.zeros((N, n, k, 2 * n))
+    Fx[..., :n] = Fq
+    if Fv is not None:
+        Fp = np.linalg.solve(np.swapaxes(M, 1, 2)[:, None], np.swapaxes(Fv, 2, 3))
+        Fx[..., n:] = np.swapaxes(Fp, 2, 3)
+        Fx[..., :n] -= np.einsum("Naip,Npb->Naib", Fx[..., n:], A)
+    return Fx
+
+
+def _drift_derivatives(scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
+    """D drift/d(q, p) (N, n, 2n) and d drift/du (N, n, m), by differences of eighth order.
+
+    The drift is the one place that needs second derivatives of a diffusion field, which nobody has to write down.
+    """
+    n, m = scene.robot.dof, scene.controls
+    start = trajectory.q[0]
+    weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+
+    def drift(q: Floats, p: Floats, u: Floats) -> Floats:
+        M, _ = node_jets(scene, q[None], np.zeros((1, n)))
+        return diffusion_and_drift(scene, q, np.linalg.solve(M[0], p), u, start)[1]
+
+    in_state, in_control = np.zeros((trajectory.steps, n, 2 * n)), np.zeros((trajectory.steps, n, m))
+    for j in range(trajectory.steps):
+        point = [trajectory.q[j].copy(), trajectory.p[j].copy(), trajectory.u[j].copy()]
+        for slot, (target, offset) in enumerate(((in_state, 0), (in_state, n), (in_control, 0))):
+            size = 2e-3 * max(1.0, np.abs(point[slot]).max()) if slot != 1 else 2e-3 * max(np.abs(point[1]).max(), 1e-9)
+            for c in range(point[slot].size):
+                for shift, weight in weights.items():
+                    for sign in (1.0, -1.0):
+                        moved = [x.copy() for x in point]
+                        moved[slot][c] += sign * shift * size
+                        target[j, :, offset + c] += sign * weight / size * drift(*moved)
+    return in_state, in_control
+
+
+def _require_match(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> None:
+    if trajectory.joint_names != scene.robot.joint_names:
+        raise InputError(
+            f"the trajectory is of joints {', '.join(trajectory.joint_names)}; "
+            f"the scene's robot has {', '.join(scene.robot.joint_names)}"
+        )
+    if trajectory.integrator != str(integrator):
+        raise InputError(f"the trajectory was made with {trajectory.integrator}, not {integrator}: give integrator=")
+    for name, array, size in (
+        ("controls", trajectory.u, scene.controls),
+        ("processes", trajectory.dw, scene.processes),
+    ):
+        if array.shape[1] != size:
+            raise InputError(f"the trajectory has {array.shape[1]} {name}, the scene {size}")
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Mean and covariance of the deviation from a trajectory, at its nodes.
+
+    Attributes:
+        mean: (N + 1, 2n).
+        covariance: (N + 1, 2n, 2n).
+    """
+
+    mean: Floats
+    covariance: Floats
+
+
+def propagate_moments(
+    linearization: Linearization, mean: ArrayLike | None = None, covariance: ArrayLike | None = None
+) -> Moments:
+    """Mean and covariance of dx under the linearization with du = 0, in closed form.
+
+        mean' = A mean,    P' = A P A' + dt sum_i [ Gx_i P Gx_i' + g_i g_i' ],    g_i = Gx_i mean + G_i
+
+    Args:
+        linearization: From :func:`linearize`.
+        mean: Of dx at the first node (2n,); zero if left out.
+        covariance: Of dx there (2n, 2n); zero if left out.
+
+    Raises:
+        InputError: A wrong shape, or values that are not finite.
+    """
+    size = linearization.A.shape[1]
+    means, covariances = np.zeros((linearization.steps + 1, size)), np.zeros((linearization.steps + 1, size, size))
+    if mean is not None:
+        means[0] = finite_array("mean", mean, (size,))
+    if covariance is not None:
+        covariances[0] = finite_array("covariance", covariance, (size, size))
+    for j in range(linearization.steps):
+        A, Gx, m, P = linearization.A[j], linearization.Gx[j], means[j], covariances[j]
+        g = linearization.G[j] + np.einsum("aib,b->ai", Gx, m)
+        means[j + 1] = A @ m
+        covariances[j + 1] = A @ P @ A.T + linearization.dt * (np.einsum("aib,bc,dic->ad", Gx, P, Gx) + g @ g.T)
+    return Moments(means, covariances)

@@ -1,0 +1,66 @@
+"""Feedback policies that kernels can evaluate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import finite_array
+from varpin.errors import InputError
+from varpin.kernels.tree import Commands
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class LinearPolicy:
+    """u = u_k + gains_k (x - x_k), evaluated at the start of each of N steps and held over it.
+
+    x is (q, p) for variational integrators and (q, v) for the others.
+
+    Attributes:
+        u: Feed-forward (N, m).
+        gains: (N, m, 2n).
+        reference: x_k (N, 2n).
+    """
+
+    u: Floats
+    gains: Floats
+    reference: Floats
+
+    def __init__(self, u: ArrayLike, gains: ArrayLike, reference: ArrayLike) -> None:
+        """Make a policy.
+
+        Args:
+            u: Feed-forward controls (N, m).
+            gains: (N, m, 2n).
+            reference: (N, 2n), or (N + 1, 2n), of which the last row is not used.
+
+        Raises:
+            InputError: Shapes that do not fit each other, or values that are not finite.
+        """
+        shape = np.shape(gains)
+        if len(shape) != 3:
+            raise InputError(f"gains must have shape (N, m, 2n), got {shape}")
+        steps, m, size = shape
+        rows = np.asarray(reference)
+        values = {
+            "u": finite_array("u", u, (steps, m)),
+            "gains": finite_array("gains", gains, shape),
+            "reference": finite_array("reference", rows[:steps] if len(rows) == steps + 1 else rows, (steps, size)),
+        }
+        for name, value in values.items():
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    def commands(self, steps: int, controls: int, dof: int) -> Commands:
+        """The policy as kernels take it.
+
+        Raises:
+            InputError: It is for another number of steps, controls or coordinates.
+        """
+        if self.gains.shape != (steps, controls, 2 * dof):
+            raise InputError(f"the policy's gains must have shape {(steps, controls, 2 * dof)}, got {self.gains.shape}")
+        return Commands(self.u, self.gains, self.reference)

@@ -1,0 +1,74 @@
+"""Wiener increments: drawn from a seed, given, refined to half the step or summed to twice."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import finite_array, positive
+from varpin.errors import InputError
+
+Floats = NDArray[np.float64]
+
+
+def wiener_increments(
+    processes: int,
+    dt: float,
+    steps: int,
+    rng: np.random.Generator | int | None = None,
+    increments: ArrayLike | None = None,
+) -> Floats:
+    """Increments of k independent Wiener processes over N steps.
+
+    Args:
+        processes: k.
+        dt: Time step [s].
+        steps: N.
+        rng: Generator or seed; each increment is drawn from N(0, dt).
+        increments: The increments themselves, (N, k) [s^0.5], to be checked only.
+
+    Returns:
+        (N, k) [s^0.5], or (0, k) with neither ``rng`` nor ``increments``, or without processes: none.
+
+    Raises:
+        InputError: Both are given, a wrong shape, or values that are not finite.
+    """
+    if increments is not None:
+        if rng is not None:
+            raise InputError("give rng, to draw the Wiener increments, or increments, to use yours; not both")
+        return finite_array("increments", increments, (steps, processes))
+    if rng is None or processes == 0:
+        return np.zeros((0, processes))
+    deviation = math.sqrt(positive("dt", dt, "s"))
+    return np.random.default_rng(rng).normal(scale=deviation, size=(steps, processes))
+
+
+def coarsen(increments: Floats, factor: int = 2) -> Floats:
+    """The same Brownian path at ``factor`` times the step: sums of increments, (N, k) to (N / factor, k).
+
+    Raises:
+        InputError: N is no multiple of ``factor``.
+    """
+    steps, processes = increments.shape
+    if factor < 1 or steps % factor:
+        raise InputError(f"{steps} increments cannot be summed by {factor}: the number must be a multiple of it")
+    total: Floats = increments.reshape(steps // factor, factor, processes).sum(axis=1)
+    return total
+
+
+def refine(increments: Floats, dt: float, rng: np.random.Generator | int) -> Floats:
+    """The same Brownian path at half the step, by Brownian bridge: (N, k) to (2 N, k).
+
+    The path's middle, given its ends, is normal with mean half the increment and variance dt / 4.
+
+    Args:
+        increments: Over steps of ``dt`` (N, k) [s^0.5].
+        dt: Their time step [s].
+        rng: Of the bridges.
+    """
+    half = 0.5 * increments
+    deviation = 0.5 * math.sqrt(positive("dt", dt, "s"))
+    bridge = np.random.default_rng(rng).normal(scale=deviation, size=increments.shape)
+    return np.stack([half + bridge, half - bridge], axis=1).reshape((-1, increments.shape[1]))

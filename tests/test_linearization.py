@@ -1,0 +1,191 @@
+"""The linearization against differences of the steps themselves, and its moments against sampling."""
+
+import numpy as np
+import pytest
+
+import varpin as vp
+
+ARMS = {
+    "finger": {},
+    "ur5": {},
+    "panda": {"panda_finger_joint1": 0.02},
+    "kinova": {},
+    "talos_arm": {},
+    "baxter": {},
+}
+WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+
+
+def make_scene(name, **noise):
+    robot = vp.load_robot(name, lock=ARMS[name])
+    size = 1e-5 if name == "finger" else 1.0
+    return vp.Scene(robot, damping=0.1 * size, stiffness=0.5 * size, **noise), size
+
+
+def one_step(scene, x, u, dw, dt, integrator):
+    """The step (q, p, u, dw) -> (q', p') through the public interface."""
+    n = scene.robot.dof
+    q, p = x[:n], x[n:]
+    v = np.linalg.solve(vp.lagrangian_jet(scene, q, np.zeros(n)).Lvv, p)
+    end = vp.simulate(scene, q, v, dt=dt, steps=1, controls=u, increments=dw[None], integrator=integrator)
+    assert end.statistics.split_steps == 0
+    return np.concatenate([end.q[1], end.p[1]])
+
+
+def difference(function, x, size):
+    """Derivative of ``function`` at x by differences of eighth order, steps in proportion to ``size``."""
+    columns = []
+    for j in range(x.size):
+        e = np.zeros(x.size)
+        e[j] = size[j]
+        columns.append(sum(c * (function(x + k * e) - function(x - k * e)) for k, c in WEIGHTS.items()) / size[j])
+    return np.array(columns).T
+
+
+def worst(given, expected, rows, columns):
+    """Largest error, each entry in units of its row and column: positions and momenta differ by orders of magnitude."""
+    scaled = expected / rows[:, None] * columns[None, :]
+    return np.abs((given - expected) / rows[:, None] * columns[None, :]).max() / np.abs(scaled).max()
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Midpoint(alpha=0.2), vp.Midpoint(kick="split")], ids=str)
+def test_first_derivatives(name, integrator):
+    """A, B, K and G to 1e-8 of eighth-order differences of the step."""
+    scene, strength = make_scene(name)
+    noise = vp.AdditiveNoise(1e-2 * strength) + vp.ControlNoise(0.1) + vp.StateNoise(strength, center=0.3)
+    scene = vp.Scene(scene.robot, damping=scene.damping, stiffness=scene.stiffness, noise=noise)
+    n, dt = scene.robot.dof, 1e-3
+    rng = np.random.default_rng(0)
+    q, v, u = rng.uniform(-1, 1, n), rng.uniform(-1, 1, n), strength * rng.uniform(-1, 1, n)
+    motion = vp.simulate(scene, q, v, dt=dt, steps=1, controls=u, integrator=integrator)
+    lin = vp.linearize(scene, motion, integrator=integrator)
+    p = motion.p[0]
+    momentum = np.full(n, np.abs(p).max())
+    rows = np.concatenate([np.ones(n), momentum])
+    x, zero = np.concatenate([q, p]), np.zeros(scene.processes)
+    in_x = difference(lambda x: one_step(scene, x, u, zero, dt, integrator), x, 2e-2 * rows)
+    in_u = difference(lambda u: one_step(scene, x, u, zero, dt, integrator), u, np.full(n, strength))
+    in_w = difference(lambda w: one_step(scene, x, u, w, dt, integrator), zero, np.full(scene.processes, 1e-2))
+    assert worst(lin.A[0], in_x, rows, rows) < 1e-8
+    assert worst(lin.K[0], in_x[:, n:], rows, momentum) < 1e-8
+    assert worst(lin.B[0], in_u, rows, np.full(n, strength)) < 1e-8
+    assert worst(lin.G[0], in_w, rows, np.full(scene.processes, 1.0)) < 1e-8
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("alpha", [0.0, 0.5, 0.7])
+def test_symplectic(name, alpha):
+    """A'JA = J to 1e-12 and det A = 1 where nothing is damped."""
+    scene = vp.Scene(vp.load_robot(name, lock=ARMS[name]))
+    n = scene.robot.dof
+    integrator = vp.Midpoint(alpha=alpha)
+    rng = np.random.default_rng(1)
+    motion = vp.simulate(scene, rng.normal(size=n), rng.normal(size=n), dt=1e-3, steps=5, integrator=integrator)
+    J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(n))
+    size = np.concatenate([np.ones(n), np.full(n, np.abs(motion.p).max())])
+    for A in vp.linearize(scene, motion, integrator=integrator).A:
+        scaled = A / size[:, None] * size[None, :]
+        assert np.abs(scaled.T @ J @ scaled - J).max() < 1e-12 * max(1.0, np.abs(scaled).max() ** 2)
+        assert np.linalg.det(scaled) == pytest.approx(1.0, abs=1e-11)
+
+
+def test_split_steps_are_chained():
+    """A step taken in parts is linearized in the same parts."""
+    scene = vp.Scene(vp.planar_chain(3))
+    q, v, dt = np.array([2.1, -2.8, 1.4]), np.array([-5.9, -4.4, -2.5]), 0.1
+    motion = vp.simulate(scene, q, v, dt=dt, steps=1)
+    assert motion.statistics.split_steps == 1
+    lin = vp.linearize(scene, motion)
+
+    def step(x):
+        v = np.linalg.solve(vp.lagrangian_jet(scene, x[:3], np.zeros(3)).Lvv, x[3:])
+        end = vp.simulate(scene, x[:3], v, dt=dt, steps=1)
+        assert end.statistics.substeps[0] == motion.statistics.substeps[0]
+        return np.concatenate([end.q[1], end.p[1]])
+
+    x = np.concatenate([q, motion.p[0]])
+    numeric = difference(step, x, np.full(6, 1e-3))
+    np.testing.assert_allclose(lin.A[0], numeric, rtol=0, atol=1e-8 * np.abs(numeric).max())
+    J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(3))
+    assert np.abs(lin.A[0].T @ J @ lin.A[0] - J).max() < 1e-11 * np.abs(lin.A[0]).max() ** 2
+
+
+def friction_noise(n, strength):
+    """Fields F_i = c (1 + v_i^2 / 2 + q_i v_i) e_i, which depend on the velocity, with their derivatives."""
+
+    def diagonal(values):
+        out = np.zeros((n, n, n))
+        out[np.arange(n), np.arange(n), np.arange(n)] = values
+        return strength * out
+
+    return vp.CustomNoise(
+        field=lambda q, v, u: strength * np.diag(1.0 + 0.5 * v**2 + q * v),
+        processes=n,
+        dq=lambda q, v, u: diagonal(v),
+        dv=lambda q, v, u: diagonal(v + q),
+        check=True,
+    )
+
+
+def test_velocity_dependent_fields():
+    """Their drift enters A and B; their derivatives at fixed momentum enter Gx."""
+    robot = vp.load_robot("ur5")
+    scene = vp.Scene(robot, damping=0.1, noise=friction_noise(6, 0.3))
+    rng = np.random.default_rng(0)
+    q, v, u, dt = rng.uniform(-1, 1, 6), rng.uniform(-1, 1, 6), rng.normal(size=6), 1e-3
+    motion = vp.simulate(scene, q, v, dt=dt, steps=1, controls=u)
+    lin = vp.linearize(scene, motion)
+    x, zero = np.concatenate([q, motion.p[0]]), np.zeros(6)
+    integrator = vp.Midpoint()
+    rows = np.concatenate([np.ones(6), np.full(6, np.abs(motion.p).max())])
+    in_x = difference(lambda x: one_step(scene, x, u, zero, dt, integrator), x, 5e-3 * rows)
+    assert worst(lin.A[0], in_x, rows, rows) < 1e-8
+    without_drift = vp.linearize(vp.Scene(robot, damping=0.1, noise=vp.AdditiveNoise(1.0)), motion)
+    assert worst(without_drift.A[0], in_x, rows, rows) > 1e-6
+
+    def field(x):
+        v = np.linalg.solve(vp.lagrangian_jet(scene, x[:6], np.zeros(6)).Lvv, x[6:])
+        return (lin.K[0] @ scene.noise.fields(x[None, :6], v[None], u[None], q).F[0]).ravel()
+
+    in_fields = difference(field, x, 1e-2 * rows).reshape(12, 6, 12)
+    np.testing.assert_allclose(lin.Gx[0], in_fields, rtol=0, atol=1e-8 * np.abs(in_fields).max())
+
+
+def test_moments_against_samples():
+    """Closed-form mean and covariance within 4 standard errors of 2e5 sampled linearizations."""
+    scene, strength = make_scene("finger")
+    noise = vp.AdditiveNoise(0.3 * strength) + vp.StateNoise(20 * strength, center=0.0)
+    scene = vp.Scene(scene.robot, damping=scene.damping, stiffness=scene.stiffness, noise=noise)
+    motion = vp.simulate(scene, [0.4, 0.3, 0.2], [0.0, 0.0, 0.0], dt=5e-3, steps=12)
+    lin = vp.linearize(scene, motion)
+    mean, spread = np.full(6, 1e-2), 1e-2
+    mean[3:] = 1e-8
+    covariance = np.diag([spread**2] * 3 + [1e-16] * 3)
+    moments = vp.propagate_moments(lin, mean, covariance)
+    rng = np.random.default_rng(0)
+    samples = 200_000
+    x = mean + rng.normal(size=(samples, 6)) * np.sqrt(np.diag(covariance))
+    for j in range(lin.steps):
+        x = lin.step(j, x, np.zeros((samples, 3)), np.sqrt(lin.dt) * rng.normal(size=(samples, scene.processes)))
+    deviation = x - x.mean(axis=0)
+    products = deviation[:, :, None] * deviation[:, None, :]
+    error = np.abs(x.mean(axis=0) - moments.mean[-1]) / (x.std(axis=0) / np.sqrt(samples))
+    assert error.max() < 4.0
+    error = np.abs(products.mean(axis=0) - moments.covariance[-1]) / (products.std(axis=0) / np.sqrt(samples))
+    assert error.max() < 4.0
+
+
+def test_multiplicative_noise_matters_to_the_moments():
+    """A test of the test above: without Gx the covariance is far off."""
+    scene, strength = make_scene("finger")
+    scene = vp.Scene(scene.robot, noise=vp.StateNoise(1e3 * strength, center=0.0), gravity=False)
+    motion = vp.simulate(scene, [0.4, 0.3, 0.2], [0.0, 0.0, 0.0], dt=5e-3, steps=12)
+    lin = vp.linearize(scene, motion)
+    covariance = np.diag([1e-2] * 3 + [0.0] * 3)
+    full = vp.propagate_moments(lin, covariance=covariance).covariance[-1]
+    additive = vp.Linearization(**{**vars(lin), "Gx": np.zeros_like(lin.Gx)})
+    assert (
+        np.abs(full - vp.propagate_moments(additive, covariance=covariance).covariance[-1]).max()
+        > 0.01 * np.abs(full).max()
+    )
