@@ -19,6 +19,7 @@ from varpin.kernels.tree import Commands
 from varpin.policy import LinearPolicy
 from varpin.scene import Scene, require_scene
 from varpin.simulation import commands_of
+from varpin.wiener import generator
 
 Floats = NDArray[np.float64]
 
@@ -136,7 +137,7 @@ def simulate_ensemble(
 
     Other Args:
         integrator: ``Midpoint()`` if left out.
-        store: Keep every path. Without, only the statistics are kept, and memory does not grow with N.
+        store: Keep every path. Without, only the statistics are kept, and memory does not grow with P N.
         quantiles: Levels in [0, 1].
         workers: Threads; as many as there are cores if left out.
         progress: Called now and then with (steps done by all paths, N).
@@ -155,8 +156,12 @@ def simulate_ensemble(
     if levels.ndim != 1 or ((levels < 0.0) | (levels > 1.0)).any():
         raise InputError(f"quantiles must be levels in [0, 1], got {quantiles}")
     workers = count("workers", (os.cpu_count() or 1) if workers is None else workers, least=1)
+    integrator = Midpoint() if integrator is None else integrator
+    if not isinstance(integrator, Integrator):
+        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
+    _require_memory(scene, steps, paths if store else 0)
     commands = commands_of(scene, controls, steps)
-    run = _Run(scene, Midpoint() if integrator is None else integrator, dt, start, rng, commands)
+    run = _Run(scene, integrator, dt, start, rng, commands)
     collector = _Collector(steps, levels, run, store)
     block = max(1, min(steps, _BLOCK // (paths * (4 * n + scene.controls + scene.processes + 8))))
     with announced_compilation(), ThreadPoolExecutor(workers) as pool:
@@ -164,19 +169,33 @@ def simulate_ensemble(
             collector.add_first(run.first)
             for begin in range(0, steps, block):
                 end = min(steps, begin + block)
-                collector.add(begin, run.advance(begin, end, pool))
+                collector.add(begin, end, *run.advance(begin, end, pool))
                 if progress is not None:
                     progress(end, steps)
+                if not run.alive.any():
+                    break
         except KeyboardInterrupt:
             raise EnsembleInterrupted(collector.ensemble()) from None
     ensemble = collector.ensemble()
     if ensemble.failures:
-        first = ensemble.failures[0]
+        first = min(ensemble.failures, key=lambda failure: failure.step)
         text = f"{len(ensemble.failures)} of {paths} paths failed, the first at step {first.step}: {first.reason}"
         if len(ensemble.failures) == paths:
             raise VarpinError(text)
         logger.warning("%s; they are left out of the statistics from there on", text)
     return ensemble
+
+
+def _require_memory(scene: Scene, steps: int, stored: int) -> None:
+    """Refuse a record that cannot be held, before anything runs."""
+    n, m = scene.robot.dof, scene.controls
+    row = 2 * n * (2 * n + 5) + m + stored * (3 * n + m + 1)
+    try:
+        np.empty((steps + 1, row))
+    except (MemoryError, ValueError, OverflowError):
+        raise InputError(
+            f"steps = {steps} with {stored} stored paths needs more memory than there is: {row * 8} bytes a step"
+        ) from None
 
 
 def _per_path(name: str, value: ArrayLike, paths: int, n: int) -> Floats:
@@ -200,7 +219,7 @@ class _Run:
     ) -> None:
         self.scene, self.integrator, self.dt, self.commands = scene, integrator, dt, commands
         self.paths = len(start[0])
-        self.generators = np.random.default_rng(rng).spawn(self.paths)
+        self.generators = generator(rng).spawn(self.paths)
         self.alive = np.ones(self.paths, dtype=bool)
         self.failures: list[PathFailure] = []
         self.groups = [slice(a, min(a + _GROUP, self.paths)) for a in range(0, self.paths, _GROUP)]
@@ -211,8 +230,8 @@ class _Run:
             self.states.append(state)
             self.first += first
 
-    def advance(self, begin: int, end: int, pool: ThreadPoolExecutor) -> list[Segment]:
-        """Steps begin .. end of every path; the segments of paths that fail are short."""
+    def advance(self, begin: int, end: int, pool: ThreadPoolExecutor) -> tuple[list[Segment], NDArray[np.int64]]:
+        """Steps begin .. end of every path, and how many of them each path did: none once it has failed."""
         rows = Commands(*(array[begin:end] for array in self.commands))
 
         def work(number: int) -> list[Segment]:
@@ -222,11 +241,14 @@ class _Run:
             return self.integrator.rollout(self.scene, self.states[number], rows, np.sqrt(self.dt) * drawn, self.dt)
 
         segments = [segment for part in pool.map(work, range(len(self.groups))) for segment in part]
-        for path, segment in enumerate(segments):
-            if self.alive[path] and segment.failure is not None:
+        done = np.zeros(self.paths, dtype=np.int64)
+        for path in np.flatnonzero(self.alive):
+            segment = segments[path]
+            done[path] = len(segment.q)
+            if segment.failure is not None:
                 self.alive[path] = False
-                self.failures.append(PathFailure(path, begin + len(segment.q), segment.failure.reason))
-        return segments
+                self.failures.append(PathFailure(int(path), begin + len(segment.q), segment.failure.reason))
+        return segments, done
 
 
 class _Collector:
@@ -241,45 +263,47 @@ class _Collector:
         self.quantiles = np.full((len(levels), steps + 1, 2 * n), np.nan)
         self.energy = np.full((2, steps + 1), np.nan)
         self.count = np.zeros(steps + 1, dtype=np.int64)
-        self.whole = np.ones(P, dtype=bool)
         shapes = {"q": n, "v": n, "p": n}
         self.stored = {name: np.full((P, steps + 1, size), np.nan) for name, size in shapes.items()} if store else {}
         if store:
             self.stored |= {"energy": np.full((P, steps + 1), np.nan), "u": np.full((P, steps, m), np.nan)}
 
     def add_first(self, segments: list[Segment]) -> None:
-        self._enter(slice(0, 1), segments)
+        self._enter(slice(0, 1), segments, np.ones(len(segments), dtype=np.int64))
 
-    def add(self, begin: int, segments: list[Segment]) -> None:
-        steps = max(len(segment.q) for segment in segments)
-        for path, segment in enumerate(segments):
-            if self.stored and self.whole[path]:
-                self.stored["u"][path, begin : begin + len(segment.u)] = segment.u
-        self._enter(slice(begin + 1, begin + 1 + steps), segments)
+    def add(self, begin: int, end: int, segments: list[Segment], done: NDArray[np.int64]) -> None:
+        """Steps begin .. end, of which path i did the first ``done[i]``."""
+        if self.stored:
+            for path, segment in enumerate(segments):
+                self.stored["u"][path, begin : begin + done[path]] = segment.u[: done[path]]
+        self._enter(slice(begin + 1, end + 1), segments, done)
 
-    def _enter(self, nodes: slice, segments: list[Segment]) -> None:
-        size = nodes.stop - nodes.start
+    def _enter(self, nodes: slice, segments: list[Segment], done: NDArray[np.int64]) -> None:
         velocity = "p" if self.run.integrator.variational else "v"
-        counted = [s for path, s in enumerate(segments) if self.whole[path] and len(s.q) == size]
         for path, segment in enumerate(segments):
-            if not self.whole[path]:
-                continue
             for name in ("q", "v", "p", "energy") if self.stored else ():
-                self.stored[name][path, nodes.start : nodes.start + len(segment.q)] = getattr(segment, name)
-            self.whole[path] = len(segment.q) == size
-        if counted:
-            x = np.array([np.concatenate([s.q, getattr(s, velocity)], axis=1) for s in counted])
-            energy = np.array([s.energy for s in counted])
-            self.mean[nodes] = x.mean(axis=0)
-            deviation = x - self.mean[nodes]
-            self.covariance[nodes] = np.einsum("Pja,Pjb->jab", deviation, deviation) / max(1, len(counted) - 1)
-            self.quantiles[:, nodes] = np.quantile(x, self.levels, axis=0)
-            self.energy[0, nodes], self.energy[1, nodes] = (
-                energy.mean(axis=0),
-                energy.std(axis=0, ddof=len(counted) > 1),
+                self.stored[name][path, nodes.start : nodes.start + done[path]] = getattr(segment, name)[: done[path]]
+        # Between two nodes at which paths fail, the same paths are counted.
+        first = 0
+        for last in np.unique(done[done > 0]):
+            counted = [segment for segment, k in zip(segments, done, strict=True) if k >= last]
+            self._reduce(
+                slice(nodes.start + first, nodes.start + last),
+                np.array([np.hstack([s.q[first:last], getattr(s, velocity)[first:last]]) for s in counted]),
+                np.array([s.energy[first:last] for s in counted]),
             )
-            self.count[nodes] = len(counted)
+            first = last
         self.done = nodes.stop - 1
+
+    def _reduce(self, nodes: slice, x: Floats, energy: Floats) -> None:
+        """Statistics of x (P, N, 2n) and of the energy (P, N)."""
+        self.mean[nodes] = x.mean(axis=0)
+        deviation = x - self.mean[nodes]
+        self.covariance[nodes] = np.einsum("Pja,Pjb->jab", deviation, deviation) / max(1, len(x) - 1)
+        self.quantiles[:, nodes] = np.quantile(x, self.levels, axis=0)
+        self.energy[0, nodes] = energy.mean(axis=0)
+        self.energy[1, nodes] = energy.std(axis=0, ddof=len(x) > 1)
+        self.count[nodes] = len(x)
 
     def ensemble(self) -> Ensemble:
         nodes = slice(0, self.done + 1)

@@ -13,6 +13,7 @@ from varpin.integrators import Integrator, Midpoint
 from varpin.integrators.base import diffusion_and_drift
 from varpin.kernels.jet import jets
 from varpin.kernels.tree import new_sweep
+from varpin.noise import Fields
 from varpin.scene import Scene, require_scene
 from varpin.trajectory import Trajectory
 
@@ -81,26 +82,27 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     integrator = Midpoint() if integrator is None else integrator
     _require_match(scene, trajectory, integrator)
     n, steps = scene.robot.dof, trajectory.steps
-    Jx, Jf = integrator.linearize(scene, trajectory)
+    Jx, Jf, Jk = integrator.linearize(scene, trajectory)
     q, v = trajectory.q, trajectory.v
     start = scene.noise.fields(q[:-1], v[:-1], trajectory.u, q[0])
     M, A_node = node_jets(scene, q, v)
-    B = Jf @ scene.actuation
-    A = Jx
-    # dv at fixed q is M^-1 dp; dv at fixed p is -M^-1 L_vq dq.
-    Fx = _in_state(start.Fq, start.Fv, M[:-1], A_node[:-1])
+    A, B = Jx, Jf @ scene.actuation
     if start.Fv is not None:
-        drift_x, drift_u = _drift_derivatives(scene, trajectory)
-        A = A + Jf @ drift_x
-        B = B + Jf @ drift_u
-    K = Jx[:, :, n:]
+        drift_x, drift_u = _drift_derivatives(scene, trajectory, variational=integrator.variational)
+        A, B = A + Jf @ drift_x, B + Jf @ drift_u
     left = integrator.left
-    G = left * (K @ start.F)
-    Gx = left * np.einsum("Nab,Nbic->Naic", K, Fx)
-    Gu = left * np.einsum("Nab,Nbic->Naic", K, start.Fu)
+    if integrator.variational:
+        K = Jk
+        jump, jump_x, jump_u = start.F, _in_momentum(start.Fq, start.Fv, M[:-1], A_node[:-1]), start.Fu
+    else:
+        K = Jk @ np.linalg.inv(M[:-1])
+        jump, jump_x, jump_u = _in_velocity(scene, q[:-1], start, M[:-1])
+    G = left * (Jk @ jump)
+    Gx = left * np.einsum("Nab,Nbic->Naic", Jk, jump_x)
+    Gu = left * np.einsum("Nab,Nbic->Naic", Jk, jump_u)
     if left < 1.0:
         end = scene.noise.fields(q[1:], v[1:], trajectory.u, q[0])
-        Ex = _in_state(end.Fq, end.Fv, M[1:], A_node[1:])
+        Ex = _in_momentum(end.Fq, end.Fv, M[1:], A_node[1:])
         G[:, n:] += (1.0 - left) * end.F
         Gx[:, n:] += (1.0 - left) * np.einsum("Naib,Nbc->Naic", Ex, A)
         Gu[:, n:] += (1.0 - left) * (end.Fu + np.einsum("Naib,Nbc->Naic", Ex, B))
@@ -125,8 +127,8 @@ def node_jets(scene: Scene, q: Floats, v: Floats) -> tuple[Floats, Floats]:
     return M, A
 
 
-def _in_state(Fq: Floats, Fv: Floats | None, M: Floats, A: Floats) -> Floats:
-    """dF/d(q, p) (N, n, k, 2n) from dF/dq and dF/dv."""
+def _in_momentum(Fq: Floats, Fv: Floats | None, M: Floats, A: Floats) -> Floats:
+    """dF/d(q, p) (N, n, k, 2n) from dF/dq and dF/dv: at fixed q dv = M^-1 dp, at fixed p dv = -M^-1 L_vq dq."""
     N, n, k, _ = Fq.shape
     Fx = np.zeros((N, n, k, 2 * n))
     Fx[..., :n] = Fq
@@ -137,8 +139,24 @@ def _in_state(Fq: Floats, Fv: Floats | None, M: Floats, A: Floats) -> Floats:
     return Fx
 
 
-def _drift_derivatives(scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
-    """D drift/d(q, p) (N, n, 2n) and d drift/du (N, n, m), by differences of eighth order.
+def _in_velocity(scene: Scene, q: Floats, fields: Fields, M: Floats) -> tuple[Floats, Floats, Floats]:
+    """Y = M^-1 F (N, n, k) and its derivatives in (q, v) (N, n, k, 2n) and u (N, n, k, m).
+
+    d(M y)/dq at fixed y is L_vq(q, y), so dy = M^-1 (dF - L_vq(q, y) dq).
+    """
+    N, n, k = fields.F.shape
+    inverse = np.linalg.inv(M)
+    y = inverse @ fields.F
+    _, bend = node_jets(scene, np.repeat(q, k, axis=0), np.ascontiguousarray(np.swapaxes(y, 1, 2)).reshape(N * k, n))
+    Fx = np.zeros((N, n, k, 2 * n))
+    Fx[..., :n] = fields.Fq - np.swapaxes(bend.reshape(N, k, n, n), 1, 2)
+    if fields.Fv is not None:
+        Fx[..., n:] = fields.Fv
+    return y, np.einsum("Nab,Nbic->Naic", inverse, Fx), np.einsum("Nab,Nbic->Naic", inverse, fields.Fu)
+
+
+def _drift_derivatives(scene: Scene, trajectory: Trajectory, *, variational: bool) -> tuple[Floats, Floats]:
+    """Derivatives of the drift in (q, p), or (q, v), (N, n, 2n) and in u (N, n, m), by differences of eighth order.
 
     The drift is the one place that needs second derivatives of a diffusion field, which nobody has to write down.
     """
@@ -146,13 +164,18 @@ def _drift_derivatives(scene: Scene, trajectory: Trajectory) -> tuple[Floats, Fl
     start = trajectory.q[0]
     weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 
-    def drift(q: Floats, p: Floats, u: Floats) -> Floats:
-        M, _ = node_jets(scene, q[None], np.zeros((1, n)))
-        return diffusion_and_drift(scene, q, np.linalg.solve(M[0], p), u, start)[1]
+    second = trajectory.p if variational else trajectory.v
+
+    def drift(q: Floats, second: Floats, u: Floats) -> Floats:
+        v = second
+        if variational:
+            M, _ = node_jets(scene, q[None], np.zeros((1, n)))
+            v = np.linalg.solve(M[0], second)
+        return diffusion_and_drift(scene, q, v, u, start)[1]
 
     in_state, in_control = np.zeros((trajectory.steps, n, 2 * n)), np.zeros((trajectory.steps, n, m))
     for j in range(trajectory.steps):
-        point = [trajectory.q[j].copy(), trajectory.p[j].copy(), trajectory.u[j].copy()]
+        point = [trajectory.q[j].copy(), second[j].copy(), trajectory.u[j].copy()]
         for slot, (target, offset) in enumerate(((in_state, 0), (in_state, n), (in_control, 0))):
             size = 2e-3 * max(1.0, np.abs(point[slot]).max()) if slot != 1 else 2e-3 * max(np.abs(point[1]).max(), 1e-9)
             for c in range(point[slot].size):

@@ -7,13 +7,13 @@ In the equations of motion they add the generalized force sum_i F_i o dw_i / dt 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, broadcast_array, finite_array, require_finite
+from varpin.checks import as_floats, broadcast_array, count, finite_array, require_finite
 from varpin.errors import InputError
 from varpin.kernels.tree import Diffusion
 
@@ -254,6 +254,11 @@ class CustomNoise(Noise):
 
     def bind(self, actuation: Floats) -> CustomFields:
         """See :meth:`Noise.bind`."""
+        count("CustomNoise processes", self.processes)
+        for name in ("field", "dq", "dv", "du"):
+            value = getattr(self, name)
+            if not callable(value) and (value is not None or name == "field"):
+                raise InputError(f"CustomNoise {name} must be a function of (q, v, u), got {value!r}")
         bound = CustomFields(self, *actuation.shape)
         if self.check:
             bound.check()
@@ -281,7 +286,8 @@ class CustomFields(BoundNoise):
     def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:  # noqa: ARG002
         """See :meth:`BoundNoise.fields`."""
         shape = (self.n, self.processes)
-        points = list(zip(q, v, u, strict=True))
+        # Copies: a field that writes into its arguments must not reach the state of a motion.
+        points = list(zip(q.copy(), v.copy(), u.copy(), strict=True))
         noise = self.noise
         return Fields(
             self._evaluate("field", noise.field, points, shape),
@@ -356,10 +362,10 @@ def bind(noise: Noise | Sequence[Noise] | None, actuation: Floats) -> BoundNoise
     Raises:
         InputError: Something else than a noise model, or parameters that do not fit.
     """
-    if noise is None:
+    if noise is None or (isinstance(noise, Sequence) and not noise):
         n, m = actuation.shape
         return _compiled(n, m, 0)
-    models: Iterator[Noise] = iter([noise] if isinstance(noise, Noise) else noise)
+    models: Sequence[Noise] = [noise] if isinstance(noise, Noise) or not isinstance(noise, Sequence) else noise
     bound = []
     for model in models:
         if not isinstance(model, Noise):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import finite_array
+from varpin.checks import as_floats, finite_array
 from varpin.errors import InputError
 from varpin.kernels.tree import Commands
 
@@ -41,15 +41,17 @@ class LinearPolicy:
         Raises:
             InputError: Shapes that do not fit each other, or values that are not finite.
         """
-        shape = np.shape(gains)
+        rows, gains = as_floats("reference", reference), as_floats("gains", gains)
+        shape = gains.shape
         if len(shape) != 3:
             raise InputError(f"gains must have shape (N, m, 2n), got {shape}")
         steps, m, size = shape
-        rows = np.asarray(reference)
+        if rows.shape == (steps + 1, size):
+            rows = rows[:steps]
         values = {
             "u": finite_array("u", u, (steps, m)),
             "gains": finite_array("gains", gains, shape),
-            "reference": finite_array("reference", rows[:steps] if len(rows) == steps + 1 else rows, (steps, size)),
+            "reference": finite_array("reference", rows, (steps, size)),
         }
         for name, value in values.items():
             value.setflags(write=False)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import finite_array, positive
+from varpin.checks import as_floats, count, finite_array, positive, require_finite
 from varpin.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -42,23 +42,36 @@ def wiener_increments(
     if rng is None or processes == 0:
         return np.zeros((0, processes))
     deviation = math.sqrt(positive("dt", dt, "s"))
-    return np.random.default_rng(rng).normal(scale=deviation, size=(steps, processes))
+    return generator(rng).normal(scale=deviation, size=(steps, processes))
 
 
-def coarsen(increments: Floats, factor: int = 2) -> Floats:
+def generator(rng: np.random.Generator | int | None) -> np.random.Generator:
+    """``rng`` itself, or a generator seeded with it.
+
+    Raises:
+        InputError: Neither a generator nor a seed.
+    """
+    try:
+        return np.random.default_rng(rng)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"rng must be a numpy Generator or a seed, an integer >= 0, got {rng!r}: {error}") from None
+
+
+def coarsen(increments: ArrayLike, factor: int = 2) -> Floats:
     """The same Brownian path at ``factor`` times the step: sums of increments, (N, k) to (N / factor, k).
 
     Raises:
-        InputError: N is no multiple of ``factor``.
+        InputError: N is no multiple of ``factor``, or the increments are not finite or no such array.
     """
-    steps, processes = increments.shape
-    if factor < 1 or steps % factor:
+    values = _rows(increments)
+    steps, processes = values.shape
+    if steps % count("factor", factor, least=1):
         raise InputError(f"{steps} increments cannot be summed by {factor}: the number must be a multiple of it")
-    total: Floats = increments.reshape(steps // factor, factor, processes).sum(axis=1)
+    total: Floats = values.reshape(steps // factor, factor, processes).sum(axis=1)
     return total
 
 
-def refine(increments: Floats, dt: float, rng: np.random.Generator | int) -> Floats:
+def refine(increments: ArrayLike, dt: float, rng: np.random.Generator | int) -> Floats:
     """The same Brownian path at half the step, by Brownian bridge: (N, k) to (2 N, k).
 
     The path's middle, given its ends, is normal with mean half the increment and variance dt / 4.
@@ -67,8 +80,18 @@ def refine(increments: Floats, dt: float, rng: np.random.Generator | int) -> Flo
         increments: Over steps of ``dt`` (N, k) [s^0.5].
         dt: Their time step [s].
         rng: Of the bridges.
+
+    Raises:
+        InputError: dt <= 0, or the increments are not finite or no such array.
     """
-    half = 0.5 * increments
+    half = 0.5 * _rows(increments)
     deviation = 0.5 * math.sqrt(positive("dt", dt, "s"))
-    bridge = np.random.default_rng(rng).normal(scale=deviation, size=increments.shape)
-    return np.stack([half + bridge, half - bridge], axis=1).reshape((-1, increments.shape[1]))
+    bridge = generator(rng).normal(scale=deviation, size=half.shape)
+    return np.stack([half + bridge, half - bridge], axis=1).reshape((2 * len(half), half.shape[1]))
+
+
+def _rows(increments: ArrayLike) -> Floats:
+    values = require_finite("increments", as_floats("increments", increments))
+    if values.ndim != 2:
+        raise InputError(f"increments must have shape (N, k), got {values.shape}")
+    return values

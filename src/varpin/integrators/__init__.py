@@ -2,4 +2,7 @@
 
 from varpin.integrators.base import Integrator as Integrator
 from varpin.integrators.base import Segment as Segment
+from varpin.integrators.explicit import ExplicitEuler as ExplicitEuler
+from varpin.integrators.explicit import RungeKutta4 as RungeKutta4
+from varpin.integrators.explicit import SemiImplicitEuler as SemiImplicitEuler
 from varpin.integrators.midpoint import Midpoint as Midpoint

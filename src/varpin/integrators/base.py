@@ -90,8 +90,11 @@ class Integrator(ABC):
         """
 
     @abstractmethod
-    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
-        """Derivatives of each step at dw = 0: in the state (N, 2n, 2n), and in a constant force (N, 2n, n).
+    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
+        """Derivatives of each step at dw = 0.
+
+        In the state (N, 2n, 2n), in a constant force (N, 2n, n), and in a jump of the momentum, or of the velocity for
+        integrators on (q, v), where noise makes it jump (N, 2n, n).
 
         Raises:
             LinearizationError: A step has no solution at dw = 0.

@@ -173,7 +173,7 @@ class Midpoint(Integrator):
         )
         return segments_of(nodes, REASONS)
 
-    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
+    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, p).
 
         A step that was taken in parts is taken in parts again, and their derivatives are chained.
@@ -200,7 +200,7 @@ class Midpoint(Integrator):
         )
         if outcome != equation.SOLVED:
             raise LinearizationError(done, done * trajectory.dt, REASONS[outcome])
-        return Jx, Jf
+        return Jx, Jf, Jx[:, :, n:]
 
     def predict(self, state: MidpointState, dt: float) -> tuple[Floats, Floats]:
         """See :meth:`Integrator.predict`; the velocity goes on from the last midpoint through the node."""

@@ -7,6 +7,7 @@ it is taken in halves, and halves of halves. Noise kicks the momentum before the
 import numpy as np
 
 from varpin.kernels._compile import inlined, kernel
+from varpin.kernels.drive import apply_policy, constant_force, noise_impulse
 from varpin.kernels.jet import mass_matrix, second_order
 from varpin.kernels.linalg import factor_ldl, solve_ldl
 from varpin.kernels.midpoint_equation import (
@@ -250,35 +251,12 @@ def path(states: State, i: int) -> State:
 
 
 @inlined
-def apply_policy(commands: Commands, s: int, state: State, u: Floats) -> None:
-    """U = u_s + gains_s (x - x_s), x = (q, p); without gains u = u_s."""
-    n = state.q.size
-    for c in range(u.size):
-        total = commands.u[s, c]
-        if commands.gains.shape[0] > 0:
-            for j in range(n):
-                total += commands.gains[s, c, j] * (state.q[j] - commands.reference[s, j])
-                total += commands.gains[s, c, n + j] * (state.p[j] - commands.reference[s, n + j])
-        u[c] = total
-
-
-@inlined
 def kick(mechanism: Mechanism, part: float, controls: Floats, increments: Floats, state: State, k: Work) -> None:
     """Add ``part`` of the noise's impulse sum_i F_i(q, u) dw_i to the momentum.
 
     ``k.ldl`` holds the factors of M(q). What the kick does to the energy is entered as work: it is no error.
     """
-    fields = mechanism.diffusion
-    n = k.v.size
-    for i in range(n):
-        impulse = 0.0
-        for w in range(increments.size):
-            offset = state.q[i] - state.center[i, w]
-            field = fields.constant[i, w] + fields.quadratic[i, w] * offset * offset
-            for c in range(controls.size):
-                field += fields.control[i, w, c] * controls[c]
-            impulse += field * increments[w]
-        k.delta[i] = part * impulse
+    noise_impulse(mechanism, part, state.q, state.center, controls, increments, k.delta)
     add_impulse(mechanism, k.delta, state, k)
 
 
@@ -371,16 +349,10 @@ def rollout(
         nodes.ended[i] = SOLVED
         nodes.done[i] = 0
         for s in range(commands.u.shape[0]):
-            apply_policy(commands, s, state, nodes.u[i, s])
+            apply_policy(commands, s, state.q, state.p, nodes.u[i, s])
             if noisy:
                 kick(mechanism, options.left, nodes.u[i, s], increments[i, s], state, k)
-            for r in range(n):
-                total = 0.0
-                if drift.shape[0] > 0:
-                    total = drift[i, s, r]
-                for c in range(nodes.u.shape[2]):
-                    total += mechanism.actuation[r, c] * nodes.u[i, s, c]
-                k.force[r] = total
+            constant_force(mechanism, drift, i, s, nodes.u[i, s], k.force)
             outcome = step(mechanism, options, h, state, k)
             for c in range(4):
                 nodes.tally[i, s, c] = k.tally[c]

@@ -1,0 +1,46 @@
+"""What drives a step from outside: controls with their feedback, and the impulses of noise."""
+
+from varpin.kernels._compile import inlined
+from varpin.kernels.tree import Commands, Floats, Mechanism
+
+
+@inlined
+def apply_policy(commands: Commands, s: int, first: Floats, second: Floats, u: Floats) -> None:
+    """U = u_s + gains_s (x - x_s) with x = (first, second); without gains u = u_s."""
+    n = first.size
+    for c in range(u.size):
+        total = commands.u[s, c]
+        if commands.gains.shape[0] > 0:
+            for j in range(n):
+                total += commands.gains[s, c, j] * (first[j] - commands.reference[s, j])
+                total += commands.gains[s, c, n + j] * (second[j] - commands.reference[s, n + j])
+        u[c] = total
+
+
+@inlined
+def constant_force(mechanism: Mechanism, drift: Floats, i: int, s: int, u: Floats, force: Floats) -> None:
+    """Force = drift + B u over step ``s`` of path ``i``; ``drift`` is (P, N, n), or (0, 0, n) for none."""
+    for r in range(force.size):
+        total = 0.0
+        if drift.shape[0] > 0:
+            total = drift[i, s, r]
+        for c in range(u.size):
+            total += mechanism.actuation[r, c] * u[c]
+        force[r] = total
+
+
+@inlined
+def noise_impulse(
+    mechanism: Mechanism, part: float, q: Floats, center: Floats, u: Floats, increments: Floats, impulse: Floats
+) -> None:
+    """Impulse = part * sum_i F_i(q, u) dw_i."""
+    fields = mechanism.diffusion
+    for i in range(q.size):
+        total = 0.0
+        for w in range(increments.size):
+            offset = q[i] - center[i, w]
+            field = fields.constant[i, w] + fields.quadratic[i, w] * offset * offset
+            for c in range(u.size):
+                field += fields.control[i, w, c] * u[c]
+            total += field * increments[w]
+        impulse[i] = part * total

@@ -1,0 +1,332 @@
+"""Wiener increments, and motions driven by them: replay, strong and weak order, the Stratonovich limit, Langevin."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_lyapunov
+
+import varpin as vp
+from varpin.wiener import coarsen, refine, wiener_increments
+
+SPLIT = vp.Midpoint(kick="split")
+BOTH = pytest.mark.parametrize("kick", ["left", "split"])
+
+
+def slider(mass):
+    model = pin.Model()
+    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slide")
+    model.appendBodyToJoint(joint, pin.Inertia.FromSphere(mass, 0.1), pin.SE3.Identity())
+    return vp.load_robot(model)
+
+
+def noisy_chain(noise):
+    return vp.Scene(vp.planar_chain(2), damping=0.3, stiffness=4.0, noise=noise)
+
+
+def test_increments_are_normal_with_variance_dt():
+    dt, samples = 0.02, 400_000
+    dw = wiener_increments(2, dt, samples // 2, rng=0)
+    assert dw.shape == (samples // 2, 2)
+    z = dw / np.sqrt(dt)
+    # The moments of N(0, 1) and the variances of their estimates.
+    for power, moment, variance in ((1, 0.0, 1.0), (2, 1.0, 2.0), (3, 0.0, 15.0), (4, 3.0, 96.0)):
+        assert abs((z**power).mean() - moment) < 4.0 * np.sqrt(variance / samples)
+    assert abs((z[:, 0] * z[:, 1]).mean()) < 4.0 / np.sqrt(samples / 2)
+    assert abs((z[1:] * z[:-1]).mean()) < 4.0 / np.sqrt(samples)
+
+
+def test_refining_keeps_the_path():
+    dt = 0.1
+    dw = wiener_increments(3, dt, 1000, rng=1)
+    fine = refine(dw, dt, rng=2)
+    assert fine.shape == (2000, 3)
+    np.testing.assert_allclose(coarsen(fine), dw, rtol=0, atol=4 * np.finfo(float).eps * np.abs(fine).max())
+    np.testing.assert_allclose(np.cumsum(fine, axis=0)[1::2], np.cumsum(dw, axis=0), rtol=0, atol=1e-12)
+    assert refine(np.zeros((4, 0)), dt, rng=0).shape == (8, 0)
+    assert refine(np.zeros((0, 2)), dt, rng=0).shape == (0, 2)
+
+
+def test_refined_increments_are_wiener_increments_of_half_the_step():
+    dt, N = 0.1, 100_000
+    dw = wiener_increments(1, dt, N, rng=1)
+    fine = refine(dw, dt, rng=2)[:, 0] / np.sqrt(dt / 2)
+    assert abs((fine**2).mean() - 1.0) < 4.0 * np.sqrt(2.0 / (2 * N))
+    # Halves of one increment are as independent as neighbours from different increments.
+    assert abs((fine[0::2] * fine[1::2]).mean()) < 4.0 / np.sqrt(N)
+    assert abs((fine[1:-1:2] * fine[2::2]).mean()) < 4.0 / np.sqrt(N)
+    # Given the increment, the middle is half of it on average, with variance dt / 4.
+    middle = (fine[0::2] * np.sqrt(dt / 2)) - 0.5 * dw[:, 0]
+    assert abs((middle * dw[:, 0]).mean()) < 4.0 * np.sqrt(0.25 * dt * dt / N)
+    assert abs((middle**2).mean() - 0.25 * dt) < 4.0 * 0.25 * dt * np.sqrt(2.0 / N)
+
+
+def test_coarsening_sums_rows():
+    dw = np.arange(24.0).reshape(12, 2)
+    np.testing.assert_array_equal(coarsen(dw, 3), [dw[k : k + 3].sum(axis=0) for k in range(0, 12, 3)])
+    np.testing.assert_array_equal(coarsen(dw, 1), dw)
+    np.testing.assert_array_equal(coarsen(coarsen(dw)), coarsen(dw, 4))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: coarsen(np.zeros((9, 1)), 2), "9 increments cannot be summed by 2: the number must be a multiple"),
+        (lambda: coarsen(np.zeros((9, 1)), 0), "factor must be at least 1, got 0"),
+        (lambda: coarsen(np.zeros((9, 1)), 1.5), "factor must be an integer, got 1.5"),
+        (lambda: coarsen(np.zeros(8)), r"increments must have shape \(N, k\), got \(8,\)"),
+        (lambda: coarsen([["a"], ["b"]]), "increments must be an array of real numbers"),
+        (lambda: refine([[0.0], [np.nan]], 0.1, rng=0), r"increments\[1, 0\] is nan; it must be finite"),
+        (lambda: refine(np.zeros((2, 1)), -0.1, rng=0), r"dt must be positive and finite \[s\], got -0.1"),
+        (lambda: refine(np.zeros((2, 1)), 0.1, rng="seed"), "rng must be a numpy Generator or a seed"),
+        (lambda: wiener_increments(1, 0.0, 3, rng=0), r"dt must be positive and finite \[s\], got 0.0"),
+        (lambda: wiener_increments(1, 0.1, 3, rng=-1), "rng must be a numpy Generator or a seed, .* got -1"),
+        (lambda: wiener_increments(2, 0.1, 3, increments=np.zeros((3, 1))), r"must have shape \(3, 2\), got \(3, 1\)"),
+        (lambda: wiener_increments(1, 0.1, 1, increments=[[np.inf]]), r"increments\[0, 0\] is inf"),
+    ],
+)
+def test_errors(call, message):
+    with pytest.raises(vp.InputError, match=message):
+        call()
+
+
+@BOTH
+def test_the_seed_or_the_increments_fix_the_motion(kick):
+    scene = noisy_chain(vp.AdditiveNoise(0.5) + vp.StateNoise(0.4))
+    options = {"dt": 0.01, "steps": 100, "integrator": vp.Midpoint(kick=kick)}
+    one, same, other = (vp.simulate(scene, [0.1, 0.2], [0, 1], rng=seed, **options) for seed in (5, 5, 6))
+    drawn = wiener_increments(4, 0.01, 100, rng=5)
+    assert one.dw.tobytes() == drawn.tobytes()
+    replayed = vp.simulate(scene, [0.1, 0.2], [0, 1], increments=one.dw, **options)
+    generator = vp.simulate(scene, [0.1, 0.2], [0, 1], rng=np.random.default_rng(5), **options)
+    for name in ("q", "v", "p", "energy", "dw"):
+        value = getattr(one, name).tobytes()
+        assert value == getattr(same, name).tobytes()
+        assert value == getattr(replayed, name).tobytes()
+        assert value == getattr(generator, name).tobytes()
+        assert value != getattr(other, name).tobytes()
+
+
+@BOTH
+def test_without_increments_the_motion_is_deterministic(kick):
+    options = {"dt": 0.01, "steps": 200, "integrator": vp.Midpoint(kick=kick), "controls": [0.3, -0.1]}
+    quiet = vp.simulate(noisy_chain(None), [0.1, 0.2], [0, 1], **options)
+    scene = noisy_chain(vp.AdditiveNoise(0.5) + vp.ControlNoise(0.4))
+    for motion in (
+        vp.simulate(scene, [0.1, 0.2], [0, 1], **options),
+        vp.simulate(scene, [0.1, 0.2], [0, 1], increments=np.zeros((200, 4)), **options),
+    ):
+        np.testing.assert_allclose(motion.q, quiet.q, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(motion.p, quiet.p, rtol=0, atol=1e-12)
+        assert not motion.dw.any()
+    assert np.abs(vp.simulate(scene, [0.1, 0.2], [0, 1], rng=0, **options).q - quiet.q).max() > 1e-2
+
+
+def test_simulate_refuses_what_it_cannot_use():
+    scene = noisy_chain(vp.AdditiveNoise(0.5))
+
+    def run(**options):
+        vp.simulate(scene, [0, 0], [0, 0], dt=0.01, steps=3, **options)
+
+    with pytest.raises(vp.InputError, match="give rng, to draw the Wiener increments, or increments, to use yours"):
+        run(rng=0, increments=np.zeros((3, 2)))
+    with pytest.raises(vp.InputError, match=r"increments must have shape \(3, 2\), got \(2, 2\)"):
+        run(increments=np.zeros((2, 2)))
+    with pytest.raises(vp.InputError, match=r"increments\[1, 0\] is nan; it must be finite"):
+        run(increments=[[0, 0], [np.nan, 0], [0, 0]])
+    with pytest.raises(vp.InputError, match="rng must be a numpy Generator or a seed"):
+        run(rng="seed")
+
+
+@BOTH
+def test_one_step_is_a_kick_and_a_deterministic_step(kick):
+    """By hand: p + left F(q, u) dw, the deterministic step, and the rest of the kick at the state reached."""
+    noise = vp.AdditiveNoise([[0.5, 0.1], [0.2, 0.3]]) + vp.StateNoise([0.4, 0.9], center=[1.0, 0.0])
+    noise += vp.ControlNoise([0.7, 0.2])
+    scene, quiet = noisy_chain(noise), noisy_chain(None)
+    q0, v0, u, dt = np.array([0.1, 0.2]), np.array([0.5, 1.0]), np.array([0.6, -0.4]), 0.01
+    dw = 0.1 * np.random.default_rng(0).normal(size=6)
+    left = 1.0 if kick == "left" else 0.5
+
+    def impulse(q):
+        own = np.array([[0.5, 0.1], [0.2, 0.3]]) @ dw[:2] + [0.4, 0.9] * (q - [1.0, 0.0]) ** 2 * dw[2:4]
+        return own + [0.7, 0.2] * u * dw[4:]
+
+    M = vp.lagrangian_jet(scene, q0, v0, backend="pinocchio").Lvv
+    kicked = np.linalg.solve(M, M @ v0 + left * impulse(q0))
+    plain = vp.simulate(quiet, q0, kicked, dt=dt, steps=1, controls=u)
+    end = vp.simulate(scene, q0, v0, dt=dt, steps=1, controls=u, increments=dw[None], integrator=vp.Midpoint(kick=kick))
+    np.testing.assert_allclose(end.q[1], plain.q[1], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(end.p[1], plain.p[1] + (1.0 - left) * impulse(plain.q[1]), rtol=0, atol=1e-13)
+    M = vp.lagrangian_jet(scene, end.q[1], v0, backend="pinocchio").Lvv
+    np.testing.assert_allclose(M @ end.v[1], end.p[1], rtol=0, atol=1e-13)
+
+
+NOISES = {
+    "additive": vp.AdditiveNoise(0.5),
+    "state": vp.StateNoise(1.5, center=[1.5, -1.0]),
+    "control": vp.ControlNoise(0.6),
+}
+
+
+@BOTH
+@pytest.mark.parametrize("name", NOISES)
+def test_strong_order_one(name, kick):
+    """Mean over 200 paths of the largest error at common nodes, against 1/64 of the step on the same Brownian path."""
+    scene, integrator = noisy_chain(NOISES[name]), vp.Midpoint(kick=kick)
+    duration, coarse, finest = 0.5, 16, 64
+    # The same control function of time at every step size.
+    u = np.array([[np.cos(3.0 * k / coarse), np.sin(5.0 * k / coarse)] for k in range(coarse)])
+
+    def motion(dw):
+        steps = len(dw)
+        end = vp.simulate(
+            scene, [1.0, 0.5], [0.0, 0.0], dt=duration / steps, steps=steps, increments=dw, integrator=integrator,
+            controls=np.repeat(u, steps // coarse, axis=0),
+        )  # fmt: skip
+        nodes = slice(None, None, steps // coarse)
+        return np.hstack([end.q[nodes], end.p[nodes]])
+
+    errors = np.zeros(4)
+    for path in range(200):
+        steps = coarse * finest
+        dw = wiener_increments(scene.processes, duration / steps, steps, rng=np.random.default_rng([7, path]))
+        reference = motion(dw)
+        errors += [np.abs(motion(coarsen(dw, finest // m)) - reference).max() / 200 for m in (1, 2, 4, 8)]
+    slope = -np.polyfit(np.log([1, 2, 4, 8]), np.log(errors), 1)[0]
+    # The reference has an error of its own, which at 8 : 64 lifts the slope by no more than 0.06.
+    assert 0.95 <= slope < 1.2, (slope, errors)
+    # Noise matters to these motions: without it the end is elsewhere by far more than the errors.
+    assert np.abs(motion(np.zeros((coarse, scene.processes))) - reference).max() > 5.0 * errors[0]
+
+
+MASS, STIFFNESS, DAMPING, HEAT = 1.3, 40.0, 0.8, 0.5
+
+
+def oscillator():
+    """A mass on a spring with friction, in a bath of temperature ``HEAT`` [J]."""
+    noise = vp.AdditiveNoise(np.sqrt(2.0 * DAMPING * HEAT))
+    return vp.Scene(slider(MASS), gravity=False, damping=DAMPING, stiffness=STIFFNESS, noise=noise)
+
+
+def map_of(scene, dt, integrator):
+    """The linear map of one step: A and G."""
+    lin = vp.linearize(
+        scene, vp.simulate(scene, [0.1], [0], dt=dt, steps=1, integrator=integrator), integrator=integrator
+    )
+    return lin.A[0], lin.G[0]
+
+
+@pytest.mark.parametrize("dt", [0.02, 0.1, 0.25])
+def test_stationary_law_of_the_linear_oscillator(dt):
+    """Split kicks are exact in law for every step; the left kick gives k <q^2> = kT (1 + h^2 k / 4m)."""
+    scene = oscillator()
+    A, G = map_of(scene, dt, SPLIT)
+    exact = np.diag([HEAT / STIFFNESS, MASS * HEAT])
+    np.testing.assert_allclose(solve_discrete_lyapunov(A, dt * G @ G.T), exact, rtol=0, atol=1e-13)
+    A, G = map_of(scene, dt, vp.Midpoint())
+    left = solve_discrete_lyapunov(A, dt * G @ G.T)
+    assert left[0, 0] * STIFFNESS == pytest.approx(HEAT * (1 + dt**2 * STIFFNESS / (4 * MASS)), rel=1e-12)
+
+
+@BOTH
+def test_long_run_of_the_linear_oscillator(kick):
+    """Time averages of q^2 and p^2 over 64 paths within 4 standard errors of the closed form, and of no other."""
+    dt, paths = 0.25, 64
+    end = vp.simulate_ensemble(
+        oscillator(), [0.0], [0.0], dt=dt, steps=3000, paths=paths, rng=3, integrator=vp.Midpoint(kick=kick)
+    )
+    growth = dt**2 * STIFFNESS / (4 * MASS)
+    squares = [STIFFNESS * (x[:, 200:, 0] ** 2).mean(axis=1) / HEAT for x in (end.q,)][0]
+    error = squares.std(ddof=1) / np.sqrt(paths)
+    assert abs(squares.mean() - (1.0 + growth * (kick == "left"))) < 4.0 * error
+    assert abs(squares.mean() - (1.0 + growth * (kick == "split"))) > 10.0 * error
+    if kick == "split":
+        squares = (end.p[:, 200:, 0] ** 2).mean(axis=1) / (MASS * HEAT)
+        assert abs(squares.mean() - 1.0) < 4.0 * squares.std(ddof=1) / np.sqrt(paths)
+
+
+@pytest.mark.parametrize(("kick", "order"), [("left", 1.0), ("split", 2.0)])
+def test_weak_order_of_the_mean_energy(kick, order):
+    """From rest towards equilibrium: the mean energy at t = 1 s from the map's moments, against the exact law."""
+    scene, integrator = oscillator(), vp.Midpoint(kick=kick)
+    flow = np.array([[0.0, 1.0 / MASS], [-STIFFNESS, -DAMPING / MASS]])
+    noise = np.diag([0.0, 2.0 * DAMPING * HEAT])
+    stationary = solve_continuous_lyapunov(flow, -noise)
+    x0 = np.array([0.3, 0.0])
+    mean = expm(flow) @ x0
+    exact = stationary - expm(flow) @ stationary @ expm(flow).T + np.outer(mean, mean)
+    errors = []
+    for steps in (64, 128, 256, 512):
+        A, G = map_of(scene, 1.0 / steps, integrator)
+        P = np.outer(x0, x0)
+        for _ in range(steps):
+            P = A @ P @ A.T + G @ G.T / steps
+        energy = [0.5 * (STIFFNESS * second[0, 0] + second[1, 1] / MASS) for second in (P, exact)]
+        errors.append(abs(energy[0] - energy[1]))
+    slopes = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert (np.abs(slopes - order) < 0.12).all(), (slopes, errors)
+
+
+RATE = 1.0  # of v in the geometric noise below [s^-0.5]
+
+
+def geometric_logs(kick, dv, steps, paths=40):
+    """Log |v(1 s)| of dv = RATE v o dw from v = 1, and w(1 s)."""
+    mass = 0.5
+    noise = vp.CustomNoise(lambda q, v, u: RATE * mass * v[:, None], processes=1, dv=dv, check=dv is not None)
+    scene = vp.Scene(slider(mass), gravity=False, noise=noise)
+    runs = [
+        vp.simulate(
+            scene, [0], [1], dt=1 / steps, steps=steps, rng=np.random.default_rng([2, path]),
+            integrator=vp.Midpoint(kick=kick),
+        )
+        for path in range(paths)
+    ]  # fmt: skip
+    return np.log([abs(run.v[-1, 0]) for run in runs]), np.array([run.dw.sum() for run in runs])
+
+
+def derivative_of_geometric_noise(q, v, u):
+    return np.full((1, 1, 1), 0.5 * RATE)
+
+
+CORRECTED = [
+    "left",
+    pytest.param(
+        "split",
+        marks=pytest.mark.xfail(reason="the drift is added in full though the second half-kick brings half of it"),
+    ),
+]
+
+
+@pytest.mark.parametrize("kick", CORRECTED)
+def test_velocity_dependent_noise_converges_to_the_stratonovich_limit(kick):
+    """There v = exp(RATE w) on every path; log v - RATE w is 0 on average, at ever smaller spread."""
+    spreads = []
+    for steps in (50, 200):
+        logs, w = geometric_logs(kick, derivative_of_geometric_noise, steps)
+        error = logs - RATE * w
+        spreads.append(error.std(ddof=1))
+        assert abs(error.mean()) < 4.0 * error.std(ddof=1) / np.sqrt(len(error))
+        assert abs(logs.mean()) < 4.0 * logs.std(ddof=1) / np.sqrt(len(logs))
+    assert spreads[1] < 0.65 * spreads[0]
+
+
+def test_velocity_dependent_noise_without_its_correction_converges_to_the_ito_limit():
+    """Without dv log v - RATE w goes to -RATE^2 t / 2 instead."""
+    for steps in (50, 200):
+        logs, w = geometric_logs("left", None, steps)
+        error = logs - RATE * w
+        deviation = error.std(ddof=1) / np.sqrt(len(error))
+        assert abs(error.mean() + 0.5 * RATE**2) < 4.0 * deviation
+        assert abs(error.mean()) > 20.0 * deviation
+
+
+@pytest.mark.parametrize("part", ["constant", "varying"])
+def test_no_correction_where_fields_do_not_depend_on_the_velocity(part):
+    """A dv of zeros moves no bit, whatever the other fields."""
+    own = {"constant": lambda q, v, u: np.eye(2), "varying": lambda q, v, u: np.diag(q) + u[:, None]}[part]
+    zeros = vp.CustomNoise(own, 2, dv=lambda q, v, u: np.zeros((2, 2, 2)))
+    motions = [
+        vp.simulate(noisy_chain(n), [1, 0], [0, 1], dt=0.01, steps=20, rng=0) for n in (zeros, vp.CustomNoise(own, 2))
+    ]
+    assert motions[0].p.tobytes() == motions[1].p.tobytes()
