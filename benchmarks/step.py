@@ -8,6 +8,7 @@ runs, their ratios far less. MuJoCo takes part where it is installed (``pip inst
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -43,8 +44,8 @@ def rnea_derivatives(robot: vp.Robot, q0: np.ndarray) -> Callable[[], float]:
     return run
 
 
-def mujoco_step(links: int, dt: float) -> Callable[[], float] | None:
-    """Seconds per Python call of mujoco.mj_step (Euler) on a planar chain, or None without MuJoCo."""
+def chain_of_mujoco(links: int, dt: float) -> Any:
+    """The planar chain as a mujoco.MjModel (Euler), or None without MuJoCo."""
     try:
         import mujoco  # noqa: PLC0415
     except ImportError:
@@ -55,12 +56,20 @@ def mujoco_step(links: int, dt: float) -> Callable[[], float] | None:
             f'<body pos="{1.0 if k else 0.0} 0 0"><joint type="hinge" axis="0 1 0"/>'
             '<inertial pos="0.5 0 0" mass="1" diaginertia="1e-9 0.083333333 0.083333333"/>'
         )
-    xml = (
+    return mujoco.MjModel.from_xml_string(
         f'<mujoco><compiler boundinertia="0" balanceinertia="true"/><option timestep="{dt}" integrator="Euler">'
         '<flag contact="disable" constraint="disable"/></option>'
         f"<worldbody>{body}{'</body>' * links}</worldbody></mujoco>"
     )
-    model = mujoco.MjModel.from_xml_string(xml)
+
+
+def mujoco_step(links: int, dt: float) -> Callable[[], float] | None:
+    """Seconds per Python call of mujoco.mj_step on a planar chain, or None without MuJoCo."""
+    model = chain_of_mujoco(links, dt)
+    if model is None:
+        return None
+    import mujoco  # noqa: PLC0415
+
     data = mujoco.MjData(model)
 
     def run() -> float:

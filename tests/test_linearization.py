@@ -189,3 +189,23 @@ def test_multiplicative_noise_matters_to_the_moments():
         np.abs(full - vp.propagate_moments(additive, covariance=covariance).covariance[-1]).max()
         > 0.01 * np.abs(full).max()
     )
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
+def test_users_can_check_their_own_model(integrator):
+    """And the check finds a derivative that is wrong."""
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.2, noise=vp.AdditiveNoise(0.1) + vp.ControlNoise(0.1))
+    q, v, u = np.random.default_rng(0).uniform(-1, 1, (3, 6))
+    found = vp.check_linearization(scene, q, v, u, dt=1e-3, integrator=integrator)
+    assert found.worst < 1e-8
+    assert found.A[1] > 0.9
+    assert found.G[1] > 0.0
+
+    class Wrong(type(integrator)):
+        def linearize(self, scene, trajectory):
+            Jx, Jf, Jk = super().linearize(scene, trajectory)
+            Jx = Jx.copy()
+            Jx[:, 0, 1] += 1e-5
+            return Jx, Jf, Jk
+
+    assert vp.check_linearization(scene, q, v, u, dt=1e-3, integrator=Wrong()).worst > 1e-6

@@ -59,21 +59,22 @@ def test_one_step_solves_the_discrete_euler_lagrange_equations(alpha):
     np.testing.assert_allclose(end.p[0], p0, rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", ["finger", "ur5", "xarm7"])
+@pytest.mark.parametrize("name", ["finger", "ur5", "xarm7", "talos_arm"])
 @pytest.mark.parametrize("forced", [False, True])
 def test_order_two(name, forced):
     robot = vp.load_robot(name)
     n = robot.dof
     # Feedback sampled once a step must be slow on the lightest link: a fingertip, the last wrist of the xArm7.
-    size = {"finger": 1e-5, "ur5": 1.0, "xarm7": 1e-2}[name]
+    size = {"finger": 1e-5, "ur5": 1.0, "xarm7": 1e-2, "talos_arm": 1.0}[name]
     q0, v0 = np.linspace(0.2, 0.6, n), np.linspace(1.0, -1.0, n) * 0.5
     law = None
     scene = vp.Scene(robot)
     if forced:
-        scene = vp.Scene(robot, damping=0.5 * size, stiffness=8.0 * size, rest=0.1)
+        actuation = np.random.default_rng(5).normal(size=(n, n - 1))
+        scene = vp.Scene(robot, damping=0.5 * size, stiffness=8.0 * size, rest=0.1, actuation=actuation)
 
         def law(t, q, v):
-            return size * (4.0 * np.cos(5.0 * t) - 2.0 * q - 0.5 * v)
+            return size * (4.0 * np.cos(5.0 * t) - 2.0 * q - 0.5 * v)[1:]
 
     duration = 0.25
     exact = reference(scene, q0, v0, duration, law)
@@ -155,7 +156,7 @@ def test_symplectic(name, alpha):
         e[j] = eps
         A[:, j] = sum(c * (step(x + k * e) - step(x - k * e)) for k, c in weights.items()) / eps
     J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(n))
-    assert np.abs(A.T @ J @ A - J).max() / max(1.0, np.abs(A).max() ** 2) < 1e-10
+    assert np.abs(A.T @ J @ A - J).max() < 1e-10
 
 
 def test_momentum_about_a_vertical_axis_is_conserved_to_rounding():
@@ -249,9 +250,11 @@ def test_without_the_energy_guard_there_are_silent_jumps():
 @pytest.mark.parametrize("name", [*(name for name in FIXED_BASE if not name.startswith("bravo7")), "finger"])
 def test_few_iterations_from_rest_under_gravity(name):
     robot = vp.load_robot(name)
-    motion = vp.simulate(vp.Scene(robot), np.zeros(robot.dof), np.zeros(robot.dof), dt=1e-3, steps=1000)
-    assert motion.statistics.newton_iterations.mean() <= 3.0
-    assert motion.statistics.residual.max() < 100.0
+    tilted = vp.Scene(robot, gravity=[3.0, -5.0, -8.0])
+    for scene, q0 in ((vp.Scene(robot), 0.0), (tilted, 0.5)):
+        motion = vp.simulate(scene, np.full(robot.dof, q0), np.zeros(robot.dof), dt=1e-3, steps=1000)
+        assert motion.statistics.newton_iterations.mean() <= 3.0
+        assert motion.statistics.residual.max() < 20.0
 
 
 @pytest.mark.parametrize("stiffness", [1e-2, 1.0, 1e2, 1e4])

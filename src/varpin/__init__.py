@@ -39,6 +39,8 @@ from varpin.linearization import Linearization as Linearization
 from varpin.linearization import Moments as Moments
 from varpin.linearization import linearize as linearize
 from varpin.linearization import propagate_moments as propagate_moments
+from varpin.linearization_check import LinearizationCheck as LinearizationCheck
+from varpin.linearization_check import check_linearization as check_linearization
 from varpin.noise import AdditiveNoise as AdditiveNoise
 from varpin.noise import ControlNoise as ControlNoise
 from varpin.noise import CustomNoise as CustomNoise

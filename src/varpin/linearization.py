@@ -85,7 +85,6 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     Jx, Jf, Jk = integrator.linearize(scene, trajectory)
     q, v = trajectory.q, trajectory.v
     start = scene.noise.fields(q[:-1], v[:-1], trajectory.u, q[0])
-    M, A_node = node_jets(scene, q, v)
     A, B = Jx, Jf @ scene.actuation
     if start.Fv is not None:
         drift_x, drift_u = _drift_derivatives(scene, trajectory, variational=integrator.variational)
@@ -93,19 +92,20 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     left = integrator.left
     if integrator.variational:
         K = Jk
-        jump, jump_x, jump_u = start.F, _in_momentum(start.Fq, start.Fv, M[:-1], A_node[:-1]), start.Fu
+        jump, jump_x, jump_u = start.F, _in_momentum(scene, q[:-1], v[:-1], start), start.Fu
     else:
-        K = Jk @ np.linalg.inv(M[:-1])
-        jump, jump_x, jump_u = _in_velocity(scene, q[:-1], start, M[:-1])
+        M, _ = node_jets(scene, q[:-1], v[:-1])
+        K = Jk @ np.linalg.inv(M)
+        jump, jump_x, jump_u = _in_velocity(scene, q[:-1], start, M)
     G = left * (Jk @ jump)
-    Gx = left * np.einsum("Nab,Nbic->Naic", Jk, jump_x)
-    Gu = left * np.einsum("Nab,Nbic->Naic", Jk, jump_u)
+    Gx = left * _chain(Jk, jump_x)
+    Gu = left * _chain(Jk, jump_u)
     if left < 1.0:
         end = scene.noise.fields(q[1:], v[1:], trajectory.u, q[0])
-        Ex = _in_momentum(end.Fq, end.Fv, M[1:], A_node[1:])
+        end_x = _in_momentum(scene, q[1:], v[1:], end)
         G[:, n:] += (1.0 - left) * end.F
-        Gx[:, n:] += (1.0 - left) * np.einsum("Naib,Nbc->Naic", Ex, A)
-        Gu[:, n:] += (1.0 - left) * (end.Fu + np.einsum("Naib,Nbc->Naic", Ex, B))
+        Gx[:, n:] += (1.0 - left) * np.einsum("Naib,Nbc->Naic", end_x, A)
+        Gu[:, n:] += (1.0 - left) * (end.Fu + np.einsum("Naib,Nbc->Naic", end_x, B))
     return Linearization(
         A=A,
         B=B,
@@ -127,14 +127,20 @@ def node_jets(scene: Scene, q: Floats, v: Floats) -> tuple[Floats, Floats]:
     return M, A
 
 
-def _in_momentum(Fq: Floats, Fv: Floats | None, M: Floats, A: Floats) -> Floats:
-    """dF/d(q, p) (N, n, k, 2n) from dF/dq and dF/dv: at fixed q dv = M^-1 dp, at fixed p dv = -M^-1 L_vq dq."""
-    N, n, k, _ = Fq.shape
+def _chain(J: Floats, derivative: Floats) -> Floats:
+    """J (N, a, b) times a derivative (N, b, k, c): (N, a, k, c)."""
+    N, b, k, c = derivative.shape
+    return (J @ derivative.reshape(N, b, k * c)).reshape(N, J.shape[1], k, c)
+
+
+def _in_momentum(scene: Scene, q: Floats, v: Floats, fields: Fields) -> Floats:
+    """dF/d(q, p) (N, n, k, 2n): at fixed q dv = M^-1 dp, at fixed p dv = -M^-1 L_vq dq."""
+    N, n, k = fields.F.shape
     Fx = np.zeros((N, n, k, 2 * n))
-    Fx[..., :n] = Fq
-    if Fv is not None:
-        Fp = np.linalg.solve(np.swapaxes(M, 1, 2)[:, None], np.swapaxes(Fv, 2, 3))
-        Fx[..., n:] = np.swapaxes(Fp, 2, 3)
+    Fx[..., :n] = fields.Fq
+    if fields.Fv is not None:
+        M, A = node_jets(scene, q, v)
+        Fx[..., n:] = np.swapaxes(np.linalg.solve(M[:, None], np.swapaxes(fields.Fv, 2, 3)), 2, 3)
         Fx[..., :n] -= np.einsum("Naip,Npb->Naib", Fx[..., n:], A)
     return Fx
 
@@ -145,14 +151,14 @@ def _in_velocity(scene: Scene, q: Floats, fields: Fields, M: Floats) -> tuple[Fl
     d(M y)/dq at fixed y is L_vq(q, y), so dy = M^-1 (dF - L_vq(q, y) dq).
     """
     N, n, k = fields.F.shape
-    inverse = np.linalg.inv(M)
+    inverse: Floats = np.asarray(np.linalg.inv(M), dtype=np.float64)
     y = inverse @ fields.F
     _, bend = node_jets(scene, np.repeat(q, k, axis=0), np.ascontiguousarray(np.swapaxes(y, 1, 2)).reshape(N * k, n))
     Fx = np.zeros((N, n, k, 2 * n))
     Fx[..., :n] = fields.Fq - np.swapaxes(bend.reshape(N, k, n, n), 1, 2)
     if fields.Fv is not None:
         Fx[..., n:] = fields.Fv
-    return y, np.einsum("Nab,Nbic->Naic", inverse, Fx), np.einsum("Nab,Nbic->Naic", inverse, fields.Fu)
+    return y, _chain(inverse, Fx), _chain(inverse, fields.Fu)
 
 
 def _drift_derivatives(scene: Scene, trajectory: Trajectory, *, variational: bool) -> tuple[Floats, Floats]:

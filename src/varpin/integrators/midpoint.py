@@ -186,7 +186,8 @@ class Midpoint(Integrator):
         Jx, Jf = np.empty((steps, 2 * n, 2 * n)), np.empty((steps, 2 * n, n))
         outcome, done = linearize(
             scene.mechanism,
-            self._options(),
+            # A root that is known to 1e-10 is good enough for derivatives, and one jet for them.
+            self._options()._replace(tolerance=1e6),
             trajectory.dt,
             q,
             p,

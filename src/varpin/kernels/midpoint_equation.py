@@ -193,7 +193,7 @@ def newton(mechanism: Mechanism, options: Options, h: float, state: State, k: Wo
         shrink = size / (quadratic_form(k.sweep.M, k.v) if before == np.inf else before)
         fresh = not worst * shrink <= options.tolerance
         before = size
-    if not worst <= ROUNDING:
+    if not worst <= max(ROUNDING, options.tolerance):
         return DIVERGED
     k.quality[0] = max(k.quality[0], worst)
     return SOLVED

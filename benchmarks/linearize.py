@@ -1,0 +1,76 @@
+"""Derivatives of one step against the step itself and against MuJoCo's finite differences; ensembles on two workers.
+
+python benchmarks/linearize.py
+"""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from step import chain_of_mujoco
+
+import varpin as vp
+
+STEPS = 2000
+ROUNDS = 15
+
+
+def best(run: Callable[[], object], repeats: int = ROUNDS) -> float:
+    """The fastest of several runs [s]."""
+    seconds = np.inf
+    for _ in range(repeats):
+        start = time.perf_counter()
+        run()
+        seconds = min(seconds, time.perf_counter() - start)
+    return seconds
+
+
+def transition_fd(links: int) -> float | None:
+    """Seconds of one mujoco.mjd_transitionFD on a chain, or None without MuJoCo."""
+    model = chain_of_mujoco(links, 1e-3)
+    if model is None:
+        return None
+    import mujoco  # noqa: PLC0415
+
+    data = mujoco.MjData(model)
+    A, B = np.zeros((2 * links, 2 * links)), np.zeros((2 * links, 0))
+
+    def run() -> None:
+        for _ in range(STEPS):
+            mujoco.mjd_transitionFD(model, data, 1e-6, True, A, B, None, None)
+
+    return best(run) / STEPS
+
+
+def main() -> None:
+    robots = (vp.load_robot("finger"), vp.load_robot("xarm7"), vp.planar_chain(3), vp.planar_chain(7))
+    for robot in robots:
+        scene = vp.Scene(robot)
+        start = np.full(robot.dof, 0.1), np.zeros(robot.dof)
+        motion = vp.simulate(scene, *start, dt=1e-3, steps=STEPS)
+        midpoint = vp.Midpoint()
+        step = best(lambda s=scene, x=start: vp.simulate(s, *x, dt=1e-3, steps=STEPS)) / STEPS
+        core = best(lambda s=scene, m=motion, i=midpoint: i.linearize(s, m)) / STEPS
+        whole = best(lambda s=scene, m=motion: vp.linearize(s, m)) / STEPS
+        line = f"{robot.name:8} step {1e6 * step:6.2f} us, derivatives {1e6 * core:6.2f} us ({core / step:.2f} of it)"
+        line += f", linearize {1e6 * whole:6.2f} us ({whole / step:.2f})"
+        if robot.name.startswith("chain"):
+            other = transition_fd(robot.dof)
+            if other is not None:
+                line += f", mjd_transitionFD {1e6 * other:.2f} us ({core / other:.2f} of it)"
+        print(line)
+    scene = vp.Scene(vp.load_robot("finger"), gravity=False, damping=1e-4, noise=vp.AdditiveNoise(1e-5))
+    start = {"q0": np.full(3, 0.3), "v0": np.zeros(3), "dt": 1e-3}
+
+    def ensemble(workers: int) -> float:
+        options = {"paths": 1000, "steps": 1000, "rng": 0, "store": False, "quantiles": ()}
+        return best(lambda: vp.simulate_ensemble(scene, **start, **options, workers=workers), 5)
+
+    one, two = ensemble(1), ensemble(2)
+    single = best(lambda: vp.simulate(scene, **start, steps=100_000, rng=0), 5) / 100_000
+    print(f"ensemble of 1000 paths: two workers {one / two:.2f} times as fast as one")
+    print(f"a path-step {one:.2f} us, a step of one simulate {1e6 * single:.2f} us ({one / 1e6 / single:.2f} of it)")
+
+
+if __name__ == "__main__":
+    main()
