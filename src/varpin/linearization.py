@@ -88,7 +88,7 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     A, B = Jx, Jf @ scene.actuation
     if start.Fv is not None:
         drift_x, drift_u = _drift_derivatives(scene, trajectory, variational=integrator.variational)
-        A, B = A + Jf @ drift_x, B + Jf @ drift_u
+        A, B = A + integrator.drift_share * Jf @ drift_x, B + integrator.drift_share * Jf @ drift_u
     left = integrator.left
     if integrator.variational:
         K = Jk

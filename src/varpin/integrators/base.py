@@ -73,6 +73,14 @@ class Integrator(ABC):
         """The part of a step's kick that comes before the step; the rest comes after it."""
         return 1.0
 
+    @property
+    def drift_share(self) -> float:
+        """The part of the drift from Stratonovich to Ito that is left to add.
+
+        A second part of the kick, at the velocity that the first has left, brings the rest by itself.
+        """
+        return 1.0 - 2.0 * self.left * (1.0 - self.left)
+
     @abstractmethod
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Any, list[Segment]]:
         """The state of a rollout of P paths at (q0, v0), each (P, n), and a segment of the first node of each.

@@ -151,7 +151,7 @@ class Midpoint(Integrator):
         if len(increment):
             kernels.apply_impulse(scene.mechanism, self.left * (F @ increment[0, 0]), now, state.work)
         nothing = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
-        (segment,) = self._compiled(scene, state, open_loop(control[None]), nothing, drift[None, None], dt)
+        (segment,) = self._compiled(scene, state, open_loop(control[None]), nothing, self.drift_share * drift[None, None], dt)
         if len(increment) and self.left < 1.0 and segment.failure is None:
             F, _ = diffusion_and_drift(scene, now.q[0], now.v[0], control, state.start[0])
             kernels.apply_impulse(scene.mechanism, (1.0 - self.left) * (F @ increment[0, 0]), now, state.work)
@@ -182,7 +182,7 @@ class Midpoint(Integrator):
         q, p, v = (np.ascontiguousarray(getattr(trajectory, name)[:-1]) for name in ("q", "p", "v"))
         # Without noise the root is known; with it the step at dw = 0 starts from another momentum.
         guess = v if trajectory.dw.any() else np.diff(trajectory.q, axis=0) / trajectory.dt
-        force = trajectory.u @ scene.actuation.T + drifts(scene, trajectory)
+        force = trajectory.u @ scene.actuation.T + self.drift_share * drifts(scene, trajectory)
         Jx, Jf = np.empty((steps, 2 * n, 2 * n)), np.empty((steps, 2 * n, n))
         outcome, done = linearize(
             scene.mechanism,

@@ -1,0 +1,371 @@
+"""Ensembles: the same bytes however they are computed, statistics against NumPy, failures, Ctrl-C and bad input."""
+
+import logging
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+import varpin as vp
+import varpin.ensemble
+
+ARRAYS = ("q", "v", "p", "u", "energy")
+START = {"q0": [0.3, -0.2], "v0": [0.0, 1.0]}
+
+
+def make_scene(strength=0.3, **options):
+    noise = vp.AdditiveNoise(strength) + vp.ControlNoise(0.2) + vp.StateNoise(0.1)
+    return vp.Scene(vp.planar_chain(2), damping=0.2, stiffness=3.0, noise=noise, **options)
+
+
+def run(scene=None, **options):
+    given = {"dt": 0.01, "steps": 50, "paths": 40, "rng": 7, "controls": [0.3, -0.1], **START} | options
+    return vp.simulate_ensemble(make_scene() if scene is None else scene, **given)
+
+
+def same_statistics(one, other, tolerance=0.0):
+    for item in fields(one.statistics):
+        a, b = getattr(one.statistics, item.name), getattr(other.statistics, item.name)
+        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance, equal_nan=True)
+
+
+def blocks_of(monkeypatch, numbers):
+    monkeypatch.setattr(varpin.ensemble, "_BLOCK", numbers)
+
+
+def numbers_a_step(scene, paths):
+    return paths * (4 * scene.robot.dof + scene.controls + scene.processes + 8)
+
+
+@pytest.mark.parametrize("kick", ["left", "split"])
+def test_same_bytes_for_any_number_of_workers_and_blocks(kick, monkeypatch):
+    integrator = vp.Midpoint(kick=kick)
+    one, two, seven = (run(paths=100, workers=w, integrator=integrator) for w in (1, 2, 7))
+    blocks_of(monkeypatch, 9 * numbers_a_step(make_scene(), 100))
+    calls = []
+    in_blocks = run(paths=100, workers=2, integrator=integrator, progress=lambda *done: calls.append(done))
+    assert calls == [(9, 50), (18, 50), (27, 50), (36, 50), (45, 50), (50, 50)]
+    for other in (two, seven, in_blocks):
+        for name in ARRAYS:
+            assert getattr(other, name).tobytes() == getattr(one, name).tobytes()
+        same_statistics(other, one, 1e-14 if other is in_blocks else 0.0)
+
+
+def test_same_bytes_for_one_path_or_a_thousand():
+    many, few, one = (run(paths=paths) for paths in (1000, 45, 1))
+    for name in ARRAYS:
+        assert getattr(few, name).tobytes() == getattr(many, name)[:45].tobytes()
+        assert getattr(one, name).tobytes() == getattr(many, name)[:1].tobytes()
+    assert len(np.unique(many.q[:, -1, 0])) == 1000
+
+
+@pytest.mark.parametrize("kick", ["left", "split"])
+@pytest.mark.parametrize("seed", [7, "generator"])
+def test_paths_are_simulations_from_the_children_of_the_generator(seed, kick):
+    scene, integrator = make_scene(), vp.Midpoint(kick=kick)
+    end = run(scene, rng=np.random.default_rng(7) if seed == "generator" else 7, integrator=integrator)
+    for path, child in enumerate(np.random.default_rng(7).spawn(40)):
+        options = {"dt": 0.01, "steps": 50, "controls": [0.3, -0.1], "integrator": integrator}
+        if path % 2:
+            alone = vp.simulate(scene, *START.values(), rng=child, **options)
+        else:
+            dw = child.normal(scale=0.1, size=(50, scene.processes))
+            alone = vp.simulate(scene, *START.values(), increments=dw, **options)
+        for name in ARRAYS:
+            assert getattr(end, name)[path].tobytes() == getattr(alone, name).tobytes()
+    np.testing.assert_array_equal(end.t, alone.t)
+
+
+def test_each_path_may_have_its_own_start():
+    q0, v0 = np.random.default_rng(0).normal(size=(2, 40, 2))
+    end = run(q0=q0, v0=v0)
+    np.testing.assert_array_equal(end.q[:, 0], q0)
+    np.testing.assert_array_equal(end.v[:, 0], v0)
+    for path, child in enumerate(np.random.default_rng(7).spawn(40)):
+        alone = vp.simulate(make_scene(), q0[path], v0[path], dt=0.01, steps=50, rng=child, controls=[0.3, -0.1])
+        assert end.p[path].tobytes() == alone.p.tobytes()
+
+
+def test_without_noise_all_paths_are_one():
+    end = run(vp.Scene(vp.planar_chain(2)), paths=3)
+    alone = vp.simulate(vp.Scene(vp.planar_chain(2)), *START.values(), dt=0.01, steps=50, controls=[0.3, -0.1])
+    for path in range(3):
+        assert end.q[path].tobytes() == alone.q.tobytes()
+    assert np.abs(end.statistics.covariance).max() < 1e-28
+
+
+def expected_statistics(x, energy, levels):
+    """By NumPy, node by node, over the paths that are not NaN there."""
+    for j in range(x.shape[1]):
+        good = ~np.isnan(energy[:, j])
+        deviation = energy[good, j].std(ddof=1)
+        quantiles = np.quantile(x[good, j], levels, axis=0)
+        yield good.sum(), x[good, j].mean(axis=0), np.cov(x[good, j].T), quantiles, energy[good, j].mean(), deviation
+
+
+def check_statistics(end):
+    own = end.statistics
+    x = np.concatenate([end.q, end.p], axis=2)
+    for j, (count, mean, covariance, quantiles, energy, deviation) in enumerate(
+        expected_statistics(x, end.energy, own.levels)
+    ):
+        assert own.count[j] == count
+        np.testing.assert_allclose(own.mean[j], mean, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(own.covariance[j], covariance, rtol=0, atol=1e-13 * max(1, np.abs(covariance).max()))
+        np.testing.assert_array_equal(own.quantiles[:, j], quantiles)
+        assert own.energy_mean[j] == pytest.approx(energy, rel=1e-13)
+        assert own.energy_deviation[j] == pytest.approx(deviation, rel=1e-10, abs=1e-12)
+
+
+def test_statistics_are_those_of_the_stored_paths():
+    end = run(quantiles=[0.0, 0.1, 0.5, 1.0])
+    np.testing.assert_array_equal(end.statistics.levels, [0.0, 0.1, 0.5, 1.0])
+    check_statistics(end)
+    assert end.statistics.covariance[-1].trace() > 1e-3
+    assert run(quantiles=[]).statistics.quantiles.shape == (0, 51, 4)
+
+
+def test_statistics_do_not_need_stored_paths(monkeypatch):
+    stored = run()
+    for _ in range(2):
+        lean = run(store=False)
+        assert all(getattr(lean, name) is None for name in ARRAYS)
+        same_statistics(lean, stored, 1e-14)
+        blocks_of(monkeypatch, 7 * numbers_a_step(make_scene(), 40))
+
+
+def test_one_path_has_no_covariance():
+    alone = run(paths=1).statistics
+    assert not alone.covariance.any()
+    assert not alone.energy_deviation.any()
+    assert (alone.count == 1).all()
+
+
+def test_no_steps():
+    end = run(steps=0)
+    assert end.q.shape == (40, 1, 2)
+    assert end.u.shape == (40, 0, 2)
+    np.testing.assert_array_equal(end.t, [0.0])
+    assert end.statistics.count.tolist() == [40]
+
+
+def feedback(scene, steps, seed=1):
+    rng = np.random.default_rng(seed)
+    m, n = scene.controls, scene.robot.dof
+    gains = -np.abs(rng.normal(size=(steps, m, 2 * n)))
+    return vp.LinearPolicy(rng.normal(size=(steps, m)), gains, rng.normal(size=(steps + 1, 2 * n)))
+
+
+@pytest.mark.parametrize("kick", ["left", "split"])
+def test_linear_feedback(kick):
+    """Applied in the kernel, against single steps with the control worked out in NumPy."""
+    scene, integrator = make_scene(actuation=["joint2"]), vp.Midpoint(kick=kick)
+    policy = feedback(scene, 50)
+    # The center of StateNoise must stay the same over single steps.
+    noise = vp.AdditiveNoise(0.3) + vp.ControlNoise(0.2) + vp.StateNoise(0.1, center=START["q0"])
+    single = vp.Scene(vp.planar_chain(2), damping=0.2, stiffness=3.0, noise=noise, actuation=["joint2"])
+    end = run(scene, controls=policy, paths=3, integrator=integrator)
+    whole = vp.simulate(
+        scene, *START.values(), dt=0.01, steps=50, controls=policy, rng=np.random.default_rng(7).spawn(1)[0],
+        integrator=integrator,
+    )  # fmt: skip
+    assert whole.p.tobytes() == end.p[0].tobytes()
+    assert whole.u.tobytes() == end.u[0].tobytes()
+    for path, child in enumerate(np.random.default_rng(7).spawn(3)):
+        dw = child.normal(scale=0.1, size=(50, scene.processes))
+        q, v = (np.array(value) for value in START.values())
+        p = vp.lagrangian_jet(scene, q, v).Lv
+        for k in range(50):
+            u = policy.u[k] + policy.gains[k] @ (np.concatenate([q, p]) - policy.reference[k])
+            np.testing.assert_allclose(end.u[path, k], u, rtol=0, atol=1e-10)
+            step = vp.simulate(
+                single, q, v, dt=0.01, steps=1, controls=u, increments=dw[k : k + 1], integrator=integrator
+            )
+            q, v, p = step.q[1], step.v[1], step.p[1]
+            np.testing.assert_allclose(end.q[path, k + 1], q, rtol=0, atol=1e-10)
+            np.testing.assert_allclose(end.p[path, k + 1], p, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([[1.0]], [1.0], [[0.0]]), r"gains must have shape \(N, m, 2n\), got \(1,\)"),
+        (([[1.0]], [[[1.0], [1.0, 2.0]]], [[0.0]]), "gains must be an array of real numbers"),
+        ((np.ones((3, 2)), np.ones((4, 2, 4)), np.ones((4, 4))), r"u must have shape \(4, 2\), got \(3, 2\)"),
+        ((np.ones((4, 2)), np.ones((4, 2, 4)), np.ones((6, 4))), r"reference must have shape \(4, 4\), got \(6, 4\)"),
+        ((np.ones((4, 2)), np.ones((4, 2, 4)), 0.0), r"reference must have shape \(4, 4\), got \(\)"),
+        ((np.ones((4, 2)), np.ones((4, 2, 4)), None), "reference must be an array of real numbers"),
+        ((np.ones((4, 2)), np.full((4, 2, 4), np.nan), np.ones((4, 4))), r"gains\[0, 0, 0\] is nan; it must be finite"),
+    ],
+)
+def test_policies_that_do_not_fit_together(arguments, message):
+    with pytest.raises(vp.InputError, match=message):
+        vp.LinearPolicy(*arguments)
+
+
+def test_policies_are_copies_and_frozen():
+    u, gains, reference = np.ones((3, 2)), np.ones((3, 2, 4)), np.ones((3, 4))
+    policy = vp.LinearPolicy(u, gains, reference)
+    u[:], gains[:], reference[:] = 2.0, 2.0, 2.0
+    for array in (policy.u, policy.gains, policy.reference):
+        assert (array == 1.0).all()
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0.0
+
+
+@pytest.mark.parametrize("shape", [(49, 2, 4), (50, 1, 4), (50, 2, 6)])
+def test_policies_that_do_not_fit_the_scene(shape):
+    steps, m, size = shape
+    policy = vp.LinearPolicy(np.ones((steps, m)), np.ones(shape), np.ones((steps, size)))
+    with pytest.raises(vp.InputError, match=r"the policy's gains must have shape \(50, 2, 4\), got"):
+        run(controls=policy)
+
+
+# Without halvings a coarse step fails on a chain that falls from the horizontal, and never on one that hangs still.
+FRAGILE = {"dt": 0.05, "steps": 60, "integrator": vp.Midpoint(max_halvings=0), "controls": None}
+
+
+def fragile_scene(links=3):
+    return vp.Scene(vp.planar_chain(links), noise=vp.AdditiveNoise(1e-2))
+
+
+def starts(paths):
+    """Every third path falls, from another height each."""
+    q0 = np.zeros((paths, 3))
+    q0[:, 0] = np.pi / 2
+    q0[::3, 0] = np.linspace(-0.5, 0.5, len(q0[::3]))
+    return q0
+
+
+def test_failing_paths_are_left_out_from_where_they_fail(monkeypatch, caplog):
+    options = FRAGILE | {"paths": 40, "q0": starts(40), "v0": np.zeros(3)}
+    with caplog.at_level(logging.WARNING, "varpin.ensemble"):
+        end = run(fragile_scene(), **options)
+    failed = {failure.path: failure for failure in end.failures}
+    steps = {path: failure.step for path, failure in failed.items()}
+    assert 3 <= len(set(steps.values()))
+    assert set(steps) <= set(range(0, 40, 3))
+    assert len(steps) == len(end.failures)
+    first = min(end.failures, key=lambda failure: failure.step)
+    assert f"{len(steps)} of 40 paths failed, the first at step {first.step}: {first.reason}" in caplog.text
+    for path, child in enumerate(np.random.default_rng(7).spawn(40)):
+        done = steps.get(path, 60)
+        for name in ("q", "v", "p", "energy"):
+            assert np.isfinite(getattr(end, name)[path, : done + 1]).all()
+            assert np.isnan(getattr(end, name)[path, done + 1 :]).all()
+        assert np.isfinite(end.u[path, :done]).all()
+        assert np.isnan(end.u[path, done:]).all()
+        alone = {"dt": 0.05, "steps": 60, "rng": child, "integrator": FRAGILE["integrator"]}
+        if path in failed:
+            with pytest.raises(vp.StepFailure) as caught:
+                vp.simulate(fragile_scene(), starts(40)[path], np.zeros(3), **alone)
+            assert caught.value.step == failed[path].step
+            assert caught.value.reason == failed[path].reason
+            assert caught.value.trajectory.p.tobytes() == end.p[path, : done + 1].tobytes()
+    assert end.statistics.count.tolist() == [40 - sum(step < j for step in steps.values()) for j in range(61)]
+    check_statistics(end)
+    # A path that has failed is not taken up again in the next block.
+    blocks_of(monkeypatch, 4 * numbers_a_step(fragile_scene(), 40))
+    again = run(fragile_scene(), **options)
+    assert {failure.path: failure for failure in again.failures} == failed
+    assert again.p.tobytes() == end.p.tobytes()
+    same_statistics(again, end, 1e-13)
+    same_statistics(run(fragile_scene(), store=False, **options), end, 1e-13)
+
+
+@pytest.mark.parametrize("block", [2, 60])
+def test_all_paths_failing_is_an_error(monkeypatch, block):
+    failing = [k for k in range(0, 40, 3)][:6]
+    options = FRAGILE | {"paths": 6, "q0": starts(40)[failing], "v0": np.zeros(3)}
+    blocks_of(monkeypatch, block * numbers_a_step(fragile_scene(), 6))
+    calls = []
+    with pytest.raises(vp.VarpinError, match=r"^6 of 6 paths failed, the first at step \d+: ") as caught:
+        run(fragile_scene(), progress=lambda *done: calls.append(done), **options)
+    assert type(caught.value) is vp.VarpinError
+    # It ends with the last path.
+    assert calls[-1][0] < 60 or block == 60
+
+
+def test_interruption_keeps_what_is_done(monkeypatch):
+    blocks_of(monkeypatch, 8 * numbers_a_step(make_scene(), 40))
+
+    def interrupt(done, total):
+        if done == 24:
+            raise KeyboardInterrupt
+
+    with pytest.raises(vp.EnsembleInterrupted, match="interrupted after 24 steps of all paths") as caught:
+        run(progress=interrupt)
+    assert isinstance(caught.value, KeyboardInterrupt)
+    part, whole = caught.value.ensemble, run()
+    assert part.t.tobytes() == whole.t[:25].tobytes()
+    for name in ARRAYS:
+        done = 24 if name == "u" else 25
+        assert getattr(part, name).shape == getattr(whole, name)[:, :done].shape
+        assert getattr(part, name).tobytes() == getattr(whole, name)[:, :done].tobytes()
+    np.testing.assert_array_equal(part.statistics.mean, whole.statistics.mean[:25])
+    assert part.statistics.quantiles.shape == (3, 25, 4)
+    assert part.statistics.count.tolist() == [40] * 25
+    with pytest.raises(vp.EnsembleInterrupted) as caught:
+        run(progress=interrupt, store=False)
+    assert caught.value.ensemble.q is None
+    np.testing.assert_array_equal(caught.value.ensemble.statistics.mean, part.statistics.mean)
+
+
+CUSTOM = vp.CustomNoise(lambda q, v, u: np.eye(2), 2)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"scene": "chain"}, "scene must be a varpin.Scene, got str"),
+        ({"scene": vp.Scene(vp.planar_chain(2), noise=CUSTOM)}, "an ensemble needs noise that kernels evaluate"),
+        ({"dt": 0.0}, r"dt must be positive and finite \[s\], got 0.0"),
+        ({"steps": -1}, "steps must be at least 0, got -1"),
+        ({"steps": 2.5}, "steps must be an integer, got 2.5"),
+        ({"steps": 10**14}, "steps = 100000000000000 with 40 stored paths needs more memory than there is"),
+        ({"paths": 0}, "paths must be at least 1, got 0"),
+        ({"paths": "many"}, "paths must be an integer, got 'many'"),
+        ({"rng": -3}, "rng must be a numpy Generator or a seed, an integer >= 0, got -3"),
+        ({"rng": "seed"}, "rng must be a numpy Generator or a seed"),
+        ({"q0": [0.0, 0.0, 0.0]}, r"q0 must have shape \(40, 2\), got \(3,\)"),
+        ({"q0": np.zeros((39, 2))}, r"q0 must have shape \(40, 2\), got \(39, 2\)"),
+        ({"v0": [0.0, np.nan]}, r"v0\[0, 1\] is nan; it must be finite"),
+        (
+            {"controls": np.zeros((49, 2))},
+            r"controls must have shape \(50, 2\), one row a step, or \(2,\), got \(49, 2\)",
+        ),
+        ({"controls": [np.inf, 0.0]}, r"controls\[0\] is inf; it must be finite"),
+        ({"controls": lambda t, q, v: q}, "controls must be an array of real numbers"),
+        ({"integrator": "midpoint"}, r"integrator must be one of varpin's, for example varpin.Midpoint\(\), got"),
+        ({"quantiles": [0.5, 1.5]}, r"quantiles must be levels in \[0, 1\], got \[0.5, 1.5\]"),
+        ({"quantiles": 0.5}, r"quantiles must be levels in \[0, 1\], got 0.5"),
+        ({"quantiles": [np.nan]}, r"quantiles\[0\] is nan; it must be finite"),
+        ({"workers": 0}, "workers must be at least 1, got 0"),
+        ({"workers": 1.5}, "workers must be an integer, got 1.5"),
+    ],
+)
+def test_bad_input(options, message):
+    with pytest.raises(vp.InputError, match=message):
+        run(**options)
+
+
+@pytest.mark.parametrize("kick", ["left", "split"])
+def test_small_noise_has_the_predicted_covariance(kick):
+    """Mean and covariance of 20 000 paths against :func:`varpin.propagate_moments` around the quiet motion."""
+    paths, strength, integrator = 20_000, 2e-4, vp.Midpoint(kick=kick)
+    noise = vp.AdditiveNoise(strength) + vp.StateNoise(strength) + vp.ControlNoise(strength)
+    scene = vp.Scene(vp.planar_chain(2), damping=0.2, stiffness=3.0, noise=noise)
+    options = {"dt": 0.01, "controls": [0.3, -0.1], "steps": 50, "integrator": integrator}
+    quiet = vp.simulate(scene, *START.values(), **options)
+    moments = vp.propagate_moments(vp.linearize(scene, quiet, integrator=integrator))
+    own = vp.simulate_ensemble(scene, *START.values(), paths=paths, rng=5, store=False, **options).statistics
+    for j in (1, 10, 50):
+        P = moments.covariance[j]
+        variances = np.diag(P)
+        x = np.concatenate([quiet.q[j], quiet.p[j]])
+        # Of Gaussian samples: var(mean) = P_aa / N, var(P_ab) = (P_aa P_bb + P_ab^2) / N.
+        assert (np.abs(own.mean[j] - x) < 4.0 * np.sqrt(variances / paths)).all()
+        error = np.sqrt((np.outer(variances, variances) + P**2) / paths)
+        assert (np.abs(own.covariance[j] - P) < 4.0 * error).all()
+        # A covariance tenth as large again would show.
+        assert (0.1 * variances > 4.0 * np.diag(error)).all()
