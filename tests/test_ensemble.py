@@ -243,7 +243,7 @@ def test_failing_paths_are_left_out_from_where_they_fail(monkeypatch, caplog):
         end = run(fragile_scene(), **options)
     failed = {failure.path: failure for failure in end.failures}
     steps = {path: failure.step for path, failure in failed.items()}
-    assert 3 <= len(set(steps.values()))
+    assert len(set(steps.values())) >= 3
     assert set(steps) <= set(range(0, 40, 3))
     assert len(steps) == len(end.failures)
     first = min(end.failures, key=lambda failure: failure.step)
@@ -275,7 +275,7 @@ def test_failing_paths_are_left_out_from_where_they_fail(monkeypatch, caplog):
 
 @pytest.mark.parametrize("block", [2, 60])
 def test_all_paths_failing_is_an_error(monkeypatch, block):
-    failing = [k for k in range(0, 40, 3)][:6]
+    failing = slice(0, 18, 3)
     options = FRAGILE | {"paths": 6, "q0": starts(40)[failing], "v0": np.zeros(3)}
     blocks_of(monkeypatch, block * numbers_a_step(fragile_scene(), 6))
     calls = []

@@ -151,7 +151,9 @@ class Midpoint(Integrator):
         if len(increment):
             kernels.apply_impulse(scene.mechanism, self.left * (F @ increment[0, 0]), now, state.work)
         nothing = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
-        (segment,) = self._compiled(scene, state, open_loop(control[None]), nothing, self.drift_share * drift[None, None], dt)
+        (segment,) = self._compiled(
+            scene, state, open_loop(control[None]), nothing, self.drift_share * drift[None, None], dt
+        )
         if len(increment) and self.left < 1.0 and segment.failure is None:
             F, _ = diffusion_and_drift(scene, now.q[0], now.v[0], control, state.start[0])
             kernels.apply_impulse(scene.mechanism, (1.0 - self.left) * (F @ increment[0, 0]), now, state.work)
