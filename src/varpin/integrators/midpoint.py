@@ -90,7 +90,8 @@ class Midpoint(Integrator):
             raise InputError(f"max_halvings must be at most 30, got {self.max_halvings}")
 
     def __str__(self) -> str:
-        return f"Midpoint(alpha={self.alpha:g})"
+        kick = "" if self.kick == "left" else f", kick={self.kick}"
+        return f"Midpoint(alpha={self.alpha:g}{kick})"
 
     @property
     def left(self) -> float:

@@ -1,0 +1,297 @@
+"""Diffusion fields against their definitions and against differences, and what users can get wrong about them."""
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin.noise import bind
+
+# Three coordinates, two controls: one joint is not actuated, and a control moves two joints.
+ACTUATION = np.array([[1.0, 0.0], [0.0, 0.0], [0.5, 2.0]])
+WEIGHTS = {1: 2 / 3, 2: -1 / 12}
+
+
+def chain(noise, links=2, **options):
+    return vp.Scene(vp.planar_chain(links), noise=noise, **options)
+
+
+def points(n=3, m=2, count=5):
+    rng = np.random.default_rng(0)
+    return rng.normal(size=(count, n)), rng.normal(size=(count, n)), rng.normal(size=(count, m)), rng.normal(size=n)
+
+
+def difference(function, x, eps=1e-2):
+    """Derivative by differences of fourth order in the last index: exact for polynomials of degree four."""
+    columns = [
+        sum(c * (function(x + k * e) - function(x - k * e)) for k, c in WEIGHTS.items()) / eps
+        for e in eps * np.eye(x.shape[1])
+    ]
+    return np.stack(columns, axis=-1)
+
+
+def own_noise(strength=0.3):
+    """F = strength (q q' + diag(v) + u_0), with all its derivatives."""
+    eye = np.eye(3)
+
+    def dq(q, v, u):
+        return strength * (np.einsum("ic,k->ikc", eye, q) + np.einsum("kc,i->ikc", eye, q))
+
+    def du(q, v, u):
+        return strength * np.einsum("ik,m->ikm", np.ones((3, 3)), [1.0, 0.0])
+
+    return vp.CustomNoise(
+        field=lambda q, v, u: strength * (np.outer(q, q) + np.diag(v) + u[0]),
+        processes=3,
+        dq=dq,
+        dv=lambda q, v, u: strength * np.einsum("ik,ic->ikc", eye, eye),
+        du=du,
+        check=True,
+    )
+
+
+TABLE = np.random.default_rng(3).normal(size=(3, 4, 2))
+MATRIX = np.random.default_rng(4).normal(size=(3, 2))
+CENTER = np.array([0.3, -0.2, 1.0])
+
+# Model, and F at one point as its definition has it.
+MODELS = {
+    "additive": (vp.AdditiveNoise(0.7), lambda q, v, u, start: np.diag([0.7] * 3)),
+    "additive row": (vp.AdditiveNoise([0.7, 0.0, 2.0]), lambda q, v, u, start: np.diag([0.7, 0.0, 2.0])),
+    "additive matrix": (vp.AdditiveNoise(MATRIX), lambda q, v, u, start: MATRIX),
+    "control": (vp.ControlNoise(0.4), lambda q, v, u, start: 0.4 * ACTUATION * u),
+    "control row": (vp.ControlNoise([0.4, -0.1]), lambda q, v, u, start: ACTUATION * [0.4, -0.1] * u),
+    "control table": (vp.ControlNoise(TABLE), lambda q, v, u, start: TABLE @ u),
+    "state": (vp.StateNoise(0.6), lambda q, v, u, start: np.diag(0.6 * (q - start) ** 2)),
+    "state center": (
+        vp.StateNoise([0.6, 1.0, 2.0], center=CENTER),
+        lambda q, v, u, start: np.diag([0.6, 1.0, 2.0] * (q - CENTER) ** 2),
+    ),
+    "custom": (own_noise(), lambda q, v, u, start: 0.3 * (np.outer(q, q) + np.diag(v) + u[0])),
+    "sum": (
+        vp.AdditiveNoise(MATRIX) + own_noise() + vp.ControlNoise(0.4),
+        lambda q, v, u, start: np.hstack([MATRIX, 0.3 * (np.outer(q, q) + np.diag(v) + u[0]), 0.4 * ACTUATION * u]),
+    ),
+    "nested sum": (
+        vp.StateNoise(0.6) + (vp.AdditiveNoise(0.7) + vp.ControlNoise(TABLE)),
+        lambda q, v, u, start: np.hstack([np.diag(0.6 * (q - start) ** 2), np.diag([0.7] * 3), TABLE @ u]),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_fields_are_as_defined(name):
+    model, expected = MODELS[name]
+    bound = model.bind(ACTUATION)
+    q, v, u, start = points()
+    fields = bound.fields(q, v, u, start)
+    exact = np.array([expected(*point, start) for point in zip(q, v, u, strict=True)])
+    assert fields.F.shape == exact.shape == (5, 3, bound.processes)
+    np.testing.assert_allclose(fields.F, exact, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_derivatives_of_fields(name):
+    model, _ = MODELS[name]
+    bound = model.bind(ACTUATION)
+    q, v, u, start = points()
+    fields = bound.fields(q, v, u, start)
+    Fq = difference(lambda q: bound.fields(q, v, u, start).F, q)
+    Fv = difference(lambda v: bound.fields(q, v, u, start).F, v)
+    Fu = difference(lambda u: bound.fields(q, v, u, start).F, u)
+    np.testing.assert_allclose(fields.Fq, Fq, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(fields.Fu, Fu, rtol=0, atol=1e-12)
+    assert bound.velocity_dependent == (fields.Fv is not None) == bool(np.abs(Fv).max() > 0.1)
+    if fields.Fv is not None:
+        np.testing.assert_allclose(fields.Fv, Fv, rtol=0, atol=1e-12)
+
+
+def test_processes_of_several_models_stand_side_by_side():
+    parts = [vp.AdditiveNoise(MATRIX), vp.ControlNoise(0.4), vp.StateNoise(0.6)]
+    point = points()
+    singles = np.concatenate([part.bind(ACTUATION).fields(*point).F for part in parts], axis=2)
+    for several in (parts, tuple(parts), parts[0] + parts[1] + parts[2], [parts[0], parts[1] + parts[2]]):
+        bound = bind(several, ACTUATION)
+        assert bound.processes == 2 + 2 + 3
+        np.testing.assert_array_equal(bound.fields(*point).F, singles)
+        assert bound.diffusion.constant.shape == (3, 7)
+    assert bind([*parts, own_noise()], ACTUATION).diffusion is None
+
+
+@pytest.mark.parametrize("nothing", [None, [], ()])
+def test_no_noise(nothing):
+    scene = chain(nothing)
+    assert scene.processes == 0
+    assert scene.noise.fields(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(2)).F.shape == (1, 2, 0)
+    assert vp.simulate(scene, [0, 0], [0, 0], dt=0.01, steps=5, rng=0).dw.shape == (5, 0)
+
+
+def test_control_noise_acts_through_the_actuation():
+    """Two controls on three joints: noise leaves the passive joint's momentum to the dynamics."""
+    scene = vp.Scene(vp.planar_chain(3), actuation=["joint1", "joint3"], noise=vp.ControlNoise(0.5), gravity=False)
+    assert (scene.controls, scene.processes) == (2, 2)
+    dw = np.array([[0.3, -0.2]])
+    noisy, quiet = (
+        vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-6, steps=1, controls=[2.0, 4.0], increments=dw * part)
+        for part in (1.0, 0.0)
+    )
+    kick = [0.5 * 2.0 * 0.3, 0.0, 0.5 * 4.0 * -0.2]
+    np.testing.assert_allclose(noisy.p[1] - quiet.p[1], kick, rtol=0, atol=1e-5)
+
+
+def test_state_noise_is_centred_on_the_start_of_the_motion():
+    """For a motion in one go and each path of an ensemble, and not on where later steps stand."""
+    start, end = np.array([0.4, -0.9]), {"dt": 0.01, "steps": 60, "rng": 3}
+    given = vp.simulate(chain(vp.StateNoise(0.8, center=start)), start, [1.0, 0.0], **end)
+    left_out = vp.simulate(chain(vp.StateNoise(0.8)), start, [1.0, 0.0], **end)
+    assert left_out.p.tobytes() == given.p.tobytes()
+    elsewhere = vp.simulate(chain(vp.StateNoise(0.8, center=0.0)), start, [1.0, 0.0], **end)
+    assert np.abs(elsewhere.p - given.p).max() > 1e-3
+    starts = np.array([start, start + 1.0])
+    paths = vp.simulate_ensemble(chain(vp.StateNoise(0.8)), starts, [1.0, 0.0], paths=2, **end)
+    for k in range(2):
+        scene = chain(vp.StateNoise(0.8, center=starts[k]))
+        alone = vp.simulate_ensemble(scene, starts, [1.0, 0.0], paths=2, **end)
+        assert alone.p[k].tobytes() == paths.p[k].tobytes()
+    # At its center the first kick is nothing.
+    first = vp.simulate(chain(vp.StateNoise(0.8)), start, [1.0, 0.0], dt=0.01, steps=1, increments=[[5.0, 5.0]])
+    quiet = vp.simulate(chain(None), start, [1.0, 0.0], dt=0.01, steps=1)
+    np.testing.assert_allclose(first.p[1], quiet.p[1], rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: vp.AdditiveNoise([1.0, 2.0]), r"AdditiveNoise intensity must be .* shape \(3,\), got \(2,\)"),
+        (lambda: vp.AdditiveNoise(np.ones((2, 4))), r"AdditiveNoise intensity must have shape \(3, 4\), got \(2, 4\)"),
+        (lambda: vp.AdditiveNoise(np.ones((3, 1, 1))), r"AdditiveNoise intensity must be .* got \(3, 1, 1\)"),
+        (lambda: vp.AdditiveNoise([1.0, np.nan, 0.0]), r"AdditiveNoise intensity\[1\] is nan; it must be finite"),
+        (lambda: vp.AdditiveNoise(np.inf), "AdditiveNoise intensity is inf; it must be finite"),
+        (lambda: vp.AdditiveNoise("strong"), "AdditiveNoise intensity must be an array of real numbers"),
+        (lambda: vp.AdditiveNoise(1j), "AdditiveNoise intensity must be an array of real numbers"),
+        (lambda: vp.AdditiveNoise(None), "AdditiveNoise intensity must be an array of real numbers"),
+        (lambda: vp.ControlNoise([1.0, 2.0, 3.0]), r"ControlNoise intensity must be .* shape \(2,\), got \(3,\)"),
+        (lambda: vp.ControlNoise(np.ones((3, 4, 3))), r"ControlNoise intensity must have shape \(3, 4, 2\), got"),
+        (lambda: vp.ControlNoise([[1.0]]), r"ControlNoise intensity must be one number .* got \(1, 1\)"),
+        (lambda: vp.ControlNoise(np.full((3, 1, 2), np.nan)), r"ControlNoise intensity\[0, 0, 0\] is nan"),
+        (lambda: vp.StateNoise(np.ones(4)), r"StateNoise intensity must be .* shape \(3,\), got \(4,\)"),
+        (lambda: vp.StateNoise(np.nan), r"StateNoise intensity\[0\] is nan; it must be finite"),
+        (lambda: vp.StateNoise(1.0, center=[0.0, 1.0]), r"StateNoise center must be .* shape \(3,\), got \(2,\)"),
+        (lambda: vp.StateNoise(1.0, center=[0.0, np.inf, 0.0]), r"StateNoise center\[1\] is inf; it must be finite"),
+        (lambda: 3.0, "noise must be a varpin noise model or several of them, got float"),
+        (lambda: "additive", "noise must be a varpin noise model or several of them, got str"),
+        (lambda: vp.AdditiveNoise, "noise must be a varpin noise model or several of them, got"),
+        (lambda: [vp.AdditiveNoise(1.0), 0.5], "noise must be a varpin noise model or several of them, got float"),
+        (lambda: vp.AdditiveNoise(1.0) + vp.StateNoise(np.ones(4)), "StateNoise intensity must be one number"),
+        (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), -1), "CustomNoise processes must be at least 0, got -1"),
+        (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), 3.0), "CustomNoise processes must be an integer, got 3.0"),
+        (lambda: vp.CustomNoise(np.eye(3), 3), r"CustomNoise field must be a function of \(q, v, u\), got array"),
+        (lambda: vp.CustomNoise(None, 3), r"CustomNoise field must be a function of \(q, v, u\), got None"),
+        (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), 3, dv=0.0), "CustomNoise dv must be a function"),
+    ],
+)
+def test_parameters_that_do_not_fit(make, message):
+    with pytest.raises(vp.InputError, match=message):
+        vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=make())
+
+
+def test_noise_adds_only_to_noise():
+    with pytest.raises(TypeError, match="unsupported operand"):
+        vp.AdditiveNoise(1.0) + 2.0
+
+
+@pytest.mark.parametrize("wrong", ["dq", "dv", "du"])
+def test_a_wrong_derivative_is_named(wrong):
+    right = own_noise()
+    slots = {name: getattr(right, name) for name in ("dq", "dv", "du")}
+
+    def off(q, v, u):
+        values = np.array(slots[wrong](q, v, u))
+        values[2, 1, 1] += 1e-3
+        return values
+
+    noise = vp.CustomNoise(right.field, 3, **{**slots, wrong: off}, check=True)
+    message = (
+        rf"CustomNoise {wrong}\(q, v, u\)\[:, :, 1\] differs from central differences of the field by 0.001 at q ="
+    )
+    with pytest.raises(vp.InputError, match=message):
+        vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=noise)
+    unchecked = vp.CustomNoise(right.field, 3, **{**slots, wrong: off})
+    assert vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=unchecked).processes == 3
+
+
+@pytest.mark.parametrize("missing", ["dq", "dv", "du"])
+def test_a_derivative_left_out_is_found_missing(missing):
+    right = own_noise()
+    slots = {name: getattr(right, name) for name in ("dq", "dv", "du") if name != missing}
+    with pytest.raises(vp.InputError, match=rf"CustomNoise {missing}\(q, v, u\)\[:, :, 0\] differs from central"):
+        vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=vp.CustomNoise(right.field, 3, **slots, check=True))
+
+
+@pytest.mark.parametrize(
+    ("slots", "message"),
+    [
+        ({"field": lambda q, v, u: np.eye(3)}, r"CustomNoise field\(q, v, u\) must have shape \(2, 2\), got \(3, 3\)"),
+        ({"field": lambda q, v, u: q}, r"CustomNoise field\(q, v, u\) must have shape \(2, 2\), got \(2,\)"),
+        ({"field": lambda q, v, u: [[1, 0], [0, np.nan]]}, r"CustomNoise field\(q, v, u\)\[1, 1\] is nan; it must be"),
+        ({"field": lambda q, v, u: None}, r"CustomNoise field\(q, v, u\) must be an array of real numbers, got None"),
+        (
+            {"dq": lambda q, v, u: np.zeros((2, 2))},
+            r"CustomNoise dq\(q, v, u\) must have shape \(2, 2, 2\), got \(2, 2\)",
+        ),
+        ({"dv": lambda q, v, u: np.full((2, 2, 2), np.inf)}, r"CustomNoise dv\(q, v, u\)\[0, 0, 0\] is inf"),
+        ({"du": lambda q, v, u: np.zeros((2, 2, 5))}, r"CustomNoise du\(q, v, u\) must have shape \(2, 2, 2\), got"),
+    ],
+)
+def test_what_a_field_returns_is_checked(slots, message):
+    """With the check when the scene is made, and without it when the motion needs the field."""
+    slots = {"field": lambda q, v, u: np.eye(2), "processes": 2} | slots
+    with pytest.raises(vp.InputError, match=message):
+        chain(vp.CustomNoise(**slots, check=True))
+    scene = chain(vp.CustomNoise(**slots))
+    with pytest.raises(vp.InputError, match=message):
+        vp.simulate(scene, [0, 0], [0, 0], dt=0.01, steps=3, rng=0)
+
+
+def test_a_field_cannot_reach_into_the_motion():
+    def vandal(q, v, u):
+        value = np.diag(q)
+        q[:], v[:], u[:] = 1e3, 1e3, 1e3
+        return value
+
+    options = {"dt": 0.01, "steps": 20, "rng": 0, "controls": [0.2, 0.1]}
+    motions = [
+        vp.simulate(chain(vp.CustomNoise(field, 2)), [0.3, 0.2], [0, 1], **options)
+        for field in (vandal, lambda q, v, u: np.diag(q))
+    ]
+    assert motions[0].p.tobytes() == motions[1].p.tobytes()
+    assert motions[0].u.tobytes() == motions[1].u.tobytes()
+
+
+@pytest.mark.parametrize("kick", ["left", "split"])
+@pytest.mark.parametrize("feedback", [False, True])
+def test_python_and_compiled_fields_give_the_same_motion(kick, feedback):
+    center, start = np.array([0.5, 0.0]), np.array([0.3, 0.2])
+    actuation = np.array([[1.0], [-0.5]])
+    compiled = vp.AdditiveNoise(0.2) + vp.StateNoise(0.7, center=center) + vp.ControlNoise(0.3)
+
+    def field(q, v, u):
+        return np.hstack([0.2 * np.eye(2), np.diag(0.7 * (q - center) ** 2), 0.3 * actuation * u])
+
+    options = {"dt": 0.01, "steps": 200, "rng": 1, "integrator": vp.Midpoint(kick=kick)}
+    options["controls"] = np.sin(np.arange(200.0))[:, None]
+    if feedback:
+        gains = np.tile([[-0.4, 0.1, -0.3, 0.2]], (200, 1, 1))
+        options["controls"] = vp.LinearPolicy(options["controls"], gains, np.full((200, 4), 0.1))
+    one = vp.simulate(chain(compiled, actuation=actuation), start, [0, 1], **options)
+    # Half in Python, half compiled is all in Python.
+    for noise in (
+        vp.CustomNoise(field, 5),
+        vp.AdditiveNoise(0.2)
+        + vp.CustomNoise(lambda q, v, u: np.diag(0.7 * (q - center) ** 2), 2)
+        + vp.ControlNoise(0.3),
+    ):
+        other = vp.simulate(chain(noise, actuation=actuation), start, [0, 1], **options)
+        assert other.dw.tobytes() == one.dw.tobytes()
+        for name in ("q", "v", "p", "u", "energy"):
+            np.testing.assert_allclose(getattr(other, name), getattr(one, name), rtol=0, atol=1e-10)
+    assert one.statistics.split_steps == 0
