@@ -43,8 +43,9 @@ def screenshot(page: Path, seconds: float, size: tuple[int, int] = (800, 640)) -
 def main() -> None:
     """Draw it."""
     finger = vp.load_robot("finger")
-    scene = vp.Scene(finger, gravity=False, stiffness=[0.54, 0.28, 0.12], damping=[3.1e-3, 2.2e-3, 0.9e-3])
-    motion = vp.simulate(scene, [0.9, 0.7, 0.5], [0.0, 0.0, 0.0], dt=1e-4, steps=1200)
+    impedance = {"stiffness": [0.54, 0.28, 0.12], "damping": [3.1e-3, 2.2e-3, 0.9e-3], "rest": [0.5, 0.7, 0.3]}
+    scene = vp.Scene(finger, gravity=False, **impedance)
+    motion = vp.simulate(scene, [1.2, 1.1, 0.6], [0.0, 0.0, 0.0], dt=1e-4, steps=3000)
     with tempfile.TemporaryDirectory() as folder:
         page = vp.replay(finger, motion.q[:1], dt=1.0, html=Path(folder) / "finger.html")
         picture = matplotlib.image.imread(io.BytesIO(screenshot(page, 3.0)))

@@ -14,14 +14,12 @@ from varpin._version import __version__ as __version__
 from varpin.ensemble import Ensemble as Ensemble
 from varpin.ensemble import EnsembleInterrupted as EnsembleInterrupted
 from varpin.ensemble import simulate_ensemble as simulate_ensemble
-from varpin.errors import ControlError as ControlError
 from varpin.errors import FileError as FileError
 from varpin.errors import InputError as InputError
 from varpin.errors import LinearizationError as LinearizationError
 from varpin.errors import RobotError as RobotError
 from varpin.errors import RobotNotFound as RobotNotFound
 from varpin.errors import SingularMassMatrix as SingularMassMatrix
-from varpin.errors import StepFailure as StepFailure
 from varpin.errors import UnknownJoint as UnknownJoint
 from varpin.errors import UnsupportedJoint as UnsupportedJoint
 from varpin.errors import VarpinError as VarpinError
@@ -51,6 +49,8 @@ from varpin.robot import Robot as Robot
 from varpin.robot import load_robot as load_robot
 from varpin.robot import planar_chain as planar_chain
 from varpin.scene import Scene as Scene
+from varpin.simulation import ControlError as ControlError
 from varpin.simulation import Interrupted as Interrupted
+from varpin.simulation import StepFailure as StepFailure
 from varpin.simulation import simulate as simulate
 from varpin.trajectory import Trajectory as Trajectory

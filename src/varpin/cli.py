@@ -25,13 +25,13 @@ from rich.text import Text
 
 from varpin._version import __version__
 from varpin.checks import count, positive, writable
-from varpin.errors import InputError, StepFailure, VarpinError
+from varpin.errors import InputError, VarpinError
 from varpin.inspection import JointReport, RobotReport, inspect_robot
 from varpin.integrators import Midpoint
 from varpin.replay import replay
 from varpin.robot import Robot, load_robot
 from varpin.scene import Scene
-from varpin.simulation import Interrupted, simulate
+from varpin.simulation import Interrupted, StepFailure, simulate
 from varpin.trajectory import Trajectory, atomic_file
 
 MISTAKE, STEP_FAILED, INTERRUPTED = 2, 3, 130

@@ -4,14 +4,6 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
-
-import numpy as np
-from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from varpin.integrators.base import Failure
-    from varpin.trajectory import Trajectory
 
 
 class VarpinError(Exception):
@@ -95,55 +87,6 @@ class InputError(VarpinError, ValueError):
 
 class FileError(VarpinError, OSError):
     """A file cannot be read, or not be written."""
-
-
-class ControlError(VarpinError, ValueError):
-    """A control function raised, or returned something that is no control.
-
-    Attributes:
-        step: Index of the step it was called for.
-        time: The time it was called with [s].
-        trajectory: What was computed before.
-    """
-
-    def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory) -> None:
-        self.step = step
-        self.time = time
-        self.trajectory = trajectory
-        super().__init__(f"step {step} (t = {time:.6g} s): {problem}; what came before is in error.trajectory")
-
-
-class StepFailure(VarpinError, RuntimeError):
-    """The step equation could not be solved on its principal branch.
-
-    Attributes:
-        step: Index of the step that failed.
-        time: Its start [s].
-        residual: The last residual, in units of the rounding error of its terms.
-        reason: What stopped the last attempt.
-        q: Configuration at the start of the step (n,) [rad or m].
-        v: Velocity there (n,).
-        p: Momentum there (n,).
-        trajectory: What was computed before.
-    """
-
-    def __init__(self, step: int, time: float, failure: Failure, trajectory: Trajectory) -> None:
-        self.step = step
-        self.time = float(time)
-        self.residual = failure.residual
-        self.reason = failure.reason
-        self.q, self.v, self.p = trajectory.q[-1], trajectory.v[-1], trajectory.p[-1]
-        self.trajectory = trajectory
-        super().__init__(
-            f"step {step} (t = {time:.6g} s) cannot be trusted: {failure.reason}; last residual {failure.residual:.3g} "
-            f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}. What came before is in error.trajectory; "
-            "a smaller dt may go further"
-        )
-
-
-def _row(values: NDArray[np.float64]) -> str:
-    """A vector on one line, whatever its length."""
-    return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"
 
 
 class LinearizationError(VarpinError, RuntimeError):

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, count, finite_array, positive, require_finite
-from varpin.errors import ControlError, InputError, StepFailure
+from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Segment
-from varpin.integrators.base import open_loop
+from varpin.integrators.base import Failure, open_loop
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
 from varpin.lagrangian import lagrangian_jet
@@ -42,6 +42,55 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
         super().__init__(f"interrupted after {trajectory.steps} steps; they are in .trajectory")
+
+
+class ControlError(VarpinError, ValueError):
+    """A control function raised, or returned something that is no control.
+
+    Attributes:
+        step: Index of the step it was called for.
+        time: The time it was called with [s].
+        trajectory: What was computed before.
+    """
+
+    def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory) -> None:
+        self.step = step
+        self.time = time
+        self.trajectory = trajectory
+        super().__init__(f"step {step} (t = {time:.6g} s): {problem}; what came before is in error.trajectory")
+
+
+class StepFailure(VarpinError, RuntimeError):
+    """The step equation could not be solved on its principal branch.
+
+    Attributes:
+        step: Index of the step that failed.
+        time: Its start [s].
+        residual: The last residual, in units of the rounding error of its terms.
+        reason: What stopped the last attempt.
+        q: Configuration at the start of the step (n,) [rad or m].
+        v: Velocity there (n,).
+        p: Momentum there (n,).
+        trajectory: What was computed before.
+    """
+
+    def __init__(self, step: int, time: float, failure: Failure, trajectory: Trajectory) -> None:
+        self.step = step
+        self.time = float(time)
+        self.residual = failure.residual
+        self.reason = failure.reason
+        self.q, self.v, self.p = trajectory.q[-1], trajectory.v[-1], trajectory.p[-1]
+        self.trajectory = trajectory
+        super().__init__(
+            f"step {step} (t = {time:.6g} s) cannot be trusted: {failure.reason}; last residual {failure.residual:.3g} "
+            f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}. What came before is in error.trajectory; "
+            "a smaller dt may go further"
+        )
+
+
+def _row(values: Floats) -> str:
+    """A vector on one line, whatever its length."""
+    return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"
 
 
 class _Record:

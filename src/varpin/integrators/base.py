@@ -60,7 +60,8 @@ class Integrator(ABC):
     Whoever adds one provides
 
     1. ``start``, which makes the state of a rollout at (q0, v0) and returns it with the first node;
-    2. ``rollout``, which moves a state through one step for each row of controls;
+    2. ``rollout_compiled`` and ``step_in_python``, which move a state on: many steps of many paths in a kernel, and one
+       step of one path with noise that only Python can evaluate;
     3. ``predict``, the state to expect half a step ahead, to second order, at which feedback is evaluated;
     4. ``linearize``, the derivatives of its steps;
     5. ``variational``, which says whether it maps (q, p) or (q, v).
@@ -89,13 +90,31 @@ class Integrator(ABC):
             SingularMassMatrix: M(q0) is not positive definite.
         """
 
-    @abstractmethod
     def rollout(self, scene: Scene, state: Any, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
         """One step of length ``dt`` [s] from ``state`` for each row of the commands; ``state`` moves along.
 
         ``increments`` are those of the Wiener processes (P, N, k) [s^0.5], or (0, 0, k) for none. Returns a segment for
-        each path.
+        each path; with diffusion fields that only Python can evaluate there is one path.
         """
+        if scene.noise.diffusion is not None:
+            return self.rollout_compiled(scene, state, commands, increments, np.zeros((0, 0, scene.robot.dof)), dt)
+        segments = []
+        for j in range(len(commands.u)):
+            row = Commands(*(array[j : j + 1] for array in commands))
+            segments.append(self.step_in_python(scene, state, row, increments[:, j : j + 1], dt))
+            if segments[-1].failure is not None:
+                break
+        return [join(segments)]
+
+    @abstractmethod
+    def rollout_compiled(
+        self, scene: Scene, state: Any, commands: Commands, increments: Floats, drift: Floats, dt: float
+    ) -> list[Segment]:
+        """:meth:`rollout` with fields that kernels evaluate; ``drift`` is a force (P, N, n), or (0, 0, n) for none."""
+
+    @abstractmethod
+    def step_in_python(self, scene: Scene, state: Any, command: Commands, increment: Floats, dt: float) -> Segment:
+        """One step of one path with diffusion fields that are evaluated in Python."""
 
     @abstractmethod
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.errors import LinearizationError, SingularMassMatrix
-from varpin.integrators.base import Integrator, Segment, diffusion_and_drift, drifts, join, open_loop, segments_of
+from varpin.integrators.base import Integrator, Segment, diffusion_and_drift, drifts, open_loop, segments_of
 from varpin.kernels import explicit as kernels
 from varpin.kernels.dynamics import Dynamics, forward_derivatives, new_dynamics
 from varpin.kernels.tree import Commands, new_nodes
@@ -59,21 +59,9 @@ class _Explicit(Integrator):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         return run, segments_of(nodes, REASONS)
 
-    def rollout(
-        self, scene: Scene, state: ExplicitRun, commands: Commands, increments: Floats, dt: float
-    ) -> list[Segment]:
-        """See :meth:`Integrator.rollout`."""
-        if scene.noise.diffusion is not None:
-            return self._compiled(scene, state, commands, increments, np.zeros((0, 0, scene.robot.dof)), dt)
-        segments = []
-        for j in range(len(commands.u)):
-            row = Commands(*(array[j : j + 1] for array in commands))
-            segments.append(self._in_python(scene, state, row, increments[:, j : j + 1], dt))
-            if segments[-1].failure is not None:
-                break
-        return [join(segments)]
-
-    def _in_python(self, scene: Scene, state: ExplicitRun, command: Commands, increment: Floats, dt: float) -> Segment:
+    def step_in_python(
+        self, scene: Scene, state: ExplicitRun, command: Commands, increment: Floats, dt: float
+    ) -> Segment:
         """One step of one path with diffusion fields that are evaluated in Python.
 
         The impulse is handed over as the drift of a constant force is: spread over the step for explicit Euler, which
@@ -91,12 +79,13 @@ class _Explicit(Integrator):
             else:
                 v += np.linalg.solve(mass(scene, q), impulse)
         nothing = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
-        (segment,) = self._compiled(scene, state, open_loop(control[None]), nothing, drift[None, None], dt)
+        (segment,) = self.rollout_compiled(scene, state, open_loop(control[None]), nothing, drift[None, None], dt)
         return segment
 
-    def _compiled(
+    def rollout_compiled(
         self, scene: Scene, state: ExplicitRun, commands: Commands, increments: Floats, drift: Floats, dt: float
     ) -> list[Segment]:
+        """See :meth:`Integrator.rollout_compiled`."""
         nodes = new_nodes(len(state.state.q), len(commands.u), scene.robot.dof, scene.controls)
         kernels.rollout(
             scene.mechanism,

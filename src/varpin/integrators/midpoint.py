@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from varpin.checks import count, fraction, positive
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
-from varpin.integrators.base import Integrator, Segment, diffusion_and_drift, drifts, join, open_loop, segments_of
+from varpin.integrators.base import Integrator, Segment, diffusion_and_drift, drifts, open_loop, segments_of
 from varpin.kernels import midpoint as kernels
 from varpin.kernels import midpoint_equation as equation
 from varpin.kernels.midpoint_linearize import linearize
@@ -126,21 +126,7 @@ class Midpoint(Integrator):
         nodes.done[:] = 1
         return run, segments_of(nodes, REASONS)
 
-    def rollout(
-        self, scene: Scene, state: MidpointState, commands: Commands, increments: Floats, dt: float
-    ) -> list[Segment]:
-        """See :meth:`Integrator.rollout`."""
-        if scene.noise.diffusion is not None:
-            return self._compiled(scene, state, commands, increments, np.zeros((0, 0, scene.robot.dof)), dt)
-        segments = []
-        for j in range(len(commands.u)):
-            row = Commands(*(array[j : j + 1] for array in commands))
-            segments.append(self._in_python(scene, state, row, increments[:, j : j + 1], dt))
-            if segments[-1].failure is not None:
-                break
-        return [join(segments)]
-
-    def _in_python(
+    def step_in_python(
         self, scene: Scene, state: MidpointState, command: Commands, increment: Floats, dt: float
     ) -> Segment:
         """One step of one path with diffusion fields that are evaluated in Python."""
@@ -152,7 +138,7 @@ class Midpoint(Integrator):
         if len(increment):
             kernels.apply_impulse(scene.mechanism, self.left * (F @ increment[0, 0]), now, state.work)
         nothing = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
-        (segment,) = self._compiled(
+        (segment,) = self.rollout_compiled(
             scene, state, open_loop(control[None]), nothing, self.drift_share * drift[None, None], dt
         )
         if len(increment) and self.left < 1.0 and segment.failure is None:
@@ -161,7 +147,7 @@ class Midpoint(Integrator):
             segment.p[-1], segment.v[-1], segment.energy[-1] = now.p[0], now.v[0], now.energy[0, :, :2].sum()
         return segment
 
-    def _compiled(
+    def rollout_compiled(
         self,
         scene: Scene,
         state: MidpointState,
@@ -170,6 +156,7 @@ class Midpoint(Integrator):
         drift: Floats,
         dt: float,
     ) -> list[Segment]:
+        """See :meth:`Integrator.rollout_compiled`."""
         nodes = new_nodes(len(state.state.q), len(commands.u), scene.robot.dof, scene.controls)
         kernels.rollout(
             scene.mechanism, self._options(), dt, commands, increments, drift, state.state, state.work, nodes
