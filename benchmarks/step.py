@@ -44,8 +44,8 @@ def rnea_derivatives(robot: vp.Robot, q0: np.ndarray) -> Callable[[], float]:
     return run
 
 
-def chain_of_mujoco(links: int, dt: float) -> Any:
-    """The planar chain as a mujoco.MjModel (Euler), or None without MuJoCo."""
+def chain_of_mujoco(links: int, dt: float, integrator: str = "Euler") -> Any:
+    """The planar chain as a mujoco.MjModel, or None without MuJoCo."""
     try:
         import mujoco  # noqa: PLC0415
     except ImportError:
@@ -54,10 +54,10 @@ def chain_of_mujoco(links: int, dt: float) -> Any:
     for k in range(links):
         body += (
             f'<body pos="{1.0 if k else 0.0} 0 0"><joint type="hinge" axis="0 1 0"/>'
-            '<inertial pos="0.5 0 0" mass="1" diaginertia="1e-9 0.083333333 0.083333333"/>'
+            '<inertial pos="0.5 0 0" mass="1" diaginertia="1e-9 0.08333333333333333 0.08333333333333333"/>'
         )
     return mujoco.MjModel.from_xml_string(
-        f'<mujoco><compiler boundinertia="0" balanceinertia="true"/><option timestep="{dt}" integrator="Euler">'
+        f'<mujoco><compiler boundinertia="0" balanceinertia="true"/><option timestep="{dt}" integrator="{integrator}">'
         '<flag contact="disable" constraint="disable"/></option>'
         f"<worldbody>{body}{'</body>' * links}</worldbody></mujoco>"
     )

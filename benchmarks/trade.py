@@ -18,6 +18,7 @@ import pinocchio as pin
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
+from step import chain_of_mujoco
 
 import varpin as vp
 
@@ -60,20 +61,12 @@ def forward_dynamics(robot: vp.Robot, rtol: float, duration: float = 1.0) -> np.
 
 def mujoco_chain(dt: float, integrator: str) -> Callable[[int], tuple[np.ndarray, np.ndarray]] | None:
     """A function of the number of steps that gives the last q and the energies; None without MuJoCo."""
-    try:
-        import mujoco  # noqa: PLC0415
-    except ImportError:
+    model = chain_of_mujoco(LINKS, dt, integrator)
+    if model is None:
         return None
-    body = "".join(
-        f'<body pos="{1.0 if k else 0.0} 0 0"><joint type="hinge" axis="0 1 0"/>'
-        '<inertial pos="0.5 0 0" mass="1" diaginertia="1e-9 0.08333333333333333 0.08333333333333333"/>'
-        for k in range(LINKS)
-    )
-    model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><compiler boundinertia="0" balanceinertia="true"/><option timestep="{dt}" integrator="{integrator}">'
-        '<flag contact="disable" constraint="disable" energy="enable"/></option>'
-        f"<worldbody>{body}{'</body>' * LINKS}</worldbody></mujoco>"
-    )
+    import mujoco  # noqa: PLC0415
+
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
     data = mujoco.MjData(model)
 
     def run(steps: int) -> tuple[np.ndarray, np.ndarray]:

@@ -57,7 +57,7 @@ class Linearization:
         return len(self.A)
 
     def step(self, j: int, dx: ArrayLike, du: ArrayLike, dw: ArrayLike) -> Floats:
-        """Dx (..., 2n) one step on, from deviations dx (..., 2n), du (..., m) and increments dw (..., k)."""
+        """The deviation (..., 2n) one step on, from dx (..., 2n), du (..., m) and increments dw (..., k)."""
         x, u, w = (np.asarray(value, dtype=float) for value in (dx, du, dw))
         noise = self.G[j] + np.einsum("aib,...b->...ai", self.Gx[j], x) + np.einsum("aib,...b->...ai", self.Gu[j], u)
         moved: Floats = x @ self.A[j].T + u @ self.B[j].T + np.einsum("...ai,...i->...a", noise, w)

@@ -6,7 +6,7 @@ from varpin.kernels.tree import Commands, Floats, Mechanism
 
 @inlined
 def apply_policy(commands: Commands, s: int, first: Floats, second: Floats, u: Floats) -> None:
-    """U = u_s + gains_s (x - x_s) with x = (first, second); without gains u = u_s."""
+    """Controls u = u_s + gains_s (x - x_s) with x = (first, second); without gains u = u_s."""
     n = first.size
     for c in range(u.size):
         total = commands.u[s, c]
@@ -19,7 +19,7 @@ def apply_policy(commands: Commands, s: int, first: Floats, second: Floats, u: F
 
 @inlined
 def constant_force(mechanism: Mechanism, drift: Floats, i: int, s: int, u: Floats, force: Floats) -> None:
-    """Force = drift + B u over step ``s`` of path ``i``; ``drift`` is (P, N, n), or (0, 0, n) for none."""
+    """The force drift + B u over step ``s`` of path ``i``; ``drift`` is (P, N, n), or (0, 0, n) for none."""
     for r in range(force.size):
         total = 0.0
         if drift.shape[0] > 0:
@@ -33,7 +33,7 @@ def constant_force(mechanism: Mechanism, drift: Floats, i: int, s: int, u: Float
 def noise_impulse(
     mechanism: Mechanism, part: float, q: Floats, center: Floats, u: Floats, increments: Floats, impulse: Floats
 ) -> None:
-    """Impulse = part * sum_i F_i(q, u) dw_i."""
+    """The impulse part * sum_i F_i(q, u) dw_i of noise."""
     fields = mechanism.diffusion
     for i in range(q.size):
         total = 0.0

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from varpin.kernels._compile import inlined, kernel
-from varpin.kernels.jet import body_inertia, branch_potential, dot6, move_body, place_body, times_inertia
+from varpin.kernels.jet import add_mass, body_inertia, branch_potential, dot6, move_body, place_body, times_inertia
 from varpin.kernels.linalg import factor_ldl, solve_ldl
 from varpin.kernels.tree import Floats, Mechanism, Sweep, new_sweep
 
@@ -112,10 +112,12 @@ def node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics) -> tuple[bool,
     """Mass matrix, its factors and the bias at (q, v), left in ``d``; whether M is definite, and the potential [J]."""
     tree, w = mechanism.tree, d.sweep
     bodies = tree.parent.size
-    S, Y, F, M = w.axis, w.inertia, w.dual_axis, w.M
+    S, Y, M = w.axis, w.inertia, w.M
     n = q.size
     potential = 0.0
     for i in range(n):
+        w.V[i] = 0.0
+        w.V_scale[i] = 0.0
         d.column[i] = 0.0
         deflection = q[i] - mechanism.rest[i]
         potential += 0.5 * mechanism.stiffness[i] * deflection * deflection
@@ -128,17 +130,9 @@ def node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics) -> tuple[bool,
         body_inertia(tree, j, w)
         accelerate_body(mechanism, j, v, d.column, d)
     for j in range(bodies - 1, -1, -1):
-        times_inertia(Y, j, S, F)
+        add_mass(tree, j, w)
         cj = tree.coordinate[j]
         d.bias[cj] += tree.ratio[j] * dot6(S, j, d.force, j)
-        i = j
-        while i >= 0:
-            ci = tree.coordinate[i]
-            mass = tree.ratio[i] * tree.ratio[j] * dot6(S, i, F, j)
-            M[ci, cj] += mass
-            if i != j:
-                M[cj, ci] += mass
-            i = tree.parent[i]
         k = tree.parent[j]
         if k >= 0:
             for i in range(10):
@@ -157,7 +151,7 @@ def node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics) -> tuple[bool,
 
 @inlined
 def acceleration_at_node(force: Floats, d: Dynamics, a: Floats) -> None:
-    """A = M^-1 (force - bias) from what :func:`node` left."""
+    """Acceleration a = M^-1 (force - bias) from what :func:`node` left."""
     for i in range(force.size):
         d.column[i] = force[i] - d.bias[i]
     solve_ldl(d.ldl, d.column, a)

@@ -392,11 +392,27 @@ def second_order(mechanism: Mechanism, q: Floats, v: Floats, w: Sweep) -> tuple[
 
 
 @inlined
+def add_mass(tree: Tree, j: int, w: Sweep) -> None:
+    """Add what body ``j`` shares with its ancestors, and with itself, to M: the composite rigid body algorithm."""
+    S, F, M = w.axis, w.dual_axis, w.M
+    times_inertia(w.inertia, j, S, F)
+    cj = tree.coordinate[j]
+    i = j
+    while i >= 0:
+        ci = tree.coordinate[i]
+        mass = tree.ratio[i] * tree.ratio[j] * dot6(S, i, F, j)
+        M[ci, cj] += mass
+        if i != j:
+            M[cj, ci] += mass
+        i = tree.parent[i]
+
+
+@inlined
 def mass_matrix(mechanism: Mechanism, q: Floats, w: Sweep) -> float:
     """M at q, left in ``w.M``; returns the potential energy [J]."""
     tree = mechanism.tree
     bodies = tree.parent.size
-    S, Y, F, M = w.axis, w.inertia, w.dual_axis, w.M
+    Y, M = w.inertia, w.M
     potential = 0.0
     for j in range(q.size):
         w.V[j] = 0.0
@@ -407,22 +423,13 @@ def mass_matrix(mechanism: Mechanism, q: Floats, w: Sweep) -> float:
         place_body(tree, j, q, w)
         body_inertia(tree, j, w)
     for j in range(bodies - 1, -1, -1):
-        times_inertia(Y, j, S, F)
-        cj = tree.coordinate[j]
-        i = j
-        while i >= 0:
-            ci = tree.coordinate[i]
-            mass = tree.ratio[i] * tree.ratio[j] * dot6(S, i, F, j)
-            M[ci, cj] += mass
-            if i != j:
-                M[cj, ci] += mass
-            i = tree.parent[i]
+        add_mass(tree, j, w)
         k = tree.parent[j]
         if k >= 0:
             for i in range(10):
                 Y[k, i] += Y[j, i]
         else:
-            angle = tree.ratio[j] * q[cj] + tree.offset[j]
+            angle = tree.ratio[j] * q[tree.coordinate[j]] + tree.offset[j]
             potential += branch_potential(mechanism, j, angle, w)
     for c in range(q.size):
         M[c, c] += tree.armature[c]

@@ -26,7 +26,7 @@ def factor_lu(a: Floats) -> bool:
 
 @inlined
 def solve_lu(lu: Floats, b: Floats, x: Floats) -> None:
-    """X with L U x = b."""
+    """The x with L U x = b."""
     n = lu.shape[0]
     for i in range(n):
         total = b[i]
@@ -63,7 +63,7 @@ def factor_ldl(a: Floats) -> bool:
 
 @inlined
 def solve_ldl(ldl: Floats, b: Floats, x: Floats) -> None:
-    """X with L D L' x = b."""
+    """The x with L D L' x = b."""
     n = ldl.shape[0]
     for i in range(n):
         total = b[i]

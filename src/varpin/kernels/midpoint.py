@@ -55,7 +55,7 @@ def branch_margin(mechanism: Mechanism, options: Options, h: float, k: Work) -> 
 
 @inlined
 def add(high: float, low: float, increment: float) -> tuple[float, float]:
-    """High + low + increment as a new high and low part (Knuth's two-sum)."""
+    """The sum high + low + increment as a new high and low part (Knuth's two-sum)."""
     increment += low
     total = high + increment
     part = total - high

@@ -139,7 +139,7 @@ def residual(mechanism: Mechanism, a: float, h: float, state: State, k: Work) ->
 
 @inlined
 def set_midpoint(a: float, h: float, state: State, k: Work) -> None:
-    """Qm = q0 + a h v."""
+    """The configuration qm = q0 + a h v."""
     for i in range(k.v.size):
         k.qm[i] = state.q[i] + (state.q_low[i] + a * h * k.v[i])
 
