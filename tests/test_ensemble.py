@@ -213,11 +213,18 @@ def test_policies_are_copies_and_frozen():
             array[0] = 0.0
 
 
-@pytest.mark.parametrize("shape", [(49, 2, 4), (50, 1, 4), (50, 2, 6)])
-def test_policies_that_do_not_fit_the_scene(shape):
+@pytest.mark.parametrize(
+    ("shape", "problem"),
+    [
+        ((49, 2, 4), "49 controls, each held over 1 steps: for 49 steps, not 50"),
+        ((50, 1, 4), r"gains must have shape \(N, 2, 4\), got \(50, 1, 4\)"),
+        ((50, 2, 6), r"gains must have shape \(N, 2, 4\), got \(50, 2, 6\)"),
+    ],
+)
+def test_policies_that_do_not_fit_the_scene(shape, problem):
     steps, m, size = shape
     policy = vp.LinearPolicy(np.ones((steps, m)), np.ones(shape), np.ones((steps, size)))
-    with pytest.raises(vp.InputError, match=r"the policy's gains must have shape \(50, 2, 4\), got"):
+    with pytest.raises(vp.InputError, match=problem):
         run(controls=policy)
 
 
@@ -369,3 +376,33 @@ def test_small_noise_has_the_predicted_covariance(kick):
         assert (np.abs(own.covariance[j] - P) < 4.0 * error).all()
         # A covariance tenth as large again would show.
         assert (0.1 * variances > 4.0 * np.diag(error)).all()
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
+def test_a_held_policy_is_the_same_policy_decided_less_often(integrator: vp.Integrator) -> None:
+    scene = vp.Scene(vp.load_robot("finger"), noise=vp.AdditiveNoise(1e-6))
+    rng = np.random.default_rng(3)
+    u, gains = 1e-5 * rng.normal(size=(6, 3)), 1e-5 * rng.normal(size=(6, 3, 6))
+    reference = rng.normal(size=(6, 6))
+    policy = vp.LinearPolicy(u, gains, reference, hold=5)
+    motion = vp.simulate(
+        scene, [0.3, 0.2, 0.1], np.zeros(3), dt=1e-3, steps=30, controls=policy, integrator=integrator, rng=4
+    )
+    second = motion.p if integrator.variational else motion.v
+    x = np.hstack([motion.q, second])[:-1:5]
+    expected = u + np.einsum("kmx,kx->km", gains, x - reference)
+    np.testing.assert_allclose(motion.u, np.repeat(expected, 5, axis=0), rtol=1e-12, atol=1e-18)
+    ensemble = vp.simulate_ensemble(
+        scene,
+        [0.3, 0.2, 0.1],
+        np.zeros(3),
+        dt=1e-3,
+        steps=30,
+        paths=2,
+        rng=4,
+        controls=policy,
+        integrator=integrator,
+    )
+    assert np.array_equal(ensemble.u[:, ::5], ensemble.u[:, 4::5])
+    with pytest.raises(vp.InputError, match="6 controls, each held over 5 steps: for 30 steps, not 31"):
+        vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=31, controls=policy)

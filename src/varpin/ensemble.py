@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import as_floats, count, finite_array, positive, require_finite
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Segment
+from varpin.integrators.base import rows
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
 from varpin.policy import LinearPolicy
@@ -163,7 +164,8 @@ def simulate_ensemble(
     commands = commands_of(scene, controls, steps)
     run = _Run(scene, integrator, dt, start, rng, commands)
     collector = _Collector(steps, levels, run, store)
-    block = max(1, min(steps, _BLOCK // (paths * (4 * n + scene.controls + scene.processes + 8))))
+    block = min(steps, _BLOCK // (paths * (4 * n + scene.controls + scene.processes + 8)))
+    block = max(1, block // commands.hold) * commands.hold
     with announced_compilation(), ThreadPoolExecutor(workers) as pool:
         try:
             collector.add_first(run.first)
@@ -232,13 +234,14 @@ class _Run:
 
     def advance(self, begin: int, end: int, pool: ThreadPoolExecutor) -> tuple[list[Segment], NDArray[np.int64]]:
         """Steps begin .. end of every path, and how many of them each path did: none once it has failed."""
-        rows = Commands(*(array[begin:end] for array in self.commands))
+        decisions = rows(self.commands, begin // self.commands.hold, end // self.commands.hold)
 
         def work(number: int) -> list[Segment]:
             group = self.groups[number]
             shape = (end - begin, self.scene.processes)
             drawn = np.array([generator.normal(size=shape) for generator in self.generators[group]])
-            return self.integrator.rollout(self.scene, self.states[number], rows, np.sqrt(self.dt) * drawn, self.dt)
+            increments = np.sqrt(self.dt) * drawn
+            return self.integrator.rollout(self.scene, self.states[number], decisions, increments, self.dt)
 
         segments = [segment for part in pool.map(work, range(len(self.groups))) for segment in part]
         done = np.zeros(self.paths, dtype=np.int64)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import as_floats, count, finite_array, positive, require_finite
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Segment
-from varpin.integrators.base import Failure, open_loop
+from varpin.integrators.base import Failure, open_loop, rows, steps_of
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
 from varpin.lagrangian import lagrangian_jet
@@ -197,22 +197,23 @@ def simulate(
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
     _warn_of_ringing(scene, q0, dt)
     with announced_compilation():
-        state, (first,) = integrator.start(scene, q0[None], v0[None])
-        record = _Record(scene, integrator, dt, steps, dw, first)
+        state, (start,) = integrator.start(scene, q0[None], v0[None])
+        record = _Record(scene, integrator, dt, steps, dw, start)
         chunk = max(1, _CHUNK // n)
         try:
             while record.steps < steps:
                 if law is not None:
                     block = open_loop(_sample(law, sampling, integrator, state, record))
                 else:
-                    block = Commands(*(array[record.steps : record.steps + chunk] for array in commands))
-                drawn = dw[None, record.steps : record.steps + len(block.u)] if len(dw) else dw[None, :0][:0]
+                    first = record.steps // commands.hold
+                    block = rows(commands, first, first + max(1, chunk // commands.hold))
+                drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
                 (segment,) = integrator.rollout(scene, state, block, drawn, dt)
                 record.add(segment)
                 if segment.failure is not None:
                     node = record.trajectory()
                     raise StepFailure(node.steps, node.t[-1], segment.failure, node)
-                if progress is not None and (record.steps % chunk == 0 or record.steps == steps):
+                if progress is not None and (law is None or record.steps % chunk == 0 or record.steps == steps):
                     progress(record.steps, steps)
         except KeyboardInterrupt:
             raise Interrupted(record.trajectory()) from None

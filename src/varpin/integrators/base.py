@@ -91,7 +91,7 @@ class Integrator(ABC):
         """
 
     def rollout(self, scene: Scene, state: Any, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
-        """One step of length ``dt`` [s] from ``state`` for each row of the commands; ``state`` moves along.
+        """The steps of length ``dt`` [s] that the commands are for; ``state`` moves along.
 
         ``increments`` are those of the Wiener processes (P, N, k) [s^0.5], or (0, 0, k) for none. Returns a segment for
         each path; with diffusion fields that only Python can evaluate there is one path.
@@ -99,8 +99,10 @@ class Integrator(ABC):
         if scene.noise.diffusion is not None:
             return self.rollout_compiled(scene, state, commands, increments, np.zeros((0, 0, scene.robot.dof)), dt)
         segments = []
-        for j in range(len(commands.u)):
-            row = Commands(*(array[j : j + 1] for array in commands))
+        for j in range(steps_of(commands)):
+            row = rows(commands, j // commands.hold, j // commands.hold + 1)
+            if j % commands.hold > 0:
+                row = open_loop(segments[-1].u)
             segments.append(self.step_in_python(scene, state, row, increments[:, j : j + 1], dt))
             if segments[-1].failure is not None:
                 break
@@ -198,4 +200,15 @@ def segments_of(nodes: Nodes, reasons: Mapping[int, str]) -> list[Segment]:
 
 def open_loop(u: Floats) -> Commands:
     """Controls (N, m) without feedback."""
-    return Commands(np.ascontiguousarray(u), np.zeros((0, u.shape[1], 0)), np.zeros((0, 0)))
+    return Commands(np.ascontiguousarray(u), np.zeros((0, u.shape[1], 0)), np.zeros((0, 0)), 1)
+
+
+def steps_of(commands: Commands) -> int:
+    """How many steps the commands are for."""
+    return len(commands.u) * commands.hold
+
+
+def rows(commands: Commands, begin: int, end: int) -> Commands:
+    """The commands of decisions begin .. end."""
+    part = slice(begin, end)
+    return Commands(commands.u[part], commands.gains[part], commands.reference[part], commands.hold)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.errors import LinearizationError, SingularMassMatrix
-from varpin.integrators.base import Integrator, Segment, diffusion_and_drift, drifts, open_loop, segments_of
+from varpin.integrators.base import Integrator, Segment, diffusion_and_drift, drifts, open_loop, segments_of, steps_of
 from varpin.kernels import explicit as kernels
 from varpin.kernels.dynamics import Dynamics, forward_derivatives, new_dynamics
 from varpin.kernels.tree import Commands, new_nodes
@@ -86,7 +86,7 @@ class _Explicit(Integrator):
         self, scene: Scene, state: ExplicitRun, commands: Commands, increments: Floats, drift: Floats, dt: float
     ) -> list[Segment]:
         """See :meth:`Integrator.rollout_compiled`."""
-        nodes = new_nodes(len(state.state.q), len(commands.u), scene.robot.dof, scene.controls)
+        nodes = new_nodes(len(state.state.q), steps_of(commands), scene.robot.dof, scene.controls)
         kernels.rollout(
             scene.mechanism,
             self.scheme,

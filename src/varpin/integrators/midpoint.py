@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from varpin.checks import count, fraction, positive
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
-from varpin.integrators.base import Integrator, Segment, diffusion_and_drift, drifts, open_loop, segments_of
+from varpin.integrators.base import Integrator, Segment, diffusion_and_drift, drifts, open_loop, segments_of, steps_of
 from varpin.kernels import midpoint as kernels
 from varpin.kernels import midpoint_equation as equation
 from varpin.kernels.midpoint_linearize import linearize
@@ -157,7 +157,7 @@ class Midpoint(Integrator):
         dt: float,
     ) -> list[Segment]:
         """See :meth:`Integrator.rollout_compiled`."""
-        nodes = new_nodes(len(state.state.q), len(commands.u), scene.robot.dof, scene.controls)
+        nodes = new_nodes(len(state.state.q), steps_of(commands), scene.robot.dof, scene.controls)
         kernels.rollout(
             scene.mechanism, self._options(), dt, commands, increments, drift, state.state, state.work, nodes
         )

@@ -6,15 +6,23 @@ from varpin.kernels.tree import Commands, Floats, Mechanism
 
 @inlined
 def apply_policy(commands: Commands, s: int, first: Floats, second: Floats, u: Floats) -> None:
-    """Controls u = u_s + gains_s (x - x_s) with x = (first, second); without gains u = u_s."""
+    """Controls of step ``s`` into u (N, m): u = u_r + gains_r (x - x_r) with x = (first, second) and r = s // hold.
+
+    Without gains u = u_r; between two decisions the control before is held.
+    """
     n = first.size
-    for c in range(u.size):
-        total = commands.u[s, c]
+    if s % commands.hold != 0:
+        for c in range(u.shape[1]):
+            u[s, c] = u[s - 1, c]
+        return
+    r = s // commands.hold
+    for c in range(u.shape[1]):
+        total = commands.u[r, c]
         if commands.gains.shape[0] > 0:
             for j in range(n):
-                total += commands.gains[s, c, j] * (first[j] - commands.reference[s, j])
-                total += commands.gains[s, c, n + j] * (second[j] - commands.reference[s, n + j])
-        u[c] = total
+                total += commands.gains[r, c, j] * (first[j] - commands.reference[r, j])
+                total += commands.gains[r, c, n + j] * (second[j] - commands.reference[r, n + j])
+        u[s, c] = total
 
 
 @inlined

@@ -102,8 +102,8 @@ def rollout(
         q, v, lead = states.q[i], states.v[i], states.lead[i]
         nodes.ended[i] = SOLVED
         nodes.done[i] = 0
-        for s in range(commands.u.shape[0]):
-            apply_policy(commands, s, q, v, nodes.u[i, s])
+        for s in range(nodes.u.shape[1]):
+            apply_policy(commands, s, q, v, nodes.u[i])
             constant_force(mechanism, drift, i, s, nodes.u[i, s], force)
             regular, _ = node(mechanism, q, v, d)
             if not regular:

@@ -334,7 +334,7 @@ def rollout(
     k: Work,
     nodes: Nodes,
 ) -> None:
-    """Steps of P paths from ``states``, one for each row of the commands.
+    """Steps of P paths from ``states``, as many as the commands are for.
 
     ``increments`` are those of the Wiener processes, (P, N, k), or (0, 0, k) for none; ``drift`` is a force besides
     the controls', (P, N, n), or (0, 0, n) for none. Writes into ``nodes`` the node after each step, what was applied in
@@ -348,8 +348,8 @@ def rollout(
             node_energy(mechanism, state.q, state.p, state.v, k)
         nodes.ended[i] = SOLVED
         nodes.done[i] = 0
-        for s in range(commands.u.shape[0]):
-            apply_policy(commands, s, state.q, state.p, nodes.u[i, s])
+        for s in range(nodes.u.shape[1]):
+            apply_policy(commands, s, state.q, state.p, nodes.u[i])
             if noisy:
                 kick(mechanism, options.left, nodes.u[i, s], increments[i, s], state, k)
             constant_force(mechanism, drift, i, s, nodes.u[i, s], k.force)

@@ -57,11 +57,12 @@ class Mechanism(NamedTuple):
 
 
 class Commands(NamedTuple):
-    """Controls of N steps: u, or u + gains (x - reference) with x = (q, p) or (q, v)."""
+    """R controls, each held over ``hold`` steps: u, or u + gains (x - reference) with x = (q, p) or (q, v)."""
 
-    u: Floats  # (N, m)
-    gains: Floats  # (N, m, 2n), or (0, m, 2n) for none
-    reference: Floats  # (N, 2n), or (0, 2n)
+    u: Floats  # (R, m)
+    gains: Floats  # (R, m, 2n), or (0, m, 2n) for none
+    reference: Floats  # (R, 2n), or (0, 2n)
+    hold: int  # steps between two looks at the state
 
 
 class Nodes(NamedTuple):
