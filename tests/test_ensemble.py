@@ -379,7 +379,7 @@ def test_small_noise_has_the_predicted_covariance(kick):
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
-def test_a_held_policy_is_the_same_policy_decided_less_often(integrator: vp.Integrator) -> None:
+def test_a_held_policy_is_the_same_policy_decided_less_often(integrator):
     scene = vp.Scene(vp.load_robot("finger"), noise=vp.AdditiveNoise(1e-6))
     rng = np.random.default_rng(3)
     u, gains = 1e-5 * rng.normal(size=(6, 3)), 1e-5 * rng.normal(size=(6, 3, 6))

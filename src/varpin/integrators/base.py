@@ -98,7 +98,7 @@ class Integrator(ABC):
         """
         if scene.noise.diffusion is not None:
             return self.rollout_compiled(scene, state, commands, increments, np.zeros((0, 0, scene.robot.dof)), dt)
-        segments = []
+        segments: list[Segment] = []
         for j in range(steps_of(commands)):
             row = rows(commands, j // commands.hold, j // commands.hold + 1)
             if j % commands.hold > 0:
