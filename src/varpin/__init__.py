@@ -33,10 +33,12 @@ from varpin.lagrangian import DiscreteLagrangian as DiscreteLagrangian
 from varpin.lagrangian import LagrangianJet as LagrangianJet
 from varpin.lagrangian import discrete_lagrangian as discrete_lagrangian
 from varpin.lagrangian import lagrangian_jet as lagrangian_jet
+from varpin.linearization import Curvature as Curvature
 from varpin.linearization import Linearization as Linearization
 from varpin.linearization import Moments as Moments
 from varpin.linearization import linearize as linearize
 from varpin.linearization import propagate_moments as propagate_moments
+from varpin.linearization import second_order as second_order
 from varpin.linearization_check import LinearizationCheck as LinearizationCheck
 from varpin.linearization_check import check_linearization as check_linearization
 from varpin.noise import AdditiveNoise as AdditiveNoise

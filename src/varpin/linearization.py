@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import finite_array
+from varpin.checks import as_floats, finite_array
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint
 from varpin.integrators.base import diffusion_and_drift
@@ -117,6 +117,57 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
         dt=trajectory.dt,
         variational=integrator.variational,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Curvature:
+    """Second derivatives of N deterministic steps, each contracted with a vector: sum_a z_a d2 x1_a.
+
+    Attributes:
+        xx: In the state, twice (N, 2n, 2n).
+        ux: In the controls and the state (N, m, 2n).
+        uu: In the controls, twice (N, m, m).
+    """
+
+    xx: Floats
+    ux: Floats
+    uu: Floats
+
+
+def second_order(
+    scene: Scene, trajectory: Trajectory, z: ArrayLike, *, integrator: Integrator | None = None
+) -> Curvature:
+    """Second-order linearization of every step of a trajectory at dw = 0, contracted with vectors.
+
+    Exact, and without a tensor: third derivatives of the Lagrangian enter through a derivative of the jet along one
+    direction. It is what full differential dynamic programming needs, with z the gradient of the value function.
+
+    Main args:
+        scene: The scene in which it was made.
+        trajectory: From :func:`varpin.simulate`.
+        z: One vector for each step (N, 2n), or one for all of them (2n,).
+
+    Other Args:
+        integrator: What made it; ``Midpoint()`` if left out. Others do not provide second derivatives.
+
+    Raises:
+        InputError: As for :func:`linearize`; an integrator that has no second derivatives; noise fields that depend on
+            the velocity.
+        LinearizationError: A step has no solution at dw = 0.
+    """
+    require_scene(scene)
+    integrator = Midpoint() if integrator is None else integrator
+    _require_match(scene, trajectory, integrator)
+    if scene.noise.velocity_dependent:
+        raise InputError("second derivatives are not there for noise fields that depend on the velocity")
+    n, steps = scene.robot.dof, trajectory.steps
+    rows = as_floats("z", z)
+    if rows.shape == (2 * n,):
+        rows = np.tile(rows, (steps, 1))
+    H = integrator.contract(scene, trajectory, finite_array("z", rows, (steps, 2 * n)))
+    B = scene.actuation
+    x, f = slice(0, 2 * n), slice(2 * n, 3 * n)
+    return Curvature(xx=H[:, x, x], ux=B.T @ H[:, f, x], uu=B.T @ H[:, f, f] @ B)
 
 
 def node_jets(scene: Scene, q: Floats, v: Floats) -> tuple[Floats, Floats]:

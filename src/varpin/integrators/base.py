@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.errors import InputError
 from varpin.kernels.tree import Commands, Nodes
 from varpin.lagrangian import lagrangian_jet
 from varpin.scene import Scene
@@ -128,6 +129,15 @@ class Integrator(ABC):
         Raises:
             LinearizationError: A step has no solution at dw = 0.
         """
+
+    def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:  # noqa: ARG002
+        """Second derivatives sum_a z_a d2 x1_a of each step at dw = 0 in (x0, f), (N, 3n, 3n), for z (N, 2n).
+
+        Raises:
+            InputError: The integrator does not provide them.
+            LinearizationError: A step has no solution at dw = 0.
+        """
+        raise InputError(f"{self} has no second-order linearization; varpin.Midpoint(...) has")
 
     @abstractmethod
     def predict(self, state: Any, dt: float) -> tuple[Floats, Floats]:

@@ -13,12 +13,15 @@ from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import Integrator, Segment, diffusion_and_drift, drifts, open_loop, segments_of, steps_of
 from varpin.kernels import midpoint as kernels
 from varpin.kernels import midpoint_equation as equation
+from varpin.kernels.jet_tangent import new_tangent
+from varpin.kernels.midpoint_curvature import contract, parts_of_step
 from varpin.kernels.midpoint_linearize import linearize
 from varpin.kernels.tree import Commands, new_nodes
 from varpin.scene import Scene
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 REASONS = {
     equation.DIVERGED: "Newton's iteration does not contract, however small the substep",
@@ -36,6 +39,13 @@ class MidpointState:
     state: equation.State
     work: equation.Work
     start: Floats
+
+
+def _room(scene: Scene, *, derivatives: bool = False, parts: int = 0) -> tuple[equation.State, equation.Work]:
+    """State and work arrays of one path."""
+    n, bodies = scene.robot.dof, scene.robot.tree.parent.size
+    state = equation.new_state(1, n, scene.mechanism.diffusion.constant.shape[1])
+    return state, equation.new_work(bodies, n, derivatives=derivatives, parts=parts)
 
 
 @dataclass(frozen=True)
@@ -168,30 +178,81 @@ class Midpoint(Integrator):
 
         A step that was taken in parts is taken in parts again, and their derivatives are chained.
         """
-        steps, n = trajectory.steps, scene.robot.dof
+        Jx, Jf = self._derivatives(scene, trajectory.dt, *self._roots(scene, trajectory))
+        return Jx, Jf, Jx[:, :, scene.robot.dof :]
+
+    def _roots(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats, Integers]:
+        """Of every step at dw = 0: q, p, a guess next to its velocity, the constant force, each (N, n); its parts."""
         q, p, v = (np.ascontiguousarray(getattr(trajectory, name)[:-1]) for name in ("q", "p", "v"))
         # Without noise the root is known; with it the step at dw = 0 starts from another momentum.
         guess = v if trajectory.dw.any() else np.diff(trajectory.q, axis=0) / trajectory.dt
-        force = trajectory.u @ scene.actuation.T + self.drift_share * drifts(scene, trajectory)
+        force = trajectory.u @ scene.actuation.T
+        if scene.noise.velocity_dependent:
+            force = force + self.drift_share * drifts(scene, trajectory)
+        return q, p, guess, force, trajectory.statistics.substeps
+
+    def _loose(self) -> equation.Options:
+        """A root that is known to 1e-10 is good enough for derivatives, and one jet for them."""
+        return self._options()._replace(tolerance=1e6)
+
+    def _derivatives(
+        self, scene: Scene, dt: float, q: Floats, p: Floats, guess: Floats, force: Floats, substeps: Integers
+    ) -> tuple[Floats, Floats]:
+        steps, n = q.shape
         Jx, Jf = np.empty((steps, 2 * n, 2 * n)), np.empty((steps, 2 * n, n))
-        outcome, done = linearize(
-            scene.mechanism,
-            # A root that is known to 1e-10 is good enough for derivatives, and one jet for them.
-            self._options()._replace(tolerance=1e6),
-            trajectory.dt,
-            q,
-            p,
-            guess,
-            force,
-            trajectory.statistics.substeps,
-            equation.new_state(1, n, scene.mechanism.diffusion.constant.shape[1]),
-            equation.new_work(scene.robot.tree.parent.size, n, derivatives=True),
-            Jx,
-            Jf,
+        state, work = _room(scene, derivatives=True)
+        outcome, done = linearize(scene.mechanism, self._loose(), dt, q, p, guess, force, substeps, state, work, Jx, Jf)
+        if outcome != equation.SOLVED:
+            raise LinearizationError(done, done * dt, REASONS[outcome])
+        return Jx, Jf
+
+    def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
+        """See :meth:`Integrator.contract`; steps that were taken in parts are chained as in :meth:`linearize`."""
+        q, p, guess, force, substeps = self._roots(scene, trajectory)
+        H = np.empty((len(q), 3 * scene.robot.dof, 3 * scene.robot.dof))
+        whole = substeps == 1
+        H[whole] = self._curvatures(scene, trajectory.dt, q[whole], p[whole], guess[whole], force[whole], z[whole])
+        for j in np.flatnonzero(~whole):
+            H[j] = self._chained_curvature(scene, trajectory.dt, q[j], p[j], force[j], int(substeps[j]), z[j])
+        return H
+
+    def _curvatures(
+        self, scene: Scene, dt: float, q: Floats, p: Floats, guess: Floats, force: Floats, z: Floats
+    ) -> Floats:
+        steps, n = q.shape
+        H, room = np.empty((steps, 3 * n, 3 * n)), np.empty((n, 3 * n))
+        state, work = _room(scene)
+        tangent = new_tangent(scene.robot.tree.parent.size, n)
+        outcome, done = contract(
+            scene.mechanism, self._loose(), dt, q, p, guess, force, z, state, work, tangent, room, H
         )
         if outcome != equation.SOLVED:
-            raise LinearizationError(done, done * trajectory.dt, REASONS[outcome])
-        return Jx, Jf, Jx[:, :, n:]
+            raise LinearizationError(done, done * dt, REASONS[outcome])
+        return H
+
+    def _chained_curvature(
+        self, scene: Scene, dt: float, q: Floats, p: Floats, force: Floats, substeps: int, z: Floats
+    ) -> Floats:
+        """Z goes back by each part's derivative, and the curvature of each part to the start of the step."""
+        n = len(q)
+        state, work = _room(scene, parts=substeps)
+        outcome = parts_of_step(scene.mechanism, self._options(), dt, q, p, force, state, work)
+        if outcome != equation.SOLVED:
+            raise LinearizationError(0, 0.0, REASONS[outcome])
+        one = np.ones(1, dtype=np.int64)
+        parts = [(row[None, :n], row[None, n : 2 * n], row[None, 2 * n : 3 * n], row[3 * n]) for row in work.trail]
+        links = []
+        for at_q, at_p, at_v, length in parts:
+            Jx, Jf = self._derivatives(scene, length, at_q, at_p, at_v, force[None], one)
+            links.append(np.block([[Jx[0], Jf[0]], [np.zeros((n, 2 * n)), np.eye(n)]]))
+        starts = [np.eye(3 * n)]
+        for link in links[:-1]:
+            starts.append(link @ starts[-1])
+        H = np.zeros((3 * n, 3 * n))
+        for (at_q, at_p, at_v, length), link, start in zip(parts[::-1], links[::-1], starts[::-1], strict=True):
+            H += start.T @ self._curvatures(scene, length, at_q, at_p, at_v, force[None], z[None])[0] @ start
+            z = z @ link[: 2 * n, : 2 * n]
+        return H
 
     def predict(self, state: MidpointState, dt: float) -> tuple[Floats, Floats]:
         """See :meth:`Integrator.predict`; the velocity goes on from the last midpoint through the node."""

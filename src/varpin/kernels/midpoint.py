@@ -156,6 +156,11 @@ def attempt(mechanism: Mechanism, options: Options, h: float, state: State, k: W
         second_order(mechanism, k.qm, k.v, k.sweep)
         add_substep(mechanism, options, h, k)
     k.quality[1] = min(k.quality[1], margin)
+    if k.tally[3] < k.trail.shape[0]:
+        row = k.trail[k.tally[3]]
+        for i in range(n):
+            row[i], row[n + i], row[2 * n + i] = state.q[i], state.p[i], k.v[i]
+        row[3 * n] = h
     k.tally[3] += 1
     for i in range(n):
         state.q[i], state.q_low[i], state.p[i], state.p_low[i] = q[i], q_low[i], p[i], p_low[i]

@@ -63,6 +63,7 @@ class Work(NamedTuple):
     Jx: Floats  # (2n, 2n) d(q1, p1)/d(q0, p0) of a step so far; (0, 0) where derivatives are not wanted
     Jf: Floats  # (2n, n) d(q1, p1)/df
     part: Floats  # (4n, 2n) of one substep, and room for their product
+    trail: Floats  # (K, 3n + 1) q, p, v and length of each part of a step; (0, 3n + 1) where nobody asks for them
     tally: Integers  # (4,) of one step: Newton iterations, jets, first-order sweeps, substeps
     quality: Floats  # (2,) of one step: worst scaled residual, smallest branch margin
 
@@ -95,8 +96,8 @@ def new_state(paths: int, dof: int, processes: int) -> State:
     )
 
 
-def new_work(bodies: int, dof: int, *, derivatives: bool = False) -> Work:
-    """Allocate the work arrays of a step, with room for its derivatives or without."""
+def new_work(bodies: int, dof: int, *, derivatives: bool = False, parts: int = 0) -> Work:
+    """Allocate the work arrays of a step, with room for its derivatives or without, and for a trail of its parts."""
     size = 2 * dof if derivatives else 0
     return Work(
         sweep=new_sweep(bodies, dof),
@@ -113,6 +114,7 @@ def new_work(bodies: int, dof: int, *, derivatives: bool = False) -> Work:
         Jx=np.zeros((size, size)),
         Jf=np.zeros((size, size // 2)),
         part=np.zeros((2 * size, size)),
+        trail=np.zeros((parts, 3 * dof + 1)),
         tally=np.zeros(4, dtype=np.int64),
         quality=np.zeros(2),
     )

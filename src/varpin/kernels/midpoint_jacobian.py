@@ -13,9 +13,56 @@ Lagrangian, but without their 1/h, so small steps lose no digits.
 """
 
 from varpin.kernels._compile import inlined
+from varpin.kernels.jet import second_order
 from varpin.kernels.linalg import solve_lu
-from varpin.kernels.midpoint_equation import Options, Work, factor_newton
+from varpin.kernels.midpoint_equation import SOLVED, Options, State, Work, factor_newton, newton
 from varpin.kernels.tree import Floats, Mechanism
+
+
+@inlined
+def solve_at(
+    mechanism: Mechanism,
+    options: Options,
+    h: float,
+    q: Floats,
+    p: Floats,
+    guess: Floats,
+    force: Floats,
+    state: State,
+    k: Work,
+) -> int:
+    """Solve the step equation at (q, p) under ``force``, each (n,), from a guess next to the root.
+
+    Leaves the root in ``k.v`` and the jet there in the sweep; returns how it ended.
+    """
+    for i in range(q.size):
+        k.force[i] = force[i]
+        k.v[i] = guess[i]
+        state.q[i], state.q_low[i], state.p[i], state.p_low[i] = q[i], 0.0, p[i], 0.0
+    k.tally[2] = 0
+    outcome = newton(mechanism, options, h, state, k)
+    if outcome == SOLVED and k.tally[2] > 0:  # the last look at the residual was a first-order one
+        second_order(mechanism, k.qm, k.v, k.sweep)
+    return outcome
+
+
+@inlined
+def root_jacobian(mechanism: Mechanism, options: Options, h: float, k: Work, dv: Floats) -> None:
+    """dv/dq0 and dv/dp0, side by side in the first n rows of ``dv``, at the root in ``k.v``, the jet in the sweep."""
+    w = k.sweep
+    a = options.alpha
+    n = k.v.size
+    factor_newton(mechanism, a, h, k)
+    for c in range(n):
+        for i in range(n):
+            k.residual[i] = h * (1.0 - a) * w.Lqq[i, c] - w.A[i, c]
+        solve_lu(k.lu, k.residual, k.delta)
+        for i in range(n):
+            dv[i, c] = k.delta[i]
+            k.residual[i] = 1.0 if i == c else 0.0
+        solve_lu(k.lu, k.residual, k.delta)
+        for i in range(n):
+            dv[i, n + c] = k.delta[i]
 
 
 @inlined
@@ -24,18 +71,7 @@ def substep_jacobian(mechanism: Mechanism, options: Options, h: float, k: Work, 
     w = k.sweep
     a = options.alpha
     n = k.v.size
-    factor_newton(mechanism, a, h, k)
-    # Columns of dv: of q0 into Jx[:n, :n], of p0 into Jx[:n, n:].
-    for c in range(n):
-        for i in range(n):
-            k.residual[i] = h * (1.0 - a) * w.Lqq[i, c] - w.A[i, c]
-        solve_lu(k.lu, k.residual, k.delta)
-        for i in range(n):
-            Jx[i, c] = k.delta[i]
-            k.residual[i] = 1.0 if i == c else 0.0
-        solve_lu(k.lu, k.residual, k.delta)
-        for i in range(n):
-            Jx[i, n + c] = k.delta[i]
+    root_jacobian(mechanism, options, h, k, Jx)
     for c in range(2 * n):
         for i in range(n):
             total = 0.0

@@ -1,10 +1,9 @@
 """The derivatives of every step of a midpoint trajectory."""
 
 from varpin.kernels._compile import kernel
-from varpin.kernels.jet import second_order
 from varpin.kernels.midpoint import begin_at, path, step
-from varpin.kernels.midpoint_equation import SINGULAR, SOLVED, Options, State, Work, newton
-from varpin.kernels.midpoint_jacobian import identity, substep_jacobian
+from varpin.kernels.midpoint_equation import SINGULAR, SOLVED, Options, State, Work
+from varpin.kernels.midpoint_jacobian import identity, solve_at, substep_jacobian
 from varpin.kernels.tree import Floats, Integers, Mechanism
 
 
@@ -32,19 +31,14 @@ def linearize(
     n = k.v.size
     state = path(states, 0)
     for s in range(q.shape[0]):
-        for i in range(n):
-            k.force[i] = force[s, i]
-            k.v[i] = guess[s, i]
-            state.q[i], state.q_low[i], state.p[i], state.p_low[i] = q[s, i], 0.0, p[s, i], 0.0
         if substeps[s] == 1:
-            k.tally[2] = 0
-            outcome = newton(mechanism, options, h, state, k)
+            outcome = solve_at(mechanism, options, h, q[s], p[s], guess[s], force[s], state, k)
             if outcome != SOLVED:
                 return outcome, s
-            if k.tally[2] > 0:  # the last look at the residual was a first-order one
-                second_order(mechanism, k.qm, k.v, k.sweep)
             substep_jacobian(mechanism, options, h, k, Jx[s], Jf[s])
             continue
+        for i in range(n):
+            k.force[i] = force[s, i]
         if not begin_at(mechanism, q[s], p[s], state, k):
             return SINGULAR, s
         identity(k)

@@ -1,0 +1,99 @@
+"""Second derivatives of the midpoint step against differences of the first, and of the steps themselves."""
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin.robot.chain import planar_chain
+
+WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+
+ARMS = {
+    "finger": (lambda: vp.load_robot("finger"), 1e-2, {"damping": 1e-6, "stiffness": 1e-5}),
+    "ur5": (lambda: vp.load_robot("ur5"), 1e-2, {"damping": 0.1, "stiffness": 1.0}),
+    "kinova": (lambda: vp.load_robot("kinova"), 1e-2, {}),
+    "talos_arm": (lambda: vp.load_robot("talos_arm"), 1e-2, {"actuation": ["arm_left_2_joint", "arm_left_4_joint"]}),
+    "chain": (lambda: planar_chain(3), 0.02, {}),
+}
+
+
+def differences_of_the_first(scene, motion, z, integrator, states_too):
+    """The contraction by eighth-order differences of A and B: rows and columns are those of (x, u)."""
+    n, m, dt = scene.robot.dof, scene.controls, motion.dt
+    light = 0.5 / np.diag(np.linalg.inv(vp.lagrangian_jet(scene, motion.q[0], motion.v[0]).Lvv))
+    units = np.concatenate([np.ones(n), light, np.abs(scene.actuation.T) @ light])
+    point = np.concatenate([motion.q[0], motion.p[0], motion.u[0]])
+
+    def gradient(y):
+        v = np.linalg.solve(vp.lagrangian_jet(scene, y[:n], np.zeros(n)).Lvv, y[n : 2 * n])
+        end = vp.simulate(scene, y[:n], v, dt=dt, steps=1, controls=y[2 * n :], integrator=integrator)
+        assert end.statistics.substeps[0] == motion.statistics.substeps[0], "the difference crosses a guard"
+        lin = vp.linearize(scene, end, integrator=integrator)
+        return z @ np.hstack([lin.A[0], lin.B[0]])
+
+    H = np.zeros((2 * n + m, 2 * n + m))
+    for c in range(2 * n + m):
+        e = np.zeros(2 * n + m)
+        e[c] = states_too * units[c]
+        total = sum(w * (gradient(point + i * e) - gradient(point - i * e)) for i, w in WEIGHTS.items())
+        H[:, c] = total / e[c]
+    return H, units[:, None] * units
+
+
+def whole(curvature):
+    return np.block([[curvature.xx[0], curvature.ux[0].T], [curvature.ux[0], curvature.uu[0]]])
+
+
+@pytest.mark.parametrize("alpha", [0.5, 0.2])
+@pytest.mark.parametrize("name", ARMS)
+def test_against_differences_of_the_first(name, alpha):
+    load, dt, extras = ARMS[name]
+    scene = vp.Scene(load(), **extras)
+    n, m = scene.robot.dof, scene.controls
+    rng = np.random.default_rng(len(name))
+    integrator = vp.Midpoint(alpha=alpha)
+    q, v = rng.normal(size=n), 2.0 * rng.normal(size=n)
+    u = 0.1 * rng.normal(size=m) * np.abs(vp.lagrangian_jet(scene, q, v).Lq).max()
+    motion = vp.simulate(scene, q, v, dt=dt, steps=1, controls=u, integrator=integrator)
+    z = rng.normal(size=2 * n)
+    z[n:] /= np.abs(motion.p).max()
+    given = whole(vp.second_order(scene, motion, z, integrator=integrator))
+    expected, units = differences_of_the_first(scene, motion, z, integrator, 1e-2)
+    assert np.abs((given - expected) * units).max() <= 1e-9 * np.abs(expected * units).max()
+    np.testing.assert_allclose(given, given.T, rtol=1e-12, atol=1e-12 * np.abs(given).max())
+
+
+def test_a_step_in_parts_is_chained():
+    scene = vp.Scene(planar_chain(3))
+    motion = vp.simulate(scene, [0.3, 0.8, -1.0], [6.0, -5.0, 9.0], dt=0.1, steps=1)
+    assert motion.statistics.substeps[0] > 1
+    z = np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.4])
+    given = whole(vp.second_order(scene, motion, z))
+    expected, units = differences_of_the_first(scene, motion, z, vp.Midpoint(), 1e-4)
+    assert np.abs((given - expected) * units).max() <= 1e-6 * np.abs(expected * units).max()
+
+
+def test_many_steps_and_one_vector_for_all():
+    scene = vp.Scene(vp.load_robot("finger"))
+    motion = vp.simulate(scene, [0.4, 0.3, 0.2], [1.0, -2.0, 3.0], dt=2e-3, steps=5, controls=[1e-5, 0.0, -1e-5])
+    z = np.array([1.0, -1.0, 0.5, 2.0, 0.0, 1.0])
+    once = vp.second_order(scene, motion, z)
+    rows = vp.second_order(scene, motion, np.outer(np.arange(5.0), z))
+    assert once.xx.shape == (5, 6, 6)
+    assert once.ux.shape == (5, 3, 6)
+    assert once.uu.shape == (5, 3, 3)
+    for j in range(5):
+        np.testing.assert_allclose(rows.xx[j], j * once.xx[j], rtol=1e-9, atol=1e-12 * np.abs(once.xx).max())
+        np.testing.assert_allclose(rows.uu[j], j * once.uu[j], rtol=1e-9, atol=1e-12 * np.abs(once.uu).max())
+
+
+def test_what_cannot_be_done_is_said():
+    scene = vp.Scene(vp.load_robot("finger"))
+    motion = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=2)
+    with pytest.raises(vp.InputError, match=r"z must have shape \(2, 6\), got \(3, 6\)"):
+        vp.second_order(scene, motion, np.zeros((3, 6)))
+    with pytest.raises(vp.InputError, match=r"z\[1, 2\] is nan"):
+        vp.second_order(scene, motion, np.array([[0.0] * 6, [0.0, 0.0, np.nan, 0.0, 0.0, 0.0]]))
+    rk = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=2, integrator=vp.RungeKutta4())
+    with pytest.raises(vp.InputError, match="RungeKutta4 has no second-order linearization"):
+        vp.second_order(scene, rk, np.zeros(6), integrator=vp.RungeKutta4())
