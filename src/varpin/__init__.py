@@ -11,6 +11,13 @@ Load an arm, integrate it variationally, replay it:
 """
 
 from varpin._version import __version__ as __version__
+from varpin.costs import ControlCost as ControlCost
+from varpin.costs import Cost as Cost
+from varpin.costs import CostError as CostError
+from varpin.costs import CustomCost as CustomCost
+from varpin.costs import Terminal as Terminal
+from varpin.costs import TrackingCost as TrackingCost
+from varpin.costs import VelocityCost as VelocityCost
 from varpin.ensemble import Ensemble as Ensemble
 from varpin.ensemble import EnsembleInterrupted as EnsembleInterrupted
 from varpin.ensemble import simulate_ensemble as simulate_ensemble
@@ -46,13 +53,19 @@ from varpin.noise import ControlNoise as ControlNoise
 from varpin.noise import CustomNoise as CustomNoise
 from varpin.noise import StateNoise as StateNoise
 from varpin.policy import LinearPolicy as LinearPolicy
+from varpin.problem import OptimalControlProblem as OptimalControlProblem
 from varpin.replay import replay as replay
 from varpin.robot import Robot as Robot
 from varpin.robot import load_robot as load_robot
 from varpin.robot import planar_chain as planar_chain
 from varpin.scene import Scene as Scene
+from varpin.sddp import solve as solve
 from varpin.simulation import ControlError as ControlError
 from varpin.simulation import Interrupted as Interrupted
 from varpin.simulation import StepFailure as StepFailure
 from varpin.simulation import simulate as simulate
+from varpin.solution import MonteCarlo as MonteCarlo
+from varpin.solution import Solution as Solution
+from varpin.solution import Status as Status
+from varpin.solution import Verification as Verification
 from varpin.trajectory import Trajectory as Trajectory

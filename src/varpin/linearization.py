@@ -12,6 +12,7 @@ from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint
 from varpin.integrators.base import diffusion_and_drift
 from varpin.kernels.jet import jets
+from varpin.kernels.jet_tangent import momentum_curvatures, new_tangent
 from varpin.kernels.tree import new_sweep
 from varpin.noise import Fields
 from varpin.scene import Scene, require_scene
@@ -33,6 +34,7 @@ class Linearization:
         A: dx1/dx0 (N, 2n, 2n); symplectic where nothing is forced or damped.
         B: dx1/du (N, 2n, m).
         K: dx1/dp0 (N, 2n, n): what a kick of the momentum at the start of the step does.
+        J: What a jump of x's second half at the start of the step does (N, 2n, n): of p, which is K, or of v.
         F: Diffusion fields (N, n, k).
         G: dx1/dw (N, 2n, k); K F where the whole kick comes before the step.
         Gx: Derivative of G in x0 through the fields (N, 2n, k, 2n).
@@ -44,6 +46,7 @@ class Linearization:
     A: Floats
     B: Floats
     K: Floats
+    J: Floats
     F: Floats
     G: Floats
     Gx: Floats
@@ -81,27 +84,43 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     require_scene(scene)
     integrator = Midpoint() if integrator is None else integrator
     _require_match(scene, trajectory, integrator)
-    n, steps = scene.robot.dof, trajectory.steps
+    return linearize_steps(scene, trajectory, integrator, trajectory.q[0])
+
+
+def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator, first: Floats) -> Linearization:
+    """:func:`linearize` of a part of a motion that began at configuration ``first`` (n,); nothing is checked."""
+    n, m, steps = scene.robot.dof, scene.controls, trajectory.steps
     Jx, Jf, Jk = integrator.linearize(scene, trajectory)
     q, v = trajectory.q, trajectory.v
-    start = scene.noise.fields(q[:-1], v[:-1], trajectory.u, q[0])
+    if scene.processes == 0:
+        return Linearization(
+            A=Jx,
+            B=Jf @ scene.actuation,
+            K=_kick_columns(scene, trajectory, integrator, Jk),
+            J=Jk,
+            F=np.zeros((steps, n, 0)),
+            G=np.zeros((steps, 2 * n, 0)),
+            Gx=np.zeros((steps, 2 * n, 0, 2 * n)),
+            Gu=np.zeros((steps, 2 * n, 0, m)),
+            dt=trajectory.dt,
+            variational=integrator.variational,
+        )
+    start = scene.noise.fields(q[:-1], v[:-1], trajectory.u, first)
     A, B = Jx, Jf @ scene.actuation
     if start.Fv is not None:
-        drift_x, drift_u = _drift_derivatives(scene, trajectory, variational=integrator.variational)
+        drift_x, drift_u = _drift_derivatives(scene, trajectory, first, variational=integrator.variational)
         A, B = A + integrator.drift_share * Jf @ drift_x, B + integrator.drift_share * Jf @ drift_u
     left = integrator.left
     if integrator.variational:
-        K = Jk
         jump, jump_x, jump_u = start.F, _in_momentum(scene, q[:-1], v[:-1], start), start.Fu
     else:
         M, _ = node_jets(scene, q[:-1], v[:-1])
-        K = Jk @ np.linalg.inv(M)
         jump, jump_x, jump_u = _in_velocity(scene, q[:-1], start, M)
     G = left * (Jk @ jump)
     Gx = left * _chain(Jk, jump_x)
     Gu = left * _chain(Jk, jump_u)
     if left < 1.0:
-        end = scene.noise.fields(q[1:], v[1:], trajectory.u, q[0])
+        end = scene.noise.fields(q[1:], v[1:], trajectory.u, first)
         end_x = _in_momentum(scene, q[1:], v[1:], end)
         G[:, n:] += (1.0 - left) * end.F
         Gx[:, n:] += (1.0 - left) * np.einsum("Naib,Nbc->Naic", end_x, A)
@@ -109,7 +128,8 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     return Linearization(
         A=A,
         B=B,
-        K=K,
+        K=_kick_columns(scene, trajectory, integrator, Jk),
+        J=Jk,
         F=np.broadcast_to(start.F, (steps, n, scene.processes)),
         G=G,
         Gx=Gx,
@@ -158,16 +178,31 @@ def second_order(
     require_scene(scene)
     integrator = Midpoint() if integrator is None else integrator
     _require_match(scene, trajectory, integrator)
-    if scene.noise.velocity_dependent:
-        raise InputError("second derivatives are not there for noise fields that depend on the velocity")
     n, steps = scene.robot.dof, trajectory.steps
     rows = as_floats("z", z)
     if rows.shape == (2 * n,):
         rows = np.tile(rows, (steps, 1))
-    H = integrator.contract(scene, trajectory, finite_array("z", rows, (steps, 2 * n)))
+    return second_order_steps(scene, trajectory, finite_array("z", rows, (steps, 2 * n)), integrator)
+
+
+def second_order_steps(scene: Scene, trajectory: Trajectory, z: Floats, integrator: Integrator) -> Curvature:
+    """:func:`second_order`, without a look at whether the trajectory fits."""
+    if scene.noise.velocity_dependent:
+        raise InputError("second derivatives are not there for noise fields that depend on the velocity")
+    n = scene.robot.dof
+    H = integrator.contract(scene, trajectory, z)
     B = scene.actuation
     x, f = slice(0, 2 * n), slice(2 * n, 3 * n)
     return Curvature(xx=H[:, x, x], ux=B.T @ H[:, f, x], uu=B.T @ H[:, f, f] @ B)
+
+
+def _kick_columns(scene: Scene, trajectory: Trajectory, integrator: Integrator, Jk: Floats) -> Floats:
+    """dx1/dp0: what a jump does itself where it is one of the momentum."""
+    if integrator.variational:
+        return Jk
+    M, _ = node_jets(scene, trajectory.q[:-1], trajectory.v[:-1])
+    columns: Floats = Jk @ np.linalg.inv(M)
+    return columns
 
 
 def node_jets(scene: Scene, q: Floats, v: Floats) -> tuple[Floats, Floats]:
@@ -176,6 +211,40 @@ def node_jets(scene: Scene, q: Floats, v: Floats) -> tuple[Floats, Floats]:
     M, A = np.empty((N, n, n)), np.empty((N, n, n))
     jets(scene.mechanism, q, v, new_sweep(scene.robot.tree.parent.size, n), M, A)
     return M, A
+
+
+def velocity_at_nodes(scene: Scene, q: Floats, v: Floats) -> Floats:
+    """Derivative of v in (q, p) at many nodes (N, n, 2n): at fixed q dv = M^-1 dp, at fixed p dv = -M^-1 L_vq dq."""
+    M, A = node_jets(scene, q, v)
+    inverse = np.linalg.inv(M)
+    rates: Floats = np.concatenate([-inverse @ A, inverse], axis=2)
+    return rates
+
+
+def velocity_curvature(scene: Scene, q: Floats, v: Floats, c: Floats) -> Floats:
+    """Second derivatives of c . v in (q, p) at many nodes (N, 2n, 2n), for c (N, n).
+
+    With y = M^-1 c they are those of -y . L_v(q, v) in (q, v), brought to (q, p).
+    """
+    N, n = q.shape
+    first = velocity_at_nodes(scene, q, v)
+    y = np.einsum("Nij,Nj->Ni", first[:, :, n:], c)
+    bodies = scene.robot.tree.parent.size
+    dA, dLqq = np.empty((N, n, n)), np.empty((N, n, n))
+    momentum_curvatures(
+        scene.mechanism,
+        np.ascontiguousarray(q),
+        np.ascontiguousarray(v),
+        -y,
+        new_sweep(bodies, n),
+        new_tangent(bodies, n),
+        dA,
+        dLqq,
+    )
+    D = np.concatenate([np.broadcast_to(np.eye(n, 2 * n), (N, n, 2 * n)), first], axis=1)
+    inner = np.block([[dLqq, np.swapaxes(dA, 1, 2)], [dA, np.zeros_like(dA)]])
+    second: Floats = np.swapaxes(D, 1, 2) @ inner @ D
+    return second
 
 
 def _chain(J: Floats, derivative: Floats) -> Floats:
@@ -212,13 +281,14 @@ def _in_velocity(scene: Scene, q: Floats, fields: Fields, M: Floats) -> tuple[Fl
     return y, _chain(inverse, Fx), _chain(inverse, fields.Fu)
 
 
-def _drift_derivatives(scene: Scene, trajectory: Trajectory, *, variational: bool) -> tuple[Floats, Floats]:
+def _drift_derivatives(
+    scene: Scene, trajectory: Trajectory, start: Floats, *, variational: bool
+) -> tuple[Floats, Floats]:
     """Derivatives of the drift in (q, p), or (q, v), (N, n, 2n) and in u (N, n, m), by differences of eighth order.
 
     The drift is the one place that needs second derivatives of a diffusion field, which nobody has to write down.
     """
     n, m = scene.robot.dof, scene.controls
-    start = trajectory.q[0]
     weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 
     second = trajectory.p if variational else trajectory.v

@@ -72,6 +72,13 @@ class BoundNoise(ABC):
         """The form that kernels evaluate, or None for fields in Python."""
         return None
 
+    def curvature(self, weight: Floats) -> Floats:
+        """Second derivatives of sum_i weight_i . F_i in q (N, n, n), for weights (N, n, k), as far as they are known.
+
+        Only what a field of one's own would have to provide is missing: there it is taken for zero.
+        """
+        return np.zeros((len(weight), weight.shape[1], weight.shape[1]))
+
     @abstractmethod
     def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:
         """F and its derivatives at q (N, n), v (N, n), u (N, m); ``start`` (n,) is q at the start of the motion."""
@@ -92,6 +99,11 @@ class CompiledFields(BoundNoise):
     def processes(self) -> int:
         """See :attr:`BoundNoise.processes`."""
         return int(self.arrays.constant.shape[1])
+
+    def curvature(self, weight: Floats) -> Floats:
+        """See :meth:`BoundNoise.curvature`."""
+        second: Floats = 2.0 * (self.arrays.quadratic * weight).sum(axis=2)
+        return second[:, :, None] * np.eye(second.shape[1])
 
     def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:  # noqa: ARG002
         """See :meth:`BoundNoise.fields`."""
@@ -128,6 +140,16 @@ class CompositeFields(BoundNoise):
             return None
         columns = zip(*(fields for fields in own if fields is not None), strict=True)
         return Diffusion(*(np.concatenate(arrays, axis=1) for arrays in columns))
+
+    def curvature(self, weight: Floats) -> Floats:
+        """See :meth:`BoundNoise.curvature`."""
+        ends = np.cumsum([part.processes for part in self.parts])
+        columns = np.split(weight, ends[:-1], axis=2)
+        total: Floats = sum(
+            (part.curvature(own) for part, own in zip(self.parts, columns, strict=True)),
+            np.zeros((len(weight), weight.shape[1], weight.shape[1])),
+        )
+        return total
 
     def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:
         """See :meth:`BoundNoise.fields`."""

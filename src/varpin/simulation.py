@@ -138,6 +138,18 @@ class _Record:
         )
 
 
+def rollout(
+    scene: Scene, integrator: Integrator, q0: Floats, v0: Floats, commands: Commands, dt: float
+) -> tuple[Trajectory, Failure | None]:
+    """The motion without noise under given commands, and why it stopped early, if it did; nothing is checked."""
+    state, (start,) = integrator.start(scene, q0[None], v0[None])
+    nothing = np.zeros((0, scene.processes))
+    record = _Record(scene, integrator, dt, steps_of(commands), nothing, start)
+    (segment,) = integrator.rollout(scene, state, commands, nothing[None][:0], dt)
+    record.add(segment)
+    return record.trajectory(), segment.failure
+
+
 def simulate(
     scene: Scene,
     q0: ArrayLike,

@@ -7,7 +7,7 @@ import os
 import tempfile
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -118,6 +118,18 @@ class Trajectory:
     def duration(self) -> float:
         """Time from the first node to the last [s]."""
         return float(self.t[-1] - self.t[0])
+
+    def part(self, begin: int, end: int) -> Trajectory:
+        """Steps begin .. end with the nodes around them, as views."""
+        nodes, steps = slice(begin, end + 1), slice(begin, end)
+        own = self.statistics
+        return replace(
+            self,
+            **{name: getattr(self, name)[nodes] for name in ("t", "q", "v", "p", "energy")},
+            u=self.u[steps],
+            dw=self.dw[steps],
+            statistics=StepStatistics(**{item.name: getattr(own, item.name)[steps] for item in fields(own)}),
+        )
 
     def __repr__(self) -> str:
         split = self.statistics.split_steps

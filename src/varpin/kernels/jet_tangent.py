@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from varpin.kernels._compile import inlined
+from varpin.kernels._compile import inlined, kernel
 from varpin.kernels.jet import body_inertia, dot6, move_body, place_body, times_inertia
 from varpin.kernels.tree import Floats, Mechanism, Sweep
 
@@ -182,3 +182,19 @@ def third_order(mechanism: Mechanism, q: Floats, v: Floats, alpha: Floats, beta:
             for i in range(10):
                 Y[k, i] += Y[j, i]
                 dY[k, i] += dY[j, i]
+
+
+@kernel
+def momentum_curvatures(
+    mechanism: Mechanism, q: Floats, v: Floats, beta: Floats, w: Sweep, t: Tangent, dA: Floats, dLqq: Floats
+) -> None:
+    """Second derivatives of beta . L_v at each row of q, v and beta (N, n): in v and q, in q twice, (N, n, n)."""
+    n = q.shape[1]
+    for s in range(q.shape[0]):
+        for i in range(n):
+            w.V[i] = 0.0
+        third_order(mechanism, q[s], v[s], w.V, beta[s], w, t)
+        for i in range(n):
+            for j in range(n):
+                dA[s, i, j] = t.A[i, j]
+                dLqq[s, i, j] = t.Lqq[i, j]

@@ -1,0 +1,380 @@
+"""Costs: integrals over time and terms at the end, which add up.
+
+A running cost l(t, q, v, u) stands for its integral over the motion, whatever the time step; ``Terminal`` makes it a
+term at the final time. All of them are evaluated and expanded over many points at once, with NumPy, so that a cost of
+one's own needs no compiled code.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import as_floats, finite_array, require_finite
+from varpin.errors import InputError, VarpinError
+
+Floats = NDArray[np.float64]
+Reference = ArrayLike | Callable[[float], ArrayLike]
+
+
+class CostError(VarpinError, ValueError):
+    """A cost raised, or returned something that is no cost.
+
+    Attributes:
+        cost: Which one, as text.
+    """
+
+    def __init__(self, cost: str, problem: str) -> None:
+        self.cost = cost
+        super().__init__(f"{cost}: {problem}")
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Where costs are to be evaluated: N points in time on a horizon.
+
+    Attributes:
+        t: Times (N,) [s].
+        duration: Of the horizon [s].
+        steps: Of the problem's grid.
+        dof: n.
+        controls: m.
+    """
+
+    t: Floats
+    duration: float
+    steps: int
+    dof: int
+    controls: int
+
+    @property
+    def size(self) -> int:
+        """2n + m, the length of z = (q, v, u)."""
+        return 2 * self.dof + self.controls
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """Gradient and Hessian of a cost at N points, in z = (q, v, u).
+
+    Attributes:
+        gradient: (N, 2n + m).
+        hessian: (N, 2n + m, 2n + m), or (1, 2n + m, 2n + m) where it is the same everywhere.
+    """
+
+    gradient: Floats
+    hessian: Floats
+
+
+class BoundCost(ABC):
+    """A cost at given points."""
+
+    @abstractmethod
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """Its values (..., N) at q (..., N, n), v (..., N, n) and u (..., N, m)."""
+
+    @abstractmethod
+    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
+        """Its expansion at q (N, n), v (N, n) and u (N, m)."""
+
+
+class Cost(ABC):
+    """A cost. Whoever adds one provides ``bind``; ``CustomCost`` is the shorter way."""
+
+    @abstractmethod
+    def bind(self, points: Points) -> BoundCost:
+        """The cost at given points.
+
+        Raises:
+            InputError: Its parameters do not fit the robot or the problem's grid.
+            CostError: A reference that is a function fails.
+        """
+
+    @property
+    def terms(self) -> tuple[Cost, ...]:
+        """What it is a sum of."""
+        return (self,)
+
+    def __add__(self, other: Cost) -> CostSum:
+        if not isinstance(other, Cost):
+            return NotImplemented
+        return CostSum((*self.terms, *other.terms))
+
+
+@dataclass(frozen=True)
+class CostSum(Cost):
+    """A sum of costs, running and terminal ones."""
+
+    parts: tuple[Cost, ...]
+
+    @property
+    def terms(self) -> tuple[Cost, ...]:
+        """See :attr:`Cost.terms`."""
+        return self.parts
+
+    def bind(self, points: Points) -> BoundCost:
+        """See :meth:`Cost.bind`."""
+        return BoundSum(tuple(part.bind(points) for part in self.parts), points)
+
+    def __repr__(self) -> str:
+        return " + ".join(map(repr, self.parts))
+
+
+@dataclass(frozen=True, eq=False)
+class BoundSum(BoundCost):
+    """A sum of bound costs; of none, zero."""
+
+    parts: tuple[BoundCost, ...]
+    points: Points
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """See :meth:`BoundCost.value`."""
+        total = np.zeros(q.shape[:-1])
+        for part in self.parts:
+            total += part.value(q, v, u)
+        return total
+
+    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
+        """See :meth:`BoundCost.expand`."""
+        gradient = np.zeros((len(q), self.points.size))
+        hessian = np.zeros((1, self.points.size, self.points.size))
+        for part in self.parts:
+            own = part.expand(q, v, u)
+            gradient += own.gradient
+            hessian = hessian + own.hessian
+        return Expansion(gradient, hessian)
+
+
+class _Quadratic(Cost):
+    """weight . (y - y_r)^2 for one block y of z."""
+
+    weight: Floats
+    reference: Reference
+    block: str
+
+    def __init__(self, reference: Reference, weight: ArrayLike) -> None:
+        array = require_finite(f"{type(self).__name__} weight", as_floats(f"{type(self).__name__} weight", weight))
+        if array.ndim > 2 or (array.ndim == 2 and array.shape[0] != array.shape[1]):
+            raise InputError(
+                f"{type(self).__name__} weight must be a number, a vector or a square matrix, got {array.shape}"
+            )
+        least = np.linalg.eigvalsh(0.5 * (array + array.T)).min() if array.ndim == 2 else array.min(initial=0.0)
+        if least < -1e-12 * np.abs(array).max(initial=0.0):
+            raise InputError(
+                f"{type(self).__name__} weight must be positive semidefinite; its least value is {least:g}"
+            )
+        self.weight = 0.5 * (array + array.T) if array.ndim == 2 else array
+        self.weight.setflags(write=False)
+        self.reference = reference if callable(reference) else as_floats(f"{type(self).__name__} reference", reference)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(weight={self.weight.tolist()})"
+
+    def bind(self, points: Points) -> BoundCost:
+        """See :meth:`Cost.bind`."""
+        size = points.controls if self.block == "u" else points.dof
+        begin = {"q": 0, "v": points.dof, "u": 2 * points.dof}[self.block]
+        name = type(self).__name__
+        if self.weight.ndim > 0 and self.weight.shape[0] != size:
+            raise InputError(f"{name} weight must be one number or have {size} rows, got shape {self.weight.shape}")
+        W = self.weight * np.eye(size) if self.weight.ndim < 2 else self.weight
+        hessian = np.zeros((1, points.size, points.size))
+        hessian[0, begin : begin + size, begin : begin + size] = 2.0 * W
+        return _BoundQuadratic(self.block, begin, sample(name, self.reference, points, size), W, hessian)
+
+
+@dataclass(frozen=True, eq=False)
+class _BoundQuadratic(BoundCost):
+    block: str
+    begin: int
+    reference: Floats  # (N, size) or (1, size)
+    weight: Floats  # (size, size)
+    hessian: Floats
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        error = {"q": q, "v": v, "u": u}[self.block] - self.reference
+        total: Floats = np.einsum("...i,...i->...", error @ self.weight, error)
+        return total
+
+    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
+        error = {"q": q, "v": v, "u": u}[self.block] - self.reference
+        gradient = np.zeros((len(q), self.hessian.shape[1]))
+        gradient[:, self.begin : self.begin + len(self.weight)] = 2.0 * (error @ self.weight)
+        return Expansion(gradient, self.hessian)
+
+
+class TrackingCost(_Quadratic):
+    """weight . (q - q_r(t))^2: follow a reference in joint space."""
+
+    block = "q"
+
+    def __init__(self, reference: Reference, weight: ArrayLike = 1.0) -> None:
+        """Describe the cost.
+
+        Args:
+            reference: q_r: a function of the time [s] that returns (n,), a constant (n,), or an array (N + 1, n) of
+                its values at the problem's nodes, between which it is linear [rad or m].
+            weight: One number, (n,), or a matrix (n, n), positive semidefinite.
+
+        Raises:
+            InputError: A weight that is not finite, indefinite, or neither number, vector nor square matrix.
+        """
+        super().__init__(reference, weight)
+
+
+class VelocityCost(_Quadratic):
+    """weight . (v - v_r(t))^2."""
+
+    block = "v"
+
+    def __init__(self, weight: ArrayLike = 1.0, reference: Reference = 0.0) -> None:
+        """Describe the cost; see :class:`TrackingCost`."""
+        super().__init__(reference, weight)
+
+
+class ControlCost(_Quadratic):
+    """weight . (u - u_r(t))^2."""
+
+    block = "u"
+
+    def __init__(self, weight: ArrayLike = 1.0, reference: Reference = 0.0) -> None:
+        """Describe the cost; see :class:`TrackingCost`, with m controls for n coordinates."""
+        super().__init__(reference, weight)
+
+
+def sample(name: str, reference: Reference, points: Points, size: int) -> Floats:
+    """A reference at the points, (N, size), or (1, size) where it is constant.
+
+    Raises:
+        InputError: Its shape does not fit.
+        CostError: A function that raises, or returns another shape or values that are not finite.
+    """
+    if callable(reference):
+        rows = np.empty((len(points.t), size))
+        for j, time in enumerate(points.t):
+            try:
+                rows[j] = finite_array(f"the reference at t = {time:.6g} s", reference(float(time)), (size,))
+            except InputError as error:
+                raise CostError(name, str(error)) from None
+            except Exception as error:
+                raise CostError(name, f"the reference raised {error!r} at t = {time:.6g} s") from error
+        return rows
+    array = require_finite(f"{name} reference", as_floats(f"{name} reference", reference))
+    if array.ndim < 2 and array.shape in ((), (size,)):
+        return np.array(np.broadcast_to(array, (1, size)))
+    if array.shape != (points.steps + 1, size):
+        raise InputError(
+            f"{name} reference must be a function of time, have shape ({size},), or ({points.steps + 1}, {size}): one "
+            f"row for each of the problem's nodes; got {array.shape}"
+        )
+    nodes = np.linspace(0.0, points.duration, points.steps + 1)
+    return np.column_stack([np.interp(points.t, nodes, column) for column in array.T])
+
+
+@dataclass(frozen=True)
+class Terminal(Cost):
+    """A cost at the final time instead of its integral: ``Terminal(TrackingCost(...))``."""
+
+    cost: Cost
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.cost, Cost):
+            raise InputError(f"Terminal takes a cost, got {type(self.cost).__name__}")
+        for term in self.cost.terms:
+            if isinstance(term, Terminal | ControlCost):
+                raise InputError(f"{term!r} cannot be a terminal cost: there is no control at the final time")
+
+    def bind(self, points: Points) -> BoundCost:
+        """See :meth:`Cost.bind`; the points must be the one at the end."""
+        return self.cost.bind(points)
+
+
+Function = Callable[[Floats, Floats, Floats, Floats], ArrayLike]
+Derivatives = Callable[[Floats, Floats, Floats, Floats], tuple[ArrayLike, ArrayLike]]
+
+
+@dataclass(frozen=True)
+class CustomCost(Cost):
+    """A cost of one's own, evaluated at many points at once.
+
+    Attributes:
+        function: Takes t (N,), q (N, n), v (N, n) and u (N, m); returns (N,).
+        derivatives: Takes the same; returns gradient (N, 2n + m) and Hessian (N, 2n + m, 2n + m) in z = (q, v, u).
+            If left out, both are differenced, to about 1e-8 and 1e-5 of the function's own size.
+        name: For messages.
+    """
+
+    function: Function
+    derivatives: Derivatives | None = None
+    name: str = "CustomCost"
+
+    def bind(self, points: Points) -> BoundCost:
+        """See :meth:`Cost.bind`."""
+        return _BoundCustom(self, points)
+
+
+@dataclass(frozen=True, eq=False)
+class _BoundCustom(BoundCost):
+    cost: CustomCost
+    points: Points
+
+    def _call(self, t: Floats, q: Floats, v: Floats, u: Floats) -> Floats:
+        try:
+            values = as_floats("what it returned", self.cost.function(t, q, v, u))
+        except Exception as error:
+            raise CostError(self.cost.name, f"function(t, q, v, u) failed: {error!r}") from error
+        if values.shape != t.shape:
+            raise CostError(self.cost.name, f"function(t, q, v, u) must return shape {t.shape}, got {values.shape}")
+        return values
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        lead = q.shape[:-1]
+        t = np.broadcast_to(self.points.t, lead).reshape(-1)
+        rows = [np.ascontiguousarray(x).reshape(len(t), x.shape[-1]) for x in (q, v, u)]
+        return self._call(t, *rows).reshape(lead)
+
+    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
+        N, d = len(q), self.points.size
+        if self.cost.derivatives is None:
+            return self._differences(np.hstack([q, v, u]))
+        try:
+            first, second = self.cost.derivatives(self.points.t, q, v, u)
+            gradient = finite_array("the gradient", first, (N, d))
+            hessian = as_floats("the Hessian", second)
+            hessian = finite_array("the Hessian", hessian, (1, d, d) if hessian.shape == (1, d, d) else (N, d, d))
+        except Exception as error:
+            raise CostError(self.cost.name, f"derivatives(t, q, v, u) failed: {error}") from error
+        return Expansion(gradient, hessian)
+
+    def _differences(self, z: Floats) -> Expansion:
+        """Central differences: of fourth order for the gradient, of second for the Hessian."""
+        N, d = z.shape
+        n = self.points.dof
+
+        def at(moved: Floats) -> Floats:
+            return self._call(self.points.t, moved[:, :n], moved[:, n : 2 * n], moved[:, 2 * n :])
+
+        size = 1e-3 * np.maximum(1.0, np.abs(z).max(axis=0))
+        gradient, hessian = np.empty((N, d)), np.empty((N, d, d))
+        middle = at(z)
+        ahead, behind = [], []
+        for a in range(d):
+            e = np.zeros(d)
+            e[a] = size[a]
+            outer = at(z + 2.0 * e) - at(z - 2.0 * e)
+            gradient[:, a] = (8.0 * (at(z + e) - at(z - e)) - outer) / (12.0 * size[a])
+            e[a] = size[a]
+            ahead.append(at(z + e))
+            behind.append(at(z - e))
+            hessian[:, a, a] = (ahead[a] - 2.0 * middle + behind[a]) / size[a] ** 2
+            for b in range(a):
+                e[b] = size[b]
+                both = at(z + e) + at(z - e)
+                e[b] = 0.0
+                mixed = both - ahead[a] - behind[a] - ahead[b] - behind[b] + 2.0 * middle
+                hessian[:, a, b] = hessian[:, b, a] = mixed / (2.0 * size[a] * size[b])
+        return Expansion(gradient, hessian)

@@ -1,0 +1,331 @@
+"""The backward pass of stochastic differential dynamic programming (Theodorou, Tassa and Todorov 2010).
+
+The value after a step is v0 + Wx . x' + Wu . u + (1/2) (x', u) W (x', u), in deviations from the nominal trajectory;
+u is in it only while a control is held over several steps. With x' = A x + B u + sum_i (g_i + Gx_i x + Gu_i u) dw_i,
+the cost of the step expanded at its sample z = D (x, u), and S = h Wxx,
+
+    Q_x  = D'l_z + A'Wx + sum_i Gx_i' S g_i,        Q_xx = D'l_zz D + A'Wxx A + sum_i Gx_i' S Gx_i,
+
+and so on in u; v0 grows by (1/2) sum_i g_i' S g_i. Everything is symmetric and only dense products of small matrices.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from varpin.kernels._compile import inlined, kernel
+from varpin.kernels.linalg import factor_ldl, solve_ldl
+from varpin.kernels.tree import Floats
+
+# Where the running cost of a step is sampled.
+MIDPOINT = 0  # at ((q + q')/2, (q' - q)/h, u)
+START = 1  # at the node where the step begins
+
+
+class Steps(NamedTuple):
+    """The linearized dynamics and the expanded costs of N steps."""
+
+    A: Floats  # (N, 2n, 2n)
+    B: Floats  # (N, 2n, m)
+    G: Floats  # (N, 2n, k)
+    Gx: Floats  # (N, 2n, k, 2n)
+    Gu: Floats  # (N, 2n, k, m)
+    gradient: Floats  # (N, 2n + m) of the running cost at the samples (q, v, u)
+    hessian: Floats  # (N, 2n + m, 2n + m), or (1, 2n + m, 2n + m)
+    velocity: Floats  # (N, n, 2n) dv/dx at the nodes, for START; (0, n, 2n) where x holds v itself
+    curvature: Floats  # (N, 2n + m, 2n + m) to be added to the Hessian in (x, u), or (0, 2n + m, 2n + m)
+
+
+class Value(NamedTuple):
+    """Quadratic model of the cost to go, in (x, u) while u is held and in x alone otherwise."""
+
+    gradient: Floats  # (2n + m,)
+    hessian: Floats  # (2n + m, 2n + m)
+    costate: Floats  # (2n + m,) the gradient without feedback and feed-forward: of the cost itself
+    noise: Floats  # (1,) what noise adds to the cost so far
+    decrease: Floats  # (2,) sums of Qu . k and k . Quu k
+
+
+class Gains(NamedTuple):
+    """What the backward pass is for: u + k + K (x - x_nominal), one row for each of R decisions."""
+
+    feedforward: Floats  # (R, m)
+    feedback: Floats  # (R, m, 2n)
+    control_gradient: Floats  # (R, m) of the cost in each control
+    costate: Floats  # (N, 2n) gradient of the cost after each step in the state there; (0, 2n) if not asked for
+    spread: Floats  # (N, 2n, 2n) S; (0, 2n, 2n) without noise
+
+
+class Room(NamedTuple):
+    """Work arrays of the backward pass."""
+
+    J: Floats  # (2n, 2n + m) [A B]
+    D: Floats  # (2n, 2n + m) of (q, v) at the sample
+    T: Floats  # (2n + m, 2n + m) a product
+    Q: Floats  # (2n + m, 2n + m)
+    Qz: Floats  # (2n + m,)
+    costate: Floats  # (2n + m,)
+    Quu: Floats  # (m, m)
+    row: Floats  # (2n + m,)
+    solved: Floats  # (2n + m,)
+
+
+def new_value(dof: int, controls: int) -> Value:
+    """A value of zero."""
+    size = 2 * dof + controls
+    return Value(np.zeros(size), np.zeros((size, size)), np.zeros(size), np.zeros(1), np.zeros(2))
+
+
+def new_room(dof: int, controls: int) -> Room:
+    """Allocate the work arrays."""
+    x, size = 2 * dof, 2 * dof + controls
+    return Room(
+        J=np.zeros((x, size)),
+        D=np.zeros((x, size)),
+        T=np.zeros((size, size)),
+        Q=np.zeros((size, size)),
+        Qz=np.zeros(size),
+        costate=np.zeros(size),
+        Quu=np.zeros((controls, controls)),
+        row=np.zeros(size),
+        solved=np.zeros(size),
+    )
+
+
+@inlined
+def add_congruence(J: Floats, W: Floats, rows: int, scale: float, T: Floats, Q: Floats) -> None:
+    """Q += scale J' W J for the leading ``rows`` rows of J and of the symmetric W."""
+    size = Q.shape[0]
+    for i in range(rows):
+        for c in range(size):
+            total = 0.0
+            for j in range(rows):
+                total += W[i, j] * J[j, c]
+            T[i, c] = total
+    for c in range(size):
+        for r in range(c + 1):
+            total = 0.0
+            for i in range(rows):
+                total += J[i, r] * T[i, c]
+            total *= scale
+            Q[r, c] += total
+            if r != c:
+                Q[c, r] += total
+
+
+@inlined
+def add_running_cost(steps: Steps, s: int, rule: int, h: float, in_velocity: bool, room: Room) -> None:
+    """Add h l(z) to Q and Qz, with z = D (x, u)."""
+    D, T, Q, Qz, J = room.D, room.T, room.Q, room.Qz, room.J
+    x, size = J.shape
+    n = x // 2
+    g = steps.gradient[s]
+    H = steps.hessian[s if steps.hessian.shape[0] > 1 else 0]
+    for i in range(n):
+        for c in range(size):
+            one = 1.0 if i == c else 0.0
+            if rule == MIDPOINT:
+                D[i, c] = 0.5 * (J[i, c] + one)
+                D[n + i, c] = (J[i, c] - one) / h
+            else:
+                D[i, c] = one
+                D[n + i, c] = 1.0 if n + i == c else 0.0
+                if steps.velocity.shape[0] > 0:
+                    D[n + i, c] = steps.velocity[s, i, c] if c < x else 0.0
+    rows = x if in_velocity else n
+    for c in range(size):
+        total = g[c] if c >= x else 0.0
+        for i in range(x):
+            total += D[i, c] * g[i]
+        Qz[c] += h * total
+        room.costate[c] += h * total
+    add_congruence(D, H, rows, h, T, Q)
+    for r in range(x, size):
+        for c in range(x, size):
+            Q[r, c] += h * H[r, c]
+        for c in range(size):
+            total = 0.0
+            for i in range(rows):
+                total += H[r, i] * D[i, c]
+            Q[r, c] += h * total
+            Q[c, r] += h * total
+
+
+@inlined
+def add_noise(steps: Steps, s: int, rule: int, h: float, value: Value, gains: Gains, room: Room) -> None:
+    """Add the terms of the noise to Q, Qz and the cost; keeps S.
+
+    Where the running cost is sampled between the nodes, it looks at the state after the kick too.
+    """
+    Q, Qz, row = room.Q, room.Qz, room.row
+    x, size = room.J.shape
+    n = x // 2
+    S = gains.spread[s]
+    for i in range(x):
+        for j in range(x):
+            S[i, j] = h * value.hessian[i, j]
+    if rule == MIDPOINT:
+        H = steps.hessian[s if steps.hessian.shape[0] > 1 else 0]
+        for i in range(n):
+            for j in range(n):
+                S[i, j] += 0.25 * h * h * H[i, j] + 0.5 * h * (H[i, n + j] + H[n + i, j]) + H[n + i, n + j]
+    for w in range(steps.G.shape[2]):
+        for i in range(x):
+            total = 0.0
+            for j in range(x):
+                total += S[i, j] * steps.G[s, j, w]
+            row[i] = total
+        for i in range(x):
+            value.noise[0] += 0.5 * steps.G[s, i, w] * row[i]
+        for c in range(size):
+            total = 0.0
+            for i in range(x):
+                total += row[i] * (steps.Gx[s, i, w, c] if c < x else steps.Gu[s, i, w, c - x])
+            Qz[c] += total
+            room.costate[c] += total
+        for c in range(size):
+            for i in range(x):
+                total = 0.0
+                for j in range(x):
+                    total += S[i, j] * (steps.Gx[s, j, w, c] if c < x else steps.Gu[s, j, w, c - x])
+                room.solved[i] = total
+            for r in range(size):
+                total = 0.0
+                for i in range(x):
+                    total += room.solved[i] * (steps.Gx[s, i, w, r] if r < x else steps.Gu[s, i, w, r - x])
+                Q[r, c] += total
+
+
+@inlined
+def decide(regularization: float, r: int, value: Value, gains: Gains, room: Room) -> bool:
+    """Gains of decision ``r`` from Q and Qz, and the value under them; False where Quu is not positive definite."""
+    Q, Qz, Quu, row, solved = room.Q, room.Qz, room.Quu, room.row, room.solved
+    x, size = room.J.shape
+    m = size - x
+    largest = 0.0
+    for i in range(m):
+        largest = max(largest, abs(Q[x + i, x + i]))
+    for i in range(m):
+        for j in range(m):
+            Quu[i, j] = Q[x + i, x + j]
+        Quu[i, i] += regularization * max(abs(Q[x + i, x + i]), 1e-6 * largest)
+        # A pivot of rounding's size is no pivot.
+        if not Quu[i, i] > 0.0:
+            return False
+    if not factor_ldl(Quu):
+        return False
+    for i in range(m):
+        row[i] = -Qz[x + i]
+        gains.control_gradient[r, i] = room.costate[x + i]
+    solve_ldl(Quu, row[:m], solved[:m])
+    for i in range(m):
+        gains.feedforward[r, i] = solved[i]
+    for c in range(x):
+        for i in range(m):
+            row[i] = -Q[x + i, c]
+        solve_ldl(Quu, row[:m], solved[:m])
+        for i in range(m):
+            gains.feedback[r, i, c] = solved[i]
+    K, k = gains.feedback[r], gains.feedforward[r]
+    for i in range(m):
+        total = 0.0
+        for j in range(m):
+            total += Q[x + i, x + j] * k[j]
+        value.decrease[0] += Qz[x + i] * k[i]
+        value.decrease[1] += k[i] * total
+        row[i] = total + Qz[x + i]
+    for c in range(x):
+        total = Qz[c]
+        for i in range(m):
+            total += K[i, c] * row[i] + Q[x + i, c] * k[i]
+        value.gradient[c] = total
+        value.costate[c] = room.costate[c]
+    # Vxx = Qxx + K'(Quu K + Qux) + Qux'K, whatever the regularization.
+    for c in range(x):
+        for i in range(m):
+            total = Q[x + i, c]
+            for j in range(m):
+                total += Q[x + i, x + j] * K[j, c]
+            solved[i] = total
+        for b in range(x):
+            total = Q[b, c]
+            for i in range(m):
+                total += K[i, b] * solved[i] + Q[x + i, b] * K[i, c]
+            value.hessian[b, c] = total
+    for c in range(x):
+        for b in range(c):
+            mean = 0.5 * (value.hessian[b, c] + value.hessian[c, b])
+            value.hessian[b, c] = mean
+            value.hessian[c, b] = mean
+    for c in range(x, size):
+        value.gradient[c] = 0.0
+        value.costate[c] = 0.0
+        for b in range(size):
+            value.hessian[b, c] = 0.0
+            value.hessian[c, b] = 0.0
+    return True
+
+
+@kernel
+def backward_pass(
+    h: float,
+    rule: int,
+    hold: int,
+    in_velocity: bool,
+    regularization: float,
+    steps: Steps,
+    value: Value,
+    gains: Gains,
+    room: Room,
+) -> int:
+    """From the value after the last step to the value before the first; -1, or the decision that has no minimum.
+
+    Each control is held over ``hold`` steps. ``in_velocity`` says whether the running cost's Hessian has anything in v.
+    """
+    J, Q, Qz = room.J, room.Q, room.Qz
+    x, size = J.shape
+    for s in range(steps.A.shape[0] - 1, -1, -1):
+        if gains.costate.shape[0] > 0:
+            for i in range(x):
+                gains.costate[s, i] = value.costate[i]
+        for i in range(x):
+            for c in range(x):
+                J[i, c] = steps.A[s, i, c]
+            for c in range(x, size):
+                J[i, c] = steps.B[s, i, c - x]
+        for c in range(size):
+            Qz[c] = value.gradient[c] if c >= x else 0.0
+            room.costate[c] = value.costate[c] if c >= x else 0.0
+            for r in range(size):
+                Q[r, c] = 0.0
+            for i in range(x):
+                Qz[c] += J[i, c] * value.gradient[i]
+                room.costate[c] += J[i, c] * value.costate[i]
+        if steps.curvature.shape[0] > 0:
+            for r in range(size):
+                for c in range(size):
+                    Q[r, c] = steps.curvature[s, r, c]
+        add_congruence(J, value.hessian, x, 1.0, room.T, Q)
+        if (s + 1) % hold != 0:  # the control is that of the next step: its own rows of the value
+            for r in range(x, size):
+                for c in range(x, size):
+                    Q[r, c] += value.hessian[r, c]
+                for c in range(size):
+                    total = 0.0
+                    for i in range(x):
+                        total += value.hessian[r, i] * J[i, c]
+                    Q[r, c] += total
+                    Q[c, r] += total
+        if steps.G.shape[2] > 0:
+            add_noise(steps, s, rule, h, value, gains, room)
+        add_running_cost(steps, s, rule, h, in_velocity, room)
+        if s % hold == 0:
+            if not decide(regularization, s // hold, value, gains, room):
+                return s // hold
+            continue
+        for c in range(size):
+            value.gradient[c] = Qz[c]
+            value.costate[c] = room.costate[c]
+            for r in range(size):
+                value.hessian[r, c] = Q[r, c]
+    return -1

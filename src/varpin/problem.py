@@ -1,0 +1,203 @@
+"""An optimal control problem: a scene, a cost, a horizon and how it is discretized."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import count, finite_array, positive
+from varpin.costs import BoundSum, Cost, Expansion, Points, Terminal
+from varpin.errors import InputError
+from varpin.integrators import Integrator, Midpoint
+from varpin.lagrangian import lagrangian_jet
+from varpin.scene import Scene, require_scene
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class OptimalControlProblem:
+    """Minimize the expected cost of a motion from (q0, v0) over the controls, each held over ``hold`` steps.
+
+    Running costs are integrals in time, sampled once a step, and references are functions of time: the problem means
+    the same at every ``dt``.
+
+    Attributes:
+        scene: The scene, its noise included.
+        cost: Running and terminal costs.
+        q0: Initial configuration (n,) [rad or m].
+        v0: Initial velocity (n,) [rad/s or m/s].
+        dt: Time step [s].
+        steps: N.
+        integrator: Any of varpin's.
+        sampling: ``"midpoint"``: running costs at ((q + q')/2, (q' - q)/dt, u) of each step, of second order. Or
+            ``"start"``: at the node where it begins, a left sum as in the paper, of first order.
+        hold: Steps that share one control: a digital controller's period over the integrator's step.
+    """
+
+    scene: Scene
+    cost: Cost
+    q0: Floats
+    v0: Floats
+    dt: float
+    steps: int
+    integrator: Integrator
+    sampling: Literal["midpoint", "start"]
+    hold: int
+    running: BoundSum = field(repr=False)
+    terminal: BoundSum = field(repr=False)
+
+    def __init__(
+        self,
+        scene: Scene,
+        cost: Cost,
+        q0: ArrayLike,
+        v0: ArrayLike,
+        *,
+        dt: float,
+        steps: int,
+        integrator: Integrator | None = None,
+        sampling: Literal["midpoint", "start"] = "midpoint",
+        hold: int = 1,
+    ) -> None:
+        """Describe a problem.
+
+        Raises:
+            InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, or a
+                reference that does not fit the problem's grid.
+            CostError: A reference that is a function fails.
+        """
+        n, m = require_scene(scene).robot.dof, scene.controls
+        if not isinstance(cost, Cost):
+            raise InputError(f"cost must be a cost, for example varpin.TrackingCost(...), got {type(cost).__name__}")
+        dt, steps, hold = positive("dt", dt, "s"), count("steps", steps, least=1), count("hold", hold, least=1)
+        if steps % hold:
+            raise InputError(f"steps = {steps} is no multiple of hold = {hold}")
+        if sampling not in ("midpoint", "start"):
+            raise InputError(f"sampling must be 'midpoint' or 'start', got {sampling!r}")
+        if integrator is not None and not isinstance(integrator, Integrator):
+            raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
+        if m == 0:
+            raise InputError("the scene has no controls, so there is nothing to optimize")
+        shift = 0.5 if sampling == "midpoint" else 0.0
+        times = (np.arange(steps, dtype=np.float64) + shift) * dt
+        running, terminal = bind_cost(cost, times, dt * steps, steps, n, m)
+        values = {
+            "scene": scene,
+            "cost": cost,
+            "q0": finite_array("q0", q0, (n,)),
+            "v0": finite_array("v0", v0, (n,)),
+            "dt": dt,
+            "steps": steps,
+            "integrator": Midpoint() if integrator is None else integrator,
+            "sampling": sampling,
+            "hold": hold,
+            "running": running,
+            "terminal": terminal,
+        }
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        held = f", each control held over {self.hold}" if self.hold > 1 else ""
+        return f"OptimalControlProblem({self.scene!r}, {self.steps} steps of {self.dt:g} s{held}, {self.integrator})"
+
+    @property
+    def duration(self) -> float:
+        """The horizon [s]."""
+        return self.dt * self.steps
+
+    @property
+    def decisions(self) -> int:
+        """R, the number of controls to choose: steps / hold."""
+        return self.steps // self.hold
+
+    def at(
+        self,
+        *,
+        q0: ArrayLike | None = None,
+        v0: ArrayLike | None = None,
+        dt: float | None = None,
+        steps: int | None = None,
+        integrator: Integrator | None = None,
+        sampling: Literal["midpoint", "start"] | None = None,
+        hold: int | None = None,
+    ) -> OptimalControlProblem:
+        """The same problem, discretized otherwise or from another state.
+
+        With ``dt`` alone the horizon stays, and the number of steps follows.
+
+        Raises:
+            InputError: The horizon is no multiple of ``dt``; or as for the problem itself.
+        """
+        if dt is not None and steps is None:
+            steps = round(self.duration / positive("dt", dt, "s"))
+            if abs(steps * dt - self.duration) > 1e-9 * self.duration:
+                raise InputError(f"the horizon of {self.duration:g} s is no multiple of dt = {dt:g} s")
+        return OptimalControlProblem(
+            self.scene,
+            self.cost,
+            self.q0 if q0 is None else q0,
+            self.v0 if v0 is None else v0,
+            dt=self.dt if dt is None else dt,
+            steps=self.steps if steps is None else steps,
+            integrator=self.integrator if integrator is None else integrator,
+            sampling=self.sampling if sampling is None else sampling,
+            hold=self.hold if hold is None else hold,
+        )
+
+    def holding_controls(self) -> Floats:
+        """The constant control (m,) that comes closest to holding the robot at q0 at rest."""
+        force = lagrangian_jet(self.scene, self.q0, np.zeros_like(self.q0)).Lq
+        return np.asarray(np.linalg.lstsq(self.scene.actuation, -force, rcond=None)[0], dtype=np.float64)
+
+    def samples(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
+        """Where running costs are taken: q and v (..., N, n), from those at the nodes (..., N + 1, n)."""
+        if self.sampling == "start":
+            return q[..., :-1, :], v[..., :-1, :]
+        return 0.5 * (q[..., :-1, :] + q[..., 1:, :]), np.diff(q, axis=-2) / self.dt
+
+    def costs(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """The cost (...) of motions without their noise terms: q and v (..., N + 1, n), u (..., N, m)."""
+        at_q, at_v = self.samples(q, v)
+        running = self.running.value(at_q, at_v, u).sum(axis=-1) * self.dt
+        end = np.zeros((*u.shape[:-2], 1, u.shape[-1]))
+        total: Floats = running + self.terminal.value(q[..., -1:, :], v[..., -1:, :], end)[..., 0]
+        return total
+
+    def cost_of(self, trajectory: Trajectory) -> float:
+        """The cost of one motion on the problem's grid.
+
+        Raises:
+            InputError: The motion has another number of steps or another time step.
+        """
+        if trajectory.steps != self.steps or abs(trajectory.dt - self.dt) > 1e-12 * self.dt:
+            raise InputError(
+                f"the motion has {trajectory.steps} steps of {trajectory.dt:g} s; "
+                f"the problem {self.steps} of {self.dt:g} s"
+            )
+        return float(self.costs(trajectory.q, trajectory.v, trajectory.u))
+
+    def expand_running(self, trajectory: Trajectory) -> Expansion:
+        """Expansion of the running costs along a motion, at their samples, in (q, v, u)."""
+        return self.running.expand(*self.samples(trajectory.q, trajectory.v), trajectory.u)
+
+    def expand_terminal(self, trajectory: Trajectory) -> Expansion:
+        """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""
+        return self.terminal.expand(trajectory.q[-1:], trajectory.v[-1:], np.zeros((1, self.scene.controls)))
+
+
+def bind_cost(
+    cost: Cost, times: Floats, duration: float, steps: int, dof: int, controls: int
+) -> tuple[BoundSum, BoundSum]:
+    """The running costs at ``times`` (N,), and the terminal ones at the end."""
+    at, end = (Points(t, duration, steps, dof, controls) for t in (times, np.array([duration])))
+    terms = cost.terms
+    running = BoundSum(tuple(term.bind(at) for term in terms if not isinstance(term, Terminal)), at)
+    return running, BoundSum(tuple(term.bind(end) for term in terms if isinstance(term, Terminal)), end)

@@ -1,0 +1,441 @@
+"""Stochastic differential dynamic programming on the structured linearization of any integrator."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import count, finite_array, fraction, positive, real
+from varpin.costs import CostError
+from varpin.errors import InputError, LinearizationError
+from varpin.integrators.base import open_loop
+from varpin.kernels import backward as kernels
+from varpin.kernels._compile import announced_compilation
+from varpin.kernels.tree import Commands
+from varpin.linearization import (
+    Linearization,
+    linearize_steps,
+    second_order_steps,
+    velocity_at_nodes,
+    velocity_curvature,
+)
+from varpin.policy import LinearPolicy
+from varpin.problem import OptimalControlProblem
+from varpin.simulation import StepFailure, rollout
+from varpin.solution import Iteration, Solution, Status
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+Callback = Callable[[Iteration], None]
+
+logger = logging.getLogger(__name__)
+
+# Nodes that are linearized at a time: their derivatives are not kept.
+_BLOCK = 2048
+# The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu.
+_GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
+# Trials of a line search: 0.25^10 is 1e-6.
+_TRIALS = 10
+
+
+def solve(
+    problem: OptimalControlProblem,
+    controls: ArrayLike | LinearPolicy | Solution | None = None,
+    *,
+    tolerance: float = 1e-7,
+    max_iterations: int = 100,
+    second_order: bool = False,
+    forward: Literal["closed", "open"] = "closed",
+    armijo: float = 1e-5,
+    backtracking: float = 0.25,
+    regularization: float = 0.0,
+    callback: Callback | None = None,
+) -> Solution:
+    """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
+
+    Each iteration takes the derivatives along the motion, goes back through the quadratic model of the cost to go,
+    noise terms included, and searches along the new controls for a motion of lower expected cost: the cost of the
+    motion itself, and what noise adds to it under the model.
+
+    Main args:
+        problem: What to minimize.
+        controls: To start from: None for those that hold the robot at q0; an array (R, m) or (m,), R the number of
+            decisions; a :class:`LinearPolicy`; or a :class:`Solution`, whose policy then runs on this problem.
+        tolerance: Stop when the decrease that the quadratic model promises is below this part of the cost.
+        max_iterations: At most.
+
+    Other Args:
+        second_order: Full differential dynamic programming: second derivatives of the dynamics too. Converges
+            quadratically; needs an integrator that has them (:class:`Midpoint`).
+        forward: ``"closed"``: the feedback gains act in the line search. ``"open"``: only the feed-forward part, as in
+            the paper; it diverges where the open loop is unstable over the horizon.
+        armijo: The part of the promised slope that a step must keep (the paper's alpha).
+        backtracking: Factor between the trials of the line search (the paper's beta), in (0, 1).
+        regularization: To begin with, relative to the diagonal of Quu; it grows where needed, and shrinks again.
+        callback: Called with each :class:`Iteration`.
+
+    Returns:
+        The best motion found, whatever happened; ``status`` says how it ended. Ctrl-C returns it too.
+
+    Raises:
+        InputError: Controls of a wrong shape, or options out of their range.
+        StepFailure: The first motion cannot be integrated; holds what came before.
+        CostError: The cost of the first motion is not finite, or a cost of one's own fails.
+    """
+    if not isinstance(problem, OptimalControlProblem):
+        raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
+    if forward not in ("closed", "open"):
+        raise InputError(f"forward must be 'closed' or 'open', got {forward!r}")
+    if not 0.0 < real("backtracking", backtracking) < 1.0:
+        raise InputError(f"backtracking must be in (0, 1), got {backtracking}")
+    if not real("regularization", regularization) >= 0.0:
+        raise InputError(f"regularization must be >= 0, got {regularization}")
+    positive("tolerance", tolerance, "1")
+    fraction("armijo", armijo)
+    max_iterations = count("max_iterations", max_iterations)
+    with announced_compilation():
+        search = _Search(problem, second_order, forward, armijo, backtracking, regularization)
+        search.begin(_first_commands(problem, controls))
+        try:
+            status = search.run(tolerance, max_iterations, callback)
+        except KeyboardInterrupt:
+            status = Status.INTERRUPTED
+    return search.solution(status)
+
+
+def _first_commands(problem: OptimalControlProblem, controls: ArrayLike | LinearPolicy | Solution | None) -> Commands:
+    R, m = problem.decisions, problem.scene.controls
+    if isinstance(controls, Solution):
+        controls = controls.policy
+    if isinstance(controls, LinearPolicy):
+        if controls.hold != problem.hold:
+            raise InputError(f"the policy holds its controls over {controls.hold} steps, the problem {problem.hold}")
+        return controls.commands(problem.steps, m, problem.scene.robot.dof)
+    if controls is None:
+        controls = problem.holding_controls()
+    array = np.asarray(controls)
+    rows = finite_array("controls", controls, (m,) if array.ndim == 1 else (R, m))
+    return _held(np.broadcast_to(rows, (R, m)), problem.hold)
+
+
+def _held(u: Floats, hold: int) -> Commands:
+    return open_loop(u)._replace(hold=hold)
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """What a backward pass found: how to change the controls, and what to expect of it."""
+
+    feedforward: Floats  # (R, m)
+    feedback: Floats  # (R, m, 2n)
+    gradient: Floats  # (R, m)
+    slope: float
+    curvature: float
+    noise: float  # cost of the noise along the motion
+    jumps: Floats  # (N, 2n, n), empty without noise
+    spread: Floats  # (N, 2n, 2n)
+
+
+class _Search:
+    """The motion so far, and what is known around it."""
+
+    def __init__(
+        self,
+        problem: OptimalControlProblem,
+        second_order: bool,
+        forward: str,
+        armijo: float,
+        backtracking: float,
+        regularization: float,
+    ) -> None:
+        self.problem, self.second_order, self.forward = problem, second_order, forward
+        self.armijo, self.backtracking, self.regularization = armijo, backtracking, regularization
+        self.growth = 1.0
+        self.history: list[Iteration] = []
+        self.plan: _Plan | None = None
+        self.trajectory: Trajectory
+        self.cost = np.inf
+
+    def begin(self, commands: Commands) -> None:
+        trajectory, failure = rollout(
+            self.problem.scene, self.problem.integrator, self.problem.q0, self.problem.v0, commands, self.problem.dt
+        )
+        if failure is not None:
+            raise StepFailure(trajectory.steps, trajectory.t[-1], failure, trajectory)
+        self.trajectory = trajectory
+        self.cost = self.problem.cost_of(trajectory)
+        if not np.isfinite(self.cost):
+            raise CostError(repr(self.problem.cost), f"the cost of the first motion is {self.cost}")
+
+    def run(self, tolerance: float, max_iterations: int, callback: Callback | None) -> Status:
+        first = self.cost
+        while True:
+            started = time.perf_counter()
+            passes = self._plan()
+            if self.plan is None:
+                return Status.INDEFINITE
+            merit = self.cost + self.plan.noise
+            # Where the optimum costs nothing, there is nothing to be relative to but where it began.
+            scale = abs(merit) + 1e-9 * abs(first)
+            promise = -0.5 * self.plan.slope
+            converged = promise <= tolerance * scale
+            if converged or len(self.history) >= max_iterations:
+                self._note(callback, started, promise, 0.0, passes, 0)
+                return Status.CONVERGED if converged else Status.MAX_ITERATIONS
+            step, trials = self._line_search(merit)
+            self._note(callback, started, promise, step, passes, trials)
+            if step > 0.0:
+                self._relax()
+            elif promise <= 1e-12 * scale:
+                return Status.CONVERGED
+            elif not self._stiffen():
+                return Status.STALLED
+
+    def _note(
+        self, callback: Callback | None, started: float, promise: float, step: float, passes: int, trials: int
+    ) -> None:
+        if self.plan is None:
+            return
+        item = Iteration(
+            index=len(self.history),
+            cost=self.cost,
+            noise_cost=self.plan.noise,
+            promised_decrease=promise,
+            step=step,
+            regularization=self.regularization,
+            gradient=float(np.abs(self.plan.gradient).max()),
+            backward_passes=passes,
+            rollouts=trials,
+            seconds=time.perf_counter() - started,
+        )
+        self.history.append(item)
+        logger.info("%s", item)
+        if callback is not None:
+            callback(item)
+
+    def _relax(self) -> None:
+        self.growth = min(1.0 / _GROWTH, self.growth / _GROWTH)
+        self.regularization *= self.growth
+        if self.regularization < _LEAST:
+            self.regularization = 0.0
+
+    def _stiffen(self) -> bool:
+        self.growth = max(_GROWTH, self.growth * _GROWTH)
+        self.regularization = max(_LEAST, self.regularization * self.growth)
+        return self.regularization <= _MOST
+
+    def _plan(self) -> int:
+        """A backward pass, with as much regularization as it takes; returns how many it took."""
+        passes = 0
+        while True:
+            passes += 1
+            self.plan = backward(self.problem, self.trajectory, self.regularization, self.second_order)
+            if self.plan is not None or not self._stiffen():
+                return passes
+
+    def _line_search(self, merit: float) -> tuple[float, int]:
+        """Move to the first motion along the plan whose expected cost is low enough: its step, or 0, and trials."""
+        if self.plan is None:
+            return 0.0, 0
+        problem, plan, step = self.problem, self.plan, 1.0
+        for trial in range(_TRIALS):
+            moved = self._move(step)
+            if moved is not None:
+                cost = problem.cost_of(moved)
+                added = noise_cost(problem, moved, plan)
+                if cost + added <= merit + self.armijo * step * plan.slope:
+                    self.trajectory, self.cost = moved, cost
+                    return step, trial + 1
+            step *= self.backtracking
+        return 0.0, _TRIALS
+
+    def _move(self, step: float) -> Trajectory | None:
+        if self.plan is None:
+            return None
+        problem, here = self.problem, self.trajectory
+        u = here.u[:: problem.hold] + step * self.plan.feedforward
+        if self.forward == "open":
+            commands = _held(u, problem.hold)
+        else:
+            commands = Commands(u, self.plan.feedback, states(problem, here)[: -1 : problem.hold], problem.hold)
+        moved, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, problem.dt)
+        return moved if failure is None else None
+
+    def solution(self, status: Status) -> Solution:
+        problem, plan = self.problem, self.plan
+        R, m, n = problem.decisions, problem.scene.controls, problem.scene.robot.dof
+        return Solution(
+            problem=problem,
+            trajectory=self.trajectory,
+            gains=np.zeros((R, m, 2 * n)) if plan is None else plan.feedback,
+            feedforward=np.zeros((R, m)) if plan is None else plan.feedforward,
+            gradient=np.full((R, m), np.nan) if plan is None else plan.gradient,
+            cost=self.cost,
+            noise_cost=np.nan if plan is None else plan.noise,
+            status=status,
+            history=tuple(self.history),
+        )
+
+
+def states(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
+    """X (N + 1, 2n): (q, p) or (q, v)."""
+    second = trajectory.p if problem.integrator.variational else trajectory.v
+    return np.hstack([trajectory.q, second])
+
+
+def noise_cost(problem: OptimalControlProblem, trajectory: Trajectory, plan: _Plan) -> float:
+    """What noise adds to the cost of a motion, if it acts and is penalized as it was along the plan's own."""
+    if problem.scene.processes == 0:
+        return 0.0
+    g = impulses(problem, trajectory, plan.jumps)
+    return 0.5 * float(np.einsum("Nai,Nai->", g, plan.spread @ g))
+
+
+def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floats) -> Floats:
+    """What each Wiener process does to the state after each step of a motion, (N, 2n, k), for given ``jumps``."""
+    scene, n, left = problem.scene, problem.scene.robot.dof, problem.integrator.left
+    q, v, u = trajectory.q, trajectory.v, trajectory.u
+    jump = scene.noise.fields(q[:-1], v[:-1], u, problem.q0).F
+    if not problem.integrator.variational:
+        jump = velocity_at_nodes(scene, q[:-1], v[:-1])[:, :, n:] @ jump
+    g: Floats = left * (jumps @ jump)
+    if left < 1.0:
+        g[:, n:] += (1.0 - left) * scene.noise.fields(q[1:], v[1:], u, problem.q0).F
+    return g
+
+
+def _curvature(problem: OptimalControlProblem, trajectory: Trajectory, plan: _Plan, costate: Floats) -> Floats:
+    """Second derivatives (N, 2n + m, 2n + m) in (x, u) that dynamics and noise fields add to the cost to go."""
+    scene, n, h = problem.scene, problem.scene.robot.dof, problem.dt
+    gradient = problem.expand_running(trajectory).gradient
+    z = costate.copy()
+    if problem.sampling == "midpoint":
+        z[:, :n] += 0.5 * h * gradient[:, :n] + gradient[:, n : 2 * n]
+    second = second_order_steps(scene, trajectory, z, problem.integrator)
+    xx = second.xx.copy()
+    if problem.sampling == "start" and problem.integrator.variational:
+        xx += h * velocity_curvature(scene, trajectory.q[:-1], trajectory.v[:-1], gradient[:, n : 2 * n])
+    if scene.processes and problem.integrator.variational:
+        pull = plan.spread @ impulses(problem, trajectory, plan.jumps)
+        weight = problem.integrator.left * np.swapaxes(plan.jumps, 1, 2) @ pull
+        xx[:, :n, :n] += scene.noise.curvature(weight)
+    return np.concatenate(
+        [np.concatenate([xx, np.swapaxes(second.ux, 1, 2)], axis=2), np.concatenate([second.ux, second.uu], axis=2)],
+        axis=1,
+    )
+
+
+def backward(
+    problem: OptimalControlProblem, trajectory: Trajectory, regularization: float, second_order: bool = False
+) -> _Plan | None:
+    """One backward pass along a motion; None where a control has no minimum.
+
+    Raises:
+        LinearizationError: A step has no derivative.
+    """
+    if not second_order:
+        return _pass(problem, trajectory, regularization)[0]
+    # First derivatives of the cost to go, then with them second derivatives of the dynamics (stagewise Newton).
+    plan, costate = _pass(problem, trajectory, max(regularization, 1e-3), costates=True)
+    if plan is None:
+        return None
+    return _pass(problem, trajectory, regularization, curvature=_curvature(problem, trajectory, plan, costate))[0]
+
+
+def _pass(
+    problem: OptimalControlProblem,
+    trajectory: Trajectory,
+    regularization: float,
+    *,
+    costates: bool = False,
+    curvature: Floats | None = None,
+) -> tuple[_Plan | None, Floats]:
+    scene = problem.scene
+    n, m, k, N, R = scene.robot.dof, scene.controls, scene.processes, problem.steps, problem.decisions
+    size = 2 * n + m
+    value, room = kernels.new_value(n, m), kernels.new_room(n, m)
+    _set_terminal(problem, trajectory, value, curvature is not None)
+    running = problem.expand_running(trajectory)
+    noisy = N if k else 0
+    jumps, spread = np.empty((noisy, 2 * n, n)), np.empty((noisy, 2 * n, 2 * n))
+    feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, 2 * n)), np.empty((R, m))
+    costate = np.empty((N if costates else 0, 2 * n))
+    hessian = running.hessian
+    in_velocity = bool(hessian[:, n : 2 * n].any())
+    at_start = problem.sampling == "start"
+    rule = kernels.START if at_start else kernels.MIDPOINT
+    block = max(1, _BLOCK // problem.hold) * problem.hold
+    for end in range(N, 0, -block):
+        begin = max(0, end - block)
+        part, steps = trajectory.part(begin, end), slice(begin, end)
+        rows = slice(begin // problem.hold, end // problem.hold)
+        lin = _linearize(problem, part, begin)
+        if k:
+            jumps[steps] = lin.J
+        velocity = np.zeros((0, n, 2 * n))
+        if at_start and problem.integrator.variational:
+            velocity = velocity_at_nodes(scene, part.q[:-1], part.v[:-1])
+        failed = kernels.backward_pass(
+            problem.dt,
+            rule,
+            problem.hold,
+            in_velocity,
+            float(regularization),
+            kernels.Steps(
+                A=lin.A,
+                B=np.ascontiguousarray(lin.B),
+                G=lin.G,
+                Gx=lin.Gx,
+                Gu=lin.Gu,
+                gradient=running.gradient[steps],
+                hessian=hessian[steps] if len(hessian) > 1 else hessian,
+                velocity=velocity,
+                curvature=np.zeros((0, size, size)) if curvature is None else curvature[steps],
+            ),
+            value,
+            kernels.Gains(
+                feedforward[rows],
+                feedback[rows],
+                gradient[rows],
+                costate[steps] if costates else costate,
+                spread[steps],
+            ),
+            room,
+        )
+        if failed >= 0:
+            return None, costate
+    if not np.isfinite(value.decrease).all():
+        return None, costate
+    plan = _Plan(feedforward, feedback, gradient, value.decrease[0], value.decrease[1], value.noise[0], jumps, spread)
+    return plan, costate
+
+
+def _linearize(problem: OptimalControlProblem, part: Trajectory, begin: int) -> Linearization:
+    try:
+        return linearize_steps(problem.scene, part, problem.integrator, problem.q0)
+    except LinearizationError as error:
+        step = begin + error.step
+        raise LinearizationError(step, step * problem.dt, error.reason) from None
+
+
+def _set_terminal(problem: OptimalControlProblem, trajectory: Trajectory, value: kernels.Value, exact: bool) -> None:
+    """The terminal cost in x."""
+    n = problem.scene.robot.dof
+    end = problem.expand_terminal(trajectory)
+    x = slice(0, 2 * n)
+    g, H = end.gradient[0, x], end.hessian[0, x, x]
+    if problem.integrator.variational:
+        D = np.eye(2 * n)
+        D[n:] = velocity_at_nodes(problem.scene, trajectory.q[-1:], trajectory.v[-1:])[0]
+        H = D.T @ H @ D
+        if exact:
+            H = H + velocity_curvature(problem.scene, trajectory.q[-1:], trajectory.v[-1:], g[None, n:])[0]
+        g = D.T @ g
+    value.gradient[x] = value.costate[x] = g
+    value.hessian[x, x] = H
