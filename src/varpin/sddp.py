@@ -71,8 +71,8 @@ def solve(
         max_iterations: At most.
 
     Other Args:
-        second_order: Full differential dynamic programming: second derivatives of the dynamics too. Converges
-            quadratically; needs an integrator that has them (:class:`Midpoint`).
+        second_order: Full differential dynamic programming: second derivatives of the dynamics too, wherever they
+            leave the model convex. Converges quadratically; needs an integrator that has them (:class:`Midpoint`).
         forward: ``"closed"``: the feedback gains act in the line search. ``"open"``: only the feed-forward part, as in
             the paper; it diverges where the open loop is unstable over the horizon.
         armijo: The part of the promised slope that a step must keep (the paper's alpha).
@@ -157,6 +157,7 @@ class _Search:
         self.problem, self.second_order, self.forward = problem, second_order, forward
         self.armijo, self.backtracking, self.regularization = armijo, backtracking, regularization
         self.growth = 1.0
+        self.exact = second_order
         self.history: list[Iteration] = []
         self.plan: _Plan | None = None
         self.trajectory: Trajectory
@@ -189,6 +190,10 @@ class _Search:
                 self._note(callback, started, promise, 0.0, passes, 0)
                 return Status.CONVERGED if converged else Status.MAX_ITERATIONS
             step, trials = self._line_search(merit)
+            if step == 0.0 and self.exact:
+                passes += self._plan(exact=False)
+                more = self._line_search(merit)
+                step, trials = more[0], trials + more[1]
             self._note(callback, started, promise, step, passes, trials)
             if step > 0.0:
                 self._relax()
@@ -230,13 +235,21 @@ class _Search:
         self.regularization = max(_LEAST, self.regularization * self.growth)
         return self.regularization <= _MOST
 
-    def _plan(self) -> int:
-        """A backward pass, with as much regularization as it takes; returns how many it took."""
+    def _plan(self, *, exact: bool | None = None) -> int:
+        """A backward pass, with as much regularization as it takes; returns how many it took.
+
+        Second derivatives can make the model indefinite far from an optimum; there they are left out.
+        """
         passes = 0
+        self.exact = self.second_order if exact is None else exact
         while True:
             passes += 1
-            self.plan = backward(self.problem, self.trajectory, self.regularization, self.second_order)
-            if self.plan is not None or not self._stiffen():
+            self.plan = backward(self.problem, self.trajectory, self.regularization, self.exact)
+            if self.plan is not None:
+                return passes
+            if self.exact:
+                self.exact = False
+            elif not self._stiffen():
                 return passes
 
     def _line_search(self, merit: float) -> tuple[float, int]:
@@ -412,7 +425,16 @@ def _pass(
             return None, costate
     if not np.isfinite(value.decrease).all():
         return None, costate
-    plan = _Plan(feedforward, feedback, gradient, value.decrease[0], value.decrease[1], value.noise[0], jumps, spread)
+    plan = _Plan(
+        feedforward,
+        feedback,
+        gradient,
+        float(value.decrease[0]),
+        float(value.decrease[1]),
+        float(value.noise[0]),
+        jumps,
+        spread,
+    )
     return plan, costate
 
 
