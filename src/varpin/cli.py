@@ -92,6 +92,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_simulate(commands.add_parser("simulate", help="integrate a robot in time", allow_abbrev=False))
     _add_inspect(commands.add_parser("inspect", help="look into a robot description", allow_abbrev=False))
+    _add_paper(commands.add_parser("paper", help="reproduce the paper's experiments", allow_abbrev=False))
     return parser
 
 
@@ -148,6 +149,20 @@ def _add_inspect(parser: argparse.ArgumentParser) -> None:
     _add_vector(parser, "q", "configuration to look at [rad or m]; default: 0")
     _add_vector(parser, "v", "velocity there [rad/s or m/s]; default: 0")
     _add_gravity(parser)
+
+
+def _add_paper(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Run the experiments of the paper on stochastic variational integrators and write tables (CSV), figures (PNG) "
+        "and a report (HTML) that holds each of its claims against what came out. What is in the folder already is not "
+        "computed again, so an interrupted run goes on where it stopped."
+    )
+    parser.set_defaults(run=_paper, log_level=logging.ERROR)
+    parser.add_argument("--quick", action="store_true", help="fewer time steps and one setting: about a minute")
+    parser.add_argument(
+        "--out", type=Path, default=Path("paper"), metavar="FOLDER", help="where to write; default: %(default)s"
+    )
+    parser.add_argument("--quiet", action="store_true", help="print nothing but the report's path")
 
 
 def _add_robot(parser: argparse.ArgumentParser) -> None:
@@ -416,6 +431,21 @@ def _inspect(request: argparse.Namespace, _errors: Console) -> int:
     return 0
 
 
+def _paper(request: argparse.Namespace, errors: Console) -> int:
+    from varpin.paper import reproduce  # noqa: PLC0415  (its figures need matplotlib, which takes long to import)
+
+    with _progress(errors, 1, quiet=request.quiet, unit="cells") as report:
+        result = reproduce(request.out, quick=request.quick, progress=lambda done, cells, _: report(done, cells))
+    console = Console() if sys.stdout.isatty() else Console(width=_WIDTH)
+    if not request.quiet:
+        table = _table("Claims", ("verdict", "sentence", "measured"))
+        for claim in result.claims:
+            _row(table, claim.verdict, claim.sentence, claim.measured)
+        console.print(table)
+    _say(console, str(result.page), prefix="")
+    return 0
+
+
 def _one_or_all(numbers: Sequence[float] | None) -> ArrayLike | None:
     return numbers[0] if numbers is not None and len(numbers) == 1 else numbers
 
@@ -491,13 +521,14 @@ class _Bar:
 
     PATIENCE = 10.0  # [s] between lines
 
-    def __init__(self, console: Console, steps: int) -> None:
+    def __init__(self, console: Console, steps: int, unit: str) -> None:
         self._console = console
+        self._unit = unit
         self._bar: Progress | None = None
         self._task: TaskID | None = None
         self._said = time.monotonic()
         if console.is_terminal:
-            columns = (TextColumn("simulating"), BarColumn(), TextColumn("{task.completed}/{task.total} steps"))
+            columns = (TextColumn("varpin"), BarColumn(), TextColumn(f"{{task.completed}}/{{task.total}} {unit}"))
             self._bar = Progress(*columns, TimeRemainingColumn(), console=console, transient=True)
             self._task = self._bar.add_task("", total=steps)
 
@@ -514,18 +545,20 @@ class _Bar:
 
     def __call__(self, done: int, steps: int) -> None:
         if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=done)
+            self._bar.update(self._task, completed=done, total=steps)
         elif time.monotonic() - self._said >= self.PATIENCE:
             self._said = time.monotonic()
-            _say(self._console, f"{done} of {steps} steps")
+            _say(self._console, f"{done} of {steps} {self._unit}")
 
 
 @contextlib.contextmanager
-def _progress(console: Console, steps: int, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
+def _progress(
+    console: Console, steps: int, *, quiet: bool, unit: str = "steps"
+) -> Iterator[Callable[[int, int], None]]:
     if quiet:
         yield lambda _done, _steps: None
         return
-    with _Bar(console, steps) as bar:
+    with _Bar(console, steps, unit) as bar:
         yield bar
 
 

@@ -13,6 +13,7 @@ from varpin.costs import BoundSum, Cost, Expansion, Points, Terminal
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint
 from varpin.lagrangian import lagrangian_jet
+from varpin.policy import LinearPolicy
 from varpin.scene import Scene, require_scene
 from varpin.trajectory import Trajectory
 
@@ -156,6 +157,23 @@ class OptimalControlProblem:
         """The constant control (m,) that comes closest to holding the robot at q0 at rest."""
         force = lagrangian_jet(self.scene, self.q0, np.zeros_like(self.q0)).Lq
         return np.asarray(np.linalg.lstsq(self.scene.actuation, -force, rcond=None)[0], dtype=np.float64)
+
+    def holding_policy(self) -> LinearPolicy:
+        """Holding controls, with feedback that keeps the robot there where every joint can be driven.
+
+        The feedback is M(q0) (omega^2 (q0 - q) - 2 omega v), twice as fast as what falls or swings at q0. Without it
+        rounding alone makes an arm fall over that stands upright.
+        """
+        n, m, R = self.scene.robot.dof, self.scene.controls, self.decisions
+        jet = lagrangian_jet(self.scene, self.q0, np.zeros(n))
+        rates = np.abs(np.linalg.eigvals(np.linalg.solve(jet.Lvv, jet.Lqq)))
+        omega = 2.0 * float(np.sqrt(rates.max())) + 1.0 / self.duration
+        gains = np.zeros((R, m, 2 * n))
+        if np.linalg.matrix_rank(self.scene.actuation) == n and omega * self.dt * self.hold <= 0.25:
+            in_v = np.eye(n) if self.integrator.variational else jet.Lvv
+            gains[:] = -np.linalg.pinv(self.scene.actuation) @ np.hstack([omega**2 * jet.Lvv, 2.0 * omega * in_v])
+        u = np.tile(self.holding_controls(), (R, 1))
+        return LinearPolicy(u, gains, np.tile(np.append(self.q0, np.zeros(n)), (R, 1)), hold=self.hold)
 
     def samples(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
         """Where running costs are taken: q and v (..., N, n), from those at the nodes (..., N + 1, n)."""

@@ -38,8 +38,10 @@ logger = logging.getLogger(__name__)
 
 # Nodes that are linearized at a time: their derivatives are not kept.
 _BLOCK = 2048
-# The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu.
+# The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it shrinks after
+# long steps and grows after short ones.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
+_LONG, _SHORT = 0.5, 0.01
 # Trials of a line search: 0.25^10 is 1e-6.
 _TRIALS = 10
 
@@ -65,7 +67,7 @@ def solve(
 
     Main args:
         problem: What to minimize.
-        controls: To start from: None for those that hold the robot at q0; an array (R, m) or (m,), R the number of
+        controls: To start from: None to hold the robot at q0; an array (R, m) or (m,), R the number of
             decisions; a :class:`LinearPolicy`; or a :class:`Solution`, whose policy then runs on this problem.
         tolerance: Stop when the decrease that the quadratic model promises is below this part of the cost.
         max_iterations: At most.
@@ -118,7 +120,7 @@ def _first_commands(problem: OptimalControlProblem, controls: ArrayLike | Linear
             raise InputError(f"the policy holds its controls over {controls.hold} steps, the problem {problem.hold}")
         return controls.commands(problem.steps, m, problem.scene.robot.dof)
     if controls is None:
-        controls = problem.holding_controls()
+        return problem.holding_policy().commands(problem.steps, m, problem.scene.robot.dof)
     array = np.asarray(controls)
     rows = finite_array("controls", controls, (m,) if array.ndim == 1 else (R, m))
     return _held(np.broadcast_to(rows, (R, m)), problem.hold)
@@ -185,7 +187,8 @@ class _Search:
             # Where the optimum costs nothing, there is nothing to be relative to but where it began.
             scale = abs(merit) + 1e-9 * abs(first)
             promise = -0.5 * self.plan.slope
-            converged = promise <= tolerance * scale
+            # Regularization makes promises smaller; it must not pass for an optimum.
+            converged = promise * (1.0 + self.regularization) <= tolerance * scale
             if converged or len(self.history) >= max_iterations:
                 self._note(callback, started, promise, 0.0, passes, 0)
                 return Status.CONVERGED if converged else Status.MAX_ITERATIONS
@@ -195,12 +198,13 @@ class _Search:
                 more = self._line_search(merit)
                 step, trials = more[0], trials + more[1]
             self._note(callback, started, promise, step, passes, trials)
-            if step > 0.0:
+            if step >= _LONG:
                 self._relax()
-            elif promise <= 1e-12 * scale:
-                return Status.CONVERGED
-            elif not self._stiffen():
-                return Status.STALLED
+            elif step <= _SHORT:
+                if step == 0.0 and promise <= 1e-12 * scale:
+                    return Status.CONVERGED
+                if not self._stiffen():
+                    return Status.STALLED
 
     def _note(
         self, callback: Callback | None, started: float, promise: float, step: float, passes: int, trials: int

@@ -1,0 +1,163 @@
+"""The paper's figures, drawn from what came out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from varpin.paper import cases
+from varpin.paper.cases import CASES, COARSE, COARSEST, MAIN
+from varpin.paper.claims import Cells, cell, series
+from varpin.paper.experiments import OPTIMUM
+from varpin.plots import COLORS
+
+Floats = NDArray[np.float64]
+Motions = Mapping[tuple[str, str, float], tuple[Floats, Floats]]
+
+_METHOD_COLOR = {"variational": COLORS[0], "Euler": COLORS[1], OPTIMUM: COLORS[6]}
+
+
+def draw(cells: Cells, motions: Motions) -> dict[str, tuple[Figure, str]]:
+    """Each figure with its caption, by the name of its file."""
+    steps = sorted({c.dt for c in cells.values()})
+    fine = steps[0]
+    return {
+        "figure1": (_free(motions), "Figure 1 (b), (c): theta_1 without controls in the vertical plane."),
+        "figure2": (
+            _tracking(cells, "1", fine, _cost_over_time),
+            f"Figure 2, case 1: tracking errors at dt = {fine:g} s (dotted) and {COARSE:g} s; cost over time.",
+        ),
+        "figure3": (
+            _tracking(cells, "2", fine, _first_controls),
+            f"Figure 3, case 2: tracking errors at dt = {fine:g} s (dotted) and {COARSE:g} s; first controls, "
+            f"variational, at {fine:g} s (dotted) and {COARSEST:g} s.",
+        ),
+        "figure4": (
+            _tracking(cells, "3", fine, _first_joint),
+            f"Figure 4, case 3: tracking errors at dt = {fine:g} s (dotted) and {COARSE:g} s; theta_1, variational.",
+        ),
+        "figure5": (_cost_over_step(cells), "Figure 5: optimized expected cost over dt; Euler dashed."),
+        "truth": (
+            _truth(cells),
+            "True cost of the plans of case 1 on the continuous system, and the optimum over held controls.",
+        ),
+    }
+
+
+def _free(motions: Motions) -> Figure:
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    for panel, axes in zip("bc", figure.subplots(1, 2), strict=True):
+        for (own, method, dt), (t, q) in motions.items():
+            if own != panel or method == "reference":
+                continue
+            axes.plot(
+                t, q, ":" if dt == cases.FINE else "-", color=_METHOD_COLOR[method], label=f"{method}, dt = {dt:g} s"
+            )
+        reference = motions[panel, "reference", cases.FINE][1]
+        span = np.ptp(reference)
+        axes.set_ylim(reference.min() - 0.4 * span, reference.max() + 0.4 * span)
+        axes.set(
+            xlabel="time [s]",
+            ylabel="theta_1 [rad]",
+            title=f"({panel}) from {'rest' if panel == 'b' else 'velocity [0, 0, 1] rad/s'}",
+        )
+        axes.legend(fontsize=8)
+    return figure
+
+
+def _tracking(cells: Cells, case: str, fine: float, third: Callable[[Axes, Cells, str, float], None]) -> Figure:
+    figure = Figure(figsize=(13, 3.6), layout="constrained")
+    axes = figure.subplots(1, 3)
+    for panel, method in zip(axes[:2], ("Euler", "variational"), strict=True):
+        for dt, dash in ((fine, ":"), (COARSE, "-")):
+            own = cell(cells, MAIN, case, method, dt)
+            if own is None:
+                continue
+            error = own.q - np.array([cases.reference(t) for t in own.t])
+            for joint in range(3):
+                panel.plot(own.t, error[:, joint], dash, color=COLORS[joint], label=f"theta_{joint + 1}, {dt:g} s")
+        panel.set(xlabel="time [s]", ylabel="tracking error [rad]", title=method)
+        panel.legend(fontsize=7, ncols=2)
+    third(axes[2], cells, case, fine)
+    return figure
+
+
+def _cost_over_time(axes: Axes, cells: Cells, case: str, fine: float) -> None:  # noqa: ARG001
+    for method in cases.METHODS:
+        own = series(cells, MAIN, case, method)
+        axes.loglog(
+            [c.seconds for c in own],
+            [c.cost + c.noise_cost for c in own],
+            "o-",
+            color=_METHOD_COLOR[method],
+            label=method,
+        )
+    axes.set(xlabel="time of the search [s]", ylabel="optimized expected cost")
+    axes.legend()
+
+
+def _first_controls(axes: Axes, cells: Cells, case: str, fine: float) -> None:
+    for dt, dash in ((fine, ":"), (COARSEST, "-")):
+        own = cell(cells, MAIN, case, "variational", dt)
+        if own is None:
+            continue
+        shown = own.t[:-1] <= 0.1
+        for joint in range(3):
+            axes.step(
+                own.t[:-1][shown], 1e6 * own.u[shown, joint], dash, where="post", color=COLORS[joint],
+                label=f"u_{joint + 1}, {dt:g} s",
+            )  # fmt: skip
+    axes.set_yscale("symlog", linthresh=10.0)
+    axes.set(xlabel="time [s]", ylabel="control [uN m], logarithmic beyond 10")
+    axes.legend(fontsize=7, ncols=2)
+
+
+def _first_joint(axes: Axes, cells: Cells, case: str, fine: float) -> None:
+    for dt, dash in ((fine, ":"), (COARSE, "-")):
+        own = cell(cells, MAIN, case, "variational", dt)
+        if own is not None:
+            axes.plot(own.t, own.q[:, 0], dash, color=COLORS[0], label=f"dt = {dt:g} s")
+    t = np.linspace(0.0, cases.DURATION, 301)
+    axes.plot(t, [cases.reference(x)[0] for x in t], color="0.6", lw=1, label="reference", zorder=0)
+    axes.set(xlabel="time [s]", ylabel="theta_1 [rad]")
+    axes.legend(fontsize=8)
+
+
+def _cost_over_step(cells: Cells) -> Figure:
+    figure = Figure(figsize=(13, 3.6), layout="constrained")
+    for axes, case in zip(figure.subplots(1, 3), CASES, strict=True):
+        for method in cases.METHODS:
+            own = series(cells, MAIN, case.key, method)
+            axes.loglog(
+                [c.dt for c in own],
+                [c.cost + c.noise_cost for c in own],
+                "s--" if method == "Euler" else "o-",
+                color=_METHOD_COLOR[method],
+                label=method,
+            )
+        axes.set(xlabel="dt [s]", ylabel="optimized expected cost", title=f"case {case.key}: {case.title}")
+        axes.legend()
+    return figure
+
+
+def _truth(cells: Cells) -> Figure:
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for method in (*cases.METHODS, OPTIMUM):
+        own = series(cells, MAIN, "0", method)
+        dts = [c.dt for c in own]
+        label = "optimum over held controls" if method == OPTIMUM else method
+        axes.loglog(dts, [c.open_loop for c in own], "o-", color=_METHOD_COLOR[method], label=f"{label}, open loop")
+        if method != OPTIMUM:
+            axes.loglog(
+                dts, [c.closed_loop for c in own], "^:", color=_METHOD_COLOR[method], label=f"{label}, with feedback"
+            )
+    best = [c.true_cost for c in series(cells, MAIN, "0", OPTIMUM)]
+    axes.set_ylim(0.5 * min(best), 1e6 * min(best))
+    axes.set(xlabel="dt [s]", ylabel="true cost")
+    axes.legend(fontsize=8)
+    return figure

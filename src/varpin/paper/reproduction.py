@@ -1,0 +1,52 @@
+"""Everything together: cells, claims, figures, report."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from varpin.checks import path_like
+from varpin.errors import FileError
+from varpin.paper.claims import Claim, assess, free_motions
+from varpin.paper.experiments import Progress, fill
+from varpin.paper.figures import draw
+from varpin.paper.report import write
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """What was written.
+
+    Attributes:
+        page: The HTML report.
+        claims: Each sentence with its verdict.
+    """
+
+    page: Path
+    claims: tuple[Claim, ...]
+
+
+def reproduce(folder: str | os.PathLike[str], *, quick: bool = False, progress: Progress | None = None) -> Reproduction:
+    """Run the paper's experiments and write PNG, CSV and one HTML report.
+
+    What an earlier run left in the folder is not computed again; Ctrl-C loses one cell at most.
+
+    Args:
+        folder: Where to write; made if it is not there.
+        quick: Four time steps and the main setting alone.
+        progress: Called with (cells done, cells in all, the next one's name).
+
+    Raises:
+        FileError: The folder cannot be made or written.
+    """
+    target = path_like("folder", folder)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"cannot make the folder {target}: {error.strerror}") from None
+    cells = fill(target / "cells", quick=quick, progress=progress)
+    motions = free_motions()
+    claims = assess(cells, motions)
+    page = write(target, cells, claims, draw(cells, motions), quick=quick)
+    return Reproduction(page, tuple(claims))
