@@ -357,7 +357,7 @@ class TestScene:
         ("value", "words"),
         [
             ([0.0, np.nan], "[1] is nan; it must be finite"),
-            (np.inf, "[0] is inf; it must be finite"),
+            (np.inf, " is inf; it must be finite"),
             ([1, 2, 3], " must be one number or have shape (2,), got (3,)"),
             ([[1, 2]], " must be one number or have shape (2,), got (1, 2)"),
             *((value, " " + words) for value, words in NOT_NUMBERS),

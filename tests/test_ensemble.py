@@ -34,7 +34,7 @@ def blocks_of(monkeypatch, numbers):
 
 
 def numbers_a_step(scene, paths):
-    return paths * (4 * scene.robot.dof + scene.controls + scene.processes + 8)
+    return paths * (2 * scene.robot.dof + 1)
 
 
 @pytest.mark.parametrize("kick", ["left", "split"])

@@ -5,6 +5,7 @@ import pytest
 
 import varpin as vp
 from varpin.noise import bind
+from varpin.simulation import NoiseError
 
 # Three coordinates, two controls: one joint is not actuated, and a control moves two joints.
 ACTUATION = np.array([[1.0, 0.0], [0.0, 0.0], [0.5, 2.0]])
@@ -174,7 +175,11 @@ def test_state_noise_is_centred_on_the_start_of_the_motion():
         (lambda: vp.ControlNoise([[1.0]]), r"ControlNoise intensity must be one number .* got \(1, 1\)"),
         (lambda: vp.ControlNoise(np.full((3, 1, 2), np.nan)), r"ControlNoise intensity\[0, 0, 0\] is nan"),
         (lambda: vp.StateNoise(np.ones(4)), r"StateNoise intensity must be .* shape \(3,\), got \(4,\)"),
-        (lambda: vp.StateNoise(np.nan), r"StateNoise intensity\[0\] is nan; it must be finite"),
+        (lambda: vp.AdditiveNoise(np.nan), "AdditiveNoise intensity is nan; it must be finite"),
+        (lambda: vp.ControlNoise(np.nan), "ControlNoise intensity is nan; it must be finite"),
+        (lambda: vp.StateNoise(np.nan), "StateNoise intensity is nan; it must be finite"),
+        (lambda: vp.StateNoise([1.0, 0.0, np.nan]), r"StateNoise intensity\[2\] is nan; it must be finite"),
+        (lambda: vp.StateNoise(1.0, center=np.nan), "StateNoise center is nan; it must be finite"),
         (lambda: vp.StateNoise(1.0, center=[0.0, 1.0]), r"StateNoise center must be .* shape \(3,\), got \(2,\)"),
         (lambda: vp.StateNoise(1.0, center=[0.0, np.inf, 0.0]), r"StateNoise center\[1\] is inf; it must be finite"),
         (lambda: 3.0, "noise must be a varpin noise model or several of them, got float"),
@@ -248,8 +253,76 @@ def test_what_a_field_returns_is_checked(slots, message):
     with pytest.raises(vp.InputError, match=message):
         chain(vp.CustomNoise(**slots, check=True))
     scene = chain(vp.CustomNoise(**slots))
-    with pytest.raises(vp.InputError, match=message):
+    with pytest.raises(NoiseError, match=rf"step 0 \(t = 0 s\): {message}"):
         vp.simulate(scene, [0, 0], [0, 0], dt=0.01, steps=3, rng=0)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Midpoint(kick="split"), vp.RungeKutta4()], ids=str)
+@pytest.mark.parametrize("slot", ["field", "dv"])
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.eye(5), r"must have shape \(2, 2.*\), got \(5, 5\)"),
+        (None, "must be an array of real numbers, got None"),
+        ("nan", r"\[0, 0.*\] is nan; it must be finite"),
+        (ZeroDivisionError("no field"), r"raised ZeroDivisionError\('no field'\)"),
+    ],
+)
+def test_a_field_that_fails_on_the_way_leaves_the_motion_so_far(integrator, slot, value, message):
+    good = {"field": np.eye(2) * 0.1, "dv": np.zeros((2, 2, 2))}
+    calls = []
+
+    def function(q, v, u):
+        calls.append(q)
+        # Split kicks take the field twice a step: at its start, and at its end.
+        if len(calls) <= (7 if integrator.left == 1.0 else 14) or not failing:
+            return good[slot]
+        if isinstance(value, Exception):
+            raise value
+        return np.full_like(good[slot], np.nan) if isinstance(value, str) else value
+
+    slots = {"field": lambda q, v, u: good["field"], "dv": lambda q, v, u: good["dv"]} | {slot: function}
+    policy = vp.LinearPolicy(np.full((5, 2), 0.2), np.full((5, 2, 4), -0.1), np.zeros((5, 4)), hold=4)
+    scene = chain(vp.AdditiveNoise(0.1) + vp.CustomNoise(processes=2, **slots))
+    options = {"dt": 0.01, "steps": 20, "rng": 0, "controls": policy, "integrator": integrator}
+    failing = False
+    whole = vp.simulate(scene, [0.3, 0.2], [0, 1], **options)
+    failing = True
+    calls.clear()
+    with pytest.raises(
+        NoiseError, match=rf"step 7 \(t = 0.07 s\): CustomNoise {slot}\(q, v, u\).*{message}; what"
+    ) as info:
+        vp.simulate(scene, [0.3, 0.2], [0, 1], **options)
+    error = info.value
+    assert isinstance(error, vp.VarpinError)
+    assert (error.step, error.time, error.trajectory.steps) == (7, pytest.approx(0.07), 7)
+    for name in ("q", "v", "p", "energy", "u", "dw"):
+        own = getattr(error.trajectory, name)
+        assert own.tobytes() == getattr(whole, name)[: len(own)].tobytes()
+    assert np.array_equal(error.trajectory.u[0], error.trajectory.u[3])
+    assert error.__cause__ is (value if isinstance(value, Exception) else None)
+
+
+def test_ctrl_c_in_a_field_is_no_noise_error():
+    calls = []
+
+    def field(q, v, u):
+        calls.append(q)
+        if len(calls) > 3:
+            raise KeyboardInterrupt
+        return np.eye(2)
+
+    with pytest.raises(vp.Interrupted) as info:
+        vp.simulate(chain(vp.CustomNoise(field, 2)), [0, 0], [0, 0], dt=0.01, steps=20, rng=0)
+    assert info.value.trajectory.steps == 3
+
+
+def test_a_field_that_raises_is_named_when_it_is_checked():
+    def field(q, v, u):
+        raise ZeroDivisionError("no field")
+
+    with pytest.raises(vp.InputError, match=r"CustomNoise field\(q, v, u\) raised ZeroDivisionError\('no field'\)"):
+        chain(vp.CustomNoise(field, 2, check=True))
 
 
 def test_a_field_cannot_reach_into_the_motion():

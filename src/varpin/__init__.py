@@ -62,6 +62,7 @@ from varpin.scene import Scene as Scene
 from varpin.sddp import solve as solve
 from varpin.simulation import ControlError as ControlError
 from varpin.simulation import Interrupted as Interrupted
+from varpin.simulation import NoiseError as NoiseError
 from varpin.simulation import StepFailure as StepFailure
 from varpin.simulation import simulate as simulate
 from varpin.solution import MonteCarlo as MonteCarlo

@@ -38,7 +38,7 @@ def broadcast_array(name: str, value: ArrayLike, size: int) -> Floats:
     array = as_floats(name, value)
     if array.shape not in ((), (size,)):
         raise InputError(f"{name} must be one number or have shape ({size},), got {array.shape}")
-    return require_finite(name, np.array(np.broadcast_to(array, (size,))))
+    return np.array(np.broadcast_to(require_finite(name, array), (size,)))
 
 
 def as_floats(name: str, value: ArrayLike) -> Floats:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import as_floats, count, finite_array, positive, require_finite
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Segment
-from varpin.integrators.base import rows
+from varpin.integrators.base import Failure, rows
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
 from varpin.policy import LinearPolicy
@@ -26,9 +26,10 @@ Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-# Paths that one kernel call takes, and how many numbers a block of nodes may hold.
+# Paths that one kernel call takes, and how many numbers a block of nodes and a part of it to be reduced may hold.
 _GROUP = 32
-_BLOCK = 8_000_000
+_BLOCK = 4_000_000
+_SPAN = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,15 +164,15 @@ def simulate_ensemble(
     _require_memory(scene, steps, paths if store else 0)
     commands = commands_of(scene, controls, steps)
     run = _Run(scene, integrator, dt, start, rng, commands)
-    collector = _Collector(steps, levels, run, store)
-    block = min(steps, _BLOCK // (paths * (4 * n + scene.controls + scene.processes + 8)))
+    block = min(steps, _BLOCK // (paths * (2 * n + 1)))
     block = max(1, block // commands.hold) * commands.hold
+    collector = _Collector(steps, block, levels, run, store)
     with announced_compilation(), ThreadPoolExecutor(workers) as pool:
         try:
-            collector.add_first(run.first)
+            run.begin(collector, pool)
             for begin in range(0, steps, block):
                 end = min(steps, begin + block)
-                collector.add(begin, end, *run.advance(begin, end, pool))
+                run.advance(begin, end, collector, pool)
                 if progress is not None:
                     progress(end, steps)
                 if not run.alive.any():
@@ -226,38 +227,46 @@ class _Run:
         self.failures: list[PathFailure] = []
         self.groups = [slice(a, min(a + _GROUP, self.paths)) for a in range(0, self.paths, _GROUP)]
         self.states = []
-        self.first: list[Segment] = []
+        self.first: list[list[Segment]] = []
         for group in self.groups:
             state, first = integrator.start(scene, start[0][group], start[1][group])
             self.states.append(state)
-            self.first += first
+            self.first.append(first)
 
-    def advance(self, begin: int, end: int, pool: ThreadPoolExecutor) -> tuple[list[Segment], NDArray[np.int64]]:
-        """Steps begin .. end of every path, and how many of them each path did: none once it has failed."""
+    def begin(self, collector: _Collector, pool: ThreadPoolExecutor) -> None:
+        """The first node of every path."""
+        for number, segments in enumerate(self.first):
+            collector.put(0, number, segments, [1] * len(segments))
+        collector.reduce(0, 1, np.ones(self.paths, dtype=np.int64), pool)
+
+    def advance(self, begin: int, end: int, collector: _Collector, pool: ThreadPoolExecutor) -> None:
+        """Steps begin .. end of every path; a path that has failed does none."""
         decisions = rows(self.commands, begin // self.commands.hold, end // self.commands.hold)
 
-        def work(number: int) -> list[Segment]:
+        def work(number: int) -> list[tuple[int, Failure | None]]:
             group = self.groups[number]
-            shape = (end - begin, self.scene.processes)
-            drawn = np.array([generator.normal(size=shape) for generator in self.generators[group]])
-            increments = np.sqrt(self.dt) * drawn
-            return self.integrator.rollout(self.scene, self.states[number], decisions, increments, self.dt)
+            increments = np.empty((group.stop - group.start, end - begin, self.scene.processes))
+            for drawn, child in zip(increments, self.generators[group], strict=True):
+                child.standard_normal(out=drawn)
+            increments *= np.sqrt(self.dt)
+            segments = self.integrator.rollout(self.scene, self.states[number], decisions, increments, self.dt)
+            done = [len(segment.q) * int(alive) for segment, alive in zip(segments, self.alive[group], strict=True)]
+            collector.put(begin + 1, number, segments, done)
+            return [(k, segment.failure) for k, segment in zip(done, segments, strict=True)]
 
-        segments = [segment for part in pool.map(work, range(len(self.groups))) for segment in part]
-        done = np.zeros(self.paths, dtype=np.int64)
+        outcomes = [outcome for part in pool.map(work, range(len(self.groups))) for outcome in part]
+        collector.reduce(begin + 1, end + 1, np.array([done for done, _ in outcomes]), pool)
         for path in np.flatnonzero(self.alive):
-            segment = segments[path]
-            done[path] = len(segment.q)
-            if segment.failure is not None:
+            done, failure = outcomes[path]
+            if failure is not None:
                 self.alive[path] = False
-                self.failures.append(PathFailure(int(path), begin + len(segment.q), segment.failure.reason))
-        return segments, done
+                self.failures.append(PathFailure(int(path), begin + done, failure.reason))
 
 
 class _Collector:
     """Puts blocks of nodes into statistics and, if asked, into arrays of all paths."""
 
-    def __init__(self, steps: int, levels: Floats, run: _Run, store: bool) -> None:
+    def __init__(self, steps: int, block: int, levels: Floats, run: _Run, store: bool) -> None:
         self.run, self.levels = run, levels
         n, m, P = run.scene.robot.dof, run.scene.controls, run.paths
         self.done = 0
@@ -266,47 +275,53 @@ class _Collector:
         self.quantiles = np.full((len(levels), steps + 1, 2 * n), np.nan)
         self.energy = np.full((2, steps + 1), np.nan)
         self.count = np.zeros(steps + 1, dtype=np.int64)
+        # A block of nodes of each group of paths, paths last: statistics run over them.
+        self.blocks = [np.empty((block, 2 * n + 1, group.stop - group.start)) for group in run.groups]
         shapes = {"q": n, "v": n, "p": n}
         self.stored = {name: np.full((P, steps + 1, size), np.nan) for name, size in shapes.items()} if store else {}
         if store:
             self.stored |= {"energy": np.full((P, steps + 1), np.nan), "u": np.full((P, steps, m), np.nan)}
 
-    def add_first(self, segments: list[Segment]) -> None:
-        self._enter(slice(0, 1), segments, np.ones(len(segments), dtype=np.int64))
+    def put(self, first: int, number: int, segments: list[Segment], done: list[int]) -> None:
+        """Nodes of a group from node ``first`` on, ``done[i]`` of its i-th path; threads may put other groups."""
+        n = self.run.scene.robot.dof
+        momentum = self.run.integrator.variational
+        for i, (segment, k) in enumerate(zip(segments, done, strict=True)):
+            x = self.blocks[number][:k, :, i]
+            x[:, :n], x[:, n:-1] = segment.q[:k], (segment.p if momentum else segment.v)[:k]
+            x[:, -1] = segment.energy[:k]
+            for name, array in self.stored.items():
+                # The control that leads to a node stands one row before it, and none leads to the first.
+                row = first - 1 if name == "u" else first
+                if row >= 0:
+                    array[self.run.groups[number].start + i, row : row + k] = getattr(segment, name)[:k]
 
-    def add(self, begin: int, end: int, segments: list[Segment], done: NDArray[np.int64]) -> None:
-        """Steps begin .. end, of which path i did the first ``done[i]``."""
-        if self.stored:
-            for path, segment in enumerate(segments):
-                self.stored["u"][path, begin : begin + done[path]] = segment.u[: done[path]]
-        self._enter(slice(begin + 1, end + 1), segments, done)
-
-    def _enter(self, nodes: slice, segments: list[Segment], done: NDArray[np.int64]) -> None:
-        velocity = "p" if self.run.integrator.variational else "v"
-        for path, segment in enumerate(segments):
-            for name in ("q", "v", "p", "energy") if self.stored else ():
-                self.stored[name][path, nodes.start : nodes.start + done[path]] = getattr(segment, name)[: done[path]]
+    def reduce(self, first: int, last: int, done: NDArray[np.int64], pool: ThreadPoolExecutor) -> None:
+        """Statistics of nodes first .. last, which have been put; path i has the first ``done[i]`` of them."""
+        size = max(1, _SPAN // (self.run.paths * self.mean.shape[1]))
+        spans = []
+        begin = 0
         # Between two nodes at which paths fail, the same paths are counted.
-        first = 0
-        for last in np.unique(done[done > 0]):
-            counted = [segment for segment, k in zip(segments, done, strict=True) if k >= last]
-            self._reduce(
-                slice(nodes.start + first, nodes.start + last),
-                np.array([np.hstack([s.q[first:last], getattr(s, velocity)[first:last]]) for s in counted]),
-                np.array([s.energy[first:last] for s in counted]),
-            )
-            first = last
-        self.done = nodes.stop - 1
+        for end in np.unique(done[done > 0]):
+            spans += [(a, min(a + size, end), done >= end) for a in range(begin, end, size)]
+            begin = end
+        list(pool.map(lambda span: self._reduce(first, *span), spans))
+        self.done = last - 1
 
-    def _reduce(self, nodes: slice, x: Floats, energy: Floats) -> None:
-        """Statistics of x (P, N, 2n) and of the energy (P, N)."""
-        self.mean[nodes] = x.mean(axis=0)
-        deviation = x - self.mean[nodes]
-        self.covariance[nodes] = np.einsum("Pja,Pjb->jab", deviation, deviation) / max(1, len(x) - 1)
-        self.quantiles[:, nodes] = np.quantile(x, self.levels, axis=0)
-        self.energy[0, nodes] = energy.mean(axis=0)
-        self.energy[1, nodes] = energy.std(axis=0, ddof=len(x) > 1)
-        self.count[nodes] = len(x)
+    def _reduce(self, first: int, begin: int, end: int, counted: NDArray[np.bool_]) -> None:
+        """Statistics of nodes begin .. end of the blocks, which start at node ``first``, over the paths counted."""
+        nodes = slice(first + begin, first + end)
+        block = np.concatenate([part[begin:end] for part in self.blocks], axis=2)
+        if not counted.all():
+            block = np.compress(counted, block, axis=2)
+        x, energy, paths = block[:, :-1], block[:, -1], block.shape[2]
+        self.mean[nodes] = x.mean(axis=2)
+        deviation = x - self.mean[nodes, :, None]
+        self.covariance[nodes] = np.einsum("jaP,jbP->jab", deviation, deviation) / max(1, paths - 1)
+        self.quantiles[:, nodes] = np.quantile(x, self.levels, axis=2)
+        self.energy[0, nodes] = energy.mean(axis=1)
+        self.energy[1, nodes] = energy.std(axis=1, ddof=paths > 1)
+        self.count[nodes] = paths
 
     def ensemble(self) -> Ensemble:
         nodes = slice(0, self.done + 1)

@@ -306,7 +306,11 @@ class CustomFields(BoundNoise):
         return self.noise.dv is not None
 
     def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:  # noqa: ARG002
-        """See :meth:`BoundNoise.fields`."""
+        """See :meth:`BoundNoise.fields`.
+
+        Raises:
+            InputError: A function raised, or returned something that is no field.
+        """
         shape = (self.n, self.processes)
         # Copies: a field that writes into its arguments must not reach the state of a motion.
         points = list(zip(q.copy(), v.copy(), u.copy(), strict=True))
@@ -323,7 +327,15 @@ class CustomFields(BoundNoise):
     ) -> Floats:
         if function is None:
             return np.zeros((len(points), *shape))
-        return np.array([finite_array(f"CustomNoise {name}(q, v, u)", function(*point), shape) for point in points])
+        return np.array([self._call(f"CustomNoise {name}(q, v, u)", function, point, shape) for point in points])
+
+    @staticmethod
+    def _call(name: str, function: Field, point: tuple[Floats, Floats, Floats], shape: tuple[int, ...]) -> Floats:
+        try:
+            value = function(*point)
+        except Exception as error:
+            raise InputError(f"{name} raised {error!r}") from error
+        return finite_array(name, value, shape)
 
     def check(self) -> None:
         """Hold the derivatives against central differences at three seeded random points.

@@ -60,6 +60,22 @@ class ControlError(VarpinError, ValueError):
         super().__init__(f"step {step} (t = {time:.6g} s): {problem}; what came before is in error.trajectory")
 
 
+class NoiseError(VarpinError, ValueError):
+    """A function of a custom noise raised, or returned something that is no field.
+
+    Attributes:
+        step: Index of the step it was called in.
+        time: The start of that step [s].
+        trajectory: What was computed before.
+    """
+
+    def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory) -> None:
+        self.step = step
+        self.time = time
+        self.trajectory = trajectory
+        super().__init__(f"step {step} (t = {time:.6g} s): {problem}; what came before is in error.trajectory")
+
+
 class StepFailure(VarpinError, RuntimeError):
     """The step equation could not be solved on its principal branch.
 
@@ -191,6 +207,7 @@ def simulate(
     Raises:
         InputError: Wrong shapes, values that are not finite, dt <= 0, steps < 0.
         ControlError: The control function returned something unusable; holds the trajectory so far.
+        NoiseError: A function of a CustomNoise did; holds the trajectory so far.
         StepFailure: A step has no trustworthy solution; holds the trajectory so far.
         SingularMassMatrix: M(q0) is not positive definite.
         Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt.
@@ -212,20 +229,28 @@ def simulate(
         state, (start,) = integrator.start(scene, q0[None], v0[None])
         record = _Record(scene, integrator, dt, steps, dw, start)
         chunk = max(1, _CHUNK // n)
+        # One step at a time where Python functions are called, so that what came before one that fails is recorded.
+        stepwise = law is not None or scene.noise.diffusion is None
         try:
             while record.steps < steps:
                 if law is not None:
                     block = open_loop(_sample(law, sampling, integrator, state, record))
+                elif stepwise:
+                    block = _next(commands, record)
                 else:
                     first = record.steps // commands.hold
                     block = rows(commands, first, first + max(1, chunk // commands.hold))
                 drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
-                (segment,) = integrator.rollout(scene, state, block, drawn, dt)
+                try:
+                    (segment,) = integrator.rollout(scene, state, block, drawn, dt)
+                except InputError as error:
+                    now = record.trajectory()
+                    raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
                 record.add(segment)
                 if segment.failure is not None:
                     node = record.trajectory()
                     raise StepFailure(node.steps, node.t[-1], segment.failure, node)
-                if progress is not None and (law is None or record.steps % chunk == 0 or record.steps == steps):
+                if progress is not None and (not stepwise or record.steps % chunk == 0 or record.steps == steps):
                     progress(record.steps, steps)
         except KeyboardInterrupt:
             raise Interrupted(record.trajectory()) from None
@@ -281,6 +306,14 @@ def control_rows(scene: Scene, controls: ArrayLike | None, steps: int) -> Floats
     if array.shape != shape and array.shape != shape[1:]:
         raise InputError(f"controls must have shape {shape}, one row a step, or {shape[1:]}, got {array.shape}")
     return np.ascontiguousarray(np.broadcast_to(require_finite("controls", array), shape))
+
+
+def _next(commands: Commands, record: _Record) -> Commands:
+    """The command of the next step alone: a decision, or the control of the last one while it is held."""
+    decision, held = divmod(record.steps, commands.hold)
+    if held:
+        return open_loop(record.u[record.steps - 1 : record.steps])
+    return rows(commands, decision, decision + 1)._replace(hold=1)
 
 
 def _sample(law: ControlLaw, sampling: str, integrator: Integrator, state: Any, record: _Record) -> Floats:

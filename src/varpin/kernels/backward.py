@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from varpin.kernels._compile import inlined, kernel
-from varpin.kernels.linalg import factor_ldl, solve_ldl
+from varpin.kernels.linalg import factor_ldl, solve_ldl, solve_ldl_rows
 from varpin.kernels.tree import Floats
 
 # Where the running cost of a step is sampled.
@@ -94,23 +94,25 @@ def new_room(dof: int, controls: int) -> Room:
 
 @inlined
 def add_congruence(J: Floats, W: Floats, rows: int, scale: float, T: Floats, Q: Floats) -> None:
-    """Q += scale J' W J for the leading ``rows`` rows of J and of the symmetric W."""
+    """Q += scale J' W J for the leading ``rows`` rows of J and of W.
+
+    Whole rows at a time, which the processor takes several entries of at once; zeros of W and J cost nothing.
+    """
     size = Q.shape[0]
     for i in range(rows):
         for c in range(size):
-            total = 0.0
-            for j in range(rows):
-                total += W[i, j] * J[j, c]
-            T[i, c] = total
-    for c in range(size):
-        for r in range(c + 1):
-            total = 0.0
-            for i in range(rows):
-                total += J[i, r] * T[i, c]
-            total *= scale
-            Q[r, c] += total
-            if r != c:
-                Q[c, r] += total
+            T[i, c] = 0.0
+        for j in range(rows):
+            weight = scale * W[i, j]
+            if weight != 0.0:
+                for c in range(size):
+                    T[i, c] += weight * J[j, c]
+    for i in range(rows):
+        for r in range(size):
+            factor = J[i, r]
+            if factor != 0.0:
+                for c in range(size):
+                    Q[r, c] += factor * T[i, c]
 
 
 @inlined
@@ -134,11 +136,13 @@ def add_running_cost(steps: Steps, s: int, rule: int, h: float, in_velocity: boo
                     D[n + i, c] = steps.velocity[s, i, c] if c < x else 0.0
     rows = x if in_velocity else n
     for c in range(size):
-        total = g[c] if c >= x else 0.0
-        for i in range(x):
-            total += D[i, c] * g[i]
-        Qz[c] += h * total
-        room.costate[c] += h * total
+        room.row[c] = g[c] if c >= x else 0.0
+    for i in range(x):
+        for c in range(size):
+            room.row[c] += D[i, c] * g[i]
+    for c in range(size):
+        Qz[c] += h * room.row[c]
+        room.costate[c] += h * room.row[c]
     add_congruence(D, H, rows, h, T, Q)
     for r in range(x, size):
         for c in range(x, size):
@@ -220,13 +224,11 @@ def decide(regularization: float, r: int, value: Value, gains: Gains, room: Room
     solve_ldl(Quu, row[:m], solved[:m])
     for i in range(m):
         gains.feedforward[r, i] = solved[i]
-    for c in range(x):
-        for i in range(m):
-            row[i] = -Q[x + i, c]
-        solve_ldl(Quu, row[:m], solved[:m])
-        for i in range(m):
-            gains.feedback[r, i, c] = solved[i]
     K, k = gains.feedback[r], gains.feedforward[r]
+    for i in range(m):
+        for c in range(x):
+            K[i, c] = -Q[x + i, c]
+    solve_ldl_rows(Quu, K)
     for i in range(m):
         total = 0.0
         for j in range(m):
@@ -235,23 +237,23 @@ def decide(regularization: float, r: int, value: Value, gains: Gains, room: Room
         value.decrease[1] += k[i] * total
         row[i] = total + Qz[x + i]
     for c in range(x):
-        total = Qz[c]
-        for i in range(m):
-            total += K[i, c] * row[i] + Q[x + i, c] * k[i]
-        value.gradient[c] = total
+        value.gradient[c] = Qz[c]
         value.costate[c] = room.costate[c]
     # Vxx = Qxx + K'(Quu K + Qux) + Qux'K, whatever the regularization.
-    for c in range(x):
+    T = room.T
+    for i in range(m):
+        for c in range(x):
+            value.gradient[c] += K[i, c] * row[i] + Q[x + i, c] * k[i]
+            T[i, c] = Q[x + i, c]
+        for j in range(m):
+            for c in range(x):
+                T[i, c] += Q[x + i, x + j] * K[j, c]
+    for b in range(x):
+        for c in range(x):
+            value.hessian[b, c] = Q[b, c]
         for i in range(m):
-            total = Q[x + i, c]
-            for j in range(m):
-                total += Q[x + i, x + j] * K[j, c]
-            solved[i] = total
-        for b in range(x):
-            total = Q[b, c]
-            for i in range(m):
-                total += K[i, b] * solved[i] + Q[x + i, b] * K[i, c]
-            value.hessian[b, c] = total
+            for c in range(x):
+                value.hessian[b, c] += K[i, b] * T[i, c] + Q[x + i, b] * K[i, c]
     for c in range(x):
         for b in range(c):
             mean = 0.5 * (value.hessian[b, c] + value.hessian[c, b])
@@ -296,11 +298,13 @@ def backward_pass(
         for c in range(size):
             Qz[c] = value.gradient[c] if c >= x else 0.0
             room.costate[c] = value.costate[c] if c >= x else 0.0
-            for r in range(size):
-                Q[r, c] = 0.0
-            for i in range(x):
+        for i in range(x):
+            for c in range(size):
                 Qz[c] += J[i, c] * value.gradient[i]
                 room.costate[c] += J[i, c] * value.costate[i]
+        for r in range(size):
+            for c in range(size):
+                Q[r, c] = 0.0
         if steps.curvature.shape[0] > 0:
             for r in range(size):
                 for c in range(size):

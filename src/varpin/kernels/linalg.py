@@ -78,6 +78,25 @@ def solve_ldl(ldl: Floats, b: Floats, x: Floats) -> None:
 
 
 @inlined
+def solve_ldl_rows(ldl: Floats, b: Floats) -> None:
+    """The X with L D L' X = b (n, k), in place, whole rows at a time."""
+    n, k = b.shape
+    for i in range(n):
+        for j in range(i):
+            factor = ldl[i, j]
+            for c in range(k):
+                b[i, c] -= factor * b[j, c]
+    for i in range(n - 1, -1, -1):
+        inverse = 1.0 / ldl[i, i]
+        for c in range(k):
+            b[i, c] *= inverse
+        for j in range(i + 1, n):
+            factor = ldl[j, i]
+            for c in range(k):
+                b[i, c] -= factor * b[j, c]
+
+
+@inlined
 def quadratic_form(a: Floats, x: Floats) -> float:
     """X' a x."""
     total = 0.0

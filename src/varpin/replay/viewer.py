@@ -13,7 +13,7 @@ import math
 import re
 import warnings
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,17 +42,20 @@ _MARGIN = 1.1
 # meshcat's grid has 40 x 40 cells of 0.5 m, its axes are 0.5 m long.
 _GRID_CELL = 0.5
 
+# A colour that neither robots nor the background have.
+_GHOST_COLOR, _GHOST_OPACITY = 0x1450D2, 0.35
+
 _ROD, _JOINT, _CENTER = (0.45, 0.52, 0.6, 1.0), (0.85, 0.45, 0.15, 1.0), (0.15, 0.35, 0.65, 1.0)
 
 
-def write_page(path: Path, robot: Robot, times: Floats, positions: Floats, loop: bool) -> Path:
+def write_page(path: Path, robot: Robot, times: Floats, positions: Mapping[str, Floats], loop: bool) -> Path:
     """Write keyframes as one self-contained HTML file.
 
     Args:
         path: Of the file.
         robot: The arm.
         times: Of the keyframes (K,) [s of playback].
-        positions: Of every joint of the tree (K, b) [rad or m].
+        positions: Of every joint of the tree (K, b) [rad or m], of "robot" and, if there is one, of its "ghost".
         loop: Start again at the end.
     """
     page = _Page()
@@ -62,7 +65,7 @@ def write_page(path: Path, robot: Robot, times: Floats, positions: Floats, loop:
     return path
 
 
-def show(robot: Robot, times: Floats, positions: Floats, loop: bool) -> meshcat.Visualizer:
+def show(robot: Robot, times: Floats, positions: Mapping[str, Floats], loop: bool) -> meshcat.Visualizer:
     """Draw keyframes, as :func:`write_page` takes them, in a new meshcat server; point a web browser to it."""
     with contextlib.redirect_stdout(io.StringIO()):
         viewer = meshcat.Visualizer()
@@ -175,13 +178,12 @@ class _Picture:
             [pin.SE3(turns[shape.parentJoint].T, np.zeros(3)) * shape.placement for shape in shapes],
         )
 
-    @property
-    def moving_nodes(self) -> list[str]:
-        """Scene path of each body (b,)."""
+    def moving_nodes(self, root: str) -> list[str]:
+        """Scene path of each body (b,) below a root."""
         names = [_label(name) for name in self.robot.free_model.names[1:]]
         nodes: list[str] = []
         for name, parent in zip(names, self.robot.tree.parent, strict=True):
-            nodes.append(f"{nodes[parent] if parent >= 0 else 'robot'}/{name}/moving")
+            nodes.append(f"{nodes[parent] if parent >= 0 else root}/{name}/moving")
         return nodes
 
     def body_poses(self, positions: Floats) -> tuple[Floats, Floats]:
@@ -303,6 +305,24 @@ class _ShapeLoader(MeshcatVisualizer):
             logger.warning("%s; it is not drawn", " ".join(problems))
         self.viewer[node].set_transform(placement.homogeneous @ np.diag([*scale, 1.0]))
 
+    def load_ghost(self, shape: pin.GeometryObject, placement: pin.SE3, node: str) -> None:
+        """Send a shape in the ghost's colour: as coal has it, for neither colours nor textures of its file are shown.
+
+        A polygon offset lets the robot win where both are in one place; without it they would flicker.
+        """
+        is_mesh = isinstance(shape.geometry, pin.coal.BVHModelBase)
+        with warnings.catch_warnings():
+            # The robot's own shape has been reported.
+            warnings.simplefilter("ignore", UserWarning)
+            form = loadMesh(shape.geometry) if is_mesh else self.loadPrimitive(shape)
+        if isinstance(form, meshcat.geometry.Geometry):
+            material = meshcat.geometry.MeshPhongMaterial(
+                color=_GHOST_COLOR, opacity=_GHOST_OPACITY, transparent=True, polygonOffset=True,
+                polygonOffsetFactor=1.0, polygonOffsetUnits=4.0,
+            )  # fmt: skip
+            self.viewer[node].set_object(form, material)
+            self.viewer[node].set_transform(placement.homogeneous)
+
 
 _PRIMITIVES = frozenset(["lines", "linestrips", "polygons", "polylist", "triangles", "trifans", "tristrips"])
 
@@ -356,35 +376,42 @@ def _hex(color: ArrayLike) -> int:
     return red << 16 | green << 8 | blue
 
 
-def _draw(viewer: meshcat.Visualizer, picture: _Picture, times: Floats, positions: Floats, loop: bool) -> None:
-    """Send the robot, the view and the animation.
+def _draw(
+    viewer: meshcat.Visualizer, picture: _Picture, times: Floats, positions: Mapping[str, Floats], loop: bool
+) -> None:
+    """Send the robot, its ghost, the view and the animation.
 
     Args:
         viewer: Where to.
         picture: What to draw.
         times: Of the keyframes (K,) [s].
-        positions: Of the joints (K, b) [rad or m].
+        positions: Of the joints (K, b) [rad or m], of "robot" and "ghost".
         loop: Whether to play for ever.
     """
     tree = picture.robot.tree
-    nodes = picture.moving_nodes
     loader = _ShapeLoader(viewer)
-    _set_view(viewer, picture, positions)
-    for j, node in enumerate(nodes):
-        placement = pin.SE3(tree.rotation[j], tree.translation[j])
-        viewer[node.removesuffix("/moving")].set_transform(placement.homogeneous)
-        viewer[node].set_transform(_joint_motion(bool(tree.prismatic[j]), positions[0, j]))
-    for k, (shape, body, placement) in enumerate(zip(picture.shapes, picture.bodies, picture.placements, strict=True)):
-        parent = nodes[body] if body >= 0 else "robot/base"
-        loader.load(shape, placement, f"{parent}/shapes/{k} {_label(shape.name)}")
-    if len(times) > 1:
-        clips = {}
+    _set_view(viewer, picture, np.concatenate([_samples(rows) for rows in positions.values()]))
+    clips = {}
+    for root, rows in positions.items():
+        nodes = picture.moving_nodes(root)
         for j, node in enumerate(nodes):
+            placement = pin.SE3(tree.rotation[j], tree.translation[j])
+            viewer[node.removesuffix("/moving")].set_transform(placement.homogeneous)
+            viewer[node].set_transform(_joint_motion(bool(tree.prismatic[j]), rows[0, j]))
             # One number a joint: the page then interpolates in q itself, and links stay whole at any frame rate.
             name = "position[z]" if tree.prismatic[j] else "rotation[z]"
-            track = AnimationTrack(name, "number", times.tolist(), positions[:, j].tolist())
+            track = AnimationTrack(name, "number", times.tolist(), rows[:, j].tolist())
             # One frame a second, so that keyframe times are seconds.
             clips[viewer[node].path] = AnimationClip({name: track}, fps=1)
+        shapes = zip(picture.shapes, picture.bodies, picture.placements, strict=True)
+        for k, (shape, body, placement) in enumerate(shapes):
+            parent = nodes[body] if body >= 0 else f"{root}/base"
+            node = f"{parent}/shapes/{k} {_label(shape.name)}"
+            if root == "robot":
+                loader.load(shape, placement, node)
+            elif body >= 0:
+                loader.load_ghost(shape, placement, node)
+    if len(times) > 1:
         viewer.set_animation(Animation(clips), play=True, repetitions=math.inf if loop else 1)
 
 
@@ -399,9 +426,13 @@ def _joint_motion(prismatic: bool, position: float) -> Floats:
     return motion
 
 
-def _set_view(viewer: meshcat.Visualizer, picture: _Picture, positions: Floats) -> None:
-    """Camera, grid, axes and background to the measure of the robot and its motion."""
-    samples = positions[np.unique(np.linspace(0, len(positions) - 1, 50).astype(int))]
+def _samples(rows: Floats) -> Floats:
+    """Some of many rows, the first and the last among them."""
+    return rows[np.unique(np.linspace(0, len(rows) - 1, 50).astype(int))]
+
+
+def _set_view(viewer: meshcat.Visualizer, picture: _Picture, samples: Floats) -> None:
+    """Camera, grid, axes and background to the measure of the robot in some poses (S, b)."""
     R, p = picture.body_poses(samples)
     base = picture.corners(-1)
     swept = [base, p.reshape(-1, 3)]
