@@ -231,9 +231,9 @@ class Solution:
         positive("tolerance", tolerance, "1")
         problem, substeps, before = self.problem, 2, (np.nan, np.nan)
         while True:
-            opened = _accurate(problem, open_loop(self.controls)._replace(hold=problem.hold * substeps), substeps)
+            opened = accurate_cost(problem, open_loop(self.controls)._replace(hold=problem.hold * substeps), substeps)
             policy = self.velocity_policy(substeps)
-            closed = _accurate(problem, Commands(policy.u, policy.gains, policy.reference, policy.hold), substeps)
+            closed = accurate_cost(problem, Commands(policy.u, policy.gains, policy.reference, policy.hold), substeps)
             changes = [
                 abs(now[0] - then) / max(abs(now[0]), 1e-300)
                 for now, then in zip((opened, closed), before, strict=True)
@@ -309,7 +309,7 @@ class Solution:
 _PATHS = 256
 
 
-def _accurate(problem: OptimalControlProblem, commands: Commands, substeps: int) -> tuple[float, Floats]:
+def accurate_cost(problem: OptimalControlProblem, commands: Commands, substeps: int) -> tuple[float, Floats]:
     """True cost under given commands, and the end configuration; NaN where the motion runs away."""
     scene, h = problem.scene, problem.dt / substeps
     n, m, N = scene.robot.dof, scene.controls, problem.steps * substeps
