@@ -18,6 +18,7 @@ from varpin.scene import Scene, require_scene
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
+Sampling = Literal["midpoint", "gauss", "start"]
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -35,8 +36,9 @@ class OptimalControlProblem:
         dt: Time step [s].
         steps: N.
         integrator: Any of varpin's.
-        sampling: ``"midpoint"``: running costs at ((q + q')/2, (q' - q)/dt, u) of each step, of second order. Or
-            ``"start"``: at the node where it begins, a left sum as in the paper, of first order.
+        sampling: ``"midpoint"``: running costs at ((q + q')/2, (q' - q)/dt, u) of each step, of second order.
+            ``"gauss"``: at its two Gauss points, the motion between the nodes taken for a cubic: of fourth order, for
+            integrators that are. ``"start"``: at the node where it begins, a left sum as in the paper, of first order.
         hold: Steps that share one control: a digital controller's period over the integrator's step.
     """
 
@@ -47,10 +49,11 @@ class OptimalControlProblem:
     dt: float
     steps: int
     integrator: Integrator
-    sampling: Literal["midpoint", "start"]
+    sampling: Sampling
     hold: int
     running: BoundSum = field(repr=False)
     terminal: BoundSum = field(repr=False)
+    rule: Floats = field(repr=False)
 
     def __init__(
         self,
@@ -62,7 +65,7 @@ class OptimalControlProblem:
         dt: float,
         steps: int,
         integrator: Integrator | None = None,
-        sampling: Literal["midpoint", "start"] = "midpoint",
+        sampling: Sampling = "midpoint",
         hold: int = 1,
     ) -> None:
         """Describe a problem.
@@ -78,14 +81,14 @@ class OptimalControlProblem:
         dt, steps, hold = positive("dt", dt, "s"), count("steps", steps, least=1), count("hold", hold, least=1)
         if steps % hold:
             raise InputError(f"steps = {steps} is no multiple of hold = {hold}")
-        if sampling not in ("midpoint", "start"):
-            raise InputError(f"sampling must be 'midpoint' or 'start', got {sampling!r}")
+        if sampling not in ("midpoint", "gauss", "start"):
+            raise InputError(f"sampling must be 'midpoint', 'gauss' or 'start', got {sampling!r}")
         if integrator is not None and not isinstance(integrator, Integrator):
             raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
         if m == 0:
             raise InputError("the scene has no controls, so there is nothing to optimize")
-        shift = 0.5 if sampling == "midpoint" else 0.0
-        times = (np.arange(steps, dtype=np.float64) + shift) * dt
+        places, rule = _rule(sampling, dt)
+        times = ((np.arange(steps, dtype=np.float64)[:, None] + places) * dt).reshape(-1)
         running, terminal = bind_cost(cost, times, dt * steps, steps, n, m)
         values = {
             "scene": scene,
@@ -99,6 +102,7 @@ class OptimalControlProblem:
             "hold": hold,
             "running": running,
             "terminal": terminal,
+            "rule": rule,
         }
         for name, value in values.items():
             if isinstance(value, np.ndarray):
@@ -127,7 +131,7 @@ class OptimalControlProblem:
         dt: float | None = None,
         steps: int | None = None,
         integrator: Integrator | None = None,
-        sampling: Literal["midpoint", "start"] | None = None,
+        sampling: Sampling | None = None,
         hold: int | None = None,
     ) -> OptimalControlProblem:
         """The same problem, discretized otherwise or from another state.
@@ -175,16 +179,25 @@ class OptimalControlProblem:
         u = np.tile(self.holding_controls(), (R, 1))
         return LinearPolicy(u, gains, np.tile(np.append(self.q0, np.zeros(n)), (R, 1)), hold=self.hold)
 
-    def samples(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
-        """Where running costs are taken: q and v (..., N, n), from those at the nodes (..., N + 1, n)."""
-        if self.sampling == "start":
-            return q[..., :-1, :], v[..., :-1, :]
-        return 0.5 * (q[..., :-1, :] + q[..., 1:, :]), np.diff(q, axis=-2) / self.dt
+    def samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
+        """Where running costs are taken, the s samples of a step one after another.
+
+        q and v (..., N s, n) and u (..., N s, m), from q and v at the nodes (..., N + 1, n) and u (..., N, m).
+        """
+        nodes = q[..., :-1, :], v[..., :-1, :], q[..., 1:, :], v[..., 1:, :]
+        at = []
+        for begin in (1, 5):
+            rows = [
+                sum(row[begin + c] * node for c, node in enumerate(nodes) if row[begin + c] != 0.0) for row in self.rule
+            ]
+            at.append(rows[0] if len(rows) == 1 else np.stack(rows, axis=-2).reshape(*u.shape[:-2], -1, q.shape[-1]))
+        return at[0], at[1], u if len(self.rule) == 1 else np.repeat(u, len(self.rule), axis=-2)
 
     def costs(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """The cost (...) of motions without their noise terms: q and v (..., N + 1, n), u (..., N, m)."""
-        at_q, at_v = self.samples(q, v)
-        running = self.running.value(at_q, at_v, u).sum(axis=-1) * self.dt
+        values = self.running.value(*self.samples(q, v, u))
+        # Every rule here weighs its samples alike.
+        running = values.sum(axis=-1) * (self.dt * self.rule[0, 0])
         end = np.zeros((*u.shape[:-2], 1, u.shape[-1]))
         total: Floats = running + self.terminal.value(q[..., -1:, :], v[..., -1:, :], end)[..., 0]
         return total
@@ -204,11 +217,29 @@ class OptimalControlProblem:
 
     def expand_running(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the running costs along a motion, at their samples, in (q, v, u)."""
-        return self.running.expand(*self.samples(trajectory.q, trajectory.v), trajectory.u)
+        return self.running.expand(*self.samples(trajectory.q, trajectory.v, trajectory.u))
 
     def expand_terminal(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""
         return self.terminal.expand(trajectory.q[-1:], trajectory.v[-1:], np.zeros((1, self.scene.controls)))
+
+
+def _rule(sampling: str, dt: float) -> tuple[Floats, Floats]:
+    """Where in a step its samples are, (s,), and how they are made (s, 9).
+
+    A row is (weight, q from q0, v0, q1, v1, v from q0, v0, q1, v1).
+    """
+    if sampling == "start":
+        return np.zeros(1), np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+    if sampling == "midpoint":
+        return np.array([0.5]), np.array([[1.0, 0.5, 0.0, 0.5, 0.0, -1.0 / dt, 0.0, 1.0 / dt, 0.0]])
+    places = 0.5 + np.array([-1.0, 1.0]) * np.sqrt(3.0) / 6.0
+    rows = []
+    for s in places:
+        position = [(1 + 2 * s) * (1 - s) ** 2, dt * s * (1 - s) ** 2, s**2 * (3 - 2 * s), dt * s**2 * (s - 1)]
+        slope = 6 * s * (1 - s) / dt
+        rows.append([0.5, *position, -slope, (1 - s) * (1 - 3 * s), slope, s * (3 * s - 2)])
+    return places, np.array(rows)
 
 
 def bind_cost(

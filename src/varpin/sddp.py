@@ -330,22 +330,33 @@ def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floa
 def _curvature(problem: OptimalControlProblem, trajectory: Trajectory, plan: _Plan, costate: Floats) -> Floats:
     """Second derivatives (N, 2n + m, 2n + m) in (x, u) that dynamics and noise fields add to the cost to go."""
     scene, n, h = problem.scene, problem.scene.robot.dof, problem.dt
-    gradient = problem.expand_running(trajectory).gradient
+    N, samples, rule = problem.steps, len(problem.rule), problem.rule
+    gradient = problem.expand_running(trajectory).gradient.reshape(N, samples, -1)
+    by_q, by_v = gradient[:, :, :n], gradient[:, :, n : 2 * n]
+    # The running cost's gradient in q0, v0, q1 and v1 of each step.
+    pulls = [
+        h * np.einsum("s,Nsi->Ni", rule[:, 0] * rule[:, 1 + c], by_q)
+        + h * np.einsum("s,Nsi->Ni", rule[:, 0] * rule[:, 5 + c], by_v)
+        for c in range(4)
+    ]
     z = costate.copy()
-    if problem.sampling == "midpoint":
-        z[:, :n] += 0.5 * h * gradient[:, :n] + gradient[:, n : 2 * n]
+    z[:, :n] += pulls[2]
+    after = bool(rule[:, [4, 8]].any())
+    if after:
+        z += np.einsum("Ni,Nix->Nx", pulls[3], velocity_at_nodes(scene, trajectory.q[1:], trajectory.v[1:]))
     second = second_order_steps(scene, trajectory, z, problem.integrator)
-    xx = second.xx.copy()
-    if problem.sampling == "start" and problem.integrator.variational:
-        xx += h * velocity_curvature(scene, trajectory.q[:-1], trajectory.v[:-1], gradient[:, n : 2 * n])
+    total = np.block([[second.xx, np.swapaxes(second.ux, 1, 2)], [second.ux, second.uu]])
+    if rule[:, [2, 6]].any():
+        total[:, : 2 * n, : 2 * n] += velocity_curvature(scene, trajectory.q[:-1], trajectory.v[:-1], pulls[1])
+    if after:
+        lin = _linearize(problem, trajectory, 0)
+        J = np.concatenate([lin.A, lin.B], axis=2)
+        total += np.swapaxes(J, 1, 2) @ velocity_curvature(scene, trajectory.q[1:], trajectory.v[1:], pulls[3]) @ J
     if scene.processes and problem.integrator.variational:
         pull = plan.spread @ impulses(problem, trajectory, plan.jumps)
         weight = problem.integrator.left * np.swapaxes(plan.jumps, 1, 2) @ pull
-        xx[:, :n, :n] += scene.noise.curvature(weight)
-    return np.concatenate(
-        [np.concatenate([xx, np.swapaxes(second.ux, 1, 2)], axis=2), np.concatenate([second.ux, second.uu], axis=2)],
-        axis=1,
-    )
+        total[:, :n, :n] += scene.noise.curvature(weight)
+    return total
 
 
 def backward(
@@ -385,8 +396,10 @@ def _pass(
     costate = np.empty((N if costates else 0, 2 * n))
     hessian = running.hessian
     in_velocity = bool(hessian[:, n : 2 * n].any())
-    at_start = problem.sampling == "start"
-    rule = kernels.START if at_start else kernels.MIDPOINT
+    rule = problem.rule
+    samples = len(rule)
+    # Velocities at nodes are needed where they are sampled and x does not hold them.
+    nodes = problem.integrator.variational and bool(rule[:, [2, 4, 6, 8]].any())
     block = max(1, _BLOCK // problem.hold) * problem.hold
     for end in range(N, 0, -block):
         begin = max(0, end - block)
@@ -395,12 +408,10 @@ def _pass(
         lin = _linearize(problem, part, begin)
         if k:
             jumps[steps] = lin.J
-        velocity = np.zeros((0, n, 2 * n))
-        if at_start and problem.integrator.variational:
-            velocity = velocity_at_nodes(scene, part.q[:-1], part.v[:-1])
+        velocity = velocity_at_nodes(scene, part.q, part.v) if nodes else np.zeros((0, n, 2 * n))
+        points = slice(begin * samples, end * samples)
         failed = kernels.backward_pass(
             problem.dt,
-            rule,
             problem.hold,
             in_velocity,
             float(regularization),
@@ -410,8 +421,9 @@ def _pass(
                 G=lin.G,
                 Gx=lin.Gx,
                 Gu=lin.Gu,
-                gradient=running.gradient[steps],
-                hessian=hessian[steps] if len(hessian) > 1 else hessian,
+                rule=rule,
+                gradient=running.gradient[points],
+                hessian=hessian[points] if len(hessian) > 1 else hessian,
                 velocity=velocity,
                 curvature=np.zeros((0, size, size)) if curvature is None else curvature[steps],
             ),

@@ -103,11 +103,10 @@ class Trajectory:
     version: str = __version__
 
     def __post_init__(self) -> None:
-        for record in (self, self.statistics):
-            for item in fields(record):
-                value = getattr(record, item.name)
-                if isinstance(value, np.ndarray):
-                    value.setflags(write=False)
+        for name in _ARRAYS:
+            getattr(self, name).setflags(write=False)
+        for array in vars(self.statistics).values():
+            array.setflags(write=False)
 
     @property
     def steps(self) -> int:
@@ -121,6 +120,8 @@ class Trajectory:
 
     def part(self, begin: int, end: int) -> Trajectory:
         """Steps begin .. end with the nodes around them, as views."""
+        if begin == 0 and end == self.steps:
+            return self
         nodes, steps = slice(begin, end + 1), slice(begin, end)
         own = self.statistics
         return replace(

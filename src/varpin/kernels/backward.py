@@ -17,10 +17,6 @@ from varpin.kernels._compile import inlined, kernel
 from varpin.kernels.linalg import factor_ldl, solve_ldl, solve_ldl_rows
 from varpin.kernels.tree import Floats
 
-# Where the running cost of a step is sampled.
-MIDPOINT = 0  # at ((q + q')/2, (q' - q)/h, u)
-START = 1  # at the node where the step begins
-
 
 class Steps(NamedTuple):
     """The linearized dynamics and the expanded costs of N steps."""
@@ -30,9 +26,10 @@ class Steps(NamedTuple):
     G: Floats  # (N, 2n, k)
     Gx: Floats  # (N, 2n, k, 2n)
     Gu: Floats  # (N, 2n, k, m)
-    gradient: Floats  # (N, 2n + m) of the running cost at the samples (q, v, u)
-    hessian: Floats  # (N, 2n + m, 2n + m), or (1, 2n + m, 2n + m)
-    velocity: Floats  # (N, n, 2n) dv/dx at the nodes, for START; (0, n, 2n) where x holds v itself
+    rule: Floats  # (s, 9) of each sample of the running cost in a step: its weight, then q and v as below
+    gradient: Floats  # (N s, 2n + m) of the running cost at the samples (q, v, u)
+    hessian: Floats  # (N s, 2n + m, 2n + m), or (1, 2n + m, 2n + m)
+    velocity: Floats  # (N + 1, n, 2n) dv/dx at the nodes; (0, n, 2n) where x holds v itself, or no sample asks for it
     curvature: Floats  # (N, 2n + m, 2n + m) to be added to the Hessian in (x, u), or (0, 2n + m, 2n + m)
 
 
@@ -61,6 +58,7 @@ class Room(NamedTuple):
 
     J: Floats  # (2n, 2n + m) [A B]
     D: Floats  # (2n, 2n + m) of (q, v) at the sample
+    P: Floats  # (2n, 2n) of the same in the state at one node
     T: Floats  # (2n + m, 2n + m) a product
     Q: Floats  # (2n + m, 2n + m)
     Qz: Floats  # (2n + m,)
@@ -82,6 +80,7 @@ def new_room(dof: int, controls: int) -> Room:
     return Room(
         J=np.zeros((x, size)),
         D=np.zeros((x, size)),
+        P=np.zeros((x, x)),
         T=np.zeros((size, size)),
         Q=np.zeros((size, size)),
         Qz=np.zeros(size),
@@ -116,63 +115,101 @@ def add_congruence(J: Floats, W: Floats, rows: int, scale: float, T: Floats, Q: 
 
 
 @inlined
-def add_running_cost(steps: Steps, s: int, rule: int, h: float, in_velocity: bool, room: Room) -> None:
-    """Add h l(z) to Q and Qz, with z = D (x, u)."""
-    D, T, Q, Qz, J = room.D, room.T, room.Q, room.Qz, room.J
-    x, size = J.shape
-    n = x // 2
-    g = steps.gradient[s]
-    H = steps.hessian[s if steps.hessian.shape[0] > 1 else 0]
-    for i in range(n):
-        for c in range(size):
-            one = 1.0 if i == c else 0.0
-            if rule == MIDPOINT:
-                D[i, c] = 0.5 * (J[i, c] + one)
-                D[n + i, c] = (J[i, c] - one) / h
-            else:
-                D[i, c] = one
-                D[n + i, c] = 1.0 if n + i == c else 0.0
-                if steps.velocity.shape[0] > 0:
-                    D[n + i, c] = steps.velocity[s, i, c] if c < x else 0.0
-    rows = x if in_velocity else n
-    for c in range(size):
-        room.row[c] = g[c] if c >= x else 0.0
-    for i in range(x):
-        for c in range(size):
-            room.row[c] += D[i, c] * g[i]
-    for c in range(size):
-        Qz[c] += h * room.row[c]
-        room.costate[c] += h * room.row[c]
-    add_congruence(D, H, rows, h, T, Q)
-    for r in range(x, size):
-        for c in range(x, size):
-            Q[r, c] += h * H[r, c]
-        for c in range(size):
-            total = 0.0
-            for i in range(rows):
-                total += H[r, i] * D[i, c]
-            Q[r, c] += h * total
-            Q[c, r] += h * total
+def state_at_sample(rule: Floats, velocity: Floats, node: int, after: int, D: Floats) -> None:
+    """Derivative D (2n, 2n) of (q, v) at a sample in the state x at ``node``.
+
+    A row of the rule is (weight, q of q0, v0, q1, v1, v of q0, v0, q1, v1): q and v at the sample are those sums of the
+    nodes' own; ``after`` is 2 for the node after the step and 0 for the one before.
+    """
+    n = D.shape[0] // 2
+    for half in range(2):
+        in_q, in_v = rule[1 + 4 * half + after], rule[2 + 4 * half + after]
+        for i in range(n):
+            row = D[half * n + i]
+            for c in range(2 * n):
+                row[c] = 0.0
+            row[i] = in_q
+            if velocity.shape[0] == 0:
+                row[n + i] = in_v
+            elif in_v != 0.0:
+                for c in range(2 * n):
+                    row[c] += in_v * velocity[node, i, c]
 
 
 @inlined
-def add_noise(steps: Steps, s: int, rule: int, h: float, value: Value, gains: Gains, room: Room) -> None:
+def add_running_cost(steps: Steps, s: int, h: float, in_velocity: bool, room: Room) -> None:
+    """Add the samples h w l(z) to Q and Qz, with z = D (x, u)."""
+    D, T, Q, Qz, J, P = room.D, room.T, room.Q, room.Qz, room.J, room.P
+    x, size = J.shape
+    n = x // 2
+    rows = x if in_velocity else n
+    samples = steps.rule.shape[0]
+    for k in range(samples):
+        point = s * samples + k
+        g = steps.gradient[point]
+        H = steps.hessian[point if steps.hessian.shape[0] > 1 else 0]
+        weight = h * steps.rule[k, 0]
+        if steps.velocity.shape[0] == 0:
+            for half in range(2):
+                rule = steps.rule[k, 1 + 4 * half : 5 + 4 * half]
+                for i in range(n):
+                    row = D[half * n + i]
+                    for c in range(size):
+                        row[c] = rule[2] * J[i, c] + rule[3] * J[n + i, c]
+                    row[i] += rule[0]
+                    row[n + i] += rule[1]
+        else:
+            for i in range(x):
+                for c in range(size):
+                    D[i, c] = 0.0
+            state_at_sample(steps.rule[k], steps.velocity, s + 1, 2, P)
+            for i in range(x):
+                for j in range(x):
+                    factor = P[i, j]
+                    for c in range(size):
+                        D[i, c] += factor * J[j, c]
+            state_at_sample(steps.rule[k], steps.velocity, s, 0, P)
+            for i in range(x):
+                for c in range(x):
+                    D[i, c] += P[i, c]
+        for c in range(size):
+            room.row[c] = g[c] if c >= x else 0.0
+        for i in range(x):
+            for c in range(size):
+                room.row[c] += D[i, c] * g[i]
+        for c in range(size):
+            Qz[c] += weight * room.row[c]
+            room.costate[c] += weight * room.row[c]
+        add_congruence(D, H, rows, weight, T, Q)
+        for r in range(x, size):
+            for c in range(x, size):
+                Q[r, c] += weight * H[r, c]
+            for i in range(rows):
+                factor = weight * H[r, i]
+                if factor != 0.0:
+                    for c in range(size):
+                        Q[r, c] += factor * D[i, c]
+                        Q[c, r] += factor * D[i, c]
+
+
+@inlined
+def add_noise(steps: Steps, s: int, h: float, value: Value, gains: Gains, room: Room) -> None:
     """Add the terms of the noise to Q, Qz and the cost; keeps S.
 
-    Where the running cost is sampled between the nodes, it looks at the state after the kick too.
+    Where the running cost is sampled after the kick, it counts too.
     """
     Q, Qz, row = room.Q, room.Qz, room.row
     x, size = room.J.shape
-    n = x // 2
     S = gains.spread[s]
     for i in range(x):
         for j in range(x):
             S[i, j] = h * value.hessian[i, j]
-    if rule == MIDPOINT:
-        H = steps.hessian[s if steps.hessian.shape[0] > 1 else 0]
-        for i in range(n):
-            for j in range(n):
-                S[i, j] += 0.25 * h * h * H[i, j] + 0.5 * h * (H[i, n + j] + H[n + i, j]) + H[n + i, n + j]
+    samples = steps.rule.shape[0]
+    for k in range(samples):
+        point = s * samples + k
+        state_at_sample(steps.rule[k], steps.velocity, s + 1, 2, room.P)
+        H = steps.hessian[point if steps.hessian.shape[0] > 1 else 0]
+        add_congruence(room.P, H, x, h * h * steps.rule[k, 0], room.T, S)
     for w in range(steps.G.shape[2]):
         for i in range(x):
             total = 0.0
@@ -271,7 +308,6 @@ def decide(regularization: float, r: int, value: Value, gains: Gains, room: Room
 @kernel
 def backward_pass(
     h: float,
-    rule: int,
     hold: int,
     in_velocity: bool,
     regularization: float,
@@ -321,8 +357,8 @@ def backward_pass(
                     Q[r, c] += total
                     Q[c, r] += total
         if steps.G.shape[2] > 0:
-            add_noise(steps, s, rule, h, value, gains, room)
-        add_running_cost(steps, s, rule, h, in_velocity, room)
+            add_noise(steps, s, h, value, gains, room)
+        add_running_cost(steps, s, h, in_velocity, room)
         if s % hold == 0:
             if not decide(regularization, s // hold, value, gains, room):
                 return s // hold

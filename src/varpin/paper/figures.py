@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
 from varpin.paper import cases
@@ -18,6 +19,10 @@ from varpin.plots import COLORS
 Floats = NDArray[np.float64]
 Motions = Mapping[tuple[str, str, float], tuple[Floats, Floats]]
 
+# Tracking errors are linear below this [rad] and logarithmic beyond: a start away from the optimum outweighs the rest a
+# hundredfold.
+_SMALL_ERROR = 1e-4
+
 _METHOD_COLOR = {"variational": COLORS[0], "Euler": COLORS[1], OPTIMUM: COLORS[6]}
 
 
@@ -26,7 +31,7 @@ def draw(cells: Cells, motions: Motions) -> dict[str, tuple[Figure, str]]:
     steps = sorted({c.dt for c in cells.values()})
     fine = steps[0]
     return {
-        "figure1": (_free(motions), "Figure 1 (b), (c): theta_1 without controls in the vertical plane."),
+        "figure1": (_free(motions), "Figure 1 (b), (c): θ₁ without controls in the vertical plane."),
         "figure2": (
             _tracking(cells, "1", fine, _cost_over_time),
             f"Figure 2, case 1: tracking errors at dt = {fine:g} s (dotted) and {COARSE:g} s; cost over time.",
@@ -38,7 +43,7 @@ def draw(cells: Cells, motions: Motions) -> dict[str, tuple[Figure, str]]:
         ),
         "figure4": (
             _tracking(cells, "3", fine, _first_joint),
-            f"Figure 4, case 3: tracking errors at dt = {fine:g} s (dotted) and {COARSE:g} s; theta_1, variational.",
+            f"Figure 4, case 3: tracking errors at dt = {fine:g} s (dotted) and {COARSE:g} s; θ₁, variational.",
         ),
         "figure5": (_cost_over_step(cells), "Figure 5: optimized expected cost over dt; Euler dashed."),
         "truth": (
@@ -49,8 +54,9 @@ def draw(cells: Cells, motions: Motions) -> dict[str, tuple[Figure, str]]:
 
 
 def _free(motions: Motions) -> Figure:
-    figure = Figure(figsize=(10, 3.6), layout="constrained")
-    for panel, axes in zip("bc", figure.subplots(1, 2), strict=True):
+    figure = Figure(figsize=(10, 4.0), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    for panel, axes in zip("bc", panels, strict=True):
         for (own, method, dt), (t, q) in motions.items():
             if own != panel or method == "reference":
                 continue
@@ -62,16 +68,25 @@ def _free(motions: Motions) -> Figure:
         axes.set_ylim(reference.min() - 0.4 * span, reference.max() + 0.4 * span)
         axes.set(
             xlabel="time [s]",
-            ylabel="theta_1 [rad]",
+            ylabel=r"$\theta_1$ [rad]",
             title=f"({panel}) from {'rest' if panel == 'b' else 'velocity [0, 0, 1] rad/s'}",
         )
-        axes.legend(fontsize=8)
+    _legend(panels[0], "center", 4)
     return figure
 
 
+def _legend(axes: Axes, where: str, columns: int) -> None:
+    """The legend of some axes below the figure, where it covers no curve."""
+    handles, labels = axes.get_legend_handles_labels()
+    axes.figure.legend(
+        handles, labels, loc=f"outside lower {where}", ncols=columns, frameon=False, fontsize=8, handlelength=2.5
+    )
+
+
 def _tracking(cells: Cells, case: str, fine: float, third: Callable[[Axes, Cells, str, float], None]) -> Figure:
-    figure = Figure(figsize=(13, 3.6), layout="constrained")
+    figure = Figure(figsize=(13, 4.0), layout="constrained")
     axes = figure.subplots(1, 3)
+    axes[1].sharey(axes[0])
     for panel, method in zip(axes[:2], ("Euler", "variational"), strict=True):
         for dt, dash in ((fine, ":"), (COARSE, "-")):
             own = cell(cells, MAIN, case, method, dt)
@@ -79,10 +94,13 @@ def _tracking(cells: Cells, case: str, fine: float, third: Callable[[Axes, Cells
                 continue
             error = own.q - np.array([cases.reference(t) for t in own.t])
             for joint in range(3):
-                panel.plot(own.t, error[:, joint], dash, color=COLORS[joint], label=f"theta_{joint + 1}, {dt:g} s")
+                label = rf"$\theta_{joint + 1}$, {dt:g} s"
+                panel.plot(own.t, error[:, joint], dash, color=COLORS[joint], lw=1.0, label=label)
+        panel.set_yscale("symlog", linthresh=_SMALL_ERROR)
         panel.set(xlabel="time [s]", ylabel="tracking error [rad]", title=method)
-        panel.legend(fontsize=7, ncols=2)
     third(axes[2], cells, case, fine)
+    _legend(axes[1], "left", 6)
+    _legend(axes[2], "right", 3)
     return figure
 
 
@@ -97,7 +115,8 @@ def _cost_over_time(axes: Axes, cells: Cells, case: str, fine: float) -> None:  
             label=method,
         )
     axes.set(xlabel="time of the search [s]", ylabel="optimized expected cost")
-    axes.legend()
+    # The times span little more than a decade, where minor ticks get labels for which there is no room.
+    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _first_controls(axes: Axes, cells: Cells, case: str, fine: float) -> None:
@@ -109,11 +128,10 @@ def _first_controls(axes: Axes, cells: Cells, case: str, fine: float) -> None:
         for joint in range(3):
             axes.step(
                 own.t[:-1][shown], 1e6 * own.u[shown, joint], dash, where="post", color=COLORS[joint],
-                label=f"u_{joint + 1}, {dt:g} s",
+                label=f"$u_{joint + 1}$, {dt:g} s",
             )  # fmt: skip
     axes.set_yscale("symlog", linthresh=10.0)
-    axes.set(xlabel="time [s]", ylabel="control [uN m], logarithmic beyond 10")
-    axes.legend(fontsize=7, ncols=2)
+    axes.set(xlabel="time [s]", ylabel=r"control [$\mu$N m], logarithmic beyond 10")
 
 
 def _first_joint(axes: Axes, cells: Cells, case: str, fine: float) -> None:
@@ -123,8 +141,7 @@ def _first_joint(axes: Axes, cells: Cells, case: str, fine: float) -> None:
             axes.plot(own.t, own.q[:, 0], dash, color=COLORS[0], label=f"dt = {dt:g} s")
     t = np.linspace(0.0, cases.DURATION, 301)
     axes.plot(t, [cases.reference(x)[0] for x in t], color="0.6", lw=1, label="reference", zorder=0)
-    axes.set(xlabel="time [s]", ylabel="theta_1 [rad]")
-    axes.legend(fontsize=8)
+    axes.set(xlabel="time [s]", ylabel=r"$\theta_1$ [rad]")
 
 
 def _cost_over_step(cells: Cells) -> Figure:
@@ -140,24 +157,27 @@ def _cost_over_step(cells: Cells) -> Figure:
                 label=method,
             )
         axes.set(xlabel="dt [s]", ylabel="optimized expected cost", title=f"case {case.key}: {case.title}")
-        axes.legend()
+        axes.legend(loc="upper left")
     return figure
 
 
 def _truth(cells: Cells) -> Figure:
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    figure = Figure(figsize=(9, 4.2), layout="constrained")
     axes = figure.subplots()
+    best = min(c.true_cost for c in series(cells, MAIN, "0", OPTIMUM))
+    top = 1e5 * best
     for method in (*cases.METHODS, OPTIMUM):
         own = series(cells, MAIN, "0", method)
         dts = [c.dt for c in own]
         label = "optimum over held controls" if method == OPTIMUM else method
         axes.loglog(dts, [c.open_loop for c in own], "o-", color=_METHOD_COLOR[method], label=f"{label}, open loop")
         if method != OPTIMUM:
-            axes.loglog(
-                dts, [c.closed_loop for c in own], "^:", color=_METHOD_COLOR[method], label=f"{label}, with feedback"
-            )
-    best = [c.true_cost for c in series(cells, MAIN, "0", OPTIMUM)]
-    axes.set_ylim(0.5 * min(best), 1e6 * min(best))
+            costs = [c.closed_loop for c in own]
+            label += ", with feedback"
+            if not any(cost < top for cost in costs):
+                label += ":\nruns away at every dt"
+            axes.loglog(dts, costs, "^:", color=_METHOD_COLOR[method], label=label)
+    axes.set_ylim(0.5 * best, top)
     axes.set(xlabel="dt [s]", ylabel="true cost")
-    axes.legend(fontsize=8)
+    figure.legend(loc="outside right upper", frameon=False, fontsize=8)
     return figure

@@ -105,8 +105,9 @@ def _page(
 <style>{_STYLE}</style></head><body>
 <h1>The paper's experiments, reproduced</h1>
 <p>varpin {__version__}{", the quick version: fewer steps, one setting" if quick else ""}.
-Stochastic differential dynamic programming on a 3-link finger that follows theta_r(t) = [1 + 0.25 sin 4 pi t, 0.1 sin 2 pi t, 0] for 1.5 s; cost: the
-integral of 10 |theta - theta_r|^2 + 0.1 |u|^2, plus |theta - theta_r|^2 at the end. Variational: the midpoint
+Stochastic differential dynamic programming on a 3-link finger that follows
+θ<sub>r</sub>(t) = [1 + 0.25 sin 4πt, 0.1 sin 2πt, 0] for 1.5 s; cost: the integral of
+10 |θ - θ<sub>r</sub>|² + 0.1 |u|², plus |θ - θ<sub>r</sub>|² at the end. Variational: the midpoint
 integrator. Euler: explicit. Running costs are sampled at mid-step for both.</p>
 <h2>What the paper leaves open, and what was taken</h2>
 <p>The finger's parameters, its initial state, gravity, friction and the powers of ten of the noise are not in the text.

@@ -133,7 +133,7 @@ def _rows(robot: Robot, name: str, shape: str, motion: ArrayLike) -> Floats:
 def _keyframes(
     robot: Robot, motions: Mapping[str, tuple[Floats, Floats]], fps: float, max_frames: int
 ) -> tuple[Floats, dict[str, Floats]]:
-    """Keyframe times (K,) [s] and, for each motion, positions (K, b) [rad or m] of all the tree's joints, mimic ones too.
+    """Keyframe times (K,) [s], and each motion's positions (K, b) [rad or m] of all joints of the tree, mimic ones too.
 
     The page interpolates linearly between keyframes, so the nodes themselves are enough where they are sparse. All
     motions get the same times: each joint's track repeats by itself, and they must not drift apart.
