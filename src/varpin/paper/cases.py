@@ -92,6 +92,16 @@ VARIATIONS = (
         OFF_REFERENCE, HANGING,
     ),
 )  # fmt: skip
+# Where the noise matters: control-dependent, up to ten times case 2, in the vertical plane.
+NOISY = Setting("noisy", "moving in the vertical plane under stronger control-dependent noise", gravity=HANGING)
+NOISY_STEP = 2e-3
+NOISY_STRENGTHS = (5e-4, 1e-3, 2e-3, 3e-3, 5e-3)
+QUICK_STRENGTHS = (1e-3, 2e-3)
+
+
+def noisy_case(strength: float) -> Case:
+    """Control-dependent noise of a given strength C [s^0.5]."""
+    return Case(f"2-{strength:g}", f"control-dependent noise, C = {strength:g}", ControlNoise(strength))
 
 
 def finger(heavier: float = 1.0) -> Robot:

@@ -6,7 +6,7 @@ import json
 import logging
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin._version import __version__
+from varpin.errors import VarpinError
 from varpin.integrators import RungeKutta4
 from varpin.linearization import linearize
 from varpin.paper import cases
@@ -30,7 +31,10 @@ SEARCH = {"tolerance": 1e-4, "armijo": 1e-5, "backtracking": 0.25, "max_iteratio
 # Longest step of the accurate integrator inside an interval, where the sampled-data optimum is computed [s].
 FINEST = 1.25e-4
 OPTIMUM = "optimum"
+# With the noise in the search, and with a search that knows nothing of it.
+STOCHASTIC, PLAIN = "S-DDP", "DDP"
 _PATHS = 400
+_MORE_PATHS = 1000
 # Where gains of different time steps are compared [s].
 GAIN_TIMES = np.linspace(0.02, 1.4, 47)
 
@@ -58,7 +62,7 @@ class Cell:
         t: Times of the nodes [s].
         q: Configurations there.
         u: Controls.
-        gains: Feedback on x at ``GAIN_TIMES``, referred to the middle of the steps; empty for the optimum.
+        gains: Feedback on x at ``GAIN_TIMES``, referred to the middle of the steps; only of the two methods.
     """
 
     setting: str
@@ -115,12 +119,17 @@ def tasks(*, quick: bool) -> Iterator[Task]:
         for dt in steps:
             for method in (*METHODS, OPTIMUM):
                 yield Task(setting, None, method, dt)
+    for strength in cases.QUICK_STRENGTHS if quick else cases.NOISY_STRENGTHS:
+        for method in (STOCHASTIC, PLAIN):
+            yield Task(cases.NOISY, cases.noisy_case(strength), method, cases.NOISY_STEP)
 
 
 def run(task: Task) -> Cell:
     """Fill a cell."""
     if task.method == OPTIMUM:
         return _optimum(task)
+    if task.method in (STOCHASTIC, PLAIN):
+        return _under_noise(task)
     problem = cases.problem(task.setting, task.case, task.method, task.dt)
     started = time.perf_counter()
     solution = solve(problem, **SEARCH)  # type: ignore[arg-type]
@@ -140,6 +149,21 @@ def _optimum(task: Task) -> Cell:
     started = time.perf_counter()
     solution = solve(problem, tolerance=1e-9, max_iterations=SEARCH["max_iterations"])  # type: ignore[arg-type]
     return _cell(task, solution, time.perf_counter() - started, (np.nan, np.nan))
+
+
+def _under_noise(task: Task) -> Cell:
+    """A policy in the noisy scene, by Monte Carlo: of S-DDP, or of DDP that was told of no noise."""
+    problem = cases.problem(task.setting, task.case, "variational", task.dt)
+    known = problem if task.method == STOCHASTIC else cases.problem(task.setting, None, "variational", task.dt)
+    started = time.perf_counter()
+    plan = replace(solve(known), problem=problem)
+    seconds = time.perf_counter() - started
+    try:
+        estimate = plan.monte_carlo(_MORE_PATHS, 1)
+    except VarpinError:  # every path ran away
+        return _cell(task, plan, seconds, (np.inf, np.nan))
+    mean = estimate.cost if estimate.failures == 0 else np.inf
+    return _cell(task, plan, seconds, (mean, estimate.standard_error))
 
 
 def _cell(task: Task, solution: Solution, seconds: float, sampled: tuple[float, float]) -> Cell:
@@ -162,7 +186,7 @@ def _cell(task: Task, solution: Solution, seconds: float, sampled: tuple[float, 
         t=trajectory.t[::hold],
         q=trajectory.q[::hold],
         u=solution.controls,
-        gains=_middle_gains(solution) if hold == 1 else np.zeros((0, 3, 6)),
+        gains=_middle_gains(solution) if task.method in METHODS else np.zeros((0, 3, 6)),
     )
 
 
