@@ -88,39 +88,40 @@ def attempt(
 
 @inlined
 def predict(tableau: Tableau, h: float, state: State, k: Work, g: Stages) -> None:
-    """Extrapolate the last one or two whole steps into ``g.V``.
+    """Extrapolate the last whole step into ``g.V``.
 
-    Their collocation polynomials go on, moved by what a kick has since done to the velocity, and bent by what the
-    force has changed. ``k.ldl`` holds the factors of M(q).
+    The polynomial through its stage velocities and the velocity at its end goes on, moved by what a kick has since done
+    to the velocity, and bent by what has changed in the force. Where nothing kicks, it misses by much the same
+    from step to step. ``k.ldl`` holds the factors of M(q).
     """
     stages, n = g.V.shape
-    past, end = state.past, stages
-    rows = end + 1 if state.counters[0] == 1 else 2 * (end + 1)
-    weights = tableau.ahead[state.counters[0] - 1]
+    past, end, force, miss = state.past, stages, stages + 1, stages + 2
+    smooth = state.counters[0] > 1 and state.center.shape[1] == 0
     for r in range(n):
-        k.residual[r] = k.force[r] - past[2 * (end + 1), r]
+        k.residual[r] = k.force[r] - past[force, r]
     solve_ldl(k.ldl, k.residual, k.delta)
     for i in range(stages):
         for r in range(n):
             total = state.v[r] - past[end, r]
-            for row in range(rows):
-                total += weights[i, row] * past[row, r]
-            g.V[i, r] = total + h * tableau.c[i] * k.delta[r]
+            for row in range(stages + 1):
+                total += tableau.ahead[i, row] * past[row, r]
+            g.guess[i, r] = total + h * tableau.c[i] * k.delta[r]
+            g.V[i, r] = g.guess[i, r]
+            if smooth:
+                g.V[i, r] += past[miss + i, r]
 
 
 @inlined
 def remember(state: State, k: Work, g: Stages) -> None:
-    """Put the step just done into the past, and what a kick did before it into the step before."""
+    """Put the step just done into the past; ``g.guess`` holds what was extrapolated, if anything was known."""
     stages, n = g.V.shape
-    past, end = state.past, stages
+    past, end, force, miss = state.past, stages, stages + 1, stages + 2
     for r in range(n):
-        jump = k.start[r] - past[end, r]
-        for row in range(end + 1):
-            past[end + 1 + row, r] = past[row, r] + jump
         for i in range(stages):
             past[i, r] = g.V[i, r]
+            past[miss + i, r] = g.V[i, r] - g.guess[i, r]
         past[end, r] = state.v[r]
-        past[2 * (end + 1), r] = k.force[r]
+        past[force, r] = k.force[r]
     state.counters[0] = min(state.counters[0] + 1, 2)
 
 
@@ -136,8 +137,6 @@ def step(mechanism: Mechanism, tableau: Tableau, options: Options, h: float, sta
     k.quality[1] = np.inf
     level = max(state.counters[1] - 1, 0)
     extrapolate = level == 0 and state.counters[0] > 0
-    for r in range(n):
-        k.start[r] = state.v[r]
     deepest = level
     place = 0  # in units of h / 2^level
     while place < 1 << level:

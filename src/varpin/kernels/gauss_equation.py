@@ -38,6 +38,7 @@ class Stages(NamedTuple):
 
     V: Floats  # (s, n) velocities
     Q: Floats  # (s, n) configurations
+    guess: Floats  # (s, n) of V, extrapolated from the step before
     M: Floats  # (s, n, n) L_vv at each stage, and so on
     A: Floats  # (s, n, n)
     Lqq: Floats  # (s, n, n)
@@ -59,6 +60,7 @@ def new_stages(stages: int, dof: int) -> Stages:
     return Stages(
         V=np.zeros(vectors),
         Q=np.zeros(vectors),
+        guess=np.zeros(vectors),
         M=np.zeros(matrices),
         A=np.zeros(matrices),
         Lqq=np.zeros(matrices),
@@ -77,9 +79,10 @@ def new_stages(stages: int, dof: int) -> Stages:
 def new_gauss_state(stages: int, paths: int, dof: int, processes: int) -> State:
     """States of several paths, to be filled in.
 
-    Their past is, of each of two steps, the stage velocities and the velocity at its end; and the last step's force.
+    Their past is of the last whole step: the stage velocities, the velocity at its end, the force, and by how much the
+    extrapolation of the step before missed each stage.
     """
-    return new_state(paths, dof, processes)._replace(past=np.zeros((paths, 2 * (stages + 1) + 1, dof)))
+    return new_state(paths, dof, processes)._replace(past=np.zeros((paths, 2 * stages + 2, dof)))
 
 
 @inlined

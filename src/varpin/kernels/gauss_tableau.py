@@ -15,7 +15,7 @@ class Tableau(NamedTuple):
     b: Floats  # (s,) in the integral over the step
     c: Floats  # (s,) the nodes
     reach: float  # the largest Rayleigh quotient of a^2 in the metric of b
-    ahead: Floats  # (2, s, 2 (s + 1)) weights of what one step, or two, left behind in a guess of the next one's stages
+    ahead: Floats  # (s, s + 1) values at the next step's nodes of the polynomial through this one's and its end
 
 
 def interpolation(nodes: Floats, at: Floats) -> Floats:
@@ -35,10 +35,7 @@ def tableau(stages: int) -> Tableau:
     c, b = 0.5 * (1.0 + x), 0.5 * w
     # The rule itself integrates the Lagrange polynomials from 0 to each node, exactly.
     a = np.array([c[i] * (b @ interpolation(c, c[i] * c)) for i in range(stages)])
-    ahead = np.zeros((2, stages, 2 * (stages + 1)))
-    one = np.append(c, 1.0)
-    ahead[0, :, : stages + 1] = interpolation(one, 1.0 + c)
-    ahead[1] = interpolation(np.append(one, one - 1.0), 1.0 + c)
+    ahead = interpolation(np.append(c, 1.0), 1.0 + c)
     root = np.sqrt(b)
     square = (root[:, None] * (a @ a)) / root[None, :]
     reach = float(np.linalg.eigvalsh(0.5 * (square + square.T))[-1])
