@@ -9,6 +9,7 @@ with a force f that is constant over the step: the controls', and the drift of t
 q1 = q0 + h sum_i b_i V_i and p1 = p0 + h sum_i b_i (L_q + F)(Q_i, V_i). One stage is the midpoint rule.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,8 @@ from varpin.kernels.midpoint_equation import (
 )
 from varpin.kernels.tree import Floats, Integers, Mechanism, Sweep
 
+SURE = 10.0  # a residual that is expected this far below the tolerance need not be looked at
+
 
 class Stages(NamedTuple):
     """Work arrays of the stages of a step."""
@@ -48,6 +51,8 @@ class Stages(NamedTuple):
     Lq_scale: Floats  # (s, n)
     slope: Floats  # (s, n) L_q + F
     lu: Floats  # (s n, s n)
+    rows: Floats  # (s, n s n) the same memory, stage by stage
+    change: Floats  # (s, n s n) of each slope with V
     order: Integers  # (s n,) of the rows of lu
     residual: Floats  # (s n,)
     delta: Floats  # (s n,)
@@ -57,6 +62,7 @@ def new_stages(stages: int, dof: int) -> Stages:
     """Allocate the work arrays of ``stages`` stages."""
     vectors, matrices = (stages, dof), (stages, dof, dof)
     size = stages * dof
+    lu = np.zeros((size, size))
     return Stages(
         V=np.zeros(vectors),
         Q=np.zeros(vectors),
@@ -69,7 +75,9 @@ def new_stages(stages: int, dof: int) -> Stages:
         Lv_scale=np.zeros(vectors),
         Lq_scale=np.zeros(vectors),
         slope=np.zeros(vectors),
-        lu=np.zeros((size, size)),
+        lu=lu,
+        rows=lu.reshape(stages, dof * size),
+        change=np.zeros((stages, dof * size)),
         order=np.zeros(size, dtype=np.int64),
         residual=np.zeros(size),
         delta=np.zeros(size),
@@ -159,21 +167,32 @@ def factor_stages(mechanism: Mechanism, tableau: Tableau, h: float, g: Stages) -
     """
     stages, n = g.V.shape
     a = tableau.a
-    for i in range(stages):
-        for j in range(stages):
-            first = h * a[i, j]
-            for r in range(n):
-                row = g.lu[i * n + r]
+    # Row j of g.change: the derivative of slope j in all of V, which rows of N take a_ij of in one long loop.
+    for j in range(stages):
+        for r in range(n):
+            for m in range(stages):
+                factor = h * a[j, m]
+                place = (r * stages + m) * n
                 for c in range(n):
-                    row[j * n + c] = first * (g.A[i, r, c] - g.A[j, c, r])
-                row[j * n + r] += first * mechanism.damping[r]
-                if i == j:
-                    for c in range(n):
-                        row[j * n + c] += g.M[i, r, c]
-                for m in range(stages):
-                    second = h * h * a[i, m] * a[m, j]
-                    for c in range(n):
-                        row[j * n + c] -= second * g.Lqq[m, r, c]
+                    g.change[j, place + c] = factor * g.Lqq[j, r, c]
+            place = (r * stages + j) * n
+            for c in range(n):
+                g.change[j, place + c] += g.A[j, c, r]
+            g.change[j, place + r] -= mechanism.damping[r]
+    for i in range(stages):
+        rows = g.rows[i]
+        rows[:] = 0.0
+        for j in range(stages):
+            factor, change = h * a[i, j], g.change[j]
+            for m in range(rows.size):
+                rows[m] -= factor * change[m]
+        for r in range(n):
+            for j in range(stages):
+                factor = h * a[i, j]
+                for c in range(n):
+                    g.lu[i * n + r, j * n + c] += factor * g.A[i, r, c]
+            for c in range(n):
+                g.lu[i * n + r, i * n + c] += g.M[i, r, c]
     return factor_lu_pivoting(g.lu, g.order) > 0
 
 
@@ -188,13 +207,42 @@ def size_of(tableau: Tableau, g: Stages, x: Floats) -> float:
 
 
 @inlined
+def speed(tableau: Tableau, g: Stages) -> float:
+    """:func:`size_of` the stage velocities."""
+    stages = g.V.shape[0]
+    total = 0.0
+    for i in range(stages):
+        total += tableau.b[i] * quadratic_form(g.M[i], g.V[i])
+    return total
+
+
+@inlined
+def correct_slopes(mechanism: Mechanism, tableau: Tableau, h: float, g: Stages) -> None:
+    """Bring L_q + F to where the correction ``g.delta`` has taken the stages, to first order in it."""
+    stages, n = g.V.shape
+    for i in range(stages):
+        for r in range(n):
+            total = 0.0
+            for j in range(stages):
+                total += tableau.a[i, j] * g.delta[j * n + r]
+            g.residual[i * n + r] = h * total
+    for i in range(stages):
+        for r in range(n):
+            total = -mechanism.damping[r] * g.delta[i * n + r]
+            for c in range(n):
+                total += g.Lqq[i, r, c] * g.residual[i * n + c] + g.A[i, c, r] * g.delta[i * n + c]
+            g.slope[i, r] += total
+
+
+@inlined
 def newton_stages(
     mechanism: Mechanism, tableau: Tableau, options: Options, h: float, state: State, k: Work, g: Stages
 ) -> int:
     """Solve the step equation from the guess in ``g.V``; returns how it ended.
 
-    As :func:`varpin.kernels.midpoint_equation.newton` does. Where derivatives are wanted it ends with the jets of
-    the root.
+    As :func:`varpin.kernels.midpoint_equation.newton` does, but a last correction is not looked at again if the
+    contraction seen so far takes the residual below a tenth of the tolerance: what it changes in ``g.slope`` is then of
+    first order to the last digit. Where derivatives are wanted it ends with the jets of the root.
     """
     stages, n = g.V.shape
     wanted = k.Jx.shape[0] > 0
@@ -224,18 +272,20 @@ def newton_stages(
         size = size_of(tableau, g, g.delta)
         if iteration == ITERATIONS or not size <= 0.25 * before:
             break
-        shrink = size / before
-        if before == np.inf:
-            shrink = 0.0
-            for i in range(stages):
-                shrink += tableau.b[i] * quadratic_form(g.M[i], g.V[i])
-            shrink = size / shrink
         for i in range(stages):
             for r in range(n):
                 g.V[i, r] += g.delta[i * n + r]
         k.tally[0] += 1
-        # The squared contraction to expect: seen, or guessed from the size of the first correction.
-        fresh = not worst * shrink <= options.tolerance
+        if before < np.inf:
+            shrink = math.sqrt(size / before)
+            if SURE * shrink * worst <= options.tolerance and not wanted:
+                correct_slopes(mechanism, tableau, h, g)
+                worst *= shrink
+                break
+            fresh = not worst * shrink * shrink <= options.tolerance
+        else:
+            shrink = math.sqrt(size / speed(tableau, g))
+            fresh = not worst * shrink * shrink * shrink <= options.tolerance
         before = size
     if not worst <= max(ROUNDING, options.tolerance):
         return DIVERGED

@@ -65,11 +65,14 @@ def factor_lu_pivoting(a: Floats, order: Integers) -> int:
         if pivot < 0.0:
             sign = -sign
         inverse = 1.0 / pivot
+        # Slices, unlike indices from k + 1 on, let the compiler use vector instructions.
+        top = a[k, k + 1 :]
         for i in range(k + 1, n):
             factor = a[i, k] * inverse
             a[i, k] = factor
-            for j in range(k + 1, n):
-                a[i, j] -= factor * a[k, j]
+            row = a[i, k + 1 :]
+            for j in range(row.size):
+                row[j] -= factor * top[j]
     return sign
 
 
