@@ -24,6 +24,7 @@ from varpin.trajectory import Trajectory
 Floats = NDArray[np.float64]
 
 MOST_STAGES = 6
+HIGH_ORDER = 0.1  # of the budget of energy errors is enough for more than one stage
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,8 @@ class Gauss(Variational):
         tolerance: As of :class:`Midpoint`, and so are the others.
         branch_margin: Of the stages' mean mass matrix and curvature.
         energy_balance: Largest error in the energy balance of a substep, in units of the energy it turns over.
-        energy_budget: The errors of all substeps together, in units of the largest kinetic energy so far.
+        energy_budget: The errors of all substeps together, in units of the largest kinetic energy so far. More than
+            one stage gets by on a tenth of it: that costs next to no substeps and keeps ten times the energy.
         max_halvings: A step is never cut into more than 2**max_halvings parts.
         kick: When noise kicks the momentum, ``"left"`` or ``"split"``.
     """
@@ -65,6 +67,12 @@ class Gauss(Variational):
         kick = "" if self.kick == "left" else f", kick={self.kick}"
         return f"Gauss(stages={self.stages}{kick})"
 
+    def _gauss_options(self) -> equation.Options:
+        options = self._options(0.5)
+        if self.stages == 1:
+            return options
+        return options._replace(budget=HIGH_ORDER * options.budget)
+
     def _arrays(self, paths: int, dof: int, processes: int) -> tuple[equation.State, stage_equation.Stages]:
         stages = int(self.stages)
         state = stage_equation.new_gauss_state(stages, paths, dof, processes)
@@ -84,7 +92,7 @@ class Gauss(Variational):
         kernels.rollout(
             scene.mechanism,
             tableau(int(self.stages)),
-            self._options(0.5),
+            self._gauss_options(),
             dt,
             commands,
             increments,
@@ -110,7 +118,7 @@ class Gauss(Variational):
             scene.mechanism,
             tableau(int(self.stages)),
             # A root that is known to 1e-10 is good enough for derivatives.
-            self._options(0.5)._replace(tolerance=1e6),
+            self._gauss_options()._replace(tolerance=1e6),
             trajectory.dt,
             q,
             p,
@@ -143,10 +151,10 @@ class Gauss(Variational):
         return guess
 
     def predict(self, state: VariationalRun, dt: float) -> tuple[Floats, Floats]:
-        """See :meth:`Integrator.predict`; the velocity goes on as it did over the last step."""
+        """See :meth:`Integrator.predict`; the velocity goes on as from the last step's mean to its end."""
         now = state.state
         velocity = now.v[0].copy()
-        if now.counters[0, 0] > 1:
-            end, rows = int(self.stages), int(self.stages) + 1
-            velocity += 0.5 * (now.past[0, end] - now.past[0, end + rows])
+        if now.counters[0, 0] > 0:
+            stages = int(self.stages)
+            velocity += now.past[0, stages] - tableau(stages).b @ now.past[0, :stages]
         return now.q[0] + 0.5 * dt * now.v[0], velocity

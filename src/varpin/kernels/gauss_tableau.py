@@ -36,6 +36,9 @@ def tableau(stages: int) -> Tableau:
     # The rule itself integrates the Lagrange polynomials from 0 to each node, exactly.
     a = np.array([c[i] * (b @ interpolation(c, c[i] * c)) for i in range(stages)])
     ahead = interpolation(np.append(c, 1.0), 1.0 + c)
+    # Symplectic, b_i a_ij + b_j a_ji = b_i b_j, to the last digit.
+    half = b[:, None] * a
+    a = 0.5 * b + 0.5 * (half - half.T) / b[:, None]
     root = np.sqrt(b)
     square = (root[:, None] * (a @ a)) / root[None, :]
     reach = float(np.linalg.eigvalsh(0.5 * (square + square.T))[-1])
