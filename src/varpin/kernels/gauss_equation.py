@@ -207,16 +207,6 @@ def size_of(tableau: Tableau, g: Stages, x: Floats) -> float:
 
 
 @inlined
-def speed(tableau: Tableau, g: Stages) -> float:
-    """:func:`size_of` the stage velocities."""
-    stages = g.V.shape[0]
-    total = 0.0
-    for i in range(stages):
-        total += tableau.b[i] * quadratic_form(g.M[i], g.V[i])
-    return total
-
-
-@inlined
 def correct_slopes(mechanism: Mechanism, tableau: Tableau, h: float, g: Stages) -> None:
     """Bring L_q + F to where the correction ``g.delta`` has taken the stages, to first order in it."""
     stages, n = g.V.shape
@@ -240,16 +230,18 @@ def newton_stages(
 ) -> int:
     """Solve the step equation from the guess in ``g.V``; returns how it ended.
 
-    As :func:`varpin.kernels.midpoint_equation.newton` does, but a last correction is not looked at again if the
-    contraction seen so far takes the residual below a tenth of the tolerance: what it changes in ``g.slope`` is then of
-    first order to the last digit. Where derivatives are wanted it ends with the jets of the root.
+    As :func:`varpin.kernels.midpoint_equation.newton` does, with two differences. The first factorisation is kept at
+    least until a second correction shows how fast it contracts, and for as long as three more would do. And a last
+    correction is not looked at again if that contraction takes the residual below a tenth of the tolerance: what it
+    changes in ``g.slope`` is then of first order to the last digit. Where derivatives are wanted it ends with the
+    jets of the root.
     """
     stages, n = g.V.shape
     wanted = k.Jx.shape[0] > 0
     before = np.inf
     fresh = True
     worst = np.inf
-    for iteration in range(ITERATIONS + 1):
+    for iteration in range(ITERATIONS + 2):  # one more than may correct: to look at the jets of the root
         set_stages(tableau, h, state, g)
         for i in range(stages):
             if fresh:
@@ -270,22 +262,20 @@ def newton_stages(
             return FOLD
         solve_lu_pivoting(g.lu, g.order, g.residual, g.delta)
         size = size_of(tableau, g, g.delta)
-        if iteration == ITERATIONS or not size <= 0.25 * before:
+        if iteration >= ITERATIONS or not size <= 0.25 * before:
             break
         for i in range(stages):
             for r in range(n):
                 g.V[i, r] += g.delta[i * n + r]
         k.tally[0] += 1
+        fresh = False
         if before < np.inf:
-            shrink = math.sqrt(size / before)
-            if SURE * shrink * worst <= options.tolerance and not wanted:
+            contraction = math.sqrt(size / before)
+            if SURE * contraction * worst <= options.tolerance and not wanted:
                 correct_slopes(mechanism, tableau, h, g)
-                worst *= shrink
+                worst *= contraction
                 break
-            fresh = not worst * shrink * shrink <= options.tolerance
-        else:
-            shrink = math.sqrt(size / speed(tableau, g))
-            fresh = not worst * shrink * shrink * shrink <= options.tolerance
+            fresh = not worst * contraction**3 <= options.tolerance
         before = size
     if not worst <= max(ROUNDING, options.tolerance):
         return DIVERGED
