@@ -5,4 +5,5 @@ from varpin.integrators.base import Segment as Segment
 from varpin.integrators.explicit import ExplicitEuler as ExplicitEuler
 from varpin.integrators.explicit import RungeKutta4 as RungeKutta4
 from varpin.integrators.explicit import SemiImplicitEuler as SemiImplicitEuler
+from varpin.integrators.gauss import Gauss as Gauss
 from varpin.integrators.midpoint import Midpoint as Midpoint

@@ -8,9 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.checks import count, fraction, positive
-from varpin.errors import InputError, LinearizationError, SingularMassMatrix
-from varpin.integrators.base import Integrator, Segment, diffusion_and_drift, drifts, open_loop, segments_of, steps_of
+from varpin.checks import fraction
+from varpin.errors import LinearizationError
+from varpin.integrators.base import Segment, drifts, segments_of, steps_of
+from varpin.integrators.variational import REASONS, Variational, VariationalRun
 from varpin.kernels import midpoint as kernels
 from varpin.kernels import midpoint_equation as equation
 from varpin.kernels.jet_tangent import new_tangent
@@ -23,23 +24,6 @@ from varpin.trajectory import Trajectory
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-REASONS = {
-    equation.DIVERGED: "Newton's iteration does not contract, however small the substep",
-    equation.NOT_FINITE: "the step equation gives values that are not finite",
-    equation.FOLD: "the step is at a fold of the step equation's solutions (its branch margin is not positive)",
-    equation.ENERGY: "the energy balance of the step does not close",
-    equation.SINGULAR: "the mass matrix at the end of the step is not positive definite",
-}
-
-
-@dataclass(frozen=True)
-class MidpointState:
-    """Where a rollout stands, with its work arrays."""
-
-    state: equation.State
-    work: equation.Work
-    start: Floats
-
 
 def _room(scene: Scene, *, derivatives: bool = False, parts: int = 0) -> tuple[equation.State, equation.Work]:
     """State and work arrays of one path."""
@@ -49,7 +33,7 @@ def _room(scene: Scene, *, derivatives: bool = False, parts: int = 0) -> tuple[e
 
 
 @dataclass(frozen=True)
-class Midpoint(Integrator):
+class Midpoint(Variational):
     """The forced midpoint variational integrator in position-momentum form.
 
     Solves the discrete Euler-Lagrange equations p0 + D1 Ld + F- = 0, p1 = D2 Ld + F+ with the generalized midpoint
@@ -85,82 +69,21 @@ class Midpoint(Integrator):
     max_halvings: int = 12
     kick: Literal["left", "split"] = "left"
 
-    variational = True
-
     def __post_init__(self) -> None:
         fraction("alpha", self.alpha)
-        positive("tolerance", self.tolerance, "rounding units")
-        if fraction("branch_margin", self.branch_margin) == 1.0:
-            raise InputError("branch_margin must be in [0, 1), got 1")
-        positive("energy_balance", self.energy_balance, "1")
-        positive("energy_budget", self.energy_budget, "1")
-        if self.kick not in ("left", "split"):
-            raise InputError(f"kick must be 'left' or 'split', got {self.kick!r}")
-        if count("max_halvings", self.max_halvings) > 30:
-            raise InputError(f"max_halvings must be at most 30, got {self.max_halvings}")
+        super().__post_init__()
 
     def __str__(self) -> str:
         kick = "" if self.kick == "left" else f", kick={self.kick}"
         return f"Midpoint(alpha={self.alpha:g}{kick})"
 
-    @property
-    def left(self) -> float:
-        """The part of a step's kick that comes before the step."""
-        return 1.0 if self.kick == "left" else 0.5
-
-    def _options(self) -> equation.Options:
-        return equation.Options(
-            float(self.alpha),
-            float(self.tolerance),
-            float(self.branch_margin),
-            float(self.energy_balance),
-            float(self.energy_budget),
-            int(self.max_halvings),
-            self.left,
-        )
-
-    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[MidpointState, list[Segment]]:
-        """See :meth:`Integrator.start`; p0 = M(q0) v0."""
-        robot = scene.robot
-        paths, n = q0.shape
-        run = MidpointState(
-            equation.new_state(paths, n, scene.mechanism.diffusion.constant.shape[1]),
-            equation.new_work(robot.tree.parent.size, n),
-            q0.copy(),
-        )
-        if not kernels.begin_paths(scene.mechanism, q0, v0, run.state, run.work):
-            raise SingularMassMatrix(robot.joint_names, q0)
-        nodes = new_nodes(paths, 1, n, scene.controls)
-        nodes.q[:, 0], nodes.p[:, 0], nodes.v[:, 0] = run.state.q, run.state.p, run.state.v
-        nodes.energy[:, 0] = run.state.energy[:, :, :2].sum(axis=(1, 2))
-        nodes.done[:] = 1
-        return run, segments_of(nodes, REASONS)
-
-    def step_in_python(
-        self, scene: Scene, state: MidpointState, command: Commands, increment: Floats, dt: float
-    ) -> Segment:
-        """One step of one path with diffusion fields that are evaluated in Python."""
-        now = state.state
-        control = command.u[0]
-        if len(command.gains):
-            control = control + command.gains[0] @ (np.concatenate([now.q[0], now.p[0]]) - command.reference[0])
-        F, drift = diffusion_and_drift(scene, now.q[0], now.v[0], control, state.start[0])
-        if len(increment):
-            kernels.apply_impulse(scene.mechanism, self.left * (F @ increment[0, 0]), now, state.work)
-        nothing = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
-        (segment,) = self.rollout_compiled(
-            scene, state, open_loop(control[None]), nothing, self.drift_share * drift[None, None], dt
-        )
-        if len(increment) and self.left < 1.0 and segment.failure is None:
-            F, _ = diffusion_and_drift(scene, now.q[0], now.v[0], control, state.start[0])
-            kernels.apply_impulse(scene.mechanism, (1.0 - self.left) * (F @ increment[0, 0]), now, state.work)
-            segment.p[-1], segment.v[-1], segment.energy[-1] = now.p[0], now.v[0], now.energy[0, :, :2].sum()
-        return segment
+    def _arrays(self, paths: int, dof: int, processes: int) -> tuple[equation.State, None]:
+        return equation.new_state(paths, dof, processes), None
 
     def rollout_compiled(
         self,
         scene: Scene,
-        state: MidpointState,
+        state: VariationalRun,
         commands: Commands,
         increments: Floats,
         drift: Floats,
@@ -169,7 +92,7 @@ class Midpoint(Integrator):
         """See :meth:`Integrator.rollout_compiled`."""
         nodes = new_nodes(len(state.state.q), steps_of(commands), scene.robot.dof, scene.controls)
         kernels.rollout(
-            scene.mechanism, self._options(), dt, commands, increments, drift, state.state, state.work, nodes
+            scene.mechanism, self._options(self.alpha), dt, commands, increments, drift, state.state, state.work, nodes
         )
         return segments_of(nodes, REASONS)
 
@@ -193,7 +116,7 @@ class Midpoint(Integrator):
 
     def _loose(self) -> equation.Options:
         """A root that is known to 1e-10 is good enough for derivatives, and one jet for them."""
-        return self._options()._replace(tolerance=1e6)
+        return self._options(self.alpha)._replace(tolerance=1e6)
 
     def _derivatives(
         self, scene: Scene, dt: float, q: Floats, p: Floats, guess: Floats, force: Floats, substeps: Integers
@@ -236,7 +159,7 @@ class Midpoint(Integrator):
         """Z goes back by each part's derivative, and the curvature of each part to the start of the step."""
         n = len(q)
         state, work = _room(scene, parts=substeps)
-        outcome = parts_of_step(scene.mechanism, self._options(), dt, q, p, force, state, work)
+        outcome = parts_of_step(scene.mechanism, self._options(self.alpha), dt, q, p, force, state, work)
         if outcome != equation.SOLVED:
             raise LinearizationError(0, 0.0, REASONS[outcome])
         one = np.ones(1, dtype=np.int64)
@@ -254,7 +177,7 @@ class Midpoint(Integrator):
             z = z @ link[: 2 * n, : 2 * n]
         return H
 
-    def predict(self, state: MidpointState, dt: float) -> tuple[Floats, Floats]:
+    def predict(self, state: VariationalRun, dt: float) -> tuple[Floats, Floats]:
         """See :meth:`Integrator.predict`; the velocity goes on from the last midpoint through the node."""
         now = state.state
         velocity = now.v[0].copy()

@@ -1,7 +1,9 @@
 """Small dense factorisations, written out: at the size of an arm a LAPACK call costs more than its work."""
 
+import numpy as np
+
 from varpin.kernels._compile import inlined
-from varpin.kernels.tree import Floats
+from varpin.kernels.tree import Floats, Integers
 
 
 @inlined
@@ -30,6 +32,56 @@ def solve_lu(lu: Floats, b: Floats, x: Floats) -> None:
     n = lu.shape[0]
     for i in range(n):
         total = b[i]
+        for j in range(i):
+            total -= lu[i, j] * x[j]
+        x[i] = total
+    for i in range(n - 1, -1, -1):
+        total = x[i]
+        for j in range(i + 1, n):
+            total -= lu[i, j] * x[j]
+        x[i] = total / lu[i, i]
+
+
+@inlined
+def factor_lu_pivoting(a: Floats, order: Integers) -> int:
+    """LU of the rows ``order`` of ``a`` (n, n) in place; the sign of the determinant, 0 where it is not finite."""
+    n = a.shape[0]
+    sign = 1
+    for i in range(n):
+        order[i] = i
+    for k in range(n):
+        best = k
+        for i in range(k + 1, n):
+            if abs(a[i, k]) > abs(a[best, k]):
+                best = i
+        if best != k:
+            sign = -sign
+            order[k], order[best] = order[best], order[k]
+            for j in range(n):
+                a[k, j], a[best, j] = a[best, j], a[k, j]
+        pivot = a[k, k]
+        if not abs(pivot) > 0.0 or not abs(pivot) < np.inf:
+            return 0
+        if pivot < 0.0:
+            sign = -sign
+        inverse = 1.0 / pivot
+        # Slices, unlike indices from k + 1 on, let the compiler use vector instructions.
+        top = a[k, k + 1 :]
+        for i in range(k + 1, n):
+            factor = a[i, k] * inverse
+            a[i, k] = factor
+            row = a[i, k + 1 :]
+            for j in range(row.size):
+                row[j] -= factor * top[j]
+    return sign
+
+
+@inlined
+def solve_lu_pivoting(lu: Floats, order: Integers, b: Floats, x: Floats) -> None:
+    """The x with a x = b for the ``a`` that :func:`factor_lu_pivoting` has factored."""
+    n = lu.shape[0]
+    for i in range(n):
+        total = b[order[i]]
         for j in range(i):
             total -= lu[i, j] * x[j]
         x[i] = total

@@ -123,6 +123,31 @@ def enter(state: State, k: Work, r: int) -> None:
 
 
 @inlined
+def settle(mechanism: Mechanism, options: Options, state: State, k: Work) -> int:
+    """Velocity and energy of the node in ``k.trial``, and whether the energy balance of the substep closes."""
+    if not node_energy(mechanism, k.trial[0], k.trial[2], k.trial[4], k):
+        return SINGULAR
+    for r in range(mechanism.tree.groups):
+        if not balanced(options, state, k, r):
+            return ENERGY
+    for r in range(mechanism.tree.groups):
+        enter(state, k, r)
+    return SOLVED
+
+
+@inlined
+def advance(margin: float, state: State, k: Work) -> None:
+    """Move the state to the node in ``k.trial``."""
+    trial = k.trial
+    k.quality[1] = min(k.quality[1], margin)
+    k.tally[3] += 1
+    for i in range(state.q.size):
+        state.q[i], state.q_low[i] = trial[0, i], trial[1, i]
+        state.p[i], state.p_low[i] = trial[2, i], trial[3, i]
+        state.v[i] = trial[4, i]
+
+
+@inlined
 def attempt(mechanism: Mechanism, options: Options, h: float, state: State, k: Work) -> int:
     """One substep from ``state`` and the guess in ``k.v``; moves the state only if it ends in SOLVED."""
     outcome = newton(mechanism, options, h, state, k)
@@ -133,7 +158,7 @@ def attempt(mechanism: Mechanism, options: Options, h: float, state: State, k: W
         return FOLD
     n = k.v.size
     group, groups = mechanism.tree.group, mechanism.tree.groups
-    q, q_low, p, p_low, v = k.trial[0], k.trial[1], k.trial[2], k.trial[3], k.trial[4]
+    q, q_low, p, p_low = k.trial[0], k.trial[1], k.trial[2], k.trial[3]
     for r in range(groups):
         k.balance[r, 1] = 0.0
         k.balance[r, 2] = 0.0
@@ -144,27 +169,19 @@ def attempt(mechanism: Mechanism, options: Options, h: float, state: State, k: W
         k.balance[group[i], 2] += h * drag * k.v[i]
         q[i], q_low[i] = add(state.q[i], state.q_low[i], h * k.v[i])
         p[i], p_low[i] = add(state.p[i], state.p_low[i], h * (k.sweep.Lq[i] + force))
-    if not node_energy(mechanism, q, p, v, k):
-        return SINGULAR
-    for r in range(groups):
-        if not balanced(options, state, k, r):
-            return ENERGY
-    for r in range(groups):
-        enter(state, k, r)
+    outcome = settle(mechanism, options, state, k)
+    if outcome != SOLVED:
+        return outcome
     if k.Jx.shape[0] > 0:
         set_midpoint(options.alpha, h, state, k)
         second_order(mechanism, k.qm, k.v, k.sweep)
         add_substep(mechanism, options, h, k)
-    k.quality[1] = min(k.quality[1], margin)
     if k.tally[3] < k.trail.shape[0]:
         row = k.trail[k.tally[3]]
         for i in range(n):
             row[i], row[n + i], row[2 * n + i] = state.q[i], state.p[i], k.v[i]
         row[3 * n] = h
-    k.tally[3] += 1
-    for i in range(n):
-        state.q[i], state.q_low[i], state.p[i], state.p_low[i] = q[i], q_low[i], p[i], p_low[i]
-        state.v[i] = v[i]
+    advance(margin, state, k)
     return SOLVED
 
 
@@ -182,6 +199,25 @@ def predict(state: State, k: Work) -> None:
         k.v[i] = 2.0 * past[0, i] - past[1, i]
         if state.counters[0] > 2:
             k.v[i] += past[0, i] - 2.0 * past[1, i] + past[2, i]
+
+
+@inlined
+def next_substep(outcome: int, extrapolated: bool, level: int, place: int, halvings: int) -> tuple[int, int]:
+    """Level and place of the next attempt after one that ended in ``outcome``; level -1 where nothing is left to try.
+
+    ``place`` counts substeps of h / 2^level. After a success at an even place the substep is doubled. After a failure
+    it is halved, unless only the extrapolated guess may be to blame.
+    """
+    if outcome == SOLVED:
+        place += 1
+        if level > 0 and place % 2 == 0:
+            return level - 1, place // 2
+        return level, place
+    if extrapolated and outcome != ENERGY:
+        return level, place
+    if level == halvings:
+        return -1, place
+    return level + 1, place * 2
 
 
 @inlined
@@ -208,20 +244,11 @@ def step(mechanism: Mechanism, options: Options, h: float, state: State, k: Work
             for i in range(n):
                 k.v[i] = state.v[i]
         outcome = attempt(mechanism, options, h / (1 << level), state, k)
-        if outcome == SOLVED:
-            place += 1
-            if level > 0 and place % 2 == 0:
-                level -= 1
-                place //= 2
-        elif extrapolate and outcome != ENERGY:
-            extrapolate = False
-        elif level == options.halvings:
+        level, place = next_substep(outcome, extrapolate, level, place, options.halvings)
+        if level < 0:
             return outcome
-        else:
-            extrapolate = False
-            level += 1
-            place *= 2
-            deepest = max(deepest, level)
+        deepest = max(deepest, level)
+        extrapolate = False
     state.counters[1] = deepest
     for i in range(n):
         state.lead[i] = k.v[i] - k.start[i] if deepest == 0 else 0.0
@@ -327,6 +354,29 @@ def begin_paths(mechanism: Mechanism, q: Floats, v: Floats, states: State, k: Wo
     return True
 
 
+@inlined
+def record_effort(outcome: int, i: int, s: int, k: Work, nodes: Nodes) -> None:
+    """Write down how step ``s`` of path ``i`` ended and what it took."""
+    nodes.ended[i] = outcome
+    for c in range(4):
+        nodes.tally[i, s, c] = k.tally[c]
+    for c in range(2):
+        nodes.quality[i, s, c] = k.quality[c]
+
+
+@inlined
+def record_node(mechanism: Mechanism, i: int, s: int, state: State, nodes: Nodes) -> None:
+    """Write down the node that step ``s`` of path ``i`` has reached."""
+    for r in range(state.q.size):
+        nodes.q[i, s, r], nodes.p[i, s, r], nodes.v[i, s, r] = state.q[r], state.p[r], state.v[r]
+    nodes.energy[i, s] = 0.0
+    nodes.quality[i, s, 2] = 0.0
+    for r in range(mechanism.tree.groups):
+        nodes.energy[i, s] += state.energy[r, 0] + state.energy[r, 1]
+        nodes.quality[i, s, 2] += abs(state.energy[r, 2])
+    nodes.done[i] = s + 1
+
+
 @kernel
 def rollout(
     mechanism: Mechanism,
@@ -345,7 +395,6 @@ def rollout(
     the controls', (P, N, n), or (0, 0, n) for none. Writes into ``nodes`` the node after each step, what was applied in
     it and what it took. A path that fails stops there; ``nodes.ended`` and ``nodes.done`` say how and where.
     """
-    n = k.v.size
     noisy = increments.shape[0] > 0 and increments.shape[2] > 0
     for i in range(states.q.shape[0]):
         state = path(states, i)
@@ -359,20 +408,9 @@ def rollout(
                 kick(mechanism, options.left, nodes.u[i, s], increments[i, s], state, k)
             constant_force(mechanism, drift, i, s, nodes.u[i, s], k.force)
             outcome = step(mechanism, options, h, state, k)
-            for c in range(4):
-                nodes.tally[i, s, c] = k.tally[c]
-            for c in range(2):
-                nodes.quality[i, s, c] = k.quality[c]
+            record_effort(outcome, i, s, k, nodes)
             if outcome != SOLVED:
-                nodes.ended[i] = outcome
                 break
             if noisy and options.left < 1.0:
                 kick(mechanism, 1.0 - options.left, nodes.u[i, s], increments[i, s], state, k)
-            for r in range(n):
-                nodes.q[i, s, r], nodes.p[i, s, r], nodes.v[i, s, r] = state.q[r], state.p[r], state.v[r]
-            nodes.energy[i, s] = 0.0
-            nodes.quality[i, s, 2] = 0.0
-            for r in range(mechanism.tree.groups):
-                nodes.energy[i, s] += state.energy[r, 0] + state.energy[r, 1]
-                nodes.quality[i, s, 2] += abs(state.energy[r, 2])
-            nodes.done[i] = s + 1
+            record_node(mechanism, i, s, state, nodes)

@@ -109,10 +109,17 @@ def identity(k: Work) -> None:
 
 @inlined
 def add_substep(mechanism: Mechanism, options: Options, h: float, k: Work) -> None:
-    """Let the substep at the root in ``k.v``, its jet in the sweep, follow those before: chain rule."""
+    """Let the substep at the root in ``k.v``, its jet in the sweep, follow those before."""
+    n = k.v.size
+    substep_jacobian(mechanism, options, h, k, k.part[: 2 * n], k.part[2 * n :, :n])
+    chain(k)
+
+
+@inlined
+def chain(k: Work) -> None:
+    """Let the substep whose derivatives stand in ``k.part`` follow those before: chain rule."""
     n = k.v.size
     Jx, Jf, product = k.part[: 2 * n], k.part[2 * n :, :n], k.part[2 * n :, n:]
-    substep_jacobian(mechanism, options, h, k, Jx, Jf)
     for half in range(2):
         for i in range(2 * n):
             for j in range(n):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -71,16 +72,16 @@ def _free(motions: Motions) -> Figure:
             ylabel=r"$\theta_1$ [rad]",
             title=f"({panel}) from {'rest' if panel == 'b' else 'velocity [0, 0, 1] rad/s'}",
         )
-    _legend(panels[0], "center", 4)
+    _legend(panels[0], "outside lower center", 4)
     return figure
 
 
-def _legend(axes: Axes, where: str, columns: int) -> None:
+def _legend(
+    axes: Axes, where: Literal["outside lower left", "outside lower center", "outside lower right"], columns: int
+) -> None:
     """The legend of some axes below the figure, where it covers no curve."""
     handles, labels = axes.get_legend_handles_labels()
-    axes.figure.legend(
-        handles, labels, loc=f"outside lower {where}", ncols=columns, frameon=False, fontsize=8, handlelength=2.5
-    )
+    axes.figure.legend(handles, labels, loc=where, ncols=columns, frameon=False, fontsize=8, handlelength=2.5)
 
 
 def _tracking(cells: Cells, case: str, fine: float, third: Callable[[Axes, Cells, str, float], None]) -> Figure:
@@ -99,8 +100,8 @@ def _tracking(cells: Cells, case: str, fine: float, third: Callable[[Axes, Cells
         panel.set_yscale("symlog", linthresh=_SMALL_ERROR)
         panel.set(xlabel="time [s]", ylabel="tracking error [rad]", title=method)
     third(axes[2], cells, case, fine)
-    _legend(axes[1], "left", 6)
-    _legend(axes[2], "right", 3)
+    _legend(axes[1], "outside lower left", 6)
+    _legend(axes[2], "outside lower right", 3)
     return figure
 
 

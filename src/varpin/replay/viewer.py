@@ -308,7 +308,8 @@ class _ShapeLoader(MeshcatVisualizer):
     def load_ghost(self, shape: pin.GeometryObject, placement: pin.SE3, node: str) -> None:
         """Send a shape in the ghost's colour: as coal has it, for neither colours nor textures of its file are shown.
 
-        A polygon offset lets the robot win where both are in one place; without it they would flicker.
+        A polygon offset lets the robot win where both are in one place, up to the facets of a sphere that has turned;
+        without it they would flicker.
         """
         is_mesh = isinstance(shape.geometry, pin.coal.BVHModelBase)
         with warnings.catch_warnings():
@@ -318,7 +319,7 @@ class _ShapeLoader(MeshcatVisualizer):
         if isinstance(form, meshcat.geometry.Geometry):
             material = meshcat.geometry.MeshPhongMaterial(
                 color=_GHOST_COLOR, opacity=_GHOST_OPACITY, transparent=True, polygonOffset=True,
-                polygonOffsetFactor=1.0, polygonOffsetUnits=4.0,
+                polygonOffsetFactor=2.0, polygonOffsetUnits=64.0,
             )  # fmt: skip
             self.viewer[node].set_object(form, material)
             self.viewer[node].set_transform(placement.homogeneous)

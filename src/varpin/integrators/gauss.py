@@ -1,0 +1,160 @@
+"""Variational integrators of high order: collocation at the Gauss points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.checks import count
+from varpin.errors import InputError, LinearizationError
+from varpin.integrators.base import Segment, drifts, segments_of, steps_of
+from varpin.integrators.variational import REASONS, Variational, VariationalRun
+from varpin.kernels import gauss as kernels
+from varpin.kernels import gauss_equation as stage_equation
+from varpin.kernels import midpoint_equation as equation
+from varpin.kernels.gauss_linearize import linearize
+from varpin.kernels.gauss_tableau import tableau
+from varpin.kernels.tree import Commands, new_nodes
+from varpin.scene import Scene
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+MOST_STAGES = 6
+HIGH_ORDER = 0.1  # of the budget of energy errors is enough for more than one stage
+
+
+@dataclass(frozen=True)
+class Gauss(Variational):
+    """Variational Gauss-Legendre collocation with s stages, in position-momentum form.
+
+    Solves L_v(Q_i, V_i) = p0 + dt sum_j a_ij (L_q + F)(Q_j, V_j) with Q_i = q0 + dt sum_j a_ij V_j for the stage
+    velocities V_i. Of order 2 s, symmetric, and symplectic where nothing is forced; one stage is ``Midpoint()``.
+    Controls are constant over a step: under a control that is not, the whole is of second order whatever s.
+
+    Steps are accepted or taken in parts as :class:`Midpoint` does.
+
+    Main args:
+        stages: s, from 1 to 6.
+
+    Other Args:
+        tolerance: As of :class:`Midpoint`, and so are the others.
+        branch_margin: Of the stages' mean mass matrix and curvature.
+        energy_balance: Largest error in the energy balance of a substep, in units of the energy it turns over.
+        energy_budget: The errors of all substeps together, in units of the largest kinetic energy so far. More than
+            one stage gets by on a tenth of it: that costs next to no substeps and keeps ten times the energy.
+        max_halvings: A step is never cut into more than 2**max_halvings parts.
+        kick: When noise kicks the momentum, ``"left"`` or ``"split"``.
+    """
+
+    stages: int = 2
+    tolerance: float = 0.5
+    branch_margin: float = 0.5
+    energy_balance: float = 0.005
+    energy_budget: float = 0.05
+    max_halvings: int = 12
+    kick: Literal["left", "split"] = "left"
+
+    def __post_init__(self) -> None:
+        if count("stages", self.stages, 1) > MOST_STAGES:
+            raise InputError(f"stages must be at most {MOST_STAGES}, got {self.stages}")
+        super().__post_init__()
+
+    def __str__(self) -> str:
+        kick = "" if self.kick == "left" else f", kick={self.kick}"
+        return f"Gauss(stages={self.stages}{kick})"
+
+    def _gauss_options(self) -> equation.Options:
+        options = self._options(0.5)
+        if self.stages == 1:
+            return options
+        return options._replace(budget=HIGH_ORDER * options.budget)
+
+    def _arrays(self, paths: int, dof: int, processes: int) -> tuple[equation.State, stage_equation.Stages]:
+        stages = int(self.stages)
+        state = stage_equation.new_gauss_state(stages, paths, dof, processes)
+        return state, stage_equation.new_stages(stages, dof)
+
+    def rollout_compiled(
+        self,
+        scene: Scene,
+        state: VariationalRun,
+        commands: Commands,
+        increments: Floats,
+        drift: Floats,
+        dt: float,
+    ) -> list[Segment]:
+        """See :meth:`Integrator.rollout_compiled`."""
+        nodes = new_nodes(len(state.state.q), steps_of(commands), scene.robot.dof, scene.controls)
+        kernels.rollout(
+            scene.mechanism,
+            tableau(int(self.stages)),
+            self._gauss_options(),
+            dt,
+            commands,
+            increments,
+            drift,
+            state.state,
+            state.work,
+            state.stages,
+            nodes,
+        )
+        return segments_of(nodes, REASONS)
+
+    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
+        """See :meth:`Integrator.linearize`; the state is (q, p).
+
+        A step that was taken in parts is taken in parts again, and their derivatives are chained.
+        """
+        steps, n = trajectory.steps, scene.robot.dof
+        q, p = (np.ascontiguousarray(getattr(trajectory, name)[:-1]) for name in ("q", "p"))
+        force = trajectory.u @ scene.actuation.T + self.drift_share * drifts(scene, trajectory)
+        Jx, Jf = np.empty((steps, 2 * n, 2 * n)), np.empty((steps, 2 * n, n))
+        state, stages = self._arrays(1, n, scene.mechanism.diffusion.constant.shape[1])
+        outcome, done = linearize(
+            scene.mechanism,
+            tableau(int(self.stages)),
+            # A root that is known to 1e-10 is good enough for derivatives.
+            self._gauss_options()._replace(tolerance=1e6),
+            trajectory.dt,
+            q,
+            p,
+            self._guess(trajectory),
+            force,
+            trajectory.statistics.substeps,
+            state,
+            equation.new_work(scene.robot.tree.parent.size, n, derivatives=True),
+            stages,
+            Jx,
+            Jf,
+        )
+        if outcome != equation.SOLVED:
+            raise LinearizationError(done, done * trajectory.dt, REASONS[outcome])
+        return Jx, Jf, Jx[:, :, n:]
+
+    def _guess(self, trajectory: Trajectory) -> Floats:
+        """Stage velocities (N, s, n) of the cubic through the nodes and their velocities.
+
+        With noise the step at dw = 0 starts from another momentum, and its velocity is all there is to go by.
+        """
+        q, v = trajectory.q, trajectory.v
+        c = tableau(int(self.stages)).c[None, :, None]
+        if trajectory.dw.any():
+            return v[:-1, None] + np.zeros_like(c)
+        mean = (np.diff(q, axis=0) / trajectory.dt)[:, None]
+        guess: Floats = (
+            (1.0 - c) * (1.0 - 3.0 * c) * v[:-1, None] + c * (3.0 * c - 2.0) * v[1:, None] + 6.0 * c * (1.0 - c) * mean
+        )
+        return guess
+
+    def predict(self, state: VariationalRun, dt: float) -> tuple[Floats, Floats]:
+        """See :meth:`Integrator.predict`; the velocity goes on as from the last step's mean to its end."""
+        now = state.state
+        velocity = now.v[0].copy()
+        if now.counters[0, 0] > 0:
+            stages = int(self.stages)
+            velocity += now.past[0, stages] - tableau(stages).b @ now.past[0, :stages]
+        return now.q[0] + 0.5 * dt * now.v[0], velocity

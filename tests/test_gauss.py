@@ -1,0 +1,463 @@
+"""Gauss collocation against exact solutions, a plain version of itself, the midpoint rule, and its own promises."""
+
+import functools
+import itertools
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import root
+
+import varpin as vp
+from varpin.kernels.gauss_tableau import tableau
+
+GRAVITY = 9.81
+ALL = [1, 2, 3, 4, 5, 6]
+WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+
+
+def reference(scene, q0, v0, duration, force):
+    """q(duration) under a constant force by DOP853 on Pinocchio's forward dynamics."""
+    robot = scene.robot
+    model = robot.model.copy()
+    model.gravity = pin.Motion(scene.gravity, np.zeros(3))
+    data = model.createData()
+    n = robot.dof
+
+    def rate(t, x):
+        q, v = x[:n], x[n:]
+        total = force - scene.damping * v - scene.stiffness * (q - scene.rest)
+        return np.concatenate([v, pin.aba(model, data, robot.configuration(q), v, total)])
+
+    return solve_ivp(rate, (0, duration), np.concatenate([q0, v0]), method="DOP853", rtol=1e-13, atol=1e-13).y[:n, -1]
+
+
+@pytest.mark.parametrize("stages", ALL)
+def test_tableau(stages):
+    """Quadrature of order 2s, collocation of order s, and symplectic: b_i a_ij + b_j a_ji = b_i b_j."""
+    t = tableau(stages)
+    for k in range(1, 2 * stages + 1):
+        assert t.b @ t.c ** (k - 1) == pytest.approx(1 / k, rel=1e-15)
+    for k in range(1, stages + 1):
+        np.testing.assert_allclose(t.a @ t.c ** (k - 1), t.c**k / k, rtol=0, atol=1e-15)
+    weighted = t.b[:, None] * t.a
+    np.testing.assert_allclose(weighted + weighted.T, np.outer(t.b, t.b), rtol=0, atol=1e-16)
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3, 5])
+def test_one_step_solves_the_stage_equations(stages):
+    """Against a plain solver: unknown positions of the stages, Pinocchio's derivatives, SciPy's root finder."""
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.7, stiffness=3.0, rest=0.2)
+    q0, v0, u = np.random.default_rng(3).normal(size=(3, 6))
+    dt = 2e-2
+    nodes, weights = np.polynomial.legendre.leggauss(stages)
+    c, b = 0.5 + 0.5 * nodes, 0.5 * weights
+    powers = np.vander(c, increasing=True)
+    a = (c[:, None] * powers / np.arange(1, stages + 1)) @ np.linalg.inv(powers)
+    p0 = vp.lagrangian_jet(scene, q0, v0, backend="pinocchio").Lv
+
+    def at(x):
+        Q = x.reshape(stages, 6)
+        V = np.linalg.solve(a, Q - q0) / dt
+        jets = [vp.lagrangian_jet(scene, *pair, backend="pinocchio") for pair in zip(Q, V, strict=True)]
+        slope = np.array([jet.Lq for jet in jets]) + u - scene.damping * V
+        return V, np.array([jet.Lv for jet in jets]), slope
+
+    def equations(x):
+        _, momenta, slope = at(x)
+        return (p0 + dt * a @ slope - momenta).ravel()
+
+    solution = root(equations, (q0 + dt * c[:, None] * v0).ravel(), tol=1e-13)
+    V, _, slope = at(solution.x)
+    end = vp.simulate(scene, q0, v0, dt=dt, steps=1, controls=u, integrator=vp.Gauss(stages))
+    np.testing.assert_allclose(end.q[1], q0 + dt * b @ V, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(end.p[1], p0 + dt * b @ slope, rtol=0, atol=1e-9)
+
+
+# For each arm: what to lock, the size of forces, how fast it starts, and how long [s]: in free fall the wrists of the
+# heavier arms whip round ever faster, and no step is small enough for long.
+ARMS = {
+    "finger": (None, 1e-5, 10.0, 1.0),
+    "ur5": (None, 1.0, 1.5, 1.0),
+    "panda": ({"panda_finger_joint1": 0.02}, 0.05, 1.0, 0.4),
+}
+# Steps: fine enough for the leading term of the error to lead, coarse enough for it to stand out from rounding.
+STEPS = {
+    "finger": {1: (500, 1000, 2000), 2: (256, 360, 512), 3: (140, 180, 240), 4: (68, 76, 84)},
+    "ur5": {1: (500, 1000, 2000), 2: (256, 360, 512), 3: (140, 180, 240), 4: (68, 76, 84)},
+    "panda": {1: (250, 500, 1000), 2: (100, 150, 200), 3: (50, 60, 80), 4: (44, 50, 56)},
+}
+
+
+@functools.cache
+def problem(name, forced):
+    """A scene, its start, its force, and q at the end: Gauss with six stages, held against DOP853."""
+    lock, size, speed, duration = ARMS[name]
+    robot = vp.load_robot(name, lock=lock)
+    n = robot.dof
+    scene, u = vp.Scene(robot), np.zeros(n)
+    if forced:
+        scene = vp.Scene(robot, damping=0.5 * size, stiffness=8.0 * size, rest=0.1)
+        u = 4.0 * size * np.cos(np.arange(n))
+    start = np.linspace(0.2, 0.6, n), 0.5 * speed * np.linspace(1.0, -1.0, n)
+    end = vp.simulate(scene, *start, dt=duration / 400, steps=400, controls=u, integrator=vp.Gauss(6)).q[-1]
+    np.testing.assert_allclose(end, reference(scene, *start, duration, u), rtol=0, atol=1e-12)
+    return scene, start, u, duration, end
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3, 4])
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("forced", [False, True])
+def test_order_twice_the_stages(stages, name, forced):
+    scene, start, u, duration, exact = problem(name, forced)
+    errors = []
+    for steps in STEPS[name][stages]:
+        end = vp.simulate(scene, *start, dt=duration / steps, steps=steps, controls=u, integrator=vp.Gauss(stages))
+        assert end.statistics.split_steps == 0
+        errors.append(np.linalg.norm(end.q[-1] - exact))
+    slopes = -np.diff(np.log(errors)) / np.diff(np.log(STEPS[name][stages]))
+    assert np.abs(slopes - 2 * stages).max() < 0.1, (errors, slopes)
+
+
+@pytest.mark.parametrize("name", ["finger", "ur5", "panda"])
+def test_one_stage_is_the_midpoint_rule(name):
+    lock, size, *_ = ARMS[name]
+    robot = vp.load_robot(name, lock=lock)
+    n = robot.dof
+    scene = vp.Scene(robot, damping=0.1 * size, stiffness=size, rest=0.3)
+    u = size * np.random.default_rng(0).normal(size=(100, n))
+    start = np.linspace(0.2, 0.6, n), np.linspace(0.5, -0.5, n)
+    runs = [
+        vp.simulate(scene, *start, dt=2e-3, steps=100, controls=u, integrator=integrator)
+        for integrator in (vp.Midpoint(), vp.Gauss(1))
+    ]
+    for quantity in ("q", "p", "v"):
+        one, other = (getattr(run, quantity) for run in runs)
+        np.testing.assert_allclose(other, one, rtol=0, atol=1e-12 * np.abs(one).max())
+    np.testing.assert_allclose(runs[1].statistics.branch_margin, runs[0].statistics.branch_margin, rtol=1e-3, atol=0)
+    lin, same = (
+        vp.linearize(scene, run, integrator=integrator)
+        for run, integrator in zip(runs, (vp.Midpoint(), vp.Gauss(1)), strict=True)
+    )
+    for quantity in ("A", "B", "K"):
+        one, other = getattr(lin, quantity), getattr(same, quantity)
+        np.testing.assert_allclose(other, one, rtol=0, atol=1e-10 * np.abs(one).max())
+
+
+@pytest.mark.parametrize("stages", ALL)
+@pytest.mark.parametrize("name", ["finger", "ur5", "panda"])
+def test_symplectic(stages, name):
+    """A'JA = J to 1e-12 where nothing is damped."""
+    scene = vp.Scene(vp.load_robot(name, lock=ARMS[name][0]))
+    n = scene.robot.dof
+    integrator = vp.Gauss(stages)
+    rng = np.random.default_rng(1)
+    motion = vp.simulate(scene, rng.normal(size=n), rng.normal(size=n), dt=5e-3, steps=5, integrator=integrator)
+    assert motion.statistics.split_steps == 0
+    J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(n))
+    size = np.concatenate([np.ones(n), np.full(n, np.abs(motion.p).max())])
+    for A in vp.linearize(scene, motion, integrator=integrator).A:
+        scaled = A / size[:, None] * size[None, :]
+        assert np.abs(scaled.T @ J @ scaled - J).max() < 1e-12 * max(1.0, np.abs(scaled).max() ** 2)
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3, 4, 6])
+@pytest.mark.parametrize("name", ["finger", "ur5", "panda"])
+@pytest.mark.parametrize("kick", ["left", "split"])
+def test_linearization_against_differences(stages, name, kick):
+    """A, B and G to 1e-8 of eighth-order differences of the step, with damping, springs, controls and noise."""
+    lock, size, *_ = ARMS[name]
+    robot = vp.load_robot(name, lock=lock)
+    noise = vp.AdditiveNoise(1e-2 * size) + vp.ControlNoise(0.1) + vp.StateNoise(size, center=0.3)
+    actuation = size * np.eye(robot.dof)  # so that controls are of the size of the check's steps
+    scene = vp.Scene(robot, damping=size, stiffness=5.0 * size, actuation=actuation, noise=noise)
+    q, v, u = np.random.default_rng(0).uniform(-1, 1, (3, robot.dof))
+    found = vp.check_linearization(scene, q, v, u, dt=2e-3, integrator=vp.Gauss(stages, kick=kick))
+    assert found.worst < 1e-8
+    assert min(found.A[1], found.B[1], found.G[1]) > 0.0
+
+
+@pytest.mark.parametrize("stages", ALL)
+def test_reversible(stages):
+    """Turned round, a conservative motion runs back to where it came from."""
+    scene = vp.Scene(vp.load_robot("ur5"))
+    q0, v0 = np.linspace(0.1, 0.6, 6), np.linspace(1.0, -1.0, 6)
+    there = vp.simulate(scene, q0, v0, dt=1e-2, steps=100, integrator=vp.Gauss(stages))
+    back = vp.simulate(scene, there.q[-1], -there.v[-1], dt=1e-2, steps=100, integrator=vp.Gauss(stages))
+    assert there.statistics.split_steps == back.statistics.split_steps == 0
+    np.testing.assert_allclose(back.q[-1], q0, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(-back.v[-1], v0, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("stages", [2, 4])
+def test_momentum_about_a_vertical_axis_is_conserved_to_rounding(stages):
+    """Gravity does not see the first joint of an arm that stands upright."""
+    scene = vp.Scene(vp.load_robot("ur5"))
+    start = [0.3, -1.0, 0.8, 0.2, 0.4, 0.1], [2.0, 0.5, 0, 1, 0, 3]
+    motion = vp.simulate(scene, *start, dt=4e-3, steps=5000, integrator=vp.Gauss(stages))
+    about_axis = motion.p[:, 0]
+    assert np.ptp(motion.p[:, 1]) > 1.0
+    assert np.abs(about_axis - about_axis[0]).max() <= 4.0 * np.spacing(abs(about_axis[0]))
+
+
+def slider(stiffness):
+    """A mass of 1 kg on a spring, nothing else."""
+    model = pin.Model()
+    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slide")
+    model.appendBodyToJoint(joint, pin.Inertia.FromSphere(1.0, 0.1), pin.SE3.Identity())
+    return vp.Scene(vp.load_robot(model), stiffness=stiffness, gravity=False)
+
+
+@pytest.mark.parametrize("stages", ALL)
+def test_a_spring_is_turned_by_the_pade_approximant(stages):
+    """One step of the oscillator is the diagonal Pade approximant of exp(h [[0, 1], [-k, 0]]), stiff or not."""
+    for product in (0.3, 5.0, 400.0):  # h sqrt(k)
+        motion = vp.simulate(slider(product**2), [1.0], [0.7], dt=1.0, steps=1, integrator=vp.Gauss(stages))
+        assert motion.statistics.split_steps == 0
+        Z = np.array([[0.0, 1.0], [-(product**2), 0.0]])
+        factors = [1.0]
+        for j in range(1, stages + 1):
+            factors.append(factors[-1] * (stages - j + 1) / (j * (2 * stages - j + 1)))
+        # Scaled, so that the powers of a stiff spring's matrix stay of one size.
+        S = np.diag([1.0, product])
+        Y = np.linalg.solve(S, Z @ S)
+        powers = [np.linalg.matrix_power(Y, j) for j in range(stages + 1)]
+        P = sum(f * power for f, power in zip(factors, powers, strict=True))
+        N = sum(f * (-1) ** j * power for j, (f, power) in enumerate(zip(factors, powers, strict=True)))
+        expected = np.linalg.solve(N, P @ [1.0, 0.7 / product])
+        given = np.array([motion.q[1, 0], motion.v[1, 0] / product])
+        np.testing.assert_allclose(given, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("stages", [2, 3])
+def test_energy_round_off_walks_at_random(stages):
+    """A mass on a spring: Gauss collocation conserves quadratic energies exactly, so what is left is rounding."""
+    motion = vp.simulate(slider(3.0), [1.0], [0.3], dt=2e-2, steps=200_000, integrator=vp.Gauss(stages))
+    assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 50 * np.finfo(float).eps
+
+
+def energy_errors(integrator, dt, duration, starts):
+    """Energy errors (len(starts), steps + 1) of three 1 m, 1 kg links from horizontal rest, in m g n^2 / 2."""
+    scene = vp.Scene(vp.planar_chain(3))
+    steps = int(duration / dt)
+    runs = [
+        vp.simulate(scene, np.full(3, tilt), np.zeros(3), dt=dt, steps=steps, integrator=integrator) for tilt in starts
+    ]
+    assert sum(run.statistics.split_steps for run in runs) <= 1e-2 * steps * len(runs)
+    return np.array([run.energy - run.energy[0] for run in runs]) / (GRAVITY * 9 / 2)
+
+
+def test_energy_of_a_long_run_has_no_trend_and_beats_the_midpoint_rule():
+    """500 s, chaotic, so eight starts within 1e-6 rad are eight independent runs; Gauss at twice the step."""
+    starts = np.arange(8) * 1e-7
+    errors = energy_errors(vp.Gauss(2), 2e-2, 500.0, starts)
+    blocks = errors[:, 1:].reshape(8, 20, -1).mean(axis=2)
+    trends = np.polyfit(np.arange(20.0), blocks.T, 1)[0]
+    assert abs(trends.mean()) < 3.5 * trends.std(ddof=1) / np.sqrt(8)
+    midpoint = energy_errors(vp.Midpoint(), 1e-2, 500.0, starts)
+    assert np.sqrt((errors**2).mean()) < np.sqrt((midpoint**2).mean())
+    assert np.abs(errors).max() < np.abs(midpoint).max()
+    assert np.abs(errors).max() < 1e-2
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3, 4, 6])
+@pytest.mark.parametrize("duration", [20.0, pytest.param(1000.0, marks=pytest.mark.slow)], ids=["20 s", "1000 s"])
+def test_no_silent_energy_jump_at_coarse_steps(stages, duration):
+    limit = 0.05 if stages == 1 else 0.01
+    for links in (2, 3, 5):
+        scene = vp.Scene(vp.planar_chain(links))
+        for dt in (0.02, 0.05, 0.1, 0.2, 0.5):
+            motion = vp.simulate(
+                scene, np.zeros(links), np.zeros(links), dt=dt, steps=int(duration / dt), integrator=vp.Gauss(stages)
+            )
+            assert np.abs(motion.energy - motion.energy[0]).max() < limit * GRAVITY * links**2 / 2
+            assert motion.statistics.branch_margin.min() > 0.0
+            if dt > 0.1:
+                assert motion.statistics.split_steps > 0
+
+
+def test_without_the_guards_there_are_silent_jumps():
+    """What the guards are for: without them the same run jumps to other branches of solutions."""
+    unguarded = vp.Gauss(2, branch_margin=0.0, energy_balance=1e12, energy_budget=1e12)
+    scene = vp.Scene(vp.planar_chain(3))
+    try:
+        motion = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=0.1, steps=2000, integrator=unguarded)
+    except vp.StepFailure as failure:
+        motion = failure.trajectory
+    assert np.abs(motion.energy - motion.energy[0]).max() > 20.0 * GRAVITY * 9 / 2
+
+
+def test_split_steps_are_counted_and_chained():
+    """A step taken in parts is counted as such, and linearized in the same parts."""
+    scene = vp.Scene(vp.planar_chain(3))
+    q, v, dt = np.array([2.1, -2.8, 1.4]), np.array([-5.9, -4.4, -2.5]), 0.2
+    integrator = vp.Gauss(2)
+    motion = vp.simulate(scene, q, v, dt=dt, steps=1, integrator=integrator)
+    parts = motion.statistics.substeps[0]
+    assert motion.statistics.split_steps == 1
+    assert parts > 1
+    # Every part takes at least one jet at both stages and one correction.
+    assert motion.statistics.jets[0] >= 2 * parts
+    assert motion.statistics.newton_iterations[0] >= parts
+    A = vp.linearize(scene, motion, integrator=integrator).A[0]
+
+    def step(x):
+        v = np.linalg.solve(vp.lagrangian_jet(scene, x[:3], np.zeros(3)).Lvv, x[3:])
+        end = vp.simulate(scene, x[:3], v, dt=dt, steps=1, integrator=integrator)
+        assert end.statistics.substeps[0] == parts
+        return np.concatenate([end.q[1], end.p[1]])
+
+    x = np.concatenate([q, motion.p[0]])
+    numeric, size = np.zeros((6, 6)), 5e-4
+    for j, e in enumerate(size * np.eye(6)):
+        numeric[:, j] = sum(w * (step(x + k * e) - step(x - k * e)) for k, w in WEIGHTS.items()) / size
+    np.testing.assert_allclose(A, numeric, rtol=0, atol=1e-8 * np.abs(numeric).max())
+    J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(3))
+    assert np.abs(A.T @ J @ A - J).max() < 1e-11 * np.abs(A).max() ** 2
+
+
+@pytest.mark.parametrize("kick", ["left", "split"])
+def test_kicks_of_one_stage_are_those_of_the_midpoint_rule(kick):
+    """With the same increments, and noise of every kind a kernel evaluates."""
+    noise = vp.AdditiveNoise(0.3) + vp.ControlNoise(0.1) + vp.StateNoise(0.5, center=0.3)
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.5, noise=noise)
+    u = np.random.default_rng(1).normal(size=(50, 6))
+    start = np.full(6, 0.2), np.zeros(6)
+    runs = [
+        vp.simulate(scene, *start, dt=1e-3, steps=50, controls=u, rng=7, integrator=integrator)
+        for integrator in (vp.Midpoint(kick=kick), vp.Gauss(1, kick=kick))
+    ]
+    quiet = vp.simulate(scene, *start, dt=1e-3, steps=50, controls=u, integrator=vp.Gauss(1, kick=kick))
+    assert np.abs(runs[1].q[-1] - quiet.q[-1]).max() > 1e-4
+    np.testing.assert_allclose(runs[1].q, runs[0].q, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(runs[1].p, runs[0].p, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kick", ["left", "split"])
+def test_fields_in_python_and_in_kernels_do_the_same(kick):
+    """A user's field, evaluated in Python, against the same field in a kernel."""
+    robot = vp.load_robot("ur5")
+    custom = vp.CustomNoise(
+        field=lambda q, v, u: np.diag(0.3 + 0.5 * (q - 0.3) ** 2),
+        processes=6,
+        dq=lambda q, v, u: np.einsum("ij,jk->ijk", np.eye(6), np.diag(q - 0.3)),
+    )
+    dw = np.random.default_rng(2).normal(size=(40, 6)) * np.sqrt(1e-3)
+    both = vp.AdditiveNoise(0.3) + vp.StateNoise(0.5, center=0.3)
+    start = np.full(6, 0.2), np.zeros(6)
+    integrator = vp.Gauss(3, kick=kick)
+    in_python = vp.simulate(
+        vp.Scene(robot, noise=custom), *start, dt=1e-3, steps=40, increments=dw, integrator=integrator
+    )
+    in_kernel = vp.simulate(
+        vp.Scene(robot, noise=both),
+        *start,
+        dt=1e-3,
+        steps=40,
+        increments=np.concatenate([dw, dw], axis=1),
+        integrator=integrator,
+    )
+    np.testing.assert_allclose(in_python.q, in_kernel.q, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(in_python.p, in_kernel.p, rtol=0, atol=1e-12)
+
+
+def test_an_ensemble_is_its_paths():
+    """Paths side by side do what each does alone: nothing leaks from one to the next."""
+    scene = vp.Scene(vp.load_robot("finger"), damping=1e-5, noise=vp.AdditiveNoise(1e-5))
+    start, options = (np.full(3, 0.3), np.zeros(3)), {"dt": 2e-3, "steps": 30, "integrator": vp.Gauss(3)}
+    together = vp.simulate_ensemble(scene, *start, paths=4, rng=7, **options)
+    for path, child in enumerate(np.random.default_rng(7).spawn(4)):
+        np.testing.assert_array_equal(together.q[path], vp.simulate(scene, *start, rng=child, **options).q)
+
+
+def test_a_function_and_an_array_of_controls_do_the_same():
+    """Step by step through Python or in one kernel: the past is carried from call to call."""
+    scene = vp.Scene(vp.load_robot("finger"), gravity=False, damping=1e-5)
+    u = np.random.default_rng(0).normal(size=(50, 3)) * 1e-5
+    start, integrator = (np.zeros(3), np.ones(3)), vp.Gauss(3)
+    by_array = vp.simulate(scene, *start, dt=1e-3, steps=50, controls=u, integrator=integrator)
+    by_law = vp.simulate(
+        scene, *start, dt=1e-3, steps=50, controls=lambda t, q, v: u[int(t / 1e-3)], integrator=integrator
+    )
+    np.testing.assert_allclose(by_law.q, by_array.q, rtol=0, atol=1e-14)
+
+
+def test_feedback_is_of_second_order():
+    """A control law is sampled once a step, at the state expected at its middle."""
+    scene = vp.Scene(vp.load_robot("ur5"), gravity=False)
+
+    def law(t, q, v):
+        return 3.0 * np.sin(4.0 * t) - 2.0 * v
+
+    ends = [
+        vp.simulate(scene, np.zeros(6), np.zeros(6), dt=0.5 / k, steps=k, controls=law, integrator=vp.Gauss(3)).q[-1]
+        for k in (100, 200, 400, 800)
+    ]
+    changes = [np.abs(one - other).max() for one, other in itertools.pairwise(ends)]
+    slopes = np.log2(np.array(changes[:-1]) / changes[1:])
+    assert ((slopes > 1.9) & (slopes < 2.1)).all(), slopes
+
+
+@pytest.mark.parametrize("links", [3, 7])
+def test_few_evaluations(links):
+    """One jet a stage on most steps, and first-order sweeps for the rest."""
+    scene = vp.Scene(vp.planar_chain(links))
+    for stages in ALL:
+        motion = vp.simulate(scene, np.zeros(links), np.zeros(links), dt=2e-2, steps=50, integrator=vp.Gauss(stages))
+        assert motion.statistics.jets.mean() / stages < 1.5
+        assert motion.statistics.sweeps.mean() / stages < 3.0
+        assert motion.statistics.residual.max() < 1.0
+
+
+@pytest.mark.parametrize("stages", [2, 4])
+def test_failure_keeps_what_was_done(stages):
+    scene = vp.Scene(vp.planar_chain(3))
+    with pytest.raises(vp.StepFailure, match="smaller dt may go further") as caught:
+        vp.simulate(
+            scene, np.zeros(3), np.zeros(3), dt=1e-2, steps=1000, controls=np.full(3, 1e7), integrator=vp.Gauss(stages)
+        )
+    assert caught.value.trajectory.steps == caught.value.step
+    assert np.isfinite(caught.value.trajectory.energy).all()
+
+
+@pytest.mark.parametrize("stages", [2, 3, 6])
+@pytest.mark.parametrize("stiffness", [1e-2, 1e2, 1e4])
+@pytest.mark.parametrize("damping", [0.0, 1e-2, 1e4])
+def test_stiff_springs_and_dampers(stages, stiffness, damping):
+    """Springs and dampers far faster than the step: finite, bounded, and dissipating what they should."""
+    scene = vp.Scene(vp.load_robot("finger"), gravity=False, stiffness=stiffness, damping=damping)
+    motion = vp.simulate(scene, [0.1, 0.1, 0.1], np.zeros(3), dt=1e-2, steps=500, integrator=vp.Gauss(stages))
+    assert np.isfinite(motion.q).all()
+    if damping == 0.0:
+        assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 0.1
+    else:
+        assert motion.energy[-1] < motion.energy[0]
+        assert motion.energy.max() <= motion.energy[0] * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ({"stages": 0}, "stages must be at least 1, got 0"),
+        ({"stages": 7}, "stages must be at most 6, got 7"),
+        ({"stages": 2.5}, "stages must be an integer, got 2.5"),
+        ({"stages": "two"}, "stages must be an integer, got 'two'"),
+        ({"tolerance": 0.0}, r"tolerance must be positive and finite \[rounding units\], got 0.0"),
+        ({"branch_margin": 1.0}, r"branch_margin must be in \[0, 1\), got 1"),
+        ({"max_halvings": 31}, "max_halvings must be at most 30, got 31"),
+        ({"kick": "right"}, "kick must be 'left' or 'split', got 'right'"),
+    ],
+)
+def test_options_out_of_range(option, words):
+    with pytest.raises(vp.InputError, match=words):
+        vp.Gauss(**option)
+
+
+def test_a_trajectory_knows_its_integrator():
+    scene = vp.Scene(vp.planar_chain(2))
+    motion = vp.simulate(scene, np.zeros(2), np.zeros(2), dt=1e-2, steps=2, integrator=vp.Gauss(stages=3))
+    assert motion.integrator == "Gauss(stages=3)"
+    assert str(vp.Gauss(2, kick="split")) == "Gauss(stages=2, kick=split)"
+    with pytest.raises(vp.InputError, match=r"made with Gauss\(stages=3\), not Gauss\(stages=2\)"):
+        vp.linearize(scene, motion, integrator=vp.Gauss(2))
