@@ -1,0 +1,32 @@
+"""The claims and figures of docs/paper.md, from a folder that ``varpin paper`` wrote.
+
+    varpin paper --out paper
+    python docs/paper.py paper
+"""
+
+import csv
+import shutil
+import sys
+from pathlib import Path
+
+DOCUMENT = Path(__file__).resolve().parent / "paper.md"
+FIGURES = ("figure1", "figure2", "figure3", "figure4", "figure5", "truth", "noise")
+
+
+def main() -> None:
+    if len(sys.argv) != 2:
+        raise SystemExit("usage: paper.py FOLDER")
+    folder = Path(sys.argv[1])
+    for name in FIGURES:
+        shutil.copy(folder / f"{name}.png", DOCUMENT.parent / "images" / f"paper_{name}.png")
+    with (folder / "claims.csv").open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    table = ["| verdict | source | sentence | measured |", "|---|---|---|---|"]
+    table += [f"| {r['verdict']} | {r['source']} | {r['sentence']} | {r['measured']} |" for r in rows]
+    begin, end = "<!-- claims:begin -->\n", "<!-- claims:end -->"
+    before, rest = DOCUMENT.read_text(encoding="utf-8").split(begin)
+    DOCUMENT.write_text(before + begin + "\n".join(table) + "\n" + end + rest.split(end)[1], encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
