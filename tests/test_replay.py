@@ -102,18 +102,19 @@ def picture(browser):
     return np.asarray(image, dtype=float)[40:]
 
 
-def shape_poses(browser):
-    """World transforms (4, 4) of the shapes on the page, in the robot's own world, by index."""
+def shape_poses(browser, figure="robot"):
+    """World transforms (4, 4) of the robot's or its ghost's shapes on the page, in their own world, by index."""
     poses = browser.execute_script(
         """
         const root = viewer.scene_tree.find(["meshcat"]).object, poses = {};
         root.updateMatrixWorld(true);
         const inverse = root.matrixWorld.clone().invert();
-        root.traverse(node => {
+        viewer.scene_tree.find(["meshcat", arguments[0]]).object.traverse(node => {
             if (node.parent && node.parent.name == "shapes")
                 poses[node.name.split(" ")[0]] = inverse.clone().multiply(node.matrixWorld).toArray();
         });
-        return poses;"""
+        return poses;""",
+        figure,
     )
     return {int(k): np.array(pose).reshape(4, 4).T for k, pose in poses.items()}
 
@@ -266,6 +267,101 @@ def test_size_stays_sane_for_a_long_motion(finger, tmp_path):
         np.testing.assert_allclose(np.interp(t, times, values), column, atol=3e-3)
 
 
+def assert_ghost_at(browser, robot, q):
+    """Every shape of the ghost that moves is where Pinocchio puts it."""
+    model, shapes = robot.free_model, geometry(robot)
+    data, placements = model.createData(), shapes.createData()
+    pin.updateGeometryPlacements(model, data, shapes, placements, robot.free_positions(np.asarray(q)))
+    poses = shape_poses(browser, "ghost")
+    assert sorted(poses) == [k for k, shape in enumerate(shapes.geometryObjects) if shape.parentJoint > 0]
+    for k, pose in poses.items():
+        np.testing.assert_allclose(pose, placements.oMg[k].homogeneous, atol=2e-5)
+
+
+@pytest.mark.parametrize("name", ["finger", "ur5", "panda"])
+def test_ghost_follows_its_own_motion(browser, tmp_path, name):
+    robot = vp.load_robot(name)
+    rng = np.random.default_rng(7)
+    q, ghost = rng.uniform(-1.0, 1.0, (4, robot.dof)), rng.uniform(-1.0, 1.0, (3, robot.dof))
+    visit(browser, replay(robot, q, dt=0.5, ghost=ghost, html=tmp_path / "ghost.html"))
+    assert len(shape_poses(browser)) == geometry(robot).ngeoms
+    # Its three rows stand at 0, 0.75 and 1.5 s.
+    for seconds, expected in [(0.0, ghost[0]), (0.375, 0.5 * (ghost[0] + ghost[1])), (0.75, ghost[1]), (1.5, ghost[2])]:
+        seek(browser, seconds)
+        assert_ghost_at(browser, robot, expected)
+    errors = [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+    assert errors == []
+
+
+def test_ghost_is_translucent_and_hides_where_the_robot_is(browser, finger, tmp_path):
+    def blue(page):
+        visit(browser, page)
+        image = picture(browser)
+        return (image[..., 2] > image[..., 0] + 60.0).mean()
+
+    q = [[0.3, 0.6, 0.9]]
+    alone = blue(replay(finger, q, dt=1.0, html=tmp_path / "alone.html"))
+    same = blue(replay(finger, q, dt=1.0, ghost=q, html=tmp_path / "same.html"))
+    apart = blue(replay(finger, q, dt=1.0, ghost=[[1.2, 0.6, 0.9]], html=tmp_path / "apart.html"))
+    assert alone == same
+    assert apart > alone + 0.01
+    opacities = browser.execute_script(
+        """
+        const found = {robot: [], ghost: []};
+        for (const name in found)
+            viewer.scene_tree.find(["meshcat", name]).object.traverse(node => {
+                if (node.material) found[name].push(node.material.transparent ? node.material.opacity : 1);
+            });
+        return found;"""
+    )
+    assert set(opacities["robot"]) == {1}
+    assert opacities["ghost"] == pytest.approx([0.35] * len(opacities["ghost"]))
+
+
+def test_ghost_of_another_time_step_and_length(finger, motion, tmp_path):
+    scene = vp.Scene(finger, gravity=False)
+    start = {"q0": [0.2, 0.3, 0.4], "v0": [1.0, 2.0, -1.0]}
+    t = np.linspace(0.0, 0.5, 200)
+    for dt, steps in [(7e-4, 1000), (1e-2, 20)]:
+        ghost = vp.simulate(scene, **start, dt=dt, steps=steps)
+        tracks, _ = animation(replay(finger, motion, ghost=ghost, fps=5000.0, html=tmp_path / "ghost.html"))
+        assert len(tracks) == 6
+        assert len({tuple(times) for times, _ in tracks.values()}) == 1
+        for shown, q in zip(("robot", "ghost"), (motion, ghost), strict=True):
+            own = [track for (path, _), track in tracks.items() if f"/{shown}/" in path]
+            for (times, values), column in zip(own, q.q.T, strict=True):
+                assert times[-1] == pytest.approx(motion.duration)
+                # Over before the motion is, it stands still: np.interp holds the last value, too.
+                np.testing.assert_allclose(np.interp(t, times, values), np.interp(t, q.t, column), atol=1e-6)
+
+
+def test_ghost_keeps_its_corners_between_sparse_nodes_of_the_motion(finger, tmp_path):
+    ghost = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    path = replay(finger, np.zeros((3, 3)), dt=1.0, ghost=ghost, speed=0.5, html=tmp_path / "ghost.html")
+    tracks, _ = animation(path)
+    for (node, _), (times, values) in tracks.items():
+        np.testing.assert_allclose(times, [0.0, 4.0 / 3.0, 2.0, 8.0 / 3.0, 4.0], rtol=1e-6)
+        moves = "/ghost/" in node and "mcp" in node.rsplit("/", 2)[-2]
+        np.testing.assert_allclose(values, [0.0, 1.0, 0.5, 0.0, 1.0] if moves else np.zeros(5), atol=1e-6)
+
+
+def test_ghost_costs_less_than_the_robot(tmp_path):
+    ur5, q = vp.load_robot("ur5"), np.zeros((2, 6))
+    empty = replay(vp.planar_chain(1), [[0.0]], dt=1.0, html=tmp_path / "empty.html").stat().st_size
+    alone = replay(ur5, q, dt=1.0, html=tmp_path / "alone.html").stat().st_size
+    both = replay(ur5, q, dt=1.0, ghost=q, html=tmp_path / "both.html").stat().st_size
+    assert both - alone < 0.5 * (alone - empty)
+
+
+def test_ghost_of_a_robot_without_geometry_is_a_skeleton(browser, tmp_path):
+    chain = vp.planar_chain(2)
+    visit(browser, replay(chain, np.zeros((2, 2)), dt=1.0, ghost=[[0.5, 0.0]], html=tmp_path / "chain.html"))
+    data = chain.model.createData()
+    pin.forwardKinematics(chain.model, data, np.array([0.5, 0.0]))
+    elbow = data.oMi[2].translation
+    assert any(np.allclose(pose[:3, 3], elbow, atol=1e-6) for pose in shape_poses(browser, "ghost").values())
+
+
 def test_a_single_row_shows_a_pose(browser, finger, tmp_path):
     path = replay(finger, [[0.3, 0.6, 0.9]], dt=1.0, html=tmp_path / "pose.html")
     visit(browser, path)
@@ -333,7 +429,7 @@ def test_a_mesh_the_page_cannot_take_is_left_out(browser, tmp_path, monkeypatch)
 def test_live_window(browser, finger, motion, monkeypatch, capfd):
     opened = []
     monkeypatch.setattr(MODULE.webbrowser, "open", lambda url, new=0: opened.append(url) or True)
-    viewer = replay(finger, motion, open=True)
+    viewer = replay(finger, motion, ghost=motion.q[::-1], open=True)
     try:
         assert opened == [viewer.url()]
         assert capfd.readouterr().out == ""
@@ -342,6 +438,8 @@ def test_live_window(browser, finger, motion, monkeypatch, capfd):
         browser.get(viewer.url())
         wait_until(lambda: browser.execute_script("return viewer.animator.duration") == 0.5)
         assert len(shape_poses(browser)) == geometry(finger).ngeoms
+        seek(browser, 0.5)
+        assert_ghost_at(browser, finger, motion.q[0])
     finally:
         browser.get("about:blank")
         viewer.window.server_proc.kill()
@@ -382,6 +480,22 @@ def test_refuses_what_it_cannot_show(finger, motion, tmp_path):
     refused(lambda: replay(finger, motion, speed=0, html=page), vp.InputError, "speed must be positive and finite")
     refused(lambda: replay(finger, motion, fps=-1, html=page), vp.InputError, "fps must be positive and finite")
     refused(lambda: replay(finger, motion, max_frames=1, html=page), vp.InputError, "max_frames must be at least 2")
+    shape = "ghost must have shape (K, 3), its rows spread evenly over the motion's time, got "
+    refused(lambda: replay(finger, motion, ghost=np.zeros((3, 2)), html=page), vp.InputError, shape + "(3, 2)")
+    refused(lambda: replay(finger, motion, ghost=np.zeros(3), html=page), vp.InputError, shape + "(3,)")
+    refused(lambda: replay(finger, motion, ghost=q, html=page), vp.InputError, "ghost[1, 2] is nan; it must be finite")
+    refused(lambda: replay(finger, motion, ghost="still", html=page), vp.InputError, "ghost must be an array of real")
+    refused(
+        lambda: replay(finger, [[0.0, 0.0, 0.0]], dt=1.0, ghost=motion.q[:4], html=page),
+        vp.InputError,
+        "the motion is a single pose, so its ghost must be one row, too, got 4",
+    )
+    other = vp.simulate(vp.Scene(vp.planar_chain(3)), [0, 0, 0], [0, 0, 0], dt=1e-3, steps=2)
+    refused(
+        lambda: replay(finger, motion, ghost=other, html=page),
+        vp.InputError,
+        "the ghost is of robot 'chain3' with joints joint1, joint2, joint3; 'finger' has joints mcp, pip, dip",
+    )
     refused(
         lambda: replay(vp.planar_chain(3), motion, html=page),
         vp.InputError,

@@ -1,0 +1,338 @@
+"""The paper's experiments: the store, the claims and the report on made-up cells, and the whole of it, slowly, by the
+command line."""
+
+import base64
+import csv
+import dataclasses
+import html
+import io
+import logging
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import varpin as vp
+from varpin.paper import cases, experiments, reproduce
+from varpin.paper.cases import CASES, COARSE, COARSEST, MAIN, METHODS, VARIATIONS
+from varpin.paper.claims import Claim, assess, free_motions, series, verdict
+from varpin.paper.experiments import OPTIMUM, PLAIN, STOCHASTIC, Cell, Store, Task, fill, run, tasks
+from varpin.paper.figures import draw
+from varpin.paper.report import write
+
+FIGURES = ["figure1", "figure2", "figure3", "figure4", "figure5", "truth"]
+
+
+def made_up(task):
+    """A cell that nobody computed, in which the paper is right: errors dt^2 (variational) and dt (Euler)."""
+    steps = round(cases.DURATION / task.dt)
+    t = np.linspace(0.0, cases.DURATION, steps + 1)
+    error = {"Euler": 100.0 * task.dt, OPTIMUM: 10.0 * task.dt**2}.get(task.method, 100.0 * task.dt**2)
+    noise = 0.0 if task.case is None else 1e-8
+    return Cell(
+        setting=task.setting.key,
+        case="0" if task.case is None else task.case.key,
+        method=task.method,
+        dt=task.dt,
+        cost=4e-6 * (1.0 + error),
+        noise_cost=noise,
+        iterations=2,
+        status="CONVERGED",
+        seconds=1e-4 / task.dt,
+        open_loop=4e-6 * (1.0 + error),
+        closed_loop=np.nan if task.method == "Euler" else 4e-6 * (1.0 + error),
+        accuracy=1e-11,
+        sampled=(8e-6 if task.method == PLAIN else 4e-6 * (1.0 + error) + noise, 1e-9),
+        t=t,
+        q=np.array([cases.reference(x) for x in t]) + 1e-3 * error,
+        u=1e-4 * np.column_stack([np.sin(t[:-1]), np.cos(t[:-1]), t[:-1]]),
+        gains=np.full((47 if task.method in METHODS else 0, 3, 6), 1.0 + error),
+    )
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """``run`` replaced by made-up cells; returns the names of the tasks that it was asked for."""
+    asked = []
+
+    def counting(task):
+        asked.append(task.name)
+        return made_up(task)
+
+    monkeypatch.setattr(experiments, "run", counting)
+    return asked
+
+
+@pytest.fixture(scope="module")
+def motions():
+    return free_motions()
+
+
+@pytest.fixture(scope="module")
+def cells():
+    return {task.name: made_up(task) for task in tasks(quick=False)}
+
+
+def assert_same(a, b):
+    for item in dataclasses.fields(Cell):
+        np.testing.assert_array_equal(getattr(a, item.name), getattr(b, item.name), err_msg=item.name)
+
+
+def test_tasks_are_complete_and_have_names_of_their_own():
+    found = list(tasks(quick=False))
+    names = {task.name for task in found}
+    assert len(names) == len(found)
+    wanted = {(MAIN.key, case.key, method, dt) for case in CASES for method in METHODS for dt in cases.STEPS}
+    for setting in (MAIN, *VARIATIONS):
+        wanted |= {(setting.key, "0", method, dt) for method in (*METHODS, OPTIMUM) for dt in cases.STEPS}
+    for strength in cases.NOISY_STRENGTHS:
+        wanted |= {("noisy", f"2-{strength:g}", method, cases.NOISY_STEP) for method in (STOCHASTIC, PLAIN)}
+    keys = {(task.setting.key, task.case.key if task.case else "0", task.method, task.dt) for task in found}
+    assert keys == wanted
+    assert names > {task.name for task in tasks(quick=True)}
+    # Names are file names.
+    assert all(re.fullmatch(r"[\w.-]+", name) for name in names)
+
+
+def test_the_problem_is_the_papers():
+    for dt in cases.STEPS:
+        problem = cases.problem(MAIN, CASES[1], "variational", dt)
+        assert problem.duration == pytest.approx(1.5, rel=1e-12)
+        assert problem.dt == pytest.approx(dt, rel=5e-3)
+    # At rest and held still: the cost is the integral of 10 |theta - theta_r|^2, and |theta - theta_r|^2 at the end.
+    problem = cases.problem(MAIN, None, "variational", 1e-3)
+    q, u = np.tile([1.0, 0.0, 0.0], (1501, 1)), np.full((1500, 3), 0.2)
+    expected = 10.0 * 1.5 * (0.25**2 + 0.1**2) / 2.0 + 0.1 * 1.5 * 3.0 * 0.2**2
+    assert problem.costs(q, np.zeros_like(q), u) == pytest.approx(expected, rel=1e-6)
+    np.testing.assert_allclose(cases.reference(1.5), [1.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_heavier_fingers_are_heavier():
+    q = np.array([0.4, 0.3, 0.2])
+    light, heavy = (vp.lagrangian_jet(vp.Scene(cases.finger(x)), q, np.ones(3)) for x in (1.0, 1000.0))
+    np.testing.assert_allclose(heavy.Lvv, 1000.0 * light.Lvv, rtol=1e-12)
+    np.testing.assert_allclose(heavy.Lq, 1000.0 * light.Lq, rtol=1e-12)
+
+
+def test_a_coarse_cell_is_what_it_says():
+    cell = run(Task(MAIN, CASES[1], "variational", COARSE))
+    assert (cell.setting, cell.case, cell.method, cell.dt) == ("main", "2", "variational", COARSE)
+    assert cell.status == "CONVERGED"
+    assert cell.iterations <= 4
+    assert cell.t.shape == (251,)
+    assert cell.q.shape == (251, 3)
+    assert cell.u.shape == (250, 3)
+    assert cell.gains.shape == (47, 3, 6)
+    assert np.isfinite(cell.gains).all()
+    assert np.abs(cell.q - [cases.reference(t) for t in cell.t]).max() < 0.01
+    assert 0.0 < cell.noise_cost < cell.cost < 1e-5
+    assert cell.cost < cell.true_cost < 2.0 * cell.cost
+    assert cell.accuracy < 1e-8
+    mean, error = cell.sampled
+    assert abs(mean - cell.cost - cell.noise_cost) < 4.0 * error
+
+
+def test_nothing_beats_the_optimum_over_held_controls():
+    best, own, other = (run(Task(MAIN, None, method, COARSEST)) for method in (OPTIMUM, "variational", "Euler"))
+    assert best.cost == pytest.approx(best.true_cost, rel=1e-3)
+    assert best.true_cost < own.true_cost < other.true_cost
+    assert best.u.shape == own.u.shape == (75, 3)
+    assert np.isnan(own.sampled).all()
+
+
+@pytest.mark.parametrize("task", [Task(MAIN, CASES[2], "Euler", 2e-3), Task(VARIATIONS[0], None, OPTIMUM, COARSE)])
+def test_store_gives_back_what_it_got(tmp_path, task):
+    store, cell = Store(tmp_path / "cells"), made_up(task)
+    assert store.load(task) is None
+    store.save(task, cell)
+    assert_same(Store(tmp_path / "cells").load(task), cell)
+    assert [path.name for path in (tmp_path / "cells").iterdir()] == [f"{task.name}.npz"]
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[: len(data) // 2], lambda data: b"", lambda data: b"no archive"])
+def test_a_damaged_cell_is_computed_again(tmp_path, caplog, counted, damage):
+    fill(tmp_path, quick=True)
+    task = next(tasks(quick=True))
+    path = tmp_path / f"{task.name}.npz"
+    path.write_bytes(damage(path.read_bytes()))
+    counted.clear()
+    with caplog.at_level(logging.WARNING, logger="varpin.paper"):
+        found = fill(tmp_path, quick=True)
+    assert f"{path} cannot be read" in caplog.text
+    assert counted == [task.name]
+    assert_same(found[task.name], made_up(task))
+    assert_same(Store(tmp_path).load(task), made_up(task))
+
+
+def test_cells_of_another_version_are_computed_again(tmp_path, monkeypatch, counted):
+    fill(tmp_path, quick=True)
+    monkeypatch.setattr(experiments, "__version__", "0.0.0")
+    counted.clear()
+    fill(tmp_path, quick=True)
+    assert counted == [task.name for task in tasks(quick=True)]
+
+
+def test_a_second_fill_computes_nothing(tmp_path, counted):
+    seen = []
+    first = fill(tmp_path, quick=True, progress=lambda done, cells, name: seen.append((done, cells, name)))
+    names = [task.name for task in tasks(quick=True)]
+    assert counted == list(first) == names
+    assert seen == [(k, len(names), name) for k, name in enumerate([*names, ""])]
+    second = fill(tmp_path, quick=True)
+    assert counted == names
+    for name in names:
+        assert_same(first[name], second[name])
+
+
+def test_an_interrupted_fill_goes_on_where_it_was(tmp_path, monkeypatch):
+    asked = []
+
+    def interrupted(task):
+        asked.append(task.name)
+        if len(asked) == 4:
+            raise KeyboardInterrupt
+        return made_up(task)
+
+    monkeypatch.setattr(experiments, "run", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fill(tmp_path, quick=True)
+    names = [task.name for task in tasks(quick=True)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(f"{name}.npz" for name in names[:3])
+    found = fill(tmp_path, quick=True)
+    assert asked == names[:4] + names[3:]
+    assert list(found) == names
+
+
+def test_verdicts():
+    assert verdict(True, True) == "holds"
+    assert verdict(True, False) == "holds in part"
+    assert verdict(False, False) == "does not hold"
+
+
+def test_claims_hold_where_the_paper_is_right_and_not_where_euler_is_better(cells, motions):
+    right = assess(cells, motions)
+    swapped = {}
+    other = {"variational": "Euler", "Euler": "variational", STOCHASTIC: PLAIN, PLAIN: STOCHASTIC, OPTIMUM: OPTIMUM}
+    for task in tasks(quick=False):
+        twin = dataclasses.replace(task, method=other[task.method])
+        swapped[task.name] = dataclasses.replace(cells[twin.name], method=task.method)
+    wrong = assess(swapped, motions)
+    assert len(right) == len(wrong) > 10
+    growth = [claim for claim in right if "table 1 and figure 5" in claim.source]
+    assert len(growth) == 3
+    of_the_methods = {"table 1 and figure 5", "true cost is never above", "gains", "hinge", "Where noise matters"}
+    for before, after in zip(right, wrong, strict=True):
+        assert before.sentence == after.sentence
+        if any(words in before.source + before.sentence for words in of_the_methods):
+            assert before.verdict == "holds", before
+            assert after.verdict != "holds", after
+
+
+def test_series_run_from_fine_to_coarse(cells):
+    own = series(cells, MAIN, "0", "Euler")
+    assert [cell.dt for cell in own] == sorted(cases.STEPS)
+    assert {(cell.setting, cell.case, cell.method) for cell in own} == {("main", "0", "Euler")}
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_report_has_every_figure_and_says_what_was_measured(tmp_path, cells, motions, quick):
+    names = {task.name for task in tasks(quick=quick)}
+    own = {name: cell for name, cell in cells.items() if name in names}
+    figures = draw(own, motions)
+    assert list(figures) == FIGURES
+    claim = Claim("nobody", "1 < 2 & <b>x</b>", "<script>alert(1)</script>", "holds in part")
+    page = write(tmp_path, own, [claim, *assess(own, motions)], figures, quick=quick)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        [*(f"{name}.png" for name in FIGURES), "claims.csv", "report.html", "table1.csv"]
+    )
+    text = page.read_text(encoding="utf-8")
+    images = [base64.b64decode(data) for data in re.findall(r'src="data:image/png;base64,([^"]+)"', text)]
+    assert images == [(tmp_path / f"{name}.png").read_bytes() for name in FIGURES]
+    for image in images:
+        picture = np.asarray(Image.open(io.BytesIO(image)).convert("L"))
+        assert picture.shape[1] > 900
+        assert picture.std() > 5.0
+    assert html.escape(claim.sentence) in text
+    assert html.escape(claim.measured) in text
+    assert "<script" not in text
+    assert text.count("<tr") == text.count("</tr>")
+    assert ("quick version" in text) == quick
+
+    with (tmp_path / "table1.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == len(own)
+    for row, cell in zip(rows, own.values(), strict=True):
+        assert (row["setting"], row["case"], row["method"]) == (cell.setting, cell.case, cell.method)
+        assert float(row["dt [s]"]) == cell.dt
+        assert float(row["cost"]) == pytest.approx(cell.cost, rel=1e-6)
+        assert np.isnan(float(row["true cost, with feedback"])) == (cell.method == "Euler")
+    with (tmp_path / "claims.csv").open(newline="") as stream:
+        claims = list(csv.DictReader(stream))
+    assert list(claims[0].values()) == [claim.source, claim.sentence, claim.measured, claim.verdict]
+
+
+def test_legends_cover_no_curve(cells, motions):
+    for name, (figure, _) in draw(cells, motions).items():
+        figure.draw_without_rendering()
+        for axes in figure.axes:
+            outside = [legend.get_window_extent() for legend in figure.legends]
+            assert not any(box.overlaps(axes.get_window_extent()) for box in outside), name
+            legend = axes.get_legend()
+            for line in axes.lines if legend is not None else ():
+                points = axes.transData.transform(line.get_xydata())
+                assert not any(legend.get_window_extent().contains(*point) for point in points), name
+
+
+def test_reproduce_makes_its_folder_and_returns_the_claims(tmp_path, counted):
+    result = reproduce(str(tmp_path / "a" / "b"), quick=True)
+    assert result.page == tmp_path / "a" / "b" / "report.html"
+    assert result.page.is_file()
+    assert len(counted) == len(list((tmp_path / "a" / "b" / "cells").iterdir()))
+    assert {claim.verdict for claim in result.claims} <= {"holds", "holds in part", "does not hold"}
+    again = reproduce(tmp_path / "a" / "b", quick=True)
+    assert [claim.verdict for claim in again.claims] == [claim.verdict for claim in result.claims]
+    assert len(counted) == len(set(counted))
+
+
+def test_a_folder_that_cannot_be_made_is_refused_before_the_work(tmp_path, counted):
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(vp.FileError, match="cannot make the folder"):
+            reproduce(folder, quick=True)
+    with pytest.raises(vp.InputError, match="folder must be a path"):
+        reproduce(3)
+    assert counted == []
+
+
+@pytest.mark.slow
+def test_quick_reproduction_by_the_command_line(tmp_path):
+    folder = tmp_path / "paper"
+    command = [sys.executable, "-m", "varpin", "paper", "--quick", "--quiet", "--out", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=900)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == str(folder / "report.html")
+    assert (folder / "report.html").stat().st_size > 100_000
+
+    with (folder / "claims.csv").open(newline="") as stream:
+        claims = list(csv.DictReader(stream))
+    found = {(row["source"], row["sentence"]): row["verdict"] for row in claims}
+
+    def verdict_of(words):
+        (one,) = [value for key, value in found.items() if words in " ".join(key)]
+        return one
+
+    assert verdict_of("figure 1") == "holds"
+    assert verdict_of("equivalent to the classic DDP") == "holds"
+    assert verdict_of("table 1 and figure 5, case 1") == "holds"
+    assert verdict_of("table 1 and figure 5, case 2") == "holds"
+    assert verdict_of("true cost is never above Euler's") == "holds"
+
+    kept = {path: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert {path: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()} == kept
+    with (folder / "claims.csv").open(newline="") as stream:
+        assert list(csv.DictReader(stream)) == claims
