@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
+from scipy.integrate import solve_ivp
 
 import varpin as vp
 
@@ -114,3 +115,28 @@ def directional(g, x: np.ndarray, directions: np.ndarray) -> np.ndarray:
 def hessian(f, x: np.ndarray) -> np.ndarray:
     """Second derivatives (k, k) of f at real x (k,)."""
     return directional(lambda y: gradient(f, y), x, np.eye(x.size))
+
+
+def continuous(scene: vp.Scene, q, v, controls, dt, running, law=None):
+    """The continuous motion under controls held over dt, by a high-order method on Pinocchio's own dynamics.
+
+    ``running(t, q, v, u)`` is integrated beside it. With ``law(k, q, v, u)`` the control of interval k is that, else
+    its row of ``controls``. Returns q (N + 1, n), v (N + 1, n) and the integral.
+    """
+    model, n = scene.robot.model, scene.robot.dof
+    data = model.createData()
+    qs, vs, total = [np.array(q, float)], [np.array(v, float)], 0.0
+    for k, row in enumerate(controls):
+        u = row if law is None else law(k, qs[-1], vs[-1], row)
+
+        def slope(t, y, u=u):
+            at_q, at_v = y[:n], y[n : 2 * n]
+            force = scene.actuation @ u - scene.damping * at_v - scene.stiffness * (at_q - scene.rest)
+            return np.concatenate([at_v, pin.aba(model, data, at_q, at_v, force), [running(t, at_q, at_v, u)]])
+
+        start = np.concatenate([qs[-1], vs[-1], [0.0]])
+        end = solve_ivp(slope, (k * dt, (k + 1) * dt), start, method="DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
+        qs.append(end[:n])
+        vs.append(end[n : 2 * n])
+        total += end[-1]
+    return np.array(qs), np.array(vs), total

@@ -304,12 +304,17 @@ class CustomCost(Cost):
     Attributes:
         function: Takes t (N,), q (N, n), v (N, n) and u (N, m); returns (N,).
         derivatives: Takes the same; returns gradient (N, 2n + m) and Hessian (N, 2n + m, 2n + m) in z = (q, v, u).
-            If left out, both are differenced, to about 1e-8 and 1e-5 of the function's own size.
+            If left out, both are differenced.
+        step: Of the differences: None for 1e-3 rad or m in q, 1e-3 of the largest velocity (or of 1) in v and 1e-3 of
+            the largest control in u; or one number for each of z (2n + m,). The differences are right to about 1e-8 of
+            the function's size where it changes little over a step, so the second derivatives to 1e-5 of it by the
+            step's square.
         name: For messages.
     """
 
     function: Function
     derivatives: Derivatives | None = None
+    step: ArrayLike | None = None
     name: str = "CustomCost"
 
     def bind(self, points: Points) -> BoundCost:
@@ -350,6 +355,17 @@ class _BoundCustom(BoundCost):
             raise CostError(self.cost.name, f"derivatives(t, q, v, u) failed: {error}") from error
         return Expansion(gradient, hessian)
 
+    def _steps(self, z: Floats) -> Floats:
+        n, d = self.points.dof, self.points.size
+        if self.cost.step is not None:
+            steps = finite_array(f"{self.cost.name} step", self.cost.step, (d,))
+            if not (steps > 0.0).all():
+                raise InputError(f"{self.cost.name} step must be positive, got {steps}")
+            return steps
+        speed = max(1.0, np.abs(z[:, n : 2 * n]).max(initial=0.0))
+        control = np.abs(z[:, 2 * n :]).max(initial=0.0)
+        return np.repeat([1e-3, 1e-3 * speed, 1e-3 * (control if control > 0.0 else 1.0)], [n, n, d - 2 * n])
+
     def _differences(self, z: Floats) -> Expansion:
         """Central differences: of fourth order for the gradient, of second for the Hessian."""
         N, d = z.shape
@@ -358,7 +374,7 @@ class _BoundCustom(BoundCost):
         def at(moved: Floats) -> Floats:
             return self._call(self.points.t, moved[:, :n], moved[:, n : 2 * n], moved[:, 2 * n :])
 
-        size = 1e-3 * np.maximum(1.0, np.abs(z).max(axis=0))
+        size = self._steps(z)
         gradient, hessian = np.empty((N, d)), np.empty((N, d, d))
         middle = at(z)
         ahead, behind = [], []

@@ -42,6 +42,8 @@ _BLOCK = 2048
 # long steps and grows after short ones.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
 _LONG, _SHORT = 0.5, 0.01
+# As much as this does not hide how far an optimum is; controls that do nothing need some.
+_LITTLE = 1e-4
 # Trials of a line search: 0.25^10 is 1e-6.
 _TRIALS = 10
 
@@ -88,7 +90,7 @@ def solve(
     Raises:
         InputError: Controls of a wrong shape, or options out of their range.
         StepFailure: The first motion cannot be integrated; holds what came before.
-        CostError: The cost of the first motion is not finite, or a cost of one's own fails.
+        CostError: The cost of the first motion is not finite, or a cost of one's own fails there.
     """
     if not isinstance(problem, OptimalControlProblem):
         raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
@@ -98,6 +100,8 @@ def solve(
         raise InputError(f"backtracking must be in (0, 1), got {backtracking}")
     if not real("regularization", regularization) >= 0.0:
         raise InputError(f"regularization must be >= 0, got {regularization}")
+    if callback is not None and not callable(callback):
+        raise InputError(f"callback must be a function of one Iteration, got {callback!r}")
     positive("tolerance", tolerance, "1")
     fraction("armijo", armijo)
     max_iterations = count("max_iterations", max_iterations)
@@ -143,6 +147,11 @@ class _Plan:
     jumps: Floats  # (N, 2n, n), empty without noise
     spread: Floats  # (N, 2n, 2n)
 
+    @property
+    def promise(self) -> float:
+        """Decrease of the expected cost with a full step, by the model."""
+        return -0.5 * self.slope
+
 
 class _Search:
     """The motion so far, and what is known around it."""
@@ -164,6 +173,7 @@ class _Search:
         self.plan: _Plan | None = None
         self.trajectory: Trajectory
         self.cost = np.inf
+        self.best: tuple[float, float, Trajectory | None] = (np.inf, np.inf, None)
 
     def begin(self, commands: Commands) -> None:
         trajectory, failure = rollout(
@@ -180,42 +190,48 @@ class _Search:
         first = self.cost
         while True:
             started = time.perf_counter()
-            passes = self._plan()
+            try:
+                passes = self._plan()
+            except (CostError, LinearizationError) as error:
+                if not self.history:
+                    raise
+                logger.warning("%s", error)
+                return Status.NOT_DIFFERENTIABLE
             if self.plan is None:
                 return Status.INDEFINITE
             merit = self.cost + self.plan.noise
+            if merit < self.best[0]:
+                self.best = merit, self.cost, self.trajectory
             # Where the optimum costs nothing, there is nothing to be relative to but where it began.
             scale = abs(merit) + 1e-9 * abs(first)
-            promise = -0.5 * self.plan.slope
-            # Regularization makes promises smaller; it must not pass for an optimum.
-            converged = promise * (1.0 + self.regularization) <= tolerance * scale
+            converged = self.plan.promise <= tolerance * scale
+            if converged and self.regularization > 0.0:
+                # Regularization makes promises smaller; it must not pass for an optimum.
+                plan, least = self._least_regularized()
+                converged = plan is not None and least <= _LITTLE and plan.promise <= tolerance * scale
+                self.plan = plan if converged else self.plan
             if converged or len(self.history) >= max_iterations:
-                self._note(callback, started, promise, 0.0, passes, 0)
+                self._note(callback, started, 0.0, passes, 0)
                 return Status.CONVERGED if converged else Status.MAX_ITERATIONS
             step, trials = self._line_search(merit)
             if step == 0.0 and self.exact:
                 passes += self._plan(exact=False)
                 more = self._line_search(merit)
                 step, trials = more[0], trials + more[1]
-            self._note(callback, started, promise, step, passes, trials)
+            self._note(callback, started, step, passes, trials)
             if step >= _LONG:
                 self._relax()
-            elif step <= _SHORT:
-                if step == 0.0 and promise <= 1e-12 * scale:
-                    return Status.CONVERGED
-                if not self._stiffen():
-                    return Status.STALLED
+            elif step <= _SHORT and not self._stiffen():
+                return Status.STALLED
 
-    def _note(
-        self, callback: Callback | None, started: float, promise: float, step: float, passes: int, trials: int
-    ) -> None:
+    def _note(self, callback: Callback | None, started: float, step: float, passes: int, trials: int) -> None:
         if self.plan is None:
             return
         item = Iteration(
             index=len(self.history),
             cost=self.cost,
             noise_cost=self.plan.noise,
-            promised_decrease=promise,
+            promised_decrease=self.plan.promise,
             step=step,
             regularization=self.regularization,
             gradient=float(np.abs(self.plan.gradient).max()),
@@ -256,6 +272,15 @@ class _Search:
             elif not self._stiffen():
                 return passes
 
+    def _least_regularized(self) -> tuple[_Plan | None, float]:
+        """The plan at the motion with as little regularization as leaves a minimum, and how much that is."""
+        for regularization in (0.0, *10.0 ** np.arange(-6, 11, 2)):
+            for exact in (True, False) if self.second_order and regularization == 0.0 else (False,):
+                plan = backward(self.problem, self.trajectory, float(regularization), exact)
+                if plan is not None:
+                    return plan, float(regularization)
+        return None, np.inf
+
     def _line_search(self, merit: float) -> tuple[float, int]:
         """Move to the first motion along the plan whose expected cost is low enough: its step, or 0, and trials."""
         if self.plan is None:
@@ -264,9 +289,12 @@ class _Search:
         for trial in range(_TRIALS):
             moved = self._move(step)
             if moved is not None:
-                cost = problem.cost_of(moved)
-                added = noise_cost(problem, moved, plan)
-                if cost + added <= merit + self.armijo * step * plan.slope:
+                try:
+                    cost = problem.cost_of(moved)
+                except CostError as error:
+                    logger.info("trial of length %g: %s", step, error)
+                    cost = np.inf
+                if cost + noise_cost(problem, moved, plan) <= merit + self.armijo * step * plan.slope:
                     self.trajectory, self.cost = moved, cost
                     return step, trial + 1
             step *= self.backtracking
@@ -284,8 +312,22 @@ class _Search:
         moved, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, problem.dt)
         return moved if failure is None else None
 
+    def _last_plan(self) -> _Plan | None:
+        try:
+            return self._least_regularized()[0]
+        except (CostError, LinearizationError):
+            return None
+
     def solution(self, status: Status) -> Solution:
         problem, plan = self.problem, self.plan
+        if status is not Status.CONVERGED:
+            # With noise the fixed point of the search is not the minimum of the expected cost, and the last motion not
+            # always the best; nor does the last plan belong to it, or hold without its regularization.
+            plan = self._last_plan()
+            merit, cost, best = self.best
+            if best is not None and best is not self.trajectory and not (plan and self.cost + plan.noise <= merit):
+                self.trajectory, self.cost = best, cost
+                plan = self._last_plan()
         R, m, n = problem.decisions, problem.scene.controls, problem.scene.robot.dof
         return Solution(
             problem=problem,
@@ -390,6 +432,9 @@ def _pass(
     value, room = kernels.new_value(n, m), kernels.new_room(n, m)
     _set_terminal(problem, trajectory, value, curvature is not None)
     running = problem.expand_running(trajectory)
+    for name, array in (("gradient", running.gradient), ("Hessian", running.hessian)):
+        if not np.isfinite(array).all():
+            raise CostError(repr(problem.cost), f"its {name} along the motion is not finite")
     noisy = N if k else 0
     jumps, spread = np.empty((noisy, 2 * n, n)), np.empty((noisy, 2 * n, 2 * n))
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, 2 * n)), np.empty((R, m))

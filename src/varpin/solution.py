@@ -38,6 +38,10 @@ class Status(Enum):
         "not converged: the model of the cost has no minimum in a control, whatever the regularization; give every "
         "control a ControlCost"
     )
+    NOT_DIFFERENTIABLE = (
+        "not converged: the derivatives of the dynamics or of the cost do not exist along the last motion; the log "
+        "says where. A smaller dt, or a cost that is finite around the motion, may help"
+    )
     INTERRUPTED = "interrupted: this is the best motion so far"
 
     @property
@@ -97,8 +101,7 @@ class Verification:
         closed_loop_gap: The same with feedback.
         defect: Largest distance in q of an accurately integrated step from the plan's [rad or m].
         substeps: Of the accurate integration, in one step of the plan.
-        accuracy: Relative change of the open-loop cost (closed-loop where that one runs away) over the last doubling
-            of the substeps.
+        accuracy: Relative change over the last doubling of the substeps, of the cost that changed more.
     """
 
     planned_cost: float
@@ -278,24 +281,32 @@ class Solution:
             policy = LinearPolicy(policy.u, np.zeros_like(policy.gains), policy.reference, hold=policy.hold)
         costs: list[Floats] = []
         for first in range(0, paths, _PATHS):
-            ensemble = simulate_ensemble(
-                problem.scene,
-                problem.q0,
-                problem.v0,
-                dt=problem.dt,
-                steps=problem.steps,
-                paths=min(_PATHS, paths - first),
-                rng=draws,
-                controls=policy,
-                integrator=problem.integrator,
-                quantiles=(),
-                workers=workers,
-            )
-            if ensemble.q is None or ensemble.v is None or ensemble.u is None:
-                raise VarpinError("the ensemble kept no paths")
-            costs.append(problem.costs(ensemble.q, ensemble.v, ensemble.u))
+            batch = min(_PATHS, paths - first)
+            try:
+                ensemble = simulate_ensemble(
+                    problem.scene,
+                    problem.q0,
+                    problem.v0,
+                    dt=problem.dt,
+                    steps=problem.steps,
+                    paths=batch,
+                    rng=draws,
+                    controls=policy,
+                    integrator=problem.integrator,
+                    quantiles=(),
+                    workers=workers,
+                )
+            except InputError:
+                raise
+            except VarpinError:  # every path of the batch failed
+                costs.append(np.full(batch, np.nan))
+                continue
+            if ensemble.q is not None and ensemble.v is not None and ensemble.u is not None:
+                costs.append(problem.costs(ensemble.q, ensemble.v, ensemble.u))
         values = np.concatenate(costs)
         good = values[np.isfinite(values)]
+        if not len(good):
+            raise VarpinError(f"every one of {paths} paths ran away; a smaller dt may help")
         return MonteCarlo(
             cost=float(good.mean()),
             standard_error=float(good.std(ddof=1) / np.sqrt(len(good))),

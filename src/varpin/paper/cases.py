@@ -104,6 +104,11 @@ def noisy_case(strength: float) -> Case:
     return Case(f"2-{strength:g}", f"control-dependent noise, C = {strength:g}", ControlNoise(strength))
 
 
+def strength_of(key: str) -> float:
+    """The strength C in the key of a :func:`noisy_case`."""
+    return float(key.split("-", 1)[1])
+
+
 def finger(heavier: float = 1.0) -> Robot:
     """The bundled finger, its masses and inertias multiplied."""
     robot = load_robot("finger")

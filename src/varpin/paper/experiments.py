@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin._version import __version__
-from varpin.errors import VarpinError
+from varpin.errors import FileError, VarpinError
 from varpin.integrators import RungeKutta4
 from varpin.linearization import linearize
 from varpin.paper import cases
@@ -211,7 +211,10 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise FileError(f"cannot make the folder {folder}: {error.strerror}") from None
 
     def _path(self, task: Task) -> Path:
         return self.folder / f"{task.name}.npz"

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from varpin.paper import cases
 from varpin.paper.cases import CASES, COARSE, COARSEST, MAIN
-from varpin.paper.claims import Cells, cell, series
-from varpin.paper.experiments import OPTIMUM
+from varpin.paper.claims import Cells, cell, series, series_of_noise
+from varpin.paper.experiments import OPTIMUM, PLAIN, STOCHASTIC
 from varpin.plots import COLORS
 
 Floats = NDArray[np.float64]
@@ -29,7 +29,7 @@ _METHOD_COLOR = {"variational": COLORS[0], "Euler": COLORS[1], OPTIMUM: COLORS[6
 
 def draw(cells: Cells, motions: Motions) -> dict[str, tuple[Figure, str]]:
     """Each figure with its caption, by the name of its file."""
-    steps = sorted({c.dt for c in cells.values()})
+    steps = sorted({c.dt for c in cells.values() if c.setting == MAIN.key})
     fine = steps[0]
     return {
         "figure1": (_free(motions), "Figure 1 (b), (c): θ₁ without controls in the vertical plane."),
@@ -50,6 +50,10 @@ def draw(cells: Cells, motions: Motions) -> dict[str, tuple[Figure, str]]:
         "truth": (
             _truth(cells),
             "True cost of the plans of case 1 on the continuous system, and the optimum over held controls.",
+        ),
+        "noise": (
+            _under_noise(cells),
+            "Expected cost under control-dependent noise in the vertical plane: S-DDP, and DDP that knows of no noise.",
         ),
     }
 
@@ -181,4 +185,32 @@ def _truth(cells: Cells) -> Figure:
     axes.set_ylim(0.5 * best, top)
     axes.set(xlabel="dt [s]", ylabel="true cost")
     figure.legend(loc="outside right upper", frameon=False, fontsize=8)
+    return figure
+
+
+def _under_noise(cells: Cells) -> Figure:
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    axes = figure.subplots()
+    known, plain = (series_of_noise(cells, method) for method in (STOCHASTIC, PLAIN))
+    strengths = [cases.strength_of(c.case) for c in known]
+    axes.loglog(strengths, [c.cost + c.noise_cost for c in known], "-", color=COLORS[0], label="S-DDP, predicted")
+    for own, color, label in ((known, COLORS[0], "S-DDP, Monte Carlo"), (plain, COLORS[1], "DDP, Monte Carlo")):
+        finite = [c for c in own if np.isfinite(c.sampled[0])]
+        axes.errorbar(
+            [cases.strength_of(c.case) for c in finite],
+            [c.sampled[0] for c in finite],
+            [2.0 * c.sampled[1] for c in finite],
+            fmt="o",
+            capsize=4,
+            color=color,
+            label=label,
+        )
+    for lost in plain:
+        if not np.isfinite(lost.sampled[0]):
+            axes.annotate(
+                "DDP: paths run away", (cases.strength_of(lost.case), 0.8), xycoords=("data", "axes fraction"),
+                color=COLORS[1], ha="right",
+            )  # fmt: skip
+    axes.set(xlabel="strength C of the noise [s$^{1/2}$]", ylabel="expected cost")
+    axes.legend()
     return figure

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from varpin.checks import path_like
-from varpin.errors import FileError
 from varpin.paper.claims import Claim, assess, free_motions
 from varpin.paper.experiments import Progress, fill
 from varpin.paper.figures import draw
@@ -41,10 +40,6 @@ def reproduce(folder: str | os.PathLike[str], *, quick: bool = False, progress: 
         FileError: The folder cannot be made or written.
     """
     target = path_like("folder", folder)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"cannot make the folder {target}: {error.strerror}") from None
     cells = fill(target / "cells", quick=quick, progress=progress)
     motions = free_motions()
     claims = assess(cells, motions)

@@ -1,0 +1,274 @@
+"""Costs: values by hand, expansions against differences, sums, references, and what is refused."""
+
+import numpy as np
+import pytest
+from test_sddp import SAMPLINGS, run, samples_of_a_step, sliders, small
+
+import varpin as vp
+from varpin.costs import Points
+
+N, DOF, M = 6, 3, 2
+WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+FULL = np.array([[2.0, 0.3, -0.1], [0.3, 1.0, 0.2], [-0.1, 0.2, 0.5]])
+
+
+def points(times=None, steps=N):
+    times = (np.arange(N) + 0.5) * 0.1 if times is None else np.asarray(times)
+    return Points(times, 0.1 * steps, steps, DOF, M)
+
+
+def random_points(seed=0, scale=1.0):
+    rng = np.random.default_rng(seed)
+    return [scale * rng.normal(size=(N, size)) for size in (DOF, DOF, M)]
+
+
+def smooth(t, q, v, u):
+    return np.sin(q[:, 0] + t) * v[:, 1] + np.exp(0.3 * q[:, 1]) * u[:, 0] ** 2 + np.cos(v[:, 2] * u[:, 1])
+
+
+def smooth_derivatives(t, q, v, u):
+    gradient, hessian = np.zeros((len(t), 8)), np.zeros((len(t), 8, 8))
+    s, c = np.sin(q[:, 0] + t), np.cos(q[:, 0] + t)
+    e = np.exp(0.3 * q[:, 1])
+    a, b = v[:, 2] * u[:, 1], v[:, 2]
+    gradient[:, 0], gradient[:, 4] = c * v[:, 1], s
+    gradient[:, 1], gradient[:, 6] = 0.3 * e * u[:, 0] ** 2, 2 * e * u[:, 0]
+    gradient[:, 5], gradient[:, 7] = -np.sin(a) * u[:, 1], -np.sin(a) * b
+    hessian[:, 0, 0], hessian[:, 0, 4] = -s * v[:, 1], c
+    hessian[:, 1, 1], hessian[:, 1, 6], hessian[:, 6, 6] = 0.09 * e * u[:, 0] ** 2, 0.6 * e * u[:, 0], 2 * e
+    hessian[:, 5, 5], hessian[:, 7, 7] = -np.cos(a) * u[:, 1] ** 2, -np.cos(a) * b**2
+    hessian[:, 5, 7] = -np.cos(a) * a - np.sin(a)
+    lower = np.tril_indices(8, -1)
+    hessian[:, lower[0], lower[1]] = hessian[:, lower[1], lower[0]]
+    return gradient, hessian
+
+
+ROWS = np.random.default_rng(9).normal(size=(N + 1, DOF))
+COSTS = {
+    "tracking, scalar, constant": vp.TrackingCost([0.1, 0.2, 0.3], 2.0),
+    "tracking, vector, one number": vp.TrackingCost(0.4, [1.0, 0.0, 3.0]),
+    "tracking, matrix, function": vp.TrackingCost(lambda t: [t, np.sin(t), 1.0], FULL),
+    "tracking, matrix, rows": vp.TrackingCost(ROWS, FULL),
+    "velocity, default": vp.VelocityCost(),
+    "velocity, vector, rows": vp.VelocityCost([1.0, 2.0, 3.0], reference=ROWS),
+    "control, default": vp.ControlCost(),
+    "control, matrix, function": vp.ControlCost([[2.0, 1.0], [1.0, 0.5]], reference=lambda t: [t, -t]),
+    "custom, with derivatives": vp.CustomCost(smooth, smooth_derivatives),
+    "sum": vp.TrackingCost(0.1)
+    + vp.VelocityCost(0.3)
+    + vp.ControlCost(0.2)
+    + vp.CustomCost(smooth, smooth_derivatives),
+    "terminal": vp.Terminal(vp.TrackingCost(lambda t: [t, 0, 0], FULL) + vp.VelocityCost(0.3)),
+}
+
+
+def differences(bound, z):
+    """Gradient and Hessian of the value by differences of eighth order."""
+
+    def value(z):
+        return bound.value(z[:, :DOF], z[:, DOF : 2 * DOF], z[:, 2 * DOF :])
+
+    def gradient(z, size=2e-2):
+        columns = []
+        for a in range(z.shape[1]):
+            e = size * np.eye(z.shape[1])[a]
+            columns.append(sum(w * (value(z + k * e) - value(z - k * e)) for k, w in WEIGHTS.items()) / size)
+        return np.array(columns).T
+
+    rows = []
+    for a in range(z.shape[1]):
+        e = 2e-2 * np.eye(z.shape[1])[a]
+        rows.append(sum(w * (gradient(z + k * e) - gradient(z - k * e)) for k, w in WEIGHTS.items()) / 2e-2)
+    return gradient(z), np.array(rows).transpose(1, 0, 2)
+
+
+@pytest.mark.parametrize("name", COSTS)
+def test_expansions(name):
+    bound = COSTS[name].bind(points())
+    q, v, u = random_points()
+    expansion = bound.expand(q, v, u)
+    gradient, hessian = differences(bound, np.hstack([q, v, u]))
+    np.testing.assert_allclose(expansion.gradient, gradient, rtol=0, atol=1e-10 * np.abs(gradient).max())
+    given = np.broadcast_to(expansion.hessian, hessian.shape)
+    np.testing.assert_allclose(given, hessian, rtol=0, atol=1e-9 * np.abs(hessian).max())
+
+
+def quadratic(weight, error):
+    W = weight * np.eye(error.shape[1]) if np.ndim(weight) < 2 else np.asarray(weight)
+    return np.array([row @ W @ row for row in error])
+
+
+def test_values():
+    """By hand; a reference in rows is linear between the nodes."""
+    q, v, u = random_points(1)
+    t = points().t
+    middles = 0.5 * (ROWS[1:] + ROWS[:-1])
+    expected = {
+        "tracking, scalar, constant": quadratic(2.0, q - [0.1, 0.2, 0.3]),
+        "tracking, vector, one number": quadratic([1.0, 0.0, 3.0], q - 0.4),
+        "tracking, matrix, function": quadratic(FULL, q - np.column_stack([t, np.sin(t), np.ones(N)])),
+        "tracking, matrix, rows": quadratic(FULL, q - middles),
+        "velocity, vector, rows": quadratic([1.0, 2.0, 3.0], v - middles),
+        "control, matrix, function": quadratic([[2.0, 1.0], [1.0, 0.5]], u - np.column_stack([t, -t])),
+        "custom, with derivatives": smooth(t, q, v, u),
+    }
+    for name, value in expected.items():
+        np.testing.assert_allclose(COSTS[name].bind(points()).value(q, v, u), value, rtol=1e-13, err_msg=name)
+
+
+def test_references_in_rows_at_nodes_and_at_the_end():
+    q, v, u = np.zeros((N, DOF)), np.zeros((N, DOF)), np.zeros((N, M))
+    cost = vp.TrackingCost(ROWS)
+    at_nodes = cost.bind(points(np.arange(N) * 0.1)).value(q, v, u)
+    np.testing.assert_allclose(at_nodes, (ROWS[:-1] ** 2).sum(axis=1), rtol=1e-12)
+    end = vp.Terminal(cost).bind(points([0.1 * N])).value(q[:1], v[:1], u[:1])
+    np.testing.assert_allclose(end, (ROWS[-1] ** 2).sum(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", COSTS)
+def test_many_paths_at_once(name):
+    """Leading axes are paths."""
+    bound = COSTS[name].bind(points())
+    paths = [random_points(seed) for seed in range(4)]
+    q, v, u = (np.array([path[i] for path in paths]) for i in range(3))
+    together = bound.value(q, v, u)
+    assert together.shape == (4, N)
+    np.testing.assert_array_equal(together, [bound.value(*path) for path in paths])
+
+
+def test_sums():
+    parts = [COSTS[name] for name in list(COSTS)[:9]]
+    total = parts[0]
+    for part in parts[1:]:
+        total = total + part
+    assert total.terms == tuple(parts)
+    assert (parts[0] + (parts[1] + parts[2])).terms == tuple(parts[:3])
+    q, v, u = random_points(2)
+    bound, own = total.bind(points()), [part.bind(points()) for part in parts]
+    np.testing.assert_allclose(bound.value(q, v, u), sum(part.value(q, v, u) for part in own), rtol=1e-13)
+    expansions = [part.expand(q, v, u) for part in own]
+    np.testing.assert_allclose(bound.expand(q, v, u).gradient, sum(e.gradient for e in expansions), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(bound.expand(q, v, u).hessian, sum(e.hessian for e in expansions), rtol=0, atol=1e-12)
+    assert repr(parts[0] + parts[6]) == "TrackingCost(weight=2.0) + ControlCost(weight=1.0)"
+    with pytest.raises(TypeError):
+        parts[0] + 1.0
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0])
+def test_custom_cost_from_its_value_alone(scale):
+    """Gradient to 1e-8 and Hessian to 1e-5 of the function's size, for one that varies over lengths of about 1."""
+    q, v, u = random_points(3, scale)
+    exact = vp.CustomCost(smooth, smooth_derivatives).bind(points()).expand(q, v, u)
+    bound = vp.CustomCost(smooth).bind(points())
+    found, size = bound.expand(q, v, u), np.abs(bound.value(q, v, u)).max()
+    assert np.abs(found.gradient - exact.gradient).max() < 1e-8 * size
+    assert np.abs(found.hessian - exact.hessian).max() < 1e-5 * size
+    np.testing.assert_array_equal(found.hessian, np.swapaxes(found.hessian, 1, 2))
+
+
+def test_custom_cost_is_the_built_in_one():
+    """The same plan from a tracking cost, and from its value alone."""
+    built_in = vp.solve(small(vp.TrackingCost([1.0, 0.0], 2.0) + vp.ControlCost(0.1)))
+    alone = vp.CustomCost(lambda t, q, v, u: 2.0 * ((q - [1.0, 0.0]) ** 2).sum(axis=1))
+    own = vp.solve(small(alone + vp.ControlCost(0.1)))
+    np.testing.assert_allclose(own.controls, built_in.controls, rtol=0, atol=1e-7 * np.abs(built_in.controls).max())
+    assert own.cost == pytest.approx(built_in.cost, rel=1e-12)
+
+
+def test_one_hessian_for_all_points():
+    same = vp.CustomCost(lambda t, q, v, u: (q**2).sum(axis=1), lambda t, q, v, u: (np.zeros((N, 8)), np.eye(8)[None]))
+    assert same.bind(points()).expand(*random_points()).hessian.shape == (1, 8, 8)
+
+
+def test_problem_is_an_integral():
+    """A sum over the samples of each step, and the terminal cost once."""
+    scene = vp.Scene(sliders(2), gravity=False)
+    each_step = vp.TrackingCost(lambda t: [t, 0.0], 2.0) + vp.VelocityCost(0.3) + vp.ControlCost(0.1)
+    cost = each_step + vp.Terminal(vp.TrackingCost([1.0, 0.0], 3.0) + vp.VelocityCost(0.7))
+    for sampling in SAMPLINGS:
+        problem = vp.OptimalControlProblem(scene, cost, [0.3, 0.1], [0.2, 0.0], dt=0.1, steps=8, sampling=sampling)
+        motion = run(problem, np.random.default_rng(0).normal(size=(8, 2)))
+        total = 3 * ((motion.q[-1] - [1.0, 0.0]) ** 2).sum() + 0.7 * (motion.v[-1] ** 2).sum()
+        for k in range(8):
+            nodes = motion.q[k], motion.v[k], motion.q[k + 1], motion.v[k + 1]
+            for weight, place, in_q, in_v in samples_of_a_step(sampling, 0.1):
+                t, q, v = (k + place) * 0.1, np.dot(in_q, nodes), np.dot(in_v, nodes)
+                running = 2 * ((q - [t, 0.0]) ** 2).sum() + 0.3 * (v**2).sum() + 0.1 * (motion.u[k] ** 2).sum()
+                total += 0.1 * weight * running
+        assert problem.cost_of(motion) == pytest.approx(total, rel=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: vp.TrackingCost(0.0, np.nan), "TrackingCost weight is nan; it must be finite"),
+        (lambda: vp.TrackingCost(0.0, [1.0, np.inf]), r"weight\[1\] is inf"),
+        (lambda: vp.TrackingCost(0.0, [[1.0, 2.0], [2.0, 1.0]]), "positive semidefinite; its least value is -1"),
+        (lambda: vp.ControlCost(-1.0), "ControlCost weight must be positive semidefinite; its least value is -1"),
+        (lambda: vp.VelocityCost([1.0, -2.0]), "VelocityCost weight must be positive semidefinite"),
+        (lambda: vp.ControlCost(np.ones((2, 3))), r"a number, a vector or a square matrix, got \(2, 3\)"),
+        (lambda: vp.ControlCost(np.ones((2, 2, 2))), r"a number, a vector or a square matrix, got \(2, 2, 2\)"),
+        (lambda: vp.ControlCost("heavy"), "ControlCost weight must be an array of real numbers, got 'heavy'"),
+        (lambda: vp.TrackingCost("home"), "TrackingCost reference must be an array of real numbers, got 'home'"),
+        (lambda: vp.Terminal(vp.ControlCost()), "cannot be a terminal cost: there is no control at the final time"),
+        (lambda: vp.Terminal(vp.TrackingCost(0.0) + vp.ControlCost()), "cannot be a terminal cost"),
+        (lambda: vp.Terminal(vp.Terminal(vp.TrackingCost(0.0))), "cannot be a terminal cost"),
+        (lambda: vp.Terminal(1.0), "Terminal takes a cost, got float"),
+        (lambda: small(vp.ControlCost([1.0, 1.0, 1.0])), r"must be one number or have 2 rows, got shape \(3,\)"),
+        (lambda: small(vp.TrackingCost(0.0, np.eye(3))), r"must be one number or have 2 rows, got shape \(3, 3\)"),
+        (lambda: small(vp.TrackingCost(np.zeros((20, 2)))), r"or \(21, 2\): one row for each .* got \(20, 2\)"),
+        (lambda: small(vp.TrackingCost([0.0, 0.0, 0.0])), r"have shape \(2,\), or \(21, 2\).*got \(3,\)"),
+        (lambda: small(vp.TrackingCost([0.0, np.nan])), r"TrackingCost reference\[1\] is nan"),
+        (lambda: small(vp.Terminal(vp.TrackingCost([0.0, np.nan]))), r"TrackingCost reference\[1\] is nan"),
+    ],
+)
+def test_what_is_refused(make, message):
+    with pytest.raises(vp.InputError, match=message):
+        make()
+
+
+def fails(*arguments):
+    raise KeyError("gain")
+
+
+@pytest.mark.parametrize(
+    ("cost", "message"),
+    [
+        (vp.TrackingCost(fails), r"TrackingCost: the reference raised KeyError\('gain'\) at t = 0.025 s"),
+        (vp.TrackingCost(lambda t: [0.0, np.nan]), r"TrackingCost: the reference at t = 0.025 s.*is nan"),
+        (vp.TrackingCost(lambda t: [0.0]), r"must have shape \(2,\), got \(1,\)"),
+        (vp.TrackingCost(lambda t: "home"), "must be an array of real numbers"),
+        (vp.Terminal(vp.VelocityCost(reference=fails)), r"VelocityCost: the reference raised .* at t = 1 s"),
+        (vp.CustomCost(fails, name="mine"), r"mine: function\(t, q, v, u\) failed: KeyError\('gain'\)"),
+        (vp.CustomCost(lambda t, q, v, u: q, name="mine"), r"mine: .* must return shape \(20,\), got \(20, 2\)"),
+        (vp.CustomCost(lambda t, q, v, u: None), "CustomCost: function"),
+        (vp.CustomCost(lambda t, q, v, u: t, lambda t, q, v, u: (q, v)), r"the gradient must have shape \(20, 6\)"),
+        (vp.CustomCost(lambda t, q, v, u: t, fails), r"derivatives\(t, q, v, u\) failed: 'gain'"),
+        (vp.CustomCost(lambda t, q, v, u: t, lambda t, q, v, u: None), r"derivatives\(t, q, v, u\) failed"),
+        (
+            vp.CustomCost(lambda t, q, v, u: t, lambda t, q, v, u: (np.full((20, 6), np.nan), np.zeros((1, 6, 6)))),
+            r"the gradient\[0, 0\] is nan",
+        ),
+    ],
+)
+def test_functions_that_fail(cost, message):
+    with pytest.raises(vp.CostError, match=message) as caught:
+        vp.solve(small(cost + vp.ControlCost(1.0)))
+    assert isinstance(caught.value, vp.VarpinError)
+    assert isinstance(caught.value.cost, str)
+
+
+def test_weights_are_copied_and_frozen():
+    weight = np.ones(2)
+    cost = vp.ControlCost(weight)
+    weight[:] = 5.0
+    np.testing.assert_array_equal(cost.weight, 1.0)
+    with pytest.raises(ValueError, match="read-only"):
+        cost.weight[0] = 2.0
+
+
+def test_semidefinite_weights_are_taken():
+    """Rank one, with rounding below zero."""
+    a = np.array([[0.1], [0.3], [-0.7]])
+    vp.TrackingCost(0.0, a @ a.T)
+    vp.TrackingCost(0.0, 0.0)

@@ -1,0 +1,1111 @@
+"""S-DDP against a plain Riccati recursion, scipy, differences of the rolled-out cost, and brute force."""
+
+import tracemalloc
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import scipy.linalg
+import scipy.optimize
+from mechanisms import random_inertia
+from scipy.interpolate import CubicHermiteSpline
+
+import varpin as vp
+from varpin.sddp import backward, noise_cost
+
+WEIGHTS = {1: 2 / 3, 2: -1 / 12}
+SAMPLINGS = ["midpoint", "gauss", "start"]
+
+
+def sliders(count, seed=0):
+    """A chain of oblique prismatic joints: its mass matrix is constant, and full."""
+    rng = np.random.default_rng(seed)
+    model = pin.Model()
+    model.name = f"sliders{count}"
+    for k in range(count):
+        axis = rng.normal(size=3)
+        kind = pin.JointModelPrismaticUnaligned(axis / np.linalg.norm(axis))
+        new = model.addJoint(k, kind, pin.SE3.Identity(), f"joint{k}")
+        model.appendBodyToJoint(new, random_inertia(rng), pin.SE3.Identity())
+    return vp.load_robot(model)
+
+
+def samples_of_a_step(sampling, h):
+    """For each: its weight, its place in the step, and q and v there as sums over (q0, v0, q1, v1)."""
+    if sampling == "start":
+        return [(1.0, 0.0, [1, 0, 0, 0], [0, 1, 0, 0])]
+    if sampling == "midpoint":
+        return [(1.0, 0.5, [0.5, 0, 0.5, 0], [-1 / h, 0, 1 / h, 0])]
+    units = np.eye(4)
+    motion = CubicHermiteSpline([0.0, h], units[[0, 2]], units[[1, 3]])
+    places, weights = np.polynomial.legendre.leggauss(2)
+    places = 0.5 + 0.5 * places
+    return [(0.5 * w, s, motion(s * h), motion(s * h, 1)) for w, s in zip(weights, places, strict=True)]
+
+
+class Plain:
+    """The matrices of M q'' + D q' + K q = B u, discretized by hand."""
+
+    def __init__(self, scene, dt, integrator):
+        n = scene.robot.dof
+        model = scene.robot.model
+        M = pin.crba(model, model.createData(), pin.neutral(model))
+        M = np.triu(M) + np.triu(M, 1).T
+        D, K, one, zero = np.diag(scene.damping), np.diag(scene.stiffness), np.eye(n), np.zeros((n, n))
+        self.n, self.M, self.rest = n, M, np.linalg.solve(M, K @ scene.rest)
+        inverse = np.linalg.inv(M)
+        if isinstance(integrator, vp.Midpoint):
+            # p0 = M v + h/2 (K qm + D v - f) and p1 = M v - h/2 (K qm + D v - f), qm = q0 + h v / 2.
+            S = np.linalg.inv(M + dt / 2 * D + dt**2 / 4 * K)
+            v0, v1 = np.hstack([-dt / 2 * S @ K, S]), dt / 2 * S
+            q = np.hstack([one, zero]) + dt * v0
+            p = np.hstack([zero, -one]) + 2 * M @ v0
+            self.A, self.Bf = np.vstack([q, p]), np.vstack([dt * v1, 2 * M @ v1])
+            self.V = np.hstack([zero, inverse])
+            self.kick = integrator.left * self.A[:, n:]
+            self.kick[n:] += (1.0 - integrator.left) * one
+            self.c = self.Bf @ K @ scene.rest
+        else:
+            Ac = np.block([[zero, one], [-inverse @ K, -inverse @ D]])
+            Bc = np.vstack([zero, inverse])
+            terms = 1 if isinstance(integrator, vp.ExplicitEuler) else 4
+            power, self.A, series = np.eye(2 * n), np.eye(2 * n), np.zeros((2 * n, 2 * n))
+            for k in range(1, terms + 1):
+                series = series + power * dt / k
+                power = power @ Ac * dt / k
+                self.A = self.A + power
+            self.Bf = series @ Bc
+            self.V = np.hstack([zero, one])
+            jump = np.vstack([zero, inverse])
+            self.kick = jump if terms == 1 else self.A @ jump
+            self.c = self.Bf @ K @ scene.rest
+        self.B = self.Bf @ scene.actuation
+        self.dt = dt
+
+
+def riccati(plain, problem, noise):
+    """Affine policy u = k + K x in absolute coordinates, and its value at x0.
+
+    ``noise(j)`` gives the columns (a, Gx, Gu) of each process at node j: dw is multiplied by a + Gx x + Gu u. Costs are
+    quadratic forms in (x, x', u, 1); the expectation over x' is taken last.
+    """
+    n, m, h, N = plain.n, problem.scene.controls, plain.dt, problem.steps
+    x, one = 2 * n, 4 * n + m
+    P = np.zeros((x + 1, x + 1))  # the value in (x, 1)
+    pick = {"q": np.hstack([np.eye(n), np.zeros((n, n))]), "v": plain.V}
+
+    def reference(term, time, size):
+        return np.broadcast_to(term.reference(time) if callable(term.reference) else term.reference, (size,))
+
+    def matrix(term, size):
+        return term.weight if term.weight.ndim == 2 else np.diag(np.broadcast_to(term.weight, (size,)))
+
+    for term in problem.cost.terms:
+        if isinstance(term, vp.Terminal):
+            for inner in term.cost.terms:
+                E = np.hstack([pick[inner.block], -reference(inner, N * h, n)[:, None]])
+                P += 2 * E.T @ matrix(inner, n) @ E
+    policies = []
+    for j in range(N - 1, -1, -1):
+        W = np.zeros((one + 1, one + 1))  # in (x, x', u, 1)
+        for term in problem.cost.terms:
+            if isinstance(term, vp.Terminal):
+                continue
+            size = m if term.block == "u" else n
+            for weight, place, in_q, in_v in samples_of_a_step(problem.sampling, h):
+                E = np.zeros((size, one + 1))
+                if term.block == "u":
+                    E[:, 2 * x : one] = np.eye(m)
+                else:
+                    q0, v0, q1, v1 = in_q if term.block == "q" else in_v
+                    E[:, :x] = q0 * pick["q"] + v0 * pick["v"]
+                    E[:, x : 2 * x] = q1 * pick["q"] + v1 * pick["v"]
+                E[:, one] = -reference(term, (j + place) * h, size)
+                W += 2 * h * weight * E.T @ matrix(term, size) @ E
+        after = [*range(x, 2 * x), one]
+        W[np.ix_(after, after)] += P
+        # x' = A x + B u + c + sum (a + Gx x + Gu u) dw: rows of (x, x', u, 1) in (x, u, 1).
+        T = np.zeros((one + 1, x + m + 1))
+        T[:x, :x] = np.eye(x)
+        T[2 * x : one, x : x + m] = np.eye(m)
+        T[one, -1] = 1.0
+        T[x : 2 * x] = np.hstack([plain.A, plain.B, plain.c[:, None]])
+        Q = T.T @ W @ T
+        S = W[x : 2 * x, x : 2 * x]
+        for a, Gx, Gu in noise(j):
+            g = np.hstack([Gx, Gu, a[:, None]])
+            Q += h * g.T @ S @ g
+        u, rest = slice(x, x + m), [*range(x), x + m]
+        K = -np.linalg.solve(Q[u, u], Q[u][:, rest])
+        policies.append(K)
+        P = Q[np.ix_(rest, rest)] + Q[u][:, rest].T @ K
+        P = 0.5 * (P + P.T)
+    start = np.concatenate(
+        [problem.q0, problem.v0 if not problem.integrator.variational else plain.M @ problem.v0, [1.0]]
+    )
+    return np.array(policies[::-1]), 0.5 * start @ P @ start
+
+
+def noise_columns(plain, scene, motion):
+    """(a, Gx, Gu) of each process at each node: fields expanded at the motion, written out by hand."""
+    n, m, B = plain.n, scene.controls, scene.actuation
+
+    def columns(additive, control, state, center):
+        def at(j):
+            found = []
+            for i in range(n):
+                found.append((plain.kick[:, i] * additive, np.zeros((2 * n, 2 * n)), np.zeros((2 * n, m))))
+            for i in range(m):
+                Gu = np.zeros((2 * n, m))
+                Gu[:, i] = plain.kick @ B[:, i] * control
+                found.append((np.zeros(2 * n), np.zeros((2 * n, 2 * n)), Gu))
+            for i in range(n):
+                away = motion.q[j, i] - center
+                Gx = np.zeros((2 * n, 2 * n))
+                Gx[:, i] = plain.kick[:, i] * state * 2 * away
+                # F = C away^2 + 2 C away (q - q_nominal).
+                a = plain.kick[:, i] * state * (away**2 - 2 * away * motion.q[j, i])
+                found.append((a, Gx, np.zeros((2 * n, m))))
+            return found
+
+        return at
+
+    return columns
+
+
+def lq_problem(integrator, sampling, noise=None, steps=40, seed=0):
+    scene = vp.Scene(
+        sliders(3),
+        gravity=False,
+        damping=[0.3, 0.1, 0.2],
+        stiffness=[1.0, 0.0, 2.0],
+        rest=[0.1, -0.2, 0.3],
+        actuation=np.random.default_rng(4).normal(size=(3, 2)),
+        noise=noise,
+    )
+    rng = np.random.default_rng(seed)
+    full = rng.normal(size=(3, 3))
+    cost = (
+        vp.TrackingCost(lambda t: [np.sin(3 * t), 0.2, t], full @ full.T)
+        + vp.VelocityCost([0.1, 0.2, 0.3], reference=[0.1, 0.0, -0.1])
+        + vp.ControlCost(0.05, reference=[0.3, -0.1])
+        + vp.Terminal(vp.TrackingCost([1.0, 0.5, -0.5], 3.0) + vp.VelocityCost(0.7))
+    )
+    return vp.OptimalControlProblem(
+        scene, cost, [0.3, -0.4, 0.2], [0.5, 0.1, -0.6], dt=0.03, steps=steps, integrator=integrator, sampling=sampling
+    )
+
+
+LINEAR = [vp.Midpoint(), vp.ExplicitEuler(), vp.RungeKutta4()]
+
+
+def run(problem, controls):
+    return vp.simulate(
+        problem.scene,
+        problem.q0,
+        problem.v0,
+        dt=problem.dt,
+        steps=problem.steps,
+        controls=np.repeat(controls, problem.hold, axis=0),
+        integrator=problem.integrator,
+    )
+
+
+def state_rows(problem, motion):
+    return np.hstack([motion.q, motion.p if problem.integrator.variational else motion.v])
+
+
+def assert_same_policy(problem, motion, plan, policies):
+    """Gains, and the whole affine law, to 1e-10."""
+    x, K = state_rows(problem, motion)[:-1], policies[:, :, :-1]
+    np.testing.assert_allclose(plan.feedback, K, rtol=0, atol=1e-10 * np.abs(K).max())
+    law = motion.u + plan.feedforward - np.einsum("Nij,Nj->Ni", plan.feedback, x)
+    np.testing.assert_allclose(law, policies[:, :, -1], rtol=0, atol=1e-10 * np.abs(policies).max())
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+@pytest.mark.parametrize("integrator", LINEAR, ids=str)
+def test_riccati_with_multiplicative_noise(integrator, sampling):
+    """Noise of every kind: gains, feed-forward, and the value with its constant."""
+    noise = vp.AdditiveNoise(0.2) + vp.ControlNoise(0.5) + vp.StateNoise(0.8, center=-0.1)
+    problem = lq_problem(integrator, sampling, noise)
+    controls = np.random.default_rng(1).normal(size=(problem.steps, 2))
+    motion = run(problem, controls)
+    plain = Plain(problem.scene, problem.dt, integrator)
+    # The discretization by hand is that of the library.
+    x = state_rows(problem, motion)
+    np.testing.assert_allclose(x[1:], x[:-1] @ plain.A.T + controls @ plain.B.T + plain.c, rtol=0, atol=1e-12)
+    plan = backward(problem, motion, 0.0)
+    policies, value = riccati(plain, problem, noise_columns(plain, problem.scene, motion)(0.2, 0.5, 0.8, -0.1))
+    assert_same_policy(problem, motion, plan, policies)
+    assert problem.cost_of(motion) + plan.noise + 0.5 * plan.slope == pytest.approx(value, rel=1e-10)
+    assert plan.noise > 0.02 * value
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_riccati_with_kicks_before_and_after_the_step(sampling):
+    integrator = vp.Midpoint(kick="split")
+    problem = lq_problem(integrator, sampling, vp.AdditiveNoise(0.2) + vp.ControlNoise(0.5))
+    motion = run(problem, np.random.default_rng(1).normal(size=(problem.steps, 2)))
+    plain = Plain(problem.scene, problem.dt, integrator)
+    plan = backward(problem, motion, 0.0)
+    columns = noise_columns(plain, problem.scene, motion)(0.2, 0.5, 0.0, 0.0)
+    policies, value = riccati(plain, problem, columns)
+    assert_same_policy(problem, motion, plan, policies)
+    assert problem.cost_of(motion) + plan.noise + 0.5 * plan.slope == pytest.approx(value, rel=1e-10)
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+@pytest.mark.parametrize("integrator", LINEAR, ids=str)
+def test_additive_noise_changes_only_the_constant(integrator, sampling):
+    noises = (None, vp.AdditiveNoise([0.3, 0.1, 0.7]))
+    problems = [lq_problem(integrator, sampling, noise) for noise in noises]
+    motion = run(problems[0], np.full((40, 2), 0.3))
+    plans = [backward(problem, motion, 0.0) for problem in problems]
+    for name in ("feedback", "feedforward", "gradient", "slope"):
+        assert np.array_equal(getattr(plans[0], name), getattr(plans[1], name)), name
+    assert plans[0].noise == 0.0
+    assert plans[1].noise > 0.01
+
+
+def test_additive_noise_does_not_change_the_plan_of_an_arm():
+    """In (q, p) a kick does not depend on the state; in (q, v) it does, by the mass matrix."""
+    quiet, noisy = (
+        vp.solve(arm_problem("ur5", vp.Midpoint(), noise=noise, steps=40), tolerance=1e-13)
+        for noise in (None, vp.AdditiveNoise(0.3))
+    )
+    np.testing.assert_allclose(noisy.controls, quiet.controls, rtol=0, atol=1e-10 * np.abs(quiet.controls).max())
+    np.testing.assert_allclose(noisy.gains, quiet.gains, rtol=0, atol=1e-10 * np.abs(quiet.gains).max())
+    assert noisy.cost == pytest.approx(quiet.cost, rel=1e-13)
+    assert noisy.noise_cost > 0.1 * quiet.cost
+
+
+def test_line_search_is_on_the_expected_cost():
+    """From the best motion without noise a whole step is taken, although the cost without noise rises."""
+    problem = lq_problem(vp.Midpoint(), "midpoint", vp.ControlNoise(0.5))
+    plain = vp.solve(problem_without_noise(problem))
+    sol = vp.solve(problem, plain)
+    assert sol.history[0].step == 1.0
+    assert sol.history[0].cost > plain.cost * (1 + 1e-5)
+    assert sol.expected_cost < plain.cost + sol.history[0].noise_cost
+
+
+def test_one_step_solves_it():
+    """And the expected cost it ends with is the Riccati value."""
+    noise = vp.AdditiveNoise(0.2) + vp.ControlNoise(0.5)
+    problem = lq_problem(vp.Midpoint(), "midpoint", noise)
+    sol = vp.solve(problem)
+    plain = Plain(problem.scene, problem.dt, problem.integrator)
+    policies, value = riccati(plain, problem, noise_columns(plain, problem.scene, sol.trajectory)(0.2, 0.5, 0.0, 0.0))
+    assert sol.status is vp.Status.CONVERGED
+    assert sol.iterations == 1
+    assert sol.expected_cost == pytest.approx(value, rel=1e-10)
+    np.testing.assert_allclose(sol.gains, policies[:, :, :-1], rtol=0, atol=1e-10 * np.abs(policies).max())
+
+
+@pytest.mark.parametrize("node", [0, 7, 19])
+def test_noise_of_one_node_stays_there(node):
+    """Where controls are zero but at one node, control noise costs what it does at that node, to the digit."""
+    problem = lq_problem(vp.Midpoint(), "start", vp.ControlNoise(0.5), steps=20)
+    controls = np.zeros((20, 2))
+    controls[node] = 1.0, -2.0
+    motion = run(problem, controls)
+    plan = backward(problem, motion, 0.0)
+    without = backward(problem, run(problem, np.zeros((20, 2))), 0.0)
+    assert without.noise == 0.0
+    plain = Plain(problem.scene, problem.dt, problem.integrator)
+    g = plain.kick @ problem.scene.actuation * (0.5 * controls[node])
+    later = lq_problem(vp.Midpoint(), "start", vp.ControlNoise(0.5), steps=20)
+    policies, P = value_matrices(plain, later, 0.5)
+    assert plan.noise == pytest.approx(0.5 * problem.dt * np.trace(g.T @ P[node + 1] @ g), rel=1e-10)
+    np.testing.assert_allclose(plan.feedback, policies, rtol=0, atol=1e-10 * np.abs(policies).max())
+
+
+def value_matrices(plain, problem, control):
+    """Gains and Hessians of the value of the textbook recursion, costs at the start of steps, weights by hand."""
+    n, h = plain.n, plain.dt
+    terms = {type(term).__name__: term for term in problem.cost.terms}
+    tracking, velocity, end = terms["TrackingCost"], terms["VelocityCost"], terms["Terminal"].cost.terms
+    pick = np.hstack([np.eye(n), np.zeros((n, n))])
+    Qx = 2 * h * (pick.T @ tracking.weight @ pick + plain.V.T @ np.diag(velocity.weight) @ plain.V)
+    R = 2 * h * float(terms["ControlCost"].weight) * np.eye(problem.scene.controls)
+    P = [2 * (float(end[0].weight) * pick.T @ pick + float(end[1].weight) * plain.V.T @ plain.V)]
+    gains = []
+    G = [plain.kick @ problem.scene.actuation[:, [i]] * control for i in range(problem.scene.controls)]
+    for _ in range(problem.steps):
+        S = P[-1]
+        Quu = R + plain.B.T @ S @ plain.B + h * np.diag([(g.T @ S @ g)[0, 0] for g in G])
+        K = -np.linalg.solve(Quu, plain.B.T @ S @ plain.A)
+        gains.append(K)
+        P.append(Qx + plain.A.T @ S @ plain.A + plain.A.T @ S @ plain.B @ K)
+    return np.array(gains[::-1]), P[::-1]
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+@pytest.mark.parametrize("integrator", LINEAR, ids=str)
+def test_long_horizon_against_scipy(integrator, sampling):
+    """The first gains are those of scipy's algebraic Riccati equation, with its cross terms for midpoint sampling."""
+    dt = 0.05
+    scene = vp.Scene(sliders(2), gravity=False, damping=[0.3, 0.1], stiffness=[1.0, 0.5])
+    cost = vp.TrackingCost(0.0, [2.0, 1.0]) + vp.VelocityCost([0.3, 0.2]) + vp.ControlCost([0.1, 0.3])
+    problem = vp.OptimalControlProblem(
+        scene, cost, [0.3, -0.4], [0, 0], dt=dt, steps=2000, integrator=integrator, sampling=sampling
+    )
+    plan = backward(problem, run(problem, np.zeros((2000, 2))), 0.0)
+    plain = Plain(scene, dt, integrator)
+    before, after = np.eye(4, 6), np.hstack([plain.A, plain.B])
+    nodes = [before[:2], plain.V @ before, after[:2], plain.V @ after]
+    H = 2 * dt * np.diag([0, 0, 0, 0, 0.1, 0.3])
+    for weight, _, in_q, in_v in samples_of_a_step(sampling, dt):
+        for row, size in ((in_q, [2.0, 1.0]), (in_v, [0.3, 0.2])):
+            E = sum(c * node for c, node in zip(row, nodes, strict=True))
+            H += 2 * dt * weight * E.T @ np.diag(size) @ E
+    X = scipy.linalg.solve_discrete_are(plain.A, plain.B, H[:4, :4], H[4:, 4:], s=H[:4, 4:])
+    K = -np.linalg.solve(H[4:, 4:] + plain.B.T @ X @ plain.B, plain.B.T @ X @ plain.A + H[4:, :4])
+    np.testing.assert_allclose(plan.feedback[0], K, rtol=0, atol=1e-10 * np.abs(K).max())
+
+
+def test_signal_dependent_noise_in_closed_form():
+    """A mass on a slider whose force is noisy: the scalar equation of Todorov (2005) in its stationary state.
+
+    p' = p + h u + c u dw, cost h (w v^2 + r u^2): P = a + P - h^2 P^2 / (rho + (h^2 + h c^2) P), a = 2 h w / m^2.
+    """
+    h, w, r, c = 0.05, 0.7, 0.2, 0.6
+    scene = vp.Scene(sliders(1), gravity=False, noise=vp.ControlNoise(c))
+    m = scene.robot.model.inertias[1].mass
+    cost = vp.VelocityCost(w) + vp.ControlCost(r)
+    problem = vp.OptimalControlProblem(scene, cost, [0.2], [0.9], dt=h, steps=1500, sampling="start")
+    sol = vp.solve(problem, tolerance=1e-12)
+    a, rho, s = 2 * h * w / m**2, 2 * h * r, h**2 + h * c**2
+    P = (a * s + np.sqrt((a * s) ** 2 + 4 * h**2 * a * rho)) / (2 * h**2)
+    gain = -h * P / (rho + s * P)
+    np.testing.assert_allclose(sol.gains[0, 0], [0.0, gain], rtol=0, atol=1e-10 * abs(gain))
+    assert sol.expected_cost == pytest.approx(0.5 * P * (m * 0.9) ** 2, rel=1e-9)
+    # The noise makes for a softer controller, and costs.
+    quiet = vp.solve(problem_without_noise(problem))
+    assert abs(gain) < 0.95 * abs(quiet.gains[0, 0, 1])
+    assert sol.noise_cost > 0.05 * sol.cost
+
+
+def problem_without_noise(problem):
+    scene = problem.scene
+    quiet = vp.Scene(
+        scene.robot,
+        gravity=scene.gravity,
+        damping=scene.damping,
+        stiffness=scene.stiffness,
+        rest=scene.rest,
+        actuation=scene.actuation,
+    )
+    return vp.OptimalControlProblem(
+        quiet,
+        problem.cost,
+        problem.q0,
+        problem.v0,
+        dt=problem.dt,
+        steps=problem.steps,
+        integrator=problem.integrator,
+        sampling=problem.sampling,
+        hold=problem.hold,
+    )
+
+
+def moved_cost(problem, controls):
+    return problem.cost_of(run(problem, controls))
+
+
+def differences(function, x, size):
+    """Gradient at x of any shape, by differences of fourth order."""
+    gradient = np.empty(x.size)
+    for j in range(x.size):
+        e = np.zeros(x.size)
+        e[j] = size
+        e = e.reshape(x.shape)
+        gradient[j] = sum(w * (function(x + i * e) - function(x - i * e)) for i, w in WEIGHTS.items()) / size
+    return gradient.reshape(x.shape)
+
+
+GRADIENT_INTEGRATORS = [vp.Midpoint(), vp.Midpoint(alpha=0.3), vp.ExplicitEuler(), vp.RungeKutta4()]
+
+
+def arm_problem(name, integrator, sampling="midpoint", hold=1, noise=None, steps=12, dt=None):
+    robot = vp.load_robot(name)
+    n = robot.dof
+    light = name == "finger"
+    scene = vp.Scene(robot, damping=1e-7 if light else 0.2, noise=noise)
+    cost = (
+        vp.TrackingCost(lambda t: 0.3 + 0.2 * np.sin(20 * t + np.arange(n)), np.linspace(1.0, 2.0, n))
+        + vp.VelocityCost(0.01)
+        + vp.ControlCost(1e8 if light else 1e-3)
+        + vp.Terminal(vp.TrackingCost(np.full(n, 0.2), 0.5) + vp.VelocityCost(0.03, reference=0.1))
+    )
+    return vp.OptimalControlProblem(
+        scene,
+        cost,
+        np.linspace(0.2, 0.7, n),
+        np.linspace(-0.5, 0.4, n),
+        dt=dt or (2e-3 if light else 1e-2),
+        steps=steps,
+        integrator=integrator,
+        sampling=sampling,
+        hold=hold,
+    )
+
+
+def arm_controls(problem, seed=3):
+    """Around what holds the arm; nothing does the finger in zero gravity."""
+    base = problem.holding_controls() + (2e-5 if problem.scene.robot.name == "finger" else 0.0)
+    shape = (problem.decisions, problem.scene.controls)
+    return base + 0.3 * np.abs(base).max() * np.random.default_rng(seed).normal(size=shape)
+
+
+@pytest.mark.parametrize("hold", [1, 3])
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+@pytest.mark.parametrize("integrator", GRADIENT_INTEGRATORS, ids=str)
+@pytest.mark.parametrize("name", ["finger", "ur5"])
+def test_gradient(name, integrator, sampling, hold):
+    problem = arm_problem(name, integrator, sampling, hold)
+    controls = arm_controls(problem)
+    expected = differences(lambda u: moved_cost(problem, u), controls, 3e-3 * np.abs(controls).max())
+    given = backward(problem, run(problem, controls), 0.0).gradient
+    np.testing.assert_allclose(given, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("integrator", LINEAR, ids=str)
+def test_gradient_of_the_expected_cost(integrator):
+    """With noise it is that of the expected cost under the policy: moments of the closed loop, by hand."""
+    problem = lq_problem(integrator, "start", vp.AdditiveNoise(0.3) + vp.ControlNoise(0.5), steps=15)
+    controls = np.random.default_rng(2).normal(size=(15, 2))
+    plan = backward(problem, run(problem, controls), 0.0)
+    plain, n, h = Plain(problem.scene, problem.dt, integrator), 3, problem.dt
+    columns = noise_columns(plain, problem.scene, run(problem, controls))(0.3, 0.5, 0.0, 0.0)
+
+    def expected(u):
+        """Cost of the mean, and half the Hessian of the cost times the covariance."""
+        covariance, added = np.zeros((2 * n, 2 * n)), 0.0
+        for j, K in enumerate(plan.feedback):
+            hessian = problem.running.expand(*np.zeros((2, 15, n)), np.zeros((15, 2))).hessian[0]
+            E = np.vstack([np.eye(n, 2 * n), plain.V, K])
+            added += 0.5 * h * np.trace(E.T @ hessian @ E @ covariance)
+            loop = plain.A + plain.B @ K
+            moved = loop @ covariance @ loop.T
+            for a, Gx, Gu in columns(j):
+                spread, mean = Gx + Gu @ K, a + Gu @ u[j]
+                moved += h * (spread @ covariance @ spread.T + np.outer(mean, mean))
+            covariance = moved
+        end = problem.terminal.expand(*np.zeros((2, 1, n)), np.zeros((1, 2))).hessian[0]
+        E = np.vstack([np.eye(n, 2 * n), plain.V, np.zeros((2, 2 * n))])
+        return moved_cost(problem, u) + added + 0.5 * np.trace(E.T @ end @ E @ covariance)
+
+    assert expected(controls) == pytest.approx(moved_cost(problem, controls) + plan.noise, rel=1e-11)
+    numeric = differences(expected, controls, 1e-2)
+    np.testing.assert_allclose(plan.gradient, numeric, rtol=0, atol=1e-9 * np.abs(numeric).max())
+    # A test of the test: the noise is in it.
+    quiet = differences(lambda u: moved_cost(problem, u), controls, 1e-2)
+    assert np.abs(numeric - quiet).max() > 1e-3 * np.abs(numeric).max()
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Midpoint(kick="split"), vp.RungeKutta4()], ids=str)
+def test_gradient_of_the_noise_on_an_arm(integrator, sampling):
+    """Every kind of noise, each kick penalized as along the plan's own motion."""
+    noise = vp.AdditiveNoise(0.3) + vp.ControlNoise(0.2) + vp.StateNoise(2.0, center=0.1)
+    problem = arm_problem("ur5", integrator, sampling, noise=noise)
+    controls = arm_controls(problem)
+    plan = backward(problem, run(problem, controls), 0.0)
+
+    def merit(u):
+        motion = run(problem, u)
+        return problem.cost_of(motion) + noise_cost(problem, motion, plan)
+
+    assert noise_cost(problem, run(problem, controls), plan) == pytest.approx(plan.noise, rel=1e-12)
+    assert plan.noise > 0.1 * moved_cost(problem, controls)
+    numeric = differences(merit, controls, 3e-3 * np.abs(controls).max())
+    np.testing.assert_allclose(plan.gradient, numeric, rtol=0, atol=1e-8 * np.abs(numeric).max())
+
+
+def swing(second_order, *, sampling="midpoint", hold=1, tolerance=1e-13):
+    """From upright to hanging in a second, on a budget."""
+    return vp.solve(swing_problem(sampling, hold), second_order=second_order, tolerance=tolerance, max_iterations=200)
+
+
+def swing_problem(sampling="midpoint", hold=1, steps=50, duration=1.0):
+    scene = vp.Scene(vp.planar_chain(2))
+    end = vp.TrackingCost([-np.pi / 2, 0.0], 50.0) + vp.VelocityCost(5.0)
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(0.01) + vp.Terminal(end)
+    return vp.OptimalControlProblem(
+        scene, cost, [np.pi / 2, 0.0], [0, 0], dt=duration / steps, steps=steps, sampling=sampling, hold=hold
+    )
+
+
+@pytest.mark.parametrize(("sampling", "hold"), [("midpoint", 1), ("gauss", 1), ("start", 1), ("midpoint", 5)])
+def test_quadratic_convergence(sampling, hold):
+    """The promised decrease goes with the square of the gradient: each is the square of the one before, in units."""
+    newton, gauss = swing(True, sampling=sampling, hold=hold), swing(False, sampling=sampling, hold=hold)
+    assert newton.status is gauss.status is vp.Status.CONVERGED
+    assert newton.cost == pytest.approx(gauss.cost, rel=1e-12)
+    assert newton.iterations <= 0.6 * gauss.iterations
+    promised = np.log([item.promised_decrease / newton.cost for item in newton.history])
+    assert promised[-1] < np.log(1e-15)
+    assert promised[-1] / promised[-2] > 1.6
+    linear = np.log([item.promised_decrease / gauss.cost for item in gauss.history])
+    assert linear[-1] / linear[-2] < 1.1
+    np.testing.assert_allclose(newton.controls, gauss.controls, rtol=0, atol=1e-5 * np.abs(gauss.controls).max())
+
+
+def total_hessian(function, x, size):
+    """By differences of fourth order of differences of fourth order."""
+    return differences_of_vector(lambda y: differences(function, y, size), x, size)
+
+
+def differences_of_vector(function, x, size):
+    rows = []
+    for j in range(x.size):
+        e = np.zeros(x.size)
+        e[j] = size
+        e = e.reshape(x.shape)
+        rows.append(sum(w * (function(x + i * e) - function(x - i * e)) for i, w in WEIGHTS.items()).ravel() / size)
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("hold", [1, 2])
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+@pytest.mark.parametrize("alpha", [0.5, 0.3])
+def test_stagewise_newton_is_newton(alpha, sampling, hold):
+    """The step of the exact expansion is -H^-1 g with H and g of the whole cost in all controls, differenced."""
+    end = vp.TrackingCost([-1.0, 0.4], 3.0) + vp.VelocityCost([0.2, 0.3])
+    tilted = vp.CustomCost(lambda t, q, v, u: 0.3 * np.cos(q[:, 0] - q[:, 1]) * v[:, 1] ** 2 + 0.1 * u[:, 0] * q[:, 1])
+    cost = vp.ControlCost(0.3) + vp.VelocityCost(0.2) + tilted + vp.TrackingCost(0.0, 0.4) + vp.Terminal(end)
+    problem = vp.OptimalControlProblem(
+        vp.Scene(vp.planar_chain(2), damping=0.1),
+        cost,
+        [0.5, -0.3],
+        [1.0, -2.0],
+        dt=0.02,
+        steps=4,
+        integrator=vp.Midpoint(alpha=alpha),
+        sampling=sampling,
+        hold=hold,
+    )
+    controls = np.random.default_rng(5).normal(size=(problem.decisions, 2))
+    motion = run(problem, controls)
+    assert motion.statistics.split_steps == 0
+    g = differences(lambda u: moved_cost(problem, u), controls, 0.05)
+    H = total_hessian(lambda u: moved_cost(problem, u), controls, 0.05)
+    newton = -np.linalg.solve(H, g.ravel()).reshape(controls.shape)
+
+    def step(second_order):
+        plan = backward(problem, motion, 0.0, second_order)
+        lin = vp.linearize(problem.scene, motion, integrator=problem.integrator)
+        dx, moves = np.zeros(4), []
+        for j in range(problem.steps):
+            if j % hold == 0:
+                moves.append(plan.feedforward[j // hold] + plan.feedback[j // hold] @ dx)
+            dx = lin.A[j] @ dx + lin.B[j] @ moves[-1]
+        # Its slope is that of Newton's step, too.
+        return np.array(moves), plan.slope
+
+    exact, slope = step(True)
+    np.testing.assert_allclose(exact, newton, rtol=0, atol=1e-6 * np.abs(newton).max())
+    assert slope == pytest.approx((g * newton).sum(), rel=1e-6)
+    assert np.abs(step(False)[0] - newton).max() > 1e-4 * np.abs(newton).max()
+
+
+def test_second_derivatives_of_the_noise():
+    """Where noise grows with the square of the distance from the start: Newton's step for the expected cost.
+
+    Two steps of a linear mechanism: the first makes no noise, and what the second makes costs F' K' h Vxx K F.
+    """
+    strength = np.array([30.0, 50.0, 40.0])
+    scene = vp.Scene(sliders(3), gravity=False, stiffness=[1.0, 0.0, 2.0], noise=vp.StateNoise(strength))
+    end = vp.TrackingCost([1.0, 0.5, -0.5], 3.0) + vp.VelocityCost(0.7)
+    cost = vp.ControlCost(0.05) + vp.TrackingCost(0.3) + vp.Terminal(end)
+    problem = vp.OptimalControlProblem(
+        scene, cost, [0.3, -0.4, 0.2], [2.0, -3.0, 1.0], dt=0.2, steps=2, sampling="start"
+    )
+    controls = np.random.default_rng(5).normal(size=(2, 3))
+    plain = Plain(scene, 0.2, vp.Midpoint())
+    spread = 2 * 0.2 * (3.0 * np.diag([1.0, 1, 1, 0, 0, 0]) + 0.7 * plain.V.T @ plain.V)
+    weight = np.diag(plain.kick.T @ spread @ plain.kick)
+
+    def expected(u):
+        motion = run(problem, u)
+        field = strength * (motion.q[1] - problem.q0) ** 2
+        return problem.cost_of(motion) + 0.5 * weight @ field**2
+
+    motion = run(problem, controls)
+    plan = backward(problem, motion, 0.0, True)
+    assert expected(controls) == pytest.approx(problem.cost_of(motion) + plan.noise, rel=1e-12)
+    assert plan.noise > 0.1 * problem.cost_of(motion)
+    g, H = differences(expected, controls, 0.05), total_hessian(expected, controls, 0.05)
+    newton = -np.linalg.solve(H, g.ravel()).reshape(2, 3)
+    first = plan.feedforward[0]
+    second = plan.feedforward[1] + plan.feedback[1] @ plain.B @ first
+    np.testing.assert_allclose([first, second], newton, rtol=0, atol=1e-6 * np.abs(newton).max())
+    rough = backward(problem, motion, 0.0).feedforward[0]
+    assert np.abs(rough - newton[0]).max() > 1e-3 * np.abs(newton).max()
+
+
+def test_second_order_needs_second_derivatives():
+    with pytest.raises(vp.InputError, match="ExplicitEuler has no second-order"):
+        vp.solve(arm_problem("ur5", vp.ExplicitEuler()), second_order=True)
+
+
+@pytest.mark.parametrize("integrator", LINEAR, ids=str)
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_hold_is_the_optimum_over_shared_controls(integrator, sampling):
+    """Linear-quadratic: controls and first gains of the one quadratic program over all shared controls."""
+    problem = lq_problem(integrator, sampling, steps=12)
+    problem = problem.at(hold=3)
+    sol = vp.solve(problem)
+    assert sol.status is vp.Status.CONVERGED
+    assert sol.gains.shape == (4, 2, 6)
+    zero = np.zeros((4, 2))
+    H = total_hessian(lambda u: moved_cost(problem, u), zero, 1.0)
+    best = -np.linalg.solve(H, differences(lambda u: moved_cost(problem, u), zero, 1.0).ravel())
+    np.testing.assert_allclose(sol.controls.ravel(), best, rtol=0, atol=1e-9 * np.abs(best).max())
+    assert sol.cost == pytest.approx(moved_cost(problem, best.reshape(4, 2)), rel=1e-11)
+    plain = Plain(problem.scene, problem.dt, integrator)
+    to_velocity = np.linalg.inv(plain.M) if integrator.variational else np.eye(3)
+
+    def optimum(x):
+        moved = problem.at(q0=x[:3], v0=to_velocity @ x[3:])
+        return -np.linalg.solve(H, differences(lambda u: moved_cost(moved, u), zero, 1.0).ravel())[:2]
+
+    start = np.concatenate([problem.q0, np.linalg.solve(to_velocity, problem.v0)])
+    gains = np.array([optimum(start + e) - optimum(start) for e in np.eye(6)]).T
+    np.testing.assert_allclose(sol.gains[0], gains, rtol=0, atol=1e-9 * np.abs(gains).max())
+
+
+@pytest.mark.parametrize("name", ["finger", "ur5"])
+def test_hold_on_an_arm(name):
+    """The nonlinear optimum over shared controls, by a quasi-Newton method on the cost alone."""
+    problem = arm_problem(name, vp.Midpoint(), hold=4, steps=12)
+    sol = vp.solve(problem, tolerance=1e-14)
+    unit = np.abs(arm_controls(problem)).max()
+
+    def cost(u):
+        return moved_cost(problem, unit * u.reshape(problem.decisions, -1)) / sol.cost
+
+    def gradient(u):
+        return differences(cost, u, 1e-2)
+
+    found = scipy.optimize.minimize(
+        cost, np.zeros(sol.controls.size), jac=gradient, method="BFGS", options={"gtol": 1e-9, "maxiter": 500}
+    )
+    assert found.fun == pytest.approx(1.0, abs=1e-11)
+    np.testing.assert_allclose(sol.controls.ravel(), unit * found.x, rtol=0, atol=1e-5 * np.abs(sol.controls).max())
+    assert sol.trajectory.u.shape == (12, problem.scene.controls)
+    np.testing.assert_array_equal(sol.trajectory.u, np.repeat(sol.controls, 4, axis=0))
+    # Sharing costs something.
+    assert vp.solve(problem.at(hold=1)).cost < sol.cost
+
+
+def test_hold_of_all_steps():
+    problem = lq_problem(vp.Midpoint(), "midpoint", steps=12).at(hold=12)
+    sol = vp.solve(problem)
+    assert sol.controls.shape == (1, 2)
+    found = scipy.optimize.minimize(lambda u: moved_cost(problem, u[None]), np.zeros(2), options={"gtol": 1e-10})
+    assert sol.cost == pytest.approx(found.fun, rel=1e-10)
+
+
+def reach_problem(dt, sampling="midpoint", integrator=None, hold=1):
+    """An arm that follows a function of time, the same at every dt."""
+    start, reach = np.array([0.0, -1.5, 1.5, 0.0, 0.5, 0.0]), np.array([0.5, 0.3, -0.3, 0.3, 0.2, 0.2])
+    duration = 0.48
+
+    def reference(t):
+        return start + reach * np.sin(3 * t) ** 2
+
+    cost = (
+        vp.TrackingCost(reference, 10.0)
+        + vp.VelocityCost(0.05)
+        + vp.ControlCost(1e-2)
+        + vp.Terminal(vp.TrackingCost(reference(duration), 2.0) + vp.VelocityCost(0.1))
+    )
+    return vp.OptimalControlProblem(
+        vp.Scene(vp.load_robot("ur5"), damping=1.0),
+        cost,
+        start,
+        np.zeros(6),
+        dt=dt,
+        steps=round(duration / dt),
+        integrator=integrator,
+        sampling=sampling,
+        hold=hold,
+    )
+
+
+def slopes(values, ratio):
+    moved = [np.abs(np.asarray(a) - b).max() for a, b in pairwise(values)]
+    return [np.log(a / b) / np.log(ratio) for a, b in pairwise(moved)]
+
+
+def middle_gains(problem, sol, k):
+    """Feedback of step k on the state in its middle, to which the control belongs: to first order (x + x') / 2."""
+    lin = vp.linearize(problem.scene, sol.trajectory, integrator=problem.integrator)
+    return sol.gains[k] @ np.linalg.inv(0.5 * (np.eye(12) + lin.A[k] + lin.B[k] @ sol.gains[k]))
+
+
+def test_plans_converge_with_the_square_of_dt():
+    """Cost, controls and gains in the middle of the horizon, which is in the middle of a step for odd N."""
+    costs, controls, gains, at_nodes = [], [], [], []
+    for steps in (21, 63, 189):
+        problem = reach_problem(0.48 / steps)
+        sol = vp.solve(problem, tolerance=1e-12)
+        assert sol.status is vp.Status.CONVERGED
+        costs.append(sol.cost)
+        controls.append(sol.controls[steps // 2])
+        gains.append(middle_gains(problem, sol, steps // 2))
+        at_nodes.append(sol.gains[steps // 2])
+    assert slopes(costs, 3)[0] > 1.9
+    assert slopes(controls, 3)[0] > 1.9
+    assert slopes(gains, 3)[0] > 1.9
+    # On the state at the start of a step they know that the control will be held: first order, whatever the method.
+    assert slopes(at_nodes, 3)[0] < 1.3
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
+def test_sampled_data_plans_converge_with_the_square_of_dt(integrator):
+    """Controls held over 40 ms, steps of 10 to 2.5 ms: everything that a user gets converges."""
+    costs, controls, gains, late = [], [], [], []
+    for hold in (4, 8, 16):
+        sol = vp.solve(reach_problem(0.04 / hold, hold=hold, integrator=integrator), tolerance=1e-12)
+        found = sol.velocity_policy().gains
+        costs.append(sol.cost)
+        controls.append(sol.controls)
+        gains.append(found[0])
+        late.append(found[6])
+    for values in (costs, controls, gains, late):
+        assert min(slopes(values, 2)) > 1.9
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
+def test_sampling_at_the_start_is_of_first_order(integrator):
+    costs, controls = [], []
+    for hold in (4, 8, 16, 32):
+        problem = reach_problem(0.04 / hold, "start", hold=hold, integrator=integrator)
+        sol = vp.solve(problem, tolerance=1e-12)
+        costs.append(sol.cost)
+        controls.append(sol.controls)
+    assert slopes(costs, 2)[-1] == pytest.approx(1.0, abs=0.1)
+    assert slopes(controls, 2)[-1] == pytest.approx(1.0, abs=0.1)
+
+
+def test_gauss_points_are_of_fourth_order():
+    """With an integrator that is, for controls that are held."""
+    costs, controls, gains = [], [], []
+    for hold in (2, 4, 8):
+        problem = reach_problem(0.04 / hold, "gauss", hold=hold, integrator=vp.RungeKutta4())
+        sol = vp.solve(problem, tolerance=1e-14)
+        costs.append(sol.cost)
+        controls.append(sol.controls)
+        gains.append(sol.gains)
+    for values in (costs, controls, gains):
+        assert slopes(values, 2)[0] > 3.7
+
+
+def test_iterations_do_not_depend_on_dt():
+    found = [vp.solve(reach_problem(dt)).iterations for dt in (0.02, 0.01, 0.004, 0.002, 0.001)]
+    assert max(found) - min(found) <= 2
+
+
+def small(cost=None, *, noise=None, actuation=None, **options):
+    """Two sliders to (1, 0) in a second."""
+    scene = vp.Scene(sliders(2), gravity=False, noise=noise, actuation=actuation)
+    goal = vp.TrackingCost([1.0, 0.0])
+    cost = goal + vp.ControlCost(0.1) + vp.Terminal(goal) if cost is None else cost
+    return vp.OptimalControlProblem(scene, cost, [0.3, 0.1], [0, 0], **{"dt": 0.05, "steps": 20, **options})
+
+
+def test_maximal_iterations():
+    """The best motion so far, with gains and gradient of that motion."""
+    problem = reach_problem(0.02)
+    sol = vp.solve(problem, max_iterations=2, tolerance=1e-12)
+    assert sol.status is vp.Status.MAX_ITERATIONS
+    assert not sol.status.converged
+    assert sol.iterations == 2
+    assert "more iterations" in sol.status.value
+    assert sol.cost == problem.cost_of(sol.trajectory)
+    assert sol.cost < vp.solve(problem, max_iterations=1).cost < vp.solve(problem, max_iterations=0).cost
+    np.testing.assert_array_equal(sol.gains, backward(problem, sol.trajectory, 0.0).feedback)
+    # And going on from it ends where one run does.
+    more = vp.solve(problem, sol, tolerance=1e-12)
+    assert more.status is vp.Status.CONVERGED
+    assert more.cost == pytest.approx(vp.solve(problem, tolerance=1e-12).cost, rel=1e-11)
+
+
+def test_interrupted():
+    problem = reach_problem(0.02)
+
+    def stop(item):
+        if item.index == 1:
+            raise KeyboardInterrupt
+
+    sol = vp.solve(problem, callback=stop)
+    assert sol.status is vp.Status.INTERRUPTED
+    assert sol.cost == problem.cost_of(sol.trajectory)
+    assert sol.cost == vp.solve(problem, max_iterations=2).cost
+    assert len(sol.history) == 2
+    sol.policy  # noqa: B018  it can be used
+
+
+def test_no_minimum():
+    """Controls that do nothing and cost nothing have no best value."""
+    for actuation, cost in (([[0.0], [0.0]], vp.TrackingCost(0.0)), (None, vp.TrackingCost(0.0))):
+        problem = small(cost, actuation=actuation, sampling="start")
+        sol = vp.solve(problem)
+        assert sol.status is vp.Status.INDEFINITE
+        assert "ControlCost" in sol.status.value
+        assert sol.iterations == 0
+        assert sol.cost == problem.cost_of(sol.trajectory)
+        np.testing.assert_array_equal(sol.gains, 0.0)
+    # Where a midpoint is looked at, the last control does something.
+    assert vp.solve(small(vp.TrackingCost(0.0))).status is vp.Status.CONVERGED
+
+
+def test_idle_actuator():
+    """A control without effect or cost beside one that has both stays where it is."""
+    cost = vp.TrackingCost(0.0) + vp.ControlCost([0.1, 0.0])
+    sol = vp.solve(small(cost, actuation=[[1.0, 0.0], [0.5, 0.0]]), controls=[0.0, 0.7])
+    assert sol.status is vp.Status.CONVERGED
+    np.testing.assert_array_equal(sol.controls[:, 1], 0.7)
+
+
+def test_heavy_regularization_is_not_mistaken_for_an_optimum():
+    best = vp.solve(small())
+    sol = vp.solve(small(), regularization=1e12)
+    assert sol.status is vp.Status.CONVERGED
+    assert sol.cost == pytest.approx(best.cost, rel=1e-6)
+    assert vp.solve(small(), regularization=1e12, max_iterations=0).status is vp.Status.MAX_ITERATIONS
+
+
+@pytest.mark.parametrize("steps", [80, 90, 100, 120])
+def test_converged_means_converged(steps):
+    """A swing on a grid so coarse that steps are taken in parts, where the cost jumps and line searches fail."""
+    scene = vp.Scene(vp.planar_chain(2))
+    end = vp.TrackingCost([-np.pi / 2, 0.0], 100.0) + vp.VelocityCost(5.0)
+    cost = vp.ControlCost(0.1) + vp.VelocityCost(0.01) + vp.Terminal(end)
+    problem = vp.OptimalControlProblem(scene, cost, [np.pi / 2, 0.0], [0, 0], dt=2.0 / steps, steps=steps)
+    sol = vp.solve(problem, [0.0, 0.0], second_order=True)
+    promise = -0.5 * backward(problem, sol.trajectory, 0.0).slope
+    assert sol.status is not vp.Status.CONVERGED or promise <= 1e-6 * sol.cost
+
+
+def test_an_optimum_that_costs_nothing():
+    sol = vp.solve(small(vp.TrackingCost([0.3, 0.1]) + vp.ControlCost(1.0)), controls=[1.0, -1.0])
+    assert sol.status is vp.Status.CONVERGED
+    assert sol.cost < 1e-15
+
+
+def test_first_motion_that_cannot_be_integrated():
+    scene = vp.Scene(sliders(2), gravity=False, stiffness=1e9)
+    cost = vp.TrackingCost(0.0) + vp.ControlCost(1.0)
+    problem = vp.OptimalControlProblem(
+        scene, cost, [0.3, 0.1], [0, 0], dt=0.05, steps=400, integrator=vp.ExplicitEuler()
+    )
+    with pytest.raises(vp.StepFailure, match="no longer finite") as caught:
+        vp.solve(problem, controls=[0.0, 0.0])
+    assert 0 < caught.value.trajectory.steps < 400
+    assert caught.value.step == caught.value.trajectory.steps
+    assert np.isfinite(caught.value.trajectory.q).all()
+
+
+def test_cost_that_is_not_finite():
+    never = vp.CustomCost(lambda t, q, v, u: np.where(t > 0.5, np.nan, 0.0), name="never")
+    with pytest.raises(vp.CostError, match="cost of the first motion is nan"):
+        vp.solve(small(vp.ControlCost(1.0) + never))
+    far = vp.CustomCost(lambda t, q, v, u: np.where(q[:, 0] > 0.8, np.nan, (q[:, 0] - 1.0) ** 2), name="far")
+    problem = small(vp.ControlCost(1e-3) + far)
+    sol = vp.solve(problem)
+    assert np.isfinite(sol.cost)
+    assert sol.cost < vp.solve(problem, max_iterations=0).cost
+    assert problem.samples(sol.trajectory.q, sol.trajectory.v, sol.trajectory.u)[0][:, 0].max() <= 0.8
+
+
+def test_history_and_callback():
+    seen = []
+    sol = vp.solve(reach_problem(0.02), callback=seen.append)
+    assert tuple(seen) == sol.history
+    assert [item.index for item in seen] == list(range(len(seen)))
+    costs = [item.cost for item in seen]
+    assert costs == sorted(costs, reverse=True)
+    assert costs[-1] == sol.cost
+    assert all(item.backward_passes >= 1 and item.seconds > 0.0 for item in seen)
+    assert sol.iterations == sum(item.rollouts > 0 for item in seen)
+    assert seen[-1].gradient == np.abs(sol.gradient).max()
+    lines = sol.table().splitlines()
+    assert lines[0].split() == ["iter", "cost", "noise", "cost", "promise", "grad", "reg", "step", "rolls"]
+    assert len(lines) == len(seen) + 2
+    assert lines[-1] == sol.status.value
+    # On a linear-quadratic problem the promise is kept.
+    first = vp.solve(small(), max_iterations=1).history[0]
+    before = vp.solve(small(), max_iterations=0).cost
+    assert before - first.cost == pytest.approx(first.promised_decrease, rel=1e-9)
+
+
+def test_warm_starts():
+    problem = reach_problem(0.02)
+    sol = vp.solve(problem, tolerance=1e-10)
+    cold = sol.iterations
+    assert vp.solve(problem, sol.controls).iterations <= 1
+    assert vp.solve(problem, sol).iterations <= 1
+    assert vp.solve(problem, sol.policy).iterations <= 1
+    np.testing.assert_array_equal(vp.solve(problem, sol, max_iterations=0).trajectory.q, sol.trajectory.q)
+    # From another state the policy is a better start than its controls.
+    moved = problem.at(q0=problem.q0 + 0.05)
+    by_policy, by_controls = (vp.solve(moved, start, max_iterations=0).cost for start in (sol, sol.controls))
+    assert by_policy < by_controls
+    assert vp.solve(moved, sol).iterations < cold
+    # The next horizon.
+    later = problem.at(q0=sol.trajectory.q[1], v0=sol.trajectory.v[1])
+    shifted = sol.shifted(1)
+    np.testing.assert_array_equal(shifted.u[:-1], sol.controls[1:])
+    np.testing.assert_array_equal(shifted.u[-1], sol.controls[-1])
+    np.testing.assert_array_equal(shifted.gains[:-1], sol.gains[1:])
+    assert vp.solve(later, shifted).iterations <= cold
+    assert len(sol.shifted(problem.decisions - 1).u) == problem.decisions
+    for wrong in (-1, problem.decisions, 1.5):
+        with pytest.raises(vp.InputError, match="decisions must be"):
+            sol.shifted(wrong)
+
+
+def test_warm_starts_that_do_not_fit():
+    problem = small(hold=2)
+    with pytest.raises(vp.InputError, match=r"controls must have shape \(10, 2\), got \(20, 2\)"):
+        vp.solve(problem, np.zeros((20, 2)))
+    with pytest.raises(vp.InputError, match="controls"):
+        vp.solve(problem, [np.nan, 0.0])
+    with pytest.raises(vp.InputError, match="holds its controls over 1 steps, the problem 2"):
+        vp.solve(problem, vp.solve(small()))
+    with pytest.raises(vp.InputError, match="for 20 steps, not 40"):
+        vp.solve(small(steps=40), vp.solve(small()))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"forward": "sideways"}, "forward must be"),
+        ({"backtracking": 1.0}, "backtracking must be"),
+        ({"backtracking": "a"}, "backtracking must be a number"),
+        ({"armijo": 2.0}, "armijo must be"),
+        ({"tolerance": 0.0}, "tolerance must be positive"),
+        ({"tolerance": np.nan}, "tolerance must be positive"),
+        ({"regularization": -1.0}, "regularization must be"),
+        ({"max_iterations": 1.5}, "max_iterations must be an integer"),
+        ({"max_iterations": -1}, "max_iterations must be at least 0"),
+    ],
+)
+def test_wrong_options(options, message):
+    with pytest.raises(vp.InputError, match=message):
+        vp.solve(small(), **options)
+
+
+def test_not_a_problem():
+    with pytest.raises(vp.InputError, match="must be an OptimalControlProblem, got str"):
+        vp.solve("finger")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dt": 0.0}, "dt must be positive"),
+        ({"steps": 0}, "steps must be at least 1"),
+        ({"hold": 3}, "steps = 20 is no multiple of hold = 3"),
+        ({"hold": 0}, "hold must be at least 1"),
+        ({"sampling": "end"}, "sampling must be"),
+        ({"integrator": "rk4"}, "integrator must be one of varpin's"),
+    ],
+)
+def test_wrong_problems(options, message):
+    with pytest.raises(vp.InputError, match=message):
+        small(**options)
+
+
+def test_wrong_states_and_scenes():
+    cost = vp.ControlCost(1.0)
+    scene = vp.Scene(sliders(2))
+    for q0, v0, name in (([0.0], [0, 0], "q0"), ([0, 0], [0, np.inf], "v0")):
+        with pytest.raises(vp.InputError, match=name):
+            vp.OptimalControlProblem(scene, cost, q0, v0, dt=0.1, steps=2)
+    with pytest.raises(vp.InputError, match="cost must be a cost"):
+        vp.OptimalControlProblem(scene, "cheap", [0, 0], [0, 0], dt=0.1, steps=2)
+    with pytest.raises(vp.InputError, match="no controls"):
+        vp.OptimalControlProblem(vp.Scene(sliders(2), actuation=[]), cost, [0, 0], [0, 0], dt=0.1, steps=2)
+    with pytest.raises(vp.InputError, match=r"the motion has 3 steps"):
+        small().cost_of(vp.simulate(small().scene, [0, 0], [0, 0], dt=0.05, steps=3))
+
+
+def test_the_same_problem_otherwise():
+    problem = small(hold=2)
+    finer = problem.at(dt=0.025)
+    assert (finer.steps, finer.dt, finer.hold) == (40, 0.025, 2)
+    assert finer.duration == problem.duration
+    longer = problem.at(dt=0.1, steps=40)
+    assert longer.duration == pytest.approx(4.0)
+    assert problem.at(integrator=vp.RungeKutta4(), sampling="start", hold=5).decisions == 4
+    np.testing.assert_array_equal(problem.at(q0=[1, 2]).q0, [1, 2])
+    for dt in (0.3, 3.0):
+        with pytest.raises(vp.InputError, match="no multiple of dt"):
+            problem.at(dt=dt)
+    for dt in (-0.1, "fast"):
+        with pytest.raises(vp.InputError, match="dt must be"):
+            problem.at(dt=dt)
+    rows = vp.TrackingCost(np.zeros((21, 2)))
+    with pytest.raises(vp.InputError, match=r"\(41, 2\)"):
+        small(rows).at(dt=0.025)
+
+
+@pytest.mark.parametrize("forward", ["closed", "open"])
+def test_forward_passes_agree(forward):
+    best = vp.solve(reach_problem(0.02), tolerance=1e-12)
+    assert vp.solve(reach_problem(0.02), tolerance=1e-12, forward=forward).cost == pytest.approx(best.cost, rel=1e-11)
+
+
+@pytest.mark.parametrize("hold", [1, 4])
+@pytest.mark.parametrize("integrator", LINEAR, ids=str)
+def test_policy_reproduces_the_motion(integrator, hold):
+    problem = arm_problem("ur5", integrator, hold=hold, noise=vp.ControlNoise(0.05))
+    sol = vp.solve(problem)
+    again = vp.simulate(
+        problem.scene,
+        problem.q0,
+        problem.v0,
+        dt=problem.dt,
+        steps=problem.steps,
+        controls=sol.policy,
+        integrator=integrator,
+    )
+    for name in ("q", "v", "p", "u"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(sol.trajectory, name))
+
+
+def test_same_bytes_on_repeat():
+    problem = arm_problem("finger", vp.Midpoint(), noise=vp.ControlNoise(0.1) + vp.AdditiveNoise(1e-6), steps=50)
+    first, second = vp.solve(problem), vp.solve(problem)
+    for name in ("gains", "feedforward", "gradient", "controls"):
+        assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
+    assert (first.cost, first.noise_cost) == (second.cost, second.noise_cost)
+
+
+@pytest.mark.parametrize("noise", [None, vp.ControlNoise(0.05)], ids=["quiet", "noisy"])
+def test_memory(noise):
+    """Below 2 kB a node at three joints."""
+    peaks = []
+    for steps in (50, 5000, 20000):
+        problem = arm_problem("finger", vp.Midpoint(), steps=steps, dt=1e-4, noise=noise)
+        tracemalloc.start()
+        vp.solve(problem, max_iterations=1)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert (peaks[2] - peaks[1]) / 15000 < 2000.0
+
+
+def test_solutions_are_frozen():
+    sol = vp.solve(small())
+    for name in ("gains", "feedforward", "gradient"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(sol, name)[:] = 0.0
+    with pytest.raises(AttributeError):
+        sol.cost = 0.0

@@ -1,0 +1,295 @@
+"""What is done with a solution: verification, Monte Carlo, policies; against scipy, Pinocchio and sampling by hand."""
+
+import dataclasses
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from naive import continuous
+from test_sddp import WEIGHTS, arm_problem, lq_problem, problem_without_noise, run, small
+
+import varpin as vp
+
+INTEGRATORS = [vp.Midpoint(), vp.Midpoint(alpha=0.3), vp.ExplicitEuler(), vp.RungeKutta4()]
+
+
+def running_cost(q_r, weights):
+    """The running cost of ``tracking``, written out."""
+    return lambda t, q, v, u: weights[0] @ (q - q_r(t)) ** 2 + weights[1] * v @ v + weights[2] * u @ u
+
+
+def tracking(name, integrator, *, hold=1, damping=None, steps=24):
+    """A problem, and its running and terminal costs as plain functions."""
+    robot = vp.load_robot(name)
+    n, light = robot.dof, name == "finger"
+    weights = np.linspace(5.0, 10.0, n), 0.05, 1e6 if light else 1e-2
+    start = np.linspace(0.2, 0.6, n)
+
+    def q_r(t):
+        return start + 0.3 * np.sin(4 * t + np.arange(n)) - 0.3 * np.sin(np.arange(n))
+
+    duration = 0.24
+    cost = (
+        vp.TrackingCost(q_r, weights[0])
+        + vp.VelocityCost(weights[1])
+        + vp.ControlCost(weights[2])
+        + vp.Terminal(vp.TrackingCost(q_r(duration), 2.0) + vp.VelocityCost(0.1))
+    )
+    scene = vp.Scene(
+        robot,
+        damping=(2e-6 if light else 0.5) if damping is None else damping,
+        stiffness=1e-5 if light else 0.7,
+        rest=0.1,
+    )
+    problem = vp.OptimalControlProblem(
+        scene, cost, start, np.zeros(n), dt=duration / steps, steps=steps, integrator=integrator, hold=hold
+    )
+
+    def end(q, v):
+        return 2.0 * ((q - q_r(duration)) ** 2).sum() + 0.1 * v @ v
+
+    return problem, running_cost(q_r, weights), end
+
+
+@pytest.mark.parametrize("hold", [1, 4])
+@pytest.mark.parametrize("integrator", INTEGRATORS, ids=str)
+@pytest.mark.parametrize("name", ["finger", "ur5"])
+def test_true_cost(name, integrator, hold):
+    """Open loop and with feedback, the end gaps and the defect: as by scipy on Pinocchio's forward dynamics."""
+    problem, running, end = tracking(name, integrator, hold=hold)
+    sol = vp.solve(problem)
+    found = sol.verify()
+    assert found.accuracy <= 1e-10
+    assert found.planned_cost == sol.cost
+    scene, dt, motion = problem.scene, problem.dt, sol.trajectory
+    q, v, integral = continuous(scene, problem.q0, problem.v0, sol.controls, dt * hold, running)
+    assert found.open_loop_cost == pytest.approx(integral + end(q[-1], v[-1]), rel=1e-8)
+    assert found.open_loop_gap == pytest.approx(np.abs(q[-1] - motion.q[-1]).max(), rel=1e-6, abs=1e-9)
+
+    policy = sol.velocity_policy()
+
+    def law(k, q, v, u):
+        return u + policy.gains[k] @ (np.concatenate([q, v]) - policy.reference[k])
+
+    q, v, integral = continuous(scene, problem.q0, problem.v0, sol.controls, dt * hold, running, law)
+    assert found.closed_loop_cost == pytest.approx(integral + end(q[-1], v[-1]), rel=1e-8)
+    assert found.closed_loop_gap == pytest.approx(np.abs(q[-1] - motion.q[-1]).max(), rel=1e-6, abs=1e-9)
+    defects = [
+        np.abs(continuous(scene, motion.q[k], motion.v[k], motion.u[k : k + 1], dt, running)[0][1] - motion.q[k + 1])
+        for k in range(problem.steps)
+    ]
+    assert found.defect == pytest.approx(np.max(defects), rel=1e-6, abs=1e-12)
+
+
+def test_defects_tell_integrators_apart():
+    """Of second order in the step for Euler, third for the midpoint rule, fifth for Runge and Kutta's."""
+    for integrator, order in ((vp.ExplicitEuler(), 2), (vp.Midpoint(), 3), (vp.RungeKutta4(), 5)):
+        found = [vp.solve(tracking("ur5", integrator, steps=steps)[0]).verify().defect for steps in (96, 192)]
+        assert np.log2(found[0] / found[1]) == pytest.approx(order, abs=0.2)
+
+
+def test_accuracy_is_honest():
+    """Cut short, it bounds the error of the cost; with one pass there is nothing to compare."""
+    problem, running, end = tracking("ur5", vp.Midpoint(), steps=12)
+    sol = vp.solve(problem)
+    q, v, integral = continuous(problem.scene, problem.q0, problem.v0, sol.controls, problem.dt, running)
+    true = integral + end(q[-1], v[-1])
+    assert sol.verify(max_substeps=2).accuracy == np.inf
+    for most in (4, 8, 16):
+        found = sol.verify(tolerance=1e-15, max_substeps=most)
+        assert found.substeps == most
+        assert abs(found.open_loop_cost / true - 1.0) <= found.accuracy
+    assert found.accuracy < 1e-8
+
+
+def test_motion_that_runs_away():
+    """A stiff spring that two substeps cannot follow gives NaN; enough of them give the cost."""
+    scene = vp.Scene(vp.planar_chain(1), stiffness=3e4, gravity=False)
+    cost = vp.TrackingCost([0.1]) + vp.ControlCost(1e-6)
+    sol = vp.solve(vp.OptimalControlProblem(scene, cost, [0.1], [0.0], dt=0.05, steps=200), [2500.0])
+    coarse = sol.verify(max_substeps=2)
+    assert np.isnan(coarse.open_loop_cost)
+    assert np.isnan(coarse.open_loop_gap)
+    assert coarse.accuracy == np.inf
+    fine = sol.verify(tolerance=1e-6)
+    assert np.isfinite(fine.open_loop_cost)
+    assert fine.accuracy <= 1e-6
+
+
+@pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, "tight"])
+def test_wrong_tolerances(wrong):
+    with pytest.raises(vp.InputError, match="tolerance"):
+        vp.solve(small()).verify(tolerance=wrong)
+
+
+@pytest.mark.parametrize("name", ["finger", "ur5"])
+def test_velocity_policy(name):
+    """dp = L_vq dq + M dv, with M v from Pinocchio and differenced."""
+    sol = vp.solve(arm_problem(name, vp.Midpoint(), hold=3))
+    model, data, n = sol.problem.scene.robot.model, sol.problem.scene.robot.model.createData(), sol.controls.shape[1]
+
+    def momentum(q, v):
+        M = pin.crba(model, data, q)
+        return (np.triu(M) + np.triu(M, 1).T) @ v
+
+    policy = sol.velocity_policy(substeps=5)
+    assert policy.hold == 15
+    for r in (0, 2, 3):
+        q, v = sol.trajectory.q[3 * r], sol.trajectory.v[3 * r]
+        np.testing.assert_array_equal(policy.reference[r], np.concatenate([q, v]))
+        step = 1e-3
+        columns = [
+            sum(w * (momentum(q + i * step * e, v) - momentum(q - i * step * e, v)) for i, w in WEIGHTS.items()) / step
+            for e in np.eye(n)
+        ]
+        M = np.array([momentum(q, e) for e in np.eye(n)]).T
+        turned = sol.gains[r] @ np.block([[np.eye(n), np.zeros((n, n))], [np.array(columns).T, M]])
+        np.testing.assert_allclose(policy.gains[r], turned, rtol=0, atol=1e-9 * np.abs(turned).max())
+    explicit = vp.solve(arm_problem(name, vp.RungeKutta4()))
+    np.testing.assert_array_equal(explicit.velocity_policy().gains, explicit.gains)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.ExplicitEuler(), vp.RungeKutta4()], ids=str)
+def test_predicted_cost_is_exact_where_everything_is_linear(integrator):
+    """Linear-quadratic with additive and control noise: Monte Carlo within 4 standard errors, and those small."""
+    problem = lq_problem(integrator, "midpoint", vp.AdditiveNoise(0.2) + vp.ControlNoise(0.3))
+    sol = vp.solve(problem)
+    found = sol.monte_carlo(4000, 1)
+    assert found.predicted == sol.expected_cost
+    assert found.paths == 4000
+    assert found.failures == 0
+    assert sol.noise_cost > 10 * found.standard_error
+    assert abs(found.cost - found.predicted) < 4 * found.standard_error
+
+
+def test_monte_carlo_against_paths_one_by_one():
+    """The mean of cost_of over single simulations with the policy, and its standard error."""
+    problem = lq_problem(vp.Midpoint(), "midpoint", vp.AdditiveNoise(0.2) + vp.ControlNoise(0.3))
+    sol = vp.solve(problem)
+    rng = np.random.default_rng(3)
+    for feedback, controls in ((True, sol.policy), (False, sol.controls)):
+        costs = np.array(
+            [
+                problem.cost_of(
+                    vp.simulate(problem.scene, problem.q0, problem.v0, dt=0.03, steps=40, controls=controls, rng=rng)
+                )
+                for _ in range(1000)
+            ]
+        )
+        found = sol.monte_carlo(1000, 5, feedback=feedback)
+        error = costs.std(ddof=1) / np.sqrt(1000)
+        assert found.standard_error == pytest.approx(error, rel=0.3)
+        assert abs(costs.mean() - found.cost) < 4 * np.hypot(error, found.standard_error)
+
+
+def test_monte_carlo_repeats():
+    sol = vp.solve(lq_problem(vp.Midpoint(), "midpoint", vp.AdditiveNoise(0.2)))
+    first = sol.monte_carlo(600, 7, workers=1)
+    assert sol.monte_carlo(600, 7, workers=2) == first
+    assert sol.monte_carlo(600, np.random.default_rng(7)) == first
+    assert sol.monte_carlo(600, 8) != first
+
+
+def test_monte_carlo_without_noise():
+    sol = vp.solve(small())
+    found = sol.monte_carlo(3, 0)
+    assert found.cost == pytest.approx(sol.cost, rel=1e-13)
+    assert found.standard_error < 1e-14
+
+
+def test_monte_carlo_that_cannot_be():
+    sol = vp.solve(small(noise=vp.AdditiveNoise(0.1)))
+    for paths in (1, 0, 2.5):
+        with pytest.raises(vp.InputError, match="paths must be"):
+            sol.monte_carlo(paths, 0)
+    own = vp.CustomNoise(lambda q, v, u: 0.1 * np.eye(2), 2)
+    with pytest.raises(vp.InputError):
+        vp.solve(small(noise=own)).monte_carlo(10, 0)
+
+
+def noisy_reach(name, intensity):
+    """To another posture, with forces that are as noisy as they are large."""
+    robot = vp.load_robot(name)
+    n, light = robot.dof, name == "finger"
+    start = np.array([0.2, 0.3, 0.2] if light else [0.0, -1.5, 1.5, 0.0, 0.5, 0.0])
+    goal = start + np.array([0.6, 0.2, 0.2] if light else [0.5, 0.3, -0.3, 0.3, 0.2, 0.2])
+    scene = vp.Scene(robot, damping=1e-6 if light else 1.0, noise=vp.ControlNoise(intensity))
+    cost = (
+        vp.TrackingCost(goal, 10.0)
+        + vp.ControlCost(1e7 if light else 1e-3)
+        + vp.Terminal(vp.TrackingCost(goal, 10.0) + vp.VelocityCost(0.1))
+    )
+    return vp.OptimalControlProblem(scene, cost, start, np.zeros(n), dt=5e-3 if light else 1e-2, steps=100)
+
+
+def path_costs(problem, policy, paths, seed):
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(paths // 500):
+        ensemble = vp.simulate_ensemble(
+            problem.scene,
+            problem.q0,
+            problem.v0,
+            dt=problem.dt,
+            steps=problem.steps,
+            paths=500,
+            rng=rng,
+            controls=policy,
+            integrator=problem.integrator,
+            quantiles=(),
+        )
+        found.append(problem.costs(ensemble.q, ensemble.v, ensemble.u))
+    return np.concatenate(found)
+
+
+@pytest.mark.parametrize(("name", "intensity"), [("ur5", 0.13), ("finger", 0.16)])
+def test_where_noise_matters(name, intensity):
+    """Noise adds a fifth to the cost. S-DDP's policy is better than plain DDP's by far, and costs what it predicts.
+
+    Plain DDP's gains are next to instability in the mean square there, so that its costs have heavy tails: they are cut
+    at 20 times the cost that S-DDP predicts, which only helps it.
+    """
+    problem = noisy_reach(name, intensity)
+    aware, plain = vp.solve(problem), vp.solve(problem_without_noise(problem))
+    assert aware.status is plain.status is vp.Status.CONVERGED
+    assert aware.expected_cost > 1.2 * plain.cost
+    ours = path_costs(problem, aware.policy, 2000, 1)
+    theirs = np.minimum(path_costs(problem, plain.policy, 2000, 1), 20 * aware.expected_cost)
+    assert np.isfinite(ours).all()
+    assert np.isfinite(theirs).all()
+    error = np.hypot(ours.std(ddof=1), theirs.std(ddof=1)) / np.sqrt(2000)
+    assert theirs.mean() - ours.mean() > 4 * error
+    assert aware.expected_cost == pytest.approx(ours.mean(), rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
+def test_where_noise_matters_uncut(integrator):
+    """The same by ``monte_carlo`` itself, nothing cut, on the arm."""
+    problem = noisy_reach("ur5", 0.13).at(integrator=integrator)
+    aware, quiet = vp.solve(problem), vp.solve(problem_without_noise(problem))
+    plain = dataclasses.replace(quiet, problem=problem)
+    ours, theirs = aware.monte_carlo(8000, 1), plain.monte_carlo(8000, 1)
+    assert ours.failures == theirs.failures == 0
+    assert theirs.cost - ours.cost > 4 * np.hypot(ours.standard_error, theirs.standard_error)
+    assert ours.predicted == pytest.approx(ours.cost, rel=0.05)
+    # Feedback is worth having.
+    assert aware.monte_carlo(2000, 1, feedback=False).cost > ours.cost
+
+
+def test_paths_that_fail_are_counted():
+    """Plain DDP's gains on the light finger, in noise they were not made for."""
+    problem = noisy_reach("finger", 0.3)
+    plain = dataclasses.replace(vp.solve(problem_without_noise(problem)), problem=problem)
+    found = plain.monte_carlo(256, 1)
+    assert found.failures > 0
+    assert found.paths + found.failures == 256
+    assert np.isfinite(found.cost)
+
+
+def test_what_it_prints():
+    noisy = vp.solve(small(noise=vp.AdditiveNoise(0.3)))
+    assert "by noise" in repr(noisy)
+    assert "converged" in repr(noisy)
+    assert "noise" not in repr(vp.solve(small()))
+    np.testing.assert_array_equal(run(noisy.problem, noisy.controls).q, noisy.trajectory.q)
