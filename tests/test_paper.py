@@ -23,7 +23,7 @@ from varpin.paper.experiments import OPTIMUM, PLAIN, STOCHASTIC, Cell, Store, Ta
 from varpin.paper.figures import draw
 from varpin.paper.report import write
 
-FIGURES = ["figure1", "figure2", "figure3", "figure4", "figure5", "truth"]
+FIGURES = ["figure1", "figure2", "figure3", "figure4", "figure5", "truth", "noise"]
 
 
 def made_up(task):

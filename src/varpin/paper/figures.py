@@ -189,7 +189,7 @@ def _truth(cells: Cells) -> Figure:
 
 
 def _under_noise(cells: Cells) -> Figure:
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    figure = Figure(figsize=(9, 4.2), layout="constrained")
     axes = figure.subplots()
     known, plain = (series_of_noise(cells, method) for method in (STOCHASTIC, PLAIN))
     strengths = [cases.strength_of(c.case) for c in known]
@@ -208,7 +208,7 @@ def _under_noise(cells: Cells) -> Figure:
     for lost in plain:
         if not np.isfinite(lost.sampled[0]):
             axes.annotate(
-                "DDP: paths run away", (cases.strength_of(lost.case), 0.8), xycoords=("data", "axes fraction"),
+                "DDP: paths run away", (cases.strength_of(lost.case), 0.6), xycoords=("data", "axes fraction"),
                 color=COLORS[1], ha="right",
             )  # fmt: skip
     axes.set(xlabel="strength C of the noise [s$^{1/2}$]", ylabel="expected cost")
