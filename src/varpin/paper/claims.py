@@ -87,7 +87,8 @@ def assess(cells: Cells, motions: Mapping[tuple[str, str, float], tuple[Floats, 
         _time(cells, fine, coarse),
         _bandwidth(cells),
         _state_dependent(cells, fine, coarse),
-        _excess(cells, steps),
+        _excess(cells, steps, "variational", "the plan with the midpoint integrator"),
+        _excess(cells, steps, cases.FOURTH_ORDER, "the plan with Gauss collocation of fourth order"),
         _true_cost(cells, steps),
         _gains(cells),
         _under_noise(cells),
@@ -214,23 +215,22 @@ def _state_dependent(cells: Cells, fine: float, coarse: float) -> Claim:
     )
 
 
-def _excess(cells: Cells, steps: Sequence[float]) -> Claim:
+def _excess(cells: Cells, steps: Sequence[float], method: str, name: str) -> Claim:
     rows, small, large = [], [], []
     for dt in steps:
-        best = cell(cells, MAIN, "0", OPTIMUM, dt)
-        own, other = (cell(cells, MAIN, "0", method, dt) for method in cases.METHODS)
+        best, own, other = (cell(cells, MAIN, "0", m, dt) for m in (OPTIMUM, method, "Euler"))
         if best is None or own is None or other is None:
             continue
         excess = [c.true_cost / best.true_cost - 1.0 for c in (own, other)]
-        rows.append(f"{dt:g} s: {excess[0]:.2%} / {excess[1]:.3g}")
+        rows.append(f"{dt:g} s: {excess[0]:.2%} / {excess[1]:.2%}")
         if dt <= COARSE:
             small.append(excess[0] < 0.02)
             large.append(excess[1] > 10.0 * excess[0])
     return Claim(
         "varpin",
-        "Over the sampled-data optimum the variational plan's true cost stays below 2% up to 6 ms, and Euler's exceeds "
-        "ten times that or fails.",
-        "Excess (variational / Euler, the latter as a multiple of the optimum): " + "; ".join(rows) + ".",
+        f"Over the sampled-data optimum the true cost of {name} stays below 2% up to 6 ms, and Euler's exceeds ten "
+        "times that or fails.",
+        "Excess (own / Euler): " + "; ".join(rows) + ".",
         verdict(all(small), all(large)),
     )
 
@@ -317,9 +317,16 @@ def _hinge(cells: Cells, setting: Setting, fine: float, coarse: float) -> Claim:
                 f"({b.status.lower().replace('_', ' ')}), true cost {b.true_cost:.4g} at {coarse:g} s"
             )
     best, own, other = (cell(cells, setting, "0", m, coarse) for m in (OPTIMUM, "variational", "Euler"))
+    fourth = cell(cells, setting, "0", cases.FOURTH_ORDER, coarse)
     if best is not None and own is not None and other is not None:
+        if fourth is not None:
+            text.append(f"fourth order: true cost {fourth.true_cost:.4g}")
         text.append(f"sampled-data optimum {best.true_cost:.4g}")
-        good = [own.true_cost <= other.true_cost, abs(factor["variational"] - 1.0) < abs(factor["Euler"] - 1.0)]
+        good = [
+            own.true_cost <= other.true_cost,
+            own.true_cost <= 1.1 * best.true_cost,
+            abs(factor["variational"] - 1.0) < abs(factor["Euler"] - 1.0),
+        ]
     return Claim(
         "varpin",
         f"The claims do not hinge on what the paper leaves open: {setting.title}.",

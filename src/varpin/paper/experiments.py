@@ -48,7 +48,7 @@ class Cell:
     Attributes:
         setting: Its key.
         case: Its key, or "0" without noise.
-        method: "variational", "Euler", or "optimum" for the sampled-data optimum.
+        method: one of ``METHODS``, "fourth-order", or "optimum" for the sampled-data optimum; or "S-DDP", "DDP".
         dt: Time between two controls [s].
         cost: The optimizer's own cost of the mean motion.
         noise_cost: What noise adds to it, by the optimizer's model.
@@ -117,7 +117,7 @@ def tasks(*, quick: bool) -> Iterator[Task]:
                 yield Task(MAIN, case, method, dt)
     for setting in (MAIN,) if quick else (MAIN, *VARIATIONS):
         for dt in steps:
-            for method in (*METHODS, OPTIMUM):
+            for method in (*METHODS, cases.FOURTH_ORDER, OPTIMUM):
                 yield Task(setting, None, method, dt)
     for strength in cases.QUICK_STRENGTHS if quick else cases.NOISY_STRENGTHS:
         for method in (STOCHASTIC, PLAIN):
@@ -258,7 +258,7 @@ def fill(folder: Path, *, quick: bool, progress: Progress | None = None) -> dict
         cell = store.load(task)
         if cell is None:
             if not warm:  # compilation is not to be part of the first times
-                for method in METHODS:
+                for method in (*METHODS, cases.FOURTH_ORDER):
                     solve(cases.problem(MAIN, CASES[0], method, cases.COARSEST), max_iterations=1)
                 warm = True
             cell = run(task)

@@ -24,7 +24,7 @@ Motions = Mapping[tuple[str, str, float], tuple[Floats, Floats]]
 # hundredfold.
 _SMALL_ERROR = 1e-4
 
-_METHOD_COLOR = {"variational": COLORS[0], "Euler": COLORS[1], OPTIMUM: COLORS[6]}
+_METHOD_COLOR = {"variational": COLORS[0], "Euler": COLORS[1], cases.FOURTH_ORDER: COLORS[2], OPTIMUM: COLORS[6]}
 
 
 def draw(cells: Cells, motions: Motions) -> dict[str, tuple[Figure, str]]:
@@ -171,7 +171,7 @@ def _truth(cells: Cells) -> Figure:
     axes = figure.subplots()
     best = min(c.true_cost for c in series(cells, MAIN, "0", OPTIMUM))
     top = 1e5 * best
-    for method in (*cases.METHODS, OPTIMUM):
+    for method in (*cases.METHODS, cases.FOURTH_ORDER, OPTIMUM):
         own = series(cells, MAIN, "0", method)
         dts = [c.dt for c in own]
         label = "optimum over held controls" if method == OPTIMUM else method
