@@ -24,7 +24,7 @@ Motions = Mapping[tuple[str, str, float], tuple[Floats, Floats]]
 # hundredfold.
 _SMALL_ERROR = 1e-4
 
-_METHOD_COLOR = {"variational": COLORS[0], "Euler": COLORS[1], cases.FOURTH_ORDER: COLORS[2], OPTIMUM: COLORS[6]}
+_METHOD_COLOR = {"variational": COLORS[0], "Euler": COLORS[1], cases.FOURTH_ORDER: COLORS[2]}
 
 
 def draw(cells: Cells, motions: Motions) -> dict[str, tuple[Figure, str]]:
@@ -175,8 +175,10 @@ def _truth(cells: Cells) -> Figure:
         own = series(cells, MAIN, "0", method)
         dts = [c.dt for c in own]
         label = "optimum over held controls" if method == OPTIMUM else method
-        axes.loglog(dts, [c.open_loop for c in own], "o-", color=_METHOD_COLOR[method], label=f"{label}, open loop")
-        if method != OPTIMUM:
+        if method == OPTIMUM:  # a broad band: the best plans lie on it
+            axes.loglog(dts, [c.open_loop for c in own], "-", color="0.8", lw=7, zorder=0, label=label)
+        else:
+            axes.loglog(dts, [c.open_loop for c in own], "o-", color=_METHOD_COLOR[method], label=f"{label}, open loop")
             costs = [c.closed_loop for c in own]
             label += ", with feedback"
             if not any(cost < top for cost in costs):
