@@ -12,7 +12,7 @@ from mechanisms import random_inertia
 from scipy.interpolate import CubicHermiteSpline
 
 import varpin as vp
-from varpin.sddp import backward, noise_cost
+from varpin.backward import backward, noise_cost
 
 WEIGHTS = {1: 2 / 3, 2: -1 / 12}
 SAMPLINGS = ["midpoint", "gauss", "start"]

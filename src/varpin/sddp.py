@@ -5,26 +5,18 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from varpin.backward import Plan, backward, noise_cost
 from varpin.checks import count, finite_array, fraction, positive, real
 from varpin.costs import CostError
 from varpin.errors import InputError, LinearizationError
 from varpin.integrators.base import open_loop
-from varpin.kernels import backward as kernels
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
-from varpin.linearization import (
-    Linearization,
-    linearize_steps,
-    second_order_steps,
-    velocity_at_nodes,
-    velocity_curvature,
-)
 from varpin.policy import LinearPolicy
 from varpin.problem import OptimalControlProblem
 from varpin.simulation import StepFailure, rollout
@@ -36,8 +28,6 @@ Callback = Callable[[Iteration], None]
 
 logger = logging.getLogger(__name__)
 
-# Nodes that are linearized at a time: their derivatives are not kept.
-_BLOCK = 2048
 # The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it shrinks after
 # long steps and grows after short ones.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
@@ -134,25 +124,6 @@ def _held(u: Floats, hold: int) -> Commands:
     return open_loop(u)._replace(hold=hold)
 
 
-@dataclass(frozen=True, eq=False)
-class _Plan:
-    """What a backward pass found: how to change the controls, and what to expect of it."""
-
-    feedforward: Floats  # (R, m)
-    feedback: Floats  # (R, m, 2n)
-    gradient: Floats  # (R, m)
-    slope: float
-    curvature: float
-    noise: float  # cost of the noise along the motion
-    jumps: Floats  # (N, 2n, n), empty without noise
-    spread: Floats  # (N, 2n, 2n)
-
-    @property
-    def promise(self) -> float:
-        """Decrease of the expected cost with a full step, by the model."""
-        return -0.5 * self.slope
-
-
 class _Search:
     """The motion so far, and what is known around it."""
 
@@ -170,7 +141,7 @@ class _Search:
         self.growth = 1.0
         self.exact = second_order
         self.history: list[Iteration] = []
-        self.plan: _Plan | None = None
+        self.plan: Plan | None = None
         self.trajectory: Trajectory
         self.cost = np.inf
         self.best: tuple[float, float, Trajectory | None] = (np.inf, np.inf, None)
@@ -272,7 +243,7 @@ class _Search:
             elif not self._stiffen():
                 return passes
 
-    def _least_regularized(self) -> tuple[_Plan | None, float]:
+    def _least_regularized(self) -> tuple[Plan | None, float]:
         """The plan at the motion with as little regularization as leaves a minimum, and how much that is."""
         for regularization in (0.0, *10.0 ** np.arange(-6, 11, 2)):
             for exact in (True, False) if self.second_order and regularization == 0.0 else (False,):
@@ -312,7 +283,7 @@ class _Search:
         moved, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, problem.dt)
         return moved if failure is None else None
 
-    def _last_plan(self) -> _Plan | None:
+    def _last_plan(self) -> Plan | None:
         try:
             return self._least_regularized()[0]
         except (CostError, LinearizationError):
@@ -346,179 +317,3 @@ def states(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
     """X (N + 1, 2n): (q, p) or (q, v)."""
     second = trajectory.p if problem.integrator.variational else trajectory.v
     return np.hstack([trajectory.q, second])
-
-
-def noise_cost(problem: OptimalControlProblem, trajectory: Trajectory, plan: _Plan) -> float:
-    """What noise adds to the cost of a motion, if it acts and is penalized as it was along the plan's own."""
-    if problem.scene.processes == 0:
-        return 0.0
-    g = impulses(problem, trajectory, plan.jumps)
-    return 0.5 * float(np.einsum("Nai,Nai->", g, plan.spread @ g))
-
-
-def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floats) -> Floats:
-    """What each Wiener process does to the state after each step of a motion, (N, 2n, k), for given ``jumps``."""
-    scene, n, left = problem.scene, problem.scene.robot.dof, problem.integrator.left
-    q, v, u = trajectory.q, trajectory.v, trajectory.u
-    jump = scene.noise.fields(q[:-1], v[:-1], u, problem.q0).F
-    if not problem.integrator.variational:
-        jump = velocity_at_nodes(scene, q[:-1], v[:-1])[:, :, n:] @ jump
-    g: Floats = left * (jumps @ jump)
-    if left < 1.0:
-        g[:, n:] += (1.0 - left) * scene.noise.fields(q[1:], v[1:], u, problem.q0).F
-    return g
-
-
-def _curvature(problem: OptimalControlProblem, trajectory: Trajectory, plan: _Plan, costate: Floats) -> Floats:
-    """Second derivatives (N, 2n + m, 2n + m) in (x, u) that dynamics and noise fields add to the cost to go."""
-    scene, n, h = problem.scene, problem.scene.robot.dof, problem.dt
-    N, samples, rule = problem.steps, len(problem.rule), problem.rule
-    gradient = problem.expand_running(trajectory).gradient.reshape(N, samples, -1)
-    by_q, by_v = gradient[:, :, :n], gradient[:, :, n : 2 * n]
-    # The running cost's gradient in q0, v0, q1 and v1 of each step.
-    pulls = [
-        h * np.einsum("s,Nsi->Ni", rule[:, 0] * rule[:, 1 + c], by_q)
-        + h * np.einsum("s,Nsi->Ni", rule[:, 0] * rule[:, 5 + c], by_v)
-        for c in range(4)
-    ]
-    z = costate.copy()
-    z[:, :n] += pulls[2]
-    after = bool(rule[:, [4, 8]].any())
-    if after:
-        z += np.einsum("Ni,Nix->Nx", pulls[3], velocity_at_nodes(scene, trajectory.q[1:], trajectory.v[1:]))
-    second = second_order_steps(scene, trajectory, z, problem.integrator)
-    total = np.block([[second.xx, np.swapaxes(second.ux, 1, 2)], [second.ux, second.uu]])
-    if rule[:, [2, 6]].any():
-        total[:, : 2 * n, : 2 * n] += velocity_curvature(scene, trajectory.q[:-1], trajectory.v[:-1], pulls[1])
-    if after:
-        lin = _linearize(problem, trajectory, 0)
-        J = np.concatenate([lin.A, lin.B], axis=2)
-        total += np.swapaxes(J, 1, 2) @ velocity_curvature(scene, trajectory.q[1:], trajectory.v[1:], pulls[3]) @ J
-    if scene.processes and problem.integrator.variational:
-        pull = plan.spread @ impulses(problem, trajectory, plan.jumps)
-        weight = problem.integrator.left * np.swapaxes(plan.jumps, 1, 2) @ pull
-        total[:, :n, :n] += scene.noise.curvature(weight)
-    return total
-
-
-def backward(
-    problem: OptimalControlProblem, trajectory: Trajectory, regularization: float, second_order: bool = False
-) -> _Plan | None:
-    """One backward pass along a motion; None where a control has no minimum.
-
-    Raises:
-        LinearizationError: A step has no derivative.
-    """
-    if not second_order:
-        return _pass(problem, trajectory, regularization)[0]
-    # First derivatives of the cost to go, then with them second derivatives of the dynamics (stagewise Newton).
-    plan, costate = _pass(problem, trajectory, max(regularization, 1e-3), costates=True)
-    if plan is None:
-        return None
-    return _pass(problem, trajectory, regularization, curvature=_curvature(problem, trajectory, plan, costate))[0]
-
-
-def _pass(
-    problem: OptimalControlProblem,
-    trajectory: Trajectory,
-    regularization: float,
-    *,
-    costates: bool = False,
-    curvature: Floats | None = None,
-) -> tuple[_Plan | None, Floats]:
-    scene = problem.scene
-    n, m, k, N, R = scene.robot.dof, scene.controls, scene.processes, problem.steps, problem.decisions
-    size = 2 * n + m
-    value, room = kernels.new_value(n, m), kernels.new_room(n, m)
-    _set_terminal(problem, trajectory, value, curvature is not None)
-    running = problem.expand_running(trajectory)
-    for name, array in (("gradient", running.gradient), ("Hessian", running.hessian)):
-        if not np.isfinite(array).all():
-            raise CostError(repr(problem.cost), f"its {name} along the motion is not finite")
-    noisy = N if k else 0
-    jumps, spread = np.empty((noisy, 2 * n, n)), np.empty((noisy, 2 * n, 2 * n))
-    feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, 2 * n)), np.empty((R, m))
-    costate = np.empty((N if costates else 0, 2 * n))
-    hessian = running.hessian
-    in_velocity = bool(hessian[:, n : 2 * n].any())
-    rule = problem.rule
-    samples = len(rule)
-    # Velocities at nodes are needed where they are sampled and x does not hold them.
-    nodes = problem.integrator.variational and bool(rule[:, [2, 4, 6, 8]].any())
-    block = max(1, _BLOCK // problem.hold) * problem.hold
-    for end in range(N, 0, -block):
-        begin = max(0, end - block)
-        part, steps = trajectory.part(begin, end), slice(begin, end)
-        rows = slice(begin // problem.hold, end // problem.hold)
-        lin = _linearize(problem, part, begin)
-        if k:
-            jumps[steps] = lin.J
-        velocity = velocity_at_nodes(scene, part.q, part.v) if nodes else np.zeros((0, n, 2 * n))
-        points = slice(begin * samples, end * samples)
-        failed = kernels.backward_pass(
-            problem.dt,
-            problem.hold,
-            in_velocity,
-            float(regularization),
-            kernels.Steps(
-                A=lin.A,
-                B=np.ascontiguousarray(lin.B),
-                G=lin.G,
-                Gx=lin.Gx,
-                Gu=lin.Gu,
-                rule=rule,
-                gradient=running.gradient[points],
-                hessian=hessian[points] if len(hessian) > 1 else hessian,
-                velocity=velocity,
-                curvature=np.zeros((0, size, size)) if curvature is None else curvature[steps],
-            ),
-            value,
-            kernels.Gains(
-                feedforward[rows],
-                feedback[rows],
-                gradient[rows],
-                costate[steps] if costates else costate,
-                spread[steps],
-            ),
-            room,
-        )
-        if failed >= 0:
-            return None, costate
-    if not np.isfinite(value.decrease).all():
-        return None, costate
-    plan = _Plan(
-        feedforward,
-        feedback,
-        gradient,
-        float(value.decrease[0]),
-        float(value.decrease[1]),
-        float(value.noise[0]),
-        jumps,
-        spread,
-    )
-    return plan, costate
-
-
-def _linearize(problem: OptimalControlProblem, part: Trajectory, begin: int) -> Linearization:
-    try:
-        return linearize_steps(problem.scene, part, problem.integrator, problem.q0)
-    except LinearizationError as error:
-        step = begin + error.step
-        raise LinearizationError(step, step * problem.dt, error.reason) from None
-
-
-def _set_terminal(problem: OptimalControlProblem, trajectory: Trajectory, value: kernels.Value, exact: bool) -> None:
-    """The terminal cost in x."""
-    n = problem.scene.robot.dof
-    end = problem.expand_terminal(trajectory)
-    x = slice(0, 2 * n)
-    g, H = end.gradient[0, x], end.hessian[0, x, x]
-    if problem.integrator.variational:
-        D = np.eye(2 * n)
-        D[n:] = velocity_at_nodes(problem.scene, trajectory.q[-1:], trajectory.v[-1:])[0]
-        H = D.T @ H @ D
-        if exact:
-            H = H + velocity_curvature(problem.scene, trajectory.q[-1:], trajectory.v[-1:], g[None, n:])[0]
-        g = D.T @ g
-    value.gradient[x] = value.costate[x] = g
-    value.hessian[x, x] = H
