@@ -156,13 +156,13 @@ def test_store_gives_back_what_it_got(tmp_path, task):
 
 @pytest.mark.parametrize("damage", [lambda data: data[: len(data) // 2], lambda data: b"", lambda data: b"no archive"])
 def test_a_damaged_cell_is_computed_again(tmp_path, caplog, counted, damage):
-    fill(tmp_path, quick=True)
+    fill(Store(tmp_path), quick=True)
     task = next(tasks(quick=True))
     path = tmp_path / f"{task.name}.npz"
     path.write_bytes(damage(path.read_bytes()))
     counted.clear()
     with caplog.at_level(logging.WARNING, logger="varpin.paper"):
-        found = fill(tmp_path, quick=True)
+        found = fill(Store(tmp_path), quick=True)
     assert f"{path} cannot be read" in caplog.text
     assert counted == [task.name]
     assert_same(found[task.name], made_up(task))
@@ -170,20 +170,20 @@ def test_a_damaged_cell_is_computed_again(tmp_path, caplog, counted, damage):
 
 
 def test_cells_of_another_version_are_computed_again(tmp_path, monkeypatch, counted):
-    fill(tmp_path, quick=True)
+    fill(Store(tmp_path), quick=True)
     monkeypatch.setattr(experiments, "__version__", "0.0.0")
     counted.clear()
-    fill(tmp_path, quick=True)
+    fill(Store(tmp_path), quick=True)
     assert counted == [task.name for task in tasks(quick=True)]
 
 
 def test_a_second_fill_computes_nothing(tmp_path, counted):
     seen = []
-    first = fill(tmp_path, quick=True, progress=lambda done, cells, name: seen.append((done, cells, name)))
+    first = fill(Store(tmp_path), quick=True, progress=lambda done, cells, name: seen.append((done, cells, name)))
     names = [task.name for task in tasks(quick=True)]
     assert counted == list(first) == names
     assert seen == [(k, len(names), name) for k, name in enumerate([*names, ""])]
-    second = fill(tmp_path, quick=True)
+    second = fill(Store(tmp_path), quick=True)
     assert counted == names
     for name in names:
         assert_same(first[name], second[name])
@@ -200,10 +200,10 @@ def test_an_interrupted_fill_goes_on_where_it_was(tmp_path, monkeypatch):
 
     monkeypatch.setattr(experiments, "run", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        fill(tmp_path, quick=True)
+        fill(Store(tmp_path), quick=True)
     names = [task.name for task in tasks(quick=True)]
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(f"{name}.npz" for name in names[:3])
-    found = fill(tmp_path, quick=True)
+    found = fill(Store(tmp_path), quick=True)
     assert asked == names[:4] + names[3:]
     assert list(found) == names
 

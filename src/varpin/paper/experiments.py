@@ -244,12 +244,12 @@ class Store:
             np.savez_compressed(stream, facts=json.dumps({**facts, "version": __version__}), **arrays)
 
 
-def fill(folder: Path, *, quick: bool, progress: Progress | None = None) -> dict[str, Cell]:
+def fill(store: Store, *, quick: bool, progress: Progress | None = None) -> dict[str, Cell]:
     """All cells, by the names of their tasks; those on disk are not computed again.
 
     Ctrl-C loses the cell it interrupts and no other.
     """
-    store, todo = Store(folder), list(tasks(quick=quick))
+    todo = list(tasks(quick=quick))
     cells: dict[str, Cell] = {}
     warm = False
     for number, task in enumerate(todo):

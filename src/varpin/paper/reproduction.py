@@ -8,7 +8,7 @@ from pathlib import Path
 
 from varpin.checks import path_like
 from varpin.paper.claims import Claim, assess, free_motions
-from varpin.paper.experiments import Progress, fill
+from varpin.paper.experiments import Progress, Store, fill
 from varpin.paper.figures import draw
 from varpin.paper.report import write
 
@@ -40,7 +40,7 @@ def reproduce(folder: str | os.PathLike[str], *, quick: bool = False, progress: 
         FileError: The folder cannot be made or written.
     """
     target = path_like("folder", folder)
-    cells = fill(target / "cells", quick=quick, progress=progress)
+    cells = fill(Store(target / "cells"), quick=quick, progress=progress)
     motions = free_motions()
     claims = assess(cells, motions)
     page = write(target, cells, claims, draw(cells, motions), quick=quick)
