@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import varpin as vp
+from varpin.linearization import linearize_steps
 
 ARMS = {
     "finger": {},
@@ -150,6 +151,42 @@ def test_velocity_dependent_fields():
 
     in_fields = difference(field, x, 1e-2 * rows).reshape(12, 6, 12)
     np.testing.assert_allclose(lin.Gx[0], in_fields, rtol=0, atol=1e-8 * np.abs(in_fields).max())
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.0, 5.0])
+@pytest.mark.parametrize(
+    "integrator",
+    [vp.Midpoint(), vp.Midpoint(kick="split"), vp.Gauss(2), vp.ExplicitEuler(), vp.RungeKutta4()],
+    ids=str,
+)
+def test_drift_at_rest_and_moving(integrator, speed):
+    """Its derivative does not take the size of a step from a momentum or velocity that may be zero."""
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=friction_noise(6, 0.3))
+    q, v, u = np.random.default_rng(0).uniform(-1, 1, (3, 6))
+    # The check's step is in units of the largest momentum, which turns a light wrist by much more: at 5 rad/s too far.
+    step = 2e-3 if speed == 5.0 else 5e-3
+    found = vp.check_linearization(scene, q, speed * v, u, dt=1e-3, integrator=integrator, step=step)
+    assert found.worst < 1e-8
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(kick="split"), vp.Gauss(2, kick="split")], ids=str)
+@pytest.mark.parametrize("custom", [False, True])
+def test_noisy_motions_are_linearized_at_zero_noise(integrator, custom):
+    """Each step of one as the step without noise from the same node: a split kick's second half at its end too."""
+    noise = friction_noise(6, 0.3) if custom else vp.StateNoise(1.0) + vp.ControlNoise(0.2)
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.1, noise=noise)
+    q, v, u = np.random.default_rng(0).uniform(-1, 1, (3, 6))
+    noisy = vp.simulate(scene, q, v, dt=1e-3, steps=4, controls=u, integrator=integrator, rng=1)
+    lin = vp.linearize(scene, noisy, integrator=integrator)
+    for j in range(noisy.steps):
+        quiet = vp.simulate(scene, noisy.q[j], noisy.v[j], dt=1e-3, steps=1, controls=u, integrator=integrator)
+        alone = linearize_steps(scene, quiet, integrator, noisy.q[0])
+        assert np.abs(noisy.v[j + 1] - quiet.v[1]).max() > 1e-4
+        for name in ("A", "B", "K", "F", "G", "Gx", "Gu"):
+            expected = getattr(alone, name)[0]
+            np.testing.assert_allclose(
+                getattr(lin, name)[j], expected, rtol=0, atol=1e-10 * np.abs(expected).max(), err_msg=name
+            )
 
 
 def test_moments_against_samples():

@@ -772,7 +772,7 @@ def test_sampled_data_plans_converge_with_the_square_of_dt(integrator):
     costs, controls, gains, late = [], [], [], []
     for hold in (4, 8, 16):
         sol = vp.solve(reach_problem(0.04 / hold, hold=hold, integrator=integrator), tolerance=1e-12)
-        found = sol.velocity_policy().gains
+        found = sol.policy_on("velocity").gains
         costs.append(sol.cost)
         controls.append(sol.controls)
         gains.append(found[0])

@@ -66,7 +66,7 @@ def test_true_cost(name, integrator, hold):
     assert found.open_loop_cost == pytest.approx(integral + end(q[-1], v[-1]), rel=1e-8)
     assert found.open_loop_gap == pytest.approx(np.abs(q[-1] - motion.q[-1]).max(), rel=1e-6, abs=1e-9)
 
-    policy = sol.velocity_policy()
+    policy = sol.policy_on("velocity")
 
     def law(k, q, v, u):
         return u + policy.gains[k] @ (np.concatenate([q, v]) - policy.reference[k])
@@ -123,7 +123,7 @@ def test_wrong_tolerances(wrong):
 
 
 @pytest.mark.parametrize("name", ["finger", "ur5"])
-def test_velocity_policy(name):
+def test_policy_on_velocities(name):
     """dp = L_vq dq + M dv, with M v from Pinocchio and differenced."""
     sol = vp.solve(arm_problem(name, vp.Midpoint(), hold=3))
     model, data, n = sol.problem.scene.robot.model, sol.problem.scene.robot.model.createData(), sol.controls.shape[1]
@@ -132,7 +132,7 @@ def test_velocity_policy(name):
         M = pin.crba(model, data, q)
         return (np.triu(M) + np.triu(M, 1).T) @ v
 
-    policy = sol.velocity_policy(substeps=5)
+    policy = sol.policy_on("velocity", substeps=5)
     assert policy.hold == 15
     for r in (0, 2, 3):
         q, v = sol.trajectory.q[3 * r], sol.trajectory.v[3 * r]
@@ -146,7 +146,7 @@ def test_velocity_policy(name):
         turned = sol.gains[r] @ np.block([[np.eye(n), np.zeros((n, n))], [np.array(columns).T, M]])
         np.testing.assert_allclose(policy.gains[r], turned, rtol=0, atol=1e-9 * np.abs(turned).max())
     explicit = vp.solve(arm_problem(name, vp.RungeKutta4()))
-    np.testing.assert_array_equal(explicit.velocity_policy().gains, explicit.gains)
+    np.testing.assert_array_equal(explicit.policy_on("velocity").gains, explicit.gains)
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.ExplicitEuler(), vp.RungeKutta4()], ids=str)
@@ -293,3 +293,42 @@ def test_what_it_prints():
     assert "converged" in repr(noisy)
     assert "noise" not in repr(vp.solve(small()))
     np.testing.assert_array_equal(run(noisy.problem, noisy.controls).q, noisy.trajectory.q)
+
+
+def test_a_policy_is_refused_by_integrators_on_the_other_state_and_turned_where_it_can_be():
+    problem = small()
+    plan = vp.solve(problem)
+    other = problem.at(integrator=vp.RungeKutta4())
+    with pytest.raises(vp.InputError, match=r"acts on \(q, p\), the integrator's state is \(q, v\)"):
+        vp.simulate(
+            problem.scene,
+            problem.q0,
+            problem.v0,
+            dt=problem.dt,
+            steps=problem.steps,
+            controls=plan.policy,
+            integrator=vp.RungeKutta4(),
+        )
+    # Warm-started from the plan, the search has next to nothing to do.
+    again = vp.solve(other, plan)
+    assert again.status is vp.Status.CONVERGED
+    assert again.history[0].promised_decrease < 1e-2 * again.cost
+    # There and back again.
+    turned = dataclasses.replace(plan, problem=other, gains=plan.policy_on("velocity").gains.copy())
+    back = turned.policy_on("momentum")
+    np.testing.assert_allclose(back.gains, plan.gains, rtol=1e-9, atol=1e-12 * np.abs(plan.gains).max())
+
+
+def test_a_noise_field_that_fails_away_from_the_start_costs_a_trial_and_not_the_motion():
+    limit = 0.05
+
+    def field(q, v, u):
+        return np.full((len(q), 1), np.nan if abs(q[0]) > limit else 1e-3)
+
+    scene = vp.Scene(vp.planar_chain(2), gravity=False, noise=vp.CustomNoise(field, processes=1))
+    cost = vp.TrackingCost([0.5, 0.0], 10.0) + vp.ControlCost(1e-3)
+    problem = vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=0.02, steps=25)
+    sol = vp.solve(problem, max_iterations=10)
+    assert np.abs(sol.trajectory.q[:-1, 0]).max() <= limit  # the last node kicks nothing
+    assert sol.cost == problem.cost_of(sol.trajectory)
+    assert sol.cost <= sol.history[0].cost

@@ -52,6 +52,8 @@ from varpin.linearization_check import check_linearization as check_linearizatio
 from varpin.noise import AdditiveNoise as AdditiveNoise
 from varpin.noise import ControlNoise as ControlNoise
 from varpin.noise import CustomNoise as CustomNoise
+from varpin.noise import Noise as Noise
+from varpin.noise import NoiseFieldError as NoiseFieldError
 from varpin.noise import StateNoise as StateNoise
 from varpin.policy import LinearPolicy as LinearPolicy
 from varpin.problem import OptimalControlProblem as OptimalControlProblem
@@ -66,6 +68,7 @@ from varpin.simulation import Interrupted as Interrupted
 from varpin.simulation import NoiseError as NoiseError
 from varpin.simulation import StepFailure as StepFailure
 from varpin.simulation import simulate as simulate
+from varpin.solution import Iteration as Iteration
 from varpin.solution import MonteCarlo as MonteCarlo
 from varpin.solution import Solution as Solution
 from varpin.solution import Status as Status

@@ -162,7 +162,7 @@ def simulate_ensemble(
     if not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
     _require_memory(scene, steps, paths if store else 0)
-    commands = commands_of(scene, controls, steps)
+    commands = commands_of(scene, integrator, controls, steps)
     run = _Run(scene, integrator, dt, start, rng, commands)
     block = min(steps, _BLOCK // (paths * (2 * n + 1)))
     block = max(1, block // commands.hold) * commands.hold

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, finite_array
-from varpin.errors import InputError
+from varpin.errors import InputError, LinearizationError
 from varpin.integrators import Integrator, Midpoint
-from varpin.integrators.base import diffusion_and_drift
+from varpin.integrators.base import diffusion_and_drift, open_loop
 from varpin.kernels.jet import jets
 from varpin.kernels.jet_tangent import momentum_curvatures, new_tangent
 from varpin.kernels.tree import new_sweep
@@ -28,7 +28,8 @@ class Linearization:
         dx[j+1] = (A + sum_i Gx_i dw_i) dx + (B + sum_i Gu_i dw_i) du + G dw
 
     with every derivative taken at dw = 0 (the paper's choice; the exact second derivative in x and dw differs by
-    O(dt)). x is (q, p) for variational integrators and (q, v) for the others.
+    O(dt)), and so at the state that a step from the trajectory's node reaches without noise, where a split kick has its
+    second half. x is (q, p) for variational integrators and (q, v) for the others.
 
     Attributes:
         A: dx1/dx0 (N, 2n, 2n); symplectic where nothing is forced or damped.
@@ -120,8 +121,9 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
     Gx = left * _chain(Jk, jump_x)
     Gu = left * _chain(Jk, jump_u)
     if left < 1.0:
-        end = scene.noise.fields(q[1:], v[1:], trajectory.u, first)
-        end_x = _in_momentum(scene, q[1:], v[1:], end)
+        end_q, end_v = _quiet_ends(scene, trajectory, integrator, first)
+        end = scene.noise.fields(end_q, end_v, trajectory.u, first)
+        end_x = _in_momentum(scene, end_q, end_v, end)
         G[:, n:] += (1.0 - left) * end.F
         Gx[:, n:] += (1.0 - left) * np.einsum("Naib,Nbc->Naic", end_x, A)
         Gu[:, n:] += (1.0 - left) * (end.Fu + np.einsum("Naib,Nbc->Naic", end_x, B))
@@ -290,28 +292,48 @@ def _drift_derivatives(
     """
     n, m = scene.robot.dof, scene.controls
     weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-
-    second = trajectory.p if variational else trajectory.v
-
-    def drift(q: Floats, second: Floats, u: Floats) -> Floats:
-        v = second
-        if variational:
-            M, _ = node_jets(scene, q[None], np.zeros((1, n)))
-            v = np.linalg.solve(M[0], second)
-        return diffusion_and_drift(scene, q, v, u, start)[1]
-
     in_state, in_control = np.zeros((trajectory.steps, n, 2 * n)), np.zeros((trajectory.steps, n, m))
     for j in range(trajectory.steps):
-        point = [trajectory.q[j].copy(), second[j].copy(), trajectory.u[j].copy()]
+        # In v also where the state is (q, p): a step in p that suits the base moves a light wrist by rad/s, and at rest
+        # the momentum says nothing of the size of a step.
+        point = [trajectory.q[j], trajectory.v[j], trajectory.u[j]]
         for slot, (target, offset) in enumerate(((in_state, 0), (in_state, n), (in_control, 0))):
-            size = 2e-3 * max(1.0, np.abs(point[slot]).max()) if slot != 1 else 2e-3 * max(np.abs(point[1]).max(), 1e-9)
+            size = 2e-3 * max(1.0, np.abs(point[slot]).max(initial=0.0))
             for c in range(point[slot].size):
                 for shift, weight in weights.items():
                     for sign in (1.0, -1.0):
                         moved = [x.copy() for x in point]
                         moved[slot][c] += sign * shift * size
-                        target[j, :, offset + c] += sign * weight / size * drift(*moved)
+                        drift = diffusion_and_drift(scene, moved[0], moved[1], moved[2], start)[1]
+                        target[j, :, offset + c] += sign * weight / size * drift
+    if variational:
+        rates = velocity_at_nodes(scene, trajectory.q[:-1], trajectory.v[:-1])
+        in_velocity = in_state[:, :, n:].copy()
+        in_state[:, :, n:] = 0.0
+        in_state += in_velocity @ rates
     return in_state, in_control
+
+
+def _quiet_ends(scene: Scene, trajectory: Trajectory, integrator: Integrator, first: Floats) -> tuple[Floats, Floats]:
+    """Where each step ends at dw = 0 (N, n), q and v: there the part of a kick that comes after it is evaluated."""
+    if not trajectory.dw.any():
+        return trajectory.q[1:], trajectory.v[1:]
+    q, v = (np.ascontiguousarray(nodes[:-1]) for nodes in (trajectory.q, trajectory.v))
+    force = trajectory.u @ scene.actuation.T
+    if scene.noise.velocity_dependent:
+        nodes = zip(q, v, trajectory.u, strict=True)
+        force += integrator.drift_share * np.array([diffusion_and_drift(scene, *node, first)[1] for node in nodes])
+    # Every step is a path of its own, whose controls come with the drift: commands are the same for all paths.
+    state, _ = integrator.start(scene, q, v)
+    silence = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
+    commands = open_loop(np.zeros((1, scene.controls)))
+    ends = integrator.rollout_compiled(
+        scene, state, commands, silence, np.ascontiguousarray(force[:, None]), trajectory.dt
+    )
+    for j, end in enumerate(ends):
+        if end.failure is not None:
+            raise LinearizationError(j, j * trajectory.dt, end.failure.reason)
+    return np.concatenate([end.q for end in ends]), np.concatenate([end.v for end in ends])
 
 
 def _require_match(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> None:

@@ -20,6 +20,10 @@ from varpin.kernels.tree import Diffusion
 Floats = NDArray[np.float64]
 
 
+class NoiseFieldError(InputError):
+    """A function of a custom noise raised, or returned something that is no field."""
+
+
 @dataclass(frozen=True, eq=False)
 class Fields:
     """Diffusion fields and their derivatives at N points.
@@ -334,8 +338,11 @@ class CustomFields(BoundNoise):
         try:
             value = function(*point)
         except Exception as error:
-            raise InputError(f"{name} raised {error!r}") from error
-        return finite_array(name, value, shape)
+            raise NoiseFieldError(f"{name} raised {error!r}") from error
+        try:
+            return finite_array(name, value, shape)
+        except InputError as error:
+            raise NoiseFieldError(str(error)) from None
 
     def check(self) -> None:
         """Hold the derivatives against central differences at three seeded random points.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,14 +26,23 @@ class LinearPolicy:
         gains: (N, m, 2n).
         reference: x_k (N, 2n).
         hold: Steps that an interval has.
+        on: What x is made for: ``"momentum"``, (q, p), ``"velocity"``, (q, v), or None where nobody said.
     """
 
     u: Floats
     gains: Floats
     reference: Floats
     hold: int
+    on: Literal["momentum", "velocity"] | None
 
-    def __init__(self, u: ArrayLike, gains: ArrayLike, reference: ArrayLike, hold: int = 1) -> None:
+    def __init__(
+        self,
+        u: ArrayLike,
+        gains: ArrayLike,
+        reference: ArrayLike,
+        hold: int = 1,
+        on: Literal["momentum", "velocity"] | None = None,
+    ) -> None:
         """Make a policy.
 
         Args:
@@ -40,6 +50,7 @@ class LinearPolicy:
             gains: (N, m, 2n).
             reference: (N, 2n), or (N + 1, 2n), of which the last row is not used.
             hold: Steps of a simulation that each control is held over: the rate of a digital controller.
+            on: Say what x is, and an integrator on the other x refuses the policy.
 
         Raises:
             InputError: Shapes that do not fit each other, or values that are not finite.
@@ -60,13 +71,26 @@ class LinearPolicy:
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         object.__setattr__(self, "hold", count("hold", hold, least=1))
+        if on not in ("momentum", "velocity", None):
+            raise InputError(f"on must be 'momentum', 'velocity' or None, got {on!r}")
+        object.__setattr__(self, "on", on)
 
-    def commands(self, steps: int, controls: int, dof: int) -> Commands:
-        """The policy as kernels take it.
+    def __repr__(self) -> str:
+        steps, m, size = self.gains.shape
+        on = "" if self.on is None else f" on (q, {'p' if self.on == 'momentum' else 'v'})"
+        return f"LinearPolicy({steps} intervals of {self.hold} steps, {m} controls, {size // 2} joints{on})"
+
+    def commands(self, steps: int, controls: int, dof: int, variational: bool) -> Commands:
+        """The policy as kernels take it, for an integrator on (q, p) if it is ``variational``, else on (q, v).
 
         Raises:
-            InputError: It is for another number of steps, controls or coordinates.
+            InputError: It is for another number of steps, controls or coordinates, or for the other x.
         """
+        if self.on is not None and variational != (self.on == "momentum"):
+            raise InputError(
+                f"the policy acts on (q, {'p' if self.on == 'momentum' else 'v'}), the integrator's state is "
+                f"(q, {'p' if variational else 'v'}); Solution.policy_on(...) gives the policy on either"
+            )
         if len(self.gains) * self.hold != steps:
             raise InputError(
                 f"the policy has {len(self.gains)} controls, each held over {self.hold} steps: "

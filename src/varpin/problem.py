@@ -177,7 +177,13 @@ class OptimalControlProblem:
             in_v = np.eye(n) if self.integrator.variational else jet.Lvv
             gains[:] = -np.linalg.pinv(self.scene.actuation) @ np.hstack([omega**2 * jet.Lvv, 2.0 * omega * in_v])
         u = np.tile(self.holding_controls(), (R, 1))
-        return LinearPolicy(u, gains, np.tile(np.append(self.q0, np.zeros(n)), (R, 1)), hold=self.hold)
+        return LinearPolicy(
+            u,
+            gains,
+            np.tile(np.append(self.q0, np.zeros(n)), (R, 1)),
+            hold=self.hold,
+            on="momentum" if self.integrator.variational else "velocity",
+        )
 
     def samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
         """Where running costs are taken, the s samples of a step one after another.

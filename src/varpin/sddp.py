@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.backward import Plan, backward, noise_cost
-from varpin.checks import count, finite_array, fraction, positive, real
+from varpin.checks import as_floats, count, finite_array, fraction, positive, real
 from varpin.costs import CostError
 from varpin.errors import InputError, LinearizationError
 from varpin.integrators.base import open_loop
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
+from varpin.noise import NoiseFieldError
 from varpin.policy import LinearPolicy
 from varpin.problem import OptimalControlProblem
 from varpin.simulation import StepFailure, rollout
@@ -32,6 +33,8 @@ logger = logging.getLogger(__name__)
 # long steps and grows after short ones.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
 _LONG, _SHORT = 0.5, 0.01
+# What a cost, a noise field or a step may raise somewhere off the motion that has been found.
+_LOST = (CostError, NoiseFieldError, LinearizationError)
 # As much as this does not hide how far an optimum is; controls that do nothing need some.
 _LITTLE = 1e-4
 # Trials of a line search: 0.25^10 is 1e-6.
@@ -79,6 +82,7 @@ def solve(
 
     Raises:
         InputError: Controls of a wrong shape, or options out of their range.
+        NoiseFieldError: A noise field of one's own fails on the first motion.
         StepFailure: The first motion cannot be integrated; holds what came before.
         CostError: The cost of the first motion is not finite, or a cost of one's own fails there.
     """
@@ -107,16 +111,17 @@ def solve(
 
 def _first_commands(problem: OptimalControlProblem, controls: ArrayLike | LinearPolicy | Solution | None) -> Commands:
     R, m = problem.decisions, problem.scene.controls
+    variational = problem.integrator.variational
     if isinstance(controls, Solution):
-        controls = controls.policy
+        controls = controls.policy_on("momentum" if variational else "velocity")
+    if controls is None:
+        controls = problem.holding_policy()
     if isinstance(controls, LinearPolicy):
         if controls.hold != problem.hold:
             raise InputError(f"the policy holds its controls over {controls.hold} steps, the problem {problem.hold}")
-        return controls.commands(problem.steps, m, problem.scene.robot.dof)
-    if controls is None:
-        return problem.holding_policy().commands(problem.steps, m, problem.scene.robot.dof)
-    array = np.asarray(controls)
-    rows = finite_array("controls", controls, (m,) if array.ndim == 1 else (R, m))
+        return controls.commands(problem.steps, m, problem.scene.robot.dof, variational)
+    rows = as_floats("controls", controls)
+    rows = finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m))
     return _held(np.broadcast_to(rows, (R, m)), problem.hold)
 
 
@@ -163,7 +168,7 @@ class _Search:
             started = time.perf_counter()
             try:
                 passes = self._plan()
-            except (CostError, LinearizationError) as error:
+            except _LOST as error:
                 if not self.history:
                     raise
                 logger.warning("%s", error)
@@ -262,10 +267,11 @@ class _Search:
             if moved is not None:
                 try:
                     cost = problem.cost_of(moved)
-                except CostError as error:
+                    added = noise_cost(problem, moved, plan)
+                except _LOST as error:
                     logger.info("trial of length %g: %s", step, error)
-                    cost = np.inf
-                if cost + noise_cost(problem, moved, plan) <= merit + self.armijo * step * plan.slope:
+                    cost = added = np.inf
+                if cost + added <= merit + self.armijo * step * plan.slope:
                     self.trajectory, self.cost = moved, cost
                     return step, trial + 1
             step *= self.backtracking
@@ -280,13 +286,17 @@ class _Search:
             commands = _held(u, problem.hold)
         else:
             commands = Commands(u, self.plan.feedback, states(problem, here)[: -1 : problem.hold], problem.hold)
-        moved, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, problem.dt)
+        try:
+            moved, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, problem.dt)
+        except NoiseFieldError as error:
+            logger.info("trial of length %g: %s", step, error)
+            return None
         return moved if failure is None else None
 
     def _last_plan(self) -> Plan | None:
         try:
             return self._least_regularized()[0]
-        except (CostError, LinearizationError):
+        except _LOST:
             return None
 
     def solution(self, status: Status) -> Solution:
@@ -307,7 +317,7 @@ class _Search:
             feedforward=np.zeros((R, m)) if plan is None else plan.feedforward,
             gradient=np.full((R, m), np.nan) if plan is None else plan.gradient,
             cost=self.cost,
-            noise_cost=np.nan if plan is None else plan.noise,
+            noise_cost=(np.nan if problem.scene.processes else 0.0) if plan is None else plan.noise,
             status=status,
             history=tuple(self.history),
         )

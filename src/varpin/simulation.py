@@ -222,7 +222,8 @@ def simulate(
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
     law = controls if callable(controls) else None
     _require_memory(scene, steps)
-    commands = commands_of(scene, None if callable(controls) else controls, 0 if callable(controls) else steps)
+    given = (None, 0) if callable(controls) else (controls, steps)
+    commands = commands_of(scene, integrator, *given)
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
     _warn_of_ringing(scene, q0, dt)
     with announced_compilation():
@@ -286,10 +287,12 @@ def _warn_of_ringing(scene: Scene, q0: Floats, dt: float) -> None:
         )
 
 
-def commands_of(scene: Scene, controls: ArrayLike | LinearPolicy | None, steps: int) -> Commands:
+def commands_of(
+    scene: Scene, integrator: Integrator, controls: ArrayLike | LinearPolicy | None, steps: int
+) -> Commands:
     """Controls of ``steps`` steps as kernels take them: None, (steps, m), (m,) or a policy."""
     if isinstance(controls, LinearPolicy):
-        return controls.commands(steps, scene.controls, scene.robot.dof)
+        return controls.commands(steps, scene.controls, scene.robot.dof, integrator.variational)
     return open_loop(control_rows(scene, controls, steps))
 
 

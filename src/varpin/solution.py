@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from varpin.checks import count, positive
+from varpin.costs import BoundSum
 from varpin.ensemble import simulate_ensemble
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import RungeKutta4
@@ -181,12 +184,7 @@ class Solution:
     @property
     def policy(self) -> LinearPolicy:
         """Controls with feedback, on the x of the problem's integrator."""
-        return LinearPolicy(self.controls, self.gains, self._states[: -1 : self.problem.hold], hold=self.problem.hold)
-
-    @property
-    def _states(self) -> Floats:
-        second = self.trajectory.p if self.problem.integrator.variational else self.trajectory.v
-        return np.hstack([self.trajectory.q, second])
+        return self.policy_on("momentum" if self.problem.integrator.variational else "velocity")
 
     def __repr__(self) -> str:
         noise = f" + {self.noise_cost:.4g} by noise" if self.noise_cost else ""
@@ -206,37 +204,57 @@ class Solution:
             raise InputError(f"decisions must be from 0 to {len(self.gains) - 1}, got {decisions}")
         own = self.policy
         rows = np.minimum(np.arange(len(self.gains)) + decisions, len(self.gains) - 1)
-        return LinearPolicy(own.u[rows], own.gains[rows], own.reference[rows], hold=own.hold)
+        return LinearPolicy(own.u[rows], own.gains[rows], own.reference[rows], hold=own.hold, on=own.on)
 
-    def velocity_policy(self, substeps: int = 1) -> LinearPolicy:
-        """The same policy on (q, v), each control held over ``substeps`` times as many steps.
+    def policy_on(self, x: Literal["momentum", "velocity"], substeps: int = 1) -> LinearPolicy:
+        """The policy on (q, p) or on (q, v), each control held over ``substeps`` times as many steps.
 
-        Where the problem's own x is (q, p), dp = L_vq dq + M dv turns the gains around, to first order.
+        Where x is not that of the problem's integrator, dp = L_vq dq + M dv turns the gains around, to first order.
+
+        Raises:
+            InputError: ``x`` is neither "momentum" nor "velocity".
         """
+        if x not in ("momentum", "velocity"):
+            raise InputError(f"x must be 'momentum' or 'velocity', got {x!r}")
         gains, trajectory, hold = self.gains, self.trajectory, self.problem.hold
-        rows = slice(0, -1, hold)
-        if self.problem.integrator.variational:
-            n = self.problem.scene.robot.dof
+        rows, n = slice(0, -1, hold), self.problem.scene.robot.dof
+        if self.problem.integrator.variational != (x == "momentum"):
             rates = velocity_at_nodes(self.problem.scene, trajectory.q[rows], trajectory.v[rows])
-            mass = np.linalg.inv(rates[:, :, n:])
-            in_p = gains[:, :, n:]
-            gains = np.concatenate([gains[:, :, :n] - in_p @ mass @ rates[:, :, :n], in_p @ mass], axis=2)
-        reference = np.hstack([trajectory.q[rows], trajectory.v[rows]])
-        return LinearPolicy(self.controls, gains, reference, hold=hold * substeps)
+            by_q, by_p = rates[:, :, :n], rates[:, :, n:]
+            second = gains[:, :, n:]
+            if x == "velocity":
+                second = second @ np.linalg.inv(by_p)
+                gains = np.concatenate([gains[:, :, :n] - second @ by_q, second], axis=2)
+            else:
+                gains = np.concatenate([gains[:, :, :n] + second @ by_q, second @ by_p], axis=2)
+        nodes = trajectory.p if x == "momentum" else trajectory.v
+        reference = np.hstack([trajectory.q[rows], nodes[rows]])
+        return LinearPolicy(self.controls, gains, reference, hold=hold * substeps, on=x)
 
-    def verify(self, *, tolerance: float = 1e-10, max_substeps: int = 4096) -> Verification:
+    def verify(
+        self, *, tolerance: float = 1e-10, max_substeps: int = 1024, progress: Callable[[int, int], None] | None = None
+    ) -> Verification:
         """Replay the plan through an accurate integration of the continuous system: classical Runge-Kutta, Simpson.
 
         Main args:
             tolerance: On the relative change of the cost when the substeps are doubled.
             max_substeps: Of one step of the plan; where they do not reach the tolerance, ``accuracy`` says so.
+
+        Other Args:
+            progress: Called before each doubling with (substeps, max_substeps).
         """
         positive("tolerance", tolerance, "1")
+        count("max_substeps", max_substeps, least=2)
         problem, substeps, before = self.problem, 2, (np.nan, np.nan)
         while True:
-            opened = accurate_cost(problem, open_loop(self.controls)._replace(hold=problem.hold * substeps), substeps)
-            policy = self.velocity_policy(substeps)
-            closed = accurate_cost(problem, Commands(policy.u, policy.gains, policy.reference, policy.hold), substeps)
+            if progress is not None:
+                progress(substeps, max_substeps)
+            costs = _fine_costs(problem, substeps)
+            blind = open_loop(self.controls)._replace(hold=problem.hold * substeps)
+            opened = accurate_cost(problem, blind, substeps, costs)
+            policy = self.policy_on("velocity", substeps)
+            feedback = Commands(policy.u, policy.gains, policy.reference, policy.hold)
+            closed = accurate_cost(problem, feedback, substeps, costs)
             changes = [
                 abs(now[0] - then) / max(abs(now[0]), 1e-300)
                 for now, then in zip((opened, closed), before, strict=True)
@@ -278,7 +296,7 @@ class Solution:
         paths = count("paths", paths, least=2)
         policy = self.policy
         if not feedback:
-            policy = LinearPolicy(policy.u, np.zeros_like(policy.gains), policy.reference, hold=policy.hold)
+            policy = LinearPolicy(policy.u, np.zeros_like(policy.gains), policy.reference, policy.hold, policy.on)
         costs: list[Floats] = []
         for first in range(0, paths, _PATHS):
             batch = min(_PATHS, paths - first)
@@ -320,17 +338,24 @@ class Solution:
 _PATHS = 256
 
 
-def accurate_cost(problem: OptimalControlProblem, commands: Commands, substeps: int) -> tuple[float, Floats]:
+def _fine_costs(problem: OptimalControlProblem, substeps: int) -> tuple[BoundSum, BoundSum]:
+    """Running and terminal costs at the nodes of a finer grid."""
+    times = np.arange(problem.steps * substeps + 1, dtype=np.float64) * (problem.dt / substeps)
+    dof, controls = problem.scene.robot.dof, problem.scene.controls
+    return bind_cost(problem.cost, times, problem.duration, problem.steps, dof, controls)
+
+
+def accurate_cost(
+    problem: OptimalControlProblem, commands: Commands, substeps: int, costs: tuple[BoundSum, BoundSum] | None = None
+) -> tuple[float, Floats]:
     """True cost under given commands, and the end configuration; NaN where the motion runs away."""
     scene, h = problem.scene, problem.dt / substeps
-    n, m, N = scene.robot.dof, scene.controls, problem.steps * substeps
+    n, m = scene.robot.dof, scene.controls
     with announced_compilation():
         motion, failure = rollout(scene, RungeKutta4(), problem.q0, problem.v0, commands, h)
     if failure is not None:
         return np.nan, np.full(n, np.nan)
-    running, terminal = bind_cost(
-        problem.cost, np.arange(N + 1, dtype=np.float64) * h, problem.duration, problem.steps, n, m
-    )
+    running, terminal = _fine_costs(problem, substeps) if costs is None else costs
     # Simpson's rule within each step of the plan: the control jumps between steps.
     after = running.value(motion.q, motion.v, np.vstack([motion.u, motion.u[-1:]]))
     before = running.value(motion.q, motion.v, np.vstack([motion.u[:1], motion.u]))
