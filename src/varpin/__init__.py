@@ -35,6 +35,7 @@ from varpin.inspection import inspect_robot as inspect_robot
 from varpin.integrators import ExplicitEuler as ExplicitEuler
 from varpin.integrators import Gauss as Gauss
 from varpin.integrators import Midpoint as Midpoint
+from varpin.integrators import Reference as Reference
 from varpin.integrators import RungeKutta4 as RungeKutta4
 from varpin.integrators import SemiImplicitEuler as SemiImplicitEuler
 from varpin.lagrangian import DiscreteLagrangian as DiscreteLagrangian
