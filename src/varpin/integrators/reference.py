@@ -102,7 +102,12 @@ class Reference(Integrator):
         return run, segments_of(nodes, REASONS)
 
     def step_in_python(
-        self, scene: Scene, state: ReferenceRun, command: Commands, increment: Floats, dt: float
+        self,
+        scene: Scene,  # noqa: ARG002
+        state: ReferenceRun,  # noqa: ARG002
+        command: Commands,  # noqa: ARG002
+        increment: Floats,  # noqa: ARG002
+        dt: float,  # noqa: ARG002
     ) -> Segment:
         """Never called for a scene without noise, and others are refused."""
         raise InputError(f"{self} integrates no noise: leave it out of the scene")
