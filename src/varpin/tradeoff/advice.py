@@ -42,8 +42,12 @@ _TIMING, _REPEATS = 0.02, 5
 _CHEAP = 0.5
 # Nodes at which the midpoint integrator's largest step is looked up.
 _NODES = 32
+# Errors from which on a motion is not the one that was asked for [rad or m].
+_SENSIBLE = 1.0
 # What no method gets below, relative to q.
 _ROUNDING = 4.0 * float(np.finfo(np.float64).eps)
+# A method is not asked for less than this many times that: rounding adds up.
+_ABOVE = 50.0
 # Halvings that bring nothing, after which rounding is in charge of a method that has shown its order at small errors.
 _STUCK, _SMALL = 2, 1e-6
 
@@ -56,7 +60,7 @@ class Choice:
         integrator: The method.
         dt: Its step [s].
         steps: Over the horizon.
-        error: Predicted error in q at the end, the largest over the joints [rad or m].
+        error: Predicted error in q at the end, the largest over the joints [rad or m]; infinite where not known.
         seconds: Predicted wall time [s].
         measured: Whether runs at steps as small or smaller stand behind it; else the method's order does.
     """
@@ -69,7 +73,8 @@ class Choice:
     measured: bool
 
     def __str__(self) -> str:
-        return f"{self.integrator} at dt = {self.dt:.4g} s: error {self.error:.1e} in {_time(self.seconds)}"
+        error = f"error {self.error:.1e}" if math.isfinite(self.error) else "unknown error"
+        return f"{self.integrator} at dt = {self.dt:.4g} s: {error} in {_time(self.seconds)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +151,8 @@ class _Method:
         self.setting, self.integrator, self.order = setting, integrator, integrator.order
         self.samples: list[_Sample] = []
         self.errors = np.zeros(0)
+        self.bounded = np.zeros(0, dtype=bool)
+        self.doubted = False
         self.open = True
         self._next = first
         self._idle, self._shown = 0, False
@@ -180,29 +187,39 @@ class _Method:
         gain = 2.0**self.order
         if not after * 2.0 ** (self.order - _SLACK) <= before:
             return None
-        return c + (c - b) / (gain - 1.0), max(after, before / (gain * 2.0**_SLACK)) / (gain - 1.0)
+        uncertainty = max(after, before / (gain * 2.0**_SLACK)) / (gain - 1.0)
+        # Coarse runs that blow up may shrink at any rate.
+        return (c + (c - b) / (gain - 1.0), uncertainty) if uncertainty < _SENSIBLE else None
 
     def judge(self, limit: Floats | None, uncertainty: float) -> None:
-        """Errors of :attr:`whole`, against the best known end if that is clearly better, else by its own runs."""
+        """Errors of :attr:`whole`, against the best known end if that is clearly better, else by its own runs.
+
+        ``bounded`` says which of them are no more than bounds, and ``doubted`` whether the last one looks better than
+        it is taken for: a further run will tell.
+        """
         whole = self.whole
-        own = self.own_limit()
-        self.errors = np.full(len(whole), np.nan)
+        self.errors, self.bounded = np.full(len(whole), np.nan), np.ones(len(whole), dtype=bool)
         if not whole:
             return
+        own = self.own_limit()
+        if own is not None:
+            self.errors[:] = [_distance(sample.q, own[0]) for sample in whole]
+            self.errors[-1] = own[1]
+            self.bounded[:] = False
         if limit is not None:
             away = np.array([_distance(sample.q, limit) for sample in whole])
             clear = away * _CLEARLY >= uncertainty
-            self.errors[clear] = away[clear]
-        if own is not None and np.isnan(self.errors[-1]):
-            self.errors[-1] = own[1]
-            for k, sample in enumerate(whole[:-1]):
-                if np.isnan(self.errors[k]):
-                    self.errors[k] = _distance(sample.q, own[0])
+            # An end that is known less well still bounds the error.
+            better = ~clear & ~(self.errors <= away + uncertainty)
+            self.errors = np.where(clear, away, np.where(better, away + uncertainty, self.errors))
+            self.bounded = better | (self.bounded & ~clear)
         # Where errors of single joints change sign a run may be right by chance: its neighbours say how right.
         gain = 2.0**self.order
         from_larger = np.append(np.nan, self.errors[:-1]) / (gain * 2.0**_SLACK)
         from_smaller = np.append(self.errors[1:], np.nan) * gain
-        self.errors = np.fmax(self.errors, np.fmin(from_larger, from_smaller))
+        cautious = np.fmax(self.errors, np.fmin(from_larger, from_smaller))
+        self.doubted = bool(cautious[-1] > 1.5 * self.errors[-1])
+        self.errors = cautious
 
     @property
     def regular(self) -> bool:
@@ -214,18 +231,26 @@ class _Method:
     def note_stagnation(self) -> None:
         """Close the method where halving its step has ceased to help after it had shown its order."""
         self._shown = self._shown or (self.regular and self.errors[-1] < _SMALL)
-        slow = self._shown and not self.errors[-1] < 0.7 * self.errors[-2]
+        slow = self._shown and not self.bounded[-1] and not self.errors[-1] < 0.7 * self.errors[-2]
         self._idle = self._idle + 1 if slow else 0
         if self._idle >= _STUCK:
             self.open = False
 
     def seconds_at(self, steps: float) -> float:
-        """Predicted wall time [s]: between runs in proportion, beyond them by the last run's time a step."""
+        """Predicted wall time [s]: between runs on a straight line, beyond them on that of the last two."""
         counts = np.array([sample.steps for sample in self.samples], dtype=float)
         times = np.array([sample.seconds for sample in self.samples])
         if steps > counts[-1]:
-            return float(times[-1] * steps / counts[-1])
+            return float(times[-1] + (steps - counts[-1]) * self._seconds_a_step)
         return float(np.interp(steps, counts, times))
+
+    @property
+    def _seconds_a_step(self) -> float:
+        """What one step more takes [s]; noise of the clock must not make it too small."""
+        before, last = self.samples[-2:]
+        slope = (last.seconds - before.seconds) / (last.steps - before.steps)
+        mean = last.seconds / last.steps
+        return min(max(slope, 0.5 * mean), mean)
 
     def steps_within(self, seconds: float) -> int:
         """The most steps that a time allows, a multiple of R."""
@@ -233,7 +258,7 @@ class _Method:
         counts = [rows, *(sample.steps for sample in self.samples)]
         times = np.append(0.0, np.maximum.accumulate([sample.seconds for sample in self.samples]))
         inside = float(np.interp(seconds, times, counts))
-        most = inside if seconds <= times[-1] else counts[-1] * seconds / times[-1]
+        most = inside if seconds <= times[-1] else counts[-1] + (seconds - times[-1]) / self._seconds_a_step
         return max(rows, rows * int(most / rows))
 
     def error_at(self, steps: float) -> float:
@@ -243,7 +268,7 @@ class _Method:
             return math.nan
         if steps > counts[-1]:
             return float(self.errors[-1] * (counts[-1] / steps) ** self.order) if self.regular else math.nan
-        return float(np.exp(np.interp(np.log(steps), np.log(counts), np.log(np.fmax(self.errors, 1e-300)))))
+        return float(np.exp(np.interp(np.log(steps), np.log(counts), np.log(np.maximum(self.errors, _ROUNDING)))))
 
     def steps_for(self, error: float) -> int | None:
         """The fewest steps whose predicted error, and that of all more, is at most ``error``; None if not known."""
@@ -259,6 +284,9 @@ class _Method:
             return counts[good]
         # On the straight line between two runs in logarithms.
         here, there = np.log(self.errors[good - 1 : good + 1])
+        if here - there > (self.order + 1) * math.log(2.0):
+            # A limit of stability lies between them, and nobody knows where.
+            return counts[good]
         share = (here - math.log(error)) / (here - there)
         return min(self._rounded(counts[good - 1] * 2.0**share), counts[good])
 
@@ -363,8 +391,10 @@ class _Search:
         self.judge()
         method.note_stagnation()
 
-    def for_tolerance(self, target: float) -> tuple[list[Choice], bool]:
-        while not self.late and target > self.floor:
+    def for_tolerance(self, wish: float) -> tuple[list[Choice], bool]:
+        while not self.late:
+            # What rounding puts out of reach is approached as far as it lets.
+            target = max(wish, _ABOVE * self.floor)
             steps = {method: method.steps_for(target) for method in self.methods}
             near = [m for m in self.methods if _near(m, steps[m])]
             best = min((m.seconds_at(steps[m] or 0) for m in near), default=math.inf)
@@ -377,17 +407,18 @@ class _Search:
             if not rivals:
                 break
             self.refine(min(rivals, key=lambda m: m.last.seconds))
-        found = {method: method.steps_for(target) for method in self.methods}
+        found = {method: method.steps_for(max(wish, _ABOVE * self.floor)) for method in self.methods}
         choices = [m.choice(k, self.floor) for m, k in found.items() if k is not None]
-        reached = target > self.floor and any(_near(m, k) for m, k in found.items())
-        if reached:
+        if any(_near(m, k) for m, k in found.items()):
             # What no run stands near is an estimate, and gives way to what is known.
-            return sorted(choices, key=lambda c: (not _near(self._of(c), c.steps), c.seconds)), True
-        return sorted(self._as_they_are(), key=lambda c: c.error), False
+            choices.sort(key=lambda c: (not _near(self._of(c), c.steps), c.seconds))
+            return choices, wish >= _ABOVE * self.floor
+        return sorted(self._as_they_are(), key=lambda c: (c.error, -c.integrator.order)), False
 
     def for_budget(self, budget: float) -> tuple[list[Choice], bool]:
         while not self.late:
-            rivals = [m for m in self.methods if m.open and m.last.seconds < budget / _REACH]
+            reach = 1.0 if budget < _CHEAP else _REACH
+            rivals = [m for m in self.methods if m.open and reach * m.last.seconds < budget]
             if not rivals:
                 break
             self.refine(min(rivals, key=lambda m: m.last.seconds))
@@ -409,7 +440,8 @@ class _Search:
     @staticmethod
     def _least(method: _Method, steps: int | None) -> float:
         """A time that the method cannot do without: that of its last run, or half of what its order asks for."""
-        return method.last.seconds if steps is None else max(method.last.seconds, 0.5 * method.seconds_at(steps))
+        unsure = steps is None or method.doubted
+        return method.last.seconds if unsure else max(method.last.seconds, 0.5 * method.seconds_at(steps or 0))
 
     def _as_they_are(self) -> list[Choice]:
         """The last whole run of each method, where its error is known to any extent.
