@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from varpin.errors import InputError
 from varpin.robot import Robot
 from varpin.tradeoff import OptimalControlTradeoff, WorkPrecision
-from varpin.tradeoff.work_precision import Quantity
+from varpin.tradeoff.precision import Quantity
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]

@@ -10,7 +10,7 @@ from varpin.tradeoff.advice import advise as advise
 from varpin.tradeoff.optimal_control import OptimalControlRun as OptimalControlRun
 from varpin.tradeoff.optimal_control import OptimalControlTradeoff as OptimalControlTradeoff
 from varpin.tradeoff.optimal_control import optimal_control_tradeoff as optimal_control_tradeoff
+from varpin.tradeoff.precision import WorkPrecision as WorkPrecision
+from varpin.tradeoff.precision import WorkPrecisionRun as WorkPrecisionRun
+from varpin.tradeoff.precision import work_precision as work_precision
 from varpin.tradeoff.setting import INTEGRATORS as INTEGRATORS
-from varpin.tradeoff.work_precision import WorkPrecision as WorkPrecision
-from varpin.tradeoff.work_precision import WorkPrecisionRun as WorkPrecisionRun
-from varpin.tradeoff.work_precision import work_precision as work_precision

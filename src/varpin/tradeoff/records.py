@@ -46,8 +46,8 @@ def read_table(path: str | os.PathLike[str], form: str, kind: type[Row]) -> tupl
     try:
         with np.load(source, allow_pickle=False) as archive:
             members = {name: archive[name] for name in archive.files}
-        columns = [members.pop(f"runs.{item.name}").tolist() for item in fields(kind)]  # type: ignore[arg-type]
         found = str(members.pop("format"))
+        columns = [members.pop(f"runs.{item.name}", np.zeros(0)).tolist() for item in fields(kind)]  # type: ignore[arg-type]
     except Exception as error:
         raise FileError(f"{source} is damaged, or no record of varpin.tradeoff: {error}") from None
     if found != form:
