@@ -101,7 +101,7 @@ class Robot:
         return str([frame.name for frame in self.free_model.frames if frame.parentJoint == last][-1])
 
     def frame_positions(self, q: ArrayLike, frame: str | None = None) -> Floats:
-        """Positions (N, 3) [m] in the world of a frame, :attr:`end_effector` if left out, at configurations ``q`` (N, n).
+        """Positions (N, 3) [m] in the world of a frame, or of :attr:`end_effector`, at configurations ``q`` (N, n).
 
         Raises:
             InputError: ``q`` is not (N, n), or there is no such frame.
