@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import logging
 import math
+import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,10 +45,10 @@ _CHEAP = 0.5
 _NODES = 32
 # Errors from which on a motion is not the one that was asked for [rad or m].
 _SENSIBLE = 1.0
-# What no method gets below, relative to q.
-_ROUNDING = 4.0 * float(np.finfo(np.float64).eps)
-# A method is not asked for less than this many times that: rounding adds up.
-_ABOVE = 50.0
+# What rounding adds up to, relative to q: no method is asked for less, or promises it.
+_ROUNDING = 200.0 * float(np.finfo(np.float64).eps)
+# Runs of the final choice, each with a few steps more, until one meets the tolerance.
+_CHECKS = 4
 # Halvings that bring nothing, after which rounding is in charge of a method that has shown its order at small errors.
 _STUCK, _SMALL = 2, 1e-6
 
@@ -268,7 +269,9 @@ class _Method:
             return math.nan
         if steps > counts[-1]:
             return float(self.errors[-1] * (counts[-1] / steps) ** self.order) if self.regular else math.nan
-        return float(np.exp(np.interp(np.log(steps), np.log(counts), np.log(np.maximum(self.errors, _ROUNDING)))))
+        return float(
+            np.exp(np.interp(np.log(steps), np.log(counts), np.log(np.maximum(self.errors, np.finfo(np.float64).tiny))))
+        )
 
     def steps_for(self, error: float) -> int | None:
         """The fewest steps whose predicted error, and that of all more, is at most ``error``; None if not known."""
@@ -279,7 +282,7 @@ class _Method:
         if good == len(counts):
             if not self.regular:
                 return None
-            return self._rounded(counts[-1] * (self.errors[-1] / error) ** (1.0 / self.order))
+            return self.rounded(counts[-1] * (self.errors[-1] / error) ** (1.0 / self.order))
         if good == 0 or not np.isfinite(self.errors[good - 1]):
             return counts[good]
         # On the straight line between two runs in logarithms.
@@ -288,9 +291,10 @@ class _Method:
             # A limit of stability lies between them, and nobody knows where.
             return counts[good]
         share = (here - math.log(error)) / (here - there)
-        return min(self._rounded(counts[good - 1] * 2.0**share), counts[good])
+        return min(self.rounded(counts[good - 1] * 2.0**share), counts[good])
 
-    def _rounded(self, steps: float) -> int:
+    def rounded(self, steps: float) -> int:
+        """A multiple of R."""
         rows = len(self.setting.controls)
         return rows * math.ceil(min(steps, 1e15) / rows)
 
@@ -368,6 +372,8 @@ class _Search:
     def __init__(self, methods: list[_Method], deadline: float) -> None:
         self.methods, self.deadline = methods, deadline
         self.floor = 0.0
+        self.limit: Floats | None = None
+        self.uncertainty = math.inf
         for method in methods:
             for _ in range(3):
                 method.refine()
@@ -380,11 +386,11 @@ class _Search:
     def judge(self) -> None:
         """Errors of all runs, by the best end that is known."""
         limits = [own for own in (method.own_limit() for method in self.methods) if own is not None]
-        limit, uncertainty = min(limits, key=lambda own: own[1]) if limits else (None, math.inf)
-        if limit is not None:
-            self.floor = _ROUNDING * max(1.0, float(np.abs(limit).max()))
+        if limits:
+            self.limit, self.uncertainty = min(limits, key=lambda own: own[1])
+            self.floor = _ROUNDING * max(1.0, float(np.abs(self.limit).max()))
         for method in self.methods:
-            method.judge(limit, uncertainty)
+            method.judge(self.limit, self.uncertainty)
 
     def refine(self, method: _Method) -> None:
         method.refine()
@@ -394,7 +400,7 @@ class _Search:
     def for_tolerance(self, wish: float) -> tuple[list[Choice], bool]:
         while not self.late:
             # What rounding puts out of reach is approached as far as it lets.
-            target = max(wish, _ABOVE * self.floor)
+            target = max(wish, self.floor)
             steps = {method: method.steps_for(target) for method in self.methods}
             near = [m for m in self.methods if _near(m, steps[m])]
             best = min((m.seconds_at(steps[m] or 0) for m in near), default=math.inf)
@@ -407,13 +413,29 @@ class _Search:
             if not rivals:
                 break
             self.refine(min(rivals, key=lambda m: m.last.seconds))
-        found = {method: method.steps_for(max(wish, _ABOVE * self.floor)) for method in self.methods}
+        found = {method: method.steps_for(max(wish, self.floor)) for method in self.methods}
         choices = [m.choice(k, self.floor) for m, k in found.items() if k is not None]
         if any(_near(m, k) for m, k in found.items()):
             # What no run stands near is an estimate, and gives way to what is known.
             choices.sort(key=lambda c: (not _near(self._of(c), c.steps), c.seconds))
-            return choices, wish >= _ABOVE * self.floor
+            choices[0] = self._checked(choices[0], _SAFETY * max(wish, self.floor))
+            return choices, wish >= self.floor
         return sorted(self._as_they_are(), key=lambda c: (c.error, -c.integrator.order)), False
+
+    def _checked(self, choice: Choice, tolerance: float) -> Choice:
+        """The choice, run as it is and with more steps where it misses the tolerance, if that costs little."""
+        method, steps = self._of(choice), choice.steps
+        for _ in range(_CHECKS):
+            if self.limit is None or self.uncertainty > 0.5 * tolerance or choice.seconds > _CHEAP or self.late:
+                break
+            outcome = method.setting.run(method.integrator, steps, repeats=2)
+            error = _distance(outcome.q[-1], self.limit) + self.uncertainty
+            if error <= tolerance:
+                return replace(method.choice(steps, self.floor), error=max(error, self.floor))
+            # A blow-up says nothing of how many more it takes.
+            growth = min((error / tolerance) ** (1.0 / method.order), 2.0) if math.isfinite(error) else 2.0
+            steps = method.rounded(1.05 * growth * steps)
+        return choice
 
     def for_budget(self, budget: float) -> tuple[list[Choice], bool]:
         while not self.late:
@@ -424,7 +446,9 @@ class _Search:
             self.refine(min(rivals, key=lambda m: m.last.seconds))
         choices = []
         for method in self.methods:
-            steps = method.steps_within(0.9 * budget)
+            # More accuracy than rounding leaves is not to be had for more steps.
+            enough = method.steps_for(self.floor)
+            steps = min(method.steps_within(0.9 * budget), enough if enough is not None else sys.maxsize)
             if not math.isfinite(method.error_at(steps)):
                 known = [s.steps for s, e in zip(method.whole, method.errors, strict=True) if np.isfinite(e)]
                 steps = max((k for k in known if method.seconds_at(k) <= budget), default=0)

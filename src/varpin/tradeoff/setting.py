@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, finite_array, positive, require_finite
 from varpin.errors import InputError
-from varpin.integrators import ExplicitEuler, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
+from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
 from varpin.integrators.base import Segment, open_loop
 from varpin.kernels._compile import announced_compilation
 from varpin.scene import Scene, require_scene
@@ -21,7 +21,13 @@ from varpin.scene import Scene, require_scene
 Floats = NDArray[np.float64]
 
 # Whom to compare where nobody is named. A new integrator enters here, and everywhere.
-INTEGRATORS: tuple[Integrator, ...] = (ExplicitEuler(), SemiImplicitEuler(), RungeKutta4(), Midpoint())
+INTEGRATORS: tuple[Integrator, ...] = (
+    ExplicitEuler(),
+    SemiImplicitEuler(),
+    RungeKutta4(),
+    Midpoint(),
+    *(Gauss(stages=stages) for stages in (2, 3, 4)),
+)
 
 # Work between two chances for Ctrl-C, in steps of one joint.
 _CHUNK = 100_000
