@@ -232,7 +232,8 @@ class _Method:
     def note_stagnation(self) -> None:
         """Close the method where halving its step has ceased to help after it had shown its order."""
         self._shown = self._shown or (self.regular and self.errors[-1] < _SMALL)
-        slow = self._shown and not self.bounded[-1] and not self.errors[-1] < 0.7 * self.errors[-2]
+        known = self._shown and len(self.errors) > 1 and not self.bounded[-1]
+        slow = known and not self.errors[-1] < 0.7 * self.errors[-2]
         self._idle = self._idle + 1 if slow else 0
         if self._idle >= _STUCK:
             self.open = False

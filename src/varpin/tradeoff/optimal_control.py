@@ -194,7 +194,6 @@ def optimal_control_tradeoff(
     wanted = {_key(own) for own in plan}
     kept = tuple(run for key, run in done.items() if key not in wanted)
     finished: list[OptimalControlRun] = []
-    warm: set[str] = set()
 
     def now() -> OptimalControlTradeoff:
         return replace(base, runs=(*kept, *finished), missing=len(plan) - len(finished))
@@ -203,9 +202,6 @@ def optimal_control_tradeoff(
         for own in plan:
             run = done.get(_key(own))
             if run is None:
-                if repr(own.integrator) not in warm:
-                    warm.add(repr(own.integrator))
-                    _measured(own, 1, {**options, "max_iterations": 1})
                 run = _measured(own, repeats, options)
             finished.append(run)
             if path is not None:
@@ -251,6 +247,8 @@ def _measured(problem: OptimalControlProblem, repeats: int, options: dict[str, A
     iterations, status = 0, ""
     # Whatever goes wrong with one run, the others are worth having.
     try:
+        # One iteration compiles all that the solver needs; held controls need kernels of their own.
+        solve(problem, **{**options, "max_iterations": 1, "callback": None})
         for _ in range(repeats):
             begin = time.perf_counter()
             solution = solve(problem, **options)
