@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,7 +122,7 @@ class Reference(Integrator):
         failures = [self._path(scene, state, commands, drift, dt, nodes, i) for i in range(len(state.x))]
         segments = segments_of(nodes, REASONS)
         return [
-            segment if failure is None else Segment(**{**vars(segment), "failure": failure})
+            segment if failure is None else replace(segment, failure=failure)
             for segment, failure in zip(segments, failures, strict=True)
         ]
 
