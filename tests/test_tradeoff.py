@@ -404,5 +404,5 @@ def test_advice_on_a_random_set():
     rng = np.random.default_rng(11)
     verdicts = [verdict for verdict in (benchmark.judge(rng) for _ in range(60)) if verdict is not None]
     assert len(verdicts) > 50
-    assert np.mean([verdict.error <= verdict.tolerance for verdict in verdicts]) >= 0.95
+    assert np.mean([verdict.met for verdict in verdicts]) >= 0.95
     assert np.mean([verdict.ratio <= 2.0 for verdict in verdicts]) >= 0.8
