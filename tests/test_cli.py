@@ -346,7 +346,8 @@ def test_version_and_help(capsys):
         main(["--version"])
     assert stop.value.code == 0
     assert capsys.readouterr().out == f"varpin {vp.__version__}\n"
-    for arguments in (["--help"], ["simulate", "--help"], ["inspect", "--help"], ["paper", "--help"]):
+    commands = "simulate", "inspect", "tradeoff", "advise", "paper"
+    for arguments in (["--help"], *([command, "--help"] for command in commands)):
         with pytest.raises(SystemExit) as stop:
             main(arguments)
         assert stop.value.code == 0
@@ -419,3 +420,48 @@ def test_plain_run_imports_neither_matplotlib_nor_meshcat(arm):
         "sys.exit(status or 'matplotlib' in sys.modules or 'meshcat' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=300).returncode == 0
+
+
+def test_tradeoff_prints_a_table_and_goes_on_where_it_stopped(arm, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "trade"
+    options = ["--duration", "0.5", "--dt", "0.05", "0.01", "--q0", "0.3", "--repeats", "1", "--out", str(out)]
+    assert main(["tradeoff", arm, *options]) == 0
+    printed, err = capsys.readouterr()
+    assert err == ""
+    for words in ("arm: speed against accuracy over 0.5 s", "RungeKutta4", "Midpoint", "Pareto", "good to"):
+        assert words in printed
+    assert sorted(path.name for path in out.iterdir()) == [f"tradeoff.{kind}" for kind in ("csv", "html", "npz", "png")]
+    monkeypatch.setattr("varpin.tradeoff.precision._measure", lambda *_: pytest.fail("it is there already"))
+    assert main(["tradeoff", arm, *options, "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
+    assert main(["tradeoff", arm, *options, "--torque", "1"]) == 2
+    assert "holds runs of another motion" in error_of(capsys)
+
+
+def test_tradeoff_interrupted_is_status_130(arm, capsys, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("varpin.tradeoff.precision._measure", interrupt)
+    assert main(["tradeoff", arm, "--duration", "0.5", "--dt", "0.05", "--quiet"]) == 130
+    assert "interrupted after 0 of " in capsys.readouterr().err
+
+
+def test_advise_says_what_to_take(arm, capsys):
+    options = ["--duration", "0.5", "--q0", "0.3", "--damping", "0.1"]
+    assert main(["advise", arm, "--tolerance", "1e-6", *options]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert re.match(
+        r"\w+.* at dt = \S+ s: error \S+ in .*, the cheapest within an error of 1e-06 in q after 0.5 s\n", out
+    )
+    assert main(["advise", arm, "--budget", "2e-3", *options]) == 0
+    assert "the most accurate after 0.5 s within 2 ms" in capsys.readouterr().out
+    assert main(["advise", arm, "--tolerance", "1e-20", *options]) == 3
+    assert "not within reach" in capsys.readouterr().out
+    assert main(["advise", arm, "--tolerance", "0"]) == 2
+    assert "tolerance must be positive" in error_of(capsys)
+
+
+def test_advise_needs_one_wish(arm, capsys):
+    assert "one of the arguments --tolerance --budget is required" in usage_error(["advise", arm], capsys)

@@ -603,3 +603,23 @@ def test_planar_chain_is_rods_in_the_vertical_plane():
     kinetic = 0.5 * mass * (speeds**2).sum() + 0.5 * mass * length**2 / 12 * (rates**2).sum()
     potential = mass * 9.81 * centers[:, 1].sum()
     assert pytest.approx(kinetic - potential, rel=1e-14) == vp.lagrangian_jet(scene, q, v).L
+
+
+def test_end_effector_is_where_pinocchio_says(load):
+    rng = np.random.default_rng(0)
+    chain = vp.planar_chain(3)
+    assert chain.end_effector == "tip"
+    q = rng.normal(size=(4, 3))
+    angles = np.cumsum(q, axis=1)
+    expected = np.stack([np.cos(angles).sum(axis=1), np.zeros(4), -np.sin(angles).sum(axis=1)], axis=1)
+    np.testing.assert_allclose(chain.frame_positions(q), expected, atol=1e-14)
+    panda = load("panda")
+    q = rng.normal(size=(2, panda.dof))
+    data = panda.model.createData()
+    for row, position in zip(q, panda.frame_positions(q, "panda_hand"), strict=True):
+        pin.framesForwardKinematics(panda.model, data, panda.configuration(row))
+        np.testing.assert_allclose(position, data.oMf[panda.model.getFrameId("panda_hand")].translation, atol=1e-14)
+    with pytest.raises(vp.InputError, match="has no frame 'hand'"):
+        panda.frame_positions(q, "hand")
+    with pytest.raises(vp.InputError, match=r"q must have shape \(N, 3\)"):
+        chain.frame_positions(np.zeros(3))

@@ -35,6 +35,7 @@ from varpin.inspection import inspect_robot as inspect_robot
 from varpin.integrators import ExplicitEuler as ExplicitEuler
 from varpin.integrators import Gauss as Gauss
 from varpin.integrators import Midpoint as Midpoint
+from varpin.integrators import Reference as Reference
 from varpin.integrators import RungeKutta4 as RungeKutta4
 from varpin.integrators import SemiImplicitEuler as SemiImplicitEuler
 from varpin.lagrangian import DiscreteLagrangian as DiscreteLagrangian
@@ -73,4 +74,10 @@ from varpin.solution import MonteCarlo as MonteCarlo
 from varpin.solution import Solution as Solution
 from varpin.solution import Status as Status
 from varpin.solution import Verification as Verification
+from varpin.tradeoff import Advice as Advice
+from varpin.tradeoff import OptimalControlTradeoff as OptimalControlTradeoff
+from varpin.tradeoff import WorkPrecision as WorkPrecision
+from varpin.tradeoff import advise as advise
+from varpin.tradeoff import optimal_control_tradeoff as optimal_control_tradeoff
+from varpin.tradeoff import work_precision as work_precision
 from varpin.trajectory import Trajectory as Trajectory

@@ -1,6 +1,7 @@
-"""The ``varpin`` command: simulate a robot, or look into its description.
+"""The ``varpin`` command: simulate a robot, look into its description, or choose an integrator for it.
 
-Exit status: 0 done, 2 a mistake in the request, 3 a step that could not be solved, 130 interrupted.
+Exit status: 0 done, 2 a mistake in the request, 3 a step that could not be solved or an accuracy out of reach, 130
+interrupted.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pathlib import Path
 from types import TracebackType
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -25,13 +26,14 @@ from rich.text import Text
 
 from varpin._version import __version__
 from varpin.checks import count, positive, writable
-from varpin.errors import InputError, VarpinError
+from varpin.errors import FileError, InputError, VarpinError
 from varpin.inspection import JointReport, RobotReport, inspect_robot
 from varpin.integrators import Midpoint
 from varpin.replay import replay
 from varpin.robot import Robot, load_robot
 from varpin.scene import Scene
 from varpin.simulation import Interrupted, StepFailure, simulate
+from varpin.tradeoff import advise, work_precision
 from varpin.trajectory import Trajectory, atomic_file
 
 MISTAKE, STEP_FAILED, INTERRUPTED = 2, 3, 130
@@ -48,6 +50,8 @@ examples:
   varpin simulate panda --lock panda_finger_joint1=0.02 --q0 -0.5 --duration 5 --save fall.npz --plot fall.png
   varpin simulate arm.urdf --dt 5e-4 --steps 4000 --damping 0.1 --torque 1 -2.5e-1
   varpin inspect ur5 --q 0 -1.2 1 0 0 0
+  varpin advise ur5 --tolerance 1e-6 --duration 1
+  varpin tradeoff ur5 --duration 1 --out ur5-tradeoff
 """
 
 
@@ -92,6 +96,8 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_simulate(commands.add_parser("simulate", help="integrate a robot in time", allow_abbrev=False))
     _add_inspect(commands.add_parser("inspect", help="look into a robot description", allow_abbrev=False))
+    _add_tradeoff(commands.add_parser("tradeoff", help="measure speed against accuracy", allow_abbrev=False))
+    _add_advise(commands.add_parser("advise", help="find the cheapest integrator and step", allow_abbrev=False))
     _add_paper(commands.add_parser("paper", help="reproduce the paper's experiments", allow_abbrev=False))
     return parser
 
@@ -115,15 +121,7 @@ def _add_simulate(parser: argparse.ArgumentParser) -> None:
         default=0.5,
         help="of the midpoint rule, in [0, 1]; second order at 0.5, first elsewhere; default: %(default)g",
     )
-    start = parser.add_argument_group("start")
-    _add_vector(start, "q0", "initial configuration [rad or m]; default: 0")
-    _add_vector(start, "v0", "initial velocity [rad/s or m/s]; default: 0")
-    surroundings = parser.add_argument_group("surroundings")
-    _add_gravity(surroundings)
-    _add_vector(surroundings, "damping", "viscous damping [N m s/rad or N s/m]; default: 0")
-    _add_vector(surroundings, "stiffness", "joint springs [N m/rad or N/m]; default: 0")
-    _add_vector(surroundings, "rest", "where the springs are slack [rad or m]; default: 0")
-    _add_vector(surroundings, "torque", "constant generalized forces [N m or N]; default: 0")
+    _add_motion(parser)
     outputs = parser.add_argument_group("outputs")
     outputs.add_argument("--save", type=Path, metavar="NPZ", help="write the trajectory, for Trajectory.load")
     outputs.add_argument("--plot", type=Path, metavar="PNG", help="draw an overview, as png, pdf or svg")
@@ -149,6 +147,46 @@ def _add_inspect(parser: argparse.ArgumentParser) -> None:
     _add_vector(parser, "q", "configuration to look at [rad or m]; default: 0")
     _add_vector(parser, "v", "velocity there [rad/s or m/s]; default: 0")
     _add_gravity(parser)
+
+
+def _add_tradeoff(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Run a robot's motion with every integrator over many steps, and print and write their errors against an "
+        "accurate reference, and their wall times. What is in the folder already is not run again, so an interrupted "
+        "measurement goes on where it stopped."
+    )
+    parser.set_defaults(run=_tradeoff, log_level=logging.WARNING)
+    _add_robot(parser)
+    parser.add_argument(
+        "--duration", type=float, default=1.0, metavar="S", help="of the motion [s]; default: %(default)g"
+    )
+    parser.add_argument("--dt", type=float, nargs="+", metavar="S", help="time steps [s]; default: 0.04 and its halves")
+    parser.add_argument("--repeats", type=int, default=3, metavar="N", help="of each run; default: %(default)d")
+    _add_motion(parser)
+    outputs = parser.add_argument_group("outputs")
+    outputs.add_argument(
+        "--out",
+        type=Path,
+        metavar="FOLDER",
+        help="write a table (CSV), a figure (PNG), a page (HTML), the record (NPZ)",
+    )
+    outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
+
+
+def _add_advise(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Find the cheapest integrator and step that keep the error in q at the end of a robot's motion below a "
+        "tolerance, or the most accurate ones within a time, from short runs."
+    )
+    parser.set_defaults(run=_advise, log_level=logging.WARNING)
+    _add_robot(parser)
+    wish = parser.add_mutually_exclusive_group(required=True)
+    wish.add_argument("--tolerance", type=float, metavar="E", help="the error to keep below [rad or m]")
+    wish.add_argument("--budget", type=float, metavar="S", help="the wall time to keep to [s]")
+    parser.add_argument(
+        "--duration", type=float, default=1.0, metavar="S", help="of the motion [s]; default: %(default)g"
+    )
+    _add_motion(parser)
 
 
 def _add_paper(parser: argparse.ArgumentParser) -> None:
@@ -184,6 +222,19 @@ def _add_robot(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="where package:// paths of meshes are looked up; repeatable",
     )
+
+
+def _add_motion(parser: argparse.ArgumentParser) -> None:
+    """Where a motion starts, and what acts on it."""
+    start = parser.add_argument_group("start")
+    _add_vector(start, "q0", "initial configuration [rad or m]; default: 0")
+    _add_vector(start, "v0", "initial velocity [rad/s or m/s]; default: 0")
+    surroundings = parser.add_argument_group("surroundings")
+    _add_gravity(surroundings)
+    _add_vector(surroundings, "damping", "viscous damping [N m s/rad or N s/m]; default: 0")
+    _add_vector(surroundings, "stiffness", "joint springs [N m/rad or N/m]; default: 0")
+    _add_vector(surroundings, "rest", "where the springs are slack [rad or m]; default: 0")
+    _add_vector(surroundings, "torque", "constant generalized forces [N m or N]; default: 0")
 
 
 def _add_vector(group: argparse._ActionsContainer, name: str, text: str) -> None:
@@ -282,9 +333,8 @@ def _replay(path: Path, speed: float) -> _Output:
     return _Output(path, write)
 
 
-def _simulate(request: argparse.Namespace, errors: Console) -> int:
-    outputs = _outputs(request)
-    steps = _steps(request)
+def _motion(request: argparse.Namespace) -> tuple[Scene, ArrayLike, ArrayLike, NDArray[np.float64] | None]:
+    """The scene, q0, v0, and the torque unless it is zero."""
     robot = load_robot(request.robot, package_dirs=request.package_dir, lock=dict(request.lock))
     scene = Scene(
         robot,
@@ -296,6 +346,14 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
     q0, v0, torque = (
         np.broadcast_to(_vector(name, getattr(request, name), robot), (robot.dof,)) for name in ("q0", "v0", "torque")
     )
+    return scene, q0, v0, torque if torque.any() else None
+
+
+def _simulate(request: argparse.Namespace, errors: Console) -> int:
+    outputs = _outputs(request)
+    steps = _steps(request)
+    scene, q0, v0, torque = _motion(request)
+    robot = scene.robot
     status, complaint, begin = 0, "", time.perf_counter()
     try:
         with _progress(errors, steps, quiet=request.quiet) as progress:
@@ -305,7 +363,7 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
                 v0,
                 dt=request.dt,
                 steps=steps,
-                controls=torque if torque.any() else None,
+                controls=torque,
                 integrator=Midpoint(alpha=request.alpha),
                 progress=progress,
             )
@@ -327,7 +385,7 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
         else:
             written.append(output.path)
     if not request.quiet:
-        driven = bool(scene.damping.any() or torque.any())
+        driven = bool(scene.damping.any() or torque is not None)
         tables = Console() if sys.stdout.isatty() else Console(width=_WIDTH)
         tables.print(_summary(robot, trajectory, steps, wall_time, driven, written))
     if status == INTERRUPTED:
@@ -429,6 +487,65 @@ def _inspect(request: argparse.Namespace, _errors: Console) -> int:
     if not report.warnings:
         _say(console, "nothing looks wrong", prefix="")
     return 0
+
+
+def _tradeoff(request: argparse.Namespace, errors: Console) -> int:
+    from varpin.tradeoff_report import COLUMNS, cells, write_report  # noqa: PLC0415 - matplotlib is slow to import
+
+    folder = None if request.out is None else _folder(request.out)
+    scene, q0, v0, torque = _motion(request)
+    with _progress(errors, 1, quiet=request.quiet, unit="runs") as progress:
+        record = work_precision(
+            scene,
+            q0,
+            v0,
+            controls=torque,
+            duration=request.duration,
+            dts=request.dt,
+            repeats=request.repeats,
+            progress=progress,
+            save=None if folder is None else folder / "tradeoff.npz",
+        )
+    title = f"{record.robot}: speed against accuracy over {record.duration:g} s"
+    files = [] if folder is None else [folder / "tradeoff.npz", *write_report(folder, record, title)]
+    console = Console() if sys.stdout.isatty() else Console(width=_WIDTH)
+    if not request.quiet:
+        table, front = _table(title, COLUMNS), record.pareto()
+        for run in record.runs:
+            _row(table, *cells(record, run, run in front), style="bold" if run in front else "")
+        console.print(table)
+        _say(console, f"errors are against {record.reference}, good to {record.reference_error:.1e}", prefix="")
+        for path in files:
+            _say(console, str(path), prefix="written")
+    return INTERRUPTED if record.missing else 0
+
+
+def _folder(path: Path) -> Path:
+    """``path`` as a folder, made if need be."""
+    folder = path.expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"cannot make the folder {folder}: {error.strerror or error}") from None
+    return folder
+
+
+def _advise(request: argparse.Namespace, _errors: Console) -> int:
+    scene, q0, v0, torque = _motion(request)
+    advice = advise(
+        scene,
+        q0,
+        v0,
+        controls=torque,
+        duration=request.duration,
+        tolerance=request.tolerance,
+        budget=request.budget,
+    )
+    console = Console() if sys.stdout.isatty() else Console(width=_WIDTH)
+    for line in advice.reason.splitlines():
+        _say(console, line, prefix="")
+    _say(console, f"(found in {advice.calibration:.2g} s)", prefix="")
+    return 0 if advice.reached else STEP_FAILED
 
 
 def _paper(request: argparse.Namespace, errors: Console) -> int:

@@ -11,11 +11,10 @@ from typing import Literal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import eigh
 
 from varpin.checks import broadcast_array
 from varpin.errors import InputError, SingularMassMatrix
-from varpin.integrators import Midpoint
+from varpin.integrators import Midpoint, largest_step
 from varpin.lagrangian import lagrangian_jet
 from varpin.robot import Robot, build_robot, check_inertia
 from varpin.robot.mimic import joint_index
@@ -183,7 +182,7 @@ def inspect_robot(
         v=velocity,
         condition=condition,
         scaled_condition=scaled,
-        largest_step=_largest_step(jet.Lvv, jet.Lqq, margin) if np.isfinite(scaled) else None,
+        largest_step=largest_step(jet.Lvv, jet.Lqq, margin) if np.isfinite(scaled) else None,
         branch_margin=margin,
         warnings=tuple(warnings),
     )
@@ -198,15 +197,6 @@ def _condition_numbers(M: Floats) -> tuple[float, float]:
     if scaled[0] <= len(M) * np.finfo(float).eps:
         return np.inf, np.inf
     return float(np.linalg.cond(M)), float(scaled[-1] / scaled[0])
-
-
-def _largest_step(M: Floats, Lqq: Floats, margin: float) -> float:
-    """The h at which M - h^2 / (4 (1 - margin)) L_qq ceases to be positive definite [s]."""
-    n = len(M)
-    fastest = eigh(Lqq, M, eigvals_only=True, subset_by_index=[n - 1, n - 1])[0]
-    # Of a direction without curvature rounding leaves a tiny one, of either sign.
-    rounding = 1e-12 * float(np.abs(eigh(Lqq, M, eigvals_only=True)).max())
-    return 2.0 * float(np.sqrt((1.0 - margin) / fastest)) if fastest > rounding else np.inf
 
 
 def _joints(robot: Robot) -> tuple[JointReport, ...]:

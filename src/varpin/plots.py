@@ -1,4 +1,4 @@
-"""Figures of trajectories.
+"""Figures of trajectories, and of speed against accuracy.
 
 Figures are made without pyplot: nothing is shown, registered or configured globally. Save one with
 ``figure.savefig("motion.png")``; a notebook displays it as the value of a cell.
@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from varpin.errors import InputError
 from varpin.robot import Robot
+from varpin.tradeoff import OptimalControlTradeoff, WorkPrecision
+from varpin.tradeoff.precision import Quantity
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -171,6 +173,87 @@ def plot_trajectory(
     if axes is None:
         new.align_ylabels()
     return panels[0].figure, panels
+
+
+def plot_work_precision(
+    record: WorkPrecision, axes: Axes | None = None, *, quantity: Quantity = "q"
+) -> tuple[Figure | SubFigure, Axes]:
+    """Error over wall time, one line an integrator, one point a step; the Pareto front is ringed and joined.
+
+    Errors that the reference cannot tell from zero stand on the grey line that marks its own.
+
+    Args:
+        record: From :func:`varpin.work_precision`.
+        axes: Where to draw; a new figure if left out.
+        quantity: ``"q"``, the largest error in q over the motion; ``"end"``, at its end; ``"energy"``, for a motion
+            that keeps its energy; ``"tip"``, of the end effector.
+
+    Returns:
+        The figure and its axes.
+
+    Raises:
+        InputError: Another ``quantity``, or no run has such an error.
+    """
+    labels = {
+        "q": "largest error in q [rad or m]",
+        "end": "error in q at the end [rad or m]",
+        "energy": "largest energy error [J]",
+        "tip": "largest error of the end effector [m]",
+    }
+    points = [(run.integrator, run.seconds, record.error_of(run, quantity)) for run in record.runs]
+    front = [(run.seconds, record.error_of(run, quantity)) for run in record.pareto(quantity)]
+    figure, axes = _plot_trade(points, front, axes)
+    axes.set_yscale("log")
+    floor = {"q": record.reference_error, "end": record.reference_error, "tip": record.tip_reference_error}
+    if floor.get(quantity, 0.0) > 0.0:
+        axes.axhline(floor[quantity], color="0.6", linewidth=0.8, linestyle="--", zorder=1)
+    axes.set_xlabel(f"wall time for {record.duration:g} s [s]")
+    axes.set_ylabel(labels[quantity])
+    return figure, axes
+
+
+def plot_optimal_control_tradeoff(
+    record: OptimalControlTradeoff, axes: Axes | None = None
+) -> tuple[Figure | SubFigure, Axes]:
+    """True cost of the plans over the time it took to find them, with the Pareto front; arguments as above.
+
+    Raises:
+        InputError: No run has a true cost.
+    """
+    points = [(run.integrator, run.seconds, run.open_loop_cost) for run in record.runs]
+    figure, axes = _plot_trade(points, [(run.seconds, run.open_loop_cost) for run in record.pareto()], axes)
+    axes.set_xlabel("solve time [s]")
+    axes.set_ylabel("true cost of the controls")
+    return figure, axes
+
+
+def _plot_trade(
+    points: Sequence[tuple[str, float, float]], front: Sequence[tuple[float, float]], axes: Axes | None
+) -> tuple[Figure | SubFigure, Axes]:
+    """Points (integrator, seconds, value) as one line an integrator, and a front, over logarithmic time."""
+    if not front:
+        raise InputError("no run has such a value, so there is nothing to plot")
+    figure, axes = _axes(axes)
+    names = list(dict.fromkeys(name for name, _, _ in points))
+    for name, style in zip(names, _styles(len(names)), strict=True):
+        own = [(seconds, value) for label, seconds, value in points if label == name]
+        axes.plot(*zip(*own, strict=True), label=name, marker="o", markersize=4, **style)
+    axes.plot(
+        *zip(*front, strict=True),
+        label="Pareto front",
+        color="0.3",
+        linewidth=0.8,
+        marker="o",
+        markersize=9,
+        markerfacecolor="none",
+        zorder=1,
+    )
+    axes.set_xscale("log")
+    axes.grid(visible=True, color="0.92", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize="small")
+    return figure, axes
 
 
 def _plot_nodes(

@@ -34,7 +34,7 @@ class StepStatistics:
     Attributes:
         newton_iterations: (N,).
         jets: Evaluations of the whole jet (N,).
-        sweeps: Evaluations of its first derivatives alone (N,).
+        sweeps: Evaluations of its first derivatives alone, or of forward dynamics (N,).
         substeps: Parts the step was taken in (N,); more than 1 where a guard refused the whole step, and there the
             map is not the integrator's own.
         residual: Residual of the step equation (N,), in units of the rounding error of its terms.

@@ -7,3 +7,5 @@ from varpin.integrators.explicit import RungeKutta4 as RungeKutta4
 from varpin.integrators.explicit import SemiImplicitEuler as SemiImplicitEuler
 from varpin.integrators.gauss import Gauss as Gauss
 from varpin.integrators.midpoint import Midpoint as Midpoint
+from varpin.integrators.midpoint import largest_step as largest_step
+from varpin.integrators.reference import Reference as Reference

@@ -65,10 +65,15 @@ class Integrator(ABC):
        step of one path with noise that only Python can evaluate;
     3. ``predict``, the state to expect half a step ahead, to second order, at which feedback is evaluated;
     4. ``linearize``, the derivatives of its steps;
-    5. ``variational``, which says whether it maps (q, p) or (q, v).
+    5. ``variational``, which says whether it maps (q, p) or (q, v), and ``order``.
     """
 
     variational: bool
+
+    @property
+    @abstractmethod
+    def order(self) -> int:
+        """The order of its error in dt where nothing is noisy and controls are constant over each step."""
 
     @property
     def left(self) -> float:

@@ -139,6 +139,7 @@ class ExplicitEuler(_Explicit):
     """q1 = q0 + h v0, v1 = v0 + h a(q0, v0): of first order, and the paper's comparison."""
 
     scheme: ClassVar[int] = kernels.EULER
+    order = 1
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, v)."""
@@ -154,6 +155,7 @@ class SemiImplicitEuler(_Explicit):
     """v1 = v0 + h a(q0, v0), q1 = q0 + h v1: of first order; most physics engines step so."""
 
     scheme: ClassVar[int] = kernels.SEMI_IMPLICIT
+    order = 1
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, v)."""
@@ -169,6 +171,7 @@ class RungeKutta4(_Explicit):
     """The classical method of Runge and Kutta: of fourth order without noise."""
 
     scheme: ClassVar[int] = kernels.RUNGE_KUTTA
+    order = 4
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, v). The four stages are differentiated in turn."""

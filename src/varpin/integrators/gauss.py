@@ -67,6 +67,11 @@ class Gauss(Variational):
         kick = "" if self.kick == "left" else f", kick={self.kick}"
         return f"Gauss(stages={self.stages}{kick})"
 
+    @property
+    def order(self) -> int:
+        """See :meth:`Integrator.order`; 2 s."""
+        return 2 * int(self.stages)
+
     def _gauss_options(self) -> equation.Options:
         options = self._options(0.5)
         if self.stages == 1:

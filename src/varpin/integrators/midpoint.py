@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh
 
 from varpin.checks import fraction
 from varpin.errors import LinearizationError
@@ -23,6 +24,18 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+
+
+def largest_step(M: Floats, Lqq: Floats, margin: float) -> float:
+    """The dt [s] up to which the branch guard of alpha = 1/2 accepts a step around a state with these M and L_qq.
+
+    Where M - dt^2 / (4 (1 - margin)) L_qq ceases to be positive definite; infinite where no direction is unstable. It
+    says nothing of accuracy.
+    """
+    rates = eigh(Lqq, M, eigvals_only=True)
+    # Of a direction without curvature rounding leaves a tiny one, of either sign.
+    rounding = 1e-12 * float(np.abs(rates).max())
+    return 2.0 * float(np.sqrt((1.0 - margin) / rates[-1])) if rates[-1] > rounding else np.inf
 
 
 def _room(scene: Scene, *, derivatives: bool = False, parts: int = 0) -> tuple[equation.State, equation.Work]:
@@ -76,6 +89,11 @@ class Midpoint(Variational):
     def __str__(self) -> str:
         kick = "" if self.kick == "left" else f", kick={self.kick}"
         return f"Midpoint(alpha={self.alpha:g}{kick})"
+
+    @property
+    def order(self) -> int:
+        """See :meth:`Integrator.order`; 2 for alpha = 1/2, and 1 elsewhere."""
+        return 2 if self.alpha == 0.5 else 1
 
     def _arrays(self, paths: int, dof: int, processes: int) -> tuple[equation.State, None]:
         return equation.new_state(paths, dof, processes), None

@@ -314,3 +314,15 @@ def forward_derivatives(
             for i in range(n):
                 af[s, i, c] = d.solution[i]
     return True
+
+
+@kernel
+def forward_dynamics(mechanism: Mechanism, x: Floats, force: Floats, d: Dynamics, rate: Floats) -> bool:
+    """The rate (v, a) of x = (q, v), each (2n,), under a force (n,); False where M is singular."""
+    n = force.size
+    q, v = x[:n], x[n:]
+    regular, _ = node(mechanism, q, v, d)
+    acceleration_at_node(force, d, rate[n:])
+    for i in range(n):
+        rate[i] = v[i]
+    return regular

@@ -57,16 +57,17 @@ def write_node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics, nodes: N
 
 @inlined
 def runge_kutta(mechanism: Mechanism, h: float, q: Floats, v: Floats, force: Floats, d: Dynamics, room: Floats) -> bool:
-    """One step of the classical method, in place; ``room`` is (5, n)."""
+    """One step of the classical method, in place; ``d`` holds the node at (q, v), and ``room`` is (5, n)."""
     n = q.size
     at_q, at_v, a, sum_q, sum_v = room[0], room[1], room[2], room[3], room[4]
     for i in range(n):
         at_q[i], at_v[i] = q[i], v[i]
         sum_q[i], sum_v[i] = 0.0, 0.0
     for stage in range(4):
-        regular, _ = node(mechanism, at_q, at_v, d)
-        if not regular:
-            return False
+        if stage > 0:
+            regular, _ = node(mechanism, at_q, at_v, d)
+            if not regular:
+                return False
         acceleration_at_node(force, d, a)
         weight = h / 3.0 if stage in (1, 2) else h / 6.0
         ahead = h if stage == 2 else 0.5 * h
@@ -102,10 +103,11 @@ def rollout(
         q, v, lead = states.q[i], states.v[i], states.lead[i]
         nodes.ended[i] = SOLVED
         nodes.done[i] = 0
+        regular, _ = node(mechanism, q, v, d)
         for s in range(nodes.u.shape[1]):
             apply_policy(commands, s, q, v, nodes.u[i])
             constant_force(mechanism, drift, i, s, nodes.u[i, s], force)
-            regular, _ = node(mechanism, q, v, d)
+            # From here d holds the node at (q, v): the first, or the one that ended the step before.
             if not regular:
                 nodes.ended[i] = SINGULAR
                 break
@@ -131,6 +133,7 @@ def rollout(
                         v[r] += jump[r]
             for r in range(n):
                 lead[r] += v[r]
+            nodes.tally[i, s, 2] = 4 if scheme == RUNGE_KUTTA else 1
             nodes.ended[i] = write_node(mechanism, q, v, d, nodes, i, s) if regular else SINGULAR
             if nodes.ended[i] != SOLVED:
                 break
@@ -145,3 +148,10 @@ def first_nodes(mechanism: Mechanism, states: ExplicitState, d: Dynamics, nodes:
             return False
         nodes.done[i] = 1
     return True
+
+
+@kernel
+def enter_node(mechanism: Mechanism, x: Floats, d: Dynamics, nodes: Nodes, i: int, s: int) -> int:
+    """Enter x = (q, v) (2n,) as node ``s`` of path ``i``, as :func:`write_node`."""
+    n = d.bias.size
+    return write_node(mechanism, x[:n], x[n:], d, nodes, i, s)

@@ -94,6 +94,32 @@ class Robot:
         return np.asarray(v, dtype=float)[..., self.tree.coordinate] * self.tree.ratio
 
     @property
+    def end_effector(self) -> str:
+        """Name of the last frame on the joint that has the most joints before it; the last of such joints."""
+        depths = [len(path) for path in self.free_model.supports]
+        last = max(range(self.free_model.njoints), key=lambda j: (depths[j], j))
+        return str([frame.name for frame in self.free_model.frames if frame.parentJoint == last][-1])
+
+    def frame_positions(self, q: ArrayLike, frame: str | None = None) -> Floats:
+        """Positions (N, 3) [m] in the world of a frame, or of :attr:`end_effector`, at configurations ``q`` (N, n).
+
+        Raises:
+            InputError: ``q`` is not (N, n), or there is no such frame.
+        """
+        q = as_floats("q", q)
+        if q.ndim != 2 or q.shape[1] != self.dof:
+            raise InputError(f"q must have shape (N, {self.dof}), got {q.shape}")
+        name = self.end_effector if frame is None else frame
+        if not self.free_model.existFrame(name):
+            raise InputError(f"robot {self.name!r} has no frame {name!r}")
+        index, data = self.free_model.getFrameId(name), self.free_model.createData()
+        positions = np.empty((len(q), 3))
+        for k, row in enumerate(self.free_positions(q)):
+            pin.forwardKinematics(self.free_model, data, row)
+            positions[k] = pin.updateFramePlacement(self.free_model, data, index).translation
+        return positions
+
+    @property
     def unbounded(self) -> NDArray[np.bool_]:
         """Which coordinates (n,) are angles without limits."""
         index = joint_index(self.model)

@@ -1,0 +1,230 @@
+"""SciPy's DOP853 under the contract of an integrator: slow and exact, to hold the others against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from varpin.checks import positive
+from varpin.errors import InputError, LinearizationError, SingularMassMatrix
+from varpin.integrators.base import Failure, Integrator, Segment, drifts, segments_of, steps_of
+from varpin.integrators.explicit import REASONS, accelerations
+from varpin.kernels import explicit as kernels
+from varpin.kernels.dynamics import Dynamics, forward_dynamics, new_dynamics
+from varpin.kernels.tree import Commands, Nodes, new_nodes
+from varpin.scene import Scene
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+Rate = Callable[[float, Floats], Floats]
+
+# SciPy raises a smaller rtol to this by itself, with a warning.
+TIGHTEST = 100.0 * float(np.finfo(np.float64).eps)
+# Speeds below this count as it [rad/s or m/s]: what rounding leaves of a robot in equilibrium is not to be resolved.
+_SLOWEST = 1e-3
+TOO_STEEP = "the adaptive method cannot go on: the motion runs away, or its tolerance is beyond rounding"
+
+
+@dataclass
+class ReferenceRun:
+    """Where the paths of a rollout stand.
+
+    Attributes:
+        x: (q, v) of each path (P, 2n).
+        dynamics: Work arrays.
+        tried: The last length of a step inside [s], 0 for none: the next begins with it.
+        last: Change of v over the last step (P, n).
+    """
+
+    x: Floats
+    dynamics: Dynamics
+    tried: float
+    last: Floats
+
+
+class _RunsAway(ArithmeticError):
+    """The rate of change cannot be evaluated."""
+
+
+@dataclass(frozen=True)
+class Reference(Integrator):
+    """The explicit Runge-Kutta method of order 8 by Dormand and Prince with its own step control, through SciPy.
+
+    Each step of the trajectory is integrated with as many steps inside as the tolerances take; the control is held.
+    Its error does not depend on ``dt``. It shares no equation with the variational integrators but the robot's: it
+    integrates q' = v, v' = M^-1 (f - bias). Noise is refused.
+
+    Main args:
+        rtol: Relative tolerance on q and v in each step inside, from 2.3e-14 on.
+        atol: Absolute tolerance on q [rad or m]; ``rtol`` if left out. That on v is as much larger as the robot is
+            faster than one unit of q per second, or as much smaller as it is slower.
+    """
+
+    rtol: float = 1e-12
+    atol: float | None = None
+
+    variational = False
+    order = 8
+
+    def __post_init__(self) -> None:
+        if not TIGHTEST <= positive("rtol", self.rtol, "1") <= 1e-2:
+            raise InputError(f"rtol must be from {TIGHTEST:.2g}, where rounding begins, to 0.01, got {self.rtol}")
+        if self.atol is not None:
+            positive("atol", self.atol, "rad or m")
+
+    def __str__(self) -> str:
+        atol = "" if self.atol is None else f", atol={self.atol:g}"
+        return f"Reference(rtol={self.rtol:g}{atol})"
+
+    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[ReferenceRun, list[Segment]]:
+        """See :meth:`Integrator.start`.
+
+        Raises:
+            InputError: The scene has noise.
+        """
+        if scene.processes:
+            raise InputError(f"{self} integrates no noise: leave it out of the scene")
+        paths, n = q0.shape
+        run = ReferenceRun(
+            x=np.hstack([q0, v0]),
+            dynamics=new_dynamics(scene.robot.tree.parent.size, n),
+            tried=0.0,
+            last=np.zeros((paths, n)),
+        )
+        nodes = new_nodes(paths, 1, n, scene.controls)
+        states = kernels.new_explicit_state(q0, v0, scene.mechanism.diffusion.center)
+        if not kernels.first_nodes(scene.mechanism, states, run.dynamics, nodes):
+            raise SingularMassMatrix(scene.robot.joint_names, q0)
+        return run, segments_of(nodes, REASONS)
+
+    def step_in_python(
+        self,
+        scene: Scene,  # noqa: ARG002
+        state: ReferenceRun,  # noqa: ARG002
+        command: Commands,  # noqa: ARG002
+        increment: Floats,  # noqa: ARG002
+        dt: float,  # noqa: ARG002
+    ) -> Segment:
+        """Never called for a scene without noise, and others are refused."""
+        raise InputError(f"{self} integrates no noise: leave it out of the scene")
+
+    def rollout_compiled(
+        self, scene: Scene, state: ReferenceRun, commands: Commands, increments: Floats, drift: Floats, dt: float
+    ) -> list[Segment]:
+        """See :meth:`Integrator.rollout_compiled`; the rate of change is compiled, the steps are SciPy's."""
+        if increments.size:
+            raise InputError(f"{self} integrates no noise: leave it out of the scene")
+        nodes = new_nodes(len(state.x), steps_of(commands), scene.robot.dof, scene.controls)
+        failures = [self._path(scene, state, commands, drift, dt, nodes, i) for i in range(len(state.x))]
+        segments = segments_of(nodes, REASONS)
+        return [
+            segment if failure is None else replace(segment, failure=failure)
+            for segment, failure in zip(segments, failures, strict=True)
+        ]
+
+    def _path(
+        self, scene: Scene, state: ReferenceRun, commands: Commands, drift: Floats, dt: float, nodes: Nodes, i: int
+    ) -> Failure | None:
+        """The steps of path ``i``, written to ``nodes``; what stopped them, if anything did."""
+        u = nodes.u[i]
+        for s in range(len(u)):
+            decision, held = divmod(s, commands.hold)
+            u[s] = u[s - 1] if held else commands.u[decision]
+            if len(commands.gains) and not held:
+                u[s] += commands.gains[decision] @ (state.x[i] - commands.reference[decision])
+            force = scene.actuation @ u[s] + (drift[i, s] if len(drift) else 0.0)
+            try:
+                x, nodes.tally[i, s, 2] = self._step(scene, state, i, force, dt)
+            except _RunsAway:
+                return Failure(TOO_STEEP, 0.0)
+            n = scene.robot.dof
+            state.last[i] = x[n:] - state.x[i, n:]
+            state.x[i] = x
+            if kernels.enter_node(scene.mechanism, x, state.dynamics, nodes, i, s) != kernels.SOLVED:
+                return Failure(TOO_STEEP, 0.0)
+            nodes.done[i] = s + 1
+        return None
+
+    def _step(self, scene: Scene, state: ReferenceRun, i: int, force: Floats, dt: float) -> tuple[Floats, int]:
+        """(q, v) of path ``i`` after one step, and how many evaluations of forward dynamics it took."""
+        n = scene.robot.dof
+        mechanism, dynamics = scene.mechanism, state.dynamics
+
+        def rate(_: float, x: Floats) -> Floats:
+            slope = np.empty(2 * n)
+            if not (forward_dynamics(mechanism, x, force, dynamics, slope) and np.isfinite(slope).all()):
+                raise _RunsAway
+            return slope
+
+        atol = self._atol(state.x[i], rate(0.0, state.x[i]), dt)
+        x, evaluations, state.tried = _integrate(rate, state.x[i], dt, self.rtol, atol, state.tried)
+        return x, evaluations + 1
+
+    def _atol(self, x: Floats, slope: Floats, dt: float) -> Floats:
+        """Absolute tolerances on (q, v) (2n,) around a state."""
+        n = len(x) // 2
+        speed = max(np.abs(x[n:]).max() + dt * np.abs(slope[n:]).max(), _SLOWEST)
+        unit = self.rtol if self.atol is None else self.atol
+        return unit * np.concatenate([np.ones(n), np.full(n, speed)])
+
+    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
+        """See :meth:`Integrator.linearize`; the state is (q, v).
+
+        The variational equations are integrated along with the motion, under the same tolerances.
+        """
+        n, dt = scene.robot.dof, trajectory.dt
+        force = trajectory.u @ scene.actuation.T + drifts(scene, trajectory)
+        J = np.empty((trajectory.steps, 2 * n, 3 * n))
+        for k in range(trajectory.steps):
+            try:
+                J[k] = self._derivatives(scene, np.append(trajectory.q[k], trajectory.v[k]), force[k], dt)
+            except (_RunsAway, LinearizationError):
+                raise LinearizationError(k, k * dt, TOO_STEEP) from None
+        return J[:, :, : 2 * n], J[:, :, 2 * n :], J[:, :, n : 2 * n]
+
+    def _derivatives(self, scene: Scene, x: Floats, force: Floats, dt: float) -> Floats:
+        """Derivatives (2n, 3n) of one step in (q, v, force)."""
+        n = len(force)
+
+        def rate(_: float, y: Floats) -> Floats:
+            a, aq, av, af = accelerations(scene, y[None, :n], y[None, n : 2 * n], force[None])
+            J = y[2 * n :].reshape(2 * n, 3 * n)
+            bent = aq[0] @ J[:n] + av[0] @ J[n:]
+            bent[:, 2 * n :] += af[0]
+            slope = np.concatenate([y[n : 2 * n], a[0], J[n:].ravel(), bent.ravel()])
+            if not np.isfinite(slope).all():
+                raise _RunsAway
+            return slope
+
+        y = np.concatenate([x, np.eye(2 * n, 3 * n).ravel()])
+        slope = rate(0.0, y)
+        atol = self._atol(x, slope[: 2 * n], dt)
+        # The derivative of v in q is a rate, that of q in v a time, those in the force are inverse inertias.
+        blocks = np.empty((2 * n, 3 * n))
+        unit = atol[0]
+        fast = max(float(np.abs(slope[2 * n :].reshape(2 * n, 3 * n)[n:, : 2 * n]).max()) * dt, _SLOWEST)
+        light = max(float(np.abs(slope[2 * n :].reshape(2 * n, 3 * n)[n:, 2 * n :]).max()) * dt, 1e-300)
+        blocks[:n, :n], blocks[:n, n : 2 * n], blocks[:n, 2 * n :] = unit, unit * dt, unit * dt * light
+        blocks[n:, :n], blocks[n:, n : 2 * n], blocks[n:, 2 * n :] = unit * fast, unit, unit * light
+        end, _, _ = _integrate(rate, y, dt, self.rtol, np.append(atol, blocks.ravel()), 0.0)
+        return end[2 * n :].reshape(2 * n, 3 * n)
+
+    def predict(self, state: ReferenceRun, dt: float) -> tuple[Floats, Floats]:
+        """See :meth:`Integrator.predict`; the velocity goes on as over the last step."""
+        n = state.last.shape[1]
+        q, v = state.x[0, :n], state.x[0, n:]
+        return q + 0.5 * dt * v, v + 0.5 * state.last[0]
+
+
+def _integrate(rate: Rate, x: Floats, dt: float, rtol: float, atol: Floats, tried: float) -> tuple[Floats, int, float]:
+    """X after ``dt`` [s], the number of evaluations, and the length of the last whole step inside [s]."""
+    first = min(tried, dt) if tried > 0.0 else None
+    solution = solve_ivp(rate, (0.0, dt), x, method="DOP853", rtol=rtol, atol=atol, first_step=first)
+    if not solution.success:
+        raise _RunsAway
+    # The last step inside is cut at the end of the interval, so the longest one is what the method wanted.
+    return solution.y[:, -1], int(solution.nfev), float(np.diff(solution.t).max())

@@ -1,0 +1,190 @@
+"""One motion to integrate in many ways: a scene, a state, controls and a duration; and a measured run of it."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import as_floats, finite_array, positive, require_finite
+from varpin.errors import InputError
+from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
+from varpin.integrators.base import Segment, open_loop
+from varpin.kernels._compile import announced_compilation
+from varpin.scene import Scene, require_scene
+
+Floats = NDArray[np.float64]
+
+# Whom to compare where nobody is named. A new integrator enters here, and everywhere.
+INTEGRATORS: tuple[Integrator, ...] = (
+    ExplicitEuler(),
+    SemiImplicitEuler(),
+    RungeKutta4(),
+    Midpoint(),
+    *(Gauss(stages=stages) for stages in (2, 3, 4)),
+)
+
+# Work between two chances for Ctrl-C, in steps of one joint.
+_CHUNK = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A run.
+
+    Attributes:
+        q: Configurations (K + 1, n) at evenly spaced times; NaN from where it failed [rad or m].
+        v: Velocities there (K + 1, n) [rad/s or m/s].
+        energy_error: Largest distance of the energy from its start over all nodes [J].
+        seconds: Wall time, the best of the repetitions [s].
+        newton_iterations: In all.
+        jets: In all.
+        sweeps: In all; evaluations of forward dynamics with integrators on (q, v).
+        split_steps: How many steps a guard took in parts.
+        failure: Why it did not get to the end; empty if it did.
+    """
+
+    q: Floats
+    v: Floats
+    energy_error: float
+    seconds: float
+    newton_iterations: int
+    jets: int
+    sweeps: int
+    split_steps: int
+    failure: str
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """A motion to integrate.
+
+    Attributes:
+        scene: Without noise.
+        q0: (n,) [rad or m].
+        v0: (n,) [rad/s or m/s].
+        controls: (R, m), each row held over duration / R.
+        duration: [s].
+    """
+
+    scene: Scene
+    q0: Floats
+    v0: Floats
+    controls: Floats
+    duration: float
+
+    @classmethod
+    def of(cls, scene: Scene, q0: ArrayLike, v0: ArrayLike, controls: ArrayLike | None, duration: float) -> Setting:
+        """Checked.
+
+        Raises:
+            InputError: Wrong shapes or values, a scene with noise, controls that are a function.
+        """
+        n, m = require_scene(scene).robot.dof, scene.controls
+        if scene.processes:
+            raise InputError("errors of single motions are compared here: leave the noise out of the scene")
+        if controls is None:
+            rows = np.zeros((1, m))
+        elif callable(controls):
+            raise InputError("controls must be rows (R, m), each held over duration / R, or one row (m,)")
+        else:
+            rows = np.atleast_2d(require_finite("controls", as_floats("controls", controls)))
+            if rows.ndim != 2 or rows.shape[1] != m or not len(rows):
+                raise InputError(f"controls must have shape (R, {m}) or ({m},), got {np.shape(controls)}")
+        return cls(
+            scene,
+            finite_array("q0", q0, (n,)),
+            finite_array("v0", v0, (n,)),
+            rows,
+            positive("duration", duration, "s"),
+        )
+
+    @property
+    def conservative(self) -> bool:
+        """Whether the energy is to stay."""
+        return not (self.scene.damping.any() or (self.controls @ self.scene.actuation.T).any())
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over everything that the motion depends on."""
+        digest = hashlib.sha256()
+        for array in _arrays((self.scene.mechanism, self.q0, self.v0, self.controls, self.duration)):
+            digest.update(str(array.shape).encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+    def run(self, integrator: Integrator, steps: int, *, samples: int = 1, repeats: int = 1) -> Outcome:
+        """The motion in ``steps`` steps, a multiple of R and of ``samples``; of several repetitions the fastest."""
+        outcomes = [self._once(integrator, steps, samples)]
+        outcomes += [self._once(integrator, steps, samples) for _ in range(repeats - 1) if not outcomes[0].failure]
+        return min(outcomes, key=lambda outcome: outcome.seconds)
+
+    def warm_up(self, integrator: Integrator) -> None:
+        """Compile what a run needs."""
+        rows = len(self.controls)
+        few = Setting(self.scene, self.q0, self.v0, self.controls, 1e-9 * rows)
+        with announced_compilation():
+            few.run(integrator, rows)
+
+    def _once(self, integrator: Integrator, steps: int, samples: int) -> Outcome:
+        n, stride, hold = self.scene.robot.dof, steps // samples, steps // len(self.controls)
+        dt, chunk = self.duration / steps, max(1, _CHUNK // n)
+        q, v = np.full((2, samples + 1, n), np.nan)
+        q[0], v[0] = self.q0, self.v0
+        nothing = np.zeros((0, 0, 0))
+        tally, drift, failure = np.zeros(4, dtype=np.int64), 0.0, ""
+        begin = time.perf_counter()
+        state, (start,) = integrator.start(self.scene, self.q0[None], self.v0[None])
+        for first in range(0, steps, chunk):
+            nodes = np.arange(first, min(first + chunk, steps))
+            commands = open_loop(self.controls[nodes // hold])
+            (segment,) = integrator.rollout(self.scene, state, commands, nothing, dt)
+            kept = np.flatnonzero((nodes[: len(segment.q)] + 1) % stride == 0)
+            at = (nodes[kept] + 1) // stride
+            q[at], v[at] = segment.q[kept], segment.v[kept]
+            if len(segment.energy):
+                drift = max(drift, float(np.abs(segment.energy - start.energy[0]).max()))
+            tally += _tally(segment)
+            if segment.failure is not None:
+                done = first + len(segment.q)
+                failure = f"step {done} of {steps} (t = {done * dt:.4g} s): {segment.failure.reason}"
+                break
+        seconds = time.perf_counter() - begin
+        newton, jets, sweeps, split = (int(x) for x in tally)
+        return Outcome(q, v, drift, seconds, newton, jets, sweeps, split, failure)
+
+
+def _tally(segment: Segment) -> NDArray[np.int64]:
+    own = segment.statistics
+    return np.array([own.newton_iterations.sum(), own.jets.sum(), own.sweeps.sum(), own.split_steps])
+
+
+def _arrays(value: Any) -> Iterator[NDArray[Any]]:
+    """All arrays and numbers of nested tuples."""
+    if isinstance(value, tuple):
+        for part in value:
+            yield from _arrays(part)
+    else:
+        yield np.asarray(value)
+
+
+def integrators_of(integrators: Sequence[Integrator] | None) -> tuple[Integrator, ...]:
+    """The integrators to compare.
+
+    Raises:
+        InputError: None is given, one twice, or one that is no integrator.
+    """
+    if integrators is None:
+        return INTEGRATORS
+    members = tuple(integrators)
+    for member in members:
+        if not isinstance(member, Integrator):
+            raise InputError(f"integrators must be varpin's, for example varpin.Midpoint(), got {member!r}")
+    if not members or len(set(map(repr, members))) < len(members):
+        raise InputError("integrators must be one or more, each once")
+    return members
