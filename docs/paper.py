@@ -1,7 +1,7 @@
 """The claims and figures of docs/paper.md, from a folder that ``varpin paper`` wrote.
 
-    varpin paper --out paper
-    python docs/paper.py paper
+varpin paper --out paper
+python docs/paper.py paper
 """
 
 import csv
@@ -14,6 +14,7 @@ FIGURES = ("figure1", "figure2", "figure3", "figure4", "figure5", "truth", "nois
 
 
 def main() -> None:
+    """Rewrite the table and copy the figures."""
     if len(sys.argv) != 2:
         raise SystemExit("usage: paper.py FOLDER")
     folder = Path(sys.argv[1])

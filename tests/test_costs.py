@@ -44,6 +44,7 @@ def smooth_derivatives(t, q, v, u):
 
 
 ROWS = np.random.default_rng(9).normal(size=(N + 1, DOF))
+HELD = np.random.default_rng(10).normal(size=(N, M))
 COSTS = {
     "tracking, scalar, constant": vp.TrackingCost([0.1, 0.2, 0.3], 2.0),
     "tracking, vector, one number": vp.TrackingCost(0.4, [1.0, 0.0, 3.0]),
@@ -58,6 +59,8 @@ COSTS = {
     + vp.VelocityCost(0.3)
     + vp.ControlCost(0.2)
     + vp.CustomCost(smooth, smooth_derivatives),
+    "control, held rows": vp.ControlCost([2.0, 0.5], reference=HELD),
+    "scaled": 3.0 * (vp.TrackingCost(0.1, FULL) + 0.5 * vp.CustomCost(smooth, smooth_derivatives)),
     "terminal": vp.Terminal(vp.TrackingCost(lambda t: [t, 0, 0], FULL) + vp.VelocityCost(0.3)),
 }
 
@@ -111,6 +114,8 @@ def test_values():
         "velocity, vector, rows": quadratic([1.0, 2.0, 3.0], v - middles),
         "control, matrix, function": quadratic([[2.0, 1.0], [1.0, 0.5]], u - np.column_stack([t, -t])),
         "custom, with derivatives": smooth(t, q, v, u),
+        "control, held rows": quadratic([2.0, 0.5], u - HELD),
+        "scaled": 3.0 * quadratic(FULL, q - 0.1) + 1.5 * smooth(t, q, v, u),
     }
     for name, value in expected.items():
         np.testing.assert_allclose(COSTS[name].bind(points()).value(q, v, u), value, rtol=1e-13, err_msg=name)
@@ -123,6 +128,28 @@ def test_references_in_rows_at_nodes_and_at_the_end():
     np.testing.assert_allclose(at_nodes, (ROWS[:-1] ** 2).sum(axis=1), rtol=1e-12)
     end = vp.Terminal(cost).bind(points([0.1 * N])).value(q[:1], v[:1], u[:1])
     np.testing.assert_allclose(end, (ROWS[-1] ** 2).sum(), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("steps", "dt"), [(7, 0.1), (300, 1e-3), (99, 1 / 3)])
+def test_held_control_references(steps, dt):
+    """A row is constant over its step, from the node where it begins on, rounding or not; N + 1 rows stay linear."""
+    rows = np.arange(1.0, steps + 1.0)[:, None] * np.ones(M)
+    zero = np.zeros((steps, DOF))
+    for place in (0.0, 0.5 - np.sqrt(3.0) / 6.0, 0.5, 0.5 + np.sqrt(3.0) / 6.0):
+        at = Points((np.arange(steps) + place) * dt, dt * steps, steps, DOF, M)
+        value = vp.ControlCost(1.0, rows).bind(at).value(zero, zero, np.zeros((steps, M)))
+        np.testing.assert_allclose(value, M * rows[:, 0] ** 2, rtol=1e-15)
+    nodes = np.arange(steps + 1.0)[:, None] * np.ones(M)
+    value = vp.ControlCost(1.0, nodes).bind(at).value(zero, zero, np.zeros((steps, M)))
+    np.testing.assert_allclose(value, M * (np.arange(steps) + place) ** 2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_controls_of_a_solution_are_a_reference(sampling):
+    """They cost nothing where they are followed."""
+    controls = np.random.default_rng(0).normal(size=(20, 2))
+    problem = small(vp.ControlCost(1.0, controls), sampling=sampling)
+    assert problem.cost_of(run(problem, controls)) == 0.0
 
 
 @pytest.mark.parametrize("name", COSTS)
@@ -150,8 +177,29 @@ def test_sums():
     np.testing.assert_allclose(bound.expand(q, v, u).gradient, sum(e.gradient for e in expansions), rtol=0, atol=1e-12)
     np.testing.assert_allclose(bound.expand(q, v, u).hessian, sum(e.hessian for e in expansions), rtol=0, atol=1e-12)
     assert repr(parts[0] + parts[6]) == "TrackingCost(weight=2.0) + ControlCost(weight=1.0)"
-    with pytest.raises(TypeError):
-        parts[0] + 1.0
+    for wrong in (lambda: parts[0] + 1.0, lambda: 1 + parts[0], lambda: "2" * parts[0], lambda: parts[0] * parts[1]):
+        with pytest.raises(TypeError):
+            wrong()
+    assert sum(parts).terms == total.terms
+    assert sum(parts[:1]) is parts[0]
+
+
+def test_scaling():
+    """Of every term, whose kind stays; numbers multiply."""
+    end, track = vp.Terminal(vp.TrackingCost(0.0) + vp.VelocityCost()), vp.TrackingCost(0.0, 2.0)
+    cost = np.float64(2.0) * (track + end)
+    assert repr(2 * vp.ControlCost()) == "2 * ControlCost(weight=1.0)"
+    assert repr(cost * 1) == repr(1 * cost)
+    first, last = cost.terms
+    assert isinstance(last, vp.Terminal)
+    assert len(last.cost.terms) == 2
+    q, v, u = random_points(4)
+    for scaled, own in ((first, track), (last, end)):
+        bound, plain = scaled.bind(points()), own.bind(points())
+        np.testing.assert_allclose(bound.value(q, v, u), 2.0 * plain.value(q, v, u), rtol=1e-14)
+    built_in = vp.solve(small(vp.TrackingCost([1.0, 0.0], 6.0) + vp.ControlCost(0.2) + vp.Terminal(track)))
+    own = vp.solve(small(2.0 * (vp.TrackingCost([1.0, 0.0], 3.0) + vp.ControlCost(0.1) + vp.Terminal(0.5 * track))))
+    np.testing.assert_allclose(own.controls, built_in.controls, rtol=0, atol=1e-12 * np.abs(built_in.controls).max())
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0])
@@ -164,6 +212,83 @@ def test_custom_cost_from_its_value_alone(scale):
     assert np.abs(found.gradient - exact.gradient).max() < 1e-8 * size
     assert np.abs(found.hessian - exact.hessian).max() < 1e-5 * size
     np.testing.assert_array_equal(found.hessian, np.swapaxes(found.hessian, 1, 2))
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-3, 0.1, 1.0])
+@pytest.mark.parametrize("size", [1e-8, 1.0, 1e8])
+def test_derivatives_that_are_right_pass_the_check(scale, size):
+    cost = vp.CustomCost(
+        lambda *z: size * smooth(*z), lambda *z: tuple(size * x for x in smooth_derivatives(*z)), check=True
+    )
+    cost.bind(points()).expand(*random_points(5, scale))
+    target = np.arange(DOF) + 1.0
+    square = vp.CustomCost(
+        lambda t, q, v, u: size * ((q - target) ** 2).sum(axis=1),
+        lambda t, q, v, u: (
+            size * 2 * np.hstack([q - target, np.zeros((N, 5))]),
+            size * 2 * np.diag([1.0] * 3 + [0.0] * 5)[None],
+        ),
+        check=True,
+    )
+    q = np.tile(target, (N, 1))
+    # At its minimum, where value and gradient are zero.
+    square.bind(points()).expand(q, 0 * q, np.zeros((N, M)))
+
+
+@pytest.mark.parametrize(
+    ("order", "where", "message"),
+    [
+        (0, (3, 4), r"mine: gradient\[3, 4\] from derivatives\(t, q, v, u\) is .*, but differences .* at t = 0.35 s"),
+        (1, (2, 1, 6), r"mine: Hessian\[2, 1, 6\] from derivatives"),
+        (1, (0, 7, 7), r"mine: Hessian\[0, 7, 7\] from derivatives"),
+    ],
+)
+def test_check_finds_a_wrong_derivative(order, where, message):
+    """At the first expansion and not after it: it costs as much as leaving the derivatives out."""
+    wrong, calls = [1.0], []
+
+    def derivatives(*z):
+        out = smooth_derivatives(*z)
+        out[order][where] += 1e-3 * wrong[0]
+        if order == 1:
+            out[1][where[0], where[2], where[1]] = out[1][where]
+        return out
+
+    def function(*z):
+        calls.append(1)
+        return smooth(*z)
+
+    bound = vp.CustomCost(function, derivatives, name="mine", check=True).bind(points())
+    with pytest.raises(vp.CostError, match=message):
+        bound.expand(*random_points())
+    wrong[0] = 0.0
+    bound.expand(*random_points())
+    wrong[0], before = 1.0, len(calls)
+    bound.expand(*random_points())
+    assert len(calls) == before > 0
+    vp.CustomCost(smooth, derivatives).bind(points()).expand(*random_points())
+
+
+def test_check_is_not_passed_by_nan():
+    cost = vp.CustomCost(lambda t, q, v, u: t * np.nan, smooth_derivatives, check=True)
+    with pytest.raises(vp.CostError, match="differences of the function give nan"):
+        cost.bind(points()).expand(*random_points())
+
+
+def test_hessians_must_be_symmetric():
+    def derivatives(t, q, v, u):
+        gradient, hessian = smooth_derivatives(t, q, v, u)
+        hessian[4, 6, 1] *= 1.0 + error
+        return gradient, hessian
+
+    bound = vp.CustomCost(smooth, derivatives, name="mine").bind(points())
+    error = 1e-10
+    bound.expand(*random_points())
+    error = 1e-3
+    with pytest.raises(
+        vp.CostError, match=r"mine: the Hessian must be symmetric: Hessian\[4, 1, 6\] is .* and Hessian"
+    ):
+        bound.expand(*random_points())
 
 
 def test_custom_cost_is_the_built_in_one():
@@ -212,7 +337,14 @@ def test_problem_is_an_integral():
         (lambda: vp.TrackingCost("home"), "TrackingCost reference must be an array of real numbers, got 'home'"),
         (lambda: vp.Terminal(vp.ControlCost()), "cannot be a terminal cost: there is no control at the final time"),
         (lambda: vp.Terminal(vp.TrackingCost(0.0) + vp.ControlCost()), "cannot be a terminal cost"),
-        (lambda: vp.Terminal(vp.Terminal(vp.TrackingCost(0.0))), "cannot be a terminal cost"),
+        (lambda: vp.Terminal(2.0 * vp.ControlCost()), "cannot be a terminal cost"),
+        (lambda: vp.Terminal(vp.Terminal(vp.TrackingCost(0.0))), "a terminal cost already: leave the outer Terminal"),
+        (lambda: -1.0 * vp.TrackingCost(0.0), "scaled by a finite number that is not negative, got -1"),
+        (lambda: np.nan * vp.TrackingCost(0.0), "scaled by a finite number that is not negative, got nan"),
+        (lambda: vp.CustomCost(3), r"CustomCost function must be a function of \(t, q, v, u\), got 3"),
+        (lambda: vp.CustomCost(None), "CustomCost function must be a function"),
+        (lambda: vp.CustomCost(smooth, 3.0, name="mine"), "mine derivatives must be a function"),
+        (lambda: small(vp.ControlCost(1.0, np.zeros((19, 2)))), r"nodes, or \(20, 2\): one for each of its steps; got"),
         (lambda: vp.Terminal(1.0), "Terminal takes a cost, got float"),
         (lambda: small(vp.ControlCost([1.0, 1.0, 1.0])), r"must be one number or have 2 rows, got shape \(3,\)"),
         (lambda: small(vp.TrackingCost(0.0, np.eye(3))), r"must be one number or have 2 rows, got shape \(3, 3\)"),

@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -104,6 +105,22 @@ class Cost(ABC):
             return NotImplemented
         return CostSum((*self.terms, *other.terms))
 
+    def __radd__(self, other: int) -> Cost:
+        # The zero that sum() begins with.
+        return self if isinstance(other, int) and other == 0 else NotImplemented
+
+    def __rmul__(self, factor: float) -> Cost:
+        if not isinstance(factor, Real):
+            return NotImplemented
+        factor = float(factor)
+        if not 0.0 <= factor < np.inf:
+            raise InputError(f"a cost can be scaled by a finite number that is not negative, got {factor:g}")
+        # Term by term, so that a terminal cost stays one.
+        scaled = [Terminal(factor * t.cost) if isinstance(t, Terminal) else Scaled(factor, t) for t in self.terms]
+        return scaled[0] if len(scaled) == 1 else CostSum(tuple(scaled))
+
+    __mul__ = __rmul__
+
 
 @dataclass(frozen=True)
 class CostSum(Cost):
@@ -149,6 +166,34 @@ class BoundSum(BoundCost):
         return Expansion(gradient, hessian)
 
 
+@dataclass(frozen=True)
+class Scaled(Cost):
+    """A number times a running cost: ``2.0 * cost``."""
+
+    factor: float
+    cost: Cost
+
+    def bind(self, points: Points) -> BoundCost:
+        """See :meth:`Cost.bind`."""
+        return _BoundScaled(self.factor, self.cost.bind(points))
+
+    def __repr__(self) -> str:
+        return f"{self.factor:g} * {self.cost!r}"
+
+
+@dataclass(frozen=True, eq=False)
+class _BoundScaled(BoundCost):
+    factor: float
+    cost: BoundCost
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        return self.factor * self.cost.value(q, v, u)
+
+    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
+        own = self.cost.expand(q, v, u)
+        return Expansion(self.factor * own.gradient, self.factor * own.hessian)
+
+
 class _Quadratic(Cost):
     """weight . (y - y_r)^2 for one block y of z."""
 
@@ -184,7 +229,8 @@ class _Quadratic(Cost):
         W = self.weight * np.eye(size) if self.weight.ndim < 2 else self.weight
         hessian = np.zeros((1, points.size, points.size))
         hessian[0, begin : begin + size, begin : begin + size] = 2.0 * W
-        return _BoundQuadratic(self.block, begin, sample(name, self.reference, points, size), W, hessian)
+        reference = sample(name, self.reference, points, size, held=self.block == "u")
+        return _BoundQuadratic(self.block, begin, reference, W, hessian)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,12 +288,20 @@ class ControlCost(_Quadratic):
     block = "u"
 
     def __init__(self, weight: ArrayLike = 1.0, reference: Reference = 0.0) -> None:
-        """Describe the cost; see :class:`TrackingCost`, with m controls for n coordinates."""
+        """Describe the cost; see :class:`TrackingCost`, with m controls for n coordinates.
+
+        Args:
+            weight: One number, (m,), or a matrix (m, m), positive semidefinite.
+            reference: u_r: a function of the time [s], a constant, or an array of rows of m: N + 1 of them as there,
+                or N, one for each step and constant over it, as controls are; for example those of another solution.
+        """
         super().__init__(reference, weight)
 
 
-def sample(name: str, reference: Reference, points: Points, size: int) -> Floats:
+def sample(name: str, reference: Reference, points: Points, size: int, *, held: bool = False) -> Floats:
     """A reference at the points, (N, size), or (1, size) where it is constant.
+
+    ``held`` says that an array of it may also have one row for each step, constant over the step.
 
     Raises:
         InputError: Its shape does not fit.
@@ -266,10 +320,16 @@ def sample(name: str, reference: Reference, points: Points, size: int) -> Floats
     array = require_finite(f"{name} reference", as_floats(f"{name} reference", reference))
     if array.ndim < 2 and array.shape in ((), (size,)):
         return np.array(np.broadcast_to(array, (1, size)))
+    if held and array.shape == (points.steps, size):
+        # Rounding must not put a time at a node into the step before it; the end belongs to the last step.
+        step = np.floor(points.t * (points.steps / points.duration) + 1e-6).astype(np.int64)
+        held_rows: Floats = array[np.minimum(step, points.steps - 1)]
+        return held_rows
     if array.shape != (points.steps + 1, size):
+        steps = f", or ({points.steps}, {size}): one for each of its steps" if held else ""
         raise InputError(
             f"{name} reference must be a function of time, have shape ({size},), or ({points.steps + 1}, {size}): one "
-            f"row for each of the problem's nodes; got {array.shape}"
+            f"row for each of the problem's nodes{steps}; got {array.shape}"
         )
     nodes = np.linspace(0.0, points.duration, points.steps + 1)
     return np.column_stack([np.interp(points.t, nodes, column) for column in array.T])
@@ -285,7 +345,9 @@ class Terminal(Cost):
         if not isinstance(self.cost, Cost):
             raise InputError(f"Terminal takes a cost, got {type(self.cost).__name__}")
         for term in self.cost.terms:
-            if isinstance(term, Terminal | ControlCost):
+            if isinstance(term, Terminal):
+                raise InputError(f"{term!r} is a terminal cost already: leave the outer Terminal out")
+            if isinstance(term.cost if isinstance(term, Scaled) else term, ControlCost):
                 raise InputError(f"{term!r} cannot be a terminal cost: there is no control at the final time")
 
     def bind(self, points: Points) -> BoundCost:
@@ -310,22 +372,34 @@ class CustomCost(Cost):
             the function's size where it changes little over a step, so the second derivatives to 1e-5 of it by the
             step's square.
         name: For messages.
+        check: Hold ``derivatives`` against differences when the cost is first expanded.
+
+    Raises:
+        InputError: ``function`` or ``derivatives`` cannot be called.
     """
 
     function: Function
     derivatives: Derivatives | None = None
     step: ArrayLike | None = None
     name: str = "CustomCost"
+    check: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("function", "derivatives"):
+            value = getattr(self, name)
+            if not callable(value) and (value is not None or name == "function"):
+                raise InputError(f"{self.name} {name} must be a function of (t, q, v, u), got {value!r}")
 
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`Cost.bind`."""
-        return _BoundCustom(self, points)
+        return _BoundCustom(self, points, unchecked=self.check)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _BoundCustom(BoundCost):
     cost: CustomCost
     points: Points
+    unchecked: bool
 
     def _call(self, t: Floats, q: Floats, v: Floats, u: Floats) -> Floats:
         try:
@@ -353,7 +427,50 @@ class _BoundCustom(BoundCost):
             hessian = finite_array("the Hessian", hessian, (1, d, d) if hessian.shape == (1, d, d) else (N, d, d))
         except Exception as error:
             raise CostError(self.cost.name, f"derivatives(t, q, v, u) failed: {error}") from error
-        return Expansion(gradient, hessian)
+        given = Expansion(gradient, hessian)
+        self._require_symmetry(hessian)
+        if self.unchecked:
+            self._check(given, np.hstack([q, v, u]))
+            self.unchecked = False
+        return given
+
+    def _require_symmetry(self, hessian: Floats) -> None:
+        gap = np.abs(hessian - np.swapaxes(hessian, 1, 2))
+        off = gap > 1e-8 * np.abs(hessian).max(axis=(1, 2), initial=0.0, keepdims=True)
+        if off.any():
+            j, a, b = np.argwhere(off)[0]
+            raise CostError(
+                self.cost.name,
+                f"the Hessian must be symmetric: Hessian[{j}, {a}, {b}] is {hessian[j, a, b]:.6g} and "
+                f"Hessian[{j}, {b}, {a}] is {hessian[j, b, a]:.6g}",
+            )
+
+    def _check(self, given: Expansion, z: Floats) -> None:
+        """Hold the user's derivatives against differences; the first entry that is off is an error."""
+        found, h = self._differences(z), self._steps(z)
+        first, second = np.abs(found.gradient), np.abs(found.hessian)
+        # What is wrong with the differences themselves goes with the function's size, or with what it varies by where
+        # it is zero, over lengths of 1000 steps.
+        size = np.abs(self._call(self.points.t, *self._blocks(z))).max(initial=0.0)
+        size = max(size, 1e6 * float((second * h[:, None] * h).max(initial=0.0)))
+        for name, derivative, expected, room in (
+            ("gradient", given.gradient, found.gradient, 1e-6 * first.max(axis=0) + 1e-11 * size / h),
+            ("Hessian", given.hessian, found.hessian, 1e-4 * second.max(axis=0) + 1e-12 * size / (h[:, None] * h)),
+        ):
+            own = np.broadcast_to(derivative, expected.shape)
+            # Not "greater": differences that are NaN must not pass.
+            off = ~(np.abs(own - expected) <= room)
+            if off.any():
+                where = tuple(int(i) for i in np.argwhere(off)[0])
+                raise CostError(
+                    self.cost.name,
+                    f"{name}{list(where)} from derivatives(t, q, v, u) is {own[where]:.6g}, but differences of the "
+                    f"function give {expected[where]:.6g}, at t = {self.points.t[where[0]]:.6g} s",
+                )
+
+    def _blocks(self, z: Floats) -> tuple[Floats, Floats, Floats]:
+        n = self.points.dof
+        return z[:, :n], z[:, n : 2 * n], z[:, 2 * n :]
 
     def _steps(self, z: Floats) -> Floats:
         n, d = self.points.dof, self.points.size
@@ -369,10 +486,9 @@ class _BoundCustom(BoundCost):
     def _differences(self, z: Floats) -> Expansion:
         """Central differences: of fourth order for the gradient, of second for the Hessian."""
         N, d = z.shape
-        n = self.points.dof
 
         def at(moved: Floats) -> Floats:
-            return self._call(self.points.t, moved[:, :n], moved[:, n : 2 * n], moved[:, 2 * n :])
+            return self._call(self.points.t, *self._blocks(moved))
 
         size = self._steps(z)
         gradient, hessian = np.empty((N, d)), np.empty((N, d, d))

@@ -162,8 +162,9 @@ def _iterations(cells: Cells) -> Claim:
     return Claim(
         "paper, table 1",
         "The number of algorithm iterations is more predictable when the variational integrator is used.",
-        f"Iterations over all cases and all steps up to 6e-3 s: {text}.",
-        verdict(spread["variational"] <= 2, spread["variational"] <= spread["Euler"]),
+        f"Iterations over all cases and all steps up to 6e-3 s, from rest on the reference: {text}. Both are: here the "
+        "problem is close to a linear-quadratic one.",
+        verdict(spread["variational"] <= 2, spread["variational"] < spread["Euler"]),
     )
 
 
@@ -266,7 +267,7 @@ def _gains(cells: Cells) -> Claim:
     if not slopes:
         text = "too few steps were run to say"
     # The coarsest steps resolve nothing of the finger's boundary layers: the finest three slopes count.
-    good = [float(np.median(own[:3])) >= 1.9 for own, _ in slopes.values()]
+    good = [bool((own[:3] >= 1.9).all()) for own, _ in slopes.values()]
     return Claim(
         "varpin",
         "The feedback gains, referred to the middle of the step, converge as dt^2.",
@@ -295,7 +296,7 @@ def _under_noise(cells: Cells) -> Claim:
         "Where noise matters, S-DDP's policy has a lower expected cost than that of DDP, which knows of no noise, and "
         "its predicted cost is right to 5%.",
         f"In the vertical plane at {cases.NOISY_STEP:g} s, by Monte Carlo: " + "; ".join(rows) + ".",
-        verdict(any(good), all(near)),
+        verdict(*good, all(near)),
     )
 
 
@@ -322,11 +323,10 @@ def _hinge(cells: Cells, setting: Setting, fine: float, coarse: float) -> Claim:
         if fourth is not None:
             text.append(f"fourth order: true cost {fourth.true_cost:.4g}")
         text.append(f"sampled-data optimum {best.true_cost:.4g}")
-        good = [
-            own.true_cost <= other.true_cost,
-            own.true_cost <= 1.1 * best.true_cost,
-            abs(factor["variational"] - 1.0) < abs(factor["Euler"] - 1.0),
-        ]
+        # Being better than Euler is no merit where the plan is of no use.
+        useful = own.true_cost <= 1.1 * best.true_cost and own.status == "CONVERGED"
+        better = own.true_cost <= other.true_cost
+        good = [useful, useful and better, useful and abs(factor["variational"] - 1.0) < abs(factor["Euler"] - 1.0)]
     return Claim(
         "varpin",
         f"The claims do not hinge on what the paper leaves open: {setting.title}.",

@@ -113,7 +113,7 @@ stages, running costs sampled at two points of each step.</p>
 <h2>What the paper leaves open, and what was taken</h2>
 <p>The finger's parameters, its initial state, gravity, friction and the powers of ten of the noise are not in the text.
 Taken: no friction; first controls that hold the finger where it starts; search parameters {html.escape(str(SEARCH))},
-the tolerance relative to the cost; and</p>
+the tolerance relative to the cost; feedback in the line search, where the paper's forward pass is open loop; and</p>
 <ul>{settings}</ul><ul>{noises}</ul>
 <p>Nothing was tuned until a figure looked like the paper's. The optimizer's own cost is what the paper reports. The
 true cost is that of its controls on the continuous system, integrated by a fourth-order method with the substeps
