@@ -25,8 +25,8 @@ _WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 class LinearizationCheck:
     """How far the derivatives of one step are from differences of it.
 
-    Errors and norms are the largest entries, in units of the variables' own sizes: positions in 1 rad or m, momenta in
-    the largest momentum of the step, velocities, controls and increments in 1.
+    Errors and norms are the largest entries, in units of the variables' own sizes: positions in 1 rad or m, each
+    momentum in what moves its joint alone at 1 rad/s or m/s, 1 / (M^-1)_ii, velocities, controls and increments in 1.
 
     Attributes:
         A: Error and norm of dx1/dx0.
@@ -79,8 +79,9 @@ def check_linearization(
     motion = simulate(scene, q, v, dt=dt, steps=1, controls=u, integrator=method)
     lin = linearize(scene, motion, integrator=method)
     second = motion.p[0] if method.variational else v
-    size = np.abs(motion.p).max() if method.variational else 1.0
-    rows = np.concatenate([np.ones(n), np.full(n, size if size > 0.0 else 1.0)])
+    mass = lagrangian_jet(scene, q, np.zeros(n)).Lvv
+    size = 1.0 / np.diag(np.linalg.inv(mass)) if method.variational else np.ones(n)
+    rows = np.concatenate([np.ones(n), size])
 
     def take(x: Floats, control: Floats, dw: Floats) -> Floats:
         velocity = x[n:]
