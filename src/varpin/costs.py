@@ -7,6 +7,7 @@ one's own needs no compiled code.
 
 from __future__ import annotations
 
+import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -308,15 +309,23 @@ def sample(name: str, reference: Reference, points: Points, size: int, *, held: 
         CostError: A function that raises, or returns another shape or values that are not finite.
     """
     if callable(reference):
-        rows = np.empty((len(points.t), size))
-        for j, time in enumerate(points.t):
+        values = []
+        for time in points.t.tolist():
             try:
-                rows[j] = finite_array(f"the reference at t = {time:.6g} s", reference(float(time)), (size,))
-            except InputError as error:
-                raise CostError(name, str(error)) from None
+                values.append(reference(time))
             except Exception as error:
                 raise CostError(name, f"the reference raised {error!r} at t = {time:.6g} s") from error
-        return rows
+        # All at once, as there may be many thousands; one by one only to say which of them is wrong.
+        with contextlib.suppress(ValueError, TypeError, OverflowError):
+            rows = np.array(values)
+            if rows.shape == (len(values), size) and rows.dtype.kind in "fiu" and np.isfinite(rows).all():
+                return np.ascontiguousarray(rows, dtype=np.float64)
+        for time, value in zip(points.t, values, strict=True):
+            try:
+                finite_array(f"the reference at t = {time:.6g} s", value, (size,))
+            except InputError as error:
+                raise CostError(name, str(error)) from None
+        return np.array(values, dtype=np.float64)
     array = require_finite(f"{name} reference", as_floats(f"{name} reference", reference))
     if array.ndim < 2 and array.shape in ((), (size,)):
         return np.array(np.broadcast_to(array, (1, size)))
