@@ -427,7 +427,8 @@ def test_tradeoff_prints_a_table_and_goes_on_where_it_stopped(arm, tmp_path, cap
     options = ["--duration", "0.5", "--dt", "0.05", "0.01", "--q0", "0.3", "--repeats", "1", "--out", str(out)]
     assert main(["tradeoff", arm, *options]) == 0
     printed, err = capsys.readouterr()
-    assert err == ""
+    # On a machine that is new or slow it says that it compiles, and how far it is.
+    assert all("compiling" in line or re.fullmatch(r"varpin: \d+ of \d+ runs", line) for line in err.splitlines())
     for words in ("arm: speed against accuracy over 0.5 s", "RungeKutta4", "Midpoint", "Pareto", "good to"):
         assert words in printed
     assert sorted(path.name for path in out.iterdir()) == [f"tradeoff.{kind}" for kind in ("csv", "html", "npz", "png")]
