@@ -452,7 +452,7 @@ def test_advise_says_what_to_take(arm, capsys):
     options = ["--duration", "0.5", "--q0", "0.3", "--damping", "0.1"]
     assert main(["advise", arm, "--tolerance", "1e-6", *options]) == 0
     out, err = capsys.readouterr()
-    assert err == ""
+    assert all("compiling" in line for line in err.splitlines())
     assert re.match(
         r"\w+.* at dt = \S+ s: error \S+ in .*, the cheapest within an error of 1e-06 in q after 0.5 s\n", out
     )
