@@ -18,19 +18,20 @@ def reference(t: float) -> list[float]:
 
 
 finger = vp.load_robot("finger")
-quiet = vp.Scene(finger, gravity=False)
-noisy = vp.Scene(finger, gravity=False, noise=vp.ControlNoise(0.1))  # the more torque, the more noise
+hanging = [9.81, 0.0, 0.0]  # gravity pulls along the stretched finger
+quiet = vp.Scene(finger, gravity=hanging)
+noisy = vp.Scene(finger, gravity=hanging, noise=vp.ControlNoise(2e-3))  # the more torque, the more noise
 cost = vp.TrackingCost(reference, 10.0) + vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost(reference, 1.0))
-start = {"q0": [0.7, 0.2, -0.1], "v0": [0.0, 0.0, 0.0], "dt": 2e-3, "steps": 750}
+start = {"q0": [1.0, 0.0, 0.0], "v0": [0.0, 0.0, 0.0], "dt": 2e-3, "steps": 750}
 
 problem = vp.OptimalControlProblem(noisy, cost, **start)
 plan = vp.solve(problem)
 print(plan.table())
 
 truth = plan.verify(tolerance=1e-6)
-print(f"cost without noise: planned {truth.planned_cost:.4f}, on the continuous system {truth.closed_loop_cost:.4f}")
+print(f"cost without noise: planned {truth.planned_cost:.3g}, on the continuous system {truth.closed_loop_cost:.3g}")
 sampled = plan.monte_carlo(1000, rng=0)
-print(f"cost under noise: predicted {sampled.predicted:.3f}, found {sampled.cost:.3f} +- {sampled.standard_error:.3f}")
+print(f"cost under noise: predicted {sampled.predicted:.3g}, found {sampled.cost:.3g} +- {sampled.standard_error:.1g}")
 
 unaware = vp.solve(vp.OptimalControlProblem(quiet, cost, **start))
 paths = vp.simulate_ensemble(noisy, **start, controls=unaware.policy, paths=1000, rng=0)

@@ -37,6 +37,8 @@ _LONG, _SHORT = 0.5, 0.01
 _LOST = (CostError, NoiseFieldError, LinearizationError)
 # As much as this does not hide how far an optimum is; controls that do nothing need some.
 _LITTLE = 1e-4
+# Iterations without a decrease worth the name before a search gives up: the cost jumps where guards cut steps.
+_PATIENCE = 15
 # Trials of a line search: 0.25^10 is 1e-6.
 _TRIALS = 10
 
@@ -149,6 +151,7 @@ class _Search:
         self.plan: Plan | None = None
         self.trajectory: Trajectory
         self.cost = np.inf
+        self.merits: list[float] = []  # the best so far, after each iteration
         self.best: tuple[float, float, Trajectory | None] = (np.inf, np.inf, None)
 
     def begin(self, commands: Commands) -> None:
@@ -178,6 +181,7 @@ class _Search:
             merit = self.cost + self.plan.noise
             if merit < self.best[0]:
                 self.best = merit, self.cost, self.trajectory
+            self.merits.append(self.best[0])
             # Where the optimum costs nothing, there is nothing to be relative to but where it began.
             scale = abs(merit) + 1e-9 * abs(first)
             converged = self.plan.promise <= tolerance * scale
@@ -189,6 +193,9 @@ class _Search:
             if converged or len(self.history) >= max_iterations:
                 self._note(callback, started, 0.0, passes, 0)
                 return Status.CONVERGED if converged else Status.MAX_ITERATIONS
+            if len(self.merits) > _PATIENCE and self.merits[-1 - _PATIENCE] - self.merits[-1] <= tolerance * scale:
+                self._note(callback, started, 0.0, passes, 0)
+                return Status.STALLED
             step, trials = self._line_search(merit)
             if step == 0.0 and self.exact:
                 passes += self._plan(exact=False)

@@ -34,8 +34,9 @@ class Status(Enum):
     CONVERGED = "converged"
     MAX_ITERATIONS = "not converged: more iterations may help; go on from this solution with solve(problem, solution)"
     STALLED = (
-        "not converged: no step along the plan lowers the expected cost; a smaller dt, other first controls or a cost "
-        "that weighs the controls more may help"
+        "not converged: no step along the plan lowers the expected cost by more than the tolerance; if what it "
+        "promises is little, that is as far as it goes; else a smaller dt, other first controls, right derivatives of "
+        "a cost of one's own or a cost that weighs the controls more may help"
     )
     INDEFINITE = (
         "not converged: the model of the cost has no minimum in a control, whatever the regularization; give every "
