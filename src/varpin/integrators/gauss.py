@@ -24,7 +24,8 @@ from varpin.trajectory import Trajectory
 Floats = NDArray[np.float64]
 
 MOST_STAGES = 6
-HIGH_ORDER = 0.1  # of the budget of energy errors is enough for more than one stage
+# Of the energy errors that one stage is allowed, what is enough for more: steps of high order seldom need it.
+BALANCE_SHARE, BUDGET_SHARE = 1 / 25, 1 / 250
 
 
 @dataclass(frozen=True)
@@ -43,9 +44,11 @@ class Gauss(Variational):
     Other Args:
         tolerance: As of :class:`Midpoint`, and so are the others.
         branch_margin: Of the stages' mean mass matrix and curvature.
-        energy_balance: Largest error in the energy balance of a substep, in units of the energy it turns over.
-        energy_budget: The errors of all substeps together, in units of the largest kinetic energy so far. More than
-            one stage gets by on a tenth of it: that costs next to no substeps and keeps ten times the energy.
+        energy_balance: Largest error in the energy balance of a substep, in units of the energy it turns over; of more
+            than one stage 1/25 of it is asked.
+        energy_budget: The errors of all substeps together, in units of the largest kinetic energy so far; of more than
+            one stage 1/250 of it is asked. That costs few substeps and keeps fifty times the energy: a chaotic
+            motion gathers its energy error in a few violent moments.
         max_halvings: A step is never cut into more than 2**max_halvings parts.
         kick: When noise kicks the momentum, ``"left"`` or ``"split"``.
     """
@@ -76,7 +79,7 @@ class Gauss(Variational):
         options = self._options(0.5)
         if self.stages == 1:
             return options
-        return options._replace(budget=HIGH_ORDER * options.budget)
+        return options._replace(balance=BALANCE_SHARE * options.balance, budget=BUDGET_SHARE * options.budget)
 
     def _arrays(self, paths: int, dof: int, processes: int) -> tuple[equation.State, stage_equation.Stages]:
         stages = int(self.stages)
