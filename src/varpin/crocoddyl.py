@@ -1,0 +1,203 @@
+"""Problems of varpin for the solvers of crocoddyl: FDDP, BoxFDDP and their callbacks on the variational map.
+
+Needs crocoddyl, which is built against one version of Pinocchio: ``pip install "varpin[crocoddyl]"``.
+
+    from varpin.crocoddyl import shooting_problem, first_guess, policy_of
+
+    solver = crocoddyl.SolverFDDP(shooting_problem(problem))
+    solver.solve(*first_guess(problem))
+    plan = varpin.solve(problem, policy_of(problem, solver), max_iterations=0)
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.errors import InputError, VarpinError
+from varpin.integrators.base import open_loop
+from varpin.lagrangian import lagrangian_jet
+from varpin.linearization import linearize_steps, velocity_at_nodes
+from varpin.policy import LinearPolicy
+from varpin.problem import OptimalControlProblem, bind_cost
+from varpin.sddp import states
+from varpin.simulation import StepFailure, rollout
+from varpin.trajectory import Trajectory
+
+try:
+    import crocoddyl
+except ImportError as missing:
+    raise ImportError(
+        f"varpin.crocoddyl needs crocoddyl ({missing}): pip install 'varpin[crocoddyl]', "
+        "in an environment of its own, as it brings the Pinocchio that it was built against"
+    ) from missing
+
+Floats = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
+
+class StepModel(crocoddyl.ActionModelAbstract):
+    """Step ``step`` of a problem, its running cost included, as an action of crocoddyl.
+
+    The state is (q, p) for variational integrators and (q, v) for the others, (2n,); ``Fx`` and ``Fu`` are the exact
+    derivatives of the step that is taken, second derivatives of the cost those of Gauss and Newton. Noise does not act.
+    A step that cannot be solved ends in NaN, on which crocoddyl's line search shortens its step, and is logged.
+    """
+
+    def __init__(self, problem: OptimalControlProblem, step: int) -> None:
+        n, m = problem.scene.robot.dof, problem.scene.controls
+        super().__init__(crocoddyl.StateVector(2 * n), m, 0)
+        self._problem = problem
+        samples = len(problem.rule)
+        times = problem.running.points.t[step * samples : (step + 1) * samples]
+        self._running, _ = bind_cost(problem.cost, times, problem.duration, problem.steps, n, m)
+        self._known: tuple[Floats, Floats, Trajectory] | None = None
+
+    def calc(self, data: Any, x: Floats, u: Floats | None = None) -> None:
+        """The next state and the cost of the step."""
+        problem = self._problem
+        control = np.zeros(problem.scene.controls) if u is None else u
+        motion = self._step(x, control)
+        if motion is None:
+            data.xnext, data.cost = np.full(x.size, np.nan), np.inf
+            return
+        data.xnext = states(problem, motion)[1]
+        samples = problem.samples(motion.q, motion.v, control[None])
+        data.cost = self._weight * float(self._running.value(*samples).sum())
+
+    def calcDiff(self, data: Any, x: Floats, u: Floats | None = None) -> None:  # crocoddyl's name
+        """Derivatives of the next state and of the cost."""
+        problem = self._problem
+        scene, n, m = problem.scene, problem.scene.robot.dof, problem.scene.controls
+        control = np.zeros(m) if u is None else u
+        motion = self._step(x, control)
+        if motion is None:
+            raise VarpinError("a step that cannot be solved has no derivatives")
+        lin = linearize_steps(scene, motion, problem.integrator, problem.q0)
+        A, B = lin.A[0], lin.B[0]
+        # Rates of q0, v0, q1, v1 in (x, u).
+        before, after = np.eye(2 * n, 2 * n + m), np.hstack([A, B])
+        nodes = [before[:n], before[n:], after[:n], after[n:]]
+        if problem.integrator.variational:
+            velocity = velocity_at_nodes(scene, motion.q, motion.v)
+            nodes[1], nodes[3] = velocity[0] @ before, velocity[1] @ after
+        own = self._running.expand(*problem.samples(motion.q, motion.v, control[None]))
+        gradient, hessian = np.zeros(2 * n + m), np.zeros((2 * n + m, 2 * n + m))
+        for i, row in enumerate(problem.rule):
+            J = np.vstack(
+                [sum(row[begin + c] * node for c, node in enumerate(nodes)) for begin in (1, 5)]
+                + [np.eye(m, 2 * n + m, 2 * n)]
+            )
+            gradient += self._weight * J.T @ own.gradient[i]
+            hessian += self._weight * J.T @ own.hessian[min(i, len(own.hessian) - 1)] @ J
+        data.Fx, data.Fu = A, B
+        data.Lx, data.Lu = gradient[: 2 * n], gradient[2 * n :]
+        data.Lxx, data.Lxu, data.Luu = hessian[: 2 * n, : 2 * n], hessian[: 2 * n, 2 * n :], hessian[2 * n :, 2 * n :]
+
+    @property
+    def _weight(self) -> float:
+        # Every rule weighs its samples alike.
+        return float(self._problem.dt * self._problem.rule[0, 0])
+
+    def _step(self, x: Floats, u: Floats) -> Trajectory | None:
+        """The step from x under u; the last one is remembered, as crocoddyl asks for its derivatives next."""
+        if self._known is not None and np.array_equal(self._known[0], x) and np.array_equal(self._known[1], u):
+            return self._known[2]
+        problem = self._problem
+        q, v = _configuration_and_velocity(problem, x)
+        if not (np.isfinite(q).all() and np.isfinite(v).all() and np.isfinite(u).all()):
+            return None
+        motion, failure = rollout(problem.scene, problem.integrator, q, v, open_loop(u[None]), problem.dt)
+        if failure is not None:
+            logger.warning("a step cannot be solved: %s", failure.reason)
+            return None
+        self._known = x.copy(), u.copy(), motion
+        return motion
+
+
+class EndModel(crocoddyl.ActionModelAbstract):
+    """The terminal cost of a problem."""
+
+    def __init__(self, problem: OptimalControlProblem) -> None:
+        super().__init__(crocoddyl.StateVector(2 * problem.scene.robot.dof), 0, 0)
+        self._problem = problem
+
+    def calc(self, data: Any, x: Floats, u: Floats | None = None) -> None:  # noqa: ARG002
+        """The terminal cost."""
+        data.xnext = x
+        q, v = _configuration_and_velocity(self._problem, x)
+        data.cost = float(self._problem.terminal.value(q[None], v[None], self._no_control)[0])
+
+    def calcDiff(self, data: Any, x: Floats, u: Floats | None = None) -> None:  # noqa: ARG002
+        """Its derivatives."""
+        n, scene = self._problem.scene.robot.dof, self._problem.scene
+        q, v = _configuration_and_velocity(self._problem, x)
+        own = self._problem.terminal.expand(q[None], v[None], self._no_control)
+        J = np.eye(2 * n)
+        if self._problem.integrator.variational:
+            J[n:] = velocity_at_nodes(scene, q[None], v[None])[0]
+        data.Fx = np.eye(2 * n)
+        data.Lx = J.T @ own.gradient[0, : 2 * n]
+        data.Lxx = J.T @ own.hessian[0, : 2 * n, : 2 * n] @ J
+
+    @property
+    def _no_control(self) -> Floats:
+        return np.zeros((1, self._problem.scene.controls))
+
+
+def shooting_problem(problem: OptimalControlProblem) -> crocoddyl.ShootingProblem:
+    """The problem as crocoddyl's: one action a step, and the terminal cost.
+
+    The actions are Python objects, so leave ``nthreads`` at 1.
+
+    Raises:
+        InputError: Controls that are held over several steps.
+    """
+    if problem.hold != 1:
+        raise InputError(f"crocoddyl decides at every step; the problem holds its controls over {problem.hold}")
+    x0 = _state(problem, problem.q0, problem.v0)
+    return crocoddyl.ShootingProblem(x0, [StepModel(problem, k) for k in range(problem.steps)], EndModel(problem))
+
+
+def first_guess(problem: OptimalControlProblem) -> tuple[list[Floats], list[Floats]]:
+    """States and controls, ``xs`` and ``us``, of the motion that :func:`varpin.solve` starts from.
+
+    Raises:
+        StepFailure: That motion cannot be integrated.
+    """
+    n, m, variational = problem.scene.robot.dof, problem.scene.controls, problem.integrator.variational
+    commands = problem.holding_policy().commands(problem.steps, m, n, variational)
+    motion, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, problem.dt)
+    if failure is not None:
+        raise StepFailure(motion.steps, motion.t[-1], failure, motion)
+    return list(states(problem, motion)), list(motion.u)
+
+
+def policy_of(problem: OptimalControlProblem, solver: Any) -> LinearPolicy:
+    """Controls and feedback of a crocoddyl solver that has solved ``shooting_problem(problem)``: us - K (x - xs)."""
+    gains: Sequence[Floats] = solver.K
+    return LinearPolicy(
+        np.array(solver.us.tolist()),
+        -np.array(gains.tolist() if hasattr(gains, "tolist") else gains),
+        np.array(solver.xs.tolist())[:-1],
+        on="momentum" if problem.integrator.variational else "velocity",
+    )
+
+
+def _state(problem: OptimalControlProblem, q: Floats, v: Floats) -> Floats:
+    second = lagrangian_jet(problem.scene, q, v).Lv if problem.integrator.variational else v
+    return np.concatenate([q, second])
+
+
+def _configuration_and_velocity(problem: OptimalControlProblem, x: Floats) -> tuple[Floats, Floats]:
+    n = problem.scene.robot.dof
+    q, second = x[:n].copy(), x[n:].copy()
+    if not problem.integrator.variational or not np.isfinite(x).all():
+        return q, second
+    v = np.asarray(np.linalg.solve(lagrangian_jet(problem.scene, q, np.zeros(n)).Lvv, second), dtype=np.float64)
+    return q, v

@@ -1,0 +1,124 @@
+"""Crocoddyl's solvers on varpin's steps find what varpin's own finds. Needs ``pip install "varpin[crocoddyl]"``."""
+
+import numpy as np
+import pytest
+
+import varpin as vp
+
+crocoddyl = pytest.importorskip("crocoddyl", reason="in an environment of its own: pip install 'varpin[crocoddyl]'")
+
+from varpin.crocoddyl import first_guess, policy_of, shooting_problem  # noqa: E402
+
+WAVE = np.array([0.3, 0.2, -0.1, 0.2, 0.1, -0.3])
+
+
+def reach(integrator, sampling="midpoint", steps=25):
+    robot = vp.load_robot("ur5")
+    begin = np.array([0.0, -1.5, 0.8, -0.5, 0.0, 0.0])
+    scene = vp.Scene(robot, damping=0.1)
+    hold = -vp.lagrangian_jet(scene, begin, np.zeros(6)).Lq
+    cost = vp.ControlCost(1e-3, reference=hold) + vp.VelocityCost(1e-2)
+    cost += vp.TrackingCost(lambda t: begin + WAVE * np.sin(6.0 * t), 1.0)
+    cost += vp.Terminal(vp.TrackingCost(begin + WAVE, 1e2) + vp.VelocityCost(1.0))
+    return vp.OptimalControlProblem(
+        scene, cost, begin, np.zeros(6), dt=0.5 / steps, steps=steps, integrator=integrator, sampling=sampling
+    )
+
+
+PROBLEMS = {
+    "midpoint": lambda: reach(vp.Midpoint()),
+    "gauss": lambda: reach(vp.Gauss(2), "gauss", 10),
+    "start": lambda: reach(vp.Midpoint(), "start"),
+    "euler": lambda: reach(vp.SemiImplicitEuler()),
+}
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_derivatives_of_a_step(name):
+    """Against central differences of the same step."""
+    problem = PROBLEMS[name]()
+    shooting = shooting_problem(problem)
+    xs, us = first_guess(problem)
+    model, k = shooting.runningModels[3], 3
+    rng = np.random.default_rng(0)
+    x, u = xs[k] + 0.1 * rng.normal(size=12), us[k] + rng.normal(size=6)
+    data = model.createData()
+    model.calc(data, x, u)
+    model.calcDiff(data, x, u)
+
+    def step(z):
+        other = model.createData()
+        model.calc(other, z[:12], z[12:])
+        return np.append(other.xnext, other.cost)
+
+    z, size = np.append(x, u), 1e-5
+    numeric = np.array([(step(z + size * e) - step(z - size * e)) / (2 * size) for e in np.eye(18)]).T
+    exact = np.hstack([data.Fx, data.Fu])
+    np.testing.assert_allclose(exact, numeric[:12], rtol=0, atol=2e-8 * np.abs(exact).max())
+    gradient = np.append(data.Lx, data.Lu)
+    np.testing.assert_allclose(gradient, numeric[12], rtol=0, atol=1e-7 * np.abs(gradient).max())
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_cost_of_a_motion(name):
+    problem = PROBLEMS[name]()
+    xs, us = first_guess(problem)
+    motion = vp.solve(problem, max_iterations=0).trajectory
+    np.testing.assert_allclose(us, motion.u, rtol=1e-12)
+    assert shooting_problem(problem).calc(xs, us) == pytest.approx(problem.cost_of(motion), rel=1e-10)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_fddp_finds_the_same_optimum(name):
+    problem = PROBLEMS[name]()
+    own = vp.solve(problem, tolerance=1e-12)
+    solver = crocoddyl.SolverFDDP(shooting_problem(problem))
+    solver.th_stop = 1e-12
+    # What it adds to the second derivatives of the cost to go is 1e-9 by default, and shows in the gains.
+    solver.reg_min = 1e-14
+    logger = crocoddyl.CallbackLogger()
+    solver.setCallbacks([logger])
+    assert solver.solve(*first_guess(problem), 100)
+    assert solver.cost == pytest.approx(own.cost, rel=1e-8)
+    np.testing.assert_allclose(np.array(solver.us.tolist()), own.trajectory.u, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(-np.array(solver.K.tolist()), own.gains, rtol=0, atol=1e-5 * np.abs(own.gains).max())
+    assert len(logger.costs) == solver.iter + 1
+
+
+def test_a_solution_of_crocoddyl_goes_on_as_one_of_varpin():
+    problem = PROBLEMS["gauss"]()
+    solver = crocoddyl.SolverFDDP(shooting_problem(problem))
+    solver.solve(*first_guess(problem), 100)
+    plan = vp.solve(problem, policy_of(problem, solver), max_iterations=0)
+    assert plan.cost == pytest.approx(solver.cost, rel=1e-9)
+    assert plan.verify(tolerance=1e-8).closed_loop_cost == pytest.approx(plan.cost, rel=0.01)
+
+
+def test_box_fddp_keeps_bounds():
+    problem = PROBLEMS["midpoint"]()
+    shooting = shooting_problem(problem)
+    free = crocoddyl.SolverFDDP(shooting)
+    free.solve(*first_guess(problem), 100)
+    most = 0.8 * np.abs(np.array(free.us.tolist())).max(axis=0)
+    for model in shooting.runningModels:
+        model.u_lb, model.u_ub = -most, most
+    boxed = crocoddyl.SolverBoxFDDP(shooting)
+    xs, us = first_guess(problem)
+    boxed.solve(xs, [np.clip(u, -most, most) for u in us], 200)
+    assert (np.abs(np.array(boxed.us.tolist())) <= most + 1e-9).all()
+    assert boxed.cost > free.cost
+
+
+def test_held_controls_are_refused():
+    problem = PROBLEMS["midpoint"]().at(hold=5)
+    with pytest.raises(vp.InputError, match="holds its controls over 5"):
+        shooting_problem(problem)
+
+
+def test_a_step_that_fails_shortens_the_line_search(caplog):
+    problem = PROBLEMS["midpoint"]()
+    model = shooting_problem(problem).runningModels[0]
+    data = model.createData()
+    model.calc(data, np.full(12, np.nan), np.zeros(6))
+    assert np.isnan(data.xnext).all()
+    assert data.cost == np.inf
