@@ -346,7 +346,14 @@ def sample(name: str, reference: Reference, points: Points, size: int, *, held: 
 
 @dataclass(frozen=True)
 class Terminal(Cost):
-    """A cost at the final time instead of its integral: ``Terminal(TrackingCost(...))``."""
+    """A cost at the final time instead of its integral: ``Terminal(TrackingCost(...))``.
+
+    Attributes:
+        cost: The argument: any cost, a sum too, but no ``ControlCost``, since there is no control at the final time.
+
+    Raises:
+        InputError: It is no cost, is terminal already, or holds a ``ControlCost``.
+    """
 
     cost: Cost
 
@@ -372,6 +379,8 @@ Derivatives = Callable[[Floats, Floats, Floats, Floats], tuple[ArrayLike, ArrayL
 class CustomCost(Cost):
     """A cost of one's own, evaluated at many points at once.
 
+        near = vp.CustomCost(lambda t, q, v, u: np.exp(-((q[:, 0] - 0.3) ** 2) / 0.01), name="keep away")
+
     Attributes:
         function: Takes t (N,), q (N, n), v (N, n) and u (N, m); returns (N,).
         derivatives: Takes the same; returns gradient (N, 2n + m) and Hessian (N, 2n + m, 2n + m) in z = (q, v, u).
@@ -392,6 +401,10 @@ class CustomCost(Cost):
     step: ArrayLike | None = None
     name: str = "CustomCost"
     check: bool = False
+
+    def __repr__(self) -> str:
+        own = getattr(self.function, "__name__", type(self.function).__name__)
+        return f"CustomCost({own})" if self.name == "CustomCost" else f"CustomCost({self.name!r})"
 
     def __post_init__(self) -> None:
         for name in ("function", "derivatives"):

@@ -226,7 +226,7 @@ def simulate(
     commands = commands_of(scene, integrator, *given)
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
     _warn_of_ringing(scene, q0, dt)
-    with announced_compilation():
+    with announced_compilation(f"simulate with {type(integrator).__name__}"):
         state, (start,) = integrator.start(scene, q0[None], v0[None])
         record = _Record(scene, integrator, dt, steps, dw, start)
         chunk = max(1, _CHUNK // n)
