@@ -877,6 +877,26 @@ def test_interrupted():
     sol.policy  # noqa: B018  it can be used
 
 
+def test_a_cost_of_nothing_is_an_optimum_also_where_the_controls_are_not_unique():
+    """A goal alone: many controls reach it, so the model needs regularization, and none does better than nothing."""
+    goal = vp.Terminal(vp.TrackingCost([0.3, 0.1]))
+    problem = vp.OptimalControlProblem(
+        vp.Scene(vp.planar_chain(2), gravity=False), goal, np.zeros(2), np.zeros(2), dt=0.01, steps=50
+    )
+    sol = vp.solve(problem)
+    assert sol.status is vp.Status.CONVERGED
+    assert sol.cost < 1e-16 * 0.1
+    assert sol.iterations < 10
+    there = problem.at(q0=[0.3, 0.1])
+    assert vp.solve(there, np.zeros(2)).status is vp.Status.CONVERGED
+    assert vp.solve(there, np.zeros(2)).iterations == 0
+    # A cost of one's own may go below nothing, and where it starts at 0 that is no optimum.
+    below = vp.CustomCost(lambda t, q, v, u: u[:, 0] + (u**2).sum(axis=1))
+    own = vp.solve(small(below), np.zeros(2))
+    assert not below.nonnegative
+    assert own.cost < -0.1 * own.problem.duration
+
+
 def test_no_minimum():
     """Controls that do nothing and cost nothing have no best value."""
     for actuation, cost in (([[0.0], [0.0]], vp.TrackingCost(0.0)), (None, vp.TrackingCost(0.0))):

@@ -101,6 +101,11 @@ class Cost(ABC):
         """What it is a sum of."""
         return (self,)
 
+    @property
+    def nonnegative(self) -> bool:
+        """Whether it is known never to be below zero: a motion that costs nothing is then an optimum."""
+        return False
+
     def __add__(self, other: Cost) -> CostSum:
         if not isinstance(other, Cost):
             return NotImplemented
@@ -133,6 +138,11 @@ class CostSum(Cost):
     def terms(self) -> tuple[Cost, ...]:
         """See :attr:`Cost.terms`."""
         return self.parts
+
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`Cost.nonnegative`."""
+        return all(part.nonnegative for part in self.parts)
 
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`Cost.bind`."""
@@ -173,6 +183,11 @@ class Scaled(Cost):
 
     factor: float
     cost: Cost
+
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`Cost.nonnegative`."""
+        return self.cost.nonnegative
 
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`Cost.bind`."""
@@ -219,6 +234,11 @@ class _Quadratic(Cost):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(weight={self.weight.tolist()})"
+
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`Cost.nonnegative`."""
+        return True
 
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`Cost.bind`."""
@@ -365,6 +385,11 @@ class Terminal(Cost):
                 raise InputError(f"{term!r} is a terminal cost already: leave the outer Terminal out")
             if isinstance(term.cost if isinstance(term, Scaled) else term, ControlCost):
                 raise InputError(f"{term!r} cannot be a terminal cost: there is no control at the final time")
+
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`Cost.nonnegative`."""
+        return self.cost.nonnegative
 
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`Cost.bind`; the points must be the one at the end."""

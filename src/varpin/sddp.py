@@ -212,11 +212,13 @@ class _Search:
             self.merits.append(self.best[0])
             # Where the optimum costs nothing, there is nothing to be relative to but where it began.
             scale = abs(merit) + 1e-9 * abs(first)
-            converged = self.plan.promise <= tolerance * scale
+            # Without costs on the controls the model may need regularization to have a minimum even there.
+            nothing = self.problem.cost.nonnegative and merit <= tolerance * scale
+            converged = nothing or self.plan.promise <= tolerance * scale
             if converged and self.regularization > 0.0:
                 # Regularization makes promises smaller; it must not pass for an optimum.
                 plan, least = self._least_regularized()
-                if plan is not None and least <= _LITTLE and plan.promise <= tolerance * scale:
+                if plan is not None and (nothing or (least <= _LITTLE and plan.promise <= tolerance * scale)):
                     self.plan = plan
                 else:
                     converged = False
