@@ -92,13 +92,13 @@ def _shielded(word: str) -> str:
 
 
 def _not_an_option(words: Sequence[str], parser: argparse.ArgumentParser) -> str:
-    """What is wrong with words that no option takes, and the options they come close to."""
+    """What is wrong with words that no option takes, and the options they come closest to."""
     known = [name for action in parser._actions for name in action.option_strings]
-    message = f"unrecognized arguments: {' '.join(words)}"
+    message = f"unrecognized arguments: {' '.join(word.strip() for word in words)}"
     for word in words:
         name = word.partition("=")[0]
-        if name.startswith("--") and (matches := difflib.get_close_matches(name, known, n=2)):
-            message += f"; did you mean {' or '.join(matches)} for {name}?"
+        if name.startswith("--") and (matches := difflib.get_close_matches(name, known, n=1)):
+            message += f"; did you mean {matches[0]} for {name}?"
     return message
 
 

@@ -144,10 +144,10 @@ class Verification:
         return "\n".join(
             [
                 *lines,
-                f"a step is off by {self.defect:.2e} rad or m at most; the costs are good to {good}, relative "
+                f"a step is off by {self.defect:.2e} rad or m at most; costs are good to {good} of themselves "
                 f"({self.substeps} substeps a step)",
-                "read it so: costs are true ones, on the continuous robot without noise; a loss of a few percent means "
-                "that the plan holds, a large one that dt is too coarse for it",
+                "read it so: with a loss of some percent the plan holds on the continuous robot; if large, dt is too "
+                "coarse",
             ]
         )
 
@@ -193,8 +193,8 @@ class MonteCarlo:
                 f"{'simulated':16}{self.cost:14.6e} +- {self.standard_error:.1e} ({self.paths} paths{lost})",
                 f"{'predicted':16}{self.predicted:14.6e}",
                 f"{'difference':16}{gap:+14.6e} ({_percent(_excess(self.cost, self.predicted))}{apart})",
-                "read it so: +- is the standard error; within two or three of them simulation and prediction agree, "
-                "beyond them the noise is too strong for the solver's model, or dt too coarse",
+                "read it so: within three standard errors (+-) the two agree; beyond, noise is too strong for the "
+                "model",
             ]
         )
 
