@@ -229,8 +229,8 @@ def simulate(
     given = (None, 0) if callable(controls) else (controls, steps)
     commands = commands_of(scene, integrator, *given)
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
-    _warn_of_ringing(scene, q0, dt)
     with announced_compilation(f"simulate with {type(integrator).__name__}"):
+        _warn_of_ringing(scene, q0, dt)
         state, (start,) = integrator.start(scene, q0[None], v0[None])
         record = _Record(scene, integrator, dt, steps, dw, start)
         chunk = max(1, _CHUNK // n)

@@ -146,8 +146,8 @@ class Verification:
                 *lines,
                 f"a step is off by {self.defect:.2e} rad or m at most; costs are good to {good} of themselves "
                 f"({self.substeps} substeps a step)",
-                "read it so: with a loss of some percent the plan holds on the continuous robot; if large, dt is too "
-                "coarse",
+                "read it so: where feedback loses some percent, the plan holds; where it loses much, dt is too coarse "
+                "(controls alone also lose much where a motion is unstable)",
             ]
         )
 
