@@ -3,19 +3,23 @@
 import io
 import logging
 import re
+import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
 from rich.console import Console
 
 import varpin as vp
+import varpin_command
 from varpin import cli
 from varpin.cli import main
 from varpin.paper import Reproduction
 from varpin.paper.claims import Claim
 from varpin.robot import load_robot
+from varpin.tradeoff.setting import Setting
 
 ROD = '<mass value="1"/><origin xyz="0.5 0 0"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.083" iyz="0" izz="0.083"/>'
 
@@ -38,6 +42,13 @@ def error_of(capsys):
     assert out == ""
     (line,) = err.splitlines()
     return line
+
+
+@pytest.fixture(autouse=True, scope="session")
+def compiled():
+    """Kernels that are there already: a new machine says that it compiles."""
+    motion = vp.simulate(vp.Scene(vp.planar_chain(2), damping=0.1), np.zeros(2), np.zeros(2), dt=1e-3, steps=1)
+    assert motion.steps == 1
 
 
 def usage_error(arguments, capsys):
@@ -138,8 +149,49 @@ def test_split_steps_are_flagged_in_the_table_and_warned_of(arm, capsys):
 def test_forced_motion_has_an_energy_change_and_no_error(arm, capsys):
     assert main(["simulate", arm, "--steps", "10", "--torque", "1"]) == 0
     out = capsys.readouterr().out
-    assert "energy change" in out
+    assert re.search(r"energy change +│ \+\S+ J from start to end, \S+ J at most in between", out)
     assert "energy error" not in out
+    assert "s, without compiling" in out
+
+
+def test_wall_time_leaves_compilation_out(arm, capsys, monkeypatch):
+    monkeypatch.setattr(Setting, "warm_up", lambda *_: time.sleep(1.0))
+    begin = time.perf_counter()
+    assert main(["simulate", arm, "--steps", "10"]) == 0
+    elapsed = time.perf_counter() - begin
+    shown = float(re.search(r"wall time +│ (\S+) s, without compiling", capsys.readouterr().out)[1])
+    assert shown < 1.01 * (elapsed - 1.0)
+
+
+def test_a_run_needs_nothing_compiled_that_warming_up_does_not():
+    """Kernels are compiled, or loaded, once for each kind of arguments they meet."""
+    code = """
+import numpy as np, varpin as vp
+from varpin.kernels import jet, midpoint
+from varpin.tradeoff.setting import Setting
+
+scene, rest, torque = vp.Scene(vp.planar_chain(2), damping=0.1), np.zeros(2), np.ones(2)
+kernels = midpoint.rollout, midpoint.begin_paths, jet.lagrangian_sweep
+signatures = lambda: [len(kernel.signatures) for kernel in kernels]
+Setting.of(scene, rest, rest, torque, 1e-3).warm_up(vp.Midpoint())
+vp.lagrangian_jet(scene, rest, rest)
+before = signatures()
+vp.simulate(scene, rest, rest, dt=1e-3, steps=3, controls=torque)
+vp.simulate(scene, rest, rest, dt=1e-3, steps=3)
+assert min(before) > 0
+assert before == signatures(), (before, signatures())
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=False, timeout=300, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_energy_of_a_damped_motion_is_what_it_lost(arm, tmp_path, capsys):
+    path = tmp_path / "a.npz"
+    assert main(["simulate", arm, "--damping", "0.5", "--no-gravity", "--v0", "1", "--save", str(path)]) == 0
+    energy = vp.Trajectory.load(path).energy
+    lost = float(re.search(r"energy change +│ (\S+) J from start to end", capsys.readouterr().out)[1])
+    assert lost == pytest.approx(energy[-1] - energy[0], rel=5e-3)
+    assert lost < 0.0
 
 
 @pytest.mark.parametrize(
@@ -187,7 +239,14 @@ def test_unknown_robot_gets_close_matches(capsys, command):
         (["simulate", "finger", "--steps", "1.5"], "argument --steps: invalid int value: '1.5'"),
         (["simulate", "finger", "--steps", "1", "--duration", "1"], "not allowed with argument --steps"),
         (["simulate", "finger", "--no-gravity", "--gravity", "0", "0", "-1"], "not allowed with argument"),
-        (["simulate", "finger", "--dur", "1"], "unrecognized arguments: --dur"),
+        (["simulate", "finger", "--dur", "1"], "unrecognized arguments: --dur 1"),
+        (
+            ["simulate", "finger", "--stifness", "0.5", "-1e-3"],
+            "varpin simulate: error: unrecognized arguments: --stifness 0.5 -1e-3; did you mean --stiffness for "
+            "--stifness?",
+        ),
+        (["inspect", "ur5", "--packagedir=x"], "did you mean --package-dir for --packagedir?"),
+        (["robots", "ur5"], "varpin robots: error: unrecognized arguments: ur5"),
     ],
 )
 def test_usage_errors_are_argparses_and_status_2(capsys, arguments, message):
@@ -322,6 +381,28 @@ def test_inspect_prints_tables_and_then_warnings(capsys):
     assert "warning: joint 'panda_joint7' is locked at 0.5" in lines
 
 
+def test_inspect_takes_a_curvature_of_rounding_for_none(capsys):
+    """A UR5 at rest at 0 has gravity along its axes but for 1.5708: seconds by the ten thousand are no advice."""
+    assert vp.inspect_robot("ur5").largest_step > 1e4
+    assert main(["inspect", "ur5"]) == 0
+    assert "any: nothing is unstable at this q, at rest (" in capsys.readouterr().out
+    assert main(["inspect", "ur5", "--q", "-1.2", "--v", "1"]) == 0
+    step = vp.inspect_robot("ur5", q=-1.2, v=1.0).largest_step
+    assert 0.0 < step < 1.0
+    assert f"{step:.3g} s at this q, and this v (" in capsys.readouterr().out
+
+
+def test_robots_are_listed_with_their_joints(capsys):
+    assert main(["robots"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    rows = dict(re.findall(r"^│ (\S+) +│ (\d+) +│$", out, flags=re.MULTILINE))
+    assert tuple(rows) == vp.robot_names()
+    assert rows["finger"] == "3"
+    assert rows["ur5"] == "6"
+    assert rows["panda"] == str(load_robot("panda").dof) == "8"
+
+
 def test_inspect_takes_what_simulate_refuses(tmp_path, capsys):
     path = tmp_path / "empty.urdf"
     path.write_text(
@@ -411,6 +492,30 @@ def test_process_reports_a_mistake_without_a_traceback():
     assert done.stdout == ""
     assert done.stderr.startswith("varpin: error: no robot or URDF file 'nobody.urdf' (looked in ")
     assert "Traceback" not in done.stderr
+
+
+def test_interruption_while_python_imports_is_no_traceback():
+    code = """
+import importlib.abc, os, signal, sys, varpin_command
+
+class Interrupt(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == "numba":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupt())
+varpin_command.main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=False, timeout=300, capture_output=True, text=True)
+    assert done.returncode == -signal.SIGINT
+    assert done.stderr == ""
+
+
+def test_installed_command_leaves_ctrl_c_to_the_command_line(monkeypatch):
+    """What a run does at Ctrl-C is its own matter again once everything is imported."""
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(cli, "main", lambda: int(signal.getsignal(signal.SIGINT) is before))
+    assert varpin_command.main() == 1
 
 
 def test_plain_run_imports_neither_matplotlib_nor_meshcat(arm):

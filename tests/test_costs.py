@@ -404,3 +404,40 @@ def test_semidefinite_weights_are_taken():
     a = np.array([[0.1], [0.3], [-0.7]])
     vp.TrackingCost(0.0, a @ a.T)
     vp.TrackingCost(0.0, 0.0)
+
+
+def test_cost_of_refuses_what_is_no_motion_of_the_problem():
+    scene = vp.Scene(vp.planar_chain(2))
+    problem = vp.OptimalControlProblem(scene, vp.ControlCost(), [0, 0], [0, 0], dt=0.1, steps=3)
+    for wrong in (None, np.zeros((4, 2))):
+        with pytest.raises(vp.InputError, match=r"the motion must be a varpin\.Trajectory"):
+            problem.cost_of(wrong)
+    other = vp.simulate(vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=0.1, steps=3)
+    with pytest.raises(vp.InputError, match=r"the trajectory is of joints .*; the scene's robot has"):
+        problem.cost_of(other)
+    driven = vp.Scene(vp.planar_chain(2), actuation=[[1.0], [0.0]])
+    with pytest.raises(vp.InputError, match="the trajectory has 1 controls, the scene 2"):
+        problem.cost_of(vp.simulate(driven, [0, 0], [0, 0], dt=0.1, steps=3))
+
+
+def test_costs_print_in_a_line():
+    def near_the_wall(t, q, v, u):
+        return q[:, 0] ** 2
+
+    assert repr(vp.CustomCost(near_the_wall)) == "CustomCost(near_the_wall)"
+    assert repr(vp.CustomCost(near_the_wall, name="wall")) == "CustomCost('wall')"
+    total = 2.0 * vp.CustomCost(near_the_wall) + vp.Terminal(vp.TrackingCost([0.0]))
+    assert repr(total) == "2 * CustomCost(near_the_wall) + Terminal(cost=TrackingCost(weight=1.0))"
+
+
+@pytest.mark.parametrize(
+    "name", ["EnsembleStatistics", "PathFailure", "Integrator", "Points", "BoundCost", "Expansion", "Choice"]
+)
+def test_types_that_users_meet_have_public_names(name):
+    assert isinstance(getattr(vp, name), type)
+
+
+def test_help_of_the_problem_lists_every_cost():
+    costs = [name for name in vars(vp) if name.endswith("Cost") and name not in ("Cost", "BoundCost")]
+    for name in (*costs, "Terminal", "Midpoint()"):
+        assert f"``{name}" in vp.OptimalControlProblem.__doc__, name

@@ -72,7 +72,7 @@ def used(tmp_path_factory) -> tuple[Copy, dict, str]:
 def test_first_run_compiles_and_says_so(used):
     _, report, stderr = used
     assert report["compilations"] > 0
-    assert stderr.count("compiling varpin's kernels; this happens once") == 1
+    assert stderr.count("compiling varpin's kernels for ") == 2  # one for each feature
     assert report["energy"] == pytest.approx(-report["L"], rel=1e-14)
 
 
@@ -106,7 +106,7 @@ def test_works_where_nothing_can_be_cached(used, tmp_path):
     report, stderr = copy.run(HOME="/proc", XDG_CACHE_HOME="/proc")
     assert report["compilations"] > 0
     assert report["energy"] == first["energy"]
-    assert stderr.count("compiling varpin's kernels") == 1
+    assert stderr.count("compiling varpin's kernels for ") == 2
     assert not list(tmp_path.rglob("*.nbi"))
 
 
@@ -128,9 +128,14 @@ def test_announces_only_compilations_within(caplog):
     with caplog.at_level(logging.WARNING, logger="varpin"):
         _compile.inlined(work)(1)
         assert not caplog.records
-        with _compile.announced_compilation():
+        with _compile.announced_compilation("a feature"):
             fresh = _compile.inlined(work)
             fresh(1)
-            fresh(1.0)
-    assert [record.name for record in caplog.records] == ["varpin.kernels._compile"]
-    assert "this happens once" in caplog.text
+            # What a feature uses is its own.
+            with _compile.announced_compilation("another"):
+                fresh(1.0)
+        with _compile.announced_compilation("a third"):
+            fresh(1j)
+    assert [record.name for record in caplog.records] == ["varpin.kernels._compile"] * 2
+    assert [record.args for record in caplog.records] == [("a feature",), ("a third",)]
+    assert "once on this machine" in caplog.text

@@ -17,7 +17,7 @@ def blocks(language):
 
 
 def test_there_are_only_blocks_that_are_run():
-    assert {kind for kind, _ in BLOCKS} == {"python", "bash"}
+    assert {kind for kind, _ in BLOCKS} == {"python", "bash", "text"}
     assert len(blocks("bash")) == 2
 
 
@@ -29,6 +29,12 @@ def test_python_block(number, tmp_path):
     assert done.returncode == 0, done.stderr
     if "replay" in blocks("python")[number]:
         assert list(tmp_path.glob("*.html"))
+    if "verify" in blocks("python")[number]:
+        begin = done.stdout.index("                          cost")
+        for found, shown in zip(done.stdout[begin:].split(), blocks("text")[0].split(), strict=False):
+            assert found == shown or float(found) == pytest.approx(float(shown), rel=0.5)
+        costs = [float(found) for found in re.findall(r" (\d\.\d{6}e-06)", done.stdout[begin:])[:3]]
+        assert costs == pytest.approx([float(x) for x in re.findall(r" (\d\.\d{6}e-06)", blocks("text")[0])], rel=1e-3)
 
 
 def test_main_command(tmp_path):

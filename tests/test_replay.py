@@ -402,8 +402,49 @@ def test_a_missing_mesh_falls_back_with_a_warning_that_names_it(tmp_path, caplog
     with caplog.at_level(logging.WARNING, logger="varpin.replay"):
         path = replay(robot, [[0.0], [1.0]], dt=0.1, html=tmp_path / "arm.html")
     assert "no_such_mesh.stl" in caplog.text
-    assert "drawing a skeleton of its joints and centres of mass instead" in caplog.text
+    assert "drawing a skeleton of link 'rod' instead" in caplog.text
     assert any("skeleton" in command.get("path", "") for command in commands(path))
+
+
+def test_a_missing_mesh_costs_its_link_alone(tmp_path, caplog):
+    """Of a box, an unreadable rod and a ball, the rod alone is drawn as a skeleton."""
+
+    def shown(shape):
+        return f"<visual><geometry>{shape}</geometry></visual>"
+
+    def hinge(name, parent, child):
+        return (
+            f'<joint name="{name}" type="continuous"><origin xyz="1 0 0"/><parent link="{parent}"/>'
+            f'<child link="{child}"/><axis xyz="0 1 0"/></joint>'
+        )
+
+    inertial = (
+        '<inertial><mass value="1"/><origin xyz="0.5 0 0"/>'
+        '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    )
+    shapes = {
+        "box": '<box size="1 1 1"/>',
+        "rod": '<mesh filename="no_such_mesh.stl"/>',
+        "ball": '<sphere radius="0.2"/>',
+    }
+    links = "".join(f'<link name="{name}">{inertial}{shown(shape)}</link>' for name, shape in shapes.items())
+    joints = hinge("first", "base", "box") + hinge("second", "box", "rod") + hinge("third", "rod", "ball")
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(f'<robot name="arm"><link name="base"/>{links}{joints}</robot>')
+    for lock in ({}, {"second": 0.5}):
+        caplog.clear()
+        robot = vp.load_robot(urdf, lock=lock)
+        with caplog.at_level(logging.WARNING, logger="varpin.replay"):
+            path = replay(robot, np.zeros((2, robot.dof)), dt=0.1, html=tmp_path / "arm.html")
+        assert len(caplog.records) == 1
+        assert "no_such_mesh.stl" in caplog.text
+        drawn = [command["path"] for command in commands(path) if command["type"] == "set_object"]
+        own = [p for p in drawn if "/shapes/" in p and "skeleton" not in p]
+        assert len(own) == 2
+        joint = "second" if not lock else "first"  # locked, the rod is a part of the box's body
+        bones = [p for p in drawn if "skeleton" in p]
+        assert bones
+        assert {p.split("/moving/shapes/")[0].rpartition("/")[2] for p in bones} == {joint}
 
 
 def test_a_mesh_pinocchio_cannot_send_is_drawn_in_one_colour(tmp_path, caplog, monkeypatch):

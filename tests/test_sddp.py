@@ -1,5 +1,6 @@
 """S-DDP against a plain Riccati recursion, scipy, differences of the rolled-out cost, and brute force."""
 
+import re
 import tracemalloc
 from itertools import pairwise
 
@@ -836,6 +837,30 @@ def test_maximal_iterations():
     assert more.cost == pytest.approx(vp.solve(problem, tolerance=1e-12).cost, rel=1e-11)
 
 
+def test_progress_comes_after_each_iteration():
+    seen = []
+    sol = vp.solve(reach_problem(0.02), max_iterations=50, progress=lambda *now: seen.append(now))
+    assert seen == [(k + 1, 50) for k in range(len(sol.history))]
+    seen.clear()
+    vp.solve(reach_problem(0.02), max_iterations=1, progress=lambda *now: seen.append(now))
+    assert set(seen) == {(1, 1)}
+    with pytest.raises(vp.InputError, match="progress must be a function"):
+        vp.solve(small(), progress=True)
+
+
+def test_reason_gives_the_numbers_behind_the_status():
+    sol = vp.solve(reach_problem(0.02), tolerance=1e-6)
+    assert sol.status is vp.Status.CONVERGED
+    promise, tolerance = (float(part) for part in re.findall(r"\d\.\de[+-]\d\d", sol.reason))
+    assert promise == pytest.approx(sol.history[-1].promised_decrease, rel=0.06)
+    assert tolerance == pytest.approx(1e-6 * sol.cost, rel=0.06)
+    assert promise <= tolerance
+    short = vp.solve(reach_problem(0.02), max_iterations=1)
+    promise, tolerance = (float(part) for part in re.findall(r"\d\.\de[+-]\d\d", short.reason))
+    assert short.status is vp.Status.MAX_ITERATIONS
+    assert promise > tolerance
+
+
 def test_interrupted():
     problem = reach_problem(0.02)
 
@@ -848,7 +873,28 @@ def test_interrupted():
     assert sol.cost == problem.cost_of(sol.trajectory)
     assert sol.cost == vp.solve(problem, max_iterations=2).cost
     assert len(sol.history) == 2
+    assert sol.reason == "in iteration 2"
     sol.policy  # noqa: B018  it can be used
+
+
+def test_a_cost_of_nothing_is_an_optimum_also_where_the_controls_are_not_unique():
+    """A goal alone: many controls reach it, so the model needs regularization, and none does better than nothing."""
+    goal = vp.Terminal(vp.TrackingCost([0.3, 0.1]))
+    problem = vp.OptimalControlProblem(
+        vp.Scene(vp.planar_chain(2), gravity=False), goal, np.zeros(2), np.zeros(2), dt=0.01, steps=50
+    )
+    sol = vp.solve(problem)
+    assert sol.status is vp.Status.CONVERGED
+    assert sol.cost < 1e-16 * 0.1
+    assert sol.iterations < 10
+    there = problem.at(q0=[0.3, 0.1])
+    assert vp.solve(there, np.zeros(2)).status is vp.Status.CONVERGED
+    assert vp.solve(there, np.zeros(2)).iterations == 0
+    # A cost of one's own may go below nothing, and where it starts at 0 that is no optimum.
+    below = vp.CustomCost(lambda t, q, v, u: u[:, 0] + (u**2).sum(axis=1))
+    own = vp.solve(small(below), np.zeros(2))
+    assert not below.nonnegative
+    assert own.cost < -0.1 * own.problem.duration
 
 
 def test_no_minimum():
@@ -936,9 +982,14 @@ def test_history_and_callback():
     assert sol.iterations == sum(item.rollouts > 0 for item in seen)
     assert seen[-1].gradient == np.abs(sol.gradient).max()
     lines = sol.table().splitlines()
-    assert lines[0].split() == ["iter", "cost", "noise", "cost", "promise", "grad", "reg", "step", "rolls"]
-    assert len(lines) == len(seen) + 2
-    assert lines[-1] == sol.status.value
+    assert lines[0].split() == ["iter", "cost", "noise", "cost", "promise", "decrease", "grad", "reg", "step", "rolls"]
+    assert all(len(line) == len(lines[0]) for line in lines[: len(seen) + 1])
+    assert lines[len(seen) + 1 :] == [sol.status.value, f"({sol.reason})"]
+    for column in ("cost", "noise cost", "promise", "decrease", "grad", "reg", "step", "rolls"):
+        assert f"\n    {column:11}" in vp.Solution.__doc__
+    # Without noise what a step brings is the difference of two motions' costs.
+    assert [item.decrease for item in seen[1:]] == pytest.approx([a - b for a, b in pairwise(costs)])
+    assert seen[-1].decrease == 0.0
     # On a linear-quadratic problem the promise is kept.
     first = vp.solve(small(), max_iterations=1).history[0]
     before = vp.solve(small(), max_iterations=0).cost

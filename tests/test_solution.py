@@ -202,9 +202,39 @@ def test_monte_carlo_that_cannot_be():
     for paths in (1, 0, 2.5):
         with pytest.raises(vp.InputError, match="paths must be"):
             sol.monte_carlo(paths, 0)
+
+
+def test_monte_carlo_of_noise_of_ones_own_draws_the_same_paths():
+    compiled = vp.solve(small(noise=vp.AdditiveNoise(0.1)))
     own = vp.CustomNoise(lambda q, v, u: 0.1 * np.eye(2), 2)
-    with pytest.raises(vp.InputError):
-        vp.solve(small(noise=own)).monte_carlo(10, 0)
+    found = dataclasses.replace(compiled, problem=small(noise=own)).monte_carlo(6, 3)
+    expected = compiled.monte_carlo(6, 3)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-12)
+    assert found.standard_error == pytest.approx(expected.standard_error, rel=1e-9)
+    assert found.paths == 6
+
+
+def test_monte_carlo_interrupted_holds_the_paths_done():
+    sol, seen = vp.solve(small(noise=vp.AdditiveNoise(0.3))), []
+
+    def stop(done, paths):
+        seen.append((done, paths))
+        if done >= 64:
+            raise KeyboardInterrupt
+
+    with pytest.raises(vp.MonteCarloInterrupted, match="after 64 paths") as caught:
+        sol.monte_carlo(200, 5, workers=1, progress=stop)
+    assert seen == [(32, 200), (64, 200)]
+    assert caught.value.result == sol.monte_carlo(64, 5, workers=2)
+    own = vp.CustomNoise(lambda q, v, u: 0.1 * np.eye(2), 2)
+
+    def stop_at_once(done, paths):
+        raise KeyboardInterrupt
+
+    # One path has no standard error.
+    with pytest.raises(vp.MonteCarloInterrupted, match="after 0 paths") as caught:
+        vp.solve(small(noise=own)).monte_carlo(5, 0, progress=stop_at_once)
+    assert caught.value.result is None
 
 
 def noisy_reach(name, intensity):
@@ -293,6 +323,33 @@ def test_what_it_prints():
     assert "converged" in repr(noisy)
     assert "noise" not in repr(vp.solve(small()))
     np.testing.assert_array_equal(run(noisy.problem, noisy.controls).q, noisy.trajectory.q)
+
+
+def test_verification_prints_a_table_with_the_loss_in_percent():
+    found = vp.Verification(2.0, 2.5, 2.02, 0.125, 0.25, 1e-3, 8, 3e-11)
+    head, planned, alone, fed, *rest = str(found).splitlines()
+    assert head.split() == ["cost", "loss", "end", "off", "by", "[rad", "or", "m]"]
+    assert planned.split() == ["planned", "2.000000e+00"]
+    assert alone.split() == ["controls", "alone", "2.500000e+00", "+25.00", "%", "1.25e-01"]
+    assert fed.split() == ["with", "feedback", "2.020000e+00", "+1.00", "%", "2.50e-01"]
+    assert "1.00e-03 rad or m" in rest[0]
+    assert "good to 3e-11" in rest[0]
+    assert rest[1].startswith("read it so: ")
+    assert (found.open_loop_loss, found.closed_loop_loss) == (pytest.approx(0.25), pytest.approx(0.01))
+    lost = vp.Verification(2.0, np.nan, np.nan, np.nan, np.nan, 1e-3, 8, np.inf)
+    assert str(lost).count("runs away") == 2
+    assert "nan" not in str(lost)
+    assert "inf" not in str(lost)
+    # Nothing is a part of a cost of nothing.
+    assert "+0.00 %" in str(vp.Verification(0.0, 0.0, 1e-9, 0.0, 0.0, 0.0, 4, 0.0))
+
+
+def test_monte_carlo_prints_how_far_it_is_from_the_prediction():
+    text = str(vp.MonteCarlo(cost=1.1, standard_error=0.05, predicted=1.0, paths=197, failures=3))
+    assert "1.100000e+00 +- 5.0e-02 (197 paths; 3 more ran away" in text
+    assert "+10.00 %, +2.0 standard errors" in text
+    assert text.splitlines()[-1].startswith("read it so: ")
+    assert "standard errors)" not in str(vp.MonteCarlo(1.0, 0.0, 1.0, 2, 0))
 
 
 def test_a_policy_is_refused_by_integrators_on_the_other_state_and_turned_where_it_can_be():

@@ -11,15 +11,20 @@ Load an arm, integrate it variationally, replay it:
 """
 
 from varpin._version import __version__ as __version__
+from varpin.costs import BoundCost as BoundCost
 from varpin.costs import ControlCost as ControlCost
 from varpin.costs import Cost as Cost
 from varpin.costs import CostError as CostError
 from varpin.costs import CustomCost as CustomCost
+from varpin.costs import Expansion as Expansion
+from varpin.costs import Points as Points
 from varpin.costs import Terminal as Terminal
 from varpin.costs import TrackingCost as TrackingCost
 from varpin.costs import VelocityCost as VelocityCost
 from varpin.ensemble import Ensemble as Ensemble
 from varpin.ensemble import EnsembleInterrupted as EnsembleInterrupted
+from varpin.ensemble import EnsembleStatistics as EnsembleStatistics
+from varpin.ensemble import PathFailure as PathFailure
 from varpin.ensemble import simulate_ensemble as simulate_ensemble
 from varpin.errors import FileError as FileError
 from varpin.errors import InputError as InputError
@@ -30,10 +35,13 @@ from varpin.errors import SingularMassMatrix as SingularMassMatrix
 from varpin.errors import UnknownJoint as UnknownJoint
 from varpin.errors import UnsupportedJoint as UnsupportedJoint
 from varpin.errors import VarpinError as VarpinError
+from varpin.inspection import JointReport as JointReport
+from varpin.inspection import LinkReport as LinkReport
 from varpin.inspection import RobotReport as RobotReport
 from varpin.inspection import inspect_robot as inspect_robot
 from varpin.integrators import ExplicitEuler as ExplicitEuler
 from varpin.integrators import Gauss as Gauss
+from varpin.integrators import Integrator as Integrator
 from varpin.integrators import Midpoint as Midpoint
 from varpin.integrators import Reference as Reference
 from varpin.integrators import RungeKutta4 as RungeKutta4
@@ -62,6 +70,7 @@ from varpin.replay import replay as replay
 from varpin.robot import Robot as Robot
 from varpin.robot import load_robot as load_robot
 from varpin.robot import planar_chain as planar_chain
+from varpin.robot import robot_names as robot_names
 from varpin.scene import Scene as Scene
 from varpin.sddp import solve as solve
 from varpin.simulation import ControlError as ControlError
@@ -71,13 +80,18 @@ from varpin.simulation import StepFailure as StepFailure
 from varpin.simulation import simulate as simulate
 from varpin.solution import Iteration as Iteration
 from varpin.solution import MonteCarlo as MonteCarlo
+from varpin.solution import MonteCarloInterrupted as MonteCarloInterrupted
 from varpin.solution import Solution as Solution
 from varpin.solution import Status as Status
 from varpin.solution import Verification as Verification
 from varpin.tradeoff import Advice as Advice
+from varpin.tradeoff import Choice as Choice
+from varpin.tradeoff import OptimalControlRun as OptimalControlRun
 from varpin.tradeoff import OptimalControlTradeoff as OptimalControlTradeoff
 from varpin.tradeoff import WorkPrecision as WorkPrecision
+from varpin.tradeoff import WorkPrecisionRun as WorkPrecisionRun
 from varpin.tradeoff import advise as advise
 from varpin.tradeoff import optimal_control_tradeoff as optimal_control_tradeoff
 from varpin.tradeoff import work_precision as work_precision
+from varpin.trajectory import StepStatistics as StepStatistics
 from varpin.trajectory import Trajectory as Trajectory

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import logging
 import math
 import sys
@@ -29,11 +30,13 @@ from varpin.checks import count, positive, writable
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.inspection import JointReport, RobotReport, inspect_robot
 from varpin.integrators import Midpoint
+from varpin.lagrangian import lagrangian_jet
 from varpin.replay import replay
-from varpin.robot import Robot, load_robot
+from varpin.robot import Robot, build_robot, load_robot, robot_names
 from varpin.scene import Scene
 from varpin.simulation import Interrupted, StepFailure, simulate
 from varpin.tradeoff import advise, work_precision
+from varpin.tradeoff.setting import Setting
 from varpin.trajectory import Trajectory, atomic_file
 
 MISTAKE, STEP_FAILED, INTERRUPTED = 2, 3, 130
@@ -41,6 +44,8 @@ MISTAKE, STEP_FAILED, INTERRUPTED = 2, 3, 130
 PLOT_FORMATS = (".png", ".pdf", ".svg")
 # More steps than anyone can hold in memory, said before NumPy says it in its own words.
 MOST_STEPS = 10**9
+# The largest step is no limit beyond this [s].
+_ANY_STEP = 100.0
 # Width of tables in a pipe or a file, which have none of their own.
 _WIDTH = 140
 
@@ -49,6 +54,7 @@ examples:
   varpin simulate finger --q0 0.5 0.3 0.2 --v0 0 0 1 --no-gravity --html finger.html
   varpin simulate panda --lock panda_finger_joint1=0.02 --q0 -0.5 --duration 5 --save fall.npz --plot fall.png
   varpin simulate arm.urdf --dt 5e-4 --steps 4000 --damping 0.1 --torque 1 -2.5e-1
+  varpin robots
   varpin inspect ur5 --q 0 -1.2 1 0 0 0
   varpin advise ur5 --tolerance 1e-6 --duration 1
   varpin tradeoff ur5 --duration 1 --out ur5-tradeoff
@@ -58,7 +64,9 @@ examples:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line ``arguments``, those of the process if left out, and return the exit status."""
     words = sys.argv[1:] if arguments is None else arguments
-    request = _parser().parse_args([_shielded(word) for word in words])
+    request, unknown = _parser().parse_known_args([_shielded(word) for word in words])
+    if unknown:
+        request.parser.error(_not_an_option(unknown, request.parser))
     errors = Console(stderr=True)
     run: Callable[[argparse.Namespace, Console], int] = request.run
     try:
@@ -84,6 +92,17 @@ def _shielded(word: str) -> str:
     return f" {word}" if word.startswith("-") else word
 
 
+def _not_an_option(words: Sequence[str], parser: argparse.ArgumentParser) -> str:
+    """What is wrong with words that no option takes, and the options they come closest to."""
+    known = [name for action in parser._actions for name in action.option_strings]
+    message = f"unrecognized arguments: {' '.join(word.strip() for word in words)}"
+    for word in words:
+        name = word.partition("=")[0]
+        if name.startswith("--") and (matches := difflib.get_close_matches(name, known, n=1)):
+            message += f"; did you mean {matches[0]} for {name}?"
+    return message
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="varpin",
@@ -95,10 +114,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"varpin {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_simulate(commands.add_parser("simulate", help="integrate a robot in time", allow_abbrev=False))
+    _add_robots(commands.add_parser("robots", help="list the robots that go by a name", allow_abbrev=False))
     _add_inspect(commands.add_parser("inspect", help="look into a robot description", allow_abbrev=False))
     _add_tradeoff(commands.add_parser("tradeoff", help="measure speed against accuracy", allow_abbrev=False))
     _add_advise(commands.add_parser("advise", help="find the cheapest integrator and step", allow_abbrev=False))
     _add_paper(commands.add_parser("paper", help="reproduce the paper's experiments", allow_abbrev=False))
+    for command in commands.choices.values():
+        command.set_defaults(parser=command)
     return parser
 
 
@@ -147,6 +169,14 @@ def _add_inspect(parser: argparse.ArgumentParser) -> None:
     _add_vector(parser, "q", "configuration to look at [rad or m]; default: 0")
     _add_vector(parser, "v", "velocity there [rad/s or m/s]; default: 0")
     _add_gravity(parser)
+
+
+def _add_robots(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "List the robots that every command takes by name: those that come with varpin, and the fixed-base ones of the "
+        "installed example-robot-data."
+    )
+    parser.set_defaults(run=_robots, log_level=logging.ERROR)
 
 
 def _add_tradeoff(parser: argparse.ArgumentParser) -> None:
@@ -354,6 +384,10 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
     steps = _steps(request)
     scene, q0, v0, torque = _motion(request)
     robot = scene.robot
+    integrator = Midpoint(alpha=request.alpha)
+    # Compilation is no part of the wall time; damping is looked at through the jet.
+    Setting.of(scene, q0, v0, torque, request.dt).warm_up(integrator)
+    lagrangian_jet(scene, q0, np.zeros(robot.dof))
     status, complaint, begin = 0, "", time.perf_counter()
     try:
         with _progress(errors, steps, quiet=request.quiet) as progress:
@@ -364,7 +398,7 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
                 dt=request.dt,
                 steps=steps,
                 controls=torque,
-                integrator=Midpoint(alpha=request.alpha),
+                integrator=integrator,
                 progress=progress,
             )
     except Interrupted as interruption:
@@ -417,7 +451,7 @@ def _summary(
     statistics, steps = trajectory.statistics, trajectory.steps
     of = f" of {asked}" if steps < asked else ""
     _row(table, "steps", f"{steps}{of}, {trajectory.dt:g} s each, {trajectory.duration:g} s in all")
-    _row(table, "wall time", f"{wall_time:.3g} s, loading of kernels included")
+    _row(table, "wall time", f"{wall_time:.3g} s, without compiling")
     if steps:
         newton, split = statistics.newton_iterations, statistics.split_steps
         _row(table, "Newton iterations", f"{newton.mean():.2f} a step, {newton.max()} at most")
@@ -434,8 +468,14 @@ def _summary(
         _row(table, "smallest branch margin", f"{statistics.branch_margin.min():.3g} (1 for dt -> 0, refused at 0)")
     drift = np.abs(trajectory.energy - trajectory.energy[0]).max()
     kinetic = 0.5 * (trajectory.p * trajectory.v).sum(axis=1).max()
-    share = f", {drift / kinetic:.2g} of the largest kinetic energy" if kinetic > 0.0 else ""
-    _row(table, "energy change" if driven else "energy error", f"{drift:.3g} J at most{share}")
+    if driven:
+        change = trajectory.energy[-1] - trajectory.energy[0]
+        _row(table, "energy change", f"{change:+.3g} J from start to end, {drift:.3g} J at most in between")
+    else:
+        part = drift / kinetic if kinetic > 0.0 else 0.0
+        share = f"{part:.2g} of" if part < 1.0 else f"{part:.3g} times"
+        of_kinetic = f", {share} the largest kinetic energy" if part > 0.0 else ""
+        _row(table, "energy error", f"{drift:.3g} J at most{of_kinetic}")
     lower, upper = robot.position_limits
     outside = np.any((trajectory.q < lower) | (trajectory.q > upper), axis=0)
     if outside.any():
@@ -563,6 +603,16 @@ def _paper(request: argparse.Namespace, errors: Console) -> int:
     return 0
 
 
+def _robots(_request: argparse.Namespace, _errors: Console) -> int:
+    table = _table("Robots", ("name", "joints"))
+    for name in robot_names():
+        _row(table, name, str(build_robot(name).dof))
+    console = Console() if sys.stdout.isatty() else Console(width=_WIDTH)
+    console.print(table)
+    _say(console, "joints without those that mimic others; --lock holds some still", prefix="")
+    return 0
+
+
 def _one_or_all(numbers: Sequence[float] | None) -> ArrayLike | None:
     return numbers[0] if numbers is not None and len(numbers) == 1 else numbers
 
@@ -624,11 +674,9 @@ def _report_table(report: RobotReport) -> Table:
     _row(table, "condition of M(q)", f"{report.condition:.3g}; {report.scaled_condition:.3g} with a unit diagonal")
     step = "undefined: the mass matrix is singular"
     if report.largest_step is not None:
-        step = (
-            "any: no direction is unstable here"
-            if math.isinf(report.largest_step)
-            else f"{report.largest_step:.3g} s at this q"
-        )
+        # A description's own rounding, a frame turned by 1.5708, makes directions unstable that are not.
+        step = "any: nothing is unstable" if report.largest_step > _ANY_STEP else f"{report.largest_step:.3g} s"
+        step += f" at this q, {'at rest' if not report.v.any() else 'and this v'}"
     _row(table, "largest step accepted", f"{step} (branch margin {report.branch_margin:g}; says nothing of accuracy)")
     return table
 

@@ -101,6 +101,11 @@ class Cost(ABC):
         """What it is a sum of."""
         return (self,)
 
+    @property
+    def nonnegative(self) -> bool:
+        """Whether it is known never to be below zero: a motion that costs nothing is then an optimum."""
+        return False
+
     def __add__(self, other: Cost) -> CostSum:
         if not isinstance(other, Cost):
             return NotImplemented
@@ -133,6 +138,11 @@ class CostSum(Cost):
     def terms(self) -> tuple[Cost, ...]:
         """See :attr:`Cost.terms`."""
         return self.parts
+
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`Cost.nonnegative`."""
+        return all(part.nonnegative for part in self.parts)
 
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`Cost.bind`."""
@@ -173,6 +183,11 @@ class Scaled(Cost):
 
     factor: float
     cost: Cost
+
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`Cost.nonnegative`."""
+        return self.cost.nonnegative
 
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`Cost.bind`."""
@@ -219,6 +234,11 @@ class _Quadratic(Cost):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(weight={self.weight.tolist()})"
+
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`Cost.nonnegative`."""
+        return True
 
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`Cost.bind`."""
@@ -346,7 +366,14 @@ def sample(name: str, reference: Reference, points: Points, size: int, *, held: 
 
 @dataclass(frozen=True)
 class Terminal(Cost):
-    """A cost at the final time instead of its integral: ``Terminal(TrackingCost(...))``."""
+    """A cost at the final time instead of its integral: ``Terminal(TrackingCost(...))``.
+
+    Attributes:
+        cost: The argument: any cost, a sum too, but no ``ControlCost``, since there is no control at the final time.
+
+    Raises:
+        InputError: It is no cost, is terminal already, or holds a ``ControlCost``.
+    """
 
     cost: Cost
 
@@ -358,6 +385,11 @@ class Terminal(Cost):
                 raise InputError(f"{term!r} is a terminal cost already: leave the outer Terminal out")
             if isinstance(term.cost if isinstance(term, Scaled) else term, ControlCost):
                 raise InputError(f"{term!r} cannot be a terminal cost: there is no control at the final time")
+
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`Cost.nonnegative`."""
+        return self.cost.nonnegative
 
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`Cost.bind`; the points must be the one at the end."""
@@ -371,6 +403,8 @@ Derivatives = Callable[[Floats, Floats, Floats, Floats], tuple[ArrayLike, ArrayL
 @dataclass(frozen=True)
 class CustomCost(Cost):
     """A cost of one's own, evaluated at many points at once.
+
+        near = vp.CustomCost(lambda t, q, v, u: np.exp(-((q[:, 0] - 0.3) ** 2) / 0.01), name="keep away")
 
     Attributes:
         function: Takes t (N,), q (N, n), v (N, n) and u (N, m); returns (N,).
@@ -392,6 +426,10 @@ class CustomCost(Cost):
     step: ArrayLike | None = None
     name: str = "CustomCost"
     check: bool = False
+
+    def __repr__(self) -> str:
+        own = getattr(self.function, "__name__", type(self.function).__name__)
+        return f"CustomCost({own})" if self.name == "CustomCost" else f"CustomCost({self.name!r})"
 
     def __post_init__(self) -> None:
         for name in ("function", "derivatives"):

@@ -167,7 +167,8 @@ def simulate_ensemble(
     block = min(steps, _BLOCK // (paths * (2 * n + 1)))
     block = max(1, block // commands.hold) * commands.hold
     collector = _Collector(steps, block, levels, run, store)
-    with announced_compilation(), ThreadPoolExecutor(workers) as pool:
+    feature = f"simulate_ensemble with {type(integrator).__name__}"
+    with announced_compilation(feature), ThreadPoolExecutor(workers) as pool:
         try:
             run.begin(collector, pool)
             for begin in range(0, steps, block):

@@ -11,12 +11,13 @@ from varpin.checks import as_floats, finite_array
 from varpin.errors import InputError, LinearizationError
 from varpin.integrators import Integrator, Midpoint
 from varpin.integrators.base import diffusion_and_drift, open_loop
+from varpin.kernels._compile import announced_compilation
 from varpin.kernels.jet import jets
 from varpin.kernels.jet_tangent import momentum_curvatures, new_tangent
 from varpin.kernels.tree import new_sweep
 from varpin.noise import Fields
 from varpin.scene import Scene, require_scene
-from varpin.trajectory import Trajectory
+from varpin.trajectory import Trajectory, require_motion
 
 Floats = NDArray[np.float64]
 
@@ -85,7 +86,8 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     require_scene(scene)
     integrator = Midpoint() if integrator is None else integrator
     _require_match(scene, trajectory, integrator)
-    return linearize_steps(scene, trajectory, integrator, trajectory.q[0])
+    with announced_compilation(f"linearize with {type(integrator).__name__}"):
+        return linearize_steps(scene, trajectory, integrator, trajectory.q[0])
 
 
 def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator, first: Floats) -> Linearization:
@@ -184,7 +186,8 @@ def second_order(
     rows = as_floats("z", z)
     if rows.shape == (2 * n,):
         rows = np.tile(rows, (steps, 1))
-    return second_order_steps(scene, trajectory, finite_array("z", rows, (steps, 2 * n)), integrator)
+    with announced_compilation(f"second_order with {type(integrator).__name__}"):
+        return second_order_steps(scene, trajectory, finite_array("z", rows, (steps, 2 * n)), integrator)
 
 
 def second_order_steps(scene: Scene, trajectory: Trajectory, z: Floats, integrator: Integrator) -> Curvature:
@@ -337,19 +340,11 @@ def _quiet_ends(scene: Scene, trajectory: Trajectory, integrator: Integrator, fi
 
 
 def _require_match(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> None:
-    if trajectory.joint_names != scene.robot.joint_names:
-        raise InputError(
-            f"the trajectory is of joints {', '.join(trajectory.joint_names)}; "
-            f"the scene's robot has {', '.join(scene.robot.joint_names)}"
-        )
+    require_motion(scene, trajectory)
     if trajectory.integrator != str(integrator):
         raise InputError(f"the trajectory was made with {trajectory.integrator}, not {integrator}: give integrator=")
-    for name, array, size in (
-        ("controls", trajectory.u, scene.controls),
-        ("processes", trajectory.dw, scene.processes),
-    ):
-        if array.shape[1] != size:
-            raise InputError(f"the trajectory has {array.shape[1]} {name}, the scene {size}")
+    if trajectory.dw.shape[1] != scene.processes:
+        raise InputError(f"the trajectory has {trajectory.dw.shape[1]} processes, the scene {scene.processes}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,20 +370,41 @@ def propagate_moments(
     Args:
         linearization: From :func:`linearize`.
         mean: Of dx at the first node (2n,); zero if left out.
-        covariance: Of dx there (2n, 2n); zero if left out.
+        covariance: Of dx there (2n, 2n), symmetric and positive semidefinite; zero if left out.
 
     Raises:
-        InputError: A wrong shape, or values that are not finite.
+        InputError: A wrong shape, values that are not finite, or a matrix that is no covariance.
     """
     size = linearization.A.shape[1]
     means, covariances = np.zeros((linearization.steps + 1, size)), np.zeros((linearization.steps + 1, size, size))
     if mean is not None:
         means[0] = finite_array("mean", mean, (size,))
     if covariance is not None:
-        covariances[0] = finite_array("covariance", covariance, (size, size))
+        covariances[0] = _require_covariance(finite_array("covariance", covariance, (size, size)))
     for j in range(linearization.steps):
         A, Gx, m, P = linearization.A[j], linearization.Gx[j], means[j], covariances[j]
         g = linearization.G[j] + np.einsum("aib,b->ai", Gx, m)
         means[j + 1] = A @ m
         covariances[j + 1] = A @ P @ A.T + linearization.dt * (np.einsum("aib,bc,dic->ad", Gx, P, Gx) + g @ g.T)
     return Moments(means, covariances)
+
+
+def _require_covariance(P: Floats) -> Floats:
+    """``P`` unless it is asymmetric or indefinite beyond rounding.
+
+    Entries of x have units of their own, so P is looked at with a unit diagonal.
+    """
+    deviation = np.sqrt(np.maximum(np.diag(P), 0.0))
+    known = deviation > 0.0
+    scale = np.where(known, deviation, 1.0)
+    scaled = P / np.outer(scale, scale)
+    least = np.linalg.eigvalsh(0.5 * (scaled + scaled.T))[0]
+    if np.diag(P).min(initial=0.0) < 0.0 or least < -1e-9:
+        raise InputError(
+            "covariance must be positive semidefinite; with a unit diagonal its least eigenvalue is "
+            f"{least:.3g}, its least variance {np.diag(P).min():.3g}"
+        )
+    asymmetry = float(np.abs(scaled - scaled.T).max())
+    if asymmetry > 1e-9:
+        raise InputError(f"covariance must be symmetric; with a unit diagonal it is off by {asymmetry:.3g}")
+    return P

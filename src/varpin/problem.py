@@ -15,7 +15,7 @@ from varpin.integrators import Integrator, Midpoint
 from varpin.lagrangian import lagrangian_jet
 from varpin.policy import LinearPolicy
 from varpin.scene import Scene, require_scene
-from varpin.trajectory import Trajectory
+from varpin.trajectory import Trajectory, require_motion
 
 Floats = NDArray[np.float64]
 Sampling = Literal["midpoint", "gauss", "start"]
@@ -26,7 +26,17 @@ class OptimalControlProblem:
     """Minimize the expected cost of a motion from (q0, v0) over the controls, each held over ``hold`` steps.
 
     Running costs are integrals in time, sampled once a step, and references are functions of time: the problem means
-    the same at every ``dt``.
+    the same at every ``dt``. Costs add up, and numbers scale them:
+
+        cost = vp.TrackingCost(reference, 10.0) + vp.ControlCost(0.1) + vp.Terminal(2.0 * vp.TrackingCost(goal))
+
+    ============================= ================================================================
+    ``TrackingCost(q_r, weight)`` weight . (q - q_r(t))^2
+    ``VelocityCost(weight, v_r)`` weight . (v - v_r(t))^2
+    ``ControlCost(weight, u_r)``  weight . (u - u_r(t))^2; give every control some
+    ``CustomCost(function)``      a function of one's own of (t, q, v, u)
+    ``Terminal(cost)``            any of them but the control's, at the end instead of its integral
+    ============================= ================================================================
 
     Attributes:
         scene: The scene, its noise included.
@@ -35,7 +45,7 @@ class OptimalControlProblem:
         v0: Initial velocity (n,) [rad/s or m/s].
         dt: Time step [s].
         steps: N.
-        integrator: Any of varpin's.
+        integrator: Any of varpin's; ``Midpoint()`` if left out.
         sampling: ``"midpoint"``: running costs at ((q + q')/2, (q' - q)/dt, u) of each step, of second order.
             ``"gauss"``: at its two Gauss points, the motion between the nodes taken for a cubic: of fourth order, for
             integrators that are. ``"start"``: at the node where it begins, a left sum as in the paper, of first order.
@@ -68,7 +78,7 @@ class OptimalControlProblem:
         sampling: Sampling = "midpoint",
         hold: int = 1,
     ) -> None:
-        """Describe a problem.
+        """Describe a problem; the class says what each argument is.
 
         Raises:
             InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, or a
@@ -212,8 +222,10 @@ class OptimalControlProblem:
         """The cost of one motion on the problem's grid.
 
         Raises:
-            InputError: The motion has another number of steps or another time step.
+            InputError: The motion is no trajectory of the problem's robot, or it has another number of steps or
+                controls, or another time step.
         """
+        require_motion(self.scene, trajectory)
         if trajectory.steps != self.steps or abs(trajectory.dt - self.dt) > 1e-12 * self.dt:
             raise InputError(
                 f"the motion has {trajectory.steps} steps of {trajectory.dt:g} s; "

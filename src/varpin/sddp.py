@@ -26,6 +26,7 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 Callback = Callable[[Iteration], None]
+Progress = Callable[[int, int], None]
 
 logger = logging.getLogger(__name__)
 
@@ -55,12 +56,23 @@ def solve(
     backtracking: float = 0.25,
     regularization: float = 0.0,
     callback: Callback | None = None,
+    progress: Progress | None = None,
 ) -> Solution:
     """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
 
     Each iteration takes the derivatives along the motion, goes back through the quadratic model of the cost to go,
     noise terms included, and searches along the new controls for a motion of lower expected cost: the cost of the
     motion itself, and what noise adds to it under the model.
+
+        robot = vp.load_robot("ur5")
+        cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost([0.5, -1, 1, 0, 0.5, 0], 1e3) + vp.VelocityCost(10))
+        problem = vp.OptimalControlProblem(vp.Scene(robot), cost, q0=np.zeros(6), v0=np.zeros(6), dt=0.01, steps=100)
+        plan = vp.solve(problem, callback=print)  # a line for each iteration
+        print(plan.table())
+        print(plan.verify())
+
+    Ctrl-C ends the search and returns the best motion so far, with ``status`` INTERRUPTED, as long as there is one: the
+    first motion has been integrated. ``solve(problem, plan)`` goes on from there.
 
     Main args:
         problem: What to minimize.
@@ -77,10 +89,12 @@ def solve(
         armijo: The part of the promised slope that a step must keep (the paper's alpha).
         backtracking: Factor between the trials of the line search (the paper's beta), in (0, 1).
         regularization: To begin with, relative to the diagonal of Quu; it grows where needed, and shrinks again.
-        callback: Called with each :class:`Iteration`.
+        callback: Called with each :class:`Iteration`; ``callback=print`` prints the rows of :meth:`Solution.table` as
+            they come. The log has them too, at level INFO.
+        progress: Called after each iteration with (iterations done, max_iterations); few searches need them all.
 
     Returns:
-        The best motion found, whatever happened; ``status`` says how it ended. Ctrl-C returns it too.
+        The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers.
 
     Raises:
         InputError: Controls of a wrong shape, or options out of their range.
@@ -98,16 +112,26 @@ def solve(
         raise InputError(f"regularization must be >= 0, got {regularization}")
     if callback is not None and not callable(callback):
         raise InputError(f"callback must be a function of one Iteration, got {callback!r}")
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress must be a function of (iterations done, max_iterations), got {progress!r}")
     positive("tolerance", tolerance, "1")
     fraction("armijo", armijo)
     max_iterations = count("max_iterations", max_iterations)
-    with announced_compilation():
+
+    def report(item: Iteration) -> None:
+        if callback is not None:
+            callback(item)
+        if progress is not None:
+            # Convergence may take a last look after the last iteration.
+            progress(min(item.index + 1, max_iterations), max_iterations)
+
+    with announced_compilation(f"solve with {type(problem.integrator).__name__}"):
         search = _Search(problem, second_order, forward, armijo, backtracking, regularization)
         search.begin(_first_commands(problem, controls))
         try:
-            status = search.run(tolerance, max_iterations, callback)
+            status = search.run(tolerance, max_iterations, report)
         except KeyboardInterrupt:
-            status = Status.INTERRUPTED
+            status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
     return search.solution(status)
 
 
@@ -151,8 +175,10 @@ class _Search:
         self.plan: Plan | None = None
         self.trajectory: Trajectory
         self.cost = np.inf
+        self.reached = np.inf  # the expected cost of the last step taken, by the plan it was taken with
         self.merits: list[float] = []  # the best so far, after each iteration
         self.best: tuple[float, float, Trajectory | None] = (np.inf, np.inf, None)
+        self.reason = ""
 
     def begin(self, commands: Commands) -> None:
         trajectory, failure = rollout(
@@ -165,7 +191,7 @@ class _Search:
         if not np.isfinite(self.cost):
             raise CostError(repr(self.problem.cost), f"the cost of the first motion is {self.cost}")
 
-    def run(self, tolerance: float, max_iterations: int, callback: Callback | None) -> Status:
+    def run(self, tolerance: float, max_iterations: int, report: Callback) -> Status:
         first = self.cost
         while True:
             started = time.perf_counter()
@@ -175,8 +201,10 @@ class _Search:
                 if not self.history:
                     raise
                 logger.warning("%s", error)
+                self.reason = str(error)
                 return Status.NOT_DIFFERENTIABLE
             if self.plan is None:
+                self.reason = f"the regularization has reached {self.regularization:.1e} of the diagonal of Quu"
                 return Status.INDEFINITE
             merit = self.cost + self.plan.noise
             if merit < self.best[0]:
@@ -184,30 +212,41 @@ class _Search:
             self.merits.append(self.best[0])
             # Where the optimum costs nothing, there is nothing to be relative to but where it began.
             scale = abs(merit) + 1e-9 * abs(first)
-            converged = self.plan.promise <= tolerance * scale
+            # Without costs on the controls the model may need regularization to have a minimum even there.
+            nothing = self.problem.cost.nonnegative and merit <= tolerance * scale
+            converged = nothing or self.plan.promise <= tolerance * scale
             if converged and self.regularization > 0.0:
                 # Regularization makes promises smaller; it must not pass for an optimum.
                 plan, least = self._least_regularized()
-                converged = plan is not None and least <= _LITTLE and plan.promise <= tolerance * scale
-                self.plan = plan if converged else self.plan
+                if plan is not None and (nothing or (least <= _LITTLE and plan.promise <= tolerance * scale)):
+                    self.plan = plan
+                else:
+                    converged = False
+            promised = f"the model promises a decrease of {self.plan.promise:.1e}"
+            share = f"the tolerance of {tolerance:g} times the cost is {tolerance * scale:.1e}"
             if converged or len(self.history) >= max_iterations:
-                self._note(callback, started, 0.0, passes, 0)
+                self._note(report, started, passes)
+                self.reason = f"{promised}; {share}"
                 return Status.CONVERGED if converged else Status.MAX_ITERATIONS
             if len(self.merits) > _PATIENCE and self.merits[-1 - _PATIENCE] - self.merits[-1] <= tolerance * scale:
-                self._note(callback, started, 0.0, passes, 0)
+                self._note(report, started, passes)
+                self.reason = f"{_PATIENCE} iterations brought less than the tolerance; {promised}; {share}"
                 return Status.STALLED
             step, trials = self._line_search(merit)
             if step == 0.0 and self.exact:
                 passes += self._plan(exact=False)
                 more = self._line_search(merit)
                 step, trials = more[0], trials + more[1]
-            self._note(callback, started, step, passes, trials)
+            self._note(report, started, passes, trials, step, merit - self.reached if step > 0.0 else 0.0)
             if step >= _LONG:
                 self._relax()
             elif step <= _SHORT and not self._stiffen():
+                self.reason = f"no step lowers the cost, whatever the regularization; {promised}; {share}"
                 return Status.STALLED
 
-    def _note(self, callback: Callback | None, started: float, step: float, passes: int, trials: int) -> None:
+    def _note(
+        self, report: Callback, started: float, passes: int, trials: int = 0, step: float = 0.0, decrease: float = 0.0
+    ) -> None:
         if self.plan is None:
             return
         item = Iteration(
@@ -215,6 +254,7 @@ class _Search:
             cost=self.cost,
             noise_cost=self.plan.noise,
             promised_decrease=self.plan.promise,
+            decrease=decrease,
             step=step,
             regularization=self.regularization,
             gradient=float(np.abs(self.plan.gradient).max()),
@@ -224,8 +264,7 @@ class _Search:
         )
         self.history.append(item)
         logger.info("%s", item)
-        if callback is not None:
-            callback(item)
+        report(item)
 
     def _relax(self) -> None:
         self.growth = min(1.0 / _GROWTH, self.growth / _GROWTH)
@@ -280,6 +319,7 @@ class _Search:
                     cost = added = np.inf
                 if cost + added <= merit + self.armijo * step * plan.slope:
                     self.trajectory, self.cost = moved, cost
+                    self.reached = cost + added
                     return step, trial + 1
             step *= self.backtracking
         return 0.0, _TRIALS
@@ -326,6 +366,7 @@ class _Search:
             cost=self.cost,
             noise_cost=(np.nan if problem.scene.processes else 0.0) if plan is None else plan.noise,
             status=status,
+            reason=self.reason,
             history=tuple(self.history),
         )
 

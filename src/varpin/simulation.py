@@ -44,7 +44,23 @@ class Interrupted(KeyboardInterrupt):
         super().__init__(f"interrupted after {trajectory.steps} steps; they are in .trajectory")
 
 
-class ControlError(VarpinError, ValueError):
+class _StepError(VarpinError, ValueError):
+    """A function of the user's failed in a step.
+
+    Attributes:
+        step: Index of the step.
+        time: When it was called [s].
+        trajectory: What was computed before.
+    """
+
+    def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory) -> None:
+        self.step = step
+        self.time = time
+        self.trajectory = trajectory
+        super().__init__(f"step {step} (t = {time:.6g} s): {problem}; what came before is in error.trajectory")
+
+
+class ControlError(_StepError):
     """A control function raised, or returned something that is no control.
 
     Attributes:
@@ -53,14 +69,8 @@ class ControlError(VarpinError, ValueError):
         trajectory: What was computed before.
     """
 
-    def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory) -> None:
-        self.step = step
-        self.time = time
-        self.trajectory = trajectory
-        super().__init__(f"step {step} (t = {time:.6g} s): {problem}; what came before is in error.trajectory")
 
-
-class NoiseError(VarpinError, ValueError):
+class NoiseError(_StepError):
     """A function of a custom noise raised, or returned something that is no field.
 
     Attributes:
@@ -68,12 +78,6 @@ class NoiseError(VarpinError, ValueError):
         time: The start of that step [s].
         trajectory: What was computed before.
     """
-
-    def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory) -> None:
-        self.step = step
-        self.time = time
-        self.trajectory = trajectory
-        super().__init__(f"step {step} (t = {time:.6g} s): {problem}; what came before is in error.trajectory")
 
 
 class StepFailure(VarpinError, RuntimeError):
@@ -225,8 +229,8 @@ def simulate(
     given = (None, 0) if callable(controls) else (controls, steps)
     commands = commands_of(scene, integrator, *given)
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
-    _warn_of_ringing(scene, q0, dt)
-    with announced_compilation():
+    with announced_compilation(f"simulate with {type(integrator).__name__}"):
+        _warn_of_ringing(scene, q0, dt)
         state, (start,) = integrator.start(scene, q0[None], v0[None])
         record = _Record(scene, integrator, dt, steps, dw, start)
         chunk = max(1, _CHUNK // n)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Literal
@@ -21,7 +22,7 @@ from varpin.kernels.tree import Commands
 from varpin.linearization import velocity_at_nodes
 from varpin.policy import LinearPolicy
 from varpin.problem import OptimalControlProblem, bind_cost
-from varpin.simulation import rollout
+from varpin.simulation import NoiseError, StepFailure, rollout, simulate
 from varpin.trajectory import Trajectory
 from varpin.wiener import generator
 
@@ -63,6 +64,7 @@ class Iteration:
         cost: Of the motion it ended with, without noise.
         noise_cost: What noise adds to the cost of the motion it began with.
         promised_decrease: Of the expected cost, by the quadratic model with a full step.
+        decrease: Of the expected cost by the step taken, with the plan's model of the noise; 0 if none was.
         step: Length of the step taken, in (0, 1]; 0 if none was.
         regularization: Relative to the diagonal of Quu.
         gradient: Largest entry of the cost's gradient in the controls.
@@ -75,6 +77,7 @@ class Iteration:
     cost: float
     noise_cost: float
     promised_decrease: float
+    decrease: float
     step: float
     regularization: float
     gradient: float
@@ -82,12 +85,12 @@ class Iteration:
     rollouts: int
     seconds: float
 
-    HEADER = "iter         cost   noise cost   promise      grad      reg      step  rolls"
+    HEADER = "iter         cost   noise cost   promise  decrease      grad      reg      step  rolls"
 
     def __str__(self) -> str:
         return (
             f"{self.index:4d} {self.cost:12.6e} {self.noise_cost:12.4e} {self.promised_decrease:9.2e} "
-            f"{self.gradient:9.2e} {self.regularization:8.1e} {self.step:9.2e} {self.rollouts:6d}"
+            f"{self.decrease:9.2e} {self.gradient:9.2e} {self.regularization:8.1e} {self.step:9.2e} {self.rollouts:6d}"
         )
 
 
@@ -117,6 +120,50 @@ class Verification:
     substeps: int
     accuracy: float
 
+    @property
+    def open_loop_loss(self) -> float:
+        """What the controls alone cost above the plan, relative to the plan's cost; NaN where they run away."""
+        return _excess(self.open_loop_cost, self.planned_cost)
+
+    @property
+    def closed_loop_loss(self) -> float:
+        """The same with feedback."""
+        return _excess(self.closed_loop_cost, self.planned_cost)
+
+    def __str__(self) -> str:
+        rows = [
+            ("planned", self.planned_cost, "", ""),
+            ("controls alone", self.open_loop_cost, _percent(self.open_loop_loss), f"{self.open_loop_gap:.2e}"),
+            ("with feedback", self.closed_loop_cost, _percent(self.closed_loop_loss), f"{self.closed_loop_gap:.2e}"),
+        ]
+        lines = [f"{'':16}{'cost':>14}{'loss':>12}  end off by [rad or m]"]
+        for name, cost, loss, gap in rows:
+            shown = (f"{cost:14.6e}{loss:>12}  {gap}" if np.isfinite(cost) else f"{'runs away':>14}").rstrip()
+            lines.append(f"{name:16}{shown}")
+        good = f"{self.accuracy:.0e}" if np.isfinite(self.accuracy) else "nothing: no motion stays"
+        return "\n".join(
+            [
+                *lines,
+                f"a step is off by {self.defect:.2e} rad or m at most; costs are good to {good} of themselves "
+                f"({self.substeps} substeps a step)",
+                "read it so: where feedback loses some percent, the plan holds; where it loses much, dt is too coarse "
+                "(controls alone also lose much where a motion is unstable)",
+            ]
+        )
+
+
+def _excess(cost: float, base: float) -> float:
+    """How far a cost is above another one, relative to it; infinite above nothing."""
+    if cost == base:
+        return 0.0
+    return (cost - base) / abs(base) if base != 0.0 else float(np.copysign(np.inf, cost - base))
+
+
+def _percent(part: float) -> str:
+    if abs(part) >= 1e4:
+        return f"{part:+.1e} x"
+    return f"{100.0 * part:+.2f} %" if abs(part) < 1.0 else f"{100.0 * part:+.0f} %"
+
 
 @dataclass(frozen=True)
 class MonteCarlo:
@@ -136,10 +183,55 @@ class MonteCarlo:
     paths: int
     failures: int
 
+    def __str__(self) -> str:
+        gap = self.cost - self.predicted
+        apart = f", {gap / self.standard_error:+.1f} standard errors" if self.standard_error > 0.0 else ""
+        lost = f"; {self.failures} more ran away and are not counted" if self.failures else ""
+        return "\n".join(
+            [
+                f"{'':16}{'expected cost':>14}",
+                f"{'simulated':16}{self.cost:14.6e} +- {self.standard_error:.1e} ({self.paths} paths{lost})",
+                f"{'predicted':16}{self.predicted:14.6e}",
+                f"{'difference':16}{gap:+14.6e} ({_percent(_excess(self.cost, self.predicted))}{apart})",
+                "read it so: within three standard errors (+-) the two agree; beyond, noise is too strong for the "
+                "model",
+            ]
+        )
+
+
+class MonteCarloInterrupted(KeyboardInterrupt):
+    """Ctrl-C during :meth:`Solution.monte_carlo`.
+
+    Attributes:
+        result: Of the paths done so far; None if there are fewer than two.
+    """
+
+    def __init__(self, result: MonteCarlo | None) -> None:
+        self.result = result
+        done = 0 if result is None else result.paths + result.failures
+        super().__init__(f"interrupted after {done} paths" + ("; they are in .result" if done else ""))
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
     """The best motion a solver found, with the policy around it.
+
+    ``print(plan.table())`` shows a row for each iteration, then how the search ended and why:
+
+    ========== =====================================================================================
+    iter       Its number, from 0.
+    cost       Of the motion it ended with, without noise.
+    noise cost What noise adds to the cost of the motion it began with, by the solver's model.
+    promise    The decrease of the expected cost that the quadratic model promises for a full step.
+    decrease   What the step taken brought; near the promise where the model is good.
+    grad       Largest entry of the expected cost's gradient in the controls.
+    reg        Regularization, relative to the diagonal of Quu; 0 where the model needs none.
+    step       Length of the step taken, in (0, 1]; 0 where none was, as at the end.
+    rolls      Motions that the line search tried.
+    ========== =====================================================================================
+
+    ``print(plan.verify())`` tells what the plan costs on the continuous robot, ``print(plan.monte_carlo(200, rng=0))``
+    what it costs under the scene's noise.
 
     Attributes:
         problem: What was solved.
@@ -150,6 +242,7 @@ class Solution:
         cost: Of the motion without noise.
         noise_cost: What noise adds to it, by the solver's model.
         status: How the solver ended.
+        reason: With which numbers.
         history: One entry for each iteration.
     """
 
@@ -161,6 +254,7 @@ class Solution:
     cost: float
     noise_cost: float
     status: Status
+    reason: str
     history: tuple[Iteration, ...]
 
     def __post_init__(self) -> None:
@@ -192,8 +286,8 @@ class Solution:
         return f"Solution(cost {self.cost:.6g}{noise}, {self.iterations} iterations, {self.status.value})"
 
     def table(self) -> str:
-        """The iterations, one line each."""
-        return "\n".join([Iteration.HEADER, *map(str, self.history), self.status.value])
+        """The iterations, one row each, and how and why they ended; :class:`Solution` explains the columns."""
+        return "\n".join([Iteration.HEADER, *map(str, self.history), self.status.value, f"({self.reason})"])
 
     def shifted(self, decisions: int) -> LinearPolicy:
         """The policy from a later decision on, its last row repeated: what to start the next horizon with.
@@ -246,6 +340,10 @@ class Solution:
         """
         positive("tolerance", tolerance, "1")
         count("max_substeps", max_substeps, least=2)
+        with announced_compilation("Solution.verify"):
+            return self._verify(tolerance, max_substeps, progress)
+
+    def _verify(self, tolerance: float, max_substeps: int, progress: Callable[[int, int], None] | None) -> Verification:
         problem, substeps, before = self.problem, 2, (np.nan, np.nan)
         while True:
             if progress is not None:
@@ -279,53 +377,102 @@ class Solution:
         )
 
     def monte_carlo(
-        self, paths: int, rng: np.random.Generator | int, *, feedback: bool = True, workers: int | None = None
+        self,
+        paths: int,
+        rng: np.random.Generator | int,
+        *,
+        feedback: bool = True,
+        workers: int | None = None,
+        progress: Callable[[int, int], None] | None = None,
     ) -> MonteCarlo:
         """Expected cost of the policy under the scene's noise, with the problem's own integrator and step.
 
-        Args:
+        Path i draws its noise from the i-th child of ``rng``, for any number of workers. Noise that only Python can
+        evaluate (:class:`varpin.CustomNoise`) is simulated path by path, which is slow.
+
+        Main args:
             paths: How many.
             rng: Seed or generator.
             feedback: Without, the controls alone.
+
+        Other Args:
             workers: Threads; as many as there are cores if left out.
+            progress: Called now and then with (paths done, paths in all).
 
         Raises:
-            InputError: Wrong arguments, or noise that only Python can evaluate.
+            InputError: Wrong arguments.
             VarpinError: Every path failed.
+            MonteCarloInterrupted: Ctrl-C; holds the result of the paths done. It is a KeyboardInterrupt.
         """
-        problem, draws = self.problem, generator(rng)
-        paths = count("paths", paths, least=2)
+        draws, paths = generator(rng), count("paths", paths, least=2)
+        workers = count("workers", (os.cpu_count() or 1) if workers is None else workers, least=1)
         policy = self.policy
         if not feedback:
             policy = LinearPolicy(policy.u, np.zeros_like(policy.gains), policy.reference, policy.hold, policy.on)
+        compiled = self.problem.scene.noise.diffusion is not None
+        most = min(_PATHS, _PATHS_PER_WORKER * workers) if compiled else 1
         costs: list[Floats] = []
-        for first in range(0, paths, _PATHS):
-            batch = min(_PATHS, paths - first)
-            try:
-                ensemble = simulate_ensemble(
-                    problem.scene,
-                    problem.q0,
-                    problem.v0,
-                    dt=problem.dt,
-                    steps=problem.steps,
-                    paths=batch,
-                    rng=draws,
-                    controls=policy,
-                    integrator=problem.integrator,
-                    quantiles=(),
-                    workers=workers,
-                )
-            except InputError:
-                raise
-            except VarpinError:  # every path of the batch failed
-                costs.append(np.full(batch, np.nan))
-                continue
-            if ensemble.q is not None and ensemble.v is not None and ensemble.u is not None:
-                costs.append(problem.costs(ensemble.q, ensemble.v, ensemble.u))
-        values = np.concatenate(costs)
+        try:
+            for first in range(0, paths, most):
+                batch = min(most, paths - first)
+                costs.append(self._sampled(batch, draws, policy, workers) if compiled else self._one(draws, policy))
+                if progress is not None:
+                    progress(first + batch, paths)
+        except KeyboardInterrupt:
+            raise MonteCarloInterrupted(self._mean(costs)) from None
+        result = self._mean(costs)
+        if result is None:
+            raise VarpinError(f"fewer than two of {paths} paths got to the end; a smaller dt may help")
+        return result
+
+    def _sampled(self, paths: int, draws: np.random.Generator, policy: LinearPolicy, workers: int) -> Floats:
+        """Costs of some paths (P,), NaN where one failed."""
+        problem = self.problem
+        try:
+            ensemble = simulate_ensemble(
+                problem.scene,
+                problem.q0,
+                problem.v0,
+                dt=problem.dt,
+                steps=problem.steps,
+                paths=paths,
+                rng=draws,
+                controls=policy,
+                integrator=problem.integrator,
+                quantiles=(),
+                workers=workers,
+            )
+        except InputError:
+            raise
+        except VarpinError:  # every path failed
+            return np.full(paths, np.nan)
+        if ensemble.q is None or ensemble.v is None or ensemble.u is None:
+            return np.full(paths, np.nan)
+        return problem.costs(ensemble.q, ensemble.v, ensemble.u)
+
+    def _one(self, draws: np.random.Generator, policy: LinearPolicy) -> Floats:
+        """The cost of a path (1,), NaN where it failed."""
+        problem, (child,) = self.problem, draws.spawn(1)
+        try:
+            motion = simulate(
+                problem.scene,
+                problem.q0,
+                problem.v0,
+                dt=problem.dt,
+                steps=problem.steps,
+                controls=policy,
+                integrator=problem.integrator,
+                rng=child,
+            )
+        except (StepFailure, NoiseError):
+            return np.full(1, np.nan)
+        return np.array([problem.cost_of(motion)])
+
+    def _mean(self, costs: Sequence[Floats]) -> MonteCarlo | None:
+        values = np.concatenate([np.zeros(0), *costs])
         good = values[np.isfinite(values)]
-        if not len(good):
-            raise VarpinError(f"every one of {paths} paths ran away; a smaller dt may help")
+        if len(good) < 2:
+            return None
         return MonteCarlo(
             cost=float(good.mean()),
             standard_error=float(good.std(ddof=1) / np.sqrt(len(good))),
@@ -335,8 +482,8 @@ class Solution:
         )
 
 
-# Paths that are kept at a time to add up their costs.
-_PATHS = 256
+# Paths that are kept at a time to add up their costs; few, so that Ctrl-C loses little.
+_PATHS, _PATHS_PER_WORKER = 256, 32
 
 
 def _fine_costs(problem: OptimalControlProblem, substeps: int) -> tuple[BoundSum, BoundSum]:
@@ -352,7 +499,7 @@ def accurate_cost(
     """True cost under given commands, and the end configuration; NaN where the motion runs away."""
     scene, h = problem.scene, problem.dt / substeps
     n, m = scene.robot.dof, scene.controls
-    with announced_compilation():
+    with announced_compilation("accurate integration"):
         motion, failure = rollout(scene, RungeKutta4(), problem.q0, problem.v0, commands, h)
     if failure is not None:
         return np.nan, np.full(n, np.nan)

@@ -18,6 +18,7 @@ from varpin._version import __version__
 from varpin.checks import path_like, writable
 from varpin.errors import FileError, InputError
 from varpin.robot import Robot
+from varpin.scene import Scene
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -219,6 +220,23 @@ class Trajectory:
             statistics=statistics,
             version=str(members["version"]),
         )
+
+
+def require_motion(scene: Scene, trajectory: Trajectory) -> None:
+    """Refuse what is no trajectory of a scene's robot with its number of controls.
+
+    Raises:
+        InputError: It says what it is instead.
+    """
+    if not isinstance(trajectory, Trajectory):
+        raise InputError(f"the motion must be a varpin.Trajectory, got {type(trajectory).__name__}")
+    if trajectory.joint_names != scene.robot.joint_names:
+        raise InputError(
+            f"the trajectory is of joints {', '.join(trajectory.joint_names)}; "
+            f"the scene's robot has {', '.join(scene.robot.joint_names)}"
+        )
+    if trajectory.u.shape[1] != scene.controls:
+        raise InputError(f"the trajectory has {trajectory.u.shape[1]} controls, the scene {scene.controls}")
 
 
 def _read_members(source: Path) -> dict[str, NDArray[Any]]:

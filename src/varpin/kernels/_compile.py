@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import logging
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -78,22 +79,40 @@ def kernel(function: _Function) -> _Function:
 
 
 class _Announcer(Listener):
-    """Says once that numba is compiling, so that the first call's delay does not look like a hang."""
+    """Says once that numba is compiling, and for what, so that the first call's delay does not look like a hang."""
 
-    def __init__(self) -> None:
+    def __init__(self, feature: str) -> None:
+        self._feature = feature
         self._said = False
 
     def on_start(self, event: Event) -> None:  # noqa: ARG002
         if not self._said:
-            logger.warning("compiling varpin's kernels; this happens once and takes up to half a minute")
+            logger.warning(
+                "compiling varpin's kernels for %s: up to half a minute, once on this machine for each feature",
+                self._feature,
+            )
             self._said = True
 
     def on_end(self, event: Event) -> None:
         pass
 
 
+# Features use each other; the one that was called speaks for all of them.
+_ANNOUNCED = ContextVar("_ANNOUNCED", default=False)
+
+
 @contextlib.contextmanager
-def announced_compilation() -> Iterator[None]:
-    """Within this context a compilation that the disk cache does not save is announced in the log."""
-    with install_listener("numba:compile", _Announcer()):
+def announced_compilation(feature: str) -> Iterator[None]:
+    """Within this context a compilation that the disk cache does not save is announced in the log, for ``feature``.
+
+    Within another such context it does nothing.
+    """
+    if _ANNOUNCED.get():
         yield
+        return
+    token = _ANNOUNCED.set(True)
+    try:
+        with install_listener("numba:compile", _Announcer(feature)):
+            yield
+    finally:
+        _ANNOUNCED.reset(token)

@@ -24,6 +24,8 @@ Motions = Mapping[tuple[str, str, float], tuple[Floats, Floats]]
 # hundredfold.
 _SMALL_ERROR = 1e-4
 
+# How a method is called where the paper has no figure of its own.
+_METHOD_NAME = {"variational": "midpoint", "Euler": "Euler", cases.FOURTH_ORDER: "Gauss(stages=2)"}
 _METHOD_COLOR = {"variational": COLORS[0], "Euler": COLORS[1], cases.FOURTH_ORDER: COLORS[2]}
 
 
@@ -174,7 +176,7 @@ def _truth(cells: Cells) -> Figure:
     for method in (*cases.METHODS, cases.FOURTH_ORDER, OPTIMUM):
         own = series(cells, MAIN, "0", method)
         dts = [c.dt for c in own]
-        label = "optimum over held controls" if method == OPTIMUM else method
+        label = _METHOD_NAME.get(method, "optimum over held controls")
         if method == OPTIMUM:  # a broad band: the best plans lie on it
             axes.loglog(dts, [c.open_loop for c in own], "-", color="0.8", lw=7, zorder=0, label=label)
         else:

@@ -55,8 +55,9 @@ def replay(
             screen's own rate.
         max_frames: Most keyframes; a longer motion gets fewer a second and keeps its speed.
 
-    The meshes are the robot's own. Where one is missing, or the source has none, a skeleton stands in, and the log
-    says why. The ghost leaves out what cannot move, and gives way to the robot where they coincide.
+    The meshes are the robot's own. Where a link's is missing, or the source has none at all, a skeleton of its joint
+    and centre of mass stands in, and the log says why. The ghost leaves out what cannot move, and gives way to the
+    robot where they coincide.
 
     The live window's server belongs to this process and ends with it; ``.wait()`` on the returned visualizer blocks
     until a browser has connected. The server listens on every network interface of the machine, as meshcat's always

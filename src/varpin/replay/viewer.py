@@ -27,7 +27,6 @@ from meshcat.animation import Animation, AnimationClip, AnimationTrack
 from numpy.typing import ArrayLike, NDArray
 from pinocchio.visualize.meshcat_visualizer import MeshcatVisualizer, hasMeshFileInfo, loadMesh
 
-from varpin.errors import RobotError
 from varpin.robot import Robot, geometry
 from varpin.robot.tree import joint_axis, z_to
 from varpin.trajectory import atomic_file
@@ -161,15 +160,20 @@ class _Picture:
     @classmethod
     def of(cls, robot: Robot) -> _Picture:
         """The picture of a robot, made of its meshes if they can be read."""
-        try:
-            shapes = list(geometry(robot).geometryObjects)
-            problem = f"robot {robot.name!r} comes without visual geometry"
-        except RobotError as error:
-            shapes, problem = [], str(error)
-        if not shapes:
-            logger.warning("%s; drawing a skeleton of its joints and centres of mass instead", problem)
-            shapes = _skeleton(robot)
         model = robot.free_model
+        unread: dict[str, str] = {}
+        shapes = list(geometry(robot, unread=unread).geometryObjects)
+        if not (shapes or unread):
+            logger.warning(
+                "robot %r comes without visual geometry; drawing a skeleton of its joints and centres of mass instead",
+                robot.name,
+            )
+            shapes = _skeleton(robot)
+        elif unread:
+            for link, reason in unread.items():
+                logger.warning("%s; drawing a skeleton of link %r instead", reason, link)
+            bare = {model.frames[model.getFrameId(link, pin.FrameType.BODY)].parentJoint for link in unread}
+            shapes += [shape for shape in _skeleton(robot) if shape.parentJoint in bare]
         turns = [np.eye(3), *(z_to(joint_axis(model, joint)[1]) for joint in range(1, model.njoints))]
         return cls(
             robot,

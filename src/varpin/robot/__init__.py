@@ -8,3 +8,4 @@ from varpin.robot.model import geometry as geometry
 from varpin.robot.model import load_robot as load_robot
 from varpin.robot.model import mass_matrix as mass_matrix
 from varpin.robot.sources import bundled_robots as bundled_robots
+from varpin.robot.sources import robot_names as robot_names

@@ -114,6 +114,16 @@ def locate(relative: str) -> Path:
     raise RobotError(f"the installed {DISTRIBUTION} {metadata.version(DISTRIBUTION)} does not hold {relative}")
 
 
+def installed() -> tuple[str, ...]:
+    """Names of the fixed-base robots that the installed example-robot-data holds; none without it."""
+    try:
+        files = metadata.files(DISTRIBUTION) or []
+    except metadata.PackageNotFoundError:
+        return ()
+    held = {file.as_posix().rpartition("example-robot-data/robots/")[2] for file in files if file.suffix == ".urdf"}
+    return tuple(name for name, relative in FIXED_BASE.items() if relative in held)
+
+
 def package_dir(urdf: Path) -> Path:
     """The folder below which ``package://example-robot-data/...`` paths of ``urdf`` are found."""
     return next(parent.parent for parent in urdf.parents if parent.name == "example-robot-data")

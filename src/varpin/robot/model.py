@@ -1,6 +1,7 @@
 """The robot: a Pinocchio model, its generalized coordinates, and the tree the kernels run on."""
 
 import os
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -185,7 +186,8 @@ def load_robot(
 
     Main args:
         source: Path of a URDF file; name of a bundled robot (``"finger"``); name of a fixed-base robot of
-            example-robot-data (``"ur5"``); a ``pin.Model``; or a ``RobotWrapper``.
+            example-robot-data (``"ur5"``); a ``pin.Model``; or a ``RobotWrapper``. :func:`varpin.robot_names` lists
+            the names.
         lock: Joints to hold still, by name, and where: ``{"panda_finger_joint1": 0.02}`` [rad or m]. They are
             removed before anything is computed. A joint that is not one-axis (a free-flyer, say) takes its
             Pinocchio configuration.
@@ -335,8 +337,10 @@ def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
     return position
 
 
-def geometry(robot: Robot) -> pin.GeometryModel:
+def geometry(robot: Robot, *, unread: dict[str, str] | None = None) -> pin.GeometryModel:
     """The robot's visual geometry, read from its meshes now; empty where the source gives none.
+
+    Where ``unread`` is given, links whose shapes cannot be read are left out and put in there, with the reason.
 
     Raises:
         RobotError: A mesh is missing or cannot be read; the message names it.
@@ -349,7 +353,9 @@ def geometry(robot: Robot) -> pin.GeometryModel:
     try:
         visuals = pin.buildGeomFromUrdf(full, str(robot.urdf), pin.GeometryType.VISUAL, None, list(robot.package_dirs))
     except (ValueError, RuntimeError) as error:
-        raise RobotError(f"the meshes of robot {robot.name!r} cannot be read: {error}") from None
+        if unread is None:
+            raise RobotError(f"the meshes of robot {robot.name!r} cannot be read: {error}") from None
+        visuals = _geometry_by_links(robot, full, unread)
     # Attach to the joints of the model the robot moves with: by name, and locked joints through their frame.
     index = joint_index(robot.free_model)
     for shape in visuals.geometryObjects:
@@ -363,6 +369,29 @@ def geometry(robot: Robot) -> pin.GeometryModel:
             shape.placement = moved.placement * shape.placement
             shape.parentJoint = moved.parentJoint
         shape.parentFrame = frame
+    return visuals
+
+
+def _geometry_by_links(robot: Robot, full: pin.Model, unread: dict[str, str]) -> pin.GeometryModel:
+    """The geometry that can be read; what cannot, and why, goes to ``unread`` by link.
+
+    Pinocchio stops at the first mesh that it cannot read, so each link is read from a text with its visuals alone.
+    """
+    visuals = pin.GeometryModel()
+    root = ET.parse(str(robot.urdf)).getroot()
+    shown = {link: link.findall("visual") for link in root.iter("link") if link.find("visual") is not None}
+    for link, own in shown.items():
+        for visual in own:
+            link.remove(visual)
+    for link, own in shown.items():
+        link.extend(own)
+        text = ET.tostring(root, encoding="unicode")
+        try:
+            pin.buildGeomFromUrdfString(full, text, pin.GeometryType.VISUAL, visuals, list(robot.package_dirs))
+        except (ValueError, RuntimeError) as error:
+            unread[link.get("name", "")] = str(error).strip()
+        for visual in own:
+            link.remove(visual)
     return visuals
 
 

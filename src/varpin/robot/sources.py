@@ -52,6 +52,14 @@ def bundled_robots() -> dict[str, Path]:
     return {path.stem: path for path in sorted(models_dir().glob("*.urdf"))}
 
 
+def robot_names() -> tuple[str, ...]:
+    """The names that :func:`varpin.load_robot` takes: varpin's own robots, then those of example-robot-data.
+
+    Of example-robot-data, the fixed-base robots that the installed version holds; none where it is not installed.
+    """
+    return (*bundled_robots(), *example_robot_data.installed())
+
+
 def describe(source: object, package_dirs: Sequence[str | os.PathLike[str]] | None, *, mimic: bool) -> Description:
     """Find and parse ``source``; see :func:`varpin.load_robot`."""
     folders = _folders(package_dirs)

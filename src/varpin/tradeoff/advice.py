@@ -90,7 +90,7 @@ class Advice:
             this motion; infinite if none is too large.
         tolerance: What was asked for [rad or m], or None.
         budget: What was asked for [s], or None.
-        calibration: What finding out took [s].
+        calibration: What finding out took [s], compilation not counted.
         reason: In words.
     """
 
@@ -157,7 +157,6 @@ class _Method:
         self.open = True
         self._next = first
         self._idle, self._shown = 0, False
-        setting.warm_up(integrator)
 
     @property
     def last(self) -> _Sample:
@@ -339,7 +338,7 @@ def advise(
     Other Args:
         controls: None for none, one row (m,), or rows (R, m) that are held over duration / R each.
         integrators: To choose from; varpin's own fixed-step ones if left out.
-        patience: Time after which no further run is begun [s].
+        patience: Time after which no further run is begun [s], compilation not counted.
 
     Raises:
         InputError: Wrong arguments, or both or none of ``tolerance`` and ``budget``.
@@ -352,8 +351,11 @@ def advise(
     if (tolerance is None) == (budget is None):
         raise InputError("give either a tolerance [rad or m] or a budget [s]")
     patience = positive("patience", patience, "s")
-    begin = time.perf_counter()
+    # Compilation is not to be part of the time.
     first = _first_steps(setting)
+    for member in members:
+        setting.warm_up(member)
+    begin = time.perf_counter()
     methods = [_Method(setting, member, first) for member in members]
     search = _Search(methods, begin + patience)
     if tolerance is not None:

@@ -9,7 +9,6 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,15 +19,13 @@ from varpin.errors import FileError, InputError
 from varpin.integrators import Integrator
 from varpin.problem import OptimalControlProblem
 from varpin.sddp import solve
-from varpin.tradeoff.records import pareto_front, read_table, write_csv, write_table
+from varpin.tradeoff.records import Record, pareto_front
 from varpin.tradeoff.setting import Setting, integrators_of
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 logger = logging.getLogger(__name__)
-
-FORMAT = "varpin.optimal-control-tradeoff/1"
 
 HEADINGS = {
     "integrator": "integrator",
@@ -90,7 +87,7 @@ class OptimalControlRun:
 
 
 @dataclass(frozen=True, eq=False)
-class OptimalControlTradeoff:
+class OptimalControlTradeoff(Record):
     """Solutions of one problem on different discretizations.
 
     Attributes:
@@ -99,6 +96,10 @@ class OptimalControlTradeoff:
         duration: The horizon [s].
         missing: Runs that an interruption left out.
     """
+
+    _run = OptimalControlRun
+    _format = "varpin.optimal-control-tradeoff/1"
+    _headings = HEADINGS
 
     runs: tuple[OptimalControlRun, ...]
     robot: str
@@ -114,38 +115,6 @@ class OptimalControlTradeoff:
     def pareto(self) -> tuple[OptimalControlRun, ...]:
         """The runs that no other beats in both solve time and true open-loop cost, from the fastest to the best."""
         return pareto_front(self.runs, lambda run: run.seconds, lambda run: run.open_loop_cost)
-
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the record as npz; returns its path.
-
-        Raises:
-            FileError: The path cannot be written.
-        """
-        facts = {name: getattr(self, name) for name in _FACTS}
-        return write_table(path, FORMAT, self.runs, OptimalControlRun, **facts)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> OptimalControlTradeoff:
-        """Read a record that :meth:`save` wrote.
-
-        Raises:
-            FileError: The file is missing, damaged or something else.
-        """
-        runs, facts = read_table(path, FORMAT, OptimalControlRun)
-        if set(facts) != set(_FACTS):
-            raise FileError(f"{path} is damaged: it has {', '.join(sorted(facts))}")
-        return cls(runs, **{name: facts[name].item() for name in _FACTS})
-
-    def to_csv(self, path: str | os.PathLike[str]) -> Path:
-        """Write the runs as a table; returns its path.
-
-        Raises:
-            FileError: The path cannot be written.
-        """
-        return write_csv(path, self.runs, HEADINGS)
-
-
-_FACTS = ("robot", "duration", "missing", "fingerprint")
 
 
 def optimal_control_tradeoff(

@@ -6,7 +6,7 @@ import logging
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +17,7 @@ from varpin.checks import count, positive, writable
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.integrators import Integrator, Reference
 from varpin.scene import Scene
-from varpin.tradeoff.records import pareto_front, read_table, write_csv, write_table
+from varpin.tradeoff.records import Record, pareto_front
 from varpin.tradeoff.setting import Outcome, Setting, integrators_of
 
 Floats = NDArray[np.float64]
@@ -25,8 +25,6 @@ Progress = Callable[[int, int], None]
 Quantity = Literal["q", "end", "energy", "tip"]
 
 logger = logging.getLogger(__name__)
-
-FORMAT = "varpin.work-precision/1"
 
 # The largest of the steps that are taken where none are named [s], and how often it is halved.
 _COARSEST, _HALVINGS = 0.04, 8
@@ -98,7 +96,7 @@ class WorkPrecisionRun:
 
 
 @dataclass(frozen=True, eq=False)
-class WorkPrecision:
+class WorkPrecision(Record):
     """Measured runs of one motion.
 
     Attributes:
@@ -112,6 +110,10 @@ class WorkPrecision:
         samples: K: errors are taken at K evenly spaced times, the end being the last.
         missing: Runs that an interruption left out.
     """
+
+    _run = WorkPrecisionRun
+    _format = "varpin.work-precision/1"
+    _headings = HEADINGS
 
     runs: tuple[WorkPrecisionRun, ...]
     robot: str
@@ -148,47 +150,6 @@ class WorkPrecision:
     def pareto(self, quantity: Quantity = "q") -> tuple[WorkPrecisionRun, ...]:
         """The runs that no other beats in both time and error, from the fastest to the most accurate."""
         return pareto_front(self.runs, lambda run: run.seconds, lambda run: self.error_of(run, quantity))
-
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the record as npz; returns its path.
-
-        Raises:
-            FileError: The path cannot be written.
-        """
-        facts = {name: getattr(self, name) for name in _FACTS}
-        return write_table(path, FORMAT, self.runs, WorkPrecisionRun, **facts)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> WorkPrecision:
-        """Read a record that :meth:`save` wrote.
-
-        Raises:
-            FileError: The file is missing, damaged or something else.
-        """
-        runs, facts = read_table(path, FORMAT, WorkPrecisionRun)
-        if set(facts) != set(_FACTS):
-            raise FileError(f"{path} is damaged: it has {', '.join(sorted(facts))}")
-        return cls(runs, **{name: facts[name].item() for name in _FACTS})
-
-    def to_csv(self, path: str | os.PathLike[str]) -> Path:
-        """Write the runs as a table; returns its path.
-
-        Raises:
-            FileError: The path cannot be written.
-        """
-        return write_csv(path, self.runs, HEADINGS)
-
-
-_FACTS = (
-    "robot",
-    "duration",
-    "reference",
-    "reference_error",
-    "tip_reference_error",
-    "samples",
-    "missing",
-    "fingerprint",
-)
 
 
 def work_precision(
@@ -251,10 +212,7 @@ def work_precision(
     finished: list[WorkPrecisionRun] = []
 
     def now() -> WorkPrecision:
-        return WorkPrecision(
-            (*kept, *finished),
-            **{name: getattr(base, name) for name in _FACTS} | {"missing": len(plan) - len(finished)},
-        )
+        return replace(base, runs=(*kept, *finished), missing=len(plan) - len(finished))
 
     try:
         for member, steps in plan:

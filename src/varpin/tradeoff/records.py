@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,51 @@ from varpin.errors import FileError
 from varpin.trajectory import atomic_file
 
 Row = TypeVar("Row")
+
+
+class Record:
+    """A frozen dataclass of ``runs`` and of the facts that belong to them all, kept as npz and written as CSV.
+
+    Whoever makes one of it says what a run is, what the file is called, and the headings of its columns.
+    """
+
+    runs: tuple[Any, ...]
+    _run: ClassVar[type[Any]]
+    _format: ClassVar[str]
+    _headings: ClassVar[Mapping[str, str]]
+
+    @classmethod
+    def _facts(cls) -> list[str]:
+        return [item.name for item in fields(cls) if item.name != "runs"]  # type: ignore[arg-type]
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the record as npz; returns its path.
+
+        Raises:
+            FileError: The path cannot be written.
+        """
+        facts = {name: getattr(self, name) for name in self._facts()}
+        return write_table(path, self._format, self.runs, self._run, **facts)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a record that :meth:`save` wrote.
+
+        Raises:
+            FileError: The file is missing, damaged or something else.
+        """
+        runs, facts = read_table(path, cls._format, cls._run)
+        if set(facts) != set(cls._facts()):
+            raise FileError(f"{path} is damaged: it has {', '.join(sorted(facts))}")
+        return cls(runs=runs, **{name: value.item() for name, value in facts.items()})  # type: ignore[call-arg]
+
+    def to_csv(self, path: str | os.PathLike[str]) -> Path:
+        """Write the runs as a table; returns its path.
+
+        Raises:
+            FileError: The path cannot be written.
+        """
+        return write_csv(path, self.runs, self._headings)
 
 
 def write_table(path: str | os.PathLike[str], form: str, rows: Sequence[Any], kind: type[Any], **facts: Any) -> Path:

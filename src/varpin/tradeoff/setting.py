@@ -128,7 +128,7 @@ class Setting:
         """Compile what a run needs."""
         rows = len(self.controls)
         few = Setting(self.scene, self.q0, self.v0, self.controls, 1e-9 * rows)
-        with announced_compilation():
+        with announced_compilation(f"simulate with {type(integrator).__name__}"):
             few.run(integrator, rows)
 
     def _once(self, integrator: Integrator, steps: int, samples: int) -> Outcome:
