@@ -357,7 +357,8 @@ def _peers_at(case: Case, points: np.ndarray) -> Iterator[tuple[str, dict[str, A
             _mujoco_start(mujoco, model, data, case)
             data.qpos[:], data.qvel[:] = q, v
             mujoco.mj_forward(model, data)
-            mujoco.mj_fullM(model, data, M)
+            for j, unit in enumerate(np.eye(n)):
+                mujoco.mj_mulM(model, data, M[j], unit)
             for name, value in zip(own, (M.copy(), data.energy.sum(), data.qacc.copy()), strict=True):
                 own[name].append(value)
         yield "MuJoCo", own | {"energy": np.array(own["energy"])}
