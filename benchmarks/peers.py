@@ -159,6 +159,8 @@ def mujoco_run(case: Case, dt: float, integrator: str) -> Callable[[], np.ndarra
         return None
     model = mujoco_model(case.scene, dt, integrator)
     data, steps = mujoco.MjData(model), round(case.duration / dt)
+    # Else every one of them goes to the terminal and into a file of MuJoCo's own.
+    mujoco.set_mju_user_warning(lambda _: None)
 
     def run() -> np.ndarray:
         _mujoco_start(mujoco, model, data, case)
