@@ -182,10 +182,11 @@ def mujoco_energies(case: Case, dt: float, integrator: str) -> np.ndarray | None
     data, steps = mujoco.MjData(model), round(case.duration / dt)
     _mujoco_start(mujoco, model, data, case)
     energy = np.empty(steps + 1)
-    # The energy in ``data`` after a step is that of the step's start.
+    # The energy in ``data`` after a step is that of its last stage: at the node it has to be asked for.
     for k in range(steps + 1):
-        mujoco.mj_step(model, data)
+        mujoco.mj_forward(model, data)
         energy[k] = data.energy.sum()
+        mujoco.mj_step(model, data)
     return energy
 
 
