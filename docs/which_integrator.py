@@ -396,18 +396,19 @@ def control(scale: Scale) -> tuple[str, Figure]:
         "| start | integrator | dt [s] | solve [ms] | iterations | planned cost | true, open loop | true, feedback |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for setting, axes in zip((cases.MAIN, cases.VARIATIONS[0]), panels, strict=True):
+    # Off the reference most solve times are those of searches that do not converge: once is enough.
+    starts = ((cases.MAIN, 3, 0.0), (cases.VARIATIONS[0], 1, 2e-3))
+    for (setting, repeats, least_step), axes in zip(starts, panels, strict=True):
         members: tuple[tuple[str, Sequence[vp.Integrator]], ...] = (
-            ("variational", (vp.ExplicitEuler(), vp.RungeKutta4(), vp.Midpoint())),
-            (cases.FOURTH_ORDER, (vp.Gauss(2),)),
+            ("variational", (vp.ExplicitEuler(), vp.Midpoint())),
+            # Running costs at the Gauss points: of fourth order, for who is.
+            (cases.FOURTH_ORDER, (vp.RungeKutta4(), vp.Gauss(2))),
         )
         runs: list[vp.OptimalControlRun] = []
         for method, integrators in members:
             problem = cases.problem(setting, None, method, scale.control_steps[0])
-            dts = [dt for dt in scale.control_steps if _divides(dt, cases.DURATION)]
-            runs += vp.optimal_control_tradeoff(problem, integrators, dts, repeats=scale.rounds).runs
-        true = np.array([[run.open_loop_cost, run.closed_loop_cost] for run in runs])
-        least = np.nanmin(np.where(np.isfinite(true), true, np.nan))
+            dts = [dt for dt in scale.control_steps if _divides(dt, cases.DURATION) and dt >= least_step]
+            runs += vp.optimal_control_tradeoff(problem, integrators, dts, repeats=repeats).runs
         start = "on the reference" if setting is cases.MAIN else "off it"
         for run in runs:
             costs = (run.planned_cost, run.open_loop_cost, run.closed_loop_cost)
@@ -418,15 +419,14 @@ def control(scale: Scale) -> tuple[str, Figure]:
             colour, marker, _ = STYLES[name]
             own = [run for run in runs if name_of_text(run.integrator) == name and run.survived]
             for cost, stroke, fill in (("open_loop_cost", "-", colour), ("closed_loop_cost", ":", "none")):
-                pairs = [(1e3 * run.seconds, getattr(run, cost) / least - 1.0) for run in own]
-                pairs = [(x, max(y, 1e-5)) for x, y in pairs if np.isfinite(y)]
+                pairs = [(1e3 * run.seconds, getattr(run, cost)) for run in own]
+                pairs = [(x, y) for x, y in pairs if np.isfinite(y)]
                 if pairs:
                     axes.loglog(
                         *zip(*pairs, strict=True), color=colour, marker=marker, linestyle=stroke, markerfacecolor=fill,
                         label=f"{name}, {'open loop' if stroke == '-' else 'with feedback'}",
                     )  # fmt: skip
-        axes.set(xlabel="solve time [ms]", title=f"finger, {start}", ylabel="true cost over the least found, less 1")
-        axes.set_ylim(0.8e-5, 1e2)
+        axes.set(xlabel="solve time [ms]", title=f"finger, {start}", ylabel="true cost")
         axes.grid(alpha=0.3)
     handles = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
