@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import varpin as vp
 
-DURATION = 0.4
+DURATION = 1.0
 MEMBERS = [vp.Midpoint(), *(vp.Gauss(s) for s in (2, 3, 4))]
 DAMPING = np.array([0.8, 0.5, 0.3])
 Q0, V0 = np.array([0.3, -0.4, 0.5]), np.array([1.0, -0.5, 0.8])
@@ -63,9 +63,9 @@ def test_dampers_and_springs_of_the_scene_keep_the_whole_order(scene, integrator
     end = None
     for k, piece in enumerate(pieces):
         end = exact(scene, lambda t, q, v, piece=piece: piece, k * DURATION / 4, (k + 1) * DURATION / 4, end)
-    counts = {2: (64, 128, 256), 4: (24, 48, 96), 6: (8, 12, 16, 24), 8: (8, 12, 16)}[integrator.order]
+    counts = {2: (128, 256), 4: (64, 96, 128), 6: (32, 40, 48, 64), 8: (28, 32, 36, 40)}[integrator.order]
     slopes, errors = orders(scene, integrator, lambda steps: np.repeat(pieces, steps // 4, axis=0), end, counts)
-    assert slopes[-1] == pytest.approx(integrator.order, abs=0.15), (slopes, errors)
+    np.testing.assert_allclose(slopes, integrator.order, atol=0.12, err_msg=str(errors))
 
 
 @pytest.mark.parametrize("integrator", MEMBERS, ids=str)
@@ -80,7 +80,7 @@ def test_controls_that_change_within_a_step_are_of_second_order(scene, integrato
         def controls(steps):
             return np.array([swing((k + 0.5) * DURATION / steps) for k in range(steps)])
 
-    slopes, errors = orders(scene, integrator, controls, end, (50, 100, 200))
+    slopes, errors = orders(scene, integrator, controls, end, (400, 800, 1600))
     np.testing.assert_allclose(slopes, 2.0, atol=0.1, err_msg=str(errors))
 
 
@@ -95,7 +95,7 @@ def test_the_hold_alone_is_to_blame(scene):
     held = np.abs(motion.q[-1] - state[:3]).max()
     missed = np.abs(motion.q[-1] - exact(scene, law)[:3]).max()
     assert held < 1e-10
-    assert 1e-6 < missed < 1e-3
+    assert 1e-5 < missed < 1e-1
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(3)], ids=str)
@@ -111,7 +111,7 @@ def test_policies_and_sampling_at_the_start_are_of_first_order(scene, integrator
     gain_on_velocity = np.diag(GAIN)
 
     def errors_of(run):
-        return np.array([np.abs(run(steps).q[-1] - end[:3]).max() for steps in (100, 200, 400)])
+        return np.array([np.abs(run(steps).q[-1] - end[:3]).max() for steps in (200, 400, 800)])
 
     starts = errors_of(
         lambda steps: vp.simulate(
