@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from step import chain_of_mujoco
+from peers import mujoco_model
 
 import varpin as vp
 
@@ -27,7 +27,7 @@ def best(run: Callable[[], object], repeats: int = ROUNDS) -> float:
 
 def transition_fd(links: int) -> float | None:
     """Seconds of one mujoco.mjd_transitionFD on a chain, or None without MuJoCo."""
-    model = chain_of_mujoco(links, 1e-3)
+    model = mujoco_model(vp.Scene(vp.planar_chain(links)), 1e-3)
     if model is None:
         return None
     import mujoco  # noqa: PLC0415

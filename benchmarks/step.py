@@ -8,10 +8,10 @@ runs, their ratios far less. MuJoCo takes part where it is installed (``pip inst
 
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from peers import mujoco_model
 
 import varpin as vp
 
@@ -44,28 +44,9 @@ def rnea_derivatives(robot: vp.Robot, q0: np.ndarray) -> Callable[[], float]:
     return run
 
 
-def chain_of_mujoco(links: int, dt: float, integrator: str = "Euler") -> Any:
-    """The planar chain as a mujoco.MjModel, or None without MuJoCo."""
-    try:
-        import mujoco  # noqa: PLC0415
-    except ImportError:
-        return None
-    body = ""
-    for k in range(links):
-        body += (
-            f'<body pos="{1.0 if k else 0.0} 0 0"><joint type="hinge" axis="0 1 0"/>'
-            '<inertial pos="0.5 0 0" mass="1" diaginertia="1e-9 0.08333333333333333 0.08333333333333333"/>'
-        )
-    return mujoco.MjModel.from_xml_string(
-        f'<mujoco><compiler boundinertia="0" balanceinertia="true"/><option timestep="{dt}" integrator="{integrator}">'
-        '<flag contact="disable" constraint="disable"/></option>'
-        f"<worldbody>{body}{'</body>' * links}</worldbody></mujoco>"
-    )
-
-
 def mujoco_step(links: int, dt: float) -> Callable[[], float] | None:
     """Seconds per Python call of mujoco.mj_step on a planar chain, or None without MuJoCo."""
-    model = chain_of_mujoco(links, dt)
+    model = mujoco_model(vp.Scene(vp.planar_chain(links)), dt)
     if model is None:
         return None
     import mujoco  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""Every code block of the README runs."""
+"""Every code block of the README runs, and that of the page on integrators."""
 
 import re
 import shutil
@@ -35,6 +35,14 @@ def test_python_block(number, tmp_path):
             assert found == shown or float(found) == pytest.approx(float(shown), rel=0.5)
         costs = [float(found) for found in re.findall(r" (\d\.\d{6}e-06)", done.stdout[begin:])[:3]]
         assert costs == pytest.approx([float(x) for x in re.findall(r" (\d\.\d{6}e-06)", blocks("text")[0])], rel=1e-3)
+
+
+def test_the_block_of_the_page_on_integrators(tmp_path):
+    page = (ROOT / "docs" / "which-integrator.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S)
+    done = subprocess.run([sys.executable, "-c", block], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Midpoint" in done.stdout
 
 
 def test_main_command(tmp_path):

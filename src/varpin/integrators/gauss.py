@@ -34,7 +34,11 @@ class Gauss(Variational):
 
     Solves L_v(Q_i, V_i) = p0 + dt sum_j a_ij (L_q + F)(Q_j, V_j) with Q_i = q0 + dt sum_j a_ij V_j for the stage
     velocities V_i. Of order 2 s, symmetric, and symplectic where nothing is forced; one stage is ``Midpoint()``.
-    Controls are constant over a step: under a control that is not, the whole is of second order whatever s.
+
+    Dampers and springs of the scene act at every stage and keep the order. Controls are constant over a step: the
+    motion under the held controls is of order 2 s, but a control that is to change with time or state within the step
+    is right to second order only, whatever s, when it is sampled in the step's middle, and to first order when at its
+    start (a :class:`varpin.LinearPolicy` is). So put viscous friction into the scene, not into a control function.
 
     Steps are accepted or taken in parts as :class:`Midpoint` does.
 

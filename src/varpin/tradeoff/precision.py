@@ -18,7 +18,7 @@ from varpin.errors import FileError, InputError, VarpinError
 from varpin.integrators import Integrator, Reference
 from varpin.scene import Scene
 from varpin.tradeoff.records import Record, pareto_front
-from varpin.tradeoff.setting import Outcome, Setting, integrators_of
+from varpin.tradeoff.setting import PARTS, Outcome, Setting, integrators_of
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -39,6 +39,7 @@ HEADINGS = {
     "dt": "dt [s]",
     "steps": "steps",
     "seconds": "wall time [s]",
+    "spread": "spread of wall time [s]",
     "error": "largest error in q [rad or m]",
     "end_error": "error in q at the end [rad or m]",
     "energy_error": "energy error [J]",
@@ -47,6 +48,7 @@ HEADINGS = {
     "jets": "jets",
     "sweeps": "sweeps",
     "split_steps": "split steps",
+    "samples": "times compared",
     "failure": "failure",
 }
 
@@ -61,7 +63,8 @@ class WorkPrecisionRun:
         order: Of its error in dt.
         dt: Time step [s].
         steps: N.
-        seconds: Wall time [s].
+        seconds: Wall time, the best of the repetitions [s].
+        spread: How far the middle one of the repetitions is above the best [s].
         error: Largest error in q over the joints and the record's times [rad or m].
         end_error: Largest error in q over the joints at the end [rad or m].
         energy_error: Largest distance from the initial energy over all nodes [J]; NaN unless energy is to stay.
@@ -70,6 +73,7 @@ class WorkPrecisionRun:
         jets: Evaluations of the whole jet.
         sweeps: Evaluations of its first derivatives alone, or of forward dynamics.
         split_steps: Steps that a guard took in parts.
+        samples: At how many evenly spaced times its motion was compared with the reference's.
         failure: Why it did not get to the end; empty if it did.
     """
 
@@ -79,6 +83,7 @@ class WorkPrecisionRun:
     dt: float
     steps: int
     seconds: float
+    spread: float
     error: float
     end_error: float
     energy_error: float
@@ -87,6 +92,7 @@ class WorkPrecisionRun:
     jets: int
     sweeps: int
     split_steps: int
+    samples: int
     failure: str
 
     @property
@@ -107,12 +113,13 @@ class WorkPrecision(Record):
         reference_error: Largest distance in q from the same at a ten times looser tolerance, in twice as long
             intervals [rad or m]. It is above the reference's own error; errors below it say that, and no more.
         tip_reference_error: The same of the end effector [m].
-        samples: K: errors are taken at K evenly spaced times, the end being the last.
+        samples: K: errors are taken at K evenly spaced times, the end being the last. A run that was added to a saved
+            record with a step that does not share these times has fewer of them.
         missing: Runs that an interruption left out.
     """
 
     _run = WorkPrecisionRun
-    _format = "varpin.work-precision/1"
+    _format = "varpin.work-precision/2"
     _headings = HEADINGS
 
     runs: tuple[WorkPrecisionRun, ...]
@@ -148,8 +155,13 @@ class WorkPrecision(Record):
         return run.error <= self.reference_error
 
     def pareto(self, quantity: Quantity = "q") -> tuple[WorkPrecisionRun, ...]:
-        """The runs that no other beats in both time and error, from the fastest to the most accurate."""
-        return pareto_front(self.runs, lambda run: run.seconds, lambda run: self.error_of(run, quantity))
+        """The runs that no other beats, from the fastest up.
+
+        One beats another that is no less accurate and faster by more than the spread of either time, and than 2 %.
+        """
+        return pareto_front(
+            self.runs, lambda run: run.seconds, lambda run: self.error_of(run, quantity), lambda run: run.spread
+        )
 
 
 def work_precision(
@@ -182,13 +194,14 @@ def work_precision(
 
     Other Args:
         reference: What errors are measured against; its tolerance is varied to see how exact it is.
-        repeats: Of each run; the fastest counts.
+        repeats: Of each run; the fastest counts. One more goes before them where runs are short.
         progress: Called with (runs done, runs in all).
-        save: Keep the record in this npz, run by run; runs that it holds already are not run again.
+        save: Keep the record in this npz, run by run; runs that it holds already are kept, and not run again,
+            whatever other steps and integrators are asked for.
 
     Raises:
         InputError: Wrong arguments.
-        FileError: ``save`` cannot be written, or holds another motion's runs or another reference's.
+        FileError: ``save`` cannot be written, or holds runs of another motion or reference.
         VarpinError: The reference cannot integrate the motion.
     """
     setting = Setting.of(scene, q0, v0, controls, duration)
@@ -197,10 +210,10 @@ def work_precision(
     if not isinstance(reference, Reference):
         raise InputError(f"reference must be a varpin.Reference, got {reference!r}")
     grids = _grids(setting, dts)
-    samples = _samples(grids, len(setting.controls))
     plan = [(member, steps) for member in members for steps in grids]
     path = None if save is None else writable(save)
-    known = _known(path, setting, reference, samples)
+    known = _known(path, setting, reference)
+    samples = _samples(grids, len(setting.controls)) if known is None else known.samples
     if known is None:
         exact = _Exact(setting, reference, samples)
         base = _record(setting, exact)
@@ -262,14 +275,18 @@ def _record(setting: Setting, exact: _Exact) -> WorkPrecision:
     )
 
 
-def _known(path: Path | None, setting: Setting, reference: Reference, samples: int) -> WorkPrecision | None:
+def _known(path: Path | None, setting: Setting, reference: Reference) -> WorkPrecision | None:
     """The record of an earlier run at ``path``, if there is one and it fits."""
     if path is None or not path.exists():
         return None
     record = WorkPrecision.load(path)
-    here = setting.fingerprint, str(reference), samples
-    if (record.fingerprint, record.reference, record.samples) != here:
-        raise FileError(f"{path} holds runs of another motion, reference or grid of steps: choose another file")
+    here, there = setting.fingerprint.split(), record.fingerprint.split()
+    if len(there) != len(PARTS):
+        raise FileError(f"{path} is damaged: it does not say what motion it is of")
+    other = [part for part, own, found in zip(PARTS, here, there, strict=True) if own != found]
+    other += ["reference"] if record.reference != str(reference) else []
+    if other:
+        raise FileError(f"{path} holds runs of another {', '.join(other)}: choose another file")
     return record
 
 
@@ -299,17 +316,19 @@ def _samples(grids: Sequence[int], rows: int) -> int:
 
 def _measure(setting: Setting, exact: _Exact, member: Integrator, steps: int, repeats: int) -> WorkPrecisionRun:
     # Whatever goes wrong with one run, the others are worth having.
+    samples = _samples([steps, len(exact.q) - 1], len(setting.controls))
+    shared = slice(None, None, (len(exact.q) - 1) // samples)
     try:
         setting.warm_up(member)
-        outcome = setting.run(member, steps, samples=len(exact.q) - 1, repeats=repeats)
+        outcome = setting.run(member, steps, samples=samples, repeats=repeats)
     except Exception as reason:
-        lost = np.full_like(exact.q, np.nan)
+        lost = np.full_like(exact.q[shared], np.nan)
         outcome = Outcome(lost, lost, np.nan, np.nan, 0, 0, 0, 0, f"{type(reason).__name__}: {reason}")
     error = end = tip = energy = math.nan
     if not outcome.failure:
-        off = np.abs(outcome.q - exact.q)
+        off = np.abs(outcome.q - exact.q[shared])
         error, end = float(off.max()), float(off[-1].max())
-        tip = _largest(setting.scene.robot.frame_positions(outcome.q) - exact.tip)
+        tip = _largest(setting.scene.robot.frame_positions(outcome.q) - exact.tip[shared])
         energy = outcome.energy_error if setting.conservative else math.nan
     return WorkPrecisionRun(
         integrator=str(member),
@@ -318,6 +337,7 @@ def _measure(setting: Setting, exact: _Exact, member: Integrator, steps: int, re
         dt=setting.duration / steps,
         steps=steps,
         seconds=outcome.seconds if not outcome.failure else math.nan,
+        spread=outcome.spread,
         error=error,
         end_error=end,
         energy_error=energy,
@@ -326,6 +346,7 @@ def _measure(setting: Setting, exact: _Exact, member: Integrator, steps: int, re
         jets=outcome.jets,
         sweeps=outcome.sweeps,
         split_steps=outcome.split_steps,
+        samples=samples,
         failure=outcome.failure,
     )
 

@@ -18,6 +18,9 @@ from varpin.trajectory import atomic_file
 
 Row = TypeVar("Row")
 
+# Costs closer than this, relative, are the same.
+MARGIN = 0.02
+
 
 class Record:
     """A frozen dataclass of ``runs`` and of the facts that belong to them all, kept as npz and written as CSV.
@@ -115,11 +118,22 @@ def write_csv(path: str | os.PathLike[str], rows: Sequence[Any], headings: Mappi
     return Path(path)
 
 
-def pareto_front(rows: Sequence[Row], cost: Callable[[Row], float], error: Callable[[Row], float]) -> tuple[Row, ...]:
-    """The rows that no other row beats in both, from the cheapest to the most accurate; rows with NaN are out."""
-    front: list[Row] = []
+def pareto_front(
+    rows: Sequence[Row],
+    cost: Callable[[Row], float],
+    error: Callable[[Row], float],
+    spread: Callable[[Row], float],
+) -> tuple[Row, ...]:
+    """The rows that no other row clearly beats, from the cheapest up; rows with NaN are out.
+
+    One beats another that is no less accurate and cheaper by more than the spread of either cost and more than 2 %:
+    costs are measured, and a difference that the next measurement may turn round decides nothing.
+    """
     finite = [row for row in rows if np.isfinite(cost(row)) and np.isfinite(error(row))]
-    for row in sorted(finite, key=lambda row: (cost(row), error(row))):
-        if not front or error(row) < error(front[-1]):
-            front.append(row)
-    return tuple(front)
+
+    def beats(other: Row, row: Row) -> bool:
+        margin = max(MARGIN * cost(row), spread(row), spread(other))
+        return error(other) <= error(row) and cost(other) < cost(row) - margin
+
+    front = [row for row in finite if not any(beats(other, row) for other in finite)]
+    return tuple(sorted(front, key=lambda row: (cost(row), error(row))))

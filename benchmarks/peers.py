@@ -1,0 +1,390 @@
+"""The same mechanism in other simulators: MuJoCo, Drake, trep, and SciPy on Pinocchio's forward dynamics.
+
+Each takes part where it is installed (``pip install "varpin[peers]"``; trep has no release for Python 3 and has to be
+ported by hand). :func:`require_same` holds every model against Pinocchio's before anybody races: mass matrix, energy
+and acceleration, with gravity, dampers, springs and torques. Robots of revolute joints without armature, and no more.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from scipy.integrate import solve_ivp
+
+import varpin as vp
+
+# The least moment of inertia that MuJoCo accepts [kg m^2]: a slender rod's own axis gets it, about which nothing turns.
+LEAST_INERTIA = 1e-9
+
+
+class PeerBlewUp(RuntimeError):
+    """A simulator's motion is no longer finite, or it gave up."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A motion: from (q0, v0) under constant torques u.
+
+    Attributes:
+        name: For people.
+        scene: Every joint actuated.
+        q0: (n,) [rad].
+        v0: (n,) [rad/s].
+        u: (n,) [N m].
+        duration: [s].
+    """
+
+    name: str
+    scene: vp.Scene
+    q0: np.ndarray
+    v0: np.ndarray
+    u: np.ndarray
+    duration: float = 1.0
+
+
+@dataclass(frozen=True)
+class Body:
+    """A link and the revolute joint that carries it, in the axes of the joint at q = 0."""
+
+    parent: int
+    placement: pin.SE3
+    axis: np.ndarray
+    inertia: pin.Inertia
+
+
+def available(name: str) -> ModuleType | None:
+    """The module, or None where it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        return None
+
+
+def bodies(robot: vp.Robot) -> list[Body]:
+    """The links of a robot from the base outwards; ``parent`` counts from 1, 0 being the base."""
+    model, data = robot.model, robot.model.createData()
+    if model.nq != model.nv or not all(
+        "Revolute" in j.shortname() or "JointModelR" in j.shortname() for j in model.joints[1:]
+    ):
+        raise ValueError(f"{robot.name} has joints that do not turn about one axis with limits")
+    if np.any(model.armature):
+        raise ValueError(f"{robot.name} has armature")
+    own = []
+    for j in range(1, model.njoints):
+        column = pin.computeJointJacobian(model, data, pin.neutral(model), j)[3:, model.joints[j].idx_v]
+        own.append(Body(int(model.parents[j]), model.jointPlacements[j], column, model.inertias[j]))
+    return own
+
+
+def forces(scene: vp.Scene, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Torques, dampers and springs (n,) [N m]."""
+    return scene.actuation @ u - scene.damping * v - scene.stiffness * (q - scene.rest)
+
+
+def acceleration(case: Case) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Forward dynamics by ``pin.aba``, a function of (q, v)."""
+    scene = case.scene
+    model = scene.robot.model.copy()
+    model.gravity.linear = scene.gravity
+    data = model.createData()
+    push, damping, stiffness, rest = scene.actuation @ case.u, scene.damping, scene.stiffness, scene.rest
+    return lambda q, v: pin.aba(model, data, q, v, push - damping * v - stiffness * (q - rest))
+
+
+# SciPy --------------------------------------------------------------------------------------------------------------
+
+
+def scipy_run(case: Case, rtol: float, method: str = "DOP853") -> Callable[[], np.ndarray]:
+    """A run of SciPy's integrator on ``pin.aba`` that gives the last q."""
+    n, aba = case.scene.robot.dof, acceleration(case)
+    start = np.concatenate([case.q0, case.v0])
+
+    def rate(_: float, x: np.ndarray) -> np.ndarray:
+        return np.concatenate([x[n:], aba(x[:n], x[n:])])
+
+    def run() -> np.ndarray:
+        solution = solve_ivp(rate, (0.0, case.duration), start, method=method, rtol=rtol, atol=rtol)
+        if not solution.success:
+            raise PeerBlewUp(solution.message)
+        return solution.y[:n, -1]
+
+    return run
+
+
+# MuJoCo -------------------------------------------------------------------------------------------------------------
+
+
+def mujoco_model(scene: vp.Scene, dt: float, integrator: str = "Euler", *, energy: bool = False) -> Any:
+    """A scene as a mujoco.MjModel, or None without MuJoCo."""
+    mujoco = available("mujoco")
+    if mujoco is None:
+        return None
+    own = bodies(scene.robot)
+    texts: list[str] = []
+    for k, body in enumerate(own):
+        moments, axes = np.linalg.eigh(body.inertia.inertia)
+        axes[:, 2] *= np.sign(np.linalg.det(axes))
+        texts.append(
+            f'<body name="b{k}" pos="{_row(body.placement.translation)}" quat="{_quaternion(body.placement.rotation)}">'
+            f'<joint type="hinge" axis="{_row(body.axis)}" damping="{float(scene.damping[k])!r}"'
+            f' stiffness="{float(scene.stiffness[k])!r}" springref="{float(scene.rest[k])!r}"/>'
+            f'<inertial pos="{_row(body.inertia.lever)}" quat="{_quaternion(axes)}" mass="{float(body.inertia.mass)!r}"'
+            f' diaginertia="{_row(np.maximum(moments, LEAST_INERTIA))}"/>'
+        )
+
+    def tree(parent: int) -> str:
+        return "".join(f"{texts[k]}{tree(k + 1)}</body>" for k, body in enumerate(own) if body.parent == parent)
+
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><compiler angle="radian" boundinertia="0" balanceinertia="true"/>'
+        f'<option timestep="{dt!r}" integrator="{integrator}" gravity="{_row(scene.gravity)}">'
+        '<flag contact="disable" constraint="disable"/></option>'
+        f"<worldbody>{tree(0)}</worldbody></mujoco>"
+    )
+    if energy:
+        model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    return model
+
+
+def mujoco_run(case: Case, dt: float, integrator: str) -> Callable[[], np.ndarray] | None:
+    """A run that gives the last q, its loop over the steps in MuJoCo; None without it."""
+    mujoco = available("mujoco")
+    if mujoco is None:
+        return None
+    model = mujoco_model(case.scene, dt, integrator)
+    data, steps = mujoco.MjData(model), round(case.duration / dt)
+    # Else every one of them goes to the terminal and into a file of MuJoCo's own.
+    mujoco.set_mju_user_warning(lambda _: None)
+
+    def run() -> np.ndarray:
+        _mujoco_start(mujoco, model, data, case)
+        mujoco.mj_step(model, data, nstep=steps)
+        # MuJoCo resets a motion that has become too fast, and counts that as a warning.
+        if data.warning.number.any() or not np.isfinite(data.qpos).all():
+            raise PeerBlewUp("MuJoCo warns of an unstable motion")
+        return data.qpos.copy()
+
+    return run
+
+
+def mujoco_energies(case: Case, dt: float, integrator: str) -> np.ndarray | None:
+    """Total energy [J] at every node (N + 1,); None without MuJoCo."""
+    mujoco = available("mujoco")
+    if mujoco is None:
+        return None
+    model = mujoco_model(case.scene, dt, integrator, energy=True)
+    data, steps = mujoco.MjData(model), round(case.duration / dt)
+    _mujoco_start(mujoco, model, data, case)
+    energy = np.empty(steps + 1)
+    # The energy in ``data`` after a step is that of its last stage: at the node it has to be asked for.
+    for k in range(steps + 1):
+        mujoco.mj_forward(model, data)
+        energy[k] = data.energy.sum()
+        mujoco.mj_step(model, data)
+    return energy
+
+
+def _mujoco_start(mujoco: ModuleType, model: Any, data: Any, case: Case) -> None:
+    mujoco.mj_resetData(model, data)
+    data.qpos[:], data.qvel[:] = case.q0, case.v0
+    data.qfrc_applied[:] = case.scene.actuation @ case.u
+
+
+# Drake --------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class DrakeModel:
+    """A scene as a continuous MultibodyPlant."""
+
+    plant: Any
+    case: Case
+
+    def context(self, q: np.ndarray, v: np.ndarray) -> Any:
+        """A context at (q, v) under the case's torques."""
+        context = self.plant.CreateDefaultContext()
+        self.plant.SetPositions(context, q)
+        self.plant.SetVelocities(context, v)
+        self.plant.get_actuation_input_port().FixValue(context, self.case.scene.actuation @ self.case.u)
+        return context
+
+    def energy(self, context: Any) -> float:
+        """Total energy [J]."""
+        return float(self.plant.CalcPotentialEnergy(context) + self.plant.CalcKineticEnergy(context))
+
+    def simulator(self, scheme: str, accuracy: float) -> Any:
+        """At the case's initial state."""
+        analysis = importlib.import_module("pydrake.systems.analysis")
+        simulator = analysis.Simulator(self.plant, self.context(self.case.q0, self.case.v0))
+        integrator = analysis.ResetIntegratorFromFlags(simulator, scheme, 0.1)
+        integrator.set_target_accuracy(accuracy)
+        simulator.Initialize()
+        return simulator
+
+
+def drake_model(case: Case) -> DrakeModel | None:
+    """A case in Drake, or None without it."""
+    if available("pydrake.multibody.plant") is None:
+        return None
+    rigid = importlib.import_module("pydrake.math")
+    tree = importlib.import_module("pydrake.multibody.tree")
+    plant = importlib.import_module("pydrake.multibody.plant").MultibodyPlant(0.0)
+    scene = case.scene
+    links = [plant.world_body()]
+    for k, body in enumerate(bodies(scene.robot)):
+        I = body.inertia.inertia  # noqa: E741
+        about = tree.RotationalInertia(I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2])
+        inertia = tree.SpatialInertia.MakeFromCentralInertia(body.inertia.mass, body.inertia.lever, about)
+        link = plant.AddRigidBody(f"b{k}", inertia)
+        pose = rigid.RigidTransform(rigid.RotationMatrix(body.placement.rotation), body.placement.translation)
+        frame = plant.AddFrame(tree.FixedOffsetFrame(f"f{k}", links[body.parent].body_frame(), pose))
+        joint = tree.RevoluteJoint(f"j{k}", frame, link.body_frame(), body.axis, float(scene.damping[k]))
+        joint = plant.AddJoint(joint)
+        plant.AddJointActuator(f"a{k}", joint)
+        if scene.stiffness[k] > 0.0:
+            plant.AddForceElement(tree.RevoluteSpring(joint, float(scene.rest[k]), float(scene.stiffness[k])))
+        links.append(link)
+    plant.mutable_gravity_field().set_gravity_vector(scene.gravity)
+    plant.Finalize()
+    return DrakeModel(plant, case)
+
+
+def drake_run(case: Case, accuracy: float, scheme: str = "runge_kutta3") -> Callable[[], np.ndarray] | None:
+    """A run that gives the last q; None without Drake."""
+    own = drake_model(case)
+    if own is None:
+        return None
+    simulator = own.simulator(scheme, accuracy)
+
+    def run() -> np.ndarray:
+        context = simulator.get_mutable_context()
+        context.SetTime(0.0)
+        own.plant.SetPositions(context, case.q0)
+        own.plant.SetVelocities(context, case.v0)
+        simulator.Initialize()
+        try:
+            simulator.AdvanceTo(case.duration)
+        except RuntimeError as error:
+            raise PeerBlewUp(str(error)) from None
+        return own.plant.GetPositions(context).copy()
+
+    return run
+
+
+def drake_energies(case: Case, accuracy: float, every: float, scheme: str = "runge_kutta3") -> np.ndarray | None:
+    """Total energy [J] every so many seconds; None without Drake."""
+    own = drake_model(case)
+    if own is None:
+        return None
+    simulator = own.simulator(scheme, accuracy)
+    context = simulator.get_context()
+    energy = [own.energy(context)]
+    for k in range(1, round(case.duration / every) + 1):
+        simulator.AdvanceTo(k * every)
+        energy.append(own.energy(context))
+    return np.array(energy)
+
+
+# trep ---------------------------------------------------------------------------------------------------------------
+
+
+def trep_run(links: int, dt: float, duration: float = 1.0) -> Callable[[], np.ndarray] | None:
+    """A run of trep's midpoint integrator on the falling ``planar_chain`` that gives the last q; None without trep."""
+    trep = available("trep")
+    if trep is None:
+        return None
+
+    def rods(k: int) -> list[Any]:
+        rod = [trep.tx(0.5, name=f"m{k}", mass=(1.0, LEAST_INERTIA, 1.0 / 12.0, 1.0 / 12.0))]
+        rest = [trep.tx(1.0, name=f"e{k}"), rods(k + 1)] if k + 1 < links else []
+        return [trep.ry(f"q{k}"), rod + rest]
+
+    system = trep.System()
+    system.import_frames(rods(0))
+    trep.potentials.Gravity(system, (0.0, 0.0, -9.81))
+    rest, steps = np.zeros(links), round(duration / dt)
+
+    def run() -> np.ndarray:
+        integrator = trep.MidpointVI(system)
+        integrator.initialize_from_state(0.0, rest, rest)
+        for k in range(1, steps + 1):
+            integrator.step(k * dt)
+        return np.array(integrator.q2)
+
+    return run
+
+
+# The same mechanism? ------------------------------------------------------------------------------------------------
+
+
+def require_same(case: Case, states: int = 5, tolerance: float = 1e-9) -> list[str]:
+    """Raise unless every peer has the case's mass matrix, energy and acceleration; their names."""
+    scene, aba = case.scene, acceleration(case)
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-2.0, 2.0, (states, 2, scene.robot.dof))
+    jets = [vp.lagrangian_jet(scene, q, v) for q, v in points]
+    want = {
+        "mass matrix": [jet.Lvv for jet in jets],
+        "energy": np.array([v @ jet.Lv - jet.L for (_, v), jet in zip(points, jets, strict=True)]),
+        "acceleration": [aba(q, v) for q, v in points],
+    }
+    # Potentials count from zeros of their own.
+    want["energy"] -= want["energy"][0]
+    found = {"pin.aba": want} | dict(_peers_at(case, points))
+    for name, own in found.items():
+        own["energy"] = own["energy"] - own["energy"][0]
+        for quantity, values in own.items():
+            scale = max(1.0, float(np.abs(want[quantity]).max()))
+            off = float(np.abs(np.subtract(values, want[quantity])).max()) / scale
+            if not off <= tolerance:
+                raise RuntimeError(
+                    f"{name} is not the same mechanism as {case.name}: its {quantity} is off by {off:.1e}"
+                )
+    return list(found)
+
+
+def _peers_at(case: Case, points: np.ndarray) -> Iterator[tuple[str, dict[str, Any]]]:
+    n = case.scene.robot.dof
+    mujoco = available("mujoco")
+    if mujoco is not None:
+        model = mujoco_model(case.scene, 1e-3, energy=True)
+        data, M = mujoco.MjData(model), np.zeros((n, n))
+        own: dict[str, Any] = {"mass matrix": [], "energy": [], "acceleration": []}
+        for q, v in points:
+            _mujoco_start(mujoco, model, data, case)
+            data.qpos[:], data.qvel[:] = q, v
+            mujoco.mj_forward(model, data)
+            for j, unit in enumerate(np.eye(n)):
+                mujoco.mj_mulM(model, data, M[j], unit)
+            for name, value in zip(own, (M.copy(), data.energy.sum(), data.qacc.copy()), strict=True):
+                own[name].append(value)
+        yield "MuJoCo", own | {"energy": np.array(own["energy"])}
+    drake = drake_model(case)
+    if drake is not None:
+        contexts = [drake.context(q, v) for q, v in points]
+        yield (
+            "Drake",
+            {
+                "mass matrix": [drake.plant.CalcMassMatrix(context) for context in contexts],
+                "energy": np.array([drake.energy(context) for context in contexts]),
+                "acceleration": [
+                    drake.plant.EvalTimeDerivatives(context).get_generalized_velocity().CopyToVector()
+                    for context in contexts
+                ],
+            },
+        )
+
+
+def _row(values: Any) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _quaternion(rotation: np.ndarray) -> str:
+    q = pin.Quaternion(rotation).normalized()
+    return _row((q.w, q.x, q.y, q.z))

@@ -1,0 +1,677 @@
+"""The measurements behind docs/which-integrator.md: its tables and figures.
+
+Short horizon, long horizon, optimal control, noise and stiffness, for varpin's integrators and, where they are
+installed (``pip install "varpin[peers]"``), for MuJoCo and Drake; SciPy's DOP853 on Pinocchio's forward dynamics always
+takes part. Times are the best of several rounds in which the methods take turns, after a round that does not count.
+
+    python docs/which_integrator.py                   # rewrites the page and its figures
+    python docs/which_integrator.py --quick FOLDER    # shorter, into a folder: the page, its figures, and which.csv
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import logging
+import platform
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+import varpin as vp
+from varpin.paper import cases
+from varpin.wiener import coarsen
+
+DOCS = Path(__file__).resolve().parent
+sys.path.insert(0, str(DOCS.parent / "benchmarks"))
+import peers  # noqa: E402
+
+PAGE = "which-integrator.md"
+Run = Callable[[], np.ndarray]
+
+# Blocks of a long run whose means tell the trend.
+BLOCKS = 20
+# Errors [rad] from which on a motion is another one.
+LOST = 1.0
+# What a table says of a motion that is not finite, or another one.
+GONE = "lost"
+
+STYLES = {
+    "Midpoint": ("#0072b2", "o", "-"),
+    "Gauss(1)": ("#0072b2", ".", ":"),
+    "Gauss(2)": ("#56b4e9", "D", "-"),
+    "Gauss(3)": ("#004d80", "h", "-"),
+    "Gauss(4)": ("#000000", "P", "-"),
+    "Gauss(5)": ("#666666", "*", "-"),
+    "ExplicitEuler": ("#f0c040", "<", "-"),
+    "SemiImplicitEuler": ("#b8860b", ">", "-"),
+    "RungeKutta4": ("#e69f00", "x", "-"),
+    "MuJoCo Euler": ("#d55e00", "^", "--"),
+    "MuJoCo implicitfast": ("#8b2500", "1", ":"),
+    "MuJoCo RK4": ("#cc79a7", "v", "--"),
+    "Drake RK3": ("#7b3294", "p", "--"),
+    "SciPy DOP853": ("#009e73", "s", "--"),
+    "trep midpoint": ("#999933", "d", "--"),
+    "Midpoint, split kick": ("#009e73", "s", "--"),
+    "Euler-Maruyama": ("#d55e00", "^", "-"),
+    "Gauss(2), split kick": ("#000000", "P", "--"),
+}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A method at one setting, and what a run of it gives: the last q (n,)."""
+
+    method: str
+    setting: str
+    run: Run
+
+
+@dataclass(frozen=True)
+class Point:
+    """A measured entry: error in q at the end [rad], time of one run [us]; NaN where it failed."""
+
+    method: str
+    setting: str
+    error: float
+    microseconds: float
+
+    @property
+    def ours(self) -> bool:
+        """Whether the method is varpin's."""
+        return not self.method.startswith(("MuJoCo", "Drake", "SciPy", "trep"))
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How much is measured.
+
+    Attributes:
+        rounds: Of a race.
+        enough: Time [s] after which a setting has been run often enough.
+        long: The long horizon [s].
+        paths: Brownian paths.
+        finest: The reference of a path takes 2**finest steps a second.
+        stationary: Duration of the runs in equilibrium [s].
+        control_steps: Time steps of plans [s].
+        thin: One in so many settings of the short races is taken.
+    """
+
+    rounds: int
+    enough: float
+    long: float
+    paths: int
+    finest: int
+    stationary: float
+    control_steps: tuple[float, ...]
+    thin: int
+
+
+FULL = Scale(7, 0.3, 1000.0, 2000, 12, 400.0, (1e-3, 2e-3, 3e-3, 4e-3, 6e-3, 1e-2, 1.5e-2, 2e-2), 1)
+QUICK = Scale(3, 0.3, 100.0, 60, 10, 50.0, (4e-3, 1e-2, 2e-2), 2)
+
+
+def race(entries: Sequence[Entry], exact: np.ndarray, scale: Scale) -> list[Point]:
+    """Errors and best times; the methods take turns, and a first round does not count."""
+    best, spent = np.full(len(entries), np.inf), np.zeros(len(entries))
+    errors = np.full(len(entries), np.nan)
+    for number, entry in enumerate(entries):
+        try:
+            q = entry.run()
+        except (vp.VarpinError, peers.PeerBlewUp):
+            spent[number] = np.inf
+            continue
+        errors[number] = np.abs(q - exact).max() if np.isfinite(q).all() else np.nan
+    for _ in range(scale.rounds):
+        for number, entry in enumerate(entries):
+            if spent[number] < scale.enough:
+                begin = time.perf_counter()
+                entry.run()
+                seconds = time.perf_counter() - begin
+                best[number], spent[number] = min(best[number], seconds), spent[number] + seconds
+    return [
+        Point(entry.method, entry.setting, float(error), 1e6 * float(seconds))
+        for entry, error, seconds in zip(entries, errors, best, strict=True)
+    ]
+
+
+def name_of(integrator: vp.Integrator) -> str:
+    """An integrator's name in tables and figures."""
+    return str(integrator).replace("(alpha=0.5)", "").replace("stages=", "")
+
+
+def varpin_run(case: peers.Case, integrator: vp.Integrator, steps: int) -> Run:
+    """A run of varpin's that gives the last q."""
+    scene, q0, v0, u, dt = case.scene, case.q0, case.v0, case.u, case.duration / steps
+
+    def run() -> np.ndarray:
+        return vp.simulate(scene, q0, v0, dt=dt, steps=steps, controls=u, integrator=integrator).q[-1]
+
+    return run
+
+
+# Short horizon ------------------------------------------------------------------------------------------------------
+
+LEVELS = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
+STEPS: dict[vp.Integrator, tuple[float, ...]] = {
+    vp.ExplicitEuler(): (1e-2, 3e-3, 1e-3, 3e-4, 1e-4),
+    vp.SemiImplicitEuler(): (1e-2, 3e-3, 1e-3, 3e-4, 1e-4),
+    vp.RungeKutta4(): (4e-2, 2e-2, 1e-2, 5e-3, 2e-3, 1e-3, 5e-4),
+    vp.Midpoint(): (4e-2, 2e-2, 1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4),
+    vp.Gauss(1): (2e-2, 1e-2, 2e-3, 5e-4),
+    **{vp.Gauss(s): tuple(1.0 / k for k in (12, 20, 25, 33, 40, 50, 66, 100, 200, 400)) for s in (2, 3, 4, 5)},
+}
+
+
+def short_cases() -> list[peers.Case]:
+    """The falling chains, and an arm under torques and friction."""
+    own = []
+    for links in (3, 7):
+        rest = np.zeros(links)
+        own.append(peers.Case(f"chain of {links}", vp.Scene(vp.planar_chain(links)), rest, rest, rest))
+    q0 = np.array([0.3, -1.2, 1.4, -0.5, 0.8, 0.1])
+    arm = vp.Scene(vp.load_robot("ur5"), damping=[4.0, 4.0, 2.0, 0.3, 0.2, 0.05])
+    torque = np.array([10.0, -30.0, -8.0, 0.5, 0.3, 0.1])
+    return [*own, peers.Case("ur5, torques and friction", arm, q0, np.zeros(6), torque)]
+
+
+def short_entries(case: peers.Case, scale: Scale) -> list[Entry]:
+    """All methods at all settings."""
+    entries = []
+    for integrator, dts in STEPS.items():
+        for dt in dts[:: scale.thin]:
+            steps = round(case.duration / dt)
+            entries.append(
+                Entry(name_of(integrator), f"{case.duration / steps:.3g} s", varpin_run(case, integrator, steps))
+            )
+    for scheme in ("Euler", "implicitfast", "RK4"):
+        for dt in (2e-2, 1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4)[:: scale.thin]:
+            run = peers.mujoco_run(case, dt, scheme)
+            entries += [] if run is None else [Entry(f"MuJoCo {scheme}", f"{dt:g} s", run)]
+    for accuracy in (10.0 ** -np.arange(2.0, 9.0))[:: scale.thin]:
+        run = peers.drake_run(case, accuracy)
+        entries += [] if run is None else [Entry("Drake RK3", f"accuracy {accuracy:.0e}", run)]
+    if case.name.startswith("chain"):
+        for dt in (2e-2, 1e-2, 5e-3, 2e-3)[:: scale.thin]:
+            run = peers.trep_run(len(case.q0), dt, case.duration)
+            entries += [] if run is None else [Entry("trep midpoint", f"{dt:g} s", run)]
+    for rtol in (10.0 ** -np.arange(3.0, 13.0))[:: scale.thin]:
+        entries.append(Entry("SciPy DOP853", f"rtol {rtol:.0e}", peers.scipy_run(case, rtol)))
+    return entries
+
+
+def short(scale: Scale) -> tuple[str, Figure, list[tuple[str, Point]]]:
+    """The race over one second."""
+    figure = Figure(figsize=(12, 4.9), layout="constrained")
+    panels = figure.subplots(1, 3, sharey=True)
+    lines = [
+        "| motion | error [rad] | varpin [us] | MuJoCo [us] | Drake [us] | SciPy [us] |",
+        "|---|---|---|---|---|---|",
+    ]
+    rows = []
+    handles: dict[str, object] = {}
+    for case, axes in zip(short_cases(), panels, strict=True):
+        exact = vp.simulate(
+            case.scene,
+            case.q0,
+            case.v0,
+            dt=case.duration,
+            steps=1,
+            controls=case.u,
+            integrator=vp.Reference(rtol=1e-13),
+        ).q[-1]
+        points = race(short_entries(case, scale), exact, scale)
+        rows += [(case.name, point) for point in points]
+        for level in LEVELS:
+            good = [p for p in points if p.error <= level]
+            sides = [[p for p in good if p.ours]]
+            sides += [[p for p in good if p.method.startswith(peer)] for peer in ("MuJoCo", "Drake", "SciPy")]
+            best = [min(side, key=lambda p: p.microseconds, default=None) for side in sides]
+            fastest = min((p.microseconds for p in best if p is not None), default=0.0)
+            cells = []
+            for p in best:
+                text = "-" if p is None else f"{p.microseconds:.0f} ({p.method.removeprefix('MuJoCo ')}, {p.setting})"
+                cells.append(f"**{text}**" if p is not None and p.microseconds == fastest else text)
+            lines.append(f"| {case.name} | {level:.0e} | {' | '.join(cells)} |")
+        for method, (colour, marker, stroke) in STYLES.items():
+            own = [p for p in points if p.method == method and p.error < LOST]
+            if own:
+                (handles[method],) = axes.loglog(
+                    [p.microseconds for p in own],
+                    [p.error for p in own],
+                    color=colour, marker=marker, linestyle=stroke, markersize=5, linewidth=1.1,
+                )  # fmt: skip
+        axes.set(title=case.name, xlabel="time for one second [us]", ylim=(1e-13, LOST))
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("error in q after 1 s [rad]")
+    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=7, fontsize=8, frameon=False)
+    return "\n".join(lines), figure, rows
+
+
+# Long horizon -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Energy:
+    """Energy errors of a long run, in m g n^2 / 2.
+
+    Attributes:
+        method: With its step.
+        t: (K,) [s].
+        error: (K,).
+        seconds: Wall time [s].
+        split: Part of the steps that a guard took in parts.
+    """
+
+    method: str
+    t: np.ndarray
+    error: np.ndarray
+    seconds: float
+    split: float = 0.0
+
+    @property
+    def figures(self) -> tuple[float, float, float]:
+        """Median, root mean square and largest of its absolute value."""
+        size = np.abs(self.error)
+        return float(np.median(size)), float(np.sqrt(np.mean(self.error**2))), float(size.max())
+
+    @property
+    def trend(self) -> tuple[float, float]:
+        """Least squares slope over means of blocks, and its standard error, for the whole duration."""
+        length = (len(self.error) - 1) // BLOCKS
+        means = self.error[1 : 1 + BLOCKS * length].reshape(BLOCKS, length).mean(axis=1)
+        x = (np.arange(BLOCKS) + 0.5) / BLOCKS - 0.5
+        slope = float(x @ means / (x @ x))
+        rest = means - means.mean() - slope * x
+        return slope, float(np.sqrt(rest @ rest / (BLOCKS - 2) / (x @ x)))
+
+
+def long_runs(scale: Scale) -> list[Energy]:
+    """The chain of three from horizontal rest; times are the better of two, in turns."""
+    rest, unit = np.zeros(3), 9.81 * 9 / 2
+    case = peers.Case("chain of 3", vp.Scene(vp.planar_chain(3)), rest, rest, rest, scale.long)
+    peers.require_same(case)
+    own = (
+        (vp.Midpoint(), 1e-2), (vp.Gauss(2), 2e-2), (vp.Gauss(2), 1e-2), (vp.Gauss(4), 4e-2), (vp.RungeKutta4(), 1e-2),
+        (vp.RungeKutta4(), 5e-3), (vp.SemiImplicitEuler(), 1e-2),
+    )  # fmt: skip
+    # Each gives energies, the part of steps split, and its time, or None where all of it counts.
+    jobs: dict[str, Callable[[], tuple[np.ndarray | None, float, float | None]]] = {}
+    for integrator, dt in own:
+        jobs[f"{name_of(integrator)}, {dt:g} s"] = lambda i=integrator, dt=dt: _own_energy(case, i, dt)
+    for scheme, dt in (("Euler", 1e-2), ("implicitfast", 1e-2), ("RK4", 1e-2), ("RK4", 5e-3)):
+        jobs[f"MuJoCo {scheme}, {dt:g} s"] = lambda s=scheme, dt=dt: _mujoco_energy(case, s, dt)
+    for accuracy in (1e-3, 1e-5):
+        jobs[f"Drake RK3, accuracy {accuracy:.0e}"] = lambda a=accuracy: (
+            peers.drake_energies(case, a, 0.1),
+            0.0,
+            None,
+        )
+    done: dict[str, Energy] = {}
+    for _ in range(2):
+        for name, job in jobs.items():
+            before = done[name].seconds if name in done else np.inf
+            if np.isfinite(before) and before > 10.0:
+                continue
+            begin = time.perf_counter()
+            energy, split, own_time = job()
+            seconds = min(before, time.perf_counter() - begin if own_time is None else own_time)
+            if energy is not None:
+                t = np.linspace(0.0, case.duration, len(energy))
+                done[name] = Energy(name, t, (energy - energy[0]) / unit, seconds, split)
+    return list(done.values())
+
+
+def _own_energy(case: peers.Case, integrator: vp.Integrator, dt: float) -> tuple[np.ndarray, float, None]:
+    motion = vp.simulate(case.scene, case.q0, case.v0, dt=dt, steps=round(case.duration / dt), integrator=integrator)
+    return motion.energy, motion.statistics.split_steps / motion.steps, None
+
+
+def _mujoco_energy(case: peers.Case, scheme: str, dt: float) -> tuple[np.ndarray | None, float, float]:
+    """Energies by one run, and the time of another that does not ask for them."""
+    run = peers.mujoco_run(case, dt, scheme)
+    begin = time.perf_counter()
+    if run is not None:
+        run()
+    seconds = time.perf_counter() - begin
+    return peers.mujoco_energies(case, dt, scheme), 0.0, seconds
+
+
+def long(scale: Scale) -> tuple[str, Figure]:
+    """Energy over the long run."""
+    runs = long_runs(scale)
+    lines = [
+        f"| {scale.long:g} s of a chain of 3 | time [s] | median | rms | largest | trend over the run | split steps |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for run in runs:
+        slope, uncertainty = run.trend
+        numbers = " | ".join(f"{x:.1e}" for x in run.figures)
+        trend = f"{slope:+.1e} ± {uncertainty:.0e}"
+        lines.append(f"| {run.method} | {run.seconds:.2f} | {numbers} | {trend} | {100 * run.split:.2g} % |")
+    by = {run.method: run for run in runs}
+    two, mid = by["Gauss(2), 0.02 s"], by["Midpoint, 0.01 s"]
+    ratios = [a / b for a, b in zip(two.figures, mid.figures, strict=True)]
+    slope, uncertainty = two.trend
+    lines += [
+        "",
+        f"Gauss(2) at 0.02 s over Midpoint at 0.01 s: median {ratios[0]:.3f}, rms {ratios[1]:.3f}, largest "
+        f"{ratios[2]:.3f}, time {two.seconds / mid.seconds:.2f}. Its trend is {abs(slope / uncertainty):.1f} standard "
+        "errors from none.",
+    ]
+    figure = Figure(figsize=(10, 4.6), layout="constrained")
+    axes = figure.subplots()
+    for run in runs:
+        method = run.method.split(",")[0]
+        colour, _, stroke = STYLES[method]
+        window = max(1, (len(run.error) - 1) // 100)
+        blocks = run.error[1 : 1 + (len(run.error) - 1) // window * window].reshape(-1, window)
+        at = (np.arange(len(blocks)) + 0.5) * window * (run.t[1] - run.t[0])
+        first = not any(line.get_color() == colour for line in axes.get_lines())
+        axes.semilogy(
+            at, np.sqrt((blocks**2).mean(axis=1)), color=colour, linestyle=stroke, label=run.method,
+            linewidth=1.4, alpha=1.0 if first else 0.55,
+        )  # fmt: skip
+    axes.set(xlabel="t [s]", ylabel=f"energy error, rms over {scale.long / 100:g} s [m g n²/2]")
+    axes.grid(alpha=0.3)
+    figure.legend(loc="outside right center", fontsize=8, frameon=False)
+    return "\n".join(lines), figure
+
+
+# Optimal control ----------------------------------------------------------------------------------------------------
+
+
+def control(scale: Scale) -> tuple[str, Figure]:
+    """True cost of the finger's plans against solve time."""
+    figure = Figure(figsize=(10, 4.4), layout="constrained")
+    panels = figure.subplots(1, 2)
+    lines = [
+        "| start | integrator | dt [s] | solve [ms] | iterations | planned cost | true, open loop | true, feedback |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    # Off the reference most solve times are those of searches that do not converge: once is enough.
+    starts = ((cases.MAIN, 3, 0.0), (cases.VARIATIONS[0], 1, 2e-3))
+    for (setting, repeats, least_step), axes in zip(starts, panels, strict=True):
+        members: tuple[tuple[str, Sequence[vp.Integrator]], ...] = (
+            ("variational", (vp.ExplicitEuler(), vp.Midpoint())),
+            # Running costs at the Gauss points: of fourth order, for who is.
+            (cases.FOURTH_ORDER, (vp.RungeKutta4(), vp.Gauss(2))),
+        )
+        runs: list[vp.OptimalControlRun] = []
+        for method, integrators in members:
+            problem = cases.problem(setting, None, method, scale.control_steps[0])
+            dts = [dt for dt in scale.control_steps if _divides(dt, cases.DURATION) and dt >= least_step]
+            runs += vp.optimal_control_tradeoff(problem, integrators, dts, repeats=repeats).runs
+        start = "on the reference" if setting is cases.MAIN else "off it"
+        for run in runs:
+            costs = (run.planned_cost, run.open_loop_cost, run.closed_loop_cost)
+            cells = " | ".join(f"{cost:.5g}" if np.isfinite(cost) else GONE for cost in costs)
+            name = name_of_text(run.integrator)
+            lines.append(f"| {start} | {name} | {run.dt:g} | {1e3 * run.seconds:.1f} | {run.iterations} | {cells} |")
+        for name in dict.fromkeys(name_of_text(run.integrator) for run in runs):
+            colour, marker, _ = STYLES[name]
+            own = [run for run in runs if name_of_text(run.integrator) == name and run.survived]
+            for cost, stroke, fill in (("open_loop_cost", "-", colour), ("closed_loop_cost", ":", "none")):
+                pairs = [(1e3 * run.seconds, getattr(run, cost)) for run in own]
+                pairs = [(x, y) for x, y in pairs if np.isfinite(y)]
+                if pairs:
+                    axes.loglog(
+                        *zip(*pairs, strict=True), color=colour, marker=marker, linestyle=stroke, markerfacecolor=fill,
+                        label=f"{name}, {'open loop' if stroke == '-' else 'with feedback'}",
+                    )  # fmt: skip
+        axes.set(xlabel="solve time [ms]", title=f"finger, {start}", ylabel="true cost")
+        axes.grid(alpha=0.3)
+    handles = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))
+    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    return "\n".join(lines), figure
+
+
+def _divides(dt: float, duration: float) -> bool:
+    return abs(duration / dt - round(duration / dt)) < 1e-9 * duration / dt
+
+
+def name_of_text(text: str) -> str:
+    """As :func:`name_of`, of an integrator as text."""
+    return text.replace("(alpha=0.5)", "").replace("stages=", "")
+
+
+# Noise --------------------------------------------------------------------------------------------------------------
+
+NOISY: dict[str, vp.Integrator] = {
+    "Euler-Maruyama": vp.ExplicitEuler(),
+    "Midpoint": vp.Midpoint(),
+    "Midpoint, split kick": vp.Midpoint(kick="split"),
+    "Gauss(2), split kick": vp.Gauss(2, kick="split"),
+}
+
+
+def noise(scale: Scale) -> tuple[str, Figure]:
+    """Strong and weak errors on the same Brownian paths, and the stationary law of an oscillator."""
+    scene = vp.Scene(vp.planar_chain(2), damping=0.3, noise=vp.AdditiveNoise(0.5))
+    rest = np.zeros(2)
+    fine = 2**scale.finest
+    exponents = range(4, scale.finest - 2)
+    ends = {(name, k): np.empty((scale.paths, 2)) for name in NOISY for k in exponents}
+    exact = np.empty((scale.paths, 2))
+
+    def end(integrator: vp.Integrator, increments: np.ndarray) -> np.ndarray:
+        steps = len(increments)
+        try:
+            return vp.simulate(
+                scene, rest, rest, dt=1.0 / steps, steps=steps, integrator=integrator, increments=increments
+            ).q[-1]
+        except vp.VarpinError:
+            return np.full(2, np.nan)
+
+    for path in range(scale.paths):
+        dw = np.random.default_rng([7, path]).normal(scale=fine**-0.5, size=(fine, scene.processes))
+        exact[path] = end(NOISY["Gauss(2), split kick"], dw)
+        for (name, k), array in ends.items():
+            array[path] = end(NOISY[name], coarsen(dw, fine // 2**k))
+    figure = Figure(figsize=(10, 4.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    lines = ["| method | dt [s] | strong error [rad] | weak error of q1^2 [rad^2] |", "|---|---|---|---|"]
+    for name in NOISY:
+        colour, marker, stroke = STYLES[name]
+        dts, strong, weak, bars = [], [], [], []
+        for k in exponents:
+            off = np.abs(ends[name, k] - exact).max(axis=1)
+            gap = ends[name, k][:, 0] ** 2 - exact[:, 0] ** 2
+            dts.append(2.0**-k)
+            strong.append(np.sqrt((off**2).mean()))
+            weak.append(abs(gap.mean()))
+            bars.append(gap.std(ddof=1) / np.sqrt(scale.paths))
+            if k % 2 == 0:
+                lines.append(f"| {name} | 1/{2**k} | {strong[-1]:.1e} | {weak[-1]:.1e} ± {2 * bars[-1]:.0e} |")
+        left.loglog(dts, strong, color=colour, marker=marker, linestyle=stroke, label=name)
+        right.errorbar(dts, weak, yerr=2.0 * np.array(bars), color=colour, marker=marker, linestyle=stroke, capsize=2)
+    right.set(yscale="log", xlabel="dt [s]", ylabel="weak error of q1² after 1 s [rad²]", title="weak")
+    left.set(xlabel="dt [s]", ylabel="strong error of q after 1 s, rms [rad]", title="strong")
+    for axes in (left, right):
+        axes.set_xscale("log", base=2)
+        axes.grid(alpha=0.3)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    return "\n".join([*lines, "", *stationary(scale)]), figure
+
+
+def stationary(scale: Scale) -> list[str]:
+    """Mean of q^2 and v^2 of a damped oscillator in thermal equilibrium, over what they are."""
+    # A rod of inertia 1/3 on a spring: omega = 3 / s; the noise is that of temperature 1 / 2.
+    damping, stiffness, inertia = 0.2, 3.0, 1.0 / 3.0
+    strength = 0.2**0.5
+    heat = strength**2 / (2.0 * damping)
+    lines = [
+        "| stationary oscillator | dt omega | mean q^2 over its law's | mean v^2 over its law's |",
+        "|---|---|---|---|",
+    ]
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=damping, stiffness=stiffness,
+                     noise=vp.AdditiveNoise(strength))  # fmt: skip
+    start = np.random.default_rng(3).normal(size=(2, 500, 1))
+    q0, v0 = start[0] * np.sqrt(heat / stiffness), start[1] * np.sqrt(heat / inertia)
+    for name in ("Euler-Maruyama", "Midpoint", "Midpoint, split kick"):
+        for product in (0.03, 0.3, 1.0, 1.8):
+            dt = product / 3.0
+            steps = round(scale.stationary / dt)
+            cells = []
+            try:
+                ensemble = vp.simulate_ensemble(
+                    scene, q0, v0, dt=dt, steps=steps, paths=500, rng=5, integrator=NOISY[name], store=False
+                )
+                own = ensemble.statistics
+                late = slice(len(own.mean) // 4, None)
+                squares = own.covariance[late].diagonal(axis1=1, axis2=2) + own.mean[late] ** 2
+                # The state is (q, p) for variational integrators, and (q, v) for the others.
+                second = heat * inertia if NOISY[name].variational else heat / inertia
+                cells = [f"{x:.3f}" if x < 1e3 else GONE for x in squares.mean(axis=0) / (heat / stiffness, second)]
+            except vp.VarpinError:
+                cells = [GONE, GONE]
+            lines.append(f"| {name} | {product:g} | {' | '.join(cells)} |")
+    return lines
+
+
+# Stiffness ----------------------------------------------------------------------------------------------------------
+
+PRODUCTS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
+STIFF_STEP = 1e-2
+
+
+def stiff_case(kind: str, product: float) -> peers.Case:
+    """A chain of three whose last joint is held by a spring, or a damper, with dt omega (or rate) = ``product``."""
+    robot, rest = vp.planar_chain(3), np.zeros(3)
+    # What the last joint's forces accelerate, the others free: 1 over the last entry of M^-1.
+    effective = 1.0 / np.linalg.inv(vp.lagrangian_jet(vp.Scene(robot), rest, rest).Lvv)[2, 2]
+    fast = product / STIFF_STEP
+    last = np.array([0.0, 0.0, 1.0])
+    if kind == "spring":
+        scene = vp.Scene(robot, stiffness=effective * fast**2 * last, damping=0.02 * effective * fast * last)
+    else:
+        scene = vp.Scene(robot, damping=effective * fast * last)
+    return peers.Case(f"stiff {kind}, {product:g}", scene, rest, rest, rest)
+
+
+def stiff(scale: Scale) -> tuple[str, Figure]:
+    """Errors of the first two joints at one step, over the stiffness of the third."""
+    own: tuple[vp.Integrator, ...] = (
+        vp.ExplicitEuler(), vp.SemiImplicitEuler(), vp.RungeKutta4(), vp.Midpoint(), vp.Gauss(2), vp.Gauss(3),
+    )  # fmt: skip
+    figure = Figure(figsize=(10, 4.6), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    tables = []
+    handles: dict[str, object] = {}
+    for kind, axes in zip(("spring", "damper"), panels, strict=True):
+        curves: dict[str, list[Point]] = {}
+        for product in PRODUCTS:
+            case = stiff_case(kind, product)
+            peers.require_same(case)
+            exact = vp.simulate(
+                case.scene, case.q0, case.v0, dt=case.duration, steps=1, integrator=vp.Reference(rtol=1e-12)
+            ).q[-1]
+            steps = round(case.duration / STIFF_STEP)
+            entries = [Entry(name_of(i), f"{STIFF_STEP:g} s", varpin_run(case, i, steps)) for i in own]
+            for scheme in ("Euler", "implicitfast", "RK4"):
+                run = peers.mujoco_run(case, STIFF_STEP, scheme)
+                entries += [] if run is None else [Entry(f"MuJoCo {scheme}", f"{STIFF_STEP:g} s", run)]
+            run = peers.drake_run(case, 1e-4)
+            entries += [] if run is None else [Entry("Drake RK3", "accuracy 1e-04", run)]
+            entries.append(Entry("SciPy DOP853", "rtol 1e-04", peers.scipy_run(case, 1e-4)))
+            # The slow part alone counts.
+            slow = [Entry(e.method, e.setting, lambda run=e.run: run()[:2]) for e in entries]
+            for point in race(slow, exact[:2], scale):
+                curves.setdefault(f"{point.method}, {point.setting}", []).append(point)
+        heading = "dt omega" if kind == "spring" else "dt times rate"
+        lines = [
+            f"| stiff {kind}: {heading} = | {' | '.join(f'{p:g}' for p in PRODUCTS)} |",
+            "|---" * (len(PRODUCTS) + 1) + "|",
+        ]
+        for label, points in curves.items():
+            cells = [f"{p.error:.0e} ({p.microseconds:.0f})" if p.error < LOST else GONE for p in points]
+            lines.append(f"| {label} | {' | '.join(cells)} |")
+            colour, marker, stroke = STYLES[points[0].method]
+            good = [(x, p.error) for x, p in zip(PRODUCTS, points, strict=True) if p.error < LOST]
+            if good:
+                (handles[label],) = axes.loglog(
+                    *zip(*good, strict=True), color=colour, marker=marker, linestyle=stroke, markersize=5
+                )
+        tables.append("\n".join(lines))
+        axes.set(xlabel=heading, title=f"stiff {kind} at the last of three joints")
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("error of the first two joints after 1 s [rad]")
+    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    return "\n\n".join(tables), figure
+
+
+# The page -----------------------------------------------------------------------------------------------------------
+
+
+def machine(scale: Scale) -> str:
+    """Who took part, and on what."""
+    here, missing = [f"varpin {vp.__version__}"], []
+    for name, module in (("MuJoCo", "mujoco"), ("Drake", "pydrake"), ("trep", "trep")):
+        own = peers.available(module)
+        version = getattr(own, "__version__", "")
+        (missing if own is None else here).append(f"{name} {version}".strip())
+    text = f"{', '.join(here)}, NumPy {np.__version__}; {platform.machine()}, Python {platform.python_version()}."
+    if missing:
+        text += f" Not installed, so their rows are left out: {', '.join(missing)}."
+    return text + (" A quick run: shorter, with fewer settings." if scale is QUICK else "")
+
+
+def fill(page: Path, parts: dict[str, str]) -> None:
+    """Put texts between the page's markers."""
+    text = page.read_text(encoding="utf-8")
+    for name, own in parts.items():
+        begin, end = f"<!-- {name}:begin -->\n", f"<!-- {name}:end -->"
+        before, rest = text.split(begin)
+        text = before + begin + own + "\n" + end + rest.split(end, 1)[1]
+    page.write_text(text, encoding="utf-8")
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    """Measure, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("folder", nargs="?", type=Path, default=DOCS, help="where page and images go; docs if left out")
+    parser.add_argument("--quick", action="store_true", help="shorter runs, fewer settings")
+    options = parser.parse_args(None if arguments is None else list(arguments))
+    scale = QUICK if options.quick else FULL
+    images = options.folder / "images"
+    images.mkdir(parents=True, exist_ok=True)
+    page = options.folder / PAGE
+    if page.resolve() != (DOCS / PAGE).resolve():
+        shutil.copy(DOCS / PAGE, page)
+    logging.getLogger("varpin").setLevel(logging.ERROR)
+    for case in short_cases():
+        peers.require_same(case)
+    parts, figures = {"machine": machine(scale)}, {}
+    begin = time.perf_counter()
+    parts["short"], figures["short"], rows = short(scale)
+    sections: dict[str, Callable[[Scale], tuple[str, Figure]]] = {
+        "long": long, "control": control, "noise": noise, "stiff": stiff,
+    }  # fmt: skip
+    _tell("short", begin)
+    for name, section in sections.items():
+        parts[name], figures[name] = section(scale)
+        _tell(name, begin)
+    for name, figure in figures.items():
+        figure.set_dpi(110)
+        FigureCanvasAgg(figure).print_png(images / f"which_{name}.png")
+    fill(page, parts)
+    if options.folder != DOCS:
+        with (options.folder / "which.csv").open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(["motion", "method", "setting", "error in q [rad]", "time [us]"])
+            writer.writerows([motion, p.method, p.setting, p.error, p.microseconds] for motion, p in rows)
+
+
+def _tell(section: str, begin: float) -> None:
+    sys.stderr.write(f"{time.perf_counter() - begin:6.0f} s: {section}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""The other simulators that benchmarks race against are the same mechanism, and would not start if they were not."""
+
+import dataclasses
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import varpin as vp
+
+PATH = Path(__file__).parents[1] / "benchmarks" / "peers.py"
+
+
+@pytest.fixture(scope="module")
+def peers():
+    spec = importlib.util.spec_from_file_location("benchmark_peers", PATH)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def case(peers):
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.7, stiffness=3.0, rest=0.2)
+    return peers.Case("ur5", scene, np.linspace(0.2, 0.6, 6), np.zeros(6), np.linspace(5.0, 1.0, 6), 0.2)
+
+
+def test_peers_are_the_same_mechanism_and_go_the_same_way(peers, case):
+    assert peers.require_same(case, tolerance=1e-11)[0] == "pin.aba"
+    exact = vp.simulate(
+        case.scene, case.q0, case.v0, dt=case.duration, steps=1, controls=case.u, integrator=vp.Reference()
+    ).q[-1]
+    np.testing.assert_allclose(peers.scipy_run(case, 1e-11)(), exact, atol=1e-9)
+    for run in (peers.mujoco_run(case, 1e-3, "RK4"), peers.drake_run(case, 1e-8)):
+        if run is not None:
+            np.testing.assert_allclose(run(), exact, atol=1e-8)
+            # A run leaves nothing behind for the next, but for what its own step control remembers.
+            np.testing.assert_allclose(run(), run(), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "quantity"),
+    [
+        ({"damping": 0.8, "stiffness": 3.0, "rest": 0.2}, "acceleration"),
+        ({"damping": 0.7, "stiffness": 3.1, "rest": 0.2}, "energy"),
+        ({"damping": 0.7, "stiffness": 3.0, "rest": 0.2, "gravity": (0.0, 0.0, -9.8)}, "energy"),
+    ],
+)
+def test_another_mechanism_does_not_start(peers, case, monkeypatch, change, quantity):
+    pytest.importorskip("mujoco")
+    other, build = vp.Scene(case.scene.robot, **change), peers.mujoco_model
+    monkeypatch.setattr(peers, "mujoco_model", lambda scene, *args, **options: build(other, *args, **options))
+    with pytest.raises(RuntimeError, match=f"MuJoCo is not the same mechanism as ur5: its {quantity} is off"):
+        peers.require_same(case)
+
+
+def test_energies_of_mujoco_are_those_of_nodes(peers):
+    """What MuJoCo itself reports after a step of RK4 belongs to the step's last stage."""
+    pytest.importorskip("mujoco")
+    rest = np.zeros(2)
+    case = peers.Case("chain", vp.Scene(vp.planar_chain(2)), rest, rest, rest, 1.0)
+    energy = peers.mujoco_energies(case, 1e-3, "RK4")
+    assert energy.shape == (1001,)
+    assert np.abs(energy - energy[0]).max() < 1e-8
+
+
+def test_robots_that_peers_are_not_built_for_are_refused(peers, case):
+    model = case.scene.robot.model.copy()
+    model.armature = np.full(6, 0.1)
+    with pytest.raises(ValueError, match="has armature"):
+        peers.require_same(dataclasses.replace(case, scene=vp.Scene(vp.load_robot(model))))
