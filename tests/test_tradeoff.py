@@ -149,8 +149,6 @@ def test_the_first_run_of_a_member_does_not_count(monkeypatch):
     monkeypatch.setattr(Setting, "_once", slow_at_first)
     options = {"duration": 1.0, "dts": [0.1], "integrators": [vp.RungeKutta4()]}
     options["reference"] = vp.Reference(rtol=1e-9)
-    exact = vp.work_precision(spring(), [0.7], [0.3], **options | {"integrators": [vp.Midpoint()], "dts": [1.0]})
-    assert exact.runs[0].survived
     for times, repeats, seconds, spread in (
         ([0.1, 1e-3, 5e-3, 2e-3], 3, 1e-3, 1e-3),
         ([0.1, 1e-3], 1, 1e-3, 0.0),
