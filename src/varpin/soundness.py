@@ -51,8 +51,9 @@ def warnings_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     defect = np.abs(trajectory.statistics.energy_defect)
     scale = energy_scale(scene, trajectory)
     worst = int(np.argmax(defect))
+    rounding = 1e-12 * float(np.abs(trajectory.energy).max())
     # Written such that what is not finite is spoken of.
-    if not defect[worst] <= ENERGY_BUDGET * scale:
+    if not defect[worst] <= ENERGY_BUDGET * scale + rounding:
         share = f", {100 * defect[worst] / scale:.3g}% of what there was to turn over" if scale > 0.0 else ""
         found.append(
             f"the energy is off by {defect[worst]:.3g} J at t = {trajectory.t[worst + 1]:.4g} s{share}: "

@@ -18,7 +18,7 @@ from varpin._version import __version__
 from varpin.checks import path_like, positive, writable
 from varpin.errors import FileError, VarpinError
 from varpin.extremes import plans
-from varpin.extremes.checks import Exact, exact_motion, findings, finite, measures
+from varpin.extremes.checks import Exact, condition, exact_motion, findings, finite, measures
 from varpin.extremes.plans import PLANS, Plan
 from varpin.extremes.scenes import TRIALS, trials_on
 from varpin.extremes.trial import Cell, Kind, Setup, Trial
@@ -251,7 +251,7 @@ class Bench:
             # Whatever has no name of varpin's own is a fault, and the others are worth having.
             text = (f"unnamed error: {type(error).__name__}: {error}",)
             return nothing | {"kind": Kind.WRONG, "said": (), "found": text, "done": 0}
-        wrong = findings(found, integrator)
+        wrong = findings(found, integrator, condition(self._setup))  # type: ignore[arg-type]
         if not finite(trajectory):
             kind, wrong = Kind.WRONG, ("the record is not finite", *wrong)
         elif complaint is not None:
