@@ -230,7 +230,8 @@ def simulate(
     with announced_compilation():
         state, (start,) = integrator.start(scene, q0[None], v0[None])
         record = _Record(scene, integrator, dt, steps, dw, start)
-        chunk = max(1, _CHUNK // n)
+        # A sweep takes as long as the robot has joints, an elimination as their cube.
+        chunk = max(1, _CHUNK // (n + n**3 // 100))
         # One step at a time where Python functions are called, so that what came before one that fails is recorded.
         stepwise = law is not None or scene.noise.diffusion is None
         try:

@@ -211,13 +211,20 @@ def reversal_error(scene: Scene, integrator: Integrator, trajectory: Trajectory)
 
 
 def symplecticity_error(A: Floats) -> float:
-    """Largest entry of A' J A - J over all A (N, 2n, 2n), in units of the magnitudes that cancel in it."""
+    """Largest entry of A' J A - J over all A (N, 2n, 2n), in units of the largest magnitude that cancels in it.
+
+    In coordinates of each A's own scale: with q_i / s_i and p_i s_i for q and p, where what a kick does is of size one.
+    """
     n = A.shape[1] // 2
     J = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
-    size = np.abs(J)
-    off = np.abs(A.transpose(0, 2, 1) @ J @ A - J)
-    terms = np.abs(A).transpose(0, 2, 1) @ size @ np.abs(A) + size
-    return float(np.max(off / np.maximum(terms, np.finfo(np.float64).tiny)))
+    # Sums over i of |dq_i/dp_j| |dp_i/dp_j|: the scales of the other joints cancel in them.
+    s = np.sqrt(np.einsum("kij,kij->kj", np.abs(A[:, :n, n:]), np.abs(A[:, n:, n:])))
+    s = np.where(s > 0.0, s, 1.0)
+    S = np.concatenate([1.0 / s, s], axis=1)
+    own = S[:, :, None] * A / S[:, None, :]
+    off = np.abs(own.transpose(0, 2, 1) @ J @ own - J).max(axis=(1, 2))
+    terms = (np.abs(own).transpose(0, 2, 1) @ np.abs(J) @ np.abs(own)).max(axis=(1, 2))
+    return float(np.max(off / np.maximum(terms, 1.0)))
 
 
 def linearized(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Floats:
@@ -290,7 +297,7 @@ def findings(found: dict[str, float], integrator: Integrator, condition: float =
     """Which measures are beyond their level, in words; ``condition`` is that of the mass matrix."""
     levels = {name: LEVELS[name] for name in found}
     # Derivatives hold solutions of linear systems, and cannot be better than those.
-    levels["symplecticity"] = max(LEVELS["symplecticity"], 1e3 * np.finfo(np.float64).eps * condition)
+    levels["symplecticity"] = max(LEVELS["symplecticity"], 10.0 * np.finfo(np.float64).eps * condition)
     if integrator.variational:
         levels["momentum"] = LEVELS["kept momentum"]
     return tuple(
