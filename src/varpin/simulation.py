@@ -319,7 +319,8 @@ def control_rows(scene: Scene, controls: ArrayLike | None, steps: int) -> Floats
     array = as_floats("controls", controls)
     if array.shape != shape and array.shape != shape[1:]:
         raise InputError(f"controls must have shape {shape}, one row a step, or {shape[1:]}, got {array.shape}")
-    return np.ascontiguousarray(np.broadcast_to(require_finite("controls", array), shape))
+    # A copy: to numba a view that must not be written to is another type, and every kernel would be compiled anew.
+    return np.broadcast_to(require_finite("controls", array), shape).copy()
 
 
 def _next(commands: Commands, record: _Record) -> Commands:

@@ -238,7 +238,7 @@ def _trials() -> Iterator[Trial]:
 
     for links, steps in ((1, 1000), (2, 1000), (4, 1000), (16, 200), (64, 20)):
         yield Trial(f"{links} links", "links", _chain(links), 1e-2, steps, window=0.5)
-    yield Trial("256 links", "links", _chain(256), 1e-3, 3, window=0.003)
+    yield Trial("256 links", "links", _chain(256), 1e-3, 3, window=0.003, deep=True)
     yield Trial("64 links, 1000 steps", "links", _chain(64), 1e-2, 1000, window=0.5, deep=True)
     yield Trial("256 links, 200 steps", "links", _chain(256), 1e-2, 200, window=0.1, deep=True)
 
