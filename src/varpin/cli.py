@@ -1,7 +1,7 @@
 """The ``varpin`` command: simulate a robot, look into its description, or choose an integrator for it.
 
-Exit status: 0 done, 2 a mistake in the request, 3 a step that could not be solved or an accuracy out of reach, 130
-interrupted.
+Exit status: 0 done, 1 a silent wrong result among extreme scenes, 2 a mistake in the request, 3 a step that could not
+be solved or an accuracy out of reach, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,7 +40,10 @@ from varpin.tradeoff import advise, work_precision
 from varpin.tradeoff.setting import Setting
 from varpin.trajectory import Trajectory, atomic_file
 
-MISTAKE, STEP_FAILED, INTERRUPTED = 2, 3, 130
+if TYPE_CHECKING:
+    from varpin.extremes import Cell
+
+FAULTY, MISTAKE, STEP_FAILED, INTERRUPTED = 1, 2, 3, 130
 
 PLOT_FORMATS = (".png", ".pdf", ".svg")
 # More steps than anyone can hold in memory, said before NumPy says it in its own words.
@@ -58,6 +62,7 @@ examples:
   varpin inspect ur5 --q 0 -1.2 1 0 0 0
   varpin advise ur5 --tolerance 1e-6 --duration 1
   varpin tradeoff ur5 --duration 1 --out ur5-tradeoff
+  varpin extremes finger --out finger-extremes
 """
 
 
@@ -119,6 +124,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_tradeoff(commands.add_parser("tradeoff", help="measure speed against accuracy", allow_abbrev=False))
     _add_advise(commands.add_parser("advise", help="find the cheapest integrator and step", allow_abbrev=False))
     _add_paper(commands.add_parser("paper", help="reproduce the paper's experiments", allow_abbrev=False))
+    _add_extremes(commands.add_parser("extremes", help="run every integrator where it is hard", allow_abbrev=False))
     for command in commands.choices.values():
         command.set_defaults(parser=command)
     return parser
@@ -233,9 +239,27 @@ def _add_paper(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="print nothing but the report's path")
 
 
-def _add_robot(parser: argparse.ArgumentParser) -> None:
+def _add_extremes(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Run scenes at the extremes with every integrator, and judge each result by independent checks: accurate; "
+        "degraded, and varpin says so; refused; stopped; or silent wrong, which is a fault of varpin's. What is in the "
+        "folder already is not run again, so an interrupted battery goes on where it stopped. Exit status 1 if "
+        "anything is silent wrong."
+    )
+    parser.set_defaults(run=_extremes, log_level=logging.CRITICAL)
+    _add_robot(parser, optional=True)
+    parser.add_argument("--deep", action="store_true", help="the long scenes too: hours")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="write the record (JSON) and a heat map (HTML)")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but what is silent wrong")
+
+
+def _add_robot(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
     parser.add_argument(
-        "robot", metavar="ROBOT", help="path of a URDF file, or name of a robot of varpin or of example-robot-data"
+        "robot",
+        metavar="ROBOT",
+        nargs="?" if optional else None,
+        help="path of a URDF file, or name of a robot of varpin or of example-robot-data"
+        + ("; scenes made up for it if left out" if optional else ""),
     )
     parser.add_argument(
         "--lock",
@@ -611,6 +635,51 @@ def _robots(_request: argparse.Namespace, _errors: Console) -> int:
     console.print(table)
     _say(console, "joints without those that mimic others; --lock holds some still", prefix="")
     return 0
+
+
+def _extremes(request: argparse.Namespace, errors: Console) -> int:
+    from varpin import extremes_report as report  # noqa: PLC0415 - most commands have no use for it
+    from varpin.extremes import Kind, run  # noqa: PLC0415
+
+    robot = None
+    if request.robot is not None:
+        robot = load_robot(request.robot, package_dirs=request.package_dir, lock=dict(request.lock))
+    folder = None if request.out is None else _folder(request.out)
+    with _progress(errors, 1, quiet=request.quiet, unit="cells") as progress:
+        record = run(
+            robot,
+            deep=request.deep,
+            save=None if folder is None else folder / "extremes.json",
+            progress=lambda done, cells, _: progress(done, cells),
+        )
+    files = [] if folder is None else [folder / "extremes.json", report.write_page(folder / "extremes.html", record)]
+    console = Console() if sys.stdout.isatty() else Console(width=_WIDTH)
+    columns, rows = report.grid(record)
+    if not request.quiet:
+        table = _table(f"{record.robot} at the extremes", ("scene", *columns))
+        last = ""
+        for family, trial, cells in rows:
+            if family != last:
+                _row(table, family, style="bold")
+                last = family
+            entries = (cells.get(name) for name in columns)
+            table.add_row(Text(f"  {trial}"), *(_extreme(cell) for cell in entries))
+        console.print(table)
+        for kind, count in record.counts().items():
+            _say(console, f"{count} {kind.value}", prefix=report.LETTERS[kind])
+        for path in files:
+            _say(console, str(path), prefix="written")
+    for cell in record.wrong():
+        _say(console, f"{cell.trial}, {cell.integrator}: {'; '.join(cell.found)}", prefix=Kind.WRONG.value, style="red")
+    if record.missing:
+        return INTERRUPTED
+    return FAULTY if record.wrong() else 0
+
+
+def _extreme(cell: Cell | None) -> Text:
+    from varpin.extremes_report import STYLES, entry  # noqa: PLC0415
+
+    return Text("") if cell is None else Text(entry(cell), style=STYLES[cell.kind])
 
 
 def _one_or_all(numbers: Sequence[float] | None) -> ArrayLike | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +19,7 @@ from varpin.kernels.tree import Commands
 from varpin.lagrangian import lagrangian_jet
 from varpin.policy import LinearPolicy
 from varpin.scene import Scene, require_scene
+from varpin.soundness import energy_defects, warnings_of
 from varpin.trajectory import StepStatistics, Trajectory
 from varpin.wiener import wiener_increments
 
@@ -230,10 +231,11 @@ def simulate(
     commands = commands_of(scene, integrator, *given)
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
     with announced_compilation(f"simulate with {type(integrator).__name__}"):
-        _warn_of_ringing(scene, q0, dt)
+        said = _ringing(scene, q0, dt)
         state, (start,) = integrator.start(scene, q0[None], v0[None])
         record = _Record(scene, integrator, dt, steps, dw, start)
-        chunk = max(1, _CHUNK // n)
+        # A sweep takes as long as the robot has joints, an elimination as their cube.
+        chunk = max(1, _CHUNK // (n + n**3 // 100))
         # One step at a time where Python functions are called, so that what came before one that fails is recorded.
         stepwise = law is not None or scene.noise.diffusion is None
         try:
@@ -258,13 +260,23 @@ def simulate(
                 if progress is not None and (not stepwise or record.steps % chunk == 0 or record.steps == steps):
                     progress(record.steps, steps)
         except KeyboardInterrupt:
-            raise Interrupted(record.trajectory()) from None
-    trajectory = record.trajectory()
+            raise Interrupted(_told(scene, integrator, record.trajectory(), said)) from None
+        trajectory = _told(scene, integrator, record.trajectory(), said)
+    for sentence in trajectory.warnings:
+        logger.warning(sentence)
+    return trajectory
+
+
+def _told(scene: Scene, integrator: Integrator, trajectory: Trajectory, said: tuple[str, ...]) -> Trajectory:
+    """A whole motion with the balance of its energy, if the integrator keeps none, and with what is to be said."""
+    if not integrator.variational:
+        own = replace(trajectory.statistics, energy_defect=energy_defects(scene, trajectory))
+        trajectory = replace(trajectory, statistics=own)
     split = trajectory.statistics.split_steps
     if split:
-        most = trajectory.statistics.substeps.max()
-        logger.warning("%d of %d steps were taken in up to %d parts: dt = %g s is coarse here", split, steps, most, dt)
-    return trajectory
+        most, steps, dt = trajectory.statistics.substeps.max(), trajectory.steps, trajectory.dt
+        said = (*said, f"{split} of {steps} steps were taken in up to {most} parts: dt = {dt:g} s is coarse here")
+    return replace(trajectory, warnings=(*said, *warnings_of(scene, integrator, trajectory)))
 
 
 def _require_memory(scene: Scene, steps: int) -> None:
@@ -276,19 +288,18 @@ def _require_memory(scene: Scene, steps: int) -> None:
         raise InputError(f"steps = {steps} needs more memory than there is: {columns * 8} bytes a step") from None
 
 
-def _warn_of_ringing(scene: Scene, q0: Floats, dt: float) -> None:
-    """Say that dampers are too fast for the step: the midpoint rule keeps stable, but turns velocities round."""
+def _ringing(scene: Scene, q0: Floats, dt: float) -> tuple[str, ...]:
+    """Says if dampers are too fast for the step: the midpoint rule keeps stable, but turns velocities round."""
     if not scene.damping.any():
-        return
+        return ()
     rate = np.linalg.solve(lagrangian_jet(scene, q0, np.zeros_like(q0)).Lvv, np.diag(scene.damping))
     fastest = float(np.abs(np.linalg.eigvals(rate)).max())
-    if 0.5 * dt * fastest > 1.0:
-        logger.warning(
-            "damping is faster than the step (dt * %.3g/s > 2): velocities that it should stop will ring; "
-            "dt below %.3g s resolves it",
-            fastest,
-            2.0 / fastest,
-        )
+    if 0.5 * dt * fastest <= 1.0:
+        return ()
+    return (
+        f"damping is faster than the step (dt * {fastest:.3g}/s > 2): velocities that it should stop will ring; "
+        f"dt below {2.0 / fastest:.3g} s resolves it",
+    )
 
 
 def commands_of(
@@ -312,7 +323,8 @@ def control_rows(scene: Scene, controls: ArrayLike | None, steps: int) -> Floats
     array = as_floats("controls", controls)
     if array.shape != shape and array.shape != shape[1:]:
         raise InputError(f"controls must have shape {shape}, one row a step, or {shape[1:]}, got {array.shape}")
-    return np.ascontiguousarray(np.broadcast_to(require_finite("controls", array), shape))
+    # A copy: to numba a view that must not be written to is another type, and every kernel would be compiled anew.
+    return np.broadcast_to(require_finite("controls", array), shape).copy()
 
 
 def _next(commands: Commands, record: _Record) -> Commands:

@@ -86,6 +86,7 @@ class Trajectory:
         joint_names: Names of the coordinates.
         statistics: What each step took.
         version: The varpin that made it.
+        warnings: What varpin said of the motion, a sentence each: dt too coarse, energy off, steps taken in parts.
     """
 
     t: Floats
@@ -102,6 +103,7 @@ class Trajectory:
     joint_names: tuple[str, ...]
     statistics: StepStatistics
     version: str = __version__
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in _ARRAYS:
@@ -153,6 +155,7 @@ class Trajectory:
         members |= {f"statistics.{item.name}": getattr(self.statistics, item.name) for item in fields(StepStatistics)}
         members |= {"format": FORMAT, "version": self.version, "integrator": self.integrator, "robot": self.robot}
         members |= {"dt": self.dt, "joint_names": np.array(self.joint_names, dtype=str)}
+        members |= {"warnings": np.array(self.warnings, dtype=str)}
         with atomic_file(path) as stream:
             np.savez_compressed(stream, **members)
         return Path(path)
@@ -202,6 +205,8 @@ class Trajectory:
                 f"{source} is of robot {members['robot']!s} with joints {', '.join(names)}; "
                 f"{robot.name!r} has joints {', '.join(robot.joint_names)}"
             )
+        if members["warnings"].ndim != 1 or members["warnings"].dtype.kind != "U":
+            raise FileError(f"{source}: warnings has no sentences, but {members['warnings'].dtype}")
         masses = members["masses"]
         if robot is not None and (
             masses.shape != robot.tree.mass.shape or not np.allclose(masses, robot.tree.mass, rtol=1e-6)
@@ -219,6 +224,7 @@ class Trajectory:
             joint_names=names,
             statistics=statistics,
             version=str(members["version"]),
+            warnings=tuple(str(sentence) for sentence in members["warnings"]),
         )
 
 
@@ -256,7 +262,10 @@ def _read_members(source: Path) -> dict[str, NDArray[Any]]:
             missing = sorted(expected - set(archive.files))
             if missing:
                 raise FileError(f"{source} is not a varpin trajectory: it has no {', '.join(missing)}")
-            return {name: archive[name] for name in expected}
+            # Records of earlier versions have no warnings.
+            members = {name: archive[name] for name in expected}
+            members["warnings"] = archive["warnings"] if "warnings" in archive.files else np.zeros(0, dtype=str)
+            return members
     except FileError:
         raise
     except OSError as error:

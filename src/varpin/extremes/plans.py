@@ -1,0 +1,244 @@
+"""Optimal control at the extremes, and what is checked of a plan: its cost, and that nothing near is better."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.costs import ControlCost, Cost, Terminal, TrackingCost
+from varpin.errors import VarpinError
+from varpin.extremes.trial import Kind
+from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint
+from varpin.noise import AdditiveNoise, ControlNoise, Noise
+from varpin.problem import OptimalControlProblem
+from varpin.robot import Robot
+from varpin.robot.chain import rod_chain
+from varpin.scene import Scene
+from varpin.sddp import solve
+from varpin.simulation import simulate
+from varpin.solution import Solution
+
+Floats = NDArray[np.float64]
+
+# Part of a plan's cost that single controls may still take off it, and relative error of the cost itself.
+LEFT_LEVEL, COST_LEVEL = 1e-2, 1e-6
+_PLANNERS = (Midpoint(), Gauss(stages=2), ExplicitEuler())
+# Controls that are varied one by one.
+_VARIED = 12
+_UP = -0.5 * math.pi  # of a rod whose angle is 0 along x and turns down
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A problem of optimal control whose cost is a weight on the distance from a reference and one on the controls.
+
+    Attributes:
+        scene: The scene.
+        q0: (n,) [rad or m].
+        reference: Rows (N + 1, n), or one (n,).
+        tracking: Weight.
+        effort: Weight.
+        final: Weight at the end.
+        controls: To start from, or None.
+    """
+
+    scene: Scene
+    q0: Floats
+    reference: Floats
+    tracking: float = 10.0
+    effort: float = 0.1
+    final: float = 1.0
+    controls: Floats | None = None
+
+    def problem(self, dt: float, steps: int, integrator: Integrator) -> OptimalControlProblem:
+        """The same for varpin."""
+        cost: Cost = TrackingCost(self.reference, self.tracking) + ControlCost(self.effort)
+        cost = cost + Terminal(TrackingCost(np.atleast_2d(self.reference)[-1], self.final))
+        v0 = np.zeros(len(self.q0))
+        return OptimalControlProblem(self.scene, cost, self.q0, v0, dt=dt, steps=steps, integrator=integrator)
+
+    def cost(self, q: Floats, u: Floats, dt: float) -> float:
+        """The cost of a motion, summed by hand at the midpoints of its steps."""
+        rows = np.broadcast_to(np.atleast_2d(self.reference), q.shape)
+        off = 0.5 * (q[1:] + q[:-1]) - 0.5 * (rows[1:] + rows[:-1])
+        running = dt * (self.tracking * (off**2).sum() + self.effort * (u**2).sum())
+        return float(running + self.final * ((q[-1] - rows[-1]) ** 2).sum())
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A task at an extreme; attributes as of :class:`varpin.extremes.Trial`."""
+
+    name: str
+    family: str
+    build: Callable[[], Task]
+    dt: float
+    steps: int
+    iterations: int = 50
+    deep: bool = False
+
+    def takes(self, integrator: Integrator) -> bool:
+        """Whether it is solved with an integrator: with three of them."""
+        return integrator in _PLANNERS
+
+
+def attempt(plan: Plan, integrator: Integrator) -> dict[str, Any]:
+    """Solve it and judge the solution: what a cell holds."""
+    outcome: dict[str, Any] = dict.fromkeys(
+        ("error", "energy", "momentum", "reversal", "symplecticity", "record"), math.nan
+    ) | {"said": (), "found": (), "done": 0}
+    try:
+        task = plan.build()
+        problem = task.problem(plan.dt, plan.steps, integrator)
+    except VarpinError as error:
+        return outcome | {"kind": Kind.REFUSED, "said": (_line(error),)}
+    try:
+        solution = solve(problem, task.controls, max_iterations=plan.iterations)
+    except VarpinError as error:
+        done = getattr(getattr(error, "trajectory", None), "steps", 0)
+        return outcome | {"kind": Kind.STOPPED, "said": (_line(error),), "done": done}
+    except Exception as error:
+        return outcome | {"kind": Kind.WRONG, "found": (f"unnamed error: {type(error).__name__}: {error}",)}
+    record, left = cost_error(task, solution), part_left(task, solution)
+    found = []
+    # Written such that NaN is found.
+    if not record <= COST_LEVEL:
+        found.append(f"cost off by {record:.2g} of itself (wrong from {COST_LEVEL:g})")
+    if not (np.isfinite(solution.gains).all() and np.isfinite(solution.feedforward).all()):
+        found.append("the policy is not finite")
+    if solution.status.converged and not (math.isnan(left) or left <= LEFT_LEVEL):
+        found.append(f"single controls take {left:.2g} off the cost (wrong from {LEFT_LEVEL:g})")
+    said = () if solution.status.converged else (solution.status.value,)
+    kind = Kind.WRONG if found else Kind.DEGRADED if said else Kind.ACCURATE
+    return outcome | {
+        "kind": kind,
+        "error": left,
+        "record": record,
+        "said": said,
+        "found": tuple(found),
+        "done": plan.steps,
+    }
+
+
+def cost_error(task: Task, solution: Solution) -> float:
+    """Distance of a solution's cost from that of its motion, summed by hand, in units of the cost."""
+    motion = solution.trajectory
+    cost = task.cost(motion.q, motion.u, motion.dt)
+    return abs(cost - solution.cost) / max(abs(cost), np.finfo(np.float64).tiny) if cost != solution.cost else 0.0
+
+
+def part_left(task: Task, solution: Solution) -> float:
+    """The part of the cost that changes of single controls would take off, by simulating them.
+
+    A parabola through three costs, for some controls spread over time, and their sum for all; NaN with noise in the
+    controls, where the expected cost is another, and where a motion fails.
+    """
+    diffusion = solution.problem.scene.noise.diffusion
+    if diffusion is None or diffusion.control.any():
+        return math.nan
+    problem, u = solution.problem, solution.trajectory.u
+    cells = np.argwhere(np.ones(u.shape, dtype=bool))
+    chosen = cells[np.unique(np.linspace(0, len(cells) - 1, _VARIED).astype(int))]
+    size = max(float(np.abs(u).max()), 1e-3)
+
+    def cost(controls: Floats) -> float:
+        motion = simulate(
+            problem.scene, problem.q0, problem.v0,
+            dt=problem.dt, steps=problem.steps, controls=controls, integrator=problem.integrator,
+        )  # fmt: skip
+        return task.cost(motion.q, controls, problem.dt)
+
+    here = cost(u)
+    gain = 0.0
+    try:
+        for row, column in chosen:
+            sides = []
+            for sign in (1.0, -1.0):
+                moved = u.copy()
+                moved[row, column] += sign * 1e-3 * size
+                sides.append(cost(moved) - here)
+            slope, bend = 0.5 * (sides[0] - sides[1]), sides[0] + sides[1]
+            if bend > 0.0:
+                gain += min(0.5 * slope * slope / bend, here)
+    except VarpinError:
+        return math.nan
+    return gain * len(cells) / len(chosen) / max(here, np.finfo(np.float64).tiny)
+
+
+def _line(error: BaseException) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def _arm(
+    links: int = 2,
+    *,
+    q0: ArrayLike = 0.0,
+    reference: ArrayLike = 0.5,
+    actuation: ArrayLike | None = None,
+    gravity: bool = True,
+    noise: Noise | None = None,
+    **task: Any,
+) -> Callable[[], Task]:
+    def build() -> Task:
+        robot = rod_chain([0.3] * links, [1.0] * links)
+        scene = Scene(robot, gravity=gravity, actuation=actuation, noise=noise)
+        start = np.broadcast_to(np.asarray(q0, dtype=np.float64), (links,)).copy()
+        rows = np.asarray(reference, dtype=np.float64)
+        return Task(scene, start, np.broadcast_to(rows, (links,)) if rows.ndim < 2 else rows, **task)
+
+    return build
+
+
+def _plans() -> Iterator[Plan]:
+    for steps in (1, 10, 1000):
+        yield Plan(f"{steps} nodes", "plans: horizon", _arm(), 1e-2, steps)
+    yield Plan("1e4 nodes", "plans: horizon", _arm(1), 1e-2, 10_000)
+    yield Plan("1e5 nodes", "plans: horizon", _arm(1), 1e-2, 100_000, deep=True)
+    for weight in (1e-9, 1e-3, 1e3, 1e9):
+        yield Plan(f"tracking weight {weight:g}", "plans: weights", _arm(tracking=weight, final=weight), 1e-2, 100)
+    for weight in (0.0, 1e-9, 1e9):
+        yield Plan(f"control weight {weight:g}", "plans: weights", _arm(effort=weight), 1e-2, 100)
+    yield Plan("all weights 1e-9", "plans: weights", _arm(tracking=1e-9, effort=1e-9, final=1e-9), 1e-2, 100)
+    yield Plan("all weights 1e9", "plans: weights", _arm(tracking=1e9, effort=1e9, final=1e9), 1e-2, 100)
+    jumps = np.where(np.arange(101) % 2 == 0, 10.0, -10.0)[:, None] * np.ones(2)
+    yield Plan("reference jumps by 20 rad a step", "plans: request", _arm(reference=jumps), 1e-2, 100)
+    yield Plan("reference at 1e6 rad", "plans: request", _arm(reference=1e6), 1e-2, 100)
+    up = _arm(q0=[_UP, 0.0], reference=[_UP, 0.0], controls=np.array([2.0, -1.0]))
+    yield Plan("upright, pushed over at first", "plans: request", up, 1e-2, 200)
+    wild = _arm(controls=np.array([1e4, -1e4]))
+    yield Plan("first controls of 1e4 N m", "plans: request", wild, 1e-2, 100)
+    yield Plan("a joint without motor", "plans: actuation", _arm(actuation=[[1.0], [0.0]]), 1e-2, 100)
+    yield Plan("motors that do nothing", "plans: actuation", _arm(actuation=[[0.0], [0.0]]), 1e-2, 100)
+    yield Plan("two motors on one joint", "plans: actuation", _arm(actuation=[[1.0, 1.0], [0.0, 0.0]]), 1e-2, 100)
+    for strength in (1e-9, 1.0, 1e6):
+        name = f"added noise of {strength:g}"
+        yield Plan(name, "plans: noise", _arm(noise=AdditiveNoise(strength)), 1e-2, 100)
+    for strength in (0.1, 10.0, 1e4):
+        name = f"controls tremble by {strength:g}"
+        yield Plan(name, "plans: noise", _arm(noise=ControlNoise(strength)), 1e-2, 100)
+
+
+PLANS: tuple[Plan, ...] = tuple(_plans())
+
+
+def plans_on(robot: Robot) -> list[Plan]:
+    """Plans that make sense for any robot."""
+
+    def task(**options: Any) -> Callable[[], Task]:
+        def build() -> Task:
+            scene = Scene(robot, noise=options.pop("noise", None)) if "noise" in options else Scene(robot)
+            return Task(scene, np.full(robot.dof, 0.3), np.zeros(robot.dof), **options)
+
+        return build
+
+    return [
+        Plan("1 node", "plans", task(), 1e-2, 1),
+        Plan("100 nodes", "plans", task(), 1e-2, 100),
+        Plan("tracking weight 1e9", "plans", task(tracking=1e9, final=1e9), 1e-2, 50),
+        Plan("no control weight", "plans", task(effort=0.0), 1e-2, 50),
+    ]

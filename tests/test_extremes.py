@@ -1,0 +1,327 @@
+"""The battery of extreme scenes: its checks can fail, its kinds mean what they say, and it finds nothing silent."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin import extremes
+from varpin.cli import main
+from varpin.extremes import Kind, Setup, Trial, checks
+from varpin.extremes.battery import INTEGRATORS
+from varpin.extremes.plans import Task, attempt, cost_error, part_left
+from varpin.robot.chain import rod_chain
+
+BY_NAME = {trial.name: trial for trial in (*extremes.TRIALS, *extremes.PLANS)}
+MEASURES = ("error", "energy", "momentum", "reversal", "symplecticity", "record")
+
+
+def falling(integrator=None, *, dt=1e-2, steps=100, **scene):
+    """Three links that fall: their setup and their motion."""
+    setup = Setup(vp.Scene(rod_chain([1.0] * 3, [1.0] * 3), **scene), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    return setup, vp.simulate(setup.scene, setup.q0, setup.v0, dt=dt, steps=steps, integrator=integrator)
+
+
+def tampered(trajectory, **changes):
+    """The record with other arrays, and nothing said of it."""
+    return dataclasses.replace(trajectory, warnings=(), **changes)
+
+
+def run_one(setup, dt=1e-2, steps=100, integrator=None, **options):
+    trial = Trial("made up", "made up", lambda: setup, dt, steps, **options)
+    return extremes.run(trials=[trial], integrators=[integrator or vp.Midpoint()]).cells[0]
+
+
+def same(one, other):
+    """Whether two cells agree in all but the time they took."""
+    one, other = (dataclasses.replace(cell, seconds=0.0) for cell in (one, other))
+    return str(one) == str(other)
+
+
+# --- each check can fail -------------------------------------------------------------------------------------------
+
+
+def test_a_sound_motion_passes_every_check():
+    setup, motion = falling(gravity=False)
+    found = checks.measures(setup, vp.Midpoint(), motion, checks.exact_motion(setup, 1e-2, 100, 0.3))
+    assert not any(math.isnan(found[name]) for name in MEASURES)
+    assert checks.findings(found, vp.Midpoint()) == ()
+    assert found["error"] < 1e-2
+    assert found["momentum"] < 1e-12
+    assert found["symplecticity"] < 1e-13
+
+
+def test_energy_that_is_made_up_is_found():
+    setup, motion = falling()
+    kinetic = (0.5 * motion.p * motion.v).sum(axis=1).max()
+    leak = np.linspace(0.0, 0.2 * kinetic, 101)
+    assert checks.energy_error(setup.scene, motion) < 0.02
+    assert checks.energy_error(setup.scene, tampered(motion, energy=motion.energy + leak)) > checks.LEVELS["energy"]
+    # And Pinocchio knows better what the energy is.
+    assert checks.record_error(setup.scene, motion) < 1e-12
+    assert checks.record_error(setup.scene, tampered(motion, energy=motion.energy + leak)) > checks.LEVELS["record"]
+
+
+def test_energy_that_overflows_is_found():
+    setup, motion = falling()
+    assert checks.energy_error(setup.scene, tampered(motion, energy=motion.energy * 1e308)) == np.inf
+
+
+def test_momentum_that_leaks_is_found():
+    setup, motion = falling(gravity=False)
+    p = motion.p * np.linspace(1.0, 1.0 + 1e-5, 101)[:, None]
+    found = checks.measures(setup, vp.Midpoint(), tampered(motion, p=p), None)
+    assert {text.split()[0] for text in checks.findings(found, vp.Midpoint())} >= {"momentum", "record"}
+
+
+def test_a_wrong_root_is_found_by_the_reference_and_by_reversal():
+    # Another root of the step equation of a rod: it goes the long way round, and every record of it is consistent.
+    setup, motion = falling()
+    turn = np.zeros_like(motion.q)
+    turn[40:, 2] = 2.0 * math.pi
+    q = motion.q + turn
+    exact = checks.exact_motion(setup, 1e-2, 100, 0.5)
+    assert len(exact.nodes) > 20
+    assert checks.reference_error(exact, motion) < 1e-2
+    assert checks.reference_error(exact, tampered(motion, q=q)) > checks.LEVELS["error"]
+    jumped = tampered(motion.part(0, 44), q=q[:45])
+    assert checks.reversal_error(setup.scene, vp.Midpoint(), motion) < 1e-9
+    assert checks.reversal_error(setup.scene, vp.Midpoint(), jumped) > checks.LEVELS["reversal"]
+
+
+def test_a_motion_that_is_not_reversible_is_found():
+    setup, _ = falling()
+    euler = vp.simulate(setup.scene, setup.q0, setup.v0, dt=1e-2, steps=20, integrator=vp.ExplicitEuler())
+    assert checks.reversal_error(setup.scene, vp.Midpoint(), euler) > checks.LEVELS["reversal"]
+
+
+def test_a_map_that_is_not_symplectic_is_found():
+    setup, motion = falling()
+    A = checks.linearized(setup.scene, vp.Midpoint(), motion)
+    assert A.shape == (4, 6, 6)
+    assert checks.symplecticity_error(A) < 1e-13
+    A[2, 0, 4] *= 1.0 + 1e-5
+    assert checks.symplecticity_error(A) > checks.LEVELS["symplecticity"]
+    # Scale does not matter: lengths in millimetres change nothing.
+    scale = np.array([1e3] * 3 + [1e-3] * 3)
+    scaled = scale[:, None] * A / scale
+    assert checks.symplecticity_error(scaled) == pytest.approx(checks.symplecticity_error(A), rel=1e-6)
+
+
+def test_nan_is_found():
+    _, motion = falling()
+    v = motion.v.copy()
+    v[7, 1] = np.nan
+    assert checks.finite(motion)
+    assert not checks.finite(tampered(motion, v=v))
+
+
+def test_the_exact_motion_is_exact():
+    # A linear oscillator, overdamped and not, in closed form against DOP853.
+    for trial in extremes.TRIALS:
+        if trial.name in (
+            "spring, h omega = 0.1",
+            "spring and damper, h d / I = 0.1",
+            "spring and damper, h d / I = 1",
+        ):
+            setup = trial.build()
+            closed = checks.exact_motion(setup, 1e-2, 100, 0.5)
+            integrated = checks.exact_motion(dataclasses.replace(setup, exact=None), 1e-2, 100, 0.5)
+            np.testing.assert_allclose(closed.q, integrated.q, rtol=0, atol=1e-9)
+
+
+def test_the_exact_motion_ends_where_it_cannot_be_told():
+    chaotic = Setup(vp.Scene(rod_chain([1.0] * 2, [1.0] * 2)), np.array([-1.5, 0.4]), np.zeros(2))
+    assert checks.exact_motion(chaotic, 1e-2, 2000, 20.0).nodes[-1] < 1000
+
+
+def test_kicks_of_noise_are_in_the_reference():
+    trial = BY_NAME["noise of 1 N m s^0.5"]
+    setup = trial.build()
+    exact = checks.exact_motion(setup, trial.dt, trial.steps, trial.window)
+    given = {"dt": trial.dt, "steps": trial.steps, "increments": setup.increments}
+    motion = vp.simulate(setup.scene, setup.q0, setup.v0, **given)
+    quiet = vp.simulate(setup.scene, setup.q0, setup.v0, dt=trial.dt, steps=trial.steps)
+    assert checks.reference_error(exact, motion) < 1e-2
+    assert checks.reference_error(exact, quiet) > checks.LEVELS["error"]
+
+
+# --- the kinds -----------------------------------------------------------------------------------------------------
+
+
+def test_what_is_wrong_and_unsaid_is_silent_wrong(monkeypatch):
+    # The bench believes in a motion of the pendulum that is none.
+    rod = vp.Scene(rod_chain([1.0], [1.0]))
+    lie = Setup(rod, np.zeros(1), np.zeros(1), exact=lambda t: np.array([-7.0 * t * t]))
+    cell = run_one(lie, window=0.5)
+    assert cell.kind is Kind.WRONG
+    assert "error" in cell.found[0]
+    # The same error, but spoken of.
+    monkeypatch.setattr("varpin.simulation.warnings_of", lambda *_: ("all is not well",))
+    assert run_one(lie, window=0.5).kind is Kind.DEGRADED
+
+
+def test_errors_without_a_name_are_silent_wrong():
+    def build():
+        raise ZeroDivisionError("of the test")
+
+    trial = Trial("made up", "made up", build, 1e-2, 10)
+    (cell,) = extremes.run(trials=[trial], integrators=[vp.Midpoint()]).cells
+    assert cell.kind is Kind.WRONG
+    assert cell.found == ("unnamed error: ZeroDivisionError: of the test",)
+
+
+def test_refused_before_anything_ran():
+    (cell,) = extremes.run(trials=[BY_NAME["tip of 0 kg"]], integrators=[vp.Midpoint()]).cells
+    assert (cell.kind, cell.done) == (Kind.REFUSED, 0)
+    assert cell.said[0].startswith("SingularMassMatrix: ")
+
+
+def test_stopped_with_the_motion_so_far():
+    (cell,) = extremes.run(trials=[BY_NAME["1000 rad/s, dt = 0.001 s"]], integrators=[vp.ExplicitEuler()]).cells
+    assert cell.kind is Kind.STOPPED
+    assert 0 < cell.done < cell.steps
+    assert cell.said[0].startswith("StepFailure: step ")
+
+
+def test_a_motion_that_takes_too_long_is_judged_by_what_there_is():
+    setup, _ = falling()
+    trial = Trial("long", "made up", lambda: setup, 1e-3, 200_000, window=0.1)
+    (cell,) = extremes.run(trials=[trial], integrators=[vp.Midpoint()], patience=0.05).cells
+    assert 0 < cell.done < cell.steps
+    assert cell.kind is Kind.ACCURATE
+
+
+# --- plans ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def small_plan():
+    plan = BY_NAME["10 nodes"]
+    task = plan.build()
+    return task, vp.solve(task.problem(plan.dt, plan.steps, vp.Midpoint()))
+
+
+def test_a_plan_is_an_optimum_and_its_cost_its_own(small_plan):
+    task, solution = small_plan
+    assert cost_error(task, solution) < 1e-12
+    assert part_left(task, solution) < 1e-6
+
+
+def test_a_plan_that_is_no_optimum_is_found(small_plan):
+    task, solution = small_plan
+    problem = solution.problem
+    worse = vp.simulate(
+        problem.scene, problem.q0, problem.v0, dt=problem.dt, steps=10, controls=solution.controls + 5.0
+    )
+    assert part_left(task, dataclasses.replace(solution, trajectory=worse)) > 0.01
+    assert cost_error(task, dataclasses.replace(solution, trajectory=worse)) > 0.01
+
+
+def test_a_plan_of_nan_is_silent_wrong(monkeypatch, small_plan):
+    _, solution = small_plan
+    monkeypatch.setattr("varpin.extremes.plans.solve", lambda *_, **__: dataclasses.replace(solution, cost=math.nan))
+    outcome = attempt(BY_NAME["10 nodes"], vp.Midpoint())
+    assert outcome["kind"] is Kind.WRONG
+    assert "cost off by" in outcome["found"][0]
+
+
+def test_the_cost_by_hand_has_the_weights():
+    task = Task(vp.Scene(rod_chain([1.0], [1.0])), np.zeros(1), np.array([2.0]), tracking=3.0, effort=5.0, final=7.0)
+    # One step of 1/2 from 0 to 1 under u = 4: off by 3/2 in the middle and by 1 at the end.
+    assert task.cost(np.array([[0.0], [1.0]]), np.array([[4.0]]), 0.5) == 0.5 * (3 * 1.5**2 + 5 * 16) + 7
+
+
+# --- the record ----------------------------------------------------------------------------------------------------
+
+
+def small_battery(load):
+    trials = extremes.trials_on(load("finger"))
+    chosen = ("falls, dt = 0.01 s", "falls, dt = 0.5 s", "10 rad/s", "springs, h omega = 2.4", "1 node")
+    return [trial for trial in trials if trial.name in chosen]
+
+
+def test_resumes_to_the_same_record(load, tmp_path):
+    trials, robot = small_battery(load), load("finger")
+    whole = extremes.run(robot, trials=trials, save=tmp_path / "whole.json")
+    assert whole.missing == 0
+    asked = []
+
+    def interrupt(done, cells, name):
+        asked.append(name)
+        if done == 7:
+            raise KeyboardInterrupt
+
+    cut = extremes.run(robot, trials=trials, save=tmp_path / "cut.json", progress=interrupt)
+    assert (len(cut.cells), cut.missing) == (7, len(whole.cells) - 7)
+    kept = extremes.Record.load(tmp_path / "cut.json")
+    assert [cell.seconds for cell in kept.cells] == [cell.seconds for cell in cut.cells]
+    again = extremes.run(robot, trials=trials, save=tmp_path / "cut.json")
+    assert all(same(*pair) for pair in zip(again.cells, whole.cells, strict=True))
+    # What was there was not run again: even its time stands.
+    assert [cell.seconds for cell in again.cells[:7]] == [cell.seconds for cell in cut.cells]
+
+
+def test_a_record_survives_the_disk(tmp_path):
+    cell = extremes.Cell(
+        "f", "t", "i", Kind.STOPPED, math.nan, math.inf, 1e-300, 0.1, math.nan, 0.0, ("a",), (), 1, 2, 0.5, "abc"
+    )
+    record = extremes.Record((cell,), "robot", deep=True, missing=3)
+    loaded = extremes.Record.load(record.save(tmp_path / "record.json"))
+    assert str(loaded.cells) == str(record.cells)
+    assert (loaded.robot, loaded.deep, loaded.missing, loaded.version) == ("robot", True, 3, vp.__version__)
+    assert json.loads((tmp_path / "record.json").read_text())["cells"][0]["error"] is None
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", '{"format": "other"}', '{"format": "varpin.extremes/1"}', "\0\1"])
+def test_damaged_records_are_refused(tmp_path, text):
+    path = tmp_path / "record.json"
+    path.write_text(text)
+    with pytest.raises(vp.FileError, match=r"record\.json"):
+        extremes.run(trials=[], save=path)
+
+
+def test_every_trial_has_a_name_of_its_own(load):
+    for trials in ((*extremes.TRIALS, *extremes.PLANS), extremes.trials_on(load("finger"))):
+        names = [trial.name for trial in trials]
+        assert len(set(names)) == len(names)
+    assert len({repr(member) for member in INTEGRATORS}) == len(INTEGRATORS) == 10
+
+
+def test_the_command_writes_its_files(tmp_path, capsys, monkeypatch, load):
+    monkeypatch.setattr("varpin.extremes.battery.trials_on", lambda _: small_battery(load)[:2])
+    assert main(["extremes", "finger", "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "finger at the extremes" in out
+    assert "0 silent wrong" in out
+    record = extremes.Record.load(tmp_path / "extremes.json")
+    assert len(record.cells) == 2 * len(INTEGRATORS)
+    page = (tmp_path / "extremes.html").read_text()
+    assert page.count("<td class=") == 2 * len(INTEGRATORS) + 2
+    assert "<script" not in page
+    assert "http" not in page.split("</style>")[1]
+
+
+def test_the_command_fails_where_anything_is_silent_wrong(capsys, monkeypatch):
+    rod = vp.Scene(rod_chain([1.0], [1.0]))
+    lie = Setup(rod, np.zeros(1), np.zeros(1), exact=lambda t: np.array([-7.0 * t * t]))
+    trial = Trial("a lie", "made up", lambda: lie, 1e-2, 50)
+    monkeypatch.setattr("varpin.extremes.battery.TRIALS", (trial,))
+    monkeypatch.setattr("varpin.extremes.battery.PLANS", ())
+    assert main(["extremes", "--quiet"]) == 1
+    assert capsys.readouterr().out.count("silent wrong: a lie, ") == len(INTEGRATORS)
+
+
+@pytest.mark.slow
+def test_nothing_on_the_finger_is_silent_wrong(load):
+    record = extremes.run(load("finger"))
+    assert record.missing == 0
+    assert [(cell.trial, cell.integrator, cell.found) for cell in record.wrong()] == []
+    counts = record.counts()
+    assert counts[Kind.ACCURATE] > 60
+    assert counts[Kind.DEGRADED] > 30
