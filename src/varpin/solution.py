@@ -146,7 +146,8 @@ class Solution:
         trajectory: The motion without noise.
         gains: Feedback (R, m, 2n) on x = (q, p) or (q, v), for each of R decisions.
         feedforward: The change of the controls (R, m) that the last backward pass asked for; zero at an optimum.
-        gradient: Of the expected cost in the controls (R, m), under the solver's model of the noise.
+        gradient: Of the expected cost in the controls (R, m), under the solver's model of the noise. At an optimum it
+            is zero but where it pushes a control against its limit.
         cost: Of the motion without noise.
         noise_cost: What noise adds to it, by the solver's model.
         status: How the solver ended.
@@ -205,7 +206,9 @@ class Solution:
             raise InputError(f"decisions must be from 0 to {len(self.gains) - 1}, got {decisions}")
         own = self.policy
         rows = np.minimum(np.arange(len(self.gains)) + decisions, len(self.gains) - 1)
-        return LinearPolicy(own.u[rows], own.gains[rows], own.reference[rows], hold=own.hold, on=own.on)
+        return LinearPolicy(
+            own.u[rows], own.gains[rows], own.reference[rows], own.hold, own.on, (own.limits[0], own.limits[1])
+        )
 
     def policy_on(self, x: Literal["momentum", "velocity"], substeps: int = 1) -> LinearPolicy:
         """The policy on (q, p) or on (q, v), each control held over ``substeps`` times as many steps.
@@ -230,7 +233,8 @@ class Solution:
                 gains = np.concatenate([gains[:, :, :n] + second @ by_q, second @ by_p], axis=2)
         nodes = trajectory.p if x == "momentum" else trajectory.v
         reference = np.hstack([trajectory.q[rows], nodes[rows]])
-        return LinearPolicy(self.controls, gains, reference, hold=hold * substeps, on=x)
+        limits = self.problem.control_limits
+        return LinearPolicy(self.controls, gains, reference, hold * substeps, x, (limits[0], limits[1]))
 
     def verify(
         self, *, tolerance: float = 1e-10, max_substeps: int = 1024, progress: Callable[[int, int], None] | None = None
@@ -254,7 +258,7 @@ class Solution:
             blind = open_loop(self.controls)._replace(hold=problem.hold * substeps)
             opened = accurate_cost(problem, blind, substeps, costs)
             policy = self.policy_on("velocity", substeps)
-            feedback = Commands(policy.u, policy.gains, policy.reference, policy.hold)
+            feedback = Commands(policy.u, policy.gains, policy.reference, policy.hold, policy.limits)
             closed = accurate_cost(problem, feedback, substeps, costs)
             changes = [
                 abs(now[0] - then) / max(abs(now[0]), 1e-300)
