@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, count, finite_array
+from varpin.checks import as_floats, checked_limits, count, finite_array
 from varpin.errors import InputError
 from varpin.kernels.tree import Commands
 
@@ -104,28 +104,3 @@ class LinearPolicy:
         if self.gains.shape[1:] != (controls, 2 * dof):
             raise InputError(f"the policy's gains must have shape (N, {controls}, {2 * dof}), got {self.gains.shape}")
         return Commands(self.u, self.gains, self.reference, self.hold, self.limits)
-
-
-def checked_limits(name: str, limits: tuple[ArrayLike, ArrayLike] | None, controls: int) -> Floats:
-    """(lower, upper), each one number or (m,), as an array (2, m); infinite where there is no limit.
-
-    Raises:
-        InputError: No pair, a wrong shape, NaN, or a lower limit above the upper one.
-    """
-    pair = (-np.inf, np.inf) if limits is None else limits
-    if not isinstance(pair, tuple | list | np.ndarray) or len(pair) != 2:
-        raise InputError(f"{name} must be a pair (lower, upper), got {limits!r}")
-    both = np.empty((2, controls))
-    for row, side, value in zip(both, ("lower", "upper"), pair, strict=True):
-        array = as_floats(f"{name}: {side}", value)
-        if array.shape not in ((), (controls,)):
-            raise InputError(f"{name}: {side} must be one number or have shape ({controls},), got {array.shape}")
-        row[:] = array
-        if np.isnan(row).any():
-            raise InputError(f"{name}: {side}[{int(np.argmax(np.isnan(row)))}] is NaN; inf stands for no limit")
-    wrong = ~(both[0] <= both[1]) | (both[0] == np.inf) | (both[1] == -np.inf)
-    if wrong.any():
-        c = int(np.argmax(wrong))
-        raise InputError(f"{name}: no control is within {both[0, c]:g} and {both[1, c]:g}, the limits of control {c}")
-    both.setflags(write=False)
-    return both

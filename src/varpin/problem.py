@@ -8,12 +8,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import count, finite_array, positive
+from varpin.checks import checked_limits, count, finite_array, positive
 from varpin.costs import BoundSum, Cost, Expansion, Points, Terminal
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint
 from varpin.lagrangian import lagrangian_jet
-from varpin.policy import LinearPolicy, checked_limits
+from varpin.policy import LinearPolicy
 from varpin.scene import Scene, require_scene
 from varpin.trajectory import Trajectory
 
@@ -170,7 +170,7 @@ class OptimalControlProblem:
         return bool(np.isfinite(self.control_limits).any())
 
     def holding_controls(self) -> Floats:
-        """The constant control (m,) that comes closest to holding the robot at q0 at rest, brought within its limits."""
+        """The constant control (m,) that comes closest to holding the robot at q0 at rest, within its limits."""
         force = lagrangian_jet(self.scene, self.q0, np.zeros_like(self.q0)).Lq
         u = np.linalg.lstsq(self.scene.actuation, -force, rcond=None)[0]
         return np.asarray(np.clip(u, *self.control_limits), dtype=np.float64)

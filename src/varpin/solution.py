@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Literal
@@ -22,6 +22,7 @@ from varpin.linearization import velocity_at_nodes
 from varpin.policy import LinearPolicy
 from varpin.problem import OptimalControlProblem, bind_cost
 from varpin.simulation import rollout
+from varpin.task_costs import barriers_of
 from varpin.trajectory import Trajectory
 from varpin.wiener import generator
 
@@ -138,6 +139,27 @@ class MonteCarlo:
 
 
 @dataclass(frozen=True, eq=False)
+class Violations:
+    """How far a motion goes beyond limits, at its nodes: the most for each joint or control, zero where it does not.
+
+    Attributes:
+        position: Beyond the limits of the robot's joints, or of a narrower :class:`varpin.JointLimitBarrier` in the
+            cost (n,) [rad or m].
+        velocity: Likewise (n,) [rad/s or m/s].
+        control: Beyond the problem's control limits (m,).
+    """
+
+    position: Floats
+    velocity: Floats
+    control: Floats
+
+    @property
+    def any(self) -> bool:
+        """Whether there is one at all."""
+        return bool(any(part.any() for part in (self.position, self.velocity, self.control)))
+
+
+@dataclass(frozen=True, eq=False)
 class Solution:
     """The best motion a solver found, with the policy around it.
 
@@ -182,6 +204,17 @@ class Solution:
     def iterations(self) -> int:
         """Steps that were taken or tried."""
         return sum(item.rollouts > 0 for item in self.history)
+
+    @property
+    def violations(self) -> Violations:
+        """What the motion does beyond the limits of joints, whether the cost knows them or not, and of controls."""
+        robot, motion, speed = self.problem.scene.robot, self.trajectory, self.problem.scene.robot.velocity_limit
+        joints, speeds = barriers_of(self.problem.cost)
+        return Violations(
+            position=_beyond(motion.q, [robot.position_limits, *(term.limits for term in joints)]),
+            velocity=_beyond(motion.v, [(-speed, speed), *(term.limits for term in speeds)]),
+            control=_beyond(motion.u, [self.problem.control_limits]),
+        )
 
     @property
     def policy(self) -> LinearPolicy:
@@ -337,6 +370,13 @@ class Solution:
             paths=len(good),
             failures=len(values) - len(good),
         )
+
+
+def _beyond(y: Floats, limits: Sequence[tuple[Floats, Floats] | Floats]) -> Floats:
+    """The most that each column of y (N, k) is outside any of some limits."""
+    excess = [np.maximum(y - upper, lower - y).max(axis=0) for lower, upper in limits]
+    most: Floats = np.maximum(0.0, np.max(excess, axis=0))
+    return most
 
 
 # Paths that are kept at a time to add up their costs.

@@ -228,7 +228,8 @@ def control_of(commands: Commands, decision: int, x: Floats) -> Floats:
     u = commands.u[decision]
     if len(commands.gains):
         u = u + commands.gains[decision] @ (x - commands.reference[decision])
-    return np.clip(u, *commands.limits)
+    limited: Floats = np.clip(u, *commands.limits)
+    return limited
 
 
 def steps_of(commands: Commands) -> int:

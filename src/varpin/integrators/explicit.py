@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.errors import LinearizationError, SingularMassMatrix
-from varpin.integrators.base import Integrator, Segment, control_of, diffusion_and_drift, drifts, open_loop, segments_of, steps_of
+from varpin.integrators.base import (
+    Integrator,
+    Segment,
+    control_of,
+    diffusion_and_drift,
+    drifts,
+    open_loop,
+    segments_of,
+    steps_of,
+)
 from varpin.kernels import explicit as kernels
 from varpin.kernels.dynamics import Dynamics, forward_derivatives, new_dynamics
 from varpin.kernels.tree import Commands, new_nodes

@@ -22,10 +22,10 @@ def apply_policy(commands: Commands, s: int, first: Floats, second: Floats, u: F
             for j in range(n):
                 total += commands.gains[r, c, j] * (first[j] - commands.reference[r, j])
                 total += commands.gains[r, c, n + j] * (second[j] - commands.reference[r, n + j])
-        # Neither comparison is true of NaN, which stays.
-        if total < commands.limits[0, c]:
+        # Neither comparison is true of NaN, which stays; max and min need not keep it.
+        if total < commands.limits[0, c]:  # noqa: PLR1730
             total = commands.limits[0, c]
-        if total > commands.limits[1, c]:
+        if total > commands.limits[1, c]:  # noqa: PLR1730
             total = commands.limits[1, c]
         u[s, c] = total
 
