@@ -248,12 +248,8 @@ def test_manipulability(load, directions):
 
     def w(q):
         index = robot.free_model.getFrameId(frame)
-        Js = [
-            (pin.computeFrameJacobian(robot.free_model, data, robot.free_positions(row), index, WORLD) @ gear)[
-                list(rows)
-            ]
-            for row in q
-        ]
+        free = robot.free_positions(q)
+        Js = [(pin.computeFrameJacobian(robot.free_model, data, row, index, WORLD) @ gear)[list(rows)] for row in free]
         return np.sqrt([np.linalg.det(J @ J.T) for J in Js])
 
     measured = w(q)
@@ -319,6 +315,7 @@ def test_barriers(load):
 
 
 def test_barriers_against_differences(load):
+    """Of a finger whose limits are closer than two margins, too: the barriers meet in the middle."""
     robot = load("panda")
     n = robot.dof
     q, v = (1.5 * part for part in state(robot, 6))
@@ -389,7 +386,7 @@ def test_what_is_refused(load):
         vp.ManipulabilityCost(chain, "tip", 0.1, directions="linear")
     with pytest.raises(vp.InputError, match="JointLimitBarrier: robot 'chain2' has no such limits"):
         vp.JointLimitBarrier(chain)
-    with pytest.raises(vp.InputError, match="margin must be >= 0, got -0.1"):
+    with pytest.raises(vp.InputError, match=r"margin must be >= 0, got -0\.1"):
         vp.JointLimitBarrier(robot, margin=-0.1)
     with pytest.raises(vp.InputError, match="VelocityLimitBarrier limits: nothing is within 1 and -1"):
         vp.VelocityLimitBarrier(robot, limits=(1.0, -1.0))
