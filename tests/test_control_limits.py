@@ -35,7 +35,7 @@ def test_box_minimum(m, condition):
         L = np.linalg.cholesky(H)
         wide = np.where(np.isfinite(limits), limits, np.sign(limits) * 1e12)
         reference = lsq_linear(L.T, -np.linalg.solve(L, g), wide, method="bvls", tol=1e-14, max_iter=200).x
-        x, F, work = 5.0 * rng.normal(size=m), np.zeros((m, m)), np.zeros((4, m))
+        x, F, work = 5.0 * rng.normal(size=m), np.zeros((m, m)), np.zeros((3, m))
         assert solve_box(H, g, limits, x, F, work)
         held = work[0] == 1.0
         held_at_all += held.sum()
@@ -59,7 +59,7 @@ def test_box_minimum(m, condition):
 def test_box_refuses_what_has_no_minimum():
     limits = np.array([[-1.0, -1.0], [1.0, 1.0]])
     for H in (np.diag([1.0, -1.0]), np.full((2, 2), np.nan)):
-        assert not solve_box(H, np.zeros(2), limits, np.zeros(2), np.zeros((2, 2)), np.zeros((4, 2)))
+        assert not solve_box(H, np.zeros(2), limits, np.zeros(2), np.zeros((2, 2)), np.zeros((3, 2)))
 
 
 def pushed(limits=None, **options):

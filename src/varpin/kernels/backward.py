@@ -68,8 +68,8 @@ class Room(NamedTuple):
     Quu: Floats  # (m, m)
     row: Floats  # (2n + m,)
     solved: Floats  # (2n + m,)
-    box: Floats  # (4, m)
-    H: Floats  # (m, m)
+    box: Floats  # (3, m) of the minimum within limits
+    H: Floats  # (m, m) Quu, kept while Quu is factored
 
 
 def new_value(dof: int, controls: int) -> Value:
@@ -92,7 +92,7 @@ def new_room(dof: int, controls: int) -> Room:
         Quu=np.zeros((controls, controls)),
         row=np.zeros(size),
         solved=np.zeros(size),
-        box=np.zeros((4, controls)),
+        box=np.zeros((3, controls)),
         H=np.zeros((controls, controls)),
     )
 
