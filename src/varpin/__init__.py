@@ -32,6 +32,7 @@ from varpin.errors import LinearizationError as LinearizationError
 from varpin.errors import RobotError as RobotError
 from varpin.errors import RobotNotFound as RobotNotFound
 from varpin.errors import SingularMassMatrix as SingularMassMatrix
+from varpin.errors import UnknownFrame as UnknownFrame
 from varpin.errors import UnknownJoint as UnknownJoint
 from varpin.errors import UnsupportedJoint as UnsupportedJoint
 from varpin.errors import VarpinError as VarpinError
@@ -84,6 +85,14 @@ from varpin.solution import MonteCarloInterrupted as MonteCarloInterrupted
 from varpin.solution import Solution as Solution
 from varpin.solution import Status as Status
 from varpin.solution import Verification as Verification
+from varpin.solution import Violations as Violations
+from varpin.task_costs import CenterOfMassCost as CenterOfMassCost
+from varpin.task_costs import FrameOrientationCost as FrameOrientationCost
+from varpin.task_costs import FramePositionCost as FramePositionCost
+from varpin.task_costs import FrameVelocityCost as FrameVelocityCost
+from varpin.task_costs import JointLimitBarrier as JointLimitBarrier
+from varpin.task_costs import ManipulabilityCost as ManipulabilityCost
+from varpin.task_costs import VelocityLimitBarrier as VelocityLimitBarrier
 from varpin.tradeoff import Advice as Advice
 from varpin.tradeoff import Choice as Choice
 from varpin.tradeoff import OptimalControlRun as OptimalControlRun

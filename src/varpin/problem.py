@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import count, finite_array, positive
+from varpin.checks import checked_limits, count, finite_array, positive
 from varpin.costs import BoundSum, Cost, Expansion, Points, Terminal
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint
@@ -26,7 +26,8 @@ class OptimalControlProblem:
     """Minimize the expected cost of a motion from (q0, v0) over the controls, each held over ``hold`` steps.
 
     Running costs are integrals in time, sampled once a step, and references are functions of time: the problem means
-    the same at every ``dt``. Costs add up, and numbers scale them:
+    the same at every ``dt``. Controls stay within their limits, feedback included. Costs add up, and numbers scale
+    them:
 
         cost = vp.TrackingCost(reference, 10.0) + vp.ControlCost(0.1) + vp.Terminal(2.0 * vp.TrackingCost(goal))
 
@@ -34,6 +35,8 @@ class OptimalControlProblem:
     ``TrackingCost(q_r, weight)`` weight . (q - q_r(t))^2
     ``VelocityCost(weight, v_r)`` weight . (v - v_r(t))^2
     ``ControlCost(weight, u_r)``  weight . (u - u_r(t))^2; give every control some
+    ``FramePositionCost(...)``    in the task; and of a frame's orientation and velocity, the centre
+                                  of mass, manipulability, barriers at limits
     ``CustomCost(function)``      a function of one's own of (t, q, v, u)
     ``Terminal(cost)``            any of them but the control's, at the end instead of its integral
     ============================= ================================================================
@@ -50,6 +53,7 @@ class OptimalControlProblem:
             ``"gauss"``: at its two Gauss points, the motion between the nodes taken for a cubic: of fourth order, for
             integrators that are. ``"start"``: at the node where it begins, a left sum as in the paper, of first order.
         hold: Steps that share one control: a digital controller's period over the integrator's step.
+        control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none.
     """
 
     scene: Scene
@@ -61,6 +65,7 @@ class OptimalControlProblem:
     integrator: Integrator
     sampling: Sampling
     hold: int
+    control_limits: Floats
     running: BoundSum = field(repr=False)
     terminal: BoundSum = field(repr=False)
     rule: Floats = field(repr=False)
@@ -77,12 +82,15 @@ class OptimalControlProblem:
         integrator: Integrator | None = None,
         sampling: Sampling = "midpoint",
         hold: int = 1,
+        control_limits: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
         """Describe a problem; the class says what each argument is.
 
+        ``control_limits`` are (lower, upper), each one number or (m,); infinite where a control has no limit.
+
         Raises:
-            InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, or a
-                reference that does not fit the problem's grid.
+            InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
+                reference that does not fit the problem's grid, or limits that leave a control nothing.
             CostError: A reference that is a function fails.
         """
         n, m = require_scene(scene).robot.dof, scene.controls
@@ -110,6 +118,7 @@ class OptimalControlProblem:
             "integrator": Midpoint() if integrator is None else integrator,
             "sampling": sampling,
             "hold": hold,
+            "control_limits": checked_limits("control_limits", control_limits, m),
             "running": running,
             "terminal": terminal,
             "rule": rule,
@@ -165,12 +174,19 @@ class OptimalControlProblem:
             integrator=self.integrator if integrator is None else integrator,
             sampling=self.sampling if sampling is None else sampling,
             hold=self.hold if hold is None else hold,
+            control_limits=(self.control_limits[0], self.control_limits[1]),
         )
 
+    @property
+    def limited(self) -> bool:
+        """Whether any control has a limit."""
+        return bool(np.isfinite(self.control_limits).any())
+
     def holding_controls(self) -> Floats:
-        """The constant control (m,) that comes closest to holding the robot at q0 at rest."""
+        """The constant control (m,) that comes closest to holding the robot at q0 at rest, within its limits."""
         force = lagrangian_jet(self.scene, self.q0, np.zeros_like(self.q0)).Lq
-        return np.asarray(np.linalg.lstsq(self.scene.actuation, -force, rcond=None)[0], dtype=np.float64)
+        u = np.linalg.lstsq(self.scene.actuation, -force, rcond=None)[0]
+        return np.asarray(np.clip(u, *self.control_limits), dtype=np.float64)
 
     def holding_policy(self) -> LinearPolicy:
         """Holding controls, with feedback that keeps the robot there where every joint can be driven.
@@ -193,6 +209,7 @@ class OptimalControlProblem:
             np.tile(np.append(self.q0, np.zeros(n)), (R, 1)),
             hold=self.hold,
             on="momentum" if self.integrator.variational else "velocity",
+            limits=(self.control_limits[0], self.control_limits[1]),
         )
 
     def samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
