@@ -85,9 +85,10 @@ class Gauss(Variational):
             return options
         return options._replace(balance=BALANCE_SHARE * options.balance, budget=BUDGET_SHARE * options.budget)
 
-    def _arrays(self, paths: int, dof: int, processes: int) -> tuple[equation.State, stage_equation.Stages]:
-        stages = int(self.stages)
-        state = stage_equation.new_gauss_state(stages, paths, dof, processes)
+    def _arrays(self, scene: Scene, paths: int) -> tuple[equation.State, stage_equation.Stages]:
+        stages, dof = int(self.stages), scene.robot.dof
+        processes, loads = scene.mechanism.diffusion.constant.shape[1], scene.robot.tree.loads.size
+        state = stage_equation.new_gauss_state(stages, paths, dof, processes, loads)
         return state, stage_equation.new_stages(stages, dof)
 
     def rollout_compiled(
@@ -125,7 +126,7 @@ class Gauss(Variational):
         q, p = (np.ascontiguousarray(getattr(trajectory, name)[:-1]) for name in ("q", "p"))
         force = trajectory.u @ scene.actuation.T + self.drift_share * drifts(scene, trajectory)
         Jx, Jf = np.empty((steps, 2 * n, 2 * n)), np.empty((steps, 2 * n, n))
-        state, stages = self._arrays(1, n, scene.mechanism.diffusion.constant.shape[1])
+        state, stages = self._arrays(scene, 1)
         outcome, done = linearize(
             scene.mechanism,
             tableau(int(self.stages)),
@@ -138,7 +139,7 @@ class Gauss(Variational):
             force,
             trajectory.statistics.substeps,
             state,
-            equation.new_work(scene.robot.tree.parent.size, n, derivatives=True),
+            equation.new_work(scene.robot.tree.parent.size, n, scene.robot.tree.loads.size, derivatives=True),
             stages,
             Jx,
             Jf,

@@ -40,9 +40,9 @@ def largest_step(M: Floats, Lqq: Floats, margin: float) -> float:
 
 def _room(scene: Scene, *, derivatives: bool = False, parts: int = 0) -> tuple[equation.State, equation.Work]:
     """State and work arrays of one path."""
-    n, bodies = scene.robot.dof, scene.robot.tree.parent.size
-    state = equation.new_state(1, n, scene.mechanism.diffusion.constant.shape[1])
-    return state, equation.new_work(bodies, n, derivatives=derivatives, parts=parts)
+    n, bodies, loads = scene.robot.dof, scene.robot.tree.parent.size, scene.robot.tree.loads.size
+    state = equation.new_state(1, n, scene.mechanism.diffusion.constant.shape[1], loads)
+    return state, equation.new_work(bodies, n, loads, derivatives=derivatives, parts=parts)
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,9 @@ class Midpoint(Variational):
         """See :meth:`Integrator.order`; 2 for alpha = 1/2, and 1 elsewhere."""
         return 2 if self.alpha == 0.5 else 1
 
-    def _arrays(self, paths: int, dof: int, processes: int) -> tuple[equation.State, None]:
-        return equation.new_state(paths, dof, processes), None
+    def _arrays(self, scene: Scene, paths: int) -> tuple[equation.State, None]:
+        processes, loads = scene.mechanism.diffusion.constant.shape[1], scene.robot.tree.loads.size
+        return equation.new_state(paths, scene.robot.dof, processes, loads), None
 
     def rollout_compiled(
         self,

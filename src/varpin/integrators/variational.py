@@ -85,15 +85,16 @@ class Variational(Integrator):
         )
 
     @abstractmethod
-    def _arrays(self, paths: int, dof: int, processes: int) -> tuple[equation.State, Any]:
+    def _arrays(self, scene: Scene, paths: int) -> tuple[equation.State, Any]:
         """The states of several paths, and the work arrays of the stages, if there are any."""
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[VariationalRun, list[Segment]]:
         """See :meth:`Integrator.start`; p0 = M(q0) v0."""
         robot = scene.robot
         paths, n = q0.shape
-        state, stages = self._arrays(paths, n, scene.mechanism.diffusion.constant.shape[1])
-        run = VariationalRun(state, equation.new_work(robot.tree.parent.size, n), stages, q0.copy())
+        state, stages = self._arrays(scene, paths)
+        work = equation.new_work(robot.tree.parent.size, n, robot.tree.loads.size)
+        run = VariationalRun(state, work, stages, q0.copy())
         if not kernels.begin_paths(scene.mechanism, q0, v0, run.state, run.work):
             raise SingularMassMatrix(robot.joint_names, q0)
         nodes = new_nodes(paths, 1, n, scene.controls)

@@ -17,7 +17,16 @@ from typing import NamedTuple
 import numpy as np
 
 from varpin.kernels._compile import inlined, kernel
-from varpin.kernels.jet import add_mass, body_inertia, branch_potential, dot6, move_body, place_body, times_inertia
+from varpin.kernels.jet import (
+    add_mass,
+    body_inertia,
+    dot6,
+    move_body,
+    origin_potential,
+    pass_inertia,
+    place_body,
+    times_inertia,
+)
 from varpin.kernels.linalg import factor_ldl, solve_ldl
 from varpin.kernels.tree import Floats, Mechanism, Sweep, new_sweep
 
@@ -112,7 +121,7 @@ def node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics) -> tuple[bool,
     """Mass matrix, its factors and the bias at (q, v), left in ``d``; whether M is definite, and the potential [J]."""
     tree, w = mechanism.tree, d.sweep
     bodies = tree.parent.size
-    S, Y, M = w.axis, w.inertia, w.M
+    S, M = w.axis, w.M
     n = q.size
     potential = 0.0
     for i in range(n):
@@ -135,13 +144,11 @@ def node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics) -> tuple[bool,
         d.bias[cj] += tree.ratio[j] * dot6(S, j, d.force, j)
         k = tree.parent[j]
         if k >= 0:
-            for i in range(10):
-                Y[k, i] += Y[j, i]
+            pass_inertia(tree, j, 10, w)
             for i in range(6):
                 d.force[k, i] += d.force[j, i]
-        else:
-            angle = tree.ratio[j] * q[cj] + tree.offset[j]
-            potential += branch_potential(mechanism, j, angle, w)
+        if tree.origin[j]:
+            potential += origin_potential(mechanism, j, q, w)
     for i in range(n):
         M[i, i] += tree.armature[i]
         for j in range(i + 1):
@@ -268,8 +275,7 @@ def inverse_dynamics_derivatives(
             i = tree.parent[i]
         k = tree.parent[j]
         if k >= 0:
-            for i in range(10):
-                Y[k, i] += Y[j, i]
+            pass_inertia(tree, j, 10, w)
             for i in range(6):
                 d.force[k, i] += d.force[j, i]
             for i in range(36):

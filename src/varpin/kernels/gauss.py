@@ -12,7 +12,6 @@ from varpin.kernels.gauss_jacobian import stages_jacobian
 from varpin.kernels.gauss_tableau import Tableau
 from varpin.kernels.linalg import solve_ldl
 from varpin.kernels.midpoint import (
-    add,
     advance,
     branch_margin,
     kick,
@@ -25,6 +24,7 @@ from varpin.kernels.midpoint import (
 )
 from varpin.kernels.midpoint_equation import FOLD, SOLVED, Options, State, Work
 from varpin.kernels.midpoint_jacobian import chain
+from varpin.kernels.place import add
 from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes
 
 
@@ -61,20 +61,22 @@ def attempt(
         return FOLD
     stages, n = g.V.shape
     group = mechanism.tree.group
-    q, q_low, p, p_low = k.trial[0], k.trial[1], k.trial[2], k.trial[3]
+    place, place_low, p, p_low = k.trial[0], k.trial[1], k.trial[2], k.trial[3]
     for r in range(mechanism.tree.groups):
         k.balance[r, 1] = 0.0
         k.balance[r, 2] = 0.0
     for r in range(n):
         move, impulse = 0.0, 0.0
+        k.work[r] = 0.0
         for i in range(stages):
             share, velocity = h * tableau.b[i], g.V[i, r]
             drag = mechanism.damping[r] * velocity
             move += tableau.b[i] * velocity
             impulse += tableau.b[i] * g.slope[i, r]
-            k.balance[group[r], 1] += share * (k.force[r] - drag) * velocity
+            k.work[r] += share * (k.force[r] - drag) * velocity
             k.balance[group[r], 2] += share * drag * velocity
-        q[r], q_low[r] = add(state.q[r], state.q_low[r], h * move)
+        k.balance[group[r], 1] += k.work[r]
+        place[r], place_low[r] = add(state.place[r], state.place_low[r], h * move)
         p[r], p_low[r] = add(state.p[r], state.p_low[r], h * impulse)
     outcome = settle(mechanism, options, state, k)
     if outcome != SOLVED:
@@ -82,7 +84,7 @@ def attempt(
     if k.Jx.shape[0] > 0:
         stages_jacobian(mechanism, tableau, h, g, k.part[: 2 * n], k.part[2 * n :, :n])
         chain(k)
-    advance(margin, state, k)
+    advance(mechanism, margin, state, k)
     return SOLVED
 
 
@@ -178,7 +180,7 @@ def rollout(
     noisy = increments.shape[0] > 0 and increments.shape[2] > 0
     for i in range(states.q.shape[0]):
         state = path(states, i)
-        node_energy(mechanism, state.q, state.p, state.v, k)
+        node_energy(mechanism, state.place, state.p, state.v, k)
         nodes.ended[i] = SOLVED
         nodes.done[i] = 0
         for s in range(nodes.u.shape[1]):

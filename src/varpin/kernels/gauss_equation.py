@@ -84,13 +84,13 @@ def new_stages(stages: int, dof: int) -> Stages:
     )
 
 
-def new_gauss_state(stages: int, paths: int, dof: int, processes: int) -> State:
+def new_gauss_state(stages: int, paths: int, dof: int, processes: int, loads: int) -> State:
     """States of several paths, to be filled in.
 
     Their past is of the last whole step: the stage velocities, the velocity at its end, the force, and by how much the
     extrapolation of the step before missed each stage.
     """
-    return new_state(paths, dof, processes)._replace(past=np.zeros((paths, 2 * stages + 2, dof)))
+    return new_state(paths, dof, processes, loads)._replace(past=np.zeros((paths, 2 * stages + 2, dof)))
 
 
 @inlined
@@ -128,7 +128,7 @@ def set_stages(tableau: Tableau, h: float, state: State, g: Stages) -> None:
             total = 0.0
             for j in range(stages):
                 total += tableau.a[i, j] * g.V[j, r]
-            g.Q[i, r] = state.q[r] + (state.q_low[r] + h * total)
+            g.Q[i, r] = state.place[r] + (state.place_low[r] + h * total)
 
 
 @inlined

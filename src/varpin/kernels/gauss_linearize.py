@@ -8,6 +8,7 @@ from varpin.kernels.gauss_tableau import Tableau
 from varpin.kernels.midpoint import begin_at, path
 from varpin.kernels.midpoint_equation import SINGULAR, SOLVED, Options, State, Work
 from varpin.kernels.midpoint_jacobian import identity
+from varpin.kernels.place import put
 from varpin.kernels.tree import Floats, Integers, Mechanism
 
 
@@ -35,8 +36,8 @@ def linearize(
         for r in range(n):
             k.force[r] = force[s, r]
         if substeps[s] == 1:
+            put(mechanism, q[s], p[s], state)
             for r in range(n):
-                state.q[r], state.q_low[r], state.p[r], state.p_low[r] = q[s, r], 0.0, p[s, r], 0.0
                 for i in range(stages):
                     g.V[i, r] = guess[s, i, r]
             outcome = newton_stages(mechanism, tableau, options, h, state, k, g)

@@ -1,7 +1,9 @@
 """The Lagrangian jet: one forward and one backward sweep over the tree give every derivative.
 
-Spatial vectors are (linear, angular), in world axes. The point they are taken at is the root of their branch
-and not the world's origin: the Lagrangian does not care, and a branch far from the origin keeps its digits.
+Spatial vectors are (linear, angular), in world axes. The point they are taken at is not the world's origin but the
+root of their branch, or the last joint of a run of sliders there: it moves with them, so that what stands or slides
+far away keeps its digits. The Lagrangian does not care: of what a slider below other sliders carries, they see masses
+and linear momenta alone, which are the same about every point.
 
 With S the motion axis of a joint, V the velocity of its body, W = V x S, Y and H the inertia and the momentum
 of the whole subtree, F = Y S, B = Y W + S x* H and g gravity, for i an ancestor of j or j itself:
@@ -31,7 +33,6 @@ def place_body(tree: Tree, j: int, q: Floats, w: Sweep) -> float:
         r00, r01, r02 = E[j, 0, 0], E[j, 0, 1], E[j, 0, 2]
         r10, r11, r12 = E[j, 1, 0], E[j, 1, 1], E[j, 1, 2]
         r20, r21, r22 = E[j, 2, 0], E[j, 2, 1], E[j, 2, 2]
-        px, py, pz = 0.0, 0.0, 0.0
     else:
         k = parent
         a00, a01, a02 = R[k, 0], R[k, 1], R[k, 2]
@@ -46,12 +47,16 @@ def place_body(tree: Tree, j: int, q: Floats, w: Sweep) -> float:
         r20 = a20 * E[j, 0, 0] + a21 * E[j, 1, 0] + a22 * E[j, 2, 0]
         r21 = a20 * E[j, 0, 1] + a21 * E[j, 1, 1] + a22 * E[j, 2, 1]
         r22 = a20 * E[j, 0, 2] + a21 * E[j, 1, 2] + a22 * E[j, 2, 2]
+    origin = tree.origin[j]
+    if origin:
+        px, py, pz = 0.0, 0.0, 0.0
+    else:
         tx, ty, tz = tree.translation[j, 0], tree.translation[j, 1], tree.translation[j, 2]
-        px = P[k, 0] + a00 * tx + a01 * ty + a02 * tz
-        py = P[k, 1] + a10 * tx + a11 * ty + a12 * tz
-        pz = P[k, 2] + a20 * tx + a21 * ty + a22 * tz
+        px = P[parent, 0] + R[parent, 0] * tx + R[parent, 1] * ty + R[parent, 2] * tz
+        py = P[parent, 1] + R[parent, 3] * tx + R[parent, 4] * ty + R[parent, 5] * tz
+        pz = P[parent, 2] + R[parent, 6] * tx + R[parent, 7] * ty + R[parent, 8] * tz
     if tree.prismatic[j]:
-        if parent >= 0:
+        if not origin:
             px += r02 * angle
             py += r12 * angle
             pz += r22 * angle
@@ -101,7 +106,7 @@ def move_body(tree: Tree, j: int, v: Floats, w: Sweep) -> None:
 
 @inlined
 def body_inertia(tree: Tree, j: int, w: Sweep) -> None:
-    """Y of body ``j`` alone: mass, first moment and inertia about the root of the branch, in world axes."""
+    """Y of body ``j`` alone: mass, first moment and inertia about the last origin, in world axes."""
     R, Y = w.rotation, w.inertia
     r00, r01, r02 = R[j, 0], R[j, 1], R[j, 2]
     r10, r11, r12 = R[j, 3], R[j, 4], R[j, 5]
@@ -160,21 +165,39 @@ def dot6(a: Floats, i: int, b: Floats, j: int) -> float:
 
 
 @inlined
-def branch_potential(mechanism: Mechanism, j: int, angle: float, w: Sweep) -> float:
-    """Gravity's potential energy of the branch whose root is body ``j`` [J]; adds it, and its scale, to its group's."""
+def origin_potential(mechanism: Mechanism, j: int, q: Floats, w: Sweep) -> float:
+    """Gravity's potential energy [J] of what body ``j``, an origin, carries: of its moments, and of all masses' shift.
+
+    Adds it, and its scale, to its group's.
+    """
     tree, g = mechanism.tree, mechanism.gravity
-    group = tree.group[tree.coordinate[j]]
+    c, k = tree.coordinate[j], tree.parent[j]
+    group = tree.group[c]
     strength = abs(g[0]) + abs(g[1]) + abs(g[2])
-    Y = w.inertia
+    R, Y = w.rotation, w.inertia
     potential = 0.0
     for i in range(3):
-        root = tree.translation[j, i]
+        shift = tree.translation[j, i]
+        if k >= 0:
+            shift = 0.0
+            for a in range(3):
+                shift += R[k, 3 * i + a] * tree.translation[j, a]
         if tree.prismatic[j]:
-            root += w.axis[j, i] * angle
-        potential -= g[i] * (Y[j, 0] * root + Y[j, i + 1])
-        w.V_scale[group] += strength * (Y[j, 0] * abs(root) + abs(Y[j, i + 1]))
+            shift += w.axis[j, i] * (tree.ratio[j] * q[c] + tree.offset[j])
+        potential -= g[i] * (Y[j, 0] * shift + Y[j, i + 1])
+        w.V_scale[group] += strength * (Y[j, 0] * abs(shift) + abs(Y[j, i + 1]))
     w.V[group] += potential
     return potential
+
+
+@inlined
+def pass_inertia(tree: Tree, j: int, entries: int, w: Sweep) -> None:
+    """Add the first entries of Y of body ``j`` to its parent's; past an origin moments are nobody's any more."""
+    Y, k = w.inertia, tree.parent[j]
+    if tree.origin[j]:
+        entries = 1
+    for i in range(entries):
+        Y[k, i] += Y[j, i]
 
 
 @inlined
@@ -311,11 +334,9 @@ def first_order(mechanism: Mechanism, q: Floats, v: Floats, w: Sweep) -> tuple[f
                 H[k, i] += H[j, i]
             for i in range(2, 5):
                 w.magnitude[k, i] += w.magnitude[j, i]
-            for i in range(4):
-                Y[k, i] += Y[j, i]
-        else:
-            angle = tree.ratio[j] * q[tree.coordinate[j]] + tree.offset[j]
-            potential += branch_potential(mechanism, j, angle, w)
+            pass_inertia(tree, j, 4, w)
+        if tree.origin[j]:
+            potential += origin_potential(mechanism, j, q, w)
     potential += add_springs(mechanism, q, w)
     return add_armature(mechanism, v, w), potential
 
@@ -379,11 +400,9 @@ def second_order(mechanism: Mechanism, q: Floats, v: Floats, w: Sweep) -> tuple[
                 H[k, i] += H[j, i]
             for i in range(2, 5):
                 w.magnitude[k, i] += w.magnitude[j, i]
-            for i in range(10):
-                Y[k, i] += Y[j, i]
-        else:
-            angle = tree.ratio[j] * q[cj] + tree.offset[j]
-            potential += branch_potential(mechanism, j, angle, w)
+            pass_inertia(tree, j, 10, w)
+        if tree.origin[j]:
+            potential += origin_potential(mechanism, j, q, w)
     potential += add_springs(mechanism, q, w)
     for c in range(q.size):
         M[c, c] += tree.armature[c]
@@ -412,7 +431,7 @@ def mass_matrix(mechanism: Mechanism, q: Floats, w: Sweep) -> float:
     """M at q, left in ``w.M``; returns the potential energy [J]."""
     tree = mechanism.tree
     bodies = tree.parent.size
-    Y, M = w.inertia, w.M
+    M = w.M
     potential = 0.0
     for j in range(q.size):
         w.V[j] = 0.0
@@ -426,11 +445,9 @@ def mass_matrix(mechanism: Mechanism, q: Floats, w: Sweep) -> float:
         add_mass(tree, j, w)
         k = tree.parent[j]
         if k >= 0:
-            for i in range(10):
-                Y[k, i] += Y[j, i]
-        else:
-            angle = tree.ratio[j] * q[tree.coordinate[j]] + tree.offset[j]
-            potential += branch_potential(mechanism, j, angle, w)
+            pass_inertia(tree, j, 10, w)
+        if tree.origin[j]:
+            potential += origin_potential(mechanism, j, q, w)
     for c in range(q.size):
         M[c, c] += tree.armature[c]
         deflection = q[c] - mechanism.rest[c]

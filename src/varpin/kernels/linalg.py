@@ -114,19 +114,33 @@ def factor_ldl(a: Floats) -> bool:
 
 
 @inlined
-def solve_ldl(ldl: Floats, b: Floats, x: Floats) -> None:
-    """The x with L D L' x = b."""
-    n = ldl.shape[0]
-    for i in range(n):
+def solve_lower(ldl: Floats, b: Floats, x: Floats) -> None:
+    """The x with L x = b."""
+    for i in range(ldl.shape[0]):
         total = b[i]
         for j in range(i):
             total -= ldl[i, j] * x[j]
         x[i] = total
+
+
+@inlined
+def solve_upper(ldl: Floats, x: Floats) -> None:
+    """The solution of L' y = x, in place of x."""
+    n = ldl.shape[0]
     for i in range(n - 1, -1, -1):
-        total = x[i] / ldl[i, i]
+        total = x[i]
         for j in range(i + 1, n):
             total -= ldl[j, i] * x[j]
         x[i] = total
+
+
+@inlined
+def solve_ldl(ldl: Floats, b: Floats, x: Floats) -> None:
+    """The x with L D L' x = b."""
+    solve_lower(ldl, b, x)
+    for i in range(ldl.shape[0]):
+        x[i] /= ldl[i, i]
+    solve_upper(ldl, x)
 
 
 @inlined

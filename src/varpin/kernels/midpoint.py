@@ -9,7 +9,15 @@ import numpy as np
 from varpin.kernels._compile import inlined, kernel
 from varpin.kernels.drive import apply_policy, constant_force, noise_impulse
 from varpin.kernels.jet import mass_matrix, second_order
-from varpin.kernels.linalg import factor_ldl, solve_ldl
+from varpin.kernels.linalg import factor_ldl, solve_lower, solve_upper
+from varpin.kernels.load import (
+    enter_loads,
+    limit_of,
+    load_balanced,
+    load_energies,
+    reset_loads,
+    varied,
+)
 from varpin.kernels.midpoint_equation import (
     ENERGY,
     FOLD,
@@ -23,9 +31,10 @@ from varpin.kernels.midpoint_equation import (
     set_midpoint,
 )
 from varpin.kernels.midpoint_jacobian import add_substep
+from varpin.kernels.place import add, put, show, unwind
 from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes
 
-FLOOR = 0.02  # of the energy guard's limit is always left, or a full ledger could never be worked off
+FADE = 1.0 / 256.0  # by which a substep forgets how far kinetic energies have varied
 ENERGY_ROUNDING = 1e-12  # of the magnitudes that make up an energy
 
 
@@ -54,33 +63,60 @@ def branch_margin(mechanism: Mechanism, options: Options, h: float, k: Work) -> 
 
 
 @inlined
-def add(high: float, low: float, increment: float) -> tuple[float, float]:
-    """The sum high + low + increment as a new high and low part (Knuth's two-sum)."""
-    increment += low
-    total = high + increment
-    part = total - high
-    return total, (high - (total - part)) + (increment - part)
+def kinetic_energy(mechanism: Mechanism, p: Floats, v: Floats, k: Work) -> None:
+    """The velocity v = M^-1 p from the factors L D L' of M in ``k.ldl``.
+
+    Leaves in ``k.share`` the terms of the kinetic energy 1/2 y' D^-1 y with L y = p, none of which is negative: what is
+    each coordinate's own while those before it are free. Leaves in ``k.balance[:, 0]`` the sums of each group.
+    """
+    n = p.size
+    solve_lower(k.ldl, p, v)
+    for i in range(n):
+        k.balance[i, 0] = 0.0
+    for i in range(n):
+        v[i], y = v[i] / k.ldl[i, i], v[i]
+        k.share[i] = 0.5 * v[i] * y
+        k.balance[mechanism.tree.group[i], 0] += k.share[i]
+    solve_upper(k.ldl, v)
 
 
 @inlined
 def node_energy(mechanism: Mechanism, q: Floats, p: Floats, v: Floats, k: Work) -> bool:
     """The velocity v = M(q)^-1 p of a node; whether M was positive definite.
 
-    Leaves the factors of M in ``k.ldl``, and of each group the kinetic energy in ``k.balance[:, 0]`` and the potential
-    energy in ``k.sweep.V``.
+    Leaves the factors of M in ``k.ldl``, what :func:`kinetic_energy` leaves, and the potential energy of each group
+    in ``k.sweep.V``.
     """
     mass_matrix(mechanism, q, k.sweep)
-    n = q.size
-    for i in range(n):
-        k.balance[i, 0] = 0.0
+    for i in range(q.size):
         for j in range(i + 1):
             k.ldl[i, j] = k.sweep.M[i, j]
     if not factor_ldl(k.ldl):
         return False
-    solve_ldl(k.ldl, p, v)
-    for i in range(n):
-        k.balance[mechanism.tree.group[i], 0] += 0.5 * p[i] * v[i]
+    kinetic_energy(mechanism, p, v, k)
     return True
+
+
+@inlined
+def moved(mechanism: Mechanism, state: State, k: Work) -> None:
+    """Leave in ``k.balance[:, 3]`` the kinetic energy that each group turns over."""
+    groups, group = mechanism.tree.groups, mechanism.tree.group
+    for r in range(groups):
+        k.balance[r, 3] = 0.0
+    for i in range(k.v.size):
+        k.balance[group[i], 3] += varied(state, k, i)
+    for r in range(groups):
+        k.balance[r, 3] = min(k.balance[r, 3], max(k.balance[r, 0], state.energy[r, 0]))
+
+
+@inlined
+def enter_shares(fade: float, state: State, k: Work) -> None:
+    """Enter the shares of a new node; the bounds of late ones draw together by ``fade``."""
+    for i in range(k.v.size):
+        share, new = state.share[i], k.share[i]
+        share[0] = new
+        share[1] = min(share[1] + fade * (new - share[1]), new)
+        share[2] = max(share[2] + fade * (new - share[2]), new)
 
 
 @inlined
@@ -92,22 +128,13 @@ def energy_error(state: State, k: Work, r: int) -> float:
 
 @inlined
 def balanced(options: Options, state: State, k: Work, r: int) -> bool:
-    """Whether the energy balance of group ``r`` closes over a substep.
-
-    The error must be a small part of the energy turned over. An error that adds to those before it has less room
-    the fuller the ledger is, so they do not wander off however often substeps break the structure. Off the middle the
-    method is of first order and its energy errors with it, from rest on: there they have more room.
-    """
+    """Whether the energy balance of group ``r`` closes over a substep."""
     ledger, new = state.energy[r], k.balance[r]
-    error, defect = energy_error(state, k, r), ledger[2]
-    off_middle = abs(1.0 - 2.0 * options.alpha)
+    error = energy_error(state, k, r)
     exchanged = abs(k.sweep.V[r] - ledger[1]) + abs(new[1])
-    limit = options.balance * (1.0 + 9.0 * off_middle) * (max(new[0], ledger[0]) + exchanged)
-    if abs(defect + error) > abs(defect):
-        room = options.budget * max(ledger[3], exchanged)
-        if room > 0.0:
-            limit *= max(FLOOR, 1.0 - abs(defect) / room)
+    limit = limit_of(options, error, ledger[2], new[3], exchanged, ledger[3])
     scale = k.sweep.V_scale[r]
+    off_middle = abs(1.0 - 2.0 * options.alpha)
     return abs(error) <= limit + ENERGY_ROUNDING * (scale + new[0]) + 1e-3 * off_middle * scale
 
 
@@ -119,7 +146,7 @@ def enter(state: State, k: Work, r: int) -> None:
     if new[2] > 0.0:
         defect *= max(0.0, 1.0 - new[2] / (new[2] + max(new[0], ledger[0])))
     ledger[0], ledger[1], ledger[2] = new[0], k.sweep.V[r], defect
-    ledger[3] = max(ledger[3], new[0])
+    ledger[3] = max(ledger[3], new[3])
 
 
 @inlined
@@ -127,22 +154,32 @@ def settle(mechanism: Mechanism, options: Options, state: State, k: Work) -> int
     """Velocity and energy of the node in ``k.trial``, and whether the energy balance of the substep closes."""
     if not node_energy(mechanism, k.trial[0], k.trial[2], k.trial[4], k):
         return SINGULAR
+    moved(mechanism, state, k)
     for r in range(mechanism.tree.groups):
         if not balanced(options, state, k, r):
             return ENERGY
+    if mechanism.tree.loads.size > 0:
+        load_energies(mechanism, k.trial[0], k.trial[2], k.trial[4], k)
+        for r in range(mechanism.tree.loads.size):
+            if not load_balanced(mechanism, options, state, k, r, ENERGY_ROUNDING):
+                return ENERGY
+        enter_loads(state, k)
     for r in range(mechanism.tree.groups):
         enter(state, k, r)
+    enter_shares(FADE, state, k)
     return SOLVED
 
 
 @inlined
-def advance(margin: float, state: State, k: Work) -> None:
+def advance(mechanism: Mechanism, margin: float, state: State, k: Work) -> None:
     """Move the state to the node in ``k.trial``."""
     trial = k.trial
     k.quality[1] = min(k.quality[1], margin)
     k.tally[3] += 1
     for i in range(state.q.size):
-        state.q[i], state.q_low[i] = trial[0, i], trial[1, i]
+        state.place[i], state.place_low[i] = trial[0, i], trial[1, i]
+        unwind(mechanism, i, state)
+        show(i, state)
         state.p[i], state.p_low[i] = trial[2, i], trial[3, i]
         state.v[i] = trial[4, i]
 
@@ -158,16 +195,17 @@ def attempt(mechanism: Mechanism, options: Options, h: float, state: State, k: W
         return FOLD
     n = k.v.size
     group, groups = mechanism.tree.group, mechanism.tree.groups
-    q, q_low, p, p_low = k.trial[0], k.trial[1], k.trial[2], k.trial[3]
+    place, place_low, p, p_low = k.trial[0], k.trial[1], k.trial[2], k.trial[3]
     for r in range(groups):
         k.balance[r, 1] = 0.0
         k.balance[r, 2] = 0.0
     for i in range(n):
         drag = mechanism.damping[i] * k.v[i]
         force = k.force[i] - drag
-        k.balance[group[i], 1] += h * force * k.v[i]
+        k.work[i] = h * force * k.v[i]
+        k.balance[group[i], 1] += k.work[i]
         k.balance[group[i], 2] += h * drag * k.v[i]
-        q[i], q_low[i] = add(state.q[i], state.q_low[i], h * k.v[i])
+        place[i], place_low[i] = add(state.place[i], state.place_low[i], h * k.v[i])
         p[i], p_low[i] = add(state.p[i], state.p_low[i], h * (k.sweep.Lq[i] + force))
     outcome = settle(mechanism, options, state, k)
     if outcome != SOLVED:
@@ -181,7 +219,7 @@ def attempt(mechanism: Mechanism, options: Options, h: float, state: State, k: W
         for i in range(n):
             row[i], row[n + i], row[2 * n + i] = state.q[i], state.p[i], k.v[i]
         row[3 * n] = h
-    advance(margin, state, k)
+    advance(mechanism, margin, state, k)
     return SOLVED
 
 
@@ -270,12 +308,16 @@ def path(states: State, i: int) -> State:
     """The state of one path of several."""
     return State(
         states.q[i],
-        states.q_low[i],
+        states.place[i],
+        states.place_low[i],
+        states.turns[i],
         states.p[i],
         states.p_low[i],
         states.v[i],
         states.past[i],
         states.energy[i],
+        states.share[i],
+        states.loads[i],
         states.lead[i],
         states.center[i],
         states.counters[i],
@@ -297,21 +339,20 @@ def add_impulse(mechanism: Mechanism, impulse: Floats, state: State, k: Work) ->
     """Add to the momentum and bring velocity and kinetic energy along; ``k.ldl`` holds the factors of M(q)."""
     for i in range(impulse.size):
         state.p[i], state.p_low[i] = add(state.p[i], state.p_low[i], impulse[i])
-    solve_ldl(k.ldl, state.p, state.v)
-    for r in range(mechanism.tree.groups):
-        k.balance[r, 0] = 0.0
-    for i in range(impulse.size):
-        k.balance[mechanism.tree.group[i], 0] += 0.5 * state.p[i] * state.v[i]
+    kinetic_energy(mechanism, state.p, state.v, k)
+    moved(mechanism, state, k)
     for r in range(mechanism.tree.groups):
         state.energy[r, 0] = k.balance[r, 0]
-        state.energy[r, 3] = max(state.energy[r, 3], k.balance[r, 0])
+        state.energy[r, 3] = max(state.energy[r, 3], k.balance[r, 3])
+    enter_shares(0.0, state, k)
+    reset_loads(mechanism, False, state, k)
 
 
 @kernel
 def apply_impulse(mechanism: Mechanism, impulse: Floats, states: State, k: Work) -> bool:
     """:func:`add_impulse` to the one path there is, for fields that are evaluated in Python."""
     state = path(states, 0)
-    regular = node_energy(mechanism, state.q, state.p, state.v, k)
+    regular = node_energy(mechanism, state.place, state.p, state.v, k)
     add_impulse(mechanism, impulse, state, k)
     return regular
 
@@ -320,17 +361,18 @@ def apply_impulse(mechanism: Mechanism, impulse: Floats, states: State, k: Work)
 def begin_at(mechanism: Mechanism, q: Floats, p: Floats, state: State, k: Work) -> bool:
     """Put the state at (q, p), with nothing known of the past; False where M(q) is not positive definite."""
     n = q.size
+    put(mechanism, q, p, state)
     for i in range(n):
-        state.q[i], state.q_low[i], state.p[i], state.p_low[i] = q[i], 0.0, p[i], 0.0
         state.lead[i] = 0.0
         for w in range(state.center.shape[1]):
             center = mechanism.diffusion.center[i, w]
             state.center[i, w] = q[i] if np.isnan(center) else center
-    regular = node_energy(mechanism, state.q, state.p, state.v, k)
+    regular = node_energy(mechanism, state.place, state.p, state.v, k)
     for r in range(n):
-        kinetic = k.balance[r, 0]
-        state.energy[r, 0], state.energy[r, 1], state.energy[r, 2] = kinetic, k.sweep.V[r], 0.0
-        state.energy[r, 3] = kinetic
+        state.energy[r, 0], state.energy[r, 1] = k.balance[r, 0], k.sweep.V[r]
+        state.energy[r, 2], state.energy[r, 3] = 0.0, 0.0
+        state.share[r, :] = k.share[r]
+    reset_loads(mechanism, True, state, k)
     state.counters[:] = 0
     return regular
 
@@ -399,7 +441,7 @@ def rollout(
     for i in range(states.q.shape[0]):
         state = path(states, i)
         if noisy:
-            node_energy(mechanism, state.q, state.p, state.v, k)
+            node_energy(mechanism, state.place, state.p, state.v, k)
         nodes.ended[i] = SOLVED
         nodes.done[i] = 0
         for s in range(nodes.u.shape[1]):

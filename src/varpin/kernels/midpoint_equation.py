@@ -26,21 +26,25 @@ ENERGY = 4  # the energy balance of the step does not close
 SINGULAR = 5  # the mass matrix at the new node is singular
 
 EPS = float(np.finfo(np.float64).eps)
-ITERATIONS = 12
+ITERATIONS = 10
 ROUNDING = 100.0  # rounding units: a residual below may stagnate; without rounding's own scatter it would be 1
 HISTORY = 3
 
 
 class State(NamedTuple):
-    """Where a rollout stands. Low parts carry what rounding took from q and p (compensated sums)."""
+    """Where a rollout stands. Low parts carry what rounding took from their sums."""
 
-    q: Floats  # (n,)
-    q_low: Floats  # (n,)
+    q: Floats  # (n,) as it is shown
+    place: Floats  # (n,) the same to more digits: without whole turns, and with a low part
+    place_low: Floats  # (n,)
+    turns: Floats  # (n,) whole turns from place to q
     p: Floats  # (n,)
     p_low: Floats  # (n,)
     v: Floats  # (n,) M(q)^-1 p
     past: Floats  # (HISTORY, n) velocities of the last whole steps, newest first
-    energy: Floats  # (n, 4) of each group: kinetic, potential, errors added up, largest kinetic so far [J]
+    energy: Floats  # (n, 4) of each group: kinetic, potential, errors added up, most that moved in a substep [J]
+    share: Floats  # (n, 3) of the kinetic energy for each coordinate, its least and its largest of late [J]
+    loads: Floats  # (l, 2n + 5) of each light part, as :mod:`varpin.kernels.load` says
     lead: Floats  # (n,) by how much the last whole step's velocity led the one it started with
     center: Floats  # (n, k) of the diffusion fields, for this rollout
     counters: Integers  # (2,) how many rows of past are set; halvings of the last step
@@ -58,8 +62,11 @@ class Work(NamedTuple):
     force: Floats  # (n,) of the controls and the noise's drift, constant over the step
     residual: Floats  # (n,)
     delta: Floats  # (n,)
-    balance: Floats  # (n, 3) of each group at the node that is tried: kinetic, work, dissipated [J]
-    trial: Floats  # (5, n): q, q_low, p, p_low, v of the node that is tried
+    balance: Floats  # (n, 4) of each group at the node that is tried: kinetic, work, dissipated, moved [J]
+    share: Floats  # (n,) of its kinetic energy for each coordinate [J]
+    work: Floats  # (n,) of the forces on each coordinate over the substep that is tried [J]
+    loads: Floats  # (l, 2n + 5) of each light part at the node that is tried
+    trial: Floats  # (5, n): place, place_low, p, p_low, v of the node that is tried
     Jx: Floats  # (2n, 2n) d(q1, p1)/d(q0, p0) of a step so far; (0, 0) where derivatives are not wanted
     Jf: Floats  # (2n, n) d(q1, p1)/df
     part: Floats  # (4n, 2n) of one substep, and room for their product
@@ -75,28 +82,32 @@ class Options(NamedTuple):
     tolerance: float  # on the residual, in rounding units of the terms that cancel in it
     margin: float  # of the branch guard
     balance: float  # largest energy error of a substep, in units of the energy it turns over
-    budget: float  # of the errors added up, in units of the largest kinetic energy so far
+    budget: float  # of the errors added up, in units of the most energy that moved in a substep so far
     halvings: int  # at most
     left: float  # part of each kick that comes before the step; the rest comes after it
 
 
-def new_state(paths: int, dof: int, processes: int) -> State:
+def new_state(paths: int, dof: int, processes: int, loads: int) -> State:
     """States of several paths, to be filled in: every array with one more axis in front."""
     return State(
         q=np.zeros((paths, dof)),
-        q_low=np.zeros((paths, dof)),
+        place=np.zeros((paths, dof)),
+        place_low=np.zeros((paths, dof)),
+        turns=np.zeros((paths, dof)),
         p=np.zeros((paths, dof)),
         p_low=np.zeros((paths, dof)),
         v=np.zeros((paths, dof)),
         past=np.zeros((paths, HISTORY, dof)),
         energy=np.zeros((paths, dof, 4)),
+        share=np.zeros((paths, dof, 3)),
+        loads=np.zeros((paths, loads, 2 * dof + 5)),
         lead=np.zeros((paths, dof)),
         center=np.zeros((paths, dof, processes)),
         counters=np.zeros((paths, 2), dtype=np.int64),
     )
 
 
-def new_work(bodies: int, dof: int, *, derivatives: bool = False, parts: int = 0) -> Work:
+def new_work(bodies: int, dof: int, loads: int, *, derivatives: bool = False, parts: int = 0) -> Work:
     """Allocate the work arrays of a step, with room for its derivatives or without, and for a trail of its parts."""
     size = 2 * dof if derivatives else 0
     return Work(
@@ -109,7 +120,10 @@ def new_work(bodies: int, dof: int, *, derivatives: bool = False, parts: int = 0
         force=np.zeros(dof),
         residual=np.zeros(dof),
         delta=np.zeros(dof),
-        balance=np.zeros((dof, 3)),
+        balance=np.zeros((dof, 4)),
+        share=np.zeros(dof),
+        work=np.zeros(dof),
+        loads=np.zeros((loads, 2 * dof + 5)),
         trial=np.zeros((5, dof)),
         Jx=np.zeros((size, size)),
         Jf=np.zeros((size, size // 2)),
@@ -143,7 +157,7 @@ def residual(mechanism: Mechanism, a: float, h: float, state: State, k: Work) ->
 def set_midpoint(a: float, h: float, state: State, k: Work) -> None:
     """The configuration qm = q0 + a h v."""
     for i in range(k.v.size):
-        k.qm[i] = state.q[i] + (state.q_low[i] + a * h * k.v[i])
+        k.qm[i] = state.place[i] + (state.place_low[i] + a * h * k.v[i])
 
 
 @inlined

@@ -16,6 +16,7 @@ from varpin.kernels._compile import inlined
 from varpin.kernels.jet import second_order
 from varpin.kernels.linalg import solve_lu
 from varpin.kernels.midpoint_equation import SOLVED, Options, State, Work, factor_newton, newton
+from varpin.kernels.place import put
 from varpin.kernels.tree import Floats, Mechanism
 
 
@@ -38,7 +39,7 @@ def solve_at(
     for i in range(q.size):
         k.force[i] = force[i]
         k.v[i] = guess[i]
-        state.q[i], state.q_low[i], state.p[i], state.p_low[i] = q[i], 0.0, p[i], 0.0
+    put(mechanism, q, p, state)
     k.tally[2] = 0
     outcome = newton(mechanism, options, h, state, k)
     if outcome == SOLVED and k.tally[2] > 0:  # the last look at the residual was a first-order one

@@ -27,6 +27,10 @@ class Tree(NamedTuple):
     coordinate: Integers  # (b,)
     ratio: Floats  # (b,)
     offset: Floats  # (b,) [rad or m]
+    origin: Integers  # (b,) 1 where no joint above turns: moments of what it carries are taken about its own joint
+    loads: Integers  # (l,) bodies with which a part begins that is light beside what carries it
+    carried: Integers  # (l, n) 1 where a coordinate belongs to the part
+    periodic: Integers  # (n,) 1 where the Lagrangian without springs is the same after a whole turn
     armature: Floats  # (n,) [kg m^2 or kg]
     group: Integers  # (n,) which of r mechanically independent groups a coordinate belongs to, from 0
     groups: int  # r; coordinates of different groups share neither inertia nor a mimic joint
@@ -102,7 +106,7 @@ class Sweep(NamedTuple):
     """Work arrays of the sweeps, and where they leave their results."""
 
     rotation: Floats  # (b, 9) world orientation of each body, row-major
-    position: Floats  # (b, 3) of each joint, from the root of its branch [m]
+    position: Floats  # (b, 3) of each joint, from the last origin above it [m]
     axis: Floats  # (b, 6) S, motion axis
     velocity: Floats  # (b, 6) V
     axis_rate: Floats  # (b, 6) W = V x S

@@ -112,6 +112,7 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
             coordinate[body] = index[joint]
     parent = np.array([model.parents[j] - 1 for j in range(1, model.njoints)], dtype=np.int64)
     group = independent_groups(parent, coordinate, len(coordinates))
+    loads, carried = light_parts(parent, coordinate, prismatic, translation, mass, center, inertia, len(coordinates))
     return Tree(
         parent=parent,
         prismatic=prismatic,
@@ -123,6 +124,10 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
         coordinate=coordinate,
         ratio=ratio,
         offset=offset,
+        origin=origins(parent, prismatic),
+        loads=loads,
+        carried=carried,
+        periodic=periodic_coordinates(coordinate, prismatic, ratio, len(coordinates)),
         armature=coordinate_armature(model, ties, coordinates),
         group=group,
         groups=int(group.max()) + 1,
@@ -180,6 +185,87 @@ def to_pinocchio(model: pin.Model, positions: Floats) -> Floats:
         else:
             configuration[..., joint.idx_q] = positions[..., k]
     return configuration
+
+
+def origins(parent: Integers, prismatic: Integers) -> Integers:
+    """Which bodies (b,) have no joint above them that turns: 1 or 0."""
+    origin = np.ones(len(parent), dtype=np.int64)
+    for body, above in enumerate(parent):
+        if above >= 0:
+            origin[body] = origin[above] and prismatic[above]
+    return origin
+
+
+# A part is light if it has less than this part of the inertia about a joint above it.
+LIGHT = 0.005
+
+
+def light_parts(
+    parent: Integers,
+    coordinate: Integers,
+    prismatic: Integers,
+    translation: Floats,
+    mass: Floats,
+    center: Floats,
+    inertia: Floats,
+    dof: int,
+) -> tuple[Integers, Integers]:
+    """Parts whose energy would be lost in that of what carries them.
+
+    Inertias are compared with all joints stretched out, which is a bound for both.
+
+    Args:
+        parent: Of each body (b,), -1 at a root.
+        coordinate: Of each body (b,).
+        prismatic: 1 where the joint of a body slides (b,).
+        translation: Of each joint in its parent's frame (b, 3) [m].
+        mass: Of each body (b,) [kg].
+        center: Of mass in each body's frame (b, 3) [m].
+        inertia: Of each body about its centre (b, 6) [kg m^2].
+        dof: n.
+
+    Returns:
+        The bodies with which they begin (l,), and which coordinates move with each (l, n): 1 or 0.
+    """
+    bodies = len(parent)
+    about = np.zeros((bodies, bodies))  # [a, b]: inertia of body b about the joint of its ancestor a
+    below = np.zeros((bodies, bodies), dtype=bool)
+    for b in range(bodies):
+        reach, a = float(np.linalg.norm(center[b])), b
+        while a >= 0:
+            below[a, b] = True
+            about[a, b] = mass[b] * (1.0 if prismatic[a] else reach**2)
+            if not prismatic[a]:
+                about[a, b] += inertia[b, [0, 2, 5]].sum() / 2.0
+            reach += float(np.linalg.norm(translation[a]))
+            a = parent[a]
+    carrier = np.full(bodies, -1)  # the light part a body is in
+    loads, rows = [], []
+    for j in range(bodies):
+        a = parent[j]
+        if a < 0:
+            continue
+        carrier[j] = carrier[a]
+        moved = np.zeros(dof, dtype=bool)
+        moved[coordinate[below[j]]] = True
+        if moved[coordinate[~below[j]]].any():  # a mimic joint elsewhere moves along
+            continue
+        while a >= 0 and carrier[a] == carrier[j]:
+            if about[a, below[j]].sum() < LIGHT * about[a, below[a]].sum():
+                carrier[j] = j
+                loads.append(j)
+                rows.append(moved)
+                break
+            a = parent[a]
+    shape = (len(loads), dof)
+    return np.array(loads, dtype=np.int64), np.array(rows, dtype=np.int64).reshape(shape)
+
+
+def periodic_coordinates(coordinate: Integers, prismatic: Integers, ratio: Floats, dof: int) -> Integers:
+    """Which coordinates (n,) bring every joint they move back by a whole turn: 1 or 0."""
+    periodic = np.ones(dof, dtype=np.int64)
+    periodic[coordinate[(prismatic == 1) | (ratio != np.rint(ratio))]] = 0
+    return periodic
 
 
 def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Integers:

@@ -1,0 +1,185 @@
+"""Numerical limits: far from the origin, after many turns, light on heavy, coarse, stiff and badly conditioned."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import varpin as vp
+
+GRAVITY = 9.81
+EPS = np.finfo(float).eps
+
+
+def built(*bodies):
+    """A chain of (joint model, placement, inertia)."""
+    model, joint = pin.Model(), 0
+    for k, (kind, offset, inertia) in enumerate(bodies):
+        joint = model.addJoint(joint, kind, pin.SE3(np.eye(3), np.array(offset, dtype=float)), f"joint{k}")
+        model.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
+    return vp.load_robot(model)
+
+
+def rod(mass=1.0):
+    return pin.Inertia(mass, np.array([0.5, 0.0, 0.0]), np.diag([0.0, mass / 12.0, mass / 12.0]))
+
+
+def chain(masses):
+    return built(*((pin.JointModelRY(), [float(k > 0), 0, 0], rod(m)) for k, m in enumerate(masses)))
+
+
+def carriage(mass):
+    return pin.Inertia.FromSphere(mass, 0.1)
+
+
+def gantry():
+    """Three sliders on each other, the second one's placement far away, and a double pendulum on them."""
+    return built(
+        (pin.JointModelPX(), [0, 0, 0], carriage(3.0)),
+        (pin.JointModelPY(), [0, 0, 5e3], carriage(2.0)),
+        (pin.JointModelPZ(), [0, 0, 0], carriage(1.0)),
+        (pin.JointModelRY(), [0.1, 0, 0], rod()),
+        (pin.JointModelRZ(), [1.0, 0, 0], rod()),
+    )
+
+
+def test_sliders_on_sliders_keep_their_digits_far_out():
+    """Nothing but V depends on where the sliders stand: the jet a thousand kilometres away is the jet at home."""
+    scene = vp.Scene(gantry())
+    q, v = np.array([0.0, 0.0, 0.0, 0.7, -0.4]), np.array([0.3, -2.0, 1.0, 3.0, -1.0])
+    near = vp.lagrangian_jet(scene, q, v)
+    far = vp.lagrangian_jet(scene, q + np.array([1e6, -3e6, 2e6, 0.0, 0.0]), v)
+    for name in ("Lq", "Lv", "Lqq", "Lvq", "Lvv"):
+        np.testing.assert_allclose(getattr(far, name), getattr(near, name), rtol=0, atol=1e-13, err_msg=name)
+
+
+def test_branches_on_sliders_agree_with_pinocchio():
+    """Two pendulums side by side on the second of two sliders, and one on the first."""
+    model, joints = pin.Model(), [0]
+    for parent, kind in ((0, "PX"), (1, "PZ"), (2, "RY"), (3, "RX"), (2, "RZ"), (1, "RX"), (6, "PY")):
+        placement = pin.SE3.Random() if parent else pin.SE3.Identity()
+        joints.append(model.addJoint(joints[parent], getattr(pin, f"JointModel{kind}")(), placement, f"j{len(joints)}"))
+        model.appendBodyToJoint(joints[-1], pin.Inertia.Random(), pin.SE3.Identity())
+    scene = vp.Scene(vp.load_robot(model))
+    rng = np.random.default_rng(3)
+    q, v = rng.normal(size=7), rng.normal(size=7)
+    fast, slow = (vp.lagrangian_jet(scene, q, v, backend=backend) for backend in ("compiled", "pinocchio"))
+    for name in ("L", "Lq", "Lv", "Lqq", "Lvq", "Lvv"):
+        np.testing.assert_allclose(getattr(fast, name), getattr(slow, name), rtol=0, atol=1e-11, err_msg=name)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)])
+def test_a_million_turns_change_nothing(integrator):
+    """A double pendulum that starts a million turns on swings as at home, and shows the turns."""
+    scene, turns = vp.Scene(vp.planar_chain(2)), 2.0 * np.pi * 2.0**20
+    home, away = (
+        vp.simulate(scene, start, [0.0, 0.0], dt=1e-2, steps=100, integrator=integrator)
+        for start in ([0.0, 0.0], [turns, -turns])
+    )
+    # What doubles near 6.6e6 can say of the start is all there is to lose, and the motion spreads it.
+    np.testing.assert_allclose(away.p, home.p, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(away.q - [turns, -turns], home.q, rtol=0, atol=2e-6)
+    assert away.statistics.residual.max() < 10.0
+    assert np.abs(away.energy - home.energy).max() < 1e-6
+
+
+def test_angles_are_continuous_over_turns():
+    """A wheel at 300 rad/s without any force: q = v t, whatever turns are taken off inside."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False)
+    motion = vp.simulate(scene, [0.1], [300.0], dt=1e-2, steps=20_000)
+    np.testing.assert_allclose(motion.q[:, 0], 0.1 + 300.0 * motion.t, rtol=4 * EPS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)])
+def test_energy_of_the_free_spinning_chain_after_a_million_turns(integrator):
+    """Three links stretched out, at 40 rad a step: 1.6e5 steps are a million turns."""
+    scene = vp.Scene(vp.planar_chain(3), gravity=False)
+    motion = vp.simulate(scene, [0.0] * 3, [40.0, 0.0, 0.0], dt=0.5, steps=320_000, integrator=integrator)
+    assert motion.q[-1, 0] > 1e6 * 2.0 * np.pi
+    assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 1e-12
+
+
+@pytest.mark.slow
+def test_pendulum_round_off_walks_at_random_over_ten_million_steps():
+    """At whole periods of the step map's own oscillation only rounding is left; it grows as the root of time."""
+    scene = vp.Scene(vp.planar_chain(1))
+    q, v, energies = np.array([0.3]), np.array([0.5]), []
+    motion = vp.simulate(scene, q, v, dt=1e-3, steps=10_000_000)
+    assert motion.statistics.split_steps == 0
+    error = (motion.energy - motion.energy[0]) / GRAVITY
+    # The rule's own error oscillates with the swing: its largest value of each ten seconds is rounding's walk.
+    energies = error[1:].reshape(1000, -1).max(axis=1)
+    walk = np.abs(energies - energies[0])
+    assert walk.max() < 1e-13
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(3)])
+@pytest.mark.parametrize("up", [False, True])
+def test_mass_ratio_of_a_million(up, integrator):
+    masses = np.logspace(0, 6, 20)
+    scene = vp.Scene(chain(masses if up else masses[::-1]))
+    motion = vp.simulate(scene, np.zeros(20), np.zeros(20), dt=1e-3, steps=100, integrator=integrator)
+    work = motion.statistics
+    whole = work.substeps == 1
+    assert whole.any()
+    assert work.newton_iterations[whole].max() <= 10
+    assert work.residual.max() < 10.0
+
+
+@pytest.mark.parametrize("product", [1e-3, 0.1, 1.0, 2.4, 10.0, 1e2, 1e3, 1e4])
+@pytest.mark.parametrize("how", ["springs", "dampers", "both"])
+def test_stiff_finger_is_solved_or_refused(how, product):
+    robot, q, dt = vp.load_robot("finger"), np.array([0.5, 0.3, 0.2]), 1e-3
+    M = np.diag(vp.lagrangian_jet(vp.Scene(robot, gravity=False), q, np.zeros(3)).Lvv)
+    options = {}
+    if how != "dampers":
+        options["stiffness"] = (product / dt) ** 2 * M
+    if how != "springs":
+        options["damping"] = product / dt * M
+    scene = vp.Scene(robot, gravity=(0.0, -GRAVITY, 0.0), **options)
+    try:
+        motion = vp.simulate(scene, q, np.zeros(3), dt=dt, steps=500)
+    except vp.StepFailure as failure:
+        motion = failure.trajectory
+    for values in (motion.q, motion.v, motion.p, motion.energy):
+        assert np.isfinite(values).all()
+    assert motion.energy.max() <= motion.energy[0] + 0.05 * abs(motion.energy[0])
+
+
+def carousel(links, inertia=1e6):
+    """Light links on hinges, 1 m from the axis of a heavy wheel."""
+    wheel = pin.Inertia(1.0, np.zeros(3), inertia * np.eye(3))
+    hinges = ((pin.JointModelRY(), [1.0, 0, 0], rod()) for _ in range(links))
+    return built((pin.JointModelRZ(), [0, 0, 0], wheel), *hinges)
+
+
+@pytest.mark.parametrize("dt", [0.05, 0.1, 0.2])
+def test_a_heavy_wheel_does_not_hide_what_it_carries(dt):
+    """Seen from a wheel that turns as ever, the links keep their energy less that of the centrifugal force."""
+    scene, rate = vp.Scene(carousel(2)), 0.5
+    assert scene.robot.tree.carried.tolist() == [[0, 1, 1]]
+    motion = vp.simulate(scene, np.zeros(3), [rate, 0.0, 0.0], dt=dt, steps=2000)
+    energies = []
+    for q, v in zip(motion.q[::5], motion.v[::5], strict=True):
+        relative = np.array([0.0, v[1], v[2]])
+        jet = vp.lagrangian_jet(scene, q, relative)
+        energies.append(relative @ jet.Lvv @ relative - jet.L - 0.5 * rate**2 * jet.Lvv[0, 0])
+    unit = GRAVITY * 4 / 2
+    assert np.abs(np.array(energies) - energies[0]).max() < 0.1 * unit
+
+
+@pytest.mark.parametrize("name", ["finger", "ur5", "xarm7"])
+def test_ordinary_arms_carry_nothing_light(name):
+    """They do not pay for the balances of light parts."""
+    assert vp.load_robot(name).tree.loads.size == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dt", [0.01, 0.05, 0.2, 0.5])
+@pytest.mark.parametrize("links", [2, 3, 5])
+def test_chains_at_coarse_steps_keep_their_energy(links, dt):
+    scene = vp.Scene(vp.planar_chain(links))
+    motion = vp.simulate(scene, np.zeros(links), np.zeros(links), dt=dt, steps=100_000)
+    error = np.abs(motion.energy - motion.energy[0]) / (GRAVITY * links**2 / 2)
+    assert error.max() < 0.1
+    assert error.max() < 0.02 or motion.statistics.split_steps > 0
