@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -345,9 +346,59 @@ def geometry(robot: Robot) -> pin.GeometryModel:
         return robot.visuals
     if robot.urdf is None:
         return pin.GeometryModel()
-    full = pin.buildModelFromUrdf(str(robot.urdf))
+    return _visuals(robot, pin.buildModelFromUrdf(str(robot.urdf)))
+
+
+def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[int, str]]]:
+    """What there is of :func:`geometry`, link by link.
+
+    Returns:
+        The shapes of the links that can be read; and by name of each other link, its joint in ``free_model`` and what
+        is wrong with it.
+    """
     try:
-        visuals = pin.buildGeomFromUrdf(full, str(robot.urdf), pin.GeometryType.VISUAL, None, list(robot.package_dirs))
+        return geometry(robot), {}
+    except RobotError:
+        assert robot.urdf is not None
+    full = pin.buildModelFromUrdf(str(robot.urdf))
+    root = ElementTree.parse(robot.urdf).getroot()
+    visuals = {link: link.findall("visual") for link in root.iter("link")}
+    for link, shapes in visuals.items():
+        for shape in shapes:
+            link.remove(shape)
+    found, missing = pin.GeometryModel(), {}
+    for link, shapes in visuals.items():
+        if not shapes:
+            continue
+        link.extend(shapes)
+        name = link.get("name", "")
+        try:
+            part = _visuals(robot, full, ElementTree.tostring(root, encoding="unicode"))
+        except RobotError as error:
+            frame = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.BODY)]
+            missing[name] = frame.parentJoint, str(error)
+        else:
+            for shape in part.geometryObjects:
+                found.addGeometryObject(shape)
+        for shape in shapes:
+            link.remove(shape)
+    return found, missing
+
+
+def _visuals(robot: Robot, full: pin.Model, text: str | None = None) -> pin.GeometryModel:
+    """The visual geometry of a robot's URDF, on the joints of the robot.
+
+    Args:
+        robot: Its meshes are looked up in its folders.
+        full: The URDF's model, nothing locked.
+        text: Of a URDF, in place of the robot's file.
+
+    Raises:
+        RobotError: A mesh is missing or cannot be read; the message names it.
+    """
+    read, source = (pin.buildGeomFromUrdf, str(robot.urdf)) if text is None else (pin.buildGeomFromUrdfString, text)
+    try:
+        visuals = read(full, source, pin.GeometryType.VISUAL, None, list(robot.package_dirs))
     except (ValueError, RuntimeError) as error:
         raise RobotError(f"the meshes of robot {robot.name!r} cannot be read: {error}") from None
     # Attach to the joints of the model the robot moves with: by name, and locked joints through their frame.
