@@ -91,14 +91,12 @@ class Film:
             InputError: Another format than gif and mp4, or a size that is none.
             MissingDependency: A package or a program is not there.
         """
-        if path.suffix.lower() not in FORMATS:
-            raise InputError(f"video must end in {' or '.join(FORMATS)}, got {path.name!r}")
+        check_film(path)
         if not isinstance(size, tuple | list) or len(size) != 2:
             raise InputError(f"size must be a width and a height [pixels], got {size!r}")
         width, height = (count("size", number, least=16) for number in size)
         if width % 2 or height % 2:
             raise InputError(f"size must be even numbers of pixels, as films have them, got {width} x {height}")
-        _require()
         return cls(path, (width, height), 1.0 / fps, max_frames)
 
     def times(self, duration: float) -> Floats:
@@ -137,7 +135,15 @@ class Film:
         return self.path
 
 
-def _require() -> None:
+def check_film(path: Path) -> None:
+    """Whether a film could be written, as far as its name and what is installed tell.
+
+    Raises:
+        InputError: Another format than gif and mp4.
+        MissingDependency: A package or a program is not there.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(f"video must end in {' or '.join(FORMATS)}, got {path.name!r}")
     packages = [name for module, name in _PACKAGES.items() if importlib.util.find_spec(module) is None]
     if packages:
         raise MissingDependency("video", packages, 'pip install "varpin[video]"')
