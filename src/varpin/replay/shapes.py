@@ -69,7 +69,8 @@ class ShapeLoader(MeshcatVisualizer):
 
     def load_plain(self, shape: pin.GeometryObject, placement: pin.SE3, node: str) -> None:
         """Send a shape in one colour that can be animated; those of mesh files cannot."""
-        material = meshcat.geometry.MeshPhongMaterial(color=_hex(shape.meshColor))
+        # Facets, for coal's meshes share corners across edges, which smooth shading would wrinkle.
+        material = meshcat.geometry.MeshPhongMaterial(color=_hex(shape.meshColor), flatShading=True)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             drawn = self._load_form(shape, placement, node, material)
