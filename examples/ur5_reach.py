@@ -30,4 +30,8 @@ for name, integrator in (("midpoint", vp.Midpoint()), ("explicit Euler", vp.Expl
     print(f"    ends {truth.open_loop_gap:.1e} rad from the plan open loop, {truth.closed_loop_gap:.1e} with feedback")
 
 motion = plans["midpoint"].trajectory
-print(vp.replay(robot, motion, ghost=[goal], html=out / "ur5_reach.html", speed=0.5))
+hand = robot.frame_positions([goal])[0]  # where the tool is to be [m]
+marks = {"targets": {"goal": hand}, "trace": True, "frames": True, "torques": True}
+print(vp.replay(robot, motion, ghost=[goal], html=out / "ur5_reach.html", speed=0.5, **marks))
+side_by_side = [(robot, plan.trajectory) for plan in plans.values()]
+print(vp.replay(side_by_side, html=out / "ur5_plans.html", speed=0.5, **marks))

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import functools
+import os
+import shutil
 
 import pytest
 
@@ -41,3 +43,16 @@ def robot(robot_name: str) -> vp.Robot:
 def load():
     """``varpin.load_robot`` for names, each loaded once a session."""
     return load_once
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory):
+    """Headless Chromium, for the tests of whole pages; they are skipped where there is none, except in CI."""
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if not (chromium and driver):
+        reason = "needs chromium and chromedriver on the PATH"
+        pytest.fail(reason) if os.environ.get("CI") else pytest.skip(reason)
+    from chromium import session  # noqa: PLC0415 - selenium is needed by few tests
+
+    with session(chromium, driver, tmp_path_factory.mktemp("chromium")) as opened:
+        yield opened

@@ -1,62 +1,21 @@
 """Replays in real, headless Chromium, cut off from the network."""
 
-import base64
-import gzip
-import importlib
-import io
 import logging
-import os
 import re
-import shutil
 import time
 
 import numpy as np
 import pinocchio as pin
 import pytest
-import umsgpack
-from PIL import Image
-from selenium import webdriver
-from selenium.webdriver.chrome.service import Service
+from chromium import animation, commands, picture, seek, shape_poses, visit, wait_until
 
 import varpin as vp
+from varpin.replay import page as page_module
 from varpin.replay import replay
+from varpin.replay import shapes as shape_module
+from varpin.replay import viewer as viewer_module
+from varpin.replay.picture import Picture
 from varpin.robot import geometry
-
-# By name the module is hidden behind the function of the same name.
-MODULE = importlib.import_module("varpin.replay.viewer")
-
-CHROMIUM_FLAGS = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--disable-dev-shm-usage",
-    "--window-size=800,600",
-]
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if not (chromium and driver):
-        reason = "needs chromium and chromedriver on the PATH"
-        pytest.fail(reason) if os.environ.get("CI") else pytest.skip(reason)
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    for flag in [*CHROMIUM_FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"]:
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    session = webdriver.Chrome(options=options, service=Service(driver))
-    session.set_script_timeout(60)
-    yield session
-    session.quit()
 
 
 @pytest.fixture(scope="module")
@@ -68,79 +27,6 @@ def finger():
 def motion(finger):
     scene = vp.Scene(finger, gravity=False, stiffness=[0.54, 0.28, 0.12], damping=[3.1e-3, 2.2e-3, 0.9e-3])
     return vp.simulate(scene, q0=[0.9, 1.2, 0.8], v0=[0.0, 0.0, 0.0], dt=1e-3, steps=500)
-
-
-def wait_until(condition, seconds=60.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "the page did not get there"
-        time.sleep(0.05)
-
-
-def visit(browser, path):
-    """Load a page offline; returns once every command has reached the viewer."""
-    browser.get_log("browser")
-    browser.execute_cdp_cmd("Network.enable", {})
-    offline = {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
-    browser.execute_cdp_cmd("Network.emulateNetworkConditions", offline)
-    browser.get(path.as_uri())
-    wait_until(lambda: browser.execute_script("return document.documentElement.dataset.loaded"))
-
-
-def seek(browser, seconds):
-    """Stop the animation at a time; returns once that is on the screen."""
-    browser.execute_async_script(
-        "viewer.animator.pause(); viewer.animator.seek(arguments[0]);"
-        "requestAnimationFrame(() => requestAnimationFrame(() => requestAnimationFrame(arguments[1])));",
-        seconds,
-    )
-
-
-def picture(browser):
-    """The screen (height, width, 3), without the strip that holds meshcat's controls."""
-    image = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
-    return np.asarray(image, dtype=float)[40:]
-
-
-def shape_poses(browser, figure="robot"):
-    """World transforms (4, 4) of the robot's or its ghost's shapes on the page, in their own world, by index."""
-    poses = browser.execute_script(
-        """
-        const root = viewer.scene_tree.find(["meshcat"]).object, poses = {};
-        root.updateMatrixWorld(true);
-        const inverse = root.matrixWorld.clone().invert();
-        viewer.scene_tree.find(["meshcat", arguments[0]]).object.traverse(node => {
-            if (node.parent && node.parent.name == "shapes")
-                poses[node.name.split(" ")[0]] = inverse.clone().multiply(node.matrixWorld).toArray();
-        });
-        return poses;""",
-        figure,
-    )
-    return {int(k): np.array(pose).reshape(4, 4).T for k, pose in poses.items()}
-
-
-def commands(path):
-    """What a page tells the viewer, read without a browser."""
-    packed = re.search(r'<script id="commands" type="text/plain">([^<]*)</script>', path.read_text()).group(1)
-    stream = gzip.decompress(base64.b64decode(packed))
-    found = []
-    while stream:
-        size = int.from_bytes(stream[:4], "little")
-        found.append(umsgpack.unpackb(stream[4 : 4 + size]))
-        stream = stream[4 + size :]
-    return found
-
-
-def animation(path):
-    """Times and values by joint node, and the options."""
-    (command,) = [command for command in commands(path) if command["type"] == "set_animation"]
-    tracks = {}
-    for part in command["animations"]:
-        (track,) = part["clip"]["tracks"]
-        keys = track["keys"]
-        assert part["clip"]["fps"] == 1
-        tracks[part["path"], track["name"]] = [[key["time"] for key in keys], [key["value"] for key in keys]]
-    return tracks, command["options"]
 
 
 def test_page_plays_offline_and_shows_the_finger_large(browser, finger, motion, tmp_path):
@@ -226,7 +112,7 @@ f 1//3 2//3 4//3
 f 1/2 2/2 3/2
 f 1 2 3"""
     expected = ["v 0 0 0", "vn 0 0 1", "f 1//3 4//6 -7//-9", "f 1//3 2//3 4//3", "f 1 2 3", "f 1 2 3"]
-    assert MODULE._plain_obj(text).splitlines() == expected
+    assert shape_module._plain_obj(text).splitlines() == expected
 
 
 def test_plays_in_real_time(browser, finger, tmp_path):
@@ -402,7 +288,7 @@ def test_a_missing_mesh_falls_back_with_a_warning_that_names_it(tmp_path, caplog
     with caplog.at_level(logging.WARNING, logger="varpin.replay"):
         path = replay(robot, [[0.0], [1.0]], dt=0.1, html=tmp_path / "arm.html")
     assert "no_such_mesh.stl" in caplog.text
-    assert "drawing a skeleton of link 'rod' instead" in caplog.text
+    assert "drawing a skeleton of its joints and centres of mass instead" in caplog.text
     assert any("skeleton" in command.get("path", "") for command in commands(path))
 
 
@@ -451,7 +337,7 @@ def test_a_mesh_pinocchio_cannot_send_is_drawn_in_one_colour(tmp_path, caplog, m
     def broken(loader, shape):
         raise UserWarning("Texture 'skin.png' not found.")
 
-    monkeypatch.setattr(MODULE.MeshcatVisualizer, "loadMeshFromFile", broken)
+    monkeypatch.setattr(shape_module.MeshcatVisualizer, "loadMeshFromFile", broken)
     with caplog.at_level(logging.WARNING, logger="varpin.replay"):
         path = replay(vp.load_robot("ur5"), np.zeros((1, 6)), dt=1.0, html=tmp_path / "ur5.html")
     assert "Texture 'skin.png' not found." in caplog.text
@@ -461,7 +347,7 @@ def test_a_mesh_pinocchio_cannot_send_is_drawn_in_one_colour(tmp_path, caplog, m
 
 
 def test_a_mesh_the_page_cannot_take_is_left_out(browser, tmp_path, monkeypatch):
-    monkeypatch.setattr(MODULE, "_collada_parts", lambda path: ["<COLLADA/>"])
+    monkeypatch.setattr(shape_module, "_collada_parts", lambda path: ["<COLLADA/>"])
     visit(browser, replay(vp.load_robot("ur5"), np.zeros((11, 6)), dt=0.1, html=tmp_path / "ur5.html"))
     assert any(entry["level"] == "SEVERE" for entry in browser.get_log("browser"))
     assert browser.execute_script("return viewer.animator.playing && viewer.animator.duration") == 1.0
@@ -469,7 +355,7 @@ def test_a_mesh_the_page_cannot_take_is_left_out(browser, tmp_path, monkeypatch)
 
 def test_live_window(browser, finger, motion, monkeypatch, capfd):
     opened = []
-    monkeypatch.setattr(MODULE.webbrowser, "open", lambda url, new=0: opened.append(url) or True)
+    monkeypatch.setattr(viewer_module.webbrowser, "open", lambda url, new=0: opened.append(url) or True)
     viewer = replay(finger, motion, ghost=motion.q[::-1], open=True)
     try:
         assert opened == [viewer.url()]
@@ -488,7 +374,7 @@ def test_live_window(browser, finger, motion, monkeypatch, capfd):
 
 
 def test_says_where_to_look_when_no_browser_opens(finger, motion, monkeypatch, caplog):
-    monkeypatch.setattr(MODULE.webbrowser, "open", lambda url, new=0: False)
+    monkeypatch.setattr(viewer_module.webbrowser, "open", lambda url, new=0: False)
     viewer = replay(finger, motion, open=True)
     viewer.window.server_proc.kill()
     viewer.window.server_proc.wait()
@@ -549,7 +435,7 @@ def test_refuses_an_unwritable_path_before_the_work(finger, motion, tmp_path, mo
     def work(robot):
         raise AssertionError("worked first")
 
-    monkeypatch.setattr(MODULE._Picture, "of", work)
+    monkeypatch.setattr(Picture, "of", work)
     nowhere = tmp_path / "missing" / "page.html"
     refused(lambda: replay(finger, motion, html=nowhere), vp.FileError, f"there is no folder {nowhere.parent}")
     refused(lambda: replay(finger, motion, html=tmp_path), vp.FileError, f"cannot write {tmp_path}: it is a folder")
@@ -558,7 +444,7 @@ def test_refuses_an_unwritable_path_before_the_work(finger, motion, tmp_path, mo
 def test_a_failure_leaves_the_old_page_alone(finger, motion, tmp_path, monkeypatch):
     page = tmp_path / "page.html"
     page.write_text("old")
-    monkeypatch.setattr(MODULE.gzip, "compress", lambda *args, **options: 1 / 0)
+    monkeypatch.setattr(page_module.gzip, "compress", lambda *args, **options: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         replay(finger, motion, html=page)
     assert page.read_text() == "old"

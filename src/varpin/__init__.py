@@ -29,6 +29,7 @@ from varpin.ensemble import simulate_ensemble as simulate_ensemble
 from varpin.errors import FileError as FileError
 from varpin.errors import InputError as InputError
 from varpin.errors import LinearizationError as LinearizationError
+from varpin.errors import MissingDependency as MissingDependency
 from varpin.errors import RobotError as RobotError
 from varpin.errors import RobotNotFound as RobotNotFound
 from varpin.errors import SingularMassMatrix as SingularMassMatrix

@@ -32,7 +32,7 @@ from varpin.errors import FileError, InputError, VarpinError
 from varpin.inspection import JointReport, RobotReport, inspect_robot
 from varpin.integrators import Midpoint
 from varpin.lagrangian import lagrangian_jet
-from varpin.replay import replay
+from varpin.replay import check_film, frame_names, replay
 from varpin.robot import Robot, build_robot, load_robot, robot_names
 from varpin.scene import Scene
 from varpin.simulation import Interrupted, StepFailure, simulate
@@ -154,6 +154,10 @@ def _add_simulate(parser: argparse.ArgumentParser) -> None:
     outputs.add_argument("--save", type=Path, metavar="NPZ", help="write the trajectory, for Trajectory.load")
     outputs.add_argument("--plot", type=Path, metavar="PNG", help="draw an overview, as png, pdf or svg")
     outputs.add_argument("--html", type=Path, metavar="HTML", help="write a replay that any browser opens")
+    outputs.add_argument(
+        "--video", type=Path, metavar="MP4", help="film the replay, as mp4 or gif; needs varpin[video]"
+    )
+    outputs.add_argument("--trace", nargs="+", default=[], metavar="FRAME", help="draw the paths of frames in it")
     outputs.add_argument(
         "--speed",
         type=float,
@@ -344,15 +348,19 @@ def _outputs(request: argparse.Namespace) -> list[_Output]:
 
     Raises:
         FileError: One of them cannot be written.
-        InputError: Two are the same file, or a figure's format is unknown.
+        InputError: Two are the same file, or a format is unknown.
+        MissingDependency: A film needs what is not installed.
     """
     outputs = []
     if request.save is not None:
         outputs.append(_record(writable(request.save)))
     if request.plot is not None:
         outputs.append(_figure(writable(request.plot)))
-    if request.html is not None:
-        outputs.append(_replay(writable(request.html), positive("--speed", request.speed, "1")))
+    for path, film in ((request.html, False), (request.video, True)):
+        if path is not None:
+            if film:
+                check_film(path)
+            outputs.append(_replay(writable(path), positive("--speed", request.speed, "1"), request.trace, film))
     paths = [output.path.resolve() for output in outputs]
     for path in paths:
         if paths.count(path) > 1:
@@ -380,9 +388,10 @@ def _figure(path: Path) -> _Output:
     return _Output(path, write)
 
 
-def _replay(path: Path, speed: float) -> _Output:
+def _replay(path: Path, speed: float, frames: Sequence[str], film: bool) -> _Output:
     def write(robot: Robot, trajectory: Trajectory) -> None:
-        replay(robot, trajectory, html=path, speed=speed)
+        html, video = (None, path) if film else (path, None)
+        replay(robot, trajectory, html=html, video=video, speed=speed, trace=frames)
 
     return _Output(path, write)
 
@@ -408,6 +417,7 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
     steps = _steps(request)
     scene, q0, v0, torque = _motion(request)
     robot = scene.robot
+    frame_names("--trace", [robot], request.trace)
     integrator = Midpoint(alpha=request.alpha)
     # Compilation is no part of the wall time; damping is looked at through the jet.
     Setting.of(scene, q0, v0, torque, request.dt).warm_up(integrator)

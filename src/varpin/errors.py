@@ -106,6 +106,22 @@ class FileError(VarpinError, OSError):
     """A file cannot be read, or not be written."""
 
 
+class MissingDependency(VarpinError, ImportError):
+    """Something that is asked for needs a package or a program that is not installed.
+
+    Attributes:
+        purpose: What needs it.
+        missing: What is not there.
+        command: What installs it.
+    """
+
+    def __init__(self, purpose: str, missing: Iterable[str], command: str) -> None:
+        self.purpose = purpose
+        self.missing = tuple(missing)
+        self.command = command
+        super().__init__(f"{purpose} needs {' and '.join(self.missing)}: {command}")
+
+
 class LinearizationError(VarpinError, RuntimeError):
     """A step of a trajectory has no solution at zero noise, so it has no derivative.
 

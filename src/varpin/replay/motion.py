@@ -1,18 +1,23 @@
-"""A motion as keyframes in time, to be shown by meshcat."""
+"""Motions as keyframes in time, to be shown by meshcat."""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+import reprlib
+import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, count, positive, require_finite, writable
+from varpin.checks import as_floats, count, finite_array, positive, require_finite, writable
 from varpin.errors import InputError
+from varpin.replay.annotations import frame_names, references, target, target_tracks, torque_shares, traces
+from varpin.replay.script import Actor, Script
+from varpin.replay.video import Film
 from varpin.robot import Robot
 from varpin.trajectory import Trajectory
 
@@ -23,24 +28,35 @@ Floats = NDArray[np.float64]
 
 
 def replay(
-    robot: Robot,
-    motion: Trajectory | ArrayLike,
+    robot: Robot | Sequence[tuple[Robot, Trajectory | ArrayLike]],
+    motion: Trajectory | ArrayLike | None = None,
     *,
     html: str | os.PathLike[str] | None = None,
     open: bool = False,
+    video: str | os.PathLike[str] | None = None,
     dt: float | None = None,
     ghost: Trajectory | ArrayLike | None = None,
+    trace: bool | str | Sequence[str] = False,
+    reference: ArrayLike | Mapping[str, ArrayLike] | None = None,
+    targets: Mapping[str, object] | None = None,
+    frames: bool | str | Sequence[str] = False,
+    torques: bool | ArrayLike = False,
+    torque_limit: ArrayLike | None = None,
+    offset: ArrayLike | None = None,
     speed: float = 1.0,
     loop: bool = True,
     fps: float = 30.0,
     max_frames: int = 10_000,
+    size: tuple[int, int] = (800, 600),
 ) -> Path | meshcat.Visualizer:
     """Show a motion in meshcat, in the time it took.
 
     Main args:
-        robot: The arm that moved.
+        robot: The arm that moved; or pairs of an arm and its motion, to be shown side by side on one clock: a plan and
+            its execution, two scenes. What is over before the others is held.
         motion: A trajectory, or configurations (N + 1, n) [rad or m] with ``dt``. A single row shows a pose.
         html: Write one self-contained HTML file here. It plays by itself, with neither server nor network.
+        video: Write a film here, as ``.gif`` or ``.mp4``; with or without ``html``.
         open: Open a live window instead.
 
     Other Args:
@@ -49,57 +65,113 @@ def replay(
             trajectory of any time step, started together with the motion, cut at its end and held if it is over
             before; or configurations (K, n) [rad or m] spread evenly over the motion's time, of which a single row
             stands still.
+        trace: Frames whose paths are drawn, the motion's and the ghost's; ``True`` for the end effector.
+        reference: A path (K, 3) in the world [m] to draw, or several by name.
+        targets: What to reach, by name, which is shown: a point (3,) [m], a pose (4, 4) or ``pin.SE3``; or rows of
+            them, (K, 3) or (K, 4, 4), spread evenly over the motion's time. In the world of each robot.
+        frames: Frames to draw as triads, x red, y green, z blue; ``True`` for the end effector.
+        torques: Colour each link by the torque of the joint that moves it, grey for none, red at its limit: ``True``
+            for the controls of the trajectory, one a joint; or the torques (N, n) themselves [N m or N], of N steps
+            spread evenly over the motion's time.
+        torque_limit: One number or (n,) [N m or N]; the robot's effort limits if left out. A joint without one is red
+            at its own largest torque.
+        offset: From each of several robots to the next (3,) [m]; far enough to see them all if left out.
         speed: Playback speed; 1 is true speed, 0.1 ten times slower.
         loop: Start again at the end; otherwise stop there.
-        fps: Keyframes a second of playback. Between them the page interpolates q linearly, and draws at the
-            screen's own rate.
-        max_frames: Most keyframes; a longer motion gets fewer a second and keeps its speed.
+        fps: Keyframes a second of playback, and frames of a film. Between them the page interpolates q linearly, and
+            draws at the screen's own rate.
+        max_frames: Most keyframes, and frames of a film; a longer motion gets fewer a second and keeps its speed.
+        size: Width and height of a film [pixels].
 
-    The meshes are the robot's own. Where a link's is missing, or the source has none at all, a skeleton of its joint
-    and centre of mass stands in, and the log says why. The ghost leaves out what cannot move, and gives way to the
-    robot where they coincide.
+    The meshes are the robot's own. Where one cannot be read, its link becomes a skeleton, as the whole robot does where
+    the source has none, and the log says why. The ghost leaves out what cannot move, and gives way to the robot where
+    they coincide.
 
     The live window's server belongs to this process and ends with it; ``.wait()`` on the returned visualizer blocks
     until a browser has connected. The server listens on every network interface of the machine, as meshcat's always
     does.
 
+    A film is taken by a headless Chromium that draws the page at the frames' exact times, so it is the same on a slow
+    machine. A GIF's frames last whole hundredths of a second; ``fps`` is rounded to that.
+
     Returns:
-        The path of the file, or the ``meshcat.Visualizer`` of the window.
+        The path of the film, if there is one, or of the page; or the ``meshcat.Visualizer`` of the window.
 
     Raises:
-        InputError: Neither or both of ``html`` and ``open``; a motion or a ghost of another shape or another robot, or
-            not finite; ``dt`` missing or out of place.
+        InputError: Neither a file nor ``open``, or both; a motion or a ghost of another shape or another robot, or not
+            finite; ``dt`` missing or out of place; a frame that is not there; a target, a reference, torques or an
+            ``offset`` that are none.
         FileError: The file cannot be written.
+        MissingDependency: A film needs imageio, selenium, Chromium or its driver, which are not there.
     """
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
-    if (html is None) != bool(open):
-        raise InputError("give either html=path, for a file, or open=True, for a window")
-    t, q = _motion(robot, motion, dt)
+    pairs = _pairs(robot, motion)
+    several = len(pairs) > 1
+    if (html is None and video is None) != bool(open):
+        raise InputError("give either html=path, for a file, or open=True, for a window; or video=path, for a film")
+    own = [shown.dt for _, shown in pairs if isinstance(shown, Trajectory)]
+    if dt is not None and len(own) == len(pairs):
+        raise InputError(f"dt belongs to an array of configurations; this trajectory has its own, {own[0]:g} s")
+    motions = [
+        _motion(arm, shown, dt, f"motion {k + 1}" if several else "motion") for k, (arm, shown) in enumerate(pairs)
+    ]
     speed, fps = positive("speed", speed, "1"), positive("fps", fps, "1/s")
     max_frames = count("max_frames", max_frames, least=2)
-    path = None if html is None else writable(html)
+    page = None if html is None else writable(html)
+    film = None if video is None else Film.of(writable(video), size, fps, max_frames)
+    end = max(t[-1] for t, _ in motions)
+    arms = [arm for arm, _ in pairs]
+    if several and (ghost is not None or not isinstance(torques, bool)):
+        raise InputError("a ghost, and torques that are not those of the trajectory, are of one robot, not of several")
+    ghosts = [] if ghost is None else [_ghost(arms[0], ghost, end)]
+    traced, triads = frame_names("trace", arms, trace), frame_names("frames", arms, frames)
+    paths, tracks = references(reference), target_tracks(targets, end)
+    shares = [torque_shares(arm, shown, torques, torque_limit) for arm, shown in pairs]
+    step = None if offset is None else finite_array("offset", offset, (3,))
 
-    motions = {"robot": (t / speed, q)}
-    if ghost is not None:
-        ghost_t, ghost_q = _ghost(robot, ghost, t[-1])
-        motions["ghost"] = ghost_t / speed, ghost_q
+    moving = [t for t, _, _ in tracks.values() if len(t) > 1]
+    times = _times([t for t, _ in motions], [t for t, _ in ghosts] + moving, end, fps / speed, max_frames)
+    actors = []
+    for k, (arm, (t, q)) in enumerate(zip(arms, motions, strict=True)):
+        positions, lines = {"robot": _positions(arm, t, q, times)}, traces("motion", arm, traced[k], t, q, end)
+        for ghost_t, ghost_q in ghosts:
+            positions["ghost"] = _positions(arm, ghost_t, ghost_q, times)
+            lines += traces("ghost", arm, traced[k], ghost_t, ghost_q, end)
+        actors.append(Actor(arm, positions, tuple(lines), triads[k], _efforts(arm, shares[k], t[-1], times)))
+    marked = tuple(target(name, track, times) for name, track in tracks.items())
+    script = Script(times / speed, tuple(actors), paths, marked, step, loop)
 
-    times, positions = _keyframes(robot, motions, fps, max_frames)
     from varpin.replay import viewer  # noqa: PLC0415 - meshcat is slow to import, and few runs show anything
 
-    if path is None:
-        return viewer.show(robot, times, positions, loop)
-    return viewer.write_page(path, robot, times, positions, loop)
+    if page is None and film is None:
+        return viewer.show(script)
+    with tempfile.TemporaryDirectory() as folder:
+        written = viewer.write_page(page or Path(folder, "page.html"), script)
+        return written if film is None else film.take(written, float(script.times[-1]))
 
 
-def _motion(robot: Robot, motion: Trajectory | ArrayLike, dt: float | None) -> tuple[Floats, Floats]:
+def _pairs(
+    robot: Robot | Sequence[tuple[Robot, Trajectory | ArrayLike]], motion: Trajectory | ArrayLike | None
+) -> list[tuple[Robot, Trajectory | ArrayLike]]:
+    """Each robot with its motion."""
+    if isinstance(robot, Robot):
+        if motion is None:
+            raise InputError("give the robot's motion: a trajectory, or configurations with dt")
+        return [(robot, motion)]
+    if not isinstance(robot, list | tuple) or not robot:
+        raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
+    if motion is not None:
+        raise InputError("of several robots, give pairs of a robot and its motion, and no motion beside them")
+    for pair in robot:
+        if not (isinstance(pair, list | tuple) and len(pair) == 2 and isinstance(pair[0], Robot)):
+            raise InputError(f"several robots must be pairs of a robot and its motion, got {reprlib.repr(pair)}")
+    return [(arm, shown) for arm, shown in robot]
+
+
+def _motion(robot: Robot, motion: Trajectory | ArrayLike, dt: float | None, name: str) -> tuple[Floats, Floats]:
     """Times (N + 1,) from 0 [s] and configurations (N + 1, n)."""
     if isinstance(motion, Trajectory):
-        if dt is not None:
-            raise InputError(f"dt belongs to an array of configurations; this trajectory has its own, {motion.dt:g} s")
-        return _nodes(robot, "trajectory", "motion", motion)
-    q = _rows(robot, "motion", "(N + 1, {}), one row a node", motion)
+        return _nodes(robot, "trajectory", name, motion)
+    q = _rows(robot, name, "(N + 1, {}), one row a node", motion)
     if dt is None:
         raise InputError("an array of configurations needs dt, the time between its rows [s]")
     return np.arange(len(q), dtype=np.float64) * positive("dt", dt, "s"), q
@@ -131,27 +203,34 @@ def _rows(robot: Robot, name: str, shape: str, motion: ArrayLike) -> Floats:
     return require_finite(name, q)
 
 
-def _keyframes(
-    robot: Robot, motions: Mapping[str, tuple[Floats, Floats]], fps: float, max_frames: int
-) -> tuple[Floats, dict[str, Floats]]:
-    """Keyframe times (K,) [s], and each motion's positions (K, b) [rad or m] of all joints of the tree, mimic ones too.
+def _times(motions: Sequence[Floats], others: Sequence[Floats], end: float, fps: float, max_frames: int) -> Floats:
+    """Keyframe times (K,) from 0 to ``end`` [s], of motions with given times and of whatever moves beside them.
 
-    The page interpolates linearly between keyframes, so the nodes themselves are enough where they are sparse. All
-    motions get the same times: each joint's track repeats by itself, and they must not drift apart.
+    The page interpolates linearly between keyframes, so the nodes themselves are enough where they are sparse.
     """
-    own, _ = motions["robot"]
-    end = own[-1]
+    if end == 0.0:
+        return np.zeros(1)
     frames = min(math.ceil(end * fps), max_frames - 1)
-    times = own
-    for t, _ in motions.values():
+    times = np.array([0.0, end])
+    for t in (*motions, *others):
         times = np.union1d(times, t[t < end])
     # Nodes of two motions can be the same but for rounding.
-    times = times[np.diff(times, prepend=-np.inf) > 1e-9 * end] if end > 0.0 else own
-    if frames < len(times) - 1:
-        times = np.linspace(0.0, end, frames + 1)
+    times = times[np.diff(times, prepend=-np.inf) > 1e-9 * end]
+    times[-1] = end
+    return np.linspace(0.0, end, frames + 1) if frames < len(times) - 1 else times
+
+
+def _positions(robot: Robot, t: Floats, q: Floats, times: Floats) -> Floats:
+    """Positions (K, b) [rad or m] of all joints of the tree, mimic ones too, at the keyframes."""
     tree = robot.tree
-    positions = {}
-    for name, (t, q) in motions.items():
-        at = np.column_stack([np.interp(times, t, column) for column in q.T])
-        positions[name] = at[:, tree.coordinate] * tree.ratio + tree.offset
-    return times, positions
+    at = np.column_stack([np.interp(times, t, column) for column in q.T])
+    return at[:, tree.coordinate] * tree.ratio + tree.offset
+
+
+def _efforts(robot: Robot, shares: Floats | None, end: float, times: Floats) -> Floats | None:
+    """Shares of the limit (K, b) of all joints of the tree at the keyframes, from those of N steps to ``end`` [s]."""
+    if shares is None or not len(shares) or end == 0.0:
+        return None if shares is None else np.zeros((len(times), len(robot.tree.parent)))
+    # Constant over each step; the last one's holds at the end.
+    step = np.minimum((times / end * len(shares) * (1.0 + 1e-12)).astype(int), len(shares) - 1)
+    return shares[step][:, robot.tree.coordinate]

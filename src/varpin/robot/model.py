@@ -1,12 +1,12 @@
 """The robot: a Pinocchio model, its generalized coordinates, and the tree the kernels run on."""
 
 import os
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -335,10 +335,8 @@ def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
     return position
 
 
-def geometry(robot: Robot, *, unread: dict[str, str] | None = None) -> pin.GeometryModel:
+def geometry(robot: Robot) -> pin.GeometryModel:
     """The robot's visual geometry, read from its meshes now; empty where the source gives none.
-
-    Where ``unread`` is given, links whose shapes cannot be read are left out and put in there, with the reason.
 
     Raises:
         RobotError: A mesh is missing or cannot be read; the message names it.
@@ -347,13 +345,61 @@ def geometry(robot: Robot, *, unread: dict[str, str] | None = None) -> pin.Geome
         return robot.visuals
     if robot.urdf is None:
         return pin.GeometryModel()
-    full = pin.buildModelFromUrdf(str(robot.urdf))
+    return _visuals(robot, pin.buildModelFromUrdf(str(robot.urdf)))
+
+
+def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[int, str]]]:
+    """What there is of :func:`geometry`, link by link.
+
+    Returns:
+        The shapes of the links that can be read; and by name of each other link, its joint in ``free_model`` and what
+        is wrong with it.
+    """
     try:
-        visuals = pin.buildGeomFromUrdf(full, str(robot.urdf), pin.GeometryType.VISUAL, None, list(robot.package_dirs))
+        return geometry(robot), {}
+    except RobotError:
+        assert robot.urdf is not None
+    full = pin.buildModelFromUrdf(str(robot.urdf))
+    root = ElementTree.parse(robot.urdf).getroot()
+    visuals = {link: link.findall("visual") for link in root.iter("link")}
+    for link, shapes in visuals.items():
+        for shape in shapes:
+            link.remove(shape)
+    found, missing = pin.GeometryModel(), {}
+    for link, shapes in visuals.items():
+        if not shapes:
+            continue
+        link.extend(shapes)
+        name = link.get("name", "")
+        try:
+            part = _visuals(robot, full, ElementTree.tostring(root, encoding="unicode"))
+        except RobotError as error:
+            frame = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.BODY)]
+            missing[name] = frame.parentJoint, str(error)
+        else:
+            for shape in part.geometryObjects:
+                found.addGeometryObject(shape)
+        for shape in shapes:
+            link.remove(shape)
+    return found, missing
+
+
+def _visuals(robot: Robot, full: pin.Model, text: str | None = None) -> pin.GeometryModel:
+    """The visual geometry of a robot's URDF, on the joints of the robot.
+
+    Args:
+        robot: Its meshes are looked up in its folders.
+        full: The URDF's model, nothing locked.
+        text: Of a URDF, in place of the robot's file.
+
+    Raises:
+        RobotError: A mesh is missing or cannot be read; the message names it.
+    """
+    read, source = (pin.buildGeomFromUrdf, str(robot.urdf)) if text is None else (pin.buildGeomFromUrdfString, text)
+    try:
+        visuals = read(full, source, pin.GeometryType.VISUAL, None, list(robot.package_dirs))
     except (ValueError, RuntimeError) as error:
-        if unread is None:
-            raise RobotError(f"the meshes of robot {robot.name!r} cannot be read: {error}") from None
-        visuals = _geometry_by_links(robot, full, unread)
+        raise RobotError(f"the meshes of robot {robot.name!r} cannot be read: {error}") from None
     # Attach to the joints of the model the robot moves with: by name, and locked joints through their frame.
     index = joint_index(robot.free_model)
     for shape in visuals.geometryObjects:
@@ -367,29 +413,6 @@ def geometry(robot: Robot, *, unread: dict[str, str] | None = None) -> pin.Geome
             shape.placement = moved.placement * shape.placement
             shape.parentJoint = moved.parentJoint
         shape.parentFrame = frame
-    return visuals
-
-
-def _geometry_by_links(robot: Robot, full: pin.Model, unread: dict[str, str]) -> pin.GeometryModel:
-    """The geometry that can be read; what cannot, and why, goes to ``unread`` by link.
-
-    Pinocchio stops at the first mesh that it cannot read, so each link is read from a text with its visuals alone.
-    """
-    visuals = pin.GeometryModel()
-    root = ET.parse(str(robot.urdf)).getroot()
-    shown = {link: link.findall("visual") for link in root.iter("link") if link.find("visual") is not None}
-    for link, own in shown.items():
-        for visual in own:
-            link.remove(visual)
-    for link, own in shown.items():
-        link.extend(own)
-        text = ET.tostring(root, encoding="unicode")
-        try:
-            pin.buildGeomFromUrdfString(full, text, pin.GeometryType.VISUAL, visuals, list(robot.package_dirs))
-        except (ValueError, RuntimeError) as error:
-            unread[link.get("name", "")] = str(error).strip()
-        for visual in own:
-            link.remove(visual)
     return visuals
 
 

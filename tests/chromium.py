@@ -1,0 +1,119 @@
+"""A replay's page in real, headless Chromium, cut off from the network, and what it holds."""
+
+import base64
+import contextlib
+import gzip
+import io
+import re
+import time
+
+import numpy as np
+import umsgpack
+from PIL import Image
+from selenium import webdriver
+from selenium.webdriver.chrome.service import Service
+
+FLAGS = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-dev-shm-usage",
+    "--window-size=800,600",
+]
+
+
+@contextlib.contextmanager
+def session(chromium, driver, profile):
+    """A browser with a new profile."""
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for flag in [*FLAGS, f"--user-data-dir={profile}"]:
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    browser = webdriver.Chrome(options=options, service=Service(driver))
+    browser.set_script_timeout(60)
+    try:
+        yield browser
+    finally:
+        browser.quit()
+
+
+def wait_until(condition, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "the page did not get there"
+        time.sleep(0.05)
+
+
+def visit(browser, path):
+    """Load a page offline; returns once every command has reached the viewer."""
+    browser.get_log("browser")
+    browser.execute_cdp_cmd("Network.enable", {})
+    offline = {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+    browser.execute_cdp_cmd("Network.emulateNetworkConditions", offline)
+    browser.get(path.as_uri())
+    wait_until(lambda: browser.execute_script("return document.documentElement.dataset.loaded"))
+
+
+def seek(browser, seconds):
+    """Stop the animation at a time; returns once that is on the screen."""
+    browser.execute_async_script(
+        "viewer.animator.pause(); viewer.animator.seek(arguments[0]);"
+        "requestAnimationFrame(() => requestAnimationFrame(() => requestAnimationFrame(arguments[1])));",
+        seconds,
+    )
+
+
+def picture(browser):
+    """The screen (height, width, 3), without the strip that holds meshcat's controls."""
+    image = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
+    return np.asarray(image, dtype=float)[40:]
+
+
+def shape_poses(browser, figure="robot"):
+    """World transforms (4, 4) of the robot's or its ghost's shapes on the page, in their own world, by index."""
+    poses = browser.execute_script(
+        """
+        const root = viewer.scene_tree.find(["meshcat"]).object, poses = {};
+        root.updateMatrixWorld(true);
+        const inverse = root.matrixWorld.clone().invert();
+        viewer.scene_tree.find(["meshcat", arguments[0]]).object.traverse(node => {
+            if (node.parent && node.parent.name == "shapes")
+                poses[node.name.split(" ")[0]] = inverse.clone().multiply(node.matrixWorld).toArray();
+        });
+        return poses;""",
+        figure,
+    )
+    return {int(k): np.array(pose).reshape(4, 4).T for k, pose in poses.items()}
+
+
+def commands(path):
+    """What a page tells the viewer, read without a browser."""
+    packed = re.search(r'<script id="commands" type="text/plain">([^<]*)</script>', path.read_text()).group(1)
+    stream = gzip.decompress(base64.b64decode(packed))
+    found = []
+    while stream:
+        size = int.from_bytes(stream[:4], "little")
+        found.append(umsgpack.unpackb(stream[4 : 4 + size]))
+        stream = stream[4 + size :]
+    return found
+
+
+def animation(path):
+    """Times and values by joint node, and the options."""
+    (command,) = [command for command in commands(path) if command["type"] == "set_animation"]
+    tracks = {}
+    for part in command["animations"]:
+        (track,) = part["clip"]["tracks"]
+        keys = track["keys"]
+        assert part["clip"]["fps"] == 1
+        tracks[part["path"], track["name"]] = [[key["time"] for key in keys], [key["value"] for key in keys]]
+    return tracks, command["options"]

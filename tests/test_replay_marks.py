@@ -1,0 +1,391 @@
+"""What a replay shows beside the robot: traces, targets, frames, torques, other robots."""
+
+import logging
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from chromium import animation, commands, picture, seek, shape_poses, visit
+from scipy.spatial.transform import Rotation
+
+import varpin as vp
+from varpin.replay import replay
+from varpin.replay.annotations import references, torque_shares
+from varpin.robot import geometry
+
+TIP = "tool0"
+
+
+@pytest.fixture(scope="module")
+def ur5():
+    return vp.load_robot("ur5")
+
+
+@pytest.fixture(scope="module")
+def sweep():
+    """Configurations of an arm with six joints, 0.05 s apart."""
+    t = np.linspace(0.0, 1.0, 21)[:, None]
+    return 0.8 * np.sin(np.array([1.0, 2.0, 1.5, 3.0, 2.5, 0.7]) * t + np.arange(6))
+
+
+def placements(robot, q, frame):
+    """World poses (N, 4, 4) of a frame, by Pinocchio."""
+    model, data = robot.model, robot.model.createData()
+    poses = []
+    for row in np.atleast_2d(q):
+        pin.framesForwardKinematics(model, data, robot.configuration(row))
+        poses.append(data.oMf[model.getFrameId(frame)].homogeneous)
+    return np.array(poses)
+
+
+def vertices(browser, path):
+    """The corners (k, 3) of an object, in the world of meshcat's root."""
+    numbers = browser.execute_script(
+        """
+        const root = viewer.scene_tree.find(["meshcat"]).object;
+        root.updateMatrixWorld(true);
+        const object = viewer.scene_tree.find(["meshcat", ...arguments[0], "<object>"]).object;
+        const matrix = root.matrixWorld.clone().invert().multiply(object.matrixWorld);
+        const place = object.geometry.attributes.position.clone().applyMatrix4(matrix);
+        return Array.from(place.array);""",
+        path,
+    )
+    return np.array(numbers).reshape(-1, 3)
+
+
+def names(browser, path):
+    """The nodes below a path."""
+    return browser.execute_script(
+        "return Object.keys(viewer.scene_tree.find(['meshcat', ...arguments[0]]).children)", path
+    )
+
+
+def pose(browser, path):
+    """A node's transform (4, 4) in the world of meshcat's root."""
+    numbers = browser.execute_script(
+        """
+        const root = viewer.scene_tree.find(["meshcat"]).object;
+        root.updateMatrixWorld(true);
+        const object = viewer.scene_tree.find(["meshcat", ...arguments[0]]).object;
+        return root.matrixWorld.clone().invert().multiply(object.matrixWorld).toArray();""",
+        path,
+    )
+    return np.array(numbers).reshape(4, 4).T
+
+
+def along(browser, name, root="notes"):
+    """The points (P, 3) that a trace's tube is around: the middles of its rings of six corners."""
+    return vertices(browser, [root, "traces", name]).reshape(-1, 6, 3).mean(axis=1)
+
+
+def assert_no_errors(browser):
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+def farthest(points, path):
+    """The largest distance of points (P, 3) from a densely sampled path (K, 3)."""
+    return max(np.linalg.norm(path - point, axis=1).min() for point in points)
+
+
+def test_traces_are_where_pinocchio_puts_the_frame(browser, ur5, sweep, tmp_path):
+    reference = np.array([[0.5, 0.0, 0.1], [0.5, 0.4, 0.1], [0.5, 0.4, 0.1], [0.5, 0.4, 0.6]])
+    ghost = sweep[::-1] + 0.2
+    marks = {"trace": [TIP, "wrist_1_link"], "reference": {"corner": reference}}
+    page = replay(ur5, sweep, dt=0.05, ghost=ghost, html=tmp_path / "traces.html", **marks)
+    visit(browser, page)
+    assert_no_errors(browser)
+    assert len(names(browser, ["notes", "traces"])) == 5
+    fine = np.arange(0.0, 20.0 + 1e-9, 0.01)
+
+    def path(q, frame):
+        return placements(ur5, np.column_stack([np.interp(fine, np.arange(21), column) for column in q.T]), frame)
+
+    for name, q, frame in [
+        ("1 motion tool0", sweep, TIP),
+        ("2 motion wrist_1_link", sweep, "wrist_1_link"),
+        ("3 ghost tool0", ghost, TIP),
+    ]:
+        expected = path(q, frame)[:, :3, 3]
+        points = along(browser, name)
+        assert len(points) >= 200
+        np.testing.assert_allclose(points[[0, -1]], expected[[0, -1]], atol=1e-5)
+        assert farthest(points, expected) < 2e-3  # between two of the dense samples
+        assert farthest(expected, points) < 1e-2
+        # The nodes themselves are on it, to single precision.
+        assert farthest(placements(ur5, q, frame)[:, :3, 3], points) < 1e-5
+    np.testing.assert_allclose(along(browser, "0 reference corner"), reference[[0, 1, 3]], atol=1e-6)
+
+
+def test_a_trace_of_a_long_motion_stays_small_and_true(browser, ur5, tmp_path):
+    t = np.linspace(0.0, 20.0, 20_001)
+    q = 0.5 * np.sin(t[:, None] * np.arange(1.0, 7.0) / 5.0)
+    visit(browser, replay(ur5, q, dt=1e-3, html=tmp_path / "long.html", trace=True))
+    points = along(browser, f"0 motion {ur5.end_effector}")
+    assert 500 < len(points) <= 1001
+    assert farthest(points, placements(ur5, q, ur5.end_effector)[:, :3, 3]) < 1e-5
+
+
+def test_a_frame_that_stays_leaves_no_trace(browser, ur5, tmp_path):
+    q = np.zeros((5, 6))
+    q[:, -1] = np.linspace(0.0, 1.0, 5)
+    visit(browser, replay(ur5, q, dt=0.1, html=tmp_path / "still.html", trace=["forearm_link", "base_link"]))
+    assert names(browser, ["notes"]) == []
+
+
+def test_frames_move_with_the_robot(browser, ur5, sweep, tmp_path):
+    visit(browser, replay(ur5, sweep, dt=0.05, html=tmp_path / "frames.html", frames=[TIP, "base_link"]))
+    found = browser.execute_script(
+        """
+        const root = viewer.scene_tree.find(["meshcat"]).object, poses = {};
+        viewer.animator.pause(); viewer.animator.seek(0.725);
+        root.updateMatrixWorld(true);
+        root.traverse(node => { if (node.parent.name == "frames")
+            poses[node.name] = root.matrixWorld.clone().invert().multiply(node.matrixWorld).toArray(); });
+        return poses;"""
+    )
+    q = 0.5 * (sweep[14] + sweep[15])
+    assert sorted(found) == ["base_link", TIP]
+    for name, numbers in found.items():
+        np.testing.assert_allclose(np.array(numbers).reshape(4, 4).T, placements(ur5, q, name)[0], atol=2e-5)
+
+
+def test_targets_stand_or_move(browser, ur5, sweep, tmp_path):
+    turn = Rotation.from_euler("z", 90.0, degrees=True)
+    first, last = pin.SE3(np.eye(3), np.array([0.1, 0.2, 0.3])), pin.SE3(turn.as_matrix(), np.array([0.5, 0.2, 0.3]))
+    targets = {
+        "point": [0.3, 0.1, 0.5],
+        "moves": [[0.0, 0.0, 0.5], [0.3, 0.0, 0.5], [0.3, 0.3, 0.5]],
+        "pose": last,
+        "turns": [first, last],
+    }
+    page = replay(ur5, sweep, dt=0.05, speed=0.5, html=tmp_path / "targets.html", targets=targets)
+    visit(browser, page)
+    assert_no_errors(browser)
+    assert sorted(names(browser, ["notes", "targets"])) == sorted(targets)
+    half = pin.SE3(turn.as_matrix(), np.array([0.3, 0.2, 0.3]))
+    half.rotation = Rotation.from_euler("z", 45.0, degrees=True).as_matrix()
+    for seconds, moving, turning in [
+        (0.0, [0.0, 0.0, 0.5], first),
+        (0.5, [0.15, 0.0, 0.5], None),
+        (1.0, [0.3, 0.0, 0.5], half),
+        (2.0, [0.3, 0.3, 0.5], last),
+    ]:
+        seek(browser, seconds)
+        np.testing.assert_allclose(pose(browser, ["notes", "targets", "point"])[:3, 3], [0.3, 0.1, 0.5], atol=1e-6)
+        np.testing.assert_allclose(pose(browser, ["notes", "targets", "moves"])[:3, 3], moving, atol=1e-6)
+        np.testing.assert_allclose(pose(browser, ["notes", "targets", "pose"]), last.homogeneous, atol=1e-6)
+        if turning is not None:
+            np.testing.assert_allclose(pose(browser, ["notes", "targets", "turns"]), turning.homogeneous, atol=1e-4)
+    kinds = browser.execute_script(
+        """
+        const kinds = {};
+        for (const name of arguments[0]) {
+            kinds[name] = [];
+            viewer.scene_tree.find(["meshcat", "notes", "targets", name]).object.traverse(node => {
+                if (node.isSprite) kinds[name].push("text of " + node.material.map.image.width);
+                else if (node.isMesh) kinds[name].push(node.parent.name);
+            });
+        }
+        return kinds;""",
+        list(targets),
+    )
+    assert sorted(kinds["point"]) == ["ball", "text of 256"]
+    assert sorted(kinds["turns"]) == ["axes", "ball", "text of 256"]
+
+
+def link_colors(browser):
+    return browser.execute_script(
+        """
+        const colors = {};
+        viewer.scene_tree.find(["meshcat", "robot"]).object.traverse(node => {
+            if (node.isMesh && node.material.color && node.parent.parent.name == "shapes")
+                colors[node.parent.name.split(" ")[0]] = node.material.color.toArray();
+        });
+        return colors;"""
+    )
+
+
+GREY, YELLOW, RED = [0.72, 0.76, 0.8], [0.98, 0.75, 0.1], [0.8, 0.05, 0.05]
+
+
+@pytest.mark.parametrize("limit", [None, [4.0, 2.0, 2.0]])
+def test_links_take_the_colour_of_their_torque(browser, tmp_path, limit):
+    finger = vp.load_robot("finger")
+    own = finger.effort_limit
+    controls = np.array([[0.0, 1.0, -2.0], [4.0, 1.0, 0.0]])
+    bound = np.where(np.isfinite(own) & (own > 0.0), own, [4.0, 1.0, 2.0]) if limit is None else np.array(limit)
+    scene = vp.Scene(finger, gravity=False, damping=1.0)
+    motion = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=0.01, steps=2, controls=controls)
+    page = replay(finger, motion, html=tmp_path / "torques.html", torques=True, torque_limit=limit)
+    visit(browser, page)
+    assert_no_errors(browser)
+    shapes = geometry(finger).geometryObjects
+    for seconds, u in [(0.0, controls[0]), (0.02, controls[1])]:
+        seek(browser, seconds)
+        colors = link_colors(browser)
+        shares = np.minimum(np.abs(u) / bound, 1.0)
+        for k, shape in enumerate(shapes):
+            if shape.parentJoint:
+                share = shares[shape.parentJoint - 1]
+                expected = [np.interp(share, [0.0, 0.5, 1.0], stops) for stops in np.transpose([GREY, YELLOW, RED])]
+                np.testing.assert_allclose(colors[str(k)], expected, atol=1e-5)
+
+
+def test_a_joint_without_a_limit_is_held_against_its_own_largest_torque():
+    chain = vp.planar_chain(2)
+    assert not (np.isfinite(chain.effort_limit) & (chain.effort_limit > 0.0)).any()
+    torques = np.array([[1.0, 0.0], [-4.0, 0.0], [2.0, 0.0]])
+    shares = torque_shares(chain, np.zeros((4, 2)), torques, None)
+    np.testing.assert_array_equal(shares, [[0.25, 0.0], [1.0, 0.0], [0.5, 0.0]])
+
+
+def test_torque_colours_are_seen(browser, ur5, tmp_path):
+    def red(seconds):
+        seek(browser, seconds)
+        image = picture(browser)
+        return ((image[..., 0] > 120.0) & (image[..., 1] < 60.0)).mean()
+
+    torques = np.zeros((10, 6))
+    torques[5:] = 1e3
+    q = np.tile([0.0, -1.0, 1.0, 0.0, 0.0, 0.0], (11, 1))
+    visit(browser, replay(ur5, q, dt=0.1, html=tmp_path / "red.html", torques=torques))
+    assert red(0.0) < 1e-3
+    assert red(0.9) > 0.01
+
+
+def test_robots_side_by_side_keep_their_own_motions(browser, ur5, sweep, tmp_path):
+    finger = vp.load_robot("finger")
+    bend = np.linspace([0.0, 0.0, 0.0], [0.5, 0.6, 0.7], 6)
+    step = np.array([0.0, 1.5, 0.0])
+    pairs = [(ur5, sweep), (ur5, sweep[::-1]), (finger, bend)]
+    page = replay(
+        pairs, dt=0.05, offset=step, html=tmp_path / "three.html", trace=TIP, targets={"goal": [0.4, 0.0, 0.5]}
+    )
+    visit(browser, page)
+    assert_no_errors(browser)
+    seek(browser, 0.75)
+    # The finger's motion is over after 0.25 s, and held.
+    for k, (robot, q) in enumerate([(ur5, sweep[15]), (ur5, sweep[::-1][15]), (finger, bend[-1])]):
+        number = f" {k + 1}" if k else ""
+        shapes, model = geometry(robot), robot.free_model
+        at, data = shapes.createData(), model.createData()
+        pin.updateGeometryPlacements(model, data, shapes, at, robot.free_positions(q))
+        for index, found in shape_poses(browser, f"robot{number}").items():
+            np.testing.assert_allclose(found[:3, 3], at.oMg[index].translation + k * step, atol=2e-5)
+        goal = pose(browser, [f"notes{number}", "targets", "goal"])[:3, 3]
+        np.testing.assert_allclose(goal, np.array([0.4, 0.0, 0.5]) + k * step, atol=1e-6)
+    second = along(browser, "0 motion tool0", "notes 2")
+    np.testing.assert_allclose(second[0], placements(ur5, sweep[-1], TIP)[0, :3, 3] + step, atol=1e-5)
+
+
+def test_robots_beside_each_other_do_not_overlap(ur5, sweep, tmp_path):
+    page = replay([(ur5, sweep), (ur5, sweep[::-1])], dt=0.05, html=tmp_path / "two.html")
+    (move,) = [
+        np.array(command["matrix"]).reshape(4, 4).T[:3, 3]
+        for command in commands(page)
+        if command["type"] == "set_transform" and command["path"] == "/meshcat/robot 2"
+    ]
+    assert move[2] == 0.0
+    model, shapes = ur5.free_model, geometry(ur5)
+    data, at = model.createData(), shapes.createData()
+    spans = []
+    for q in sweep:
+        pin.updateGeometryPlacements(model, data, shapes, at, ur5.free_positions(q))
+        for shape, placed in zip(shapes.geometryObjects, at.oMg, strict=True):
+            corners = np.asarray(shape.geometry.vertices()) @ placed.rotation.T + placed.translation
+            spans.append(corners @ move)
+    values = np.concatenate(spans) / np.linalg.norm(move)
+    assert np.ptp(values) < np.linalg.norm(move) < 3.0 * np.ptp(values)
+
+
+def test_robots_share_one_clock(ur5, sweep, tmp_path):
+    tracks, _ = animation(replay([(ur5, sweep), (ur5, sweep[:8])], dt=0.05, html=tmp_path / "clock.html"))
+    assert {len(times) for times, _ in tracks.values()} == {21}
+    assert [times[-1] for times, _ in tracks.values()] == pytest.approx([1.0] * 12)
+    for (path, _), (times, values) in tracks.items():
+        if "/robot 2/" in path:
+            late = [value for time, value in zip(times, values, strict=True) if time >= 0.35]
+            assert len(set(late)) == 1
+
+
+ARM = """<robot name="arm">
+  <link name="base"/>
+  <link name="upper"><inertial><mass value="1"/><origin xyz="0.5 0 0"/>
+      <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><origin xyz="0.5 0 0"/><geometry><box size="1 0.1 0.1"/></geometry></visual></link>
+  <link name="lower"><inertial><mass value="1"/><origin xyz="0.5 0 0"/>
+      <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><geometry><mesh filename="no_such_mesh.stl"/></geometry></visual></link>
+  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/></joint>
+  <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/><origin xyz="1 0 0"/>
+    <axis xyz="0 1 0"/></joint>
+</robot>"""
+
+
+def test_a_missing_mesh_costs_its_own_link_only(browser, tmp_path, caplog):
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(ARM)
+    with caplog.at_level(logging.WARNING, logger="varpin.replay"):
+        page = replay(vp.load_robot(urdf), [[0.0, 0.5]], dt=1.0, html=tmp_path / "arm.html")
+    assert "no_such_mesh.stl" in caplog.text
+    assert "drawing the skeleton of 'lower' instead" in caplog.text
+    drawn = [command for command in commands(page) if command["type"] == "set_object" and "shapes" in command["path"]]
+    upper = [command for command in drawn if "/elbow/" not in command["path"]]
+    assert [command["object"]["geometries"][0]["type"] for command in upper] == ["BoxGeometry"]
+    visit(browser, page)
+    c, s = np.cos(0.5), np.sin(0.5)
+    places = [found[:3, 3] for found in shape_poses(browser).values()]
+    # The box, the elbow, the rod to the centre of mass and that centre.
+    for expected in (
+        [0.5, 0.0, 0.0],
+        [1.0, 0.0, 0.0],
+        [1.0 + 0.25 * c, 0.0, -0.25 * s],
+        [1.0 + 0.5 * c, 0.0, -0.5 * s],
+    ):
+        assert any(np.allclose(place, expected, atol=1e-6) for place in places)
+    assert len(places) == 4
+
+
+def refused(message, *arguments, **options):
+    with pytest.raises(vp.InputError) as caught:
+        replay(*arguments, **options)
+    assert message in str(caught.value)
+
+
+def test_refuses_marks_it_cannot_show(ur5, sweep, tmp_path):
+    page = tmp_path / "page.html"
+
+    def no(message, robot=ur5, motion=sweep, dt=0.05, **options):
+        refused(message, robot, motion, dt=dt, html=page, **options)
+
+    no("trace: robot 'ur5' has no frame 'fore_link'; did you mean 'forearm_link'", trace="fore_link")
+    no("frames must be names of frames, got 3", frames=[3])
+    no("reference must have shape (K, 3), points on a path in the world [m], got (3,)", reference=[0.0, 0.0, 1.0])
+    no("reference['a'] stays in one place; give a place as a target", reference={"a": np.ones((4, 3))})
+    no("reference[1, 0] is nan", reference=[[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])
+    no("targets must map names to places or poses", targets=[0.0, 0.0, 1.0])
+    no("targets['a'] must be a point (3,), a pose (4, 4)", targets={"a": np.zeros(4)})
+    no("targets['a'][2] is inf", targets={"a": [0.0, 0.0, np.inf]})
+    no("targets['a'] is no pose", targets={"a": 2.0 * np.eye(4)})
+    no("targets['a'] is no pose", targets={"a": np.diag([1.0, 1.0, -1.0, 1.0])})
+    no("so targets['a'] must stay, too, got 2 rows", motion=sweep[:1], targets={"a": np.zeros((2, 3))})
+    no("torques=True takes the controls of a trajectory", torques=True)
+    no("torques must have shape (N, 6), one row a step, got (20, 5)", torques=np.zeros((20, 5)))
+    no("torque_limit colours nothing without torques", torque_limit=1.0)
+    no("torque_limit must be positive", torques=np.ones((20, 6)), torque_limit=0.0)
+    no("offset must have shape (3,), got (2,)", offset=[1.0, 0.0])
+    no("of several robots, give pairs", robot=[(ur5, sweep)])
+    no("several robots must be pairs of a robot and its motion", robot=[ur5, ur5], motion=None)
+    no("a ghost, and torques that are not", robot=[(ur5, sweep), (ur5, sweep)], motion=None, ghost=sweep)
+    no("motion 2 must have shape (N + 1, 6)", robot=[(ur5, sweep), (ur5, sweep[:, :3])], motion=None)
+    no("give the robot's motion", motion=None)
+    scene = vp.Scene(vp.planar_chain(2), actuation=["joint1"])
+    half = vp.simulate(scene, [0, 0], [0, 0], dt=1e-2, steps=2, controls=np.zeros((2, 1)))
+    no("takes one control for each of the 2 joints, this trajectory has 1", scene.robot, half, dt=None, torques=True)
+    assert not page.exists()
+
+
+def test_a_reference_keeps_its_corners():
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    (trace,) = references(points)
+    np.testing.assert_array_equal(trace.points, points)

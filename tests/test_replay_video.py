@@ -1,0 +1,111 @@
+"""Films of replays, taken by a real browser."""
+
+import importlib.util
+import itertools
+import shutil
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+import varpin as vp
+from varpin.cli import main
+from varpin.replay import replay, video
+
+Q = np.linspace([0.0, 0.0], [1.2, -0.8], 11)
+
+
+@pytest.fixture(scope="module")
+def chain():
+    return vp.planar_chain(2)
+
+
+def frames(path):
+    return np.array(
+        [np.asarray(frame.convert("RGB"), dtype=float) for frame in ImageSequence.Iterator(Image.open(path))]
+    )
+
+
+def test_a_gif_has_a_frame_for_each_moment_and_they_differ(browser, chain, tmp_path):
+    path = tmp_path / "chain.gif"
+    size = (320, 240)
+    assert replay(chain, Q, dt=0.1, video=path, fps=10.0, size=size) == path
+    film = frames(path)
+    assert film.shape == (11, 240, 320, 3)
+    assert Image.open(path).info["duration"] == 100  # [ms]
+    for before, after in itertools.pairwise(film):
+        assert (np.abs(after - before).max(axis=-1) > 40.0).mean() > 1e-3
+
+
+def test_frames_are_at_exact_times(browser, chain, tmp_path):
+    q = np.repeat([[0.0, 0.0], [1.0, 0.5]], [6, 5], axis=0)  # moves between 0.5 s and 0.6 s alone
+    film = frames(replay(chain, q, dt=0.1, video=tmp_path / "jump.gif", fps=10.0, size=(320, 240)))
+    assert len(film) == 11
+    assert (film[:6] == film[0]).all()
+    assert (film[6:] == film[-1]).all()
+    assert (film[0] != film[-1]).any()
+
+
+def test_an_mp4_and_its_page(browser, chain, tmp_path):
+    path, page = tmp_path / "chain.mp4", tmp_path / "chain.html"
+    assert replay(chain, Q, dt=0.1, html=page, video=path, fps=5.0, size=(320, 240), loop=False, speed=2.0) == path
+    film = imageio.imread(path, plugin="FFMPEG").astype(float)
+    assert film.shape == (3, 240, 320, 3)
+    assert (np.abs(film[2] - film[0]).max(axis=-1) > 40.0).mean() > 1e-3
+    assert page.stat().st_size > 10_000
+
+
+def test_frame_times(tmp_path):
+    def times(name, fps, duration, most=10_000):
+        return video.Film(tmp_path / name, (320, 240), 1.0 / fps, most).times(duration)
+
+    np.testing.assert_allclose(times("a.mp4", 30.0, 1.0), np.arange(31) / 30.0)
+    np.testing.assert_allclose(times("a.gif", 30.0, 1.0), 0.03 * np.arange(34))
+    np.testing.assert_allclose(times("a.gif", 1000.0, 0.1), 0.02 * np.arange(6))
+    assert len(times("a.mp4", 30.0, 100.0, most=11)) == 11
+    assert len(times("a.gif", 30.0, 100.0, most=11)) == 11
+    np.testing.assert_array_equal(times("a.gif", 30.0, 0.0), [0.0])
+
+
+def test_says_what_is_missing_and_how_to_get_it(chain, tmp_path, monkeypatch):
+    found, which = importlib.util.find_spec, shutil.which
+
+    def without(*gone):
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in gone else found(name))
+        monkeypatch.setattr(shutil, "which", lambda name: None if name in gone else (which(name) or f"/usr/bin/{name}"))
+        with pytest.raises(vp.MissingDependency) as caught:
+            replay(chain, Q, dt=0.1, video=tmp_path / "chain.gif")
+        return caught.value
+
+    error = without("imageio", "imageio_ffmpeg")
+    assert str(error) == 'video needs imageio and imageio-ffmpeg: pip install "varpin[video]"'
+    assert error.missing == ("imageio", "imageio-ffmpeg")
+    assert isinstance(error, ImportError)
+    assert str(without("selenium")) == 'video needs selenium: pip install "varpin[video]"'
+    nothing = without("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chromedriver")
+    assert str(nothing) == "video needs chromium and chromedriver: apt install chromium chromium-driver"
+    assert not (tmp_path / "chain.gif").exists()
+
+
+def test_refuses_other_formats_and_sizes(chain, tmp_path):
+    for name, size, message in [
+        ("chain.avi", (320, 240), "video must end in .gif or .mp4, got 'chain.avi'"),
+        ("chain.mp4", (321, 240), "size must be even numbers of pixels, as films have them, got 321 x 240"),
+        ("chain.mp4", 320, "size must be a width and a height [pixels], got 320"),
+        ("chain.mp4", (320, 2), "size must be at least 16, got 2"),
+    ]:
+        with pytest.raises(vp.InputError) as caught:
+            replay(chain, Q, dt=0.1, video=tmp_path / name, size=size)
+        assert str(caught.value) == message
+
+
+def test_the_command_line_films_with_traces(browser, tmp_path, capsys):
+    path = tmp_path / "finger.gif"
+    start = ["simulate", "finger", "--no-gravity", "--v0", "2", "1", "1", "--dt", "1e-2", "--steps", "10"]
+    assert main([*start, "--video", str(path), "--trace", "tip", "--speed", "0.5", "--quiet"]) == 0
+    assert len(frames(path)) == 7  # 0.2 s of playback, 0.03 s each
+    assert main([*start, "--html", str(tmp_path / "page.html"), "--trace", "nail"]) == 2
+    assert "--trace: robot 'finger' has no frame 'nail'" in " ".join(capsys.readouterr().err.split())
+    assert main([*start, "--video", str(tmp_path / "finger.avi")]) == 2
+    assert "must end in .gif or .mp4" in capsys.readouterr().err
