@@ -49,14 +49,33 @@ MEMORY = 1_000_000_000  # bytes that a reader may take in all
 TIMEOUT = 20.0  # [s] that one input may take, on a busy machine
 KINDS = ("urdf", "npz")
 
-NUMBERS = (
-    "0 -0 1 -1 2 1e-3 1e3 1e8 1e-12 1e-320 1e150 -1e150 1e160 1e308 -1e308 1e309 nan NaN -nan inf -inf infinity 0x1p3 "
-    "1_000 1,5 1e 1d3 +1 .5 5. ٣ ½ abc 3.14159265358979 1.5707963 99999999999999999999 2147483648 1e-9 1e9"
-).split() + ["", " ", "1 2", "\t1", "9" * 5000]
-WORDS = (
-    "revolute continuous prismatic fixed floating planar spherical mimic universe world root_joint base base_link l1 l2 "
-    "j1 j2 %s%n%s ../../etc/passwd package://x/y.stl file:///dev/zero /dev/zero /dev/stdin é 机器人 \u202e 🤖"
-).split() + ["", " ", "a" * 20_000, "a b", "universe"]
+NUMBERS = [
+    *(
+        "0",
+        "-0",
+        "1",
+        "-1",
+        "2",
+        "1e-3",
+        "1e3",
+        "1e8",
+        "1e-12",
+        "1e-320",
+        "1e150",
+        "-1e150",
+        "1e160",
+        "1e308",
+        "-1e308",
+    ),
+    *("1e309", "nan", "NaN", "-nan", "inf", "-inf", "infinity", "0x1p3", "1_000", "1,5", "1e", "1d3", "+1", ".5", "5."),
+    *("٣", "½", "abc", "3.14159265358979", "1.5707963", "99999999999999999999", "2147483648", "1e-9", "1e9", "", " "),
+    *("1 2", "\t1", "9" * 5000),
+]
+WORDS = [
+    *("revolute", "continuous", "prismatic", "fixed", "floating", "planar", "spherical", "mimic", "universe", "world"),
+    *("root_joint", "base", "base_link", "l1", "l2", "j1", "j2", "%s%n%s", "../../etc/passwd", "package://x/y.stl"),
+    *("file:///dev/zero", "/dev/zero", "/dev/stdin", "é", "机器人", "\u202e", "🤖", "", " ", "a" * 20_000, "a b"),
+]
 ELEMENTS = [
     INERTIAL,
     mimic("j1"),
@@ -142,9 +161,11 @@ def extreme_urdf(rng: random.Random) -> bytes:
     which = rng.randrange(14)
     links = "".join(link(f"l{i}") for i in range(1, size + 1))
     if which == 0:
-        return _robot(links, *(joint(f"j{i}", f"l{i - 1}", f"l{i}", kind) for i in range(1, size + 1))).replace(
-            '"base"', '"l0"'
-        ).encode()
+        return (
+            _robot(links, *(joint(f"j{i}", f"l{i - 1}", f"l{i}", kind) for i in range(1, size + 1)))
+            .replace('"base"', '"l0"')
+            .encode()
+        )
     if which == 1:
         return _robot(links, *(joint(f"j{i}", "base", f"l{i}", kind) for i in range(1, size + 1))).encode()
     if which == 2:
@@ -162,9 +183,7 @@ def extreme_urdf(rng: random.Random) -> bytes:
             f'<robot name="a"><link name="b"/>&x;</robot>'
         ).encode()
     if which == 6:
-        return _robot(
-            links, *(joint(f"j{i}", f"l{i}", f"l{i % size + 1}", kind) for i in range(1, size + 1))
-        ).encode()
+        return _robot(links, *(joint(f"j{i}", f"l{i}", f"l{i % size + 1}", kind) for i in range(1, size + 1))).encode()
     if which == 7:
         text = _robot(link("l1"), joint("j1", "base", "l1"))
         encoding = rng.choice(["utf-16", "utf-16-le", "utf-32", "utf-8-sig", "latin-1", "cp037", "utf-7"])
@@ -373,7 +392,9 @@ def _strange_array(array: np.ndarray, rng: random.Random) -> np.ndarray:
     if change == 5:
         return np.zeros(rng.choice([(), (0,), (0, 0), (3, 0), (0, 3), (1,) * 32, (7,), (7, 3)]))
     if change == 6:
-        return np.array(rng.choice(["", "x" * 3000, "varpin.trajectory/2", "\0", "é", "{", "[]", "{}", "null", "1" * 5000]))
+        return np.array(
+            rng.choice(["", "x" * 3000, "varpin.trajectory/2", "\0", "é", "{", "[]", "{}", "null", "1" * 5000])
+        )
     if change == 7:
         return np.zeros(3, dtype=[("a", "f8"), ("b", "U3")])
     if change == 8 and array.ndim:
@@ -383,15 +404,32 @@ def _strange_array(array: np.ndarray, rng: random.Random) -> np.ndarray:
 
 def _strange_header(npy: bytes, rng: random.Random) -> bytes:
     """An array whose header says something else than its data."""
-    shape = rng.choice(
-        ["()", "(1,)", "(-1,)", "(10**9,)", "(1000000000,)", "(100000000, 100)", "(9223372036854775807,)", "(2, 2)"]
-        + ["(4611686018427387904, 4)", "(0, 1000000000000)", "(1.5,)", "('a',)", "None", "(True,)", "(" * 900 + ")" * 900]
-        + ["(" + "1, " * 70 + ")", "(" + "0, " * 40 + ")", "(-4611686018427387904, 2)"]
-    )
-    kind = rng.choice(
-        ["'<f8'", "'|O'", "'<U1000000000'", "'<U0'", "'V0'", "[('a', '<f8')]", "'<f8, <f8'", "'>i8'", "'<M8[s]'", "1"]
-        + ["[('a', '|O')]", "('<f8', (1000, 1000, 1000))", "[" * 300 + "]" * 300, "'x'", "'<U2147483647'", "'<f16'"]
-    )
+    shapes = [
+        "()",
+        "(1,)",
+        "(-1,)",
+        "(10**9,)",
+        "(1000000000,)",
+        "(100000000, 100)",
+        "(9223372036854775807,)",
+        "(2, 2)",
+    ]
+    shapes += ["(4611686018427387904, 4)", "(0, 1000000000000)", "(1.5,)", "('a',)", "None", "(True,)"]
+    shapes += ["(" * 900 + ")" * 900, "(" + "1, " * 70 + ")", "(" + "0, " * 40 + ")", "(-4611686018427387904, 2)"]
+    kinds = [
+        "'<f8'",
+        "'|O'",
+        "'<U1000000000'",
+        "'<U0'",
+        "'V0'",
+        "[('a', '<f8')]",
+        "'<f8, <f8'",
+        "'>i8'",
+        "'<M8[s]'",
+        "1",
+    ]
+    kinds += ["[('a', '|O')]", "('<f8', (1000, 1000, 1000))", "[" * 300 + "]" * 300, "'x'", "'<U2147483647'", "'<f16'"]
+    shape, kind = rng.choice(shapes), rng.choice(kinds)
     head = "{'descr': %s, 'fortran_order': %s, 'shape': %s, }" % (  # noqa: UP031
         kind if rng.random() < 0.5 else "'<f8'",
         rng.choice(["False", "True", "2", "None"]),
@@ -429,7 +467,7 @@ def _bomb(members: Members, rng: random.Random) -> bytes:
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)
     packed = packer.compress(members[name]) + b"".join(packer.compress(bytes(10**6)) for _ in range(size // 10**6))
     packed += packer.flush()
-    # Written as a stored member of that content, and then called deflated, with a checksum that is wrong or not looked at.
+    # Written as a stored member of that content, and then called deflated, with a checksum that does not fit.
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         for other, content in members.items():
@@ -603,7 +641,7 @@ def run(kind: str, seed: int, begin: int, end: int, folder: Path | None = None, 
     report = Report() if report is None else report
     corpus = None
     while begin < end:
-        number, problem = begin, ""
+        number, problem, started = begin, "", False
         for line in _watched(kind, seed, begin, end):
             if line is None:
                 problem = f"hangs: more than {TIMEOUT:g} s"
@@ -616,9 +654,11 @@ def run(kind: str, seed: int, begin: int, end: int, folder: Path | None = None, 
                     report.findings.append((kind, number, problem))
                 begin, problem = number + 1, ""
             elif line.startswith("died"):
+                if not started:
+                    raise RuntimeError(f"a worker does not get to its first input: {line}")
                 problem = line if begin < end else ""
             else:
-                number = int(line)
+                number, started = int(line), True
         if problem:
             report.inputs += 1
             report.outcomes["FINDING"] += 1

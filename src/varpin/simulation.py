@@ -225,9 +225,9 @@ def simulate(
     given = (None, 0) if callable(controls) else (controls, steps)
     commands = commands_of(scene, integrator, *given)
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
-    _warn_of_ringing(scene, q0, dt)
     with announced_compilation():
         state, (start,) = integrator.start(scene, q0[None], v0[None])
+        _warn_of_ringing(scene, q0, dt)
         record = _Record(scene, integrator, dt, steps, dw, start)
         chunk = max(1, _CHUNK // n)
         # One step at a time where Python functions are called, so that what came before one that fails is recorded.
@@ -277,7 +277,7 @@ def _warn_of_ringing(scene: Scene, q0: Floats, dt: float) -> None:
     if not scene.damping.any():
         return
     rate = np.linalg.solve(lagrangian_jet(scene, q0, np.zeros_like(q0)).Lvv, np.diag(scene.damping))
-    fastest = float(np.abs(np.linalg.eigvals(rate)).max())
+    fastest = float(np.abs(np.linalg.eigvals(rate)).max()) if np.isfinite(rate).all() else np.inf
     if 0.5 * dt * fastest > 1.0:
         logger.warning(
             "damping is faster than the step (dt * %.3g/s > 2): velocities that it should stop will ring; "

@@ -1,6 +1,7 @@
 """The robot: a Pinocchio model, its generalized coordinates, and the tree the kernels run on."""
 
 import os
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,9 +17,13 @@ from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoi
 from varpin.kernels.tree import Tree
 from varpin.robot.mimic import Tie, joint_index, rebuild, tied_model
 from varpin.robot.sources import Description, describe, hang_shapes
-from varpin.robot.tree import flatten, is_unbounded, joint_axis, to_pinocchio
+from varpin.robot.tree import flatten, is_unbounded, joint_axis, to_pinocchio, tree_mass_matrix
+from varpin.robot.urdf import read_root
 
 Floats = NDArray[np.float64]
+
+# Joints up to which a robot is checked with Pinocchio's algorithms.
+_FEW = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,10 +350,11 @@ def geometry(robot: Robot) -> pin.GeometryModel:
         return robot.visuals
     if robot.urdf is None:
         return pin.GeometryModel()
-    full = pin.buildModelFromUrdf(str(robot.urdf))
+    text = ET.tostring(read_root(robot.urdf), encoding="unicode")
     try:
-        visuals = pin.buildGeomFromUrdf(full, str(robot.urdf), pin.GeometryType.VISUAL, None, list(robot.package_dirs))
-    except (ValueError, RuntimeError) as error:
+        full = pin.buildModelFromXML(text)
+        visuals = pin.buildGeomFromUrdfString(full, text, pin.GeometryType.VISUAL, None, list(robot.package_dirs))
+    except (ValueError, RuntimeError, IndexError) as error:
         raise RobotError(f"the meshes of robot {robot.name!r} cannot be read: {error}") from None
     # Attach to the joints of the model the robot moves with: by name, and locked joints through their frame.
     index = joint_index(robot.free_model)
@@ -371,11 +377,18 @@ def check_inertia(robot: Robot) -> None:
 
     Raises:
         SingularMassMatrix: Naming the joints whose motion carries no inertia.
+        RobotError: It is not finite.
     """
     rng = np.random.default_rng(0)
-    data = robot.free_model.createData()
+    # Pinocchio's data take 64 n^3 bytes.
+    data = robot.free_model.createData() if robot.free_model.nv <= _FEW else None
     for q in [np.zeros(robot.dof), *rng.uniform(-np.pi, np.pi, (3, robot.dof))]:
-        M = mass_matrix(robot, q, data)
+        M = tree_mass_matrix(robot.tree, q) if data is None else mass_matrix(robot, q, data)
+        if not np.isfinite(M).all():
+            raise RobotError(
+                f"the mass matrix of robot {robot.name!r} is not finite at q = {q}: masses, inertias or distances are "
+                "beyond the range of floating-point numbers"
+            )
         scale = np.sqrt(np.diag(M))
         if not (np.diag(M) > 0.0).all():
             raise SingularMassMatrix(

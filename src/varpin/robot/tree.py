@@ -155,6 +155,45 @@ def to_pinocchio(model: pin.Model, positions: Floats) -> Floats:
     return configuration
 
 
+def tree_mass_matrix(tree: Tree, q: Floats) -> Floats:
+    """M(q) (n, n), armature included: M_ij = S_i . Y_j S_j for an ancestor i of j, or j itself; see kernels.jet.
+
+    In plain NumPy and n^2 memory, for robots whose data in Pinocchio would not fit.
+    """
+    bodies = tree.parent.size
+    rotation, position = np.empty((bodies, 3, 3)), np.empty((bodies, 3))
+    axis, inertia = np.zeros((bodies, 6)), np.zeros((bodies, 6, 6))
+    M = np.zeros((bodies, bodies))
+    for j, s in enumerate(tree.ratio * q[tree.coordinate] + tree.offset):
+        up = tree.parent[j]
+        R, p = (rotation[up], position[up]) if up >= 0 else (np.eye(3), np.zeros(3))
+        p, R = p + R @ tree.translation[j], R @ tree.rotation[j]
+        z = R[:, 2]
+        if tree.prismatic[j]:
+            p = p + s * z
+            axis[j, :3] = z
+        else:
+            R = R @ np.array([[np.cos(s), -np.sin(s), 0.0], [np.sin(s), np.cos(s), 0.0], [0.0, 0.0, 1.0]])
+            axis[j, :3], axis[j, 3:] = np.cross(p, z), z
+        rotation[j], position[j] = R, p
+        x, y, w = p + R @ tree.center[j]
+        cross = np.array([[0.0, -w, y], [w, 0.0, -x], [-y, x, 0.0]])
+        xx, xy, yy, xz, yz, zz = tree.inertia[j]
+        own = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
+        m = tree.mass[j]
+        inertia[j] = np.block([[m * np.eye(3), -m * cross], [m * cross, own - m * cross @ cross]])
+    for j in range(bodies - 1, -1, -1):
+        dual, i = inertia[j] @ axis[j], j
+        while i >= 0:
+            M[i, j] = M[j, i] = axis[i] @ dual
+            i = tree.parent[i]
+        if tree.parent[j] >= 0:
+            inertia[tree.parent[j]] += inertia[j]
+    G = np.zeros((bodies, tree.armature.size))
+    G[np.arange(bodies), tree.coordinate] = tree.ratio
+    return np.asarray(G.T @ M @ G + np.diag(tree.armature))
+
+
 def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Integers:
     """Which coordinates (n,) move each other: labels from 0 of the groups that inertia or mimic joints tie together.
 

@@ -131,10 +131,8 @@ class OptimalControlTradeoff:
         Raises:
             FileError: The file is missing, damaged or something else.
         """
-        runs, facts = read_table(path, FORMAT, OptimalControlRun)
-        if set(facts) != set(_FACTS):
-            raise FileError(f"{path} is damaged: it has {', '.join(sorted(facts))}")
-        return cls(runs, **{name: facts[name].item() for name in _FACTS})
+        runs, facts = read_table(path, FORMAT, OptimalControlRun, cls, _FACTS)
+        return cls(runs, **facts)
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write the runs as a table; returns its path.

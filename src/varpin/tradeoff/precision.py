@@ -165,10 +165,8 @@ class WorkPrecision:
         Raises:
             FileError: The file is missing, damaged or something else.
         """
-        runs, facts = read_table(path, FORMAT, WorkPrecisionRun)
-        if set(facts) != set(_FACTS):
-            raise FileError(f"{path} is damaged: it has {', '.join(sorted(facts))}")
-        return cls(runs, **{name: facts[name].item() for name in _FACTS})
+        runs, facts = read_table(path, FORMAT, WorkPrecisionRun, cls, _FACTS)
+        return cls(runs, **facts)
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write the runs as a table; returns its path.
