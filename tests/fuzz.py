@@ -46,7 +46,7 @@ from varpin.tradeoff.optimal_control import OptimalControlRun
 from varpin.tradeoff.precision import WorkPrecisionRun
 
 MEMORY = 1_000_000_000  # bytes that a reader may take in all
-TIMEOUT = 20.0  # [s] that one input may take, on a busy machine
+TIMEOUT = 40.0  # [s] that one input may take, on a busy machine
 KINDS = ("urdf", "npz")
 
 NUMBERS = [
