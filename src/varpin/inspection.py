@@ -158,7 +158,8 @@ def inspect_robot(
     scene = Scene(robot, gravity=gravity)
     configuration = broadcast_array("q", 0.0 if q is None else q, robot.dof)
     velocity = broadcast_array("v", 0.0 if v is None else v, robot.dof)
-    jet = lagrangian_jet(scene, configuration, velocity, backend="pinocchio")
+    with np.errstate(all="ignore"):
+        jet = lagrangian_jet(scene, configuration, velocity, backend="pinocchio")
     if not all(np.isfinite(array).all() for array in (jet.Lvv, jet.Lqq)):
         raise RobotError(
             f"robot {robot.name!r} cannot be looked into: its mass matrix or its derivatives are not finite"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import reprlib
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
@@ -104,10 +105,23 @@ class Trajectory:
     version: str = __version__
 
     def __post_init__(self) -> None:
+        nodes, n = np.size(self.t), len(self.joint_names)
+        # Kernels check no shapes.
+        for name, lead in {"t": nodes, "energy": nodes, "q": nodes, "v": nodes, "p": nodes}.items():
+            self._require(name, (lead, n) if name in "qvp" else (lead,))
+        for name in ("u", "dw"):
+            self._require(name, (nodes - 1, *np.shape(getattr(self, name))[1:2]))
+        if nodes < 1 or self.u.ndim != 2 or self.dw.ndim != 2:
+            raise InputError("a trajectory has one node or more, and controls and increments (N, ...)")
         for name in _ARRAYS:
             getattr(self, name).setflags(write=False)
         for array in vars(self.statistics).values():
             array.setflags(write=False)
+
+    def _require(self, name: str, shape: tuple[int, ...]) -> None:
+        array = getattr(self, name)
+        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
+            raise InputError(f"a trajectory's {name} must be a float64 array {shape}, got {reprlib.repr(array)}")
 
     @property
     def steps(self) -> int:

@@ -8,5 +8,6 @@ from varpin.robot.model import geometry as geometry
 from varpin.robot.model import load_robot as load_robot
 from varpin.robot.model import mass_matrix as mass_matrix
 from varpin.robot.sources import bundled_robots as bundled_robots
+from varpin.robot.tree import require_sound as require_sound
 from varpin.robot.urdf import MAX_JOINTS as MAX_JOINTS
 from varpin.robot.urdf import read_root as read_root

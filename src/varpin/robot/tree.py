@@ -155,6 +155,36 @@ def to_pinocchio(model: pin.Model, positions: Floats) -> Floats:
     return configuration
 
 
+def require_sound(tree: Tree) -> None:
+    """Refuse arrays that kernels, which check no bounds, would read or write beyond their ends.
+
+    :func:`flatten` makes none; a tree that was changed afterwards may be one.
+
+    Raises:
+        RobotError: Naming the array.
+    """
+    b, n = np.size(tree.parent), np.size(tree.armature)
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("parent", "prismatic", "mass", "coordinate", "ratio"), (b,))
+    shapes |= {"offset": (b,), "rotation": (b, 3, 3), "translation": (b, 3), "center": (b, 3), "inertia": (b, 6)}
+    shapes |= {"armature": (n,), "group": (n,)}
+    for name, shape in shapes.items():
+        array = getattr(tree, name)
+        kind = np.int64 if name in ("parent", "prismatic", "coordinate", "group") else np.float64
+        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != kind:
+            raise RobotError(f"the robot's tree is damaged: its {name} is no array {shape} of {np.dtype(kind)}")
+        if kind is np.float64 and not np.isfinite(array).all():
+            raise RobotError(f"the robot's tree is damaged: its {name} is not finite")
+    # (name, lowest, beyond the highest)
+    for name, low, high in (
+        ("parent", -1, np.arange(b)),
+        ("coordinate", 0, n),
+        ("group", 0, min(n, tree.groups)),
+    ):
+        values = getattr(tree, name)
+        if ((values < low) | (values >= high)).any():
+            raise RobotError(f"the robot's tree is damaged: its {name} points to what is not there")
+
+
 def tree_mass_matrix(tree: Tree, q: Floats) -> Floats:
     """M(q) (n, n), armature included: M_ij = S_i . Y_j S_j for an ancestor i of j, or j itself; see kernels.jet.
 
