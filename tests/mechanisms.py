@@ -60,8 +60,13 @@ def random_axis(rng: np.random.Generator) -> np.ndarray:
     return axis / np.linalg.norm(axis)
 
 
-def random_tree(seed: int, bodies: int = 7, *, branching: bool = True, armature: bool = True) -> pin.Model:
-    """A tree of every one-axis joint Pinocchio can make in Python: all but continuous ones about oblique axes."""
+def random_tree(
+    seed: int, bodies: int = 7, *, branching: bool = True, armature: bool = True, ratio: float = 1.0
+) -> pin.Model:
+    """A tree of every one-axis joint Pinocchio can make in Python: all but continuous ones about oblique axes.
+
+    The last body is ``ratio`` times as heavy as it would be, those before it by powers in between.
+    """
     rng = np.random.default_rng(seed)
     aligned = [pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ, pin.JointModelPX, pin.JointModelPY]
     aligned += [pin.JointModelPZ, pin.JointModelRUBX, pin.JointModelRUBY, pin.JointModelRUBZ]
@@ -76,7 +81,10 @@ def random_tree(seed: int, bodies: int = 7, *, branching: bool = True, armature:
             kind = oblique[rng.integers(len(oblique))](random_axis(rng))
         placement = pin.SE3(random_rotation(rng), rng.normal(0.0, 0.3, 3))
         new = model.addJoint(parent, kind, placement, f"joint{k}")
-        model.appendBodyToJoint(new, random_inertia(rng), pin.SE3.Identity())
+        weight = ratio ** (k / max(1, bodies - 1))
+        body = random_inertia(rng)
+        body = pin.Inertia(weight * body.mass, body.lever, weight * body.inertia)
+        model.appendBodyToJoint(new, body, pin.SE3.Identity())
     if armature:
         model.armature = rng.uniform(0.0, 0.1, model.nv)
     return model

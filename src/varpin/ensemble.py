@@ -30,6 +30,8 @@ logger = logging.getLogger(__name__)
 _GROUP = 32
 _BLOCK = 4_000_000
 _SPAN = 100_000
+# What a path's generator takes, in numbers.
+_PATH = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +153,7 @@ def simulate_ensemble(
     """
     n = require_scene(scene).robot.dof
     dt, steps, paths = positive("dt", dt, "s"), count("steps", steps), count("paths", paths, least=1)
+    _require_memory(scene, steps, paths, store=store)
     start = [_per_path(name, value, paths, n) for name, value in (("q0", q0), ("v0", v0))]
     if scene.noise.diffusion is None:
         raise InputError("an ensemble needs noise that kernels evaluate; a CustomNoise is simulated path by path")
@@ -161,7 +164,6 @@ def simulate_ensemble(
     integrator = Midpoint() if integrator is None else integrator
     if not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
-    _require_memory(scene, steps, paths if store else 0)
     commands = commands_of(scene, integrator, controls, steps)
     run = _Run(scene, integrator, dt, start, rng, commands)
     block = min(steps, _BLOCK // (paths * (2 * n + 1)))
@@ -190,16 +192,21 @@ def simulate_ensemble(
     return ensemble
 
 
-def _require_memory(scene: Scene, steps: int, stored: int) -> None:
+def _require_memory(scene: Scene, steps: int, paths: int, *, store: bool) -> None:
     """Refuse a record that cannot be held, before anything runs."""
     n, m = scene.robot.dof, scene.controls
+    stored = paths if store else 0
     row = 2 * n * (2 * n + 5) + m + stored * (3 * n + m + 1)
-    try:
-        np.empty((steps + 1, row))
-    except (MemoryError, ValueError, OverflowError):
-        raise InputError(
-            f"steps = {steps} with {stored} stored paths needs more memory than there is: {row * 8} bytes a step"
-        ) from None
+    for shape, what in (
+        ((steps + 1, row), f"steps = {steps} with {stored} stored paths"),
+        ((paths, _PATH + 16 * n), f"paths = {paths}"),
+    ):
+        try:
+            np.empty(shape)
+        except (MemoryError, ValueError, OverflowError):
+            raise InputError(
+                f"{what} needs more memory than there is: {8 * shape[1]} bytes a {what.partition(' ')[0][:-1]}"
+            ) from None
 
 
 def _per_path(name: str, value: ArrayLike, paths: int, n: int) -> Floats:

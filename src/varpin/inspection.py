@@ -13,10 +13,10 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import broadcast_array
-from varpin.errors import InputError, SingularMassMatrix
+from varpin.errors import InputError, RobotError, SingularMassMatrix
 from varpin.integrators import Midpoint, largest_step
 from varpin.lagrangian import lagrangian_jet
-from varpin.robot import Robot, build_robot, check_inertia
+from varpin.robot import Robot, build_robot, check_inertia, read_root
 from varpin.robot.mimic import joint_index
 from varpin.robot.tree import is_unbounded, joint_axis
 from varpin.scene import Scene
@@ -158,7 +158,12 @@ def inspect_robot(
     scene = Scene(robot, gravity=gravity)
     configuration = broadcast_array("q", 0.0 if q is None else q, robot.dof)
     velocity = broadcast_array("v", 0.0 if v is None else v, robot.dof)
-    jet = lagrangian_jet(scene, configuration, velocity, backend="pinocchio")
+    with np.errstate(all="ignore"):
+        jet = lagrangian_jet(scene, configuration, velocity, backend="pinocchio")
+    if not all(np.isfinite(array).all() for array in (jet.Lvv, jet.Lqq)):
+        raise RobotError(
+            f"robot {robot.name!r} cannot be looked into: its mass matrix or its derivatives are not finite"
+        )
     margin = Midpoint().branch_margin
     condition, scaled = _condition_numbers(jet.Lvv)
     joints, links = _joints(robot), _links(robot)
@@ -243,7 +248,7 @@ def _links(robot: Robot) -> tuple[LinkReport, ...]:
         return tuple(_body(robot, joint) for joint in bodies)
     # Pinocchio merges links on fixed joints into one body, in which a faulty inertia can hide.
     model, reports = robot.free_model, []
-    for link in ET.parse(robot.urdf).getroot().iter("link"):
+    for link in read_root(robot.urdf).findall("link"):
         inertial, name = link.find("inertial"), link.get("name", "")
         if inertial is None or not model.existBodyName(name):
             continue
@@ -418,7 +423,7 @@ def _mimic_warnings(robot: Robot, joints: Sequence[JointReport], *, tied: bool) 
     if robot.urdf is None:
         return
     index = joint_index(robot.free_model)
-    elements = list(ET.parse(robot.urdf).getroot().iter("joint"))
+    elements = read_root(robot.urdf).findall("joint")
     moving = {element.get("name", "") for element in elements if element.get("type") not in (None, "fixed")}
     for element in elements:
         mimic, name = element.find("mimic"), element.get("name", "")

@@ -85,7 +85,8 @@ def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
     M = pin.crba(model, data, full_q).copy()
     M = np.triu(M) + np.triu(M, 1).T
     pin.computeRNEADerivatives(model, data, full_q, np.zeros(model.nv), full_v)
-    A = data.dtau_dq.copy() - pin.computeGeneralizedGravityDerivatives(model, model.createData(), full_q)
+    A = data.dtau_dq.copy()
+    A -= pin.computeGeneralizedGravityDerivatives(model, data, full_q)
     C = pin.computeCoriolisMatrix(model, data, full_q, full_v).copy()
     gravity = pin.computeGeneralizedGravity(model, data, full_q).copy()
     M += np.diag(own_armature)
@@ -93,18 +94,17 @@ def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
     deflection = q - scene.rest
     Lvv = G.T @ M @ G
     Lq = G.T @ (C.T @ full_v - gravity) - scene.stiffness * deflection
-    Lqq = G.T @ _curvature(model, full_q, full_v, scene.gravity) @ G - np.diag(scene.stiffness)
+    Lqq = G.T @ _curvature(model, data, full_q, full_v, scene.gravity) @ G - np.diag(scene.stiffness)
     potential = pin.computePotentialEnergy(model, data, full_q) + 0.5 * scene.stiffness @ deflection**2
     return LagrangianJet(float(0.5 * v @ Lvv @ v - potential), Lq, Lvv @ v, Lqq, G.T @ A @ G, Lvv)
 
 
-def _curvature(model: pin.Model, q: Floats, v: Floats, gravity: Floats) -> Floats:
+def _curvature(model: pin.Model, data: pin.Data, q: Floats, v: Floats, gravity: Floats) -> Floats:
     """L_qq (nv, nv) of gravity and motion from Pinocchio's world-frame Jacobian and its rate.
 
     Pinocchio's Python bindings have no second derivatives of RNEA; see :mod:`varpin.kernels.jet` for the formula
     L_qq[i, j] = W_i . B_j - F_j . (S_i x g), i an ancestor of j or j itself.
     """
-    data = model.createData()
     pin.computeJointJacobiansTimeVariation(model, data, q, v)
     # With one joint the bindings drop an axis.
     S, W = data.J.reshape(6, model.nv), data.dJ.reshape(6, model.nv)

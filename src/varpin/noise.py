@@ -397,6 +397,23 @@ def _terms(noise: Noise) -> tuple[Noise, ...]:
     return noise.terms if isinstance(noise, NoiseSum) else (noise,)
 
 
+def _sound(model: Noise, bound: BoundNoise, n: int, m: int) -> BoundNoise:
+    """What a model's own ``bind`` gave, if kernels can take it: they check no shapes."""
+    name = type(model).__name__
+    if not isinstance(bound, BoundNoise):
+        raise InputError(f"bind of {name} must return a BoundNoise, got {type(bound).__name__}")
+    k = count(f"processes of {name}", bound.processes)
+    if bound.diffusion is not None:
+        shapes = ((n, k), (n, k, m), (n, k), (n, k))
+        for field, array, shape in zip(Diffusion._fields, bound.diffusion, shapes, strict=True):
+            if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
+                raise InputError(f"the diffusion of {name} has a field {field!r} that is no float64 array {shape}")
+            # NaN in a center stands for the start of the motion.
+            if not (np.isfinite(array).all() or field == "center"):
+                raise InputError(f"the diffusion of {name} has a field {field!r} that is not finite")
+    return bound
+
+
 def bind(noise: Noise | Sequence[Noise] | None, actuation: Floats) -> BoundNoise:
     """None, a model or several, on a robot with this actuation matrix (n, m).
 
@@ -411,5 +428,5 @@ def bind(noise: Noise | Sequence[Noise] | None, actuation: Floats) -> BoundNoise
     for model in models:
         if not isinstance(model, Noise):
             raise InputError(f"noise must be a varpin noise model or several of them, got {type(model).__name__}")
-        bound.append(model.bind(actuation))
+        bound.append(_sound(model, model.bind(actuation), *actuation.shape))
     return bound[0] if len(bound) == 1 else CompositeFields(tuple(bound))

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, broadcast_array, finite_array
-from varpin.errors import InputError
+from varpin.errors import InputError, RobotError
 from varpin.kernels.tree import Diffusion, Mechanism
 from varpin.noise import BoundNoise, Noise, bind
-from varpin.robot import Robot
+from varpin.robot import Robot, require_sound
 
 Floats = NDArray[np.float64]
 
@@ -73,7 +73,10 @@ class Scene:
         """
         if not isinstance(robot, Robot):
             raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
+        require_sound(robot.tree)
         n = robot.dof
+        if robot.tree.armature.size != n:
+            raise RobotError(f"the robot's tree is damaged: it has {robot.tree.armature.size} coordinates, not {n}")
         if isinstance(gravity, bool | np.bool_):
             gravity = EARTH if gravity else (0.0, 0.0, 0.0)
         values: dict[str, Any] = {

@@ -231,8 +231,8 @@ def simulate(
     commands = commands_of(scene, integrator, *given)
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
     with announced_compilation(f"simulate with {type(integrator).__name__}"):
-        said = _ringing(scene, q0, dt)
         state, (start,) = integrator.start(scene, q0[None], v0[None])
+        said = _ringing(scene, q0, dt)
         record = _Record(scene, integrator, dt, steps, dw, start)
         # A sweep takes as long as the robot has joints, an elimination as their cube.
         chunk = max(1, _CHUNK // (n + n**3 // 100))
@@ -293,7 +293,7 @@ def _ringing(scene: Scene, q0: Floats, dt: float) -> tuple[str, ...]:
     if not scene.damping.any():
         return ()
     rate = np.linalg.solve(lagrangian_jet(scene, q0, np.zeros_like(q0)).Lvv, np.diag(scene.damping))
-    fastest = float(np.abs(np.linalg.eigvals(rate)).max())
+    fastest = float(np.abs(np.linalg.eigvals(rate)).max()) if np.isfinite(rate).all() else np.inf
     if 0.5 * dt * fastest <= 1.0:
         return ()
     return (

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import reprlib
 import tempfile
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin._version import __version__
+from varpin.archive import read_npz
 from varpin.checks import path_like, writable
 from varpin.errors import FileError, InputError
-from varpin.robot import Robot
+from varpin.robot import MAX_JOINTS, Robot
 from varpin.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -26,6 +27,7 @@ Integers = NDArray[np.int64]
 FORMAT = "varpin.trajectory/1"
 
 _ARRAYS = ("t", "q", "v", "p", "u", "dw", "energy", "masses")
+_COUNTS = {f"statistics.{name}" for name in ("newton_iterations", "jets", "sweeps", "substeps")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,10 +108,23 @@ class Trajectory:
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        nodes, n = np.size(self.t), len(self.joint_names)
+        # Kernels check no shapes.
+        for name, lead in {"t": nodes, "energy": nodes, "q": nodes, "v": nodes, "p": nodes}.items():
+            self._require(name, (lead, n) if name in "qvp" else (lead,))
+        for name in ("u", "dw"):
+            self._require(name, (nodes - 1, *np.shape(getattr(self, name))[1:2]))
+        if nodes < 1 or self.u.ndim != 2 or self.dw.ndim != 2:
+            raise InputError("a trajectory has one node or more, and controls and increments (N, ...)")
         for name in _ARRAYS:
             getattr(self, name).setflags(write=False)
         for array in vars(self.statistics).values():
             array.setflags(write=False)
+
+    def _require(self, name: str, shape: tuple[int, ...]) -> None:
+        array = getattr(self, name)
+        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
+            raise InputError(f"a trajectory's {name} must be a float64 array {shape}, got {reprlib.repr(array)}")
 
     @property
     def steps(self) -> int:
@@ -191,9 +206,17 @@ class Trajectory:
             if array.ndim != len(shape) or any(b not in (-1, a) for a, b in zip(array.shape, shape, strict=True)):
                 raise FileError(f"{source}: {name} has shape {array.shape}, where {shape} belongs")
             if name in ("joint_names", "version", "integrator", "robot"):
+                if array.dtype.kind != "U":
+                    raise FileError(f"{source}: {name} holds {array.dtype}, where text belongs")
                 continue
             if array.dtype.kind not in "fi" or not np.isfinite(array).all():
                 raise FileError(f"{source}: {name} holds values that are not finite numbers")
+            if array.dtype != (np.int64 if name in _COUNTS else np.float64):
+                raise FileError(
+                    f"{source}: {name} holds {array.dtype}, where {'int64' if name in _COUNTS else 'float64'} belongs"
+                )
+        if n > MAX_JOINTS:
+            raise FileError(f"{source} is of {n} joints; varpin takes robots of at most {MAX_JOINTS}")
         if steps < 0 or not members["dt"] > 0.0:
             raise FileError(f"{source}: it has {steps + 1} nodes and dt = {members['dt']} s")
         expected = members["t"][0] + np.arange(steps + 1) * members["dt"]
@@ -246,35 +269,10 @@ def require_motion(scene: Scene, trajectory: Trajectory) -> None:
 
 
 def _read_members(source: Path) -> dict[str, NDArray[Any]]:
-    """All arrays of an npz file, or a FileError that says what is wrong with it."""
-    expected = {*_ARRAYS, "dt", "format", "version", "integrator", "robot", "joint_names"}
+    """All arrays of a trajectory's file, or a FileError that says what is wrong with it."""
+    expected = {*_ARRAYS, "dt", "format", "version", "integrator", "robot", "joint_names", "warnings"}
     expected |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
-    if source.is_dir():
-        raise FileError(f"{source} is a folder, not a trajectory")
-    if not source.is_file():
-        raise FileError(f"there is no file {source}")
-    try:
-        with source.open("rb") as stream:
-            whole = zipfile.is_zipfile(stream)
-        if not whole:
-            raise FileError(f"{source} is not an npz file, or it is truncated")
-        with np.load(source, allow_pickle=False) as archive:
-            missing = sorted(expected - set(archive.files))
-            if missing:
-                raise FileError(f"{source} is not a varpin trajectory: it has no {', '.join(missing)}")
-            # Records of earlier versions have no warnings.
-            members = {name: archive[name] for name in expected}
-            members["warnings"] = archive["warnings"] if "warnings" in archive.files else np.zeros(0, dtype=str)
-            return members
-    except FileError:
-        raise
-    except OSError as error:
-        raise FileError(f"cannot read {source}: {error.strerror or error}") from None
-    # A damaged archive raises whatever zipfile, zlib and numpy stumble over: there is no list of it.
-    except Exception as error:
-        if "allow_pickle" in str(error):
-            raise FileError(f"{source} cannot be read without unpickling objects, which is not done") from None
-        raise FileError(f"{source} is truncated or damaged: {error}") from None
+    return read_npz(source, expected, "varpin trajectory")
 
 
 @contextlib.contextmanager

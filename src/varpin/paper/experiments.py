@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import reprlib
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, replace
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin._version import __version__
+from varpin.archive import read_npz
 from varpin.errors import FileError, VarpinError
 from varpin.integrators import RungeKutta4
 from varpin.linearization import linearize
@@ -89,7 +91,9 @@ class Cell:
         return float(np.nanmin([self.open_loop, self.closed_loop, np.inf]))
 
 
-_ARRAYS = ("t", "q", "u", "gains")
+# Shapes of the rows of a cell's arrays, and the types of the rest as JSON gives them.
+_ARRAYS: dict[str, tuple[int, ...]] = {"t": (), "q": (3,), "u": (3,), "gains": (3, 6)}
+_TYPES: dict[str, type] = {"str": str, "int": int, "float": float, "tuple[float, float]": list}
 
 
 @dataclass(frozen=True)
@@ -206,6 +210,35 @@ def _middle_gains(solution: Solution) -> Floats:
     return np.array(rows).T.reshape(len(GAIN_TIMES), *gains.shape[1:])
 
 
+def _facts(path: Path, text: NDArray[Any]) -> dict[str, Any] | None:
+    """All of a cell that is no array, or None where another version wrote it."""
+    try:
+        facts = json.loads(str(text))
+    except (ValueError, RecursionError) as error:
+        raise FileError(f"{path} is damaged: {error}") from None
+    if isinstance(facts, dict) and isinstance(facts.get("version"), str) and facts.pop("version") != __version__:
+        return None
+    kinds = {item.name: _TYPES[str(item.type)] for item in fields(Cell) if item.name not in _ARRAYS}
+    if not isinstance(facts, dict) or set(facts) != set(kinds):
+        raise FileError(f"{path} is damaged: its facts are not {', '.join(kinds)}")
+    for name, kind in kinds.items():
+        if type(facts[name]) is not kind:
+            raise FileError(f"{path} is damaged: its {name} is {reprlib.repr(facts[name])}")
+    pair = facts["sampled"]
+    if len(pair) != 2 or not all(type(number) is float for number in pair):
+        raise FileError(f"{path} is damaged: its sampled is {reprlib.repr(pair)}")
+    return facts | {"sampled": tuple(pair)}
+
+
+def _require_fit(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    for name, shape in _ARRAYS.items():
+        array = arrays[name]
+        if array.dtype != np.float64 or array.ndim != len(shape) + 1 or array.shape[1:] != shape:
+            raise FileError(f"{path} is damaged: its array {name} is not one of numbers (N, ...) = (N, *{shape})")
+    if len(arrays["t"]) != len(arrays["q"]):
+        raise FileError(f"{path} is damaged: it has {len(arrays['t'])} times and {len(arrays['q'])} configurations")
+
+
 class Store:
     """Cells on disk, one file each."""
 
@@ -225,15 +258,15 @@ class Store:
         if not path.is_file():
             return None
         try:
-            with np.load(path, allow_pickle=False) as archive:
-                facts: dict[str, Any] = json.loads(str(archive["facts"]))
-                arrays = {name: archive[name] for name in _ARRAYS}
-        except Exception as error:  # a damaged archive raises whatever zipfile and numpy stumble over
+            members = read_npz(path, {"facts", *_ARRAYS}, "cell")
+            facts = _facts(path, members.pop("facts"))
+            if facts is None:
+                return None
+            _require_fit(path, members)
+        except FileError as error:
             logger.warning("%s cannot be read (%s); it is computed again", path, error)
             return None
-        if facts.pop("version") != __version__:
-            return None
-        facts["sampled"] = tuple(facts["sampled"])
+        arrays: dict[str, Any] = {**members}
         return Cell(**facts, **arrays)
 
     def save(self, task: Task, cell: Cell) -> None:

@@ -16,6 +16,20 @@ from varpin.robot.urdf import Mimic
 
 logger = logging.getLogger(__name__)
 
+# What a model has one number of for each degree of freedom.
+JOINT_PARAMETERS = (
+    "lowerVelocityLimit",
+    "upperVelocityLimit",
+    "lowerEffortLimit",
+    "upperEffortLimit",
+    "lowerDryFrictionLimit",
+    "upperDryFrictionLimit",
+    "armature",
+    "rotorInertia",
+    "rotorGearRatio",
+    "damping",
+)
+
 
 @dataclass(frozen=True)
 class Tie:
@@ -106,19 +120,20 @@ def depth_first(model: pin.Model, ties: Sequence[Tie]) -> list[int]:
         first, then = leaders[leaders.index(fork) - 1], followers[followers.index(fork) - 1]
         before.setdefault(then, set()).add(first)
 
-    order: list[int] = []
-
-    def visit(joint: int) -> None:
-        order.append(joint)
-        waiting = [child for child in range(1, model.njoints) if parents[child] == joint]
+    children: list[list[int]] = [[] for _ in parents]
+    for joint in range(1, model.njoints):
+        children[parents[joint]].append(joint)
+    order, stack = [], [0]
+    while stack:
+        order.append(joint := stack.pop())
+        waiting, visits = children[joint], []
         while waiting:
             ready = [child for child in waiting if not before.get(child, set()) & set(waiting)]
             if not ready:
                 raise RobotError(f"mimic joints below {model.names[joint]!r} follow each other across branches")
             waiting.remove(ready[0])
-            visit(ready[0])
-
-    visit(0)
+            visits.append(ready[0])
+        stack.extend(reversed(visits))
     return order[1:]
 
 
@@ -188,18 +203,7 @@ def rebuild(model: pin.Model, order: Sequence[int], joint_of: Callable[[int], pi
                     old.idx_q : old.idx_q + old.nq
                 ]
         if old.nv == copy.nv:
-            for limits in (
-                "lowerVelocityLimit",
-                "upperVelocityLimit",
-                "lowerEffortLimit",
-                "upperEffortLimit",
-                "lowerDryFrictionLimit",
-                "upperDryFrictionLimit",
-                "armature",
-                "rotorInertia",
-                "rotorGearRatio",
-                "damping",
-            ):
+            for limits in JOINT_PARAMETERS:
                 getattr(new, limits)[copy.idx_v : copy.idx_v + copy.nv] = getattr(model, limits)[
                     old.idx_v : old.idx_v + old.nv
                 ]

@@ -1,12 +1,12 @@
 """The robot: a Pinocchio model, its generalized coordinates, and the tree the kernels run on."""
 
 import os
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
-from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -17,9 +17,13 @@ from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoi
 from varpin.kernels.tree import Tree
 from varpin.robot.mimic import Tie, joint_index, rebuild, tied_model
 from varpin.robot.sources import Description, describe, hang_shapes
-from varpin.robot.tree import flatten, frame_index, is_unbounded, joint_axis, to_pinocchio
+from varpin.robot.tree import flatten, frame_index, is_unbounded, joint_axis, to_pinocchio, tree_mass_matrix
+from varpin.robot.urdf import read_root
 
 Floats = NDArray[np.float64]
+
+# Joints up to which a robot is checked with Pinocchio's algorithms.
+_FEW = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,7 +349,8 @@ def geometry(robot: Robot) -> pin.GeometryModel:
         return robot.visuals
     if robot.urdf is None:
         return pin.GeometryModel()
-    return _visuals(robot, pin.buildModelFromUrdf(str(robot.urdf)))
+    text = ET.tostring(read_root(robot.urdf), encoding="unicode")
+    return _visuals(robot, _whole_model(robot, text), text)
 
 
 def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[int, str]]]:
@@ -359,8 +364,8 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
         return geometry(robot), {}
     except RobotError:
         assert robot.urdf is not None
-    full = pin.buildModelFromUrdf(str(robot.urdf))
-    root = ElementTree.parse(robot.urdf).getroot()
+    root = read_root(robot.urdf)
+    full = _whole_model(robot, ET.tostring(root, encoding="unicode"))
     visuals = {link: link.findall("visual") for link in root.iter("link")}
     for link, shapes in visuals.items():
         for shape in shapes:
@@ -372,7 +377,7 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
         link.extend(shapes)
         name = link.get("name", "")
         try:
-            part = _visuals(robot, full, ElementTree.tostring(root, encoding="unicode"))
+            part = _visuals(robot, full, ET.tostring(root, encoding="unicode"))
         except RobotError as error:
             frame = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.BODY)]
             missing[name] = frame.parentJoint, str(error)
@@ -384,21 +389,28 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
     return found, missing
 
 
-def _visuals(robot: Robot, full: pin.Model, text: str | None = None) -> pin.GeometryModel:
-    """The visual geometry of a robot's URDF, on the joints of the robot.
+def _whole_model(robot: Robot, text: str) -> pin.Model:
+    """The model of a robot's URDF, nothing locked."""
+    try:
+        return pin.buildModelFromXML(text)
+    except (ValueError, RuntimeError, IndexError) as error:
+        raise RobotError(f"robot {robot.name!r} cannot be read again: {error}") from None
+
+
+def _visuals(robot: Robot, full: pin.Model, text: str) -> pin.GeometryModel:
+    """The visual geometry in a URDF's text, on the joints of the robot.
 
     Args:
         robot: Its meshes are looked up in its folders.
-        full: The URDF's model, nothing locked.
-        text: Of a URDF, in place of the robot's file.
+        full: Its URDF's model, nothing locked.
+        text: Of the URDF, or of a part of it.
 
     Raises:
         RobotError: A mesh is missing or cannot be read; the message names it.
     """
-    read, source = (pin.buildGeomFromUrdf, str(robot.urdf)) if text is None else (pin.buildGeomFromUrdfString, text)
     try:
-        visuals = read(full, source, pin.GeometryType.VISUAL, None, list(robot.package_dirs))
-    except (ValueError, RuntimeError) as error:
+        visuals = pin.buildGeomFromUrdfString(full, text, pin.GeometryType.VISUAL, None, list(robot.package_dirs))
+    except (ValueError, RuntimeError, IndexError) as error:
         raise RobotError(f"the meshes of robot {robot.name!r} cannot be read: {error}") from None
     # Attach to the joints of the model the robot moves with: by name, and locked joints through their frame.
     index = joint_index(robot.free_model)
@@ -421,11 +433,19 @@ def check_inertia(robot: Robot) -> None:
 
     Raises:
         SingularMassMatrix: Naming the joints whose motion carries no inertia.
+        RobotError: It is not finite.
     """
     rng = np.random.default_rng(0)
-    data = robot.free_model.createData()
+    # Pinocchio's data take 64 n^3 bytes.
+    data = robot.free_model.createData() if robot.free_model.nv <= _FEW else None
     for q in [np.zeros(robot.dof), *rng.uniform(-np.pi, np.pi, (3, robot.dof))]:
-        M = mass_matrix(robot, q, data)
+        with np.errstate(all="ignore"):
+            M = tree_mass_matrix(robot.tree, q) if data is None else mass_matrix(robot, q, data)
+        if not np.isfinite(M).all():
+            raise RobotError(
+                f"the mass matrix of robot {robot.name!r} is not finite at q = {q}: masses, inertias or distances are "
+                "beyond the range of floating-point numbers"
+            )
         scale = np.sqrt(np.diag(M))
         if not (np.diag(M) > 0.0).all():
             raise SingularMassMatrix(

@@ -11,8 +11,17 @@ import pinocchio as pin
 
 from varpin.errors import FileError, InputError, RobotError, RobotNotFound
 from varpin.robot import example_robot_data
-from varpin.robot.mimic import Tie, depth_first, joint_frames, reordered, repair_velocity_limits, ties_of, untied_model
-from varpin.robot.urdf import read_urdf
+from varpin.robot.mimic import (
+    JOINT_PARAMETERS,
+    Tie,
+    depth_first,
+    joint_frames,
+    reordered,
+    repair_velocity_limits,
+    ties_of,
+    untied_model,
+)
+from varpin.robot.urdf import MAX_JOINTS, read_urdf
 
 logger = logging.getLogger(__name__)
 
@@ -114,6 +123,7 @@ def _urdf_files(folder: Path) -> str:
 
 
 def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) -> Description:
+    _check_model(model, name)
     # Copies: what the user does to the model afterwards must not reach the robot.
     free, ties = untied_model(model.copy())
     shapes = visuals.copy() if visuals is not None else None
@@ -137,6 +147,37 @@ def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) ->
     if shapes is not None:
         hang_shapes(shapes, model, free)
     return Description(name, free, ties, visuals=shapes)
+
+
+def _check_model(model: pin.Model, name: str) -> None:
+    """Refuse a model whose parts do not fit together: Pinocchio's algorithms do not look, and end the process.
+
+    Raises:
+        RobotError: Naming the part.
+    """
+    n, nq, nv = model.njoints, model.nq, model.nv
+    if n - 1 > MAX_JOINTS:
+        raise RobotError(f"model {name!r} has {n - 1} joints; varpin takes robots of at most {MAX_JOINTS}")
+    sizes = dict.fromkeys(("joints", "names", "parents", "inertias", "jointPlacements"), n)
+    sizes |= dict.fromkeys(("lowerPositionLimit", "upperPositionLimit"), nq)
+    sizes |= dict.fromkeys(JOINT_PARAMETERS, nv)
+    for part, size in sizes.items():
+        if (found := len(getattr(model, part))) != size:
+            raise RobotError(f"model {name!r} is damaged: its {part} has {found} entries, where {size} belong")
+    q, v = 0, 0
+    for joint in range(1, n):
+        kind, parent = model.joints[joint], model.parents[joint]
+        if parent >= joint:
+            raise RobotError(f"model {name!r} is damaged: joint {model.names[joint]!r} comes before its parent")
+        # A mimic joint has no coordinates of its own and stands at its leader's.
+        if kind.id != joint or (kind.nv and (kind.idx_q, kind.idx_v) != (q, v)) or kind.idx_v >= nv:
+            raise RobotError(f"model {name!r} is damaged: joint {model.names[joint]!r} is not at the place it has")
+        q, v = q + kind.nq, v + kind.nv
+    if (q, v) != (nq, nv):
+        raise RobotError(f"model {name!r} is damaged: its joints have {q} and {v} coordinates, not nq and nv")
+    for frame in model.frames:
+        if frame.parentJoint >= n or frame.parentFrame >= model.nframes:
+            raise RobotError(f"model {name!r} is damaged: frame {frame.name!r} hangs on what is not there")
 
 
 def _has_joint_frames(model: pin.Model) -> bool:

@@ -268,6 +268,80 @@ def periodic_coordinates(coordinate: Integers, prismatic: Integers, ratio: Float
     return periodic
 
 
+def require_sound(tree: Tree) -> None:
+    """Refuse arrays that kernels, which check no bounds, would read or write beyond their ends.
+
+    :func:`flatten` makes none; a tree that was changed afterwards may be one.
+
+    Raises:
+        RobotError: Naming the array.
+    """
+    b, n = np.size(tree.parent), np.size(tree.armature)
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
+        ("parent", "prismatic", "mass", "coordinate", "ratio", "origin"), (b,)
+    )
+    shapes |= {"offset": (b,), "rotation": (b, 3, 3), "translation": (b, 3), "center": (b, 3), "inertia": (b, 6)}
+    shapes |= {"armature": (n,), "group": (n,), "periodic": (n,)}
+    shapes |= {"loads": (np.size(tree.loads),), "carried": (np.size(tree.loads), n)}
+    whole = ("parent", "prismatic", "coordinate", "group", "origin", "periodic", "loads", "carried")
+    for name, shape in shapes.items():
+        array = getattr(tree, name)
+        kind = np.int64 if name in whole else np.float64
+        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != kind:
+            raise RobotError(f"the robot's tree is damaged: its {name} is no array {shape} of {np.dtype(kind)}")
+        if kind is np.float64 and not np.isfinite(array).all():
+            raise RobotError(f"the robot's tree is damaged: its {name} is not finite")
+    # (name, lowest, beyond the highest)
+    for name, low, high in (
+        ("parent", -1, np.arange(b)),
+        ("coordinate", 0, n),
+        ("group", 0, min(n, tree.groups)),
+        ("loads", 0, b),
+    ):
+        values = getattr(tree, name)
+        if ((values < low) | (values >= high)).any():
+            raise RobotError(f"the robot's tree is damaged: its {name} points to what is not there")
+
+
+def tree_mass_matrix(tree: Tree, q: Floats) -> Floats:
+    """M(q) (n, n), armature included: M_ij = S_i . Y_j S_j for an ancestor i of j, or j itself; see kernels.jet.
+
+    In plain NumPy and n^2 memory, for robots whose data in Pinocchio would not fit.
+    """
+    bodies = tree.parent.size
+    rotation, position = np.empty((bodies, 3, 3)), np.empty((bodies, 3))
+    axis, inertia = np.zeros((bodies, 6)), np.zeros((bodies, 6, 6))
+    M = np.zeros((bodies, bodies))
+    for j, s in enumerate(tree.ratio * q[tree.coordinate] + tree.offset):
+        up = tree.parent[j]
+        R, p = (rotation[up], position[up]) if up >= 0 else (np.eye(3), np.zeros(3))
+        p, R = p + R @ tree.translation[j], R @ tree.rotation[j]
+        z = R[:, 2]
+        if tree.prismatic[j]:
+            p = p + s * z
+            axis[j, :3] = z
+        else:
+            R = R @ np.array([[np.cos(s), -np.sin(s), 0.0], [np.sin(s), np.cos(s), 0.0], [0.0, 0.0, 1.0]])
+            axis[j, :3], axis[j, 3:] = np.cross(p, z), z
+        rotation[j], position[j] = R, p
+        x, y, w = p + R @ tree.center[j]
+        cross = np.array([[0.0, -w, y], [w, 0.0, -x], [-y, x, 0.0]])
+        xx, xy, yy, xz, yz, zz = tree.inertia[j]
+        own = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
+        m = tree.mass[j]
+        inertia[j] = np.block([[m * np.eye(3), -m * cross], [m * cross, own - m * cross @ cross]])
+    for j in range(bodies - 1, -1, -1):
+        dual, i = inertia[j] @ axis[j], j
+        while i >= 0:
+            M[i, j] = M[j, i] = axis[i] @ dual
+            i = tree.parent[i]
+        if tree.parent[j] >= 0:
+            inertia[tree.parent[j]] += inertia[j]
+    G = np.zeros((bodies, tree.armature.size))
+    G[np.arange(bodies), tree.coordinate] = tree.ratio
+    return np.asarray(G.T @ M @ G + np.diag(tree.armature))
+
+
 def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Integers:
     """Which coordinates (n,) move each other: labels from 0 of the groups that inertia or mimic joints tie together.
 

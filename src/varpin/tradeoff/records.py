@@ -5,18 +5,22 @@ from __future__ import annotations
 import csv
 import io
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
+from varpin.archive import read_npz
 from varpin.checks import path_like
 from varpin.errors import FileError
 from varpin.trajectory import atomic_file
 
 Row = TypeVar("Row")
+
+# What numpy keeps the types of fields in.
+_DTYPES = {"int": "iu", "float": "fiu", "str": "U"}
 
 # Costs closer than this, relative, are the same.
 MARGIN = 0.02
@@ -53,10 +57,8 @@ class Record:
         Raises:
             FileError: The file is missing, damaged or something else.
         """
-        runs, facts = read_table(path, cls._format, cls._run)
-        if set(facts) != set(cls._facts()):
-            raise FileError(f"{path} is damaged: it has {', '.join(sorted(facts))}")
-        return cls(runs=runs, **{name: value.item() for name, value in facts.items()})  # type: ignore[call-arg]
+        runs, facts = read_table(path, cls._format, cls._run, cls, cls._facts())
+        return cls(runs=runs, **facts)  # type: ignore[call-arg]
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write the runs as a table; returns its path.
@@ -81,8 +83,10 @@ def write_table(path: str | os.PathLike[str], form: str, rows: Sequence[Any], ki
     return Path(path)
 
 
-def read_table(path: str | os.PathLike[str], form: str, kind: type[Row]) -> tuple[tuple[Row, ...], dict[str, Any]]:
-    """What :func:`write_table` wrote: the rows, and the rest by name.
+def read_table(
+    path: str | os.PathLike[str], form: str, kind: type[Row], record: type[Any], facts: Collection[str]
+) -> tuple[tuple[Row, ...], dict[str, Any]]:
+    """What :func:`write_table` wrote: the rows, and by name the ``facts``, which are fields of ``record``.
 
     Raises:
         FileError: The file is missing, damaged, or something else.
@@ -90,17 +94,30 @@ def read_table(path: str | os.PathLike[str], form: str, kind: type[Row]) -> tupl
     source = path_like("path", path)
     if not source.is_file():
         raise FileError(f"there is no file {source}")
-    # A damaged archive raises whatever zipfile, zlib and numpy stumble over: there is no list of it.
     try:
-        with np.load(source, allow_pickle=False) as archive:
-            members = {name: archive[name] for name in archive.files}
-        found = str(members.pop("format"))
-        columns = [members.pop(f"runs.{item.name}", np.zeros(0)).tolist() for item in fields(kind)]  # type: ignore[arg-type]
-    except Exception as error:
+        members = read_npz(source)
+    except FileError as error:
         raise FileError(f"{source} is damaged, or no record of varpin.tradeoff: {error}") from None
+    found = str(members.pop("format", "missing"))
     if found != form:
         raise FileError(f"{source} is not what is expected: its format is {found}, not {form!r}")
-    return tuple(kind(*values) for values in zip(*columns, strict=True)), members
+    columns = {item.name: (f"runs.{item.name}", str(item.type)) for item in fields(kind)}  # type: ignore[arg-type]
+    own = {item.name: (item.name, str(item.type)) for item in fields(record) if item.name in facts}
+    wanted = {name for name, _ in (*columns.values(), *own.values())}
+    if set(members) != wanted:
+        odd = ", ".join(sorted(set(members) ^ wanted))
+        raise FileError(f"{source} is damaged: it lacks, or has beyond what it should, {odd}")
+    rows = members[columns[next(iter(columns))][0]].size
+    for dimensions, places in (((rows,), columns), ((), own)):
+        for name, wants in places.values():
+            array = members[name]
+            # A column of no rows has forgotten what it was to hold.
+            if array.shape != dimensions or (array.size and array.dtype.kind not in _DTYPES[wants]):
+                raise FileError(
+                    f"{source} is damaged: {name} is {array.dtype} {array.shape}, where {wants} {dimensions} belongs"
+                )
+    runs = zip(*(members[name].tolist() for name, _ in columns.values()), strict=True)
+    return tuple(kind(*values) for values in runs), {key: members[name].item() for key, (name, _) in own.items()}
 
 
 def write_csv(path: str | os.PathLike[str], rows: Sequence[Any], headings: Mapping[str, str]) -> Path:

@@ -1,0 +1,285 @@
+"""Damaged files end in an error of varpin's, and those that once did not, each by itself."""
+
+from __future__ import annotations
+
+import io
+import struct
+import threading
+import zipfile
+
+import fuzz
+import numpy as np
+import pinocchio as pin
+import pytest
+from mechanisms import INERTIAL, joint, link, random_tree, write_urdf
+
+import varpin as vp
+from varpin.archive import read_npz
+from varpin.robot import geometry
+from varpin.robot.model import mass_matrix
+from varpin.robot.tree import tree_mass_matrix
+from varpin.robot.urdf import MAX_BYTES, MAX_DEPTH, MAX_JOINTS, MAX_LINKS
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", fuzz.KINDS)
+def test_no_input_kills_hangs_or_surprises(kind):
+    report = fuzz.run(kind, seed=7, begin=0, end=1000)
+    assert not report.findings, str(report)
+    assert report.inputs == 1000
+    # Most damage is told, and some of it does none.
+    assert report.outcomes["taken"] > 20
+    assert report.outcomes["RobotError"] + report.outcomes["FileError"] > 300
+
+
+def test_the_fuzzer_sees_what_it_is_there_for(monkeypatch):
+    lines = {
+        "crash": ["5", "died: exit code -11"],
+        "hang": ["5", None],
+        "surprise": ["5", '[5, "FINDING", "KeyError: 3", 0.1, 1000]'],
+    }
+    for line in lines.values():
+        calls = []
+
+        def watched(kind, seed, begin, end, line=line, calls=calls):
+            calls.append(begin)
+            return iter(line if begin == 5 else [f'[{n}, "taken", "", 0.1, 1000]' for n in range(begin, end)])
+
+        monkeypatch.setattr(fuzz, "_watched", watched)
+        report = fuzz.run("urdf", 0, 5, 8)
+        assert [(kind, number) for kind, number, _ in report.findings] == [("urdf", 5)]
+        assert (report.inputs, calls) == (3, [5, 6])
+
+
+class TestUrdf:
+    def chain(self, folder, links, kind="fixed"):
+        parts = [
+            link(f"l{k}") + joint(f"j{k}", f"l{k - 1}" if k > 1 else "base", f"l{k}", kind) for k in range(1, links)
+        ]
+        return write_urdf(folder, *parts)
+
+    def refused(self, path, words):
+        with pytest.raises(vp.RobotError, match=words):
+            vp.load_robot(path)
+
+    def test_deeper_than_the_parser_s_stack(self, tmp_path):
+        # At 5000 links Pinocchio ends the process.
+        self.refused(self.chain(tmp_path, 5001), f"is {MAX_DEPTH + 1} joints from its root; {MAX_DEPTH} are the most")
+
+    def test_as_deep_as_allowed(self, tmp_path):
+        path = self.chain(tmp_path, MAX_DEPTH + 1)
+        text = path.read_text().replace('name="j1" type="fixed"', 'name="j1" type="continuous"')
+        path.write_text(text)
+        assert vp.load_robot(path).joint_names == ("j1",)
+        # Also on the smaller stack of a thread.
+        done = []
+        worker = threading.Thread(target=lambda: done.append(vp.load_robot(path).dof))
+        worker.start()
+        worker.join()
+        assert done == [1]
+
+    def test_too_many_joints(self, tmp_path):
+        self.refused(
+            self.chain(tmp_path, MAX_JOINTS + 2, "continuous"), f"has {MAX_JOINTS + 1} moving joints; .* {MAX_JOINTS}"
+        )
+
+    def test_too_many_links(self, tmp_path):
+        path = write_urdf(tmp_path, *(f'<link name="l{k}"/>' for k in range(MAX_LINKS + 1)))
+        self.refused(path, f"has {MAX_LINKS + 2} links")
+
+    def test_too_large(self, tmp_path):
+        path = tmp_path / "a.urdf"
+        path.write_text("<robot name='a'>" + " " * MAX_BYTES + "</robot>")
+        self.refused(path, "is larger than 10 MB")
+
+    def test_entities(self, tmp_path):
+        laughs = "".join(f'<!ENTITY e{k} "{f"&e{k - 1};" * 10}">' for k in range(1, 12))
+        path = tmp_path / "a.urdf"
+        path.write_text(f'<!DOCTYPE robot [<!ENTITY e0 "ha">{laughs}]><robot name="a"><link name="&e11;"/></robot>')
+        self.refused(path, "declares XML entities")
+
+    def test_nested_elements(self, tmp_path):
+        self.refused(write_urdf(tmp_path, "<a>" * 20_000 + "</a>" * 20_000), "nested more than 100 deep")
+
+    def test_numbers_that_only_one_of_the_parsers_reads(self, tmp_path):
+        # Pinocchio dropped the inertial, or the whole link, without a word.
+        for word in ("1_000", "٣", "0x1p3"):
+            path = write_urdf(tmp_path, link("l1", INERTIAL.replace('"1.3"', f'"{word}"')), joint("j1", "base", "l1"))
+            self.refused(path, "its mass is .*, where a finite number belongs")
+
+    def test_numbers_in_odd_white_space(self, tmp_path):
+        odd = INERTIAL.replace('value="1.3"', 'value=" 1.3&#9;"').replace("0.02 0.05 0.1", "&#10;0.02&#9;0.05  0.1 ")
+        body = vp.load_robot(write_urdf(tmp_path, link("l1", odd), joint("j1", "base", "l1"))).model.inertias[1]
+        assert body.mass == 1.3
+        np.testing.assert_array_equal(body.lever, [0.02, 0.05, 0.1])
+
+    def test_bytes_that_are_no_utf_8(self, tmp_path):
+        path = write_urdf(tmp_path, link("l1"), joint("jXX", "base", "l1"))
+        path.write_bytes(path.read_bytes().replace(b"jXX", b"j\xff\xfe"))
+        robot = vp.load_robot(path)
+        assert robot.joint_names == ("j\ufffd\ufffd",)
+        assert vp.inspect_robot(path).joints
+        assert geometry(robot).ngeoms == 0
+
+    def test_masses_beyond_floating_point(self, tmp_path):
+        heavy = INERTIAL.replace('ixx="0.02"', 'ixx="1e308"').replace('iyy="0.03"', 'iyy="1e308"')
+        path = write_urdf(
+            tmp_path, link("l1", heavy), link("l2", heavy), joint("j1", "base", "l1"), joint("j2", "l1", "l2")
+        )
+        self.refused(path, "the mass matrix of robot 'made_up' is not finite")
+        with pytest.raises(vp.RobotError, match="not finite"):
+            vp.inspect_robot(path)
+
+    def test_dampers_beyond_floating_point(self):
+        scene = vp.Scene(vp.planar_chain(2, mass=1e-150, length=1e-5), damping=1e160)
+        with pytest.raises(vp.VarpinError):
+            vp.simulate(scene, np.zeros(2), np.ones(2), dt=1e-3, steps=2)
+
+    def test_links_that_pinocchio_loses(self, tmp_path, monkeypatch):
+        path = write_urdf(tmp_path, link("l1"), joint("j1", "base", "l1"))
+        build = pin.buildModelFromXML
+
+        def lossy(text):
+            model = build(text)
+            model.inertias[1] = pin.Inertia.Zero()
+            return model
+
+        monkeypatch.setattr(pin, "buildModelFromXML", lossy)
+        self.refused(path, "describes links of 1.3 kg in all, of which Pinocchio reads 0 kg")
+
+
+class TestModels:
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            (lambda model: model.parents.__setitem__(2, 77), "comes before its parent"),
+            (lambda model: setattr(model, "armature", np.zeros(1)), "its armature has 1 entries, where 3 belong"),
+            (lambda model: setattr(model, "lowerPositionLimit", np.zeros(9)), "its lowerPositionLimit has 9 entries"),
+            (lambda model: model.names.append("more"), "its names has 5 entries, where 4 belong"),
+            (lambda model: model.inertias.append(pin.Inertia.Zero()), "its inertias has 5 entries"),
+            (lambda model: setattr(model.frames[1], "parentJoint", 99), "hangs on what is not there"),
+        ],
+    )
+    def test_whose_parts_do_not_fit(self, change, words):
+        model = random_tree(0, 3, branching=False)
+        model.addFrame(pin.Frame("tool", 1, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
+        while any(joint.nq != 1 for joint in list(model.joints)[1:]):
+            model = random_tree(int(model.name[4:]) + 1, 3, branching=False)
+            model.addFrame(pin.Frame("tool", 1, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
+        change(model)
+        with pytest.raises(vp.RobotError, match=words):
+            vp.load_robot(model)
+
+    def test_of_too_many_joints(self):
+        with pytest.raises(vp.RobotError, match=f"has {MAX_JOINTS + 1} joints; .* at most {MAX_JOINTS}"):
+            vp.planar_chain(MAX_JOINTS + 1)
+
+    def test_as_long_as_allowed(self):
+        assert vp.planar_chain(MAX_JOINTS).dof == MAX_JOINTS
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_mass_matrix_in_numpy_is_pinocchio_s(self, seed):
+        robot = vp.load_robot(random_tree(seed, 8))
+        q = np.random.default_rng(seed).normal(size=8)
+        expected = mass_matrix(robot, q, robot.free_model.createData())
+        np.testing.assert_allclose(
+            tree_mass_matrix(robot.tree, q), expected, rtol=0, atol=1e-13 * np.abs(expected).max()
+        )
+
+    @pytest.mark.parametrize("name", ["tiago", "allegro_left_hand", "panda"])
+    def test_mass_matrix_in_numpy_knows_mimic_joints(self, load, name):
+        robot = load(name)
+        q = np.random.default_rng(0).normal(size=robot.dof)
+        expected = mass_matrix(robot, q, robot.free_model.createData())
+        np.testing.assert_allclose(
+            tree_mass_matrix(robot.tree, q), expected, rtol=0, atol=1e-13 * np.abs(expected).max()
+        )
+
+
+class TestArchives:
+    def written(self, path, **members):
+        """An npz of raw contents."""
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, content in members.items():
+                archive.writestr(f"{name}.npy", content)
+        return path
+
+    def npy(self, head, data=b""):
+        return b"\x93NUMPY\1\0" + struct.pack("<H", len(head) + 1) + head.encode() + b"\n" + data
+
+    @pytest.mark.parametrize(
+        ("head", "words"),
+        [
+            # numpy made room for a header's word: 8 TB here.
+            ("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }", "a has 8 bytes for shape"),
+            ("{'descr': '<f8', 'fortran_order': False, 'shape': (-1,), }", "for shape"),
+            ("{'descr': '<U0', 'fortran_order': False, 'shape': (1000000000000,), }", "is an array of"),
+            ("{'descr': '<U1000000', 'fortran_order': False, 'shape': (), }", "is an array of"),
+            ("{'descr': '|O', 'fortran_order': False, 'shape': (), }", "without unpickling"),
+            ("{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (1,), }", "is an array of"),
+            ("[" * 5000, "truncated or damaged"),
+        ],
+    )
+    def test_headers_that_ask_for_more_than_there_is(self, tmp_path, head, words):
+        with pytest.raises(vp.FileError, match=words):
+            read_npz(self.written(tmp_path / "a.npz", a=self.npy(head, b"12345678")))
+
+    def test_bombs(self, tmp_path):
+        stream = io.BytesIO()
+        np.lib.format.write_array_header_1_0(stream, {"descr": "|i1", "fortran_order": False, "shape": (6 * 10**8,)})
+        path = tmp_path / "a.npz"
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.npy", "w") as member:
+            member.write(stream.getvalue())
+            for _ in range(600):
+                member.write(bytes(10**6))
+        with pytest.raises(vp.FileError, match="unpacks to 600 MB, which is over 512 MB and over 100 times its size"):
+            read_npz(path)
+
+    @pytest.mark.parametrize("order", ["C", "F"])
+    def test_arrays_come_back(self, tmp_path, order):
+        arrays = {
+            "a": np.asarray(np.random.default_rng(0).normal(size=(3, 4)), order=order),
+            "b": np.array("text"),
+            "c": np.zeros((0, 3)),
+            "d": np.array(3),
+        }
+        np.savez(tmp_path / "a.npz", **arrays)
+        back = read_npz(tmp_path / "a.npz")
+        for name, array in arrays.items():
+            assert (back[name].dtype, back[name].shape) == (array.dtype, array.shape)
+            assert np.array_equal(back[name], array)
+            assert back[name].flags.c_contiguous
+            assert not back[name].flags.writeable or order == "F"
+
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            ({"q": np.zeros((5, 2), dtype=">f8")}, "q holds >f8, where float64 belongs"),
+            ({"statistics.jets": np.zeros(4)}, "statistics.jets holds float64, where int64 belongs"),
+            ({"joint_names": np.zeros(2)}, "joint_names holds float64, where text belongs"),
+        ],
+    )
+    def test_trajectories_of_other_types(self, tmp_path, change, words):
+        path = tmp_path / "a.npz"
+        vp.simulate(vp.Scene(vp.planar_chain(2)), [0.1, 0.2], [0, 0], dt=1e-3, steps=4).save(path)
+        np.savez(path, **{**np.load(path), **change})
+        with pytest.raises(vp.FileError, match=words):
+            vp.Trajectory.load(path)
+
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            ({"runs.dt": np.zeros(1)}, r"runs.dt is float64 \(1,\), where float \(2,\) belongs"),
+            ({"runs.dt": np.array(["a", "b"])}, "runs.dt is <U1"),
+            ({"runs.dt": np.array(3.0)}, "runs.dt is float64"),
+            ({"robot": np.zeros(())}, "robot is float64"),
+            ({"robot": np.array(["a", "b"])}, "robot is <U1"),
+            ({"more": np.zeros(())}, "beyond what it should, more"),
+        ],
+    )
+    def test_records_of_other_shapes(self, tmp_path, change, words):
+        path = tmp_path / "a.npz"
+        path.write_bytes(fuzz.npz_corpus()["tradeoff"][0])
+        np.savez(path, **{**np.load(path), **change})
+        with pytest.raises(vp.FileError, match=words):
+            vp.OptimalControlTradeoff.load(path)

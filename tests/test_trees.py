@@ -1,0 +1,148 @@
+"""What holds for every robot, on random trees: branching or not, all kinds of joints and axes, light and heavy ends."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mechanisms import random_tree
+
+import varpin as vp
+
+INTEGRATORS = [vp.Midpoint(), vp.Gauss(1), vp.Gauss(2), vp.Gauss(3)]
+RATIOS = [1e-4, 1e-2, 1.0, 1e2, 1e4]
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A scene on a random tree and a state of it."""
+
+    seed: int
+    bodies: int
+    branching: bool
+    armature: bool
+    ratio: float
+    integrator: vp.Midpoint | vp.Gauss
+    dt: float = 1e-3
+
+    @property
+    def rng(self) -> np.random.Generator:
+        return np.random.default_rng(self.seed)
+
+    @property
+    def scene(self) -> vp.Scene:
+        robot = vp.load_robot(
+            random_tree(self.seed, self.bodies, branching=self.branching, armature=self.armature, ratio=self.ratio)
+        )
+        return vp.Scene(robot, gravity=self.rng.normal(0.0, 6.0, 3), stiffness=0.5, rest=0.2)
+
+    @property
+    def state(self) -> np.ndarray:
+        return self.rng.uniform(-1.0, 1.0, (2, self.bodies))
+
+
+cases = st.builds(
+    Case,
+    seed=st.integers(0, 2**32 - 1),
+    bodies=st.integers(1, 8),
+    branching=st.booleans(),
+    armature=st.booleans(),
+    ratio=st.sampled_from(RATIOS),
+    integrator=st.sampled_from(INTEGRATORS),
+)
+
+
+def jet_is_pinocchio_s(case: Case) -> None:
+    scene, (q, v) = case.scene, case.state
+    compiled = vp.lagrangian_jet(scene, q, v)
+    reference = vp.lagrangian_jet(scene, q, v, backend="pinocchio")
+    # The momentum in the place of what vanishes on a tree of single joints side by side.
+    least = np.abs(reference.Lv).max()
+    for name in ("Lq", "Lv", "Lqq", "Lvq", "Lvv"):
+        expected = getattr(reference, name)
+        room = 1e-12 * max(np.abs(expected).max(), least)
+        np.testing.assert_allclose(getattr(compiled, name), expected, rtol=0, atol=room, err_msg=name)
+
+
+def is_symplectic(case: Case) -> None:
+    """A'JA = J, in coordinates of like size: a step of h moves sqrt(M / h) q and p / sqrt(M / h) by their own size."""
+    scene, (q, v) = case.scene, case.state
+    motion = vp.simulate(scene, q, v, dt=case.dt, steps=4, integrator=case.integrator)
+    n = case.bodies
+    size = np.sqrt(np.diag(vp.lagrangian_jet(scene, q, v).Lvv) / case.dt)
+    size = np.concatenate([1.0 / size, size])
+    J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(n))
+    for A in vp.linearize(scene, motion, integrator=case.integrator).A:
+        scaled = A / size[:, None] * size
+        room = 1e-12 * (np.abs(scaled).T @ np.abs(J) @ np.abs(scaled)).max()
+        assert np.abs(scaled.T @ J @ scaled - J).max() < room
+        assert room < 1e-9
+
+
+def runs_back(case: Case) -> None:
+    scene, (q, v) = case.scene, case.state
+    there = vp.simulate(scene, q, v, dt=case.dt, steps=20, integrator=case.integrator)
+    back = vp.simulate(scene, there.q[-1], -there.v[-1], dt=case.dt, steps=20, integrator=case.integrator)
+    assert there.statistics.split_steps == back.statistics.split_steps == 0
+    np.testing.assert_allclose(back.q[-1], q, rtol=0, atol=1e-10)
+    # Momenta are reversed to rounding; a light end's velocity has the rounding of the heavy one's momentum.
+    momentum = np.abs(there.p).max()
+    np.testing.assert_allclose(-back.p[-1], there.p[0], rtol=0, atol=1e-11 * momentum)
+    assert np.abs(there.q[-1] - q).max() > 1e-4
+
+
+def linearization_is_the_derivative(case: Case) -> None:
+    scene, (q, v) = case.scene, case.state
+    noise = vp.AdditiveNoise(1e-2) + vp.ControlNoise(0.1)
+    scene = vp.Scene(scene.robot, gravity=scene.gravity, damping=0.01, stiffness=0.5, noise=noise)
+    u = case.rng.normal(size=case.bodies)
+    found = vp.check_linearization(scene, q, v, u, dt=case.dt, integrator=case.integrator)
+    assert found.worst < 1e-7
+
+
+def survives_a_file(case: Case) -> None:
+    scene, (q, v) = case.scene, case.state
+    scene = vp.Scene(scene.robot, gravity=scene.gravity, noise=vp.AdditiveNoise(1e-3))
+    motion = vp.simulate(scene, q, v, dt=case.dt, steps=case.seed % 7, rng=case.seed, integrator=case.integrator)
+    with tempfile.TemporaryDirectory() as folder:
+        loaded = vp.Trajectory.load(motion.save(Path(folder, "a.npz")), scene.robot)
+    for one, other in ((motion, loaded), (motion.statistics, loaded.statistics)):
+        for item in dataclasses.fields(one):
+            before, after = getattr(one, item.name), getattr(other, item.name)
+            if isinstance(before, np.ndarray):
+                assert (before.dtype, before.shape, before.tobytes()) == (after.dtype, after.shape, after.tobytes())
+            elif item.name != "statistics":
+                assert before == after
+
+
+PROPERTIES = [jet_is_pinocchio_s, is_symplectic, runs_back, linearization_is_the_derivative, survives_a_file]
+
+
+@pytest.mark.parametrize("check", PROPERTIES, ids=lambda check: check.__name__)
+def test_on_a_few(check):
+    settings(max_examples=15, deadline=None, derandomize=True, database=None)(given(cases)(check))()
+
+
+@pytest.mark.slow
+def test_on_two_hundred():
+    """Each of 200 trees, with every property; the integrators take turns."""
+    for seed in range(200):
+        rng = np.random.default_rng([seed, 6])
+        case = Case(
+            seed=seed,
+            bodies=int(rng.integers(1, 9)),
+            branching=bool(seed % 2),
+            armature=bool(seed // 2 % 2),
+            ratio=RATIOS[seed // 4 % len(RATIOS)],
+            integrator=INTEGRATORS[seed // 20 % len(INTEGRATORS)],
+        )
+        for check in PROPERTIES:
+            try:
+                check(case)
+            except (AssertionError, vp.VarpinError) as error:
+                raise AssertionError(f"{check.__name__} fails on {case}: {error}") from error
