@@ -27,6 +27,7 @@ from varpin.errors import LinearizationError as LinearizationError
 from varpin.errors import RobotError as RobotError
 from varpin.errors import RobotNotFound as RobotNotFound
 from varpin.errors import SingularMassMatrix as SingularMassMatrix
+from varpin.errors import UnknownFrame as UnknownFrame
 from varpin.errors import UnknownJoint as UnknownJoint
 from varpin.errors import UnsupportedJoint as UnsupportedJoint
 from varpin.errors import VarpinError as VarpinError
@@ -59,6 +60,7 @@ from varpin.noise import StateNoise as StateNoise
 from varpin.policy import LinearPolicy as LinearPolicy
 from varpin.problem import OptimalControlProblem as OptimalControlProblem
 from varpin.replay import replay as replay
+from varpin.robot import Payload as Payload
 from varpin.robot import Robot as Robot
 from varpin.robot import load_robot as load_robot
 from varpin.robot import planar_chain as planar_chain

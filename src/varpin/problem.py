@@ -157,6 +157,22 @@ class OptimalControlProblem:
             hold=self.hold if hold is None else hold,
         )
 
+    def differs(self, other: OptimalControlProblem) -> str:
+        """In words, what of two problems differs that can be told without comparing costs; empty if nothing."""
+        own, its = self.scene.robot, other.scene.robot
+        if own.joint_names != its.joint_names:
+            return f"joints {', '.join(its.joint_names)}, not {', '.join(own.joint_names)}"
+        if not np.array_equal(own.tree.mass, its.tree.mass):
+            return f"links of {its.tree.mass.sum():.6g} kg, not {own.tree.mass.sum():.6g} kg"
+        for name in ("dt", "steps", "hold", "sampling", "q0", "v0", "integrator"):
+            mine, theirs = getattr(self, name), getattr(other, name)
+            if not np.array_equal(mine, theirs):
+                return f"{name} = {theirs}, not {mine}"
+        for name in ("gravity", "damping", "stiffness", "rest", "actuation"):
+            if not np.array_equal(getattr(self.scene, name), getattr(other.scene, name)):
+                return f"another {name}"
+        return ""
+
     def holding_controls(self) -> Floats:
         """The constant control (m,) that comes closest to holding the robot at q0 at rest."""
         force = lagrangian_jet(self.scene, self.q0, np.zeros_like(self.q0)).Lq

@@ -21,7 +21,7 @@ from varpin.noise import NoiseFieldError
 from varpin.policy import LinearPolicy
 from varpin.problem import OptimalControlProblem
 from varpin.simulation import StepFailure, rollout
-from varpin.solution import Iteration, Solution, Status
+from varpin.solution import Iteration, SearchState, Solution, Status
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -55,6 +55,7 @@ def solve(
     backtracking: float = 0.25,
     regularization: float = 0.0,
     callback: Callback | None = None,
+    resume: Solution | None = None,
 ) -> Solution:
     """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
 
@@ -78,6 +79,9 @@ def solve(
         backtracking: Factor between the trials of the line search (the paper's beta), in (0, 1).
         regularization: To begin with, relative to the diagonal of Quu; it grows where needed, and shrinks again.
         callback: Called with each :class:`Iteration`.
+        resume: A solution of this very problem, as solve returned it or as read from a file: the search goes on where
+            it stopped, for at most ``max_iterations`` more, as if it had not been interrupted. Give the other options
+            as before; ``regularization`` goes on by itself.
 
     Returns:
         The best motion found, whatever happened; ``status`` says how it ended. Ctrl-C returns it too.
@@ -103,7 +107,10 @@ def solve(
     max_iterations = count("max_iterations", max_iterations)
     with announced_compilation():
         search = _Search(problem, second_order, forward, armijo, backtracking, regularization)
-        search.begin(_first_commands(problem, controls))
+        if resume is None:
+            search.begin(_first_commands(problem, controls))
+        else:
+            search.resume(_search_of(problem, controls, resume))
         try:
             status = search.run(tolerance, max_iterations, callback)
         except KeyboardInterrupt:
@@ -125,6 +132,19 @@ def _first_commands(problem: OptimalControlProblem, controls: ArrayLike | Linear
     rows = as_floats("controls", controls)
     rows = finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m))
     return _held(np.broadcast_to(rows, (R, m)), problem.hold)
+
+
+def _search_of(problem: OptimalControlProblem, controls: object, resume: Solution) -> SearchState:
+    if not isinstance(resume, Solution):
+        raise InputError(f"resume must be a Solution, got {type(resume).__name__}")
+    if controls is not None:
+        raise InputError("resume goes on from the solution's own controls: leave out either controls or resume")
+    if resume.search is None:
+        raise InputError("resume: the solution does not hold the state of its search; give it as controls")
+    difference = problem.differs(resume.problem)
+    if difference:
+        raise InputError(f"resume: the solution is of another problem: {difference}; give it as controls")
+    return resume.search
 
 
 def _held(u: Floats, hold: int) -> Commands:
@@ -150,7 +170,8 @@ class _Search:
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
         self.trajectory: Trajectory
-        self.cost = np.inf
+        self.cost = self.first = np.inf
+        self.state: SearchState | None = None  # at the start of the last iteration, from where it can go on
         self.merits: list[float] = []  # the best so far, after each iteration
         self.best: tuple[float, float, Trajectory | None] = (np.inf, np.inf, None)
 
@@ -164,10 +185,34 @@ class _Search:
         self.cost = self.problem.cost_of(trajectory)
         if not np.isfinite(self.cost):
             raise CostError(repr(self.problem.cost), f"the cost of the first motion is {self.cost}")
+        self.first = self.cost
+
+    def resume(self, state: SearchState) -> None:
+        """Stand where ``state`` was taken."""
+        self.trajectory, self.cost, self.first = state.trajectory, state.cost, state.first
+        self.merits, self.history = list(state.merits), list(state.history)
+        self.best = state.best_merit, state.best_cost, state.best
+        self.regularization, self.growth = state.regularization, state.growth
+
+    def _state(self) -> SearchState:
+        merit, cost, best = self.best
+        return SearchState(
+            trajectory=self.trajectory,
+            cost=self.cost,
+            first=self.first,
+            best=best,
+            best_merit=merit,
+            best_cost=cost,
+            merits=tuple(self.merits),
+            regularization=self.regularization,
+            growth=self.growth,
+            history=tuple(self.history),
+        )
 
     def run(self, tolerance: float, max_iterations: int, callback: Callback | None) -> Status:
-        first = self.cost
+        last = len(self.history) + max_iterations
         while True:
+            self.state = self._state()
             started = time.perf_counter()
             try:
                 passes = self._plan()
@@ -183,14 +228,14 @@ class _Search:
                 self.best = merit, self.cost, self.trajectory
             self.merits.append(self.best[0])
             # Where the optimum costs nothing, there is nothing to be relative to but where it began.
-            scale = abs(merit) + 1e-9 * abs(first)
+            scale = abs(merit) + 1e-9 * abs(self.first)
             converged = self.plan.promise <= tolerance * scale
             if converged and self.regularization > 0.0:
                 # Regularization makes promises smaller; it must not pass for an optimum.
                 plan, least = self._least_regularized()
                 converged = plan is not None and least <= _LITTLE and plan.promise <= tolerance * scale
                 self.plan = plan if converged else self.plan
-            if converged or len(self.history) >= max_iterations:
+            if converged or len(self.history) >= last:
                 self._note(callback, started, 0.0, passes, 0)
                 return Status.CONVERGED if converged else Status.MAX_ITERATIONS
             if len(self.merits) > _PATIENCE and self.merits[-1 - _PATIENCE] - self.merits[-1] <= tolerance * scale:
@@ -327,6 +372,7 @@ class _Search:
             noise_cost=(np.nan if problem.scene.processes else 0.0) if plan is None else plan.noise,
             status=status,
             history=tuple(self.history),
+            search=self.state,
         )
 
 

@@ -6,7 +6,7 @@ import contextlib
 import os
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -148,13 +148,16 @@ class Trajectory:
         Raises:
             FileError: The path cannot be written.
         """
+        with atomic_file(path) as stream:
+            np.savez_compressed(stream, **self.members(), format=FORMAT)
+        return Path(path)
+
+    def members(self) -> dict[str, Any]:
+        """What an npz file holds of it, by name."""
         members: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
         members |= {f"statistics.{item.name}": getattr(self.statistics, item.name) for item in fields(StepStatistics)}
-        members |= {"format": FORMAT, "version": self.version, "integrator": self.integrator, "robot": self.robot}
-        members |= {"dt": self.dt, "joint_names": np.array(self.joint_names, dtype=str)}
-        with atomic_file(path) as stream:
-            np.savez_compressed(stream, **members)
-        return Path(path)
+        members |= {"version": self.version, "integrator": self.integrator, "robot": self.robot}
+        return members | {"dt": self.dt, "joint_names": np.array(self.joint_names, dtype=str)}
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], robot: Robot | None = None) -> Trajectory:
@@ -171,10 +174,15 @@ class Trajectory:
         source = path_like("path", path)
         if robot is not None and not isinstance(robot, Robot):
             raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
-        members = _read_members(source)
-        found = members["format"]
-        if found.shape != () or str(found) != FORMAT:
-            raise FileError(f"{source} is not a varpin trajectory: its format is {found}, not {FORMAT!r}")
+        return cls.of_members(source, read_members(source, FORMAT, MEMBERS), robot)
+
+    @classmethod
+    def of_members(cls, source: Path, members: Mapping[str, NDArray[Any]], robot: Robot | None) -> Trajectory:
+        """The trajectory that members of the file ``source`` describe, by the names that :meth:`members` gives.
+
+        Raises:
+            FileError: As for :meth:`load`.
+        """
         steps, n = members["t"].size - 1, members["joint_names"].size
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys("qvp", (steps + 1, n)) | dict.fromkeys(
             ("t", "energy"), (steps + 1,)
@@ -221,12 +229,16 @@ class Trajectory:
         )
 
 
-def _read_members(source: Path) -> dict[str, NDArray[Any]]:
-    """All arrays of an npz file, or a FileError that says what is wrong with it."""
-    expected = {*_ARRAYS, "dt", "format", "version", "integrator", "robot", "joint_names"}
-    expected |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
+# What a file of a trajectory holds beside its format.
+MEMBERS = frozenset(_ARRAYS) | {"dt", "version", "integrator", "robot", "joint_names"}
+MEMBERS |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
+
+
+def read_members(source: Path, kind: str, expected: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """The arrays of an npz file of format ``kind``, or a FileError that says what is wrong with it."""
+    what = kind.removeprefix("varpin.").partition("/")[0]
     if source.is_dir():
-        raise FileError(f"{source} is a folder, not a trajectory")
+        raise FileError(f"{source} is a folder, not a {what}")
     if not source.is_file():
         raise FileError(f"there is no file {source}")
     try:
@@ -235,10 +247,10 @@ def _read_members(source: Path) -> dict[str, NDArray[Any]]:
         if not whole:
             raise FileError(f"{source} is not an npz file, or it is truncated")
         with np.load(source, allow_pickle=False) as archive:
-            missing = sorted(expected - set(archive.files))
+            missing = sorted({*expected, "format"} - set(archive.files))
             if missing:
-                raise FileError(f"{source} is not a varpin trajectory: it has no {', '.join(missing)}")
-            return {name: archive[name] for name in expected}
+                raise FileError(f"{source} is not a varpin {what}: it has no {', '.join(missing)}")
+            members = {name: archive[name] for name in archive.files}
     except FileError:
         raise
     except OSError as error:
@@ -248,6 +260,10 @@ def _read_members(source: Path) -> dict[str, NDArray[Any]]:
         if "allow_pickle" in str(error):
             raise FileError(f"{source} cannot be read without unpickling objects, which is not done") from None
         raise FileError(f"{source} is truncated or damaged: {error}") from None
+    found = members["format"]
+    if found.shape != () or str(found) != kind:
+        raise FileError(f"{source} is not a varpin {what}: its format is {found}, not {kind!r}")
+    return members
 
 
 @contextlib.contextmanager

@@ -7,4 +7,6 @@ from varpin.robot.model import check_inertia as check_inertia
 from varpin.robot.model import geometry as geometry
 from varpin.robot.model import load_robot as load_robot
 from varpin.robot.model import mass_matrix as mass_matrix
+from varpin.robot.payload import Payload as Payload
 from varpin.robot.sources import bundled_robots as bundled_robots
+from varpin.robot.sources import models_dir as models_dir
