@@ -122,7 +122,7 @@ def test_files_that_are_no_solutions(tmp_path):
 def test_resume_of_something_else():
     problem = problem_of()
     plan = vp.solve(problem, max_iterations=1)
-    with pytest.raises(vp.InputError, match="another problem: dt = 0.02"):
+    with pytest.raises(vp.InputError, match=r"another problem: dt = 0\.02"):
         vp.solve(problem_of(dt=0.03), resume=plan)
     with pytest.raises(vp.InputError, match="leave out either"):
         vp.solve(problem, plan, resume=plan)

@@ -34,7 +34,9 @@ class Status(Enum):
     """How a solver ended; its value says what that means and what to do."""
 
     CONVERGED = "converged"
-    MAX_ITERATIONS = "not converged: more iterations may help; go on from this solution with solve(problem, resume=solution)"
+    MAX_ITERATIONS = (
+        "not converged: more iterations may help; go on from this solution with solve(problem, resume=solution)"
+    )
     STALLED = (
         "not converged: no step along the plan lowers the expected cost by more than the tolerance; if what it "
         "promises is little, that is as far as it goes; else a smaller dt, other first controls, right derivatives of "
@@ -474,10 +476,11 @@ class _Reader:
     def history(self) -> tuple[Iteration, ...]:
         rows = self.array("history", (-1, len(_COLUMNS)), finite=False)
         whole = {item.name for item in fields(Iteration) if item.type == "int"}
-        return tuple(
-            Iteration(**{name: int(x) if name in whole else float(x) for name, x in zip(_COLUMNS, row, strict=True)})
-            for row in rows
-        )
+        found = []
+        for row in rows.tolist():
+            values: dict[str, Any] = dict(zip(_COLUMNS, row, strict=True))
+            found.append(Iteration(**values | {name: int(values[name]) for name in whole}))
+        return tuple(found)
 
     def solution(self) -> Solution:
         problem, members = self.problem, self.members

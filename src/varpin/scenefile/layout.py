@@ -237,7 +237,9 @@ def lay_out(spec: SceneSpec) -> Layout:
     if spec.actuated is not None:
         for index, joint in enumerate(spec.actuated):
             if joint not in names:
-                raise actuation.error(f"joints[{index}]", f"there is no joint {joint!r}; {suggestion(joint, names, 'joints')}")
+                raise actuation.error(
+                    f"joints[{index}]", f"there is no joint {joint!r}; {suggestion(joint, names, 'joints')}"
+                )
     driven = names if spec.actuated is None else spec.actuated
     gear = actuation.spread("gear", spec.gear, driven, "driven joint")
     if not gear.all():
@@ -299,7 +301,9 @@ def _torque_limit(spec: SceneSpec, robot: Robot, actuated: NDArray[np.int64], dr
     limit = table.spread("torque_limit", spec.torque_limit, driven, "driven joint")
     if not (limit > 0.0).all():
         joint = driven[int(np.argmax(~(limit > 0.0)))]
-        raise table.error("torque_limit", f"must be > 0 [N m or N], and is {limit[driven.index(joint)]:g} for {joint!r}")
+        raise table.error(
+            "torque_limit", f"must be > 0 [N m or N], and is {limit[driven.index(joint)]:g} for {joint!r}"
+        )
     return limit
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 import zipfile
 from collections.abc import Callable, Sequence
@@ -33,7 +34,9 @@ class Timeline:
     constant: bool
 
     def __call__(self, time: float) -> Floats:
-        return self.at(np.array([time]))[0]
+        """Values (c,) at one time [s]."""
+        row: Floats = self.at(np.array([time]))[0]
+        return row
 
     def columns(self, keep: Sequence[int]) -> Timeline:
         """Some of the components."""
@@ -162,8 +165,8 @@ def _csv(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
             except ValueError:
                 raise wrong(f"row {number}, column {head[column]!r}: {word.strip()!r} is no number") from None
     if not np.isfinite(found).all():
-        row, column = (int(x) for x in np.argwhere(~np.isfinite(found))[0])
-        raise wrong(f"row {row + 2}, column {head[column]!r} is not finite")
+        line, place = (int(x) for x in np.argwhere(~np.isfinite(found))[0])
+        raise wrong(f"row {line + 2}, column {head[place]!r} is not finite")
     return dict(zip(head, found.T, strict=True))
 
 
@@ -205,7 +208,7 @@ def read_reference(table: Table, name: str, folder: Path, dt: float, default: fl
     if kind == "times":
         own.allow("times", "values", "between")
         times = own.numbers("times")
-        if len(times) < 2 or not all(b > a for a, b in zip(times, times[1:], strict=False)):
+        if len(times) < 2 or not all(b > a for a, b in itertools.pairwise(times)):
             raise own.error("times", f"must be two or more, and increase [s], got {list(times)}")
         rows = own.require("values", "a list of rows, one for each of times")
         if not isinstance(rows, list) or len(rows) != len(times):

@@ -206,7 +206,9 @@ class Table:
         """The tables under ``name``, ``[[name]]`` in the file."""
         value = self.data.get(name, [])
         if isinstance(value, dict):
-            raise self.error(name, f"there may be several of them: write [[{self.path(name)}]], not [{self.path(name)}]")
+            raise self.error(
+                name, f"there may be several of them: write [[{self.path(name)}]], not [{self.path(name)}]"
+            )
         if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
             raise self.error(name, f"must be tables, [[{self.path(name)}]], got {shown(value)}")
         return [Table(self.source, f"{self.path(name)}[{index}]", entry) for index, entry in enumerate(value)]
@@ -228,7 +230,9 @@ class Table:
         if isinstance(value, Mapping):
             for entry in value:
                 if entry not in names:
-                    raise self.error(f"{name}.{entry}", f"there is no such {what}; {suggestion(entry, names, what + 's')}")
+                    raise self.error(
+                        f"{name}.{entry}", f"there is no such {what}; {suggestion(entry, names, what + 's')}"
+                    )
             return np.array([value.get(entry, 0.0) for entry in names], dtype=np.float64)
         if isinstance(value, tuple):
             if len(value) != len(names):
@@ -286,7 +290,5 @@ def inside(table: Table, name: str, text: str, folder: Path, what: str) -> Path:
     except (OSError, RuntimeError) as error:
         raise table.error(name, f"{text!r} is no path: {error}") from None
     if not found.is_relative_to(root):
-        raise table.error(
-            name, f"{text!r} leads out of {what} {root}; name files below it, or give an absolute path"
-        )
+        raise table.error(name, f"{text!r} leads out of {what} {root}; name files below it, or give an absolute path")
     return found
