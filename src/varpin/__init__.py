@@ -81,6 +81,14 @@ from varpin.solution import SearchState as SearchState
 from varpin.solution import Solution as Solution
 from varpin.solution import Status as Status
 from varpin.solution import Verification as Verification
+from varpin.solution import Violations as Violations
+from varpin.task_costs import CenterOfMassCost as CenterOfMassCost
+from varpin.task_costs import FrameOrientationCost as FrameOrientationCost
+from varpin.task_costs import FramePositionCost as FramePositionCost
+from varpin.task_costs import FrameVelocityCost as FrameVelocityCost
+from varpin.task_costs import JointLimitBarrier as JointLimitBarrier
+from varpin.task_costs import ManipulabilityCost as ManipulabilityCost
+from varpin.task_costs import VelocityLimitBarrier as VelocityLimitBarrier
 from varpin.tradeoff import Advice as Advice
 from varpin.tradeoff import OptimalControlTradeoff as OptimalControlTradeoff
 from varpin.tradeoff import WorkPrecision as WorkPrecision

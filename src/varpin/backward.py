@@ -38,11 +38,19 @@ class Plan:
     noise: float  # cost of the noise along the motion
     jumps: Floats  # (N, 2n, n), empty without noise
     spread: Floats  # (N, 2n, 2n)
+    limited: bool
 
     @property
     def promise(self) -> float:
         """Decrease of the expected cost with a full step, by the model."""
-        return -0.5 * self.slope
+        # Without limits the step is the model's minimum, where the curvature takes back half of what the slope gives.
+        return -self.slope - 0.5 * self.curvature if self.limited else -0.5 * self.slope
+
+    def free_gradient(self, problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
+        """The gradient (R, m) without what pushes controls against limits they are at: zero at an optimum."""
+        u, (lower, upper) = trajectory.u[:: problem.hold], problem.control_limits
+        held = ((u <= lower) & (self.gradient > 0.0)) | ((u >= upper) & (self.gradient < 0.0))
+        return np.where(held, 0.0, self.gradient)
 
 
 def noise_cost(problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan) -> float:
@@ -142,6 +150,9 @@ def _pass(
     samples = len(rule)
     # Velocities at nodes are needed where they are sampled and x does not hold them.
     nodes = problem.integrator.variational and bool(rule[:, [2, 4, 6, 8]].any())
+    slack = np.zeros((0, 2, m))
+    if problem.limited:
+        slack = problem.control_limits - trajectory.u[:: problem.hold, None]
     block = max(1, _BLOCK // problem.hold) * problem.hold
     for end in range(N, 0, -block):
         begin = max(0, end - block)
@@ -168,6 +179,7 @@ def _pass(
                 hessian=hessian[points] if len(hessian) > 1 else hessian,
                 velocity=velocity,
                 curvature=np.zeros((0, size, size)) if curvature is None else curvature[steps],
+                slack=slack[rows],
             ),
             value,
             kernels.Gains(
@@ -192,6 +204,7 @@ def _pass(
         float(value.noise[0]),
         jumps,
         spread,
+        problem.limited,
     )
     return plan, costate
 

@@ -41,6 +41,31 @@ def broadcast_array(name: str, value: ArrayLike, size: int) -> Floats:
     return np.array(np.broadcast_to(require_finite(name, array), (size,)))
 
 
+def checked_limits(name: str, limits: tuple[ArrayLike, ArrayLike] | None, size: int) -> Floats:
+    """(lower, upper), each one number or (size,), as an array (2, size); infinite where there is no limit.
+
+    Raises:
+        InputError: No pair, a wrong shape, NaN, or a lower limit above the upper one.
+    """
+    pair = (-np.inf, np.inf) if limits is None else limits
+    if not isinstance(pair, tuple | list | np.ndarray) or len(pair) != 2:
+        raise InputError(f"{name} must be a pair (lower, upper), got {limits!r}")
+    both = np.empty((2, size))
+    for row, side, value in zip(both, ("lower", "upper"), pair, strict=True):
+        array = as_floats(f"{name}: {side}", value)
+        if array.shape not in ((), (size,)):
+            raise InputError(f"{name}: {side} must be one number or have shape ({size},), got {array.shape}")
+        row[:] = array
+        if np.isnan(row).any():
+            raise InputError(f"{name}: {side}[{int(np.argmax(np.isnan(row)))}] is NaN; inf stands for no limit")
+    wrong = ~(both[0] <= both[1]) | (both[0] == np.inf) | (both[1] == -np.inf)
+    if wrong.any():
+        c = int(np.argmax(wrong))
+        raise InputError(f"{name}: nothing is within {both[0, c]:g} and {both[1, c]:g}, the limits of entry {c}")
+    both.setflags(write=False)
+    return both
+
+
 def as_floats(name: str, value: ArrayLike) -> Floats:
     """``value`` as a new float array, or an InputError that names it."""
     try:

@@ -203,18 +203,7 @@ class _Quadratic(Cost):
     block: str
 
     def __init__(self, reference: Reference, weight: ArrayLike) -> None:
-        array = require_finite(f"{type(self).__name__} weight", as_floats(f"{type(self).__name__} weight", weight))
-        if array.ndim > 2 or (array.ndim == 2 and array.shape[0] != array.shape[1]):
-            raise InputError(
-                f"{type(self).__name__} weight must be a number, a vector or a square matrix, got {array.shape}"
-            )
-        least = np.linalg.eigvalsh(0.5 * (array + array.T)).min() if array.ndim == 2 else array.min(initial=0.0)
-        if least < -1e-12 * np.abs(array).max(initial=0.0):
-            raise InputError(
-                f"{type(self).__name__} weight must be positive semidefinite; its least value is {least:g}"
-            )
-        self.weight = 0.5 * (array + array.T) if array.ndim == 2 else array
-        self.weight.setflags(write=False)
+        self.weight = checked_weight(type(self).__name__, weight)
         self.reference = reference if callable(reference) else as_floats(f"{type(self).__name__} reference", reference)
 
     def __repr__(self) -> str:
@@ -225,13 +214,39 @@ class _Quadratic(Cost):
         size = points.controls if self.block == "u" else points.dof
         begin = {"q": 0, "v": points.dof, "u": 2 * points.dof}[self.block]
         name = type(self).__name__
-        if self.weight.ndim > 0 and self.weight.shape[0] != size:
-            raise InputError(f"{name} weight must be one number or have {size} rows, got shape {self.weight.shape}")
-        W = self.weight * np.eye(size) if self.weight.ndim < 2 else self.weight
+        W = weight_matrix(name, self.weight, size)
         hessian = np.zeros((1, points.size, points.size))
         hessian[0, begin : begin + size, begin : begin + size] = 2.0 * W
         reference = sample(name, self.reference, points, size, held=self.block == "u")
         return _BoundQuadratic(self.block, begin, reference, W, hessian)
+
+
+def checked_weight(name: str, weight: ArrayLike) -> Floats:
+    """A weight as given: one number, a vector or a symmetric matrix.
+
+    Raises:
+        InputError: Not finite, indefinite, or neither number, vector nor square matrix.
+    """
+    array = require_finite(f"{name} weight", as_floats(f"{name} weight", weight))
+    if array.ndim > 2 or (array.ndim == 2 and array.shape[0] != array.shape[1]):
+        raise InputError(f"{name} weight must be a number, a vector or a square matrix, got {array.shape}")
+    least = np.linalg.eigvalsh(0.5 * (array + array.T)).min() if array.ndim == 2 else array.min(initial=0.0)
+    if least < -1e-12 * np.abs(array).max(initial=0.0):
+        raise InputError(f"{name} weight must be positive semidefinite; its least value is {least:g}")
+    array = 0.5 * (array + array.T) if array.ndim == 2 else array
+    array.setflags(write=False)
+    return array
+
+
+def weight_matrix(name: str, weight: Floats, size: int) -> Floats:
+    """A weight as a matrix (size, size).
+
+    Raises:
+        InputError: It is for another size.
+    """
+    if weight.ndim > 0 and weight.shape[0] != size:
+        raise InputError(f"{name} weight must be one number or have {size} rows, got shape {weight.shape}")
+    return weight * np.eye(size) if weight.ndim < 2 else weight
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,23 +47,6 @@ class UnknownJoint(RobotError):
         super().__init__(f"{where}: the robot has no joint {joint!r}; {hint}joints: {', '.join(self.joints)}")
 
 
-class UnknownFrame(RobotError):
-    """A frame name that the robot does not have.
-
-    Attributes:
-        frame: The name given.
-        frames: The names there are.
-        matches: Those that come close.
-    """
-
-    def __init__(self, frame: str, frames: Iterable[str], where: str) -> None:
-        self.frame = frame
-        self.frames = tuple(frames)
-        self.matches = difflib.get_close_matches(frame, self.frames, n=3, cutoff=0.4)
-        hint = f"did you mean {' or '.join(map(repr, self.matches))}? " if self.matches else ""
-        super().__init__(f"{where}: the robot has no frame {frame!r}; {hint}frames: {', '.join(self.frames)}")
-
-
 class UnsupportedJoint(RobotError):
     """A joint type outside generalized coordinates in R^n.
 
@@ -100,6 +83,23 @@ class SingularMassMatrix(RobotError):
 
 class InputError(VarpinError, ValueError):
     """An argument has a wrong shape, type or value."""
+
+
+class UnknownFrame(InputError):
+    """A frame name that the robot does not have.
+
+    Attributes:
+        frame: The name given.
+        frames: The names there are.
+        matches: Those that come close.
+    """
+
+    def __init__(self, frame: str, frames: Iterable[str], robot: str) -> None:
+        self.frame = frame
+        self.frames = tuple(frames)
+        self.matches = difflib.get_close_matches(frame, self.frames, n=3, cutoff=0.4)
+        hint = f"did you mean {' or '.join(map(repr, self.matches))}? " if self.matches else ""
+        super().__init__(f"robot {robot!r} has no frame {frame!r}; {hint}frames: {', '.join(self.frames)}")
 
 
 class FileError(VarpinError, OSError):

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, count, finite_array
+from varpin.checks import as_floats, checked_limits, count, finite_array
 from varpin.errors import InputError
 from varpin.kernels.tree import Commands
 
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False, init=False)
 class LinearPolicy:
-    """u = u_k + gains_k (x - x_k), evaluated at the start of each of N intervals and held over it.
+    """u = u_k + gains_k (x - x_k) within limits, evaluated at the start of each of N intervals and held over it.
 
     x is (q, p) for variational integrators and (q, v) for the others.
 
@@ -27,6 +27,7 @@ class LinearPolicy:
         reference: x_k (N, 2n).
         hold: Steps that an interval has.
         on: What x is made for: ``"momentum"``, (q, p), ``"velocity"``, (q, v), or None where nobody said.
+        limits: Least and greatest control (2, m), infinite where there is none.
     """
 
     u: Floats
@@ -34,6 +35,7 @@ class LinearPolicy:
     reference: Floats
     hold: int
     on: Literal["momentum", "velocity"] | None
+    limits: Floats
 
     def __init__(
         self,
@@ -42,6 +44,7 @@ class LinearPolicy:
         reference: ArrayLike,
         hold: int = 1,
         on: Literal["momentum", "velocity"] | None = None,
+        limits: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
         """Make a policy.
 
@@ -51,6 +54,7 @@ class LinearPolicy:
             reference: (N, 2n), or (N + 1, 2n), of which the last row is not used.
             hold: Steps of a simulation that each control is held over: the rate of a digital controller.
             on: Say what x is, and an integrator on the other x refuses the policy.
+            limits: (lower, upper), each one number or (m,), of the whole control: feedback saturates there.
 
         Raises:
             InputError: Shapes that do not fit each other, or values that are not finite.
@@ -74,6 +78,7 @@ class LinearPolicy:
         if on not in ("momentum", "velocity", None):
             raise InputError(f"on must be 'momentum', 'velocity' or None, got {on!r}")
         object.__setattr__(self, "on", on)
+        object.__setattr__(self, "limits", checked_limits("limits", limits, m))
 
     def __repr__(self) -> str:
         steps, m, size = self.gains.shape
@@ -98,4 +103,4 @@ class LinearPolicy:
             )
         if self.gains.shape[1:] != (controls, 2 * dof):
             raise InputError(f"the policy's gains must have shape (N, {controls}, {2 * dof}), got {self.gains.shape}")
-        return Commands(self.u, self.gains, self.reference, self.hold)
+        return Commands(self.u, self.gains, self.reference, self.hold, self.limits)

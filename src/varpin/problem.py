@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import count, finite_array, positive
+from varpin.checks import checked_limits, count, finite_array, positive
 from varpin.costs import BoundSum, Cost, Expansion, Points, Terminal
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint
@@ -26,7 +26,7 @@ class OptimalControlProblem:
     """Minimize the expected cost of a motion from (q0, v0) over the controls, each held over ``hold`` steps.
 
     Running costs are integrals in time, sampled once a step, and references are functions of time: the problem means
-    the same at every ``dt``.
+    the same at every ``dt``. Controls stay within their limits, feedback included.
 
     Attributes:
         scene: The scene, its noise included.
@@ -40,6 +40,7 @@ class OptimalControlProblem:
             ``"gauss"``: at its two Gauss points, the motion between the nodes taken for a cubic: of fourth order, for
             integrators that are. ``"start"``: at the node where it begins, a left sum as in the paper, of first order.
         hold: Steps that share one control: a digital controller's period over the integrator's step.
+        control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none.
     """
 
     scene: Scene
@@ -51,6 +52,7 @@ class OptimalControlProblem:
     integrator: Integrator
     sampling: Sampling
     hold: int
+    control_limits: Floats
     running: BoundSum = field(repr=False)
     terminal: BoundSum = field(repr=False)
     rule: Floats = field(repr=False)
@@ -67,12 +69,15 @@ class OptimalControlProblem:
         integrator: Integrator | None = None,
         sampling: Sampling = "midpoint",
         hold: int = 1,
+        control_limits: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
         """Describe a problem.
 
+        ``control_limits`` are (lower, upper), each one number or (m,); infinite where a control has no limit.
+
         Raises:
-            InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, or a
-                reference that does not fit the problem's grid.
+            InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
+                reference that does not fit the problem's grid, or limits that leave a control nothing.
             CostError: A reference that is a function fails.
         """
         n, m = require_scene(scene).robot.dof, scene.controls
@@ -100,6 +105,7 @@ class OptimalControlProblem:
             "integrator": Midpoint() if integrator is None else integrator,
             "sampling": sampling,
             "hold": hold,
+            "control_limits": checked_limits("control_limits", control_limits, m),
             "running": running,
             "terminal": terminal,
             "rule": rule,
@@ -155,6 +161,7 @@ class OptimalControlProblem:
             integrator=self.integrator if integrator is None else integrator,
             sampling=self.sampling if sampling is None else sampling,
             hold=self.hold if hold is None else hold,
+            control_limits=(self.control_limits[0], self.control_limits[1]),
         )
 
     def differs(self, other: OptimalControlProblem) -> str:
@@ -164,7 +171,7 @@ class OptimalControlProblem:
             return f"joints {', '.join(its.joint_names)}, not {', '.join(own.joint_names)}"
         if not np.array_equal(own.tree.mass, its.tree.mass):
             return f"links of {its.tree.mass.sum():.6g} kg, not {own.tree.mass.sum():.6g} kg"
-        for name in ("dt", "steps", "hold", "sampling", "q0", "v0", "integrator"):
+        for name in ("dt", "steps", "hold", "sampling", "q0", "v0", "integrator", "control_limits"):
             mine, theirs = getattr(self, name), getattr(other, name)
             if not np.array_equal(mine, theirs):
                 return f"{name} = {theirs}, not {mine}"
@@ -173,10 +180,16 @@ class OptimalControlProblem:
                 return f"another {name}"
         return ""
 
+    @property
+    def limited(self) -> bool:
+        """Whether any control has a limit."""
+        return bool(np.isfinite(self.control_limits).any())
+
     def holding_controls(self) -> Floats:
-        """The constant control (m,) that comes closest to holding the robot at q0 at rest."""
+        """The constant control (m,) that comes closest to holding the robot at q0 at rest, within its limits."""
         force = lagrangian_jet(self.scene, self.q0, np.zeros_like(self.q0)).Lq
-        return np.asarray(np.linalg.lstsq(self.scene.actuation, -force, rcond=None)[0], dtype=np.float64)
+        u = np.linalg.lstsq(self.scene.actuation, -force, rcond=None)[0]
+        return np.asarray(np.clip(u, *self.control_limits), dtype=np.float64)
 
     def holding_policy(self) -> LinearPolicy:
         """Holding controls, with feedback that keeps the robot there where every joint can be driven.
@@ -199,6 +212,7 @@ class OptimalControlProblem:
             np.tile(np.append(self.q0, np.zeros(n)), (R, 1)),
             hold=self.hold,
             on="momentum" if self.integrator.variational else "velocity",
+            limits=(self.control_limits[0], self.control_limits[1]),
         )
 
     def samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:

@@ -63,10 +63,15 @@ def solve(
     noise terms included, and searches along the new controls for a motion of lower expected cost: the cost of the
     motion itself, and what noise adds to it under the model.
 
+    Where controls have limits, each decision minimizes the model within them, and a control at a limit has no feedback
+    (Tassa, Mansard and Todorov, "Control-limited differential dynamic programming", 2014). What noise adds is then that
+    of the linear feedback: that noise may drive a control into its limit is not in the model. ``monte_carlo`` has it.
+
     Main args:
         problem: What to minimize.
         controls: To start from: None to hold the robot at q0; an array (R, m) or (m,), R the number of
-            decisions; a :class:`LinearPolicy`; or a :class:`Solution`, whose policy then runs on this problem.
+            decisions; a :class:`LinearPolicy`; or a :class:`Solution`, whose policy then runs on this problem. What
+            leaves the problem's limits is brought within them.
         tolerance: Stop when the decrease that the quadratic model promises is below this part of the cost.
         max_iterations: At most.
 
@@ -128,10 +133,13 @@ def _first_commands(problem: OptimalControlProblem, controls: ArrayLike | Linear
     if isinstance(controls, LinearPolicy):
         if controls.hold != problem.hold:
             raise InputError(f"the policy holds its controls over {controls.hold} steps, the problem {problem.hold}")
-        return controls.commands(problem.steps, m, problem.scene.robot.dof, variational)
+        commands = controls.commands(problem.steps, m, problem.scene.robot.dof, variational)
+        narrowed = np.clip(commands.limits, *problem.control_limits)
+        narrowed.setflags(write=False)
+        return commands._replace(limits=narrowed)
     rows = as_floats("controls", controls)
     rows = finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m))
-    return _held(np.broadcast_to(rows, (R, m)), problem.hold)
+    return _held(np.broadcast_to(rows, (R, m)), problem)
 
 
 def _search_of(problem: OptimalControlProblem, controls: object, resume: Solution) -> SearchState:
@@ -147,8 +155,16 @@ def _search_of(problem: OptimalControlProblem, controls: object, resume: Solutio
     return resume.search
 
 
-def _held(u: Floats, hold: int) -> Commands:
-    return open_loop(u)._replace(hold=hold)
+def _held(u: Floats, problem: OptimalControlProblem) -> Commands:
+    return open_loop(u)._replace(hold=problem.hold, limits=problem.control_limits.copy())
+
+
+def _onto_limits(u: Floats, limits: Floats) -> Floats:
+    """Controls (R, m) that rounding keeps from a limit brought to it, so that they are known to be there."""
+    room = 8.0 * np.finfo(float).eps * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
+    for limit in limits:
+        u = np.where(np.abs(u - limit) <= room, limit, u)
+    return u
 
 
 class _Search:
@@ -262,7 +278,7 @@ class _Search:
             promised_decrease=self.plan.promise,
             step=step,
             regularization=self.regularization,
-            gradient=float(np.abs(self.plan.gradient).max()),
+            gradient=float(np.abs(self.plan.free_gradient(self.problem, self.trajectory)).max()),
             backward_passes=passes,
             rollouts=trials,
             seconds=time.perf_counter() - started,
@@ -333,11 +349,12 @@ class _Search:
         if self.plan is None:
             return None
         problem, here = self.problem, self.trajectory
-        u = here.u[:: problem.hold] + step * self.plan.feedforward
+        u = _onto_limits(here.u[:: problem.hold] + step * self.plan.feedforward, problem.control_limits)
         if self.forward == "open":
-            commands = _held(u, problem.hold)
+            commands = _held(u, problem)
         else:
-            commands = Commands(u, self.plan.feedback, states(problem, here)[: -1 : problem.hold], problem.hold)
+            reference = states(problem, here)[: -1 : problem.hold]
+            commands = Commands(u, self.plan.feedback, reference, problem.hold, problem.control_limits.copy())
         try:
             moved, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, problem.dt)
         except NoiseFieldError as error:

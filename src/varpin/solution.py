@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from enum import Enum
 from pathlib import Path
@@ -24,6 +24,7 @@ from varpin.linearization import velocity_at_nodes
 from varpin.policy import LinearPolicy
 from varpin.problem import OptimalControlProblem, bind_cost
 from varpin.simulation import rollout
+from varpin.task_costs import barriers_of
 from varpin.trajectory import MEMBERS, Trajectory, atomic_file, read_members
 from varpin.wiener import generator
 
@@ -171,6 +172,27 @@ class MonteCarlo:
 
 
 @dataclass(frozen=True, eq=False)
+class Violations:
+    """How far a motion goes beyond limits, at its nodes: the most for each joint or control, zero where it does not.
+
+    Attributes:
+        position: Beyond the limits of the robot's joints, or of a narrower :class:`varpin.JointLimitBarrier` in the
+            cost (n,) [rad or m].
+        velocity: Likewise (n,) [rad/s or m/s].
+        control: Beyond the problem's control limits (m,).
+    """
+
+    position: Floats
+    velocity: Floats
+    control: Floats
+
+    @property
+    def any(self) -> bool:
+        """Whether there is one at all."""
+        return bool(any(part.any() for part in (self.position, self.velocity, self.control)))
+
+
+@dataclass(frozen=True, eq=False)
 class Solution:
     """The best motion a solver found, with the policy around it.
 
@@ -179,7 +201,8 @@ class Solution:
         trajectory: The motion without noise.
         gains: Feedback (R, m, 2n) on x = (q, p) or (q, v), for each of R decisions.
         feedforward: The change of the controls (R, m) that the last backward pass asked for; zero at an optimum.
-        gradient: Of the expected cost in the controls (R, m), under the solver's model of the noise.
+        gradient: Of the expected cost in the controls (R, m), under the solver's model of the noise. At an optimum it
+            is zero but where it pushes a control against its limit.
         cost: Of the motion without noise.
         noise_cost: What noise adds to it, by the solver's model.
         status: How the solver ended.
@@ -216,6 +239,17 @@ class Solution:
     def iterations(self) -> int:
         """Steps that were taken or tried."""
         return sum(item.rollouts > 0 for item in self.history)
+
+    @property
+    def violations(self) -> Violations:
+        """What the motion does beyond the limits of joints, whether the cost knows them or not, and of controls."""
+        robot, motion, speed = self.problem.scene.robot, self.trajectory, self.problem.scene.robot.velocity_limit
+        joints, speeds = barriers_of(self.problem.cost)
+        return Violations(
+            position=_beyond(motion.q, [robot.position_limits, *(term.limits for term in joints)]),
+            velocity=_beyond(motion.v, [(-speed, speed), *(term.limits for term in speeds)]),
+            control=_beyond(motion.u, [self.problem.control_limits]),
+        )
 
     @property
     def policy(self) -> LinearPolicy:
@@ -286,7 +320,9 @@ class Solution:
             raise InputError(f"decisions must be from 0 to {len(self.gains) - 1}, got {decisions}")
         own = self.policy
         rows = np.minimum(np.arange(len(self.gains)) + decisions, len(self.gains) - 1)
-        return LinearPolicy(own.u[rows], own.gains[rows], own.reference[rows], hold=own.hold, on=own.on)
+        return LinearPolicy(
+            own.u[rows], own.gains[rows], own.reference[rows], own.hold, own.on, (own.limits[0], own.limits[1])
+        )
 
     def policy_on(self, x: Literal["momentum", "velocity"], substeps: int = 1) -> LinearPolicy:
         """The policy on (q, p) or on (q, v), each control held over ``substeps`` times as many steps.
@@ -311,7 +347,8 @@ class Solution:
                 gains = np.concatenate([gains[:, :, :n] + second @ by_q, second @ by_p], axis=2)
         nodes = trajectory.p if x == "momentum" else trajectory.v
         reference = np.hstack([trajectory.q[rows], nodes[rows]])
-        return LinearPolicy(self.controls, gains, reference, hold=hold * substeps, on=x)
+        limits = self.problem.control_limits
+        return LinearPolicy(self.controls, gains, reference, hold * substeps, x, (limits[0], limits[1]))
 
     def verify(
         self, *, tolerance: float = 1e-10, max_substeps: int = 1024, progress: Callable[[int, int], None] | None = None
@@ -335,7 +372,7 @@ class Solution:
             blind = open_loop(self.controls)._replace(hold=problem.hold * substeps)
             opened = accurate_cost(problem, blind, substeps, costs)
             policy = self.policy_on("velocity", substeps)
-            feedback = Commands(policy.u, policy.gains, policy.reference, policy.hold)
+            feedback = Commands(policy.u, policy.gains, policy.reference, policy.hold, policy.limits)
             closed = accurate_cost(problem, feedback, substeps, costs)
             changes = [
                 abs(now[0] - then) / max(abs(now[0]), 1e-300)
@@ -419,7 +456,7 @@ class Solution:
 FORMAT = "varpin.solution/1"
 _PLAN = ("gains", "feedforward", "gradient")
 _NUMBERS = ("cost", "noise_cost")
-_PROBLEM = ("q0", "v0", "steps", "hold", "sampling")
+_PROBLEM = ("q0", "v0", "steps", "hold", "sampling", "control_limits")
 _SEARCH = ("cost", "first", "best_merit", "best_cost", "regularization", "growth")
 _COLUMNS = tuple(item.name for item in fields(Iteration))
 
@@ -521,6 +558,13 @@ class _Reader:
             history=history,
             search=search,
         )
+
+
+def _beyond(y: Floats, limits: Sequence[tuple[Floats, Floats] | Floats]) -> Floats:
+    """The most that each column of y (N, k) is outside any of some limits."""
+    excess = [np.maximum(y - upper, lower - y).max(axis=0) for lower, upper in limits]
+    most: Floats = np.maximum(0.0, np.max(excess, axis=0))
+    return most
 
 
 # Paths that are kept at a time to add up their costs.

@@ -215,7 +215,21 @@ def segments_of(nodes: Nodes, reasons: Mapping[int, str]) -> list[Segment]:
 
 def open_loop(u: Floats) -> Commands:
     """Controls (N, m) without feedback."""
-    return Commands(np.ascontiguousarray(u), np.zeros((0, u.shape[1], 0)), np.zeros((0, 0)), 1)
+    return Commands(np.ascontiguousarray(u), np.zeros((0, u.shape[1], 0)), np.zeros((0, 0)), 1, no_limits(u.shape[1]))
+
+
+def no_limits(controls: int) -> Floats:
+    """The limits (2, m) of controls that have none."""
+    return np.outer([-np.inf, np.inf], np.ones(controls))
+
+
+def control_of(commands: Commands, decision: int, x: Floats) -> Floats:
+    """The control (m,) of a decision at a state x (2n,), as kernels find it."""
+    u = commands.u[decision]
+    if len(commands.gains):
+        u = u + commands.gains[decision] @ (x - commands.reference[decision])
+    limited: Floats = np.clip(u, *commands.limits)
+    return limited
 
 
 def steps_of(commands: Commands) -> int:
@@ -226,4 +240,4 @@ def steps_of(commands: Commands) -> int:
 def rows(commands: Commands, begin: int, end: int) -> Commands:
     """The commands of decisions begin .. end."""
     part = slice(begin, end)
-    return Commands(commands.u[part], commands.gains[part], commands.reference[part], commands.hold)
+    return commands._replace(u=commands.u[part], gains=commands.gains[part], reference=commands.reference[part])

@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.errors import LinearizationError, SingularMassMatrix
-from varpin.integrators.base import Integrator, Segment, diffusion_and_drift, drifts, open_loop, segments_of, steps_of
+from varpin.integrators.base import (
+    Integrator,
+    Segment,
+    control_of,
+    diffusion_and_drift,
+    drifts,
+    open_loop,
+    segments_of,
+    steps_of,
+)
 from varpin.kernels import explicit as kernels
 from varpin.kernels.dynamics import Dynamics, forward_derivatives, new_dynamics
 from varpin.kernels.tree import Commands, new_nodes
@@ -68,9 +77,7 @@ class _Explicit(Integrator):
         is the same there, and as a jump of the velocity before the step for the others.
         """
         q, v = state.state.q[0], state.state.v[0]
-        control = command.u[0]
-        if len(command.gains):
-            control = control + command.gains[0] @ (np.concatenate([q, v]) - command.reference[0])
+        control = control_of(command, 0, np.concatenate([q, v]))
         F, drift = diffusion_and_drift(scene, q, v, control, state.start[0])
         if len(increment):
             impulse = F @ increment[0, 0]

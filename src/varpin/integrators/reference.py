@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from varpin.checks import positive
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
-from varpin.integrators.base import Failure, Integrator, Segment, drifts, segments_of, steps_of
+from varpin.integrators.base import Failure, Integrator, Segment, control_of, drifts, segments_of, steps_of
 from varpin.integrators.explicit import REASONS, accelerations
 from varpin.kernels import explicit as kernels
 from varpin.kernels.dynamics import Dynamics, forward_dynamics, new_dynamics
@@ -133,9 +133,7 @@ class Reference(Integrator):
         u = nodes.u[i]
         for s in range(len(u)):
             decision, held = divmod(s, commands.hold)
-            u[s] = u[s - 1] if held else commands.u[decision]
-            if len(commands.gains) and not held:
-                u[s] += commands.gains[decision] @ (state.x[i] - commands.reference[decision])
+            u[s] = u[s - 1] if held else control_of(commands, decision, state.x[i])
             force = scene.actuation @ u[s] + (drift[i, s] if len(drift) else 0.0)
             try:
                 x, nodes.tally[i, s, 2] = self._step(scene, state, i, force, dt)

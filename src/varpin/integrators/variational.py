@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from varpin.checks import count, fraction, positive
 from varpin.errors import InputError, SingularMassMatrix
-from varpin.integrators.base import Integrator, Segment, diffusion_and_drift, open_loop, segments_of
+from varpin.integrators.base import Integrator, Segment, control_of, diffusion_and_drift, open_loop, segments_of
 from varpin.kernels import midpoint as kernels
 from varpin.kernels import midpoint_equation as equation
 from varpin.kernels.tree import Commands, new_nodes
@@ -107,9 +107,7 @@ class Variational(Integrator):
     ) -> Segment:
         """One step of one path with diffusion fields that are evaluated in Python."""
         now = state.state
-        control = command.u[0]
-        if len(command.gains):
-            control = control + command.gains[0] @ (np.concatenate([now.q[0], now.p[0]]) - command.reference[0])
+        control = control_of(command, 0, np.concatenate([now.q[0], now.p[0]]))
         F, drift = diffusion_and_drift(scene, now.q[0], now.v[0], control, state.start[0])
         if len(increment):
             kernels.apply_impulse(scene.mechanism, self.left * (F @ increment[0, 0]), now, state.work)

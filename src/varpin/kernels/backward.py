@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from varpin.kernels._compile import inlined, kernel
+from varpin.kernels.box import solve_box
 from varpin.kernels.linalg import factor_ldl, solve_ldl, solve_ldl_rows
 from varpin.kernels.tree import Floats
 
@@ -31,6 +32,7 @@ class Steps(NamedTuple):
     hessian: Floats  # (N s, 2n + m, 2n + m), or (1, 2n + m, 2n + m)
     velocity: Floats  # (N + 1, n, 2n) dv/dx at the nodes; (0, n, 2n) where x holds v itself, or no sample asks for it
     curvature: Floats  # (N, 2n + m, 2n + m) to be added to the Hessian in (x, u), or (0, 2n + m, 2n + m)
+    slack: Floats  # (R, 2, m) least and greatest change of each control, or (0, 2, m) where controls have no limits
 
 
 class Value(NamedTuple):
@@ -66,6 +68,8 @@ class Room(NamedTuple):
     Quu: Floats  # (m, m)
     row: Floats  # (2n + m,)
     solved: Floats  # (2n + m,)
+    box: Floats  # (4, m)
+    H: Floats  # (m, m)
 
 
 def new_value(dof: int, controls: int) -> Value:
@@ -88,6 +92,8 @@ def new_room(dof: int, controls: int) -> Room:
         Quu=np.zeros((controls, controls)),
         row=np.zeros(size),
         solved=np.zeros(size),
+        box=np.zeros((4, controls)),
+        H=np.zeros((controls, controls)),
     )
 
 
@@ -238,8 +244,12 @@ def add_noise(steps: Steps, s: int, h: float, value: Value, gains: Gains, room: 
 
 
 @inlined
-def decide(regularization: float, r: int, value: Value, gains: Gains, room: Room) -> bool:
-    """Gains of decision ``r`` from Q and Qz, and the value under them; False where Quu is not positive definite."""
+def decide(regularization: float, r: int, slack: Floats, value: Value, gains: Gains, room: Room) -> bool:
+    """Gains of decision ``r`` from Q and Qz, and the value under them; False where Quu is not positive definite.
+
+    Within limits the feed-forward part minimizes the model there, and controls at a limit have no feedback (Tassa,
+    Mansard and Todorov 2014).
+    """
     Q, Qz, Quu, row, solved = room.Q, room.Qz, room.Quu, room.row, room.solved
     x, size = room.J.shape
     m = size - x
@@ -253,18 +263,25 @@ def decide(regularization: float, r: int, value: Value, gains: Gains, room: Room
         # A pivot of rounding's size is no pivot.
         if not Quu[i, i] > 0.0:
             return False
+    limited = slack.shape[0] > 0
+    if limited:
+        for i in range(m):
+            for j in range(m):
+                room.H[i, j] = Quu[i, j]
     if not factor_ldl(Quu):
         return False
     for i in range(m):
         row[i] = -Qz[x + i]
         gains.control_gradient[r, i] = room.costate[x + i]
     solve_ldl(Quu, row[:m], solved[:m])
+    if limited and not solve_box(room.H, Qz[x:], slack[r], solved[:m], Quu, room.box):
+        return False
     for i in range(m):
         gains.feedforward[r, i] = solved[i]
     K, k = gains.feedback[r], gains.feedforward[r]
     for i in range(m):
         for c in range(x):
-            K[i, c] = -Q[x + i, c]
+            K[i, c] = 0.0 if limited and room.box[0, i] != 0.0 else -Q[x + i, c]
     solve_ldl_rows(Quu, K)
     for i in range(m):
         total = 0.0
@@ -360,7 +377,7 @@ def backward_pass(
             add_noise(steps, s, h, value, gains, room)
         add_running_cost(steps, s, h, in_velocity, room)
         if s % hold == 0:
-            if not decide(regularization, s // hold, value, gains, room):
+            if not decide(regularization, s // hold, steps.slack, value, gains, room):
                 return s // hold
             continue
         for c in range(size):

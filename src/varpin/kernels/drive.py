@@ -8,7 +8,7 @@ from varpin.kernels.tree import Commands, Floats, Mechanism
 def apply_policy(commands: Commands, s: int, first: Floats, second: Floats, u: Floats) -> None:
     """Controls of step ``s`` into u (N, m): u = u_r + gains_r (x - x_r) with x = (first, second) and r = s // hold.
 
-    Without gains u = u_r; between two decisions the control before is held.
+    Without gains u = u_r; beyond a limit u is that limit; between two decisions the control before is held.
     """
     n = first.size
     if s % commands.hold != 0:
@@ -22,6 +22,11 @@ def apply_policy(commands: Commands, s: int, first: Floats, second: Floats, u: F
             for j in range(n):
                 total += commands.gains[r, c, j] * (first[j] - commands.reference[r, j])
                 total += commands.gains[r, c, n + j] * (second[j] - commands.reference[r, n + j])
+        # Neither comparison is true of NaN, which stays; max and min need not keep it.
+        if total < commands.limits[0, c]:  # noqa: PLR1730
+            total = commands.limits[0, c]
+        if total > commands.limits[1, c]:  # noqa: PLR1730
+            total = commands.limits[1, c]
         u[s, c] = total
 
 

@@ -17,7 +17,7 @@ from varpin.kernels.tree import Tree
 from varpin.robot.mimic import Tie, joint_index, rebuild, tied_model
 from varpin.robot.payload import Payload, carry
 from varpin.robot.sources import Description, describe, hang_shapes
-from varpin.robot.tree import flatten, is_unbounded, joint_axis, to_pinocchio
+from varpin.robot.tree import flatten, frame_index, is_unbounded, joint_axis, to_pinocchio
 
 Floats = NDArray[np.float64]
 
@@ -111,9 +111,7 @@ class Robot:
         if q.ndim != 2 or q.shape[1] != self.dof:
             raise InputError(f"q must have shape (N, {self.dof}), got {q.shape}")
         name = self.end_effector if frame is None else frame
-        if not self.free_model.existFrame(name):
-            raise InputError(f"robot {self.name!r} has no frame {name!r}")
-        index, data = self.free_model.getFrameId(name), self.free_model.createData()
+        index, data = frame_index(self.free_model, name, self.name), self.free_model.createData()
         positions = np.empty((len(q), 3))
         for k, row in enumerate(self.free_positions(q)):
             pin.forwardKinematics(self.free_model, data, row)

@@ -74,7 +74,7 @@ def carry(model: pin.Model, payload: Sequence[Payload], robot: str) -> None:
             raise InputError(f"payload must be of varpin.Payload, got {type(load).__name__}")
         names = [frame.name for frame in model.frames]
         if load.frame not in names:
-            raise UnknownFrame(load.frame, names, f"payload of robot {robot!r}")
+            raise UnknownFrame(load.frame, names, robot)
         frame = model.frames[names.index(load.frame)]
         if frame.parentJoint == 0:
             raise InputError(f"payload of robot {robot!r}: frame {load.frame!r} is part of the base, which carries it")

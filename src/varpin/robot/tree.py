@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from varpin.errors import RobotError, UnsupportedJoint
+from varpin.errors import InputError, RobotError, UnknownFrame, UnsupportedJoint
 from varpin.kernels.tree import Tree
 from varpin.robot.mimic import Tie
 
@@ -127,6 +127,33 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
         group=group,
         groups=int(group.max()) + 1,
     )
+
+
+def frame_index(model: pin.Model, frame: str, robot: str) -> int:
+    """Index of a frame by its name.
+
+    Raises:
+        UnknownFrame: There is none.
+    """
+    names = [item.name for item in model.frames]
+    if not isinstance(frame, str) or frame not in names:
+        raise UnknownFrame(str(frame), names, robot)
+    return names.index(frame)
+
+
+def frame_on_body(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats, Floats]:
+    """The body of the flat tree that carries a frame, and the frame's rotation (3, 3) and place (3,) in it.
+
+    Raises:
+        UnknownFrame: There is no such frame.
+        InputError: It is fixed to the base, and no joint moves it.
+    """
+    found = model.frames[frame_index(model, frame, robot)]
+    joint = found.parentJoint
+    if joint == 0:
+        raise InputError(f"frame {frame!r} of robot {robot!r} is fixed to the base: no joint moves it")
+    turn = z_to(joint_axis(model, joint)[1])
+    return joint - 1, turn.T @ found.placement.rotation, turn.T @ found.placement.translation
 
 
 def coordinate_armature(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...]) -> Floats:

@@ -1,0 +1,225 @@
+"""Where a frame and the centre of mass are, with their derivatives, at many configurations at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.errors import InputError
+from varpin.kernels.kinematics import Bodies, place
+from varpin.kernels.tree import Tree
+from varpin.robot.model import Robot
+from varpin.robot.tree import frame_on_body
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """Some bodies of a robot's tree with all their ancestors.
+
+    Attributes:
+        bodies: For the kernel.
+        gear: What each coordinate does to each of their c joints (c, n): a selection, but for mimic joints.
+    """
+
+    bodies: Bodies
+    gear: Floats
+
+    def place(self, q: Floats) -> tuple[Floats, Floats]:
+        """World rotations (N, c, 3, 3) and positions (N, c, 3) [m] at q (N, n)."""
+        count = len(self.gear)
+        # A copy, so that the kernel meets one kind of array.
+        q = np.array(q, order="C")
+        rotation, position = np.empty((len(q), count, 3, 3)), np.empty((len(q), count, 3))
+        place(self.bodies, q, rotation, position)
+        return rotation, position
+
+    def motions(self, rotation: Floats, lever: Floats) -> tuple[Floats, Floats]:
+        """Angular (N, c, 3) and linear velocity (N, c, 3) that each joint gives to a point at ``lever`` from it.
+
+        In world axes and per unit of the joint's rate; ``lever`` is (N, c, 3).
+        """
+        z = rotation[:, :, :, 2]
+        turns = (self.bodies.prismatic == 0)[:, None]
+        angular = np.where(turns, z, 0.0)
+        return angular, np.where(turns, cross(z, lever), z)
+
+
+def links(tree: Tree, body: int | None = None) -> Links:
+    """The bodies from the root to one of them, or all of them."""
+    if body is None:
+        members = np.arange(tree.parent.size)
+    else:
+        path = [body]
+        while tree.parent[path[-1]] >= 0:
+            path.append(int(tree.parent[path[-1]]))
+        members = np.array(path[::-1])
+    index = {int(b): k for k, b in enumerate(members)}
+    gear = np.zeros((len(members), tree.armature.size))
+    gear[np.arange(len(members)), tree.coordinate[members]] = tree.ratio[members]
+    parent = np.array([index.get(int(tree.parent[b]), -1) for b in members], dtype=np.int64)
+    bodies = Bodies(parent, *(np.ascontiguousarray(getattr(tree, name)[members]) for name in Bodies._fields[1:]))
+    return Links(bodies, gear)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameMotion:
+    """A frame at N configurations, and how the c joints before it move it, from the root on.
+
+    Attributes:
+        rotation: World orientation (N, 3, 3).
+        position: In the world (N, 3) [m].
+        angular: Angular velocity that each joint gives it (N, c, 3), in world axes, per unit of the joint's rate.
+        linear: Velocity of its origin likewise (N, c, 3).
+        gear: From coordinates to joints (c, n).
+    """
+
+    rotation: Floats
+    position: Floats
+    angular: Floats
+    linear: Floats
+    gear: Floats
+
+    def jacobian(self) -> Floats:
+        """(N, 6, n): linear over angular velocity in world axes, in v."""
+        both = np.concatenate([self.linear, self.angular], axis=2)
+        total: Floats = np.swapaxes(both, 1, 2) @ self.gear
+        return total
+
+    def twist_in_q(self, v: Floats) -> Floats:
+        """Derivative (N, 6, n) in q of linear and angular velocity at velocities v (N, n).
+
+        A joint turns the axes of all after it: with w_i and l_i what joint i gives to the frame, d l_j / dq_i is
+        w_i x l_j for i up to j and w_j x l_i beyond, and d w_j / dq_i is w_i x w_j for i before j, else zero.
+        """
+        rate = (v @ self.gear.T)[:, :, None]
+        spin, slide = rate * self.angular, rate * self.linear
+        before = np.cumsum(spin, axis=1) - spin
+        beyond = spin.sum(axis=1, keepdims=True) - before - spin
+        from_here = slide.sum(axis=1, keepdims=True) - np.cumsum(slide, axis=1) + slide
+        linear = cross(self.angular, from_here) + cross(before, self.linear)
+        both = np.concatenate([linear, cross(self.angular, beyond)], axis=2)
+        total: Floats = np.swapaxes(both, 1, 2) @ self.gear
+        return total
+
+    def jacobian_in_q(self) -> Floats:
+        """Derivative (N, n, 6, n) of the Jacobian: [:, i] in q_i, as in :meth:`twist_in_q`."""
+        c = self.angular.shape[1]
+        w, slide = self.angular, self.linear
+        first = np.arange(c)[:, None] <= np.arange(c)[None, :]  # joint i is not after joint j
+        ahead = cross(w[:, :, None], slide[:, None, :])  # [i, j]: w_i x l_j
+        linear = np.where(first[:, :, None], ahead, np.swapaxes(ahead, 1, 2))
+        turned = np.where(np.triu(first, 1)[:, :, None], cross(w[:, :, None], w[:, None, :]), 0.0)
+        both = np.concatenate([linear, turned], axis=3)
+        total: Floats = np.einsum("Nijr,ia,jb->Narb", both, self.gear, self.gear, optimize=True)
+        return total
+
+
+@dataclass(frozen=True, eq=False)
+class FrameKinematics:
+    """A frame of a robot. Made by :func:`frame_kinematics`.
+
+    Attributes:
+        frame: Its name.
+        links: The bodies from the root to the one that carries it.
+        rotation: Its orientation in that body (3, 3).
+        translation: Its place there (3,) [m].
+    """
+
+    frame: str
+    links: Links
+    rotation: Floats
+    translation: Floats
+
+    def placements(self, q: Floats) -> tuple[Floats, Floats]:
+        """World rotations (N, 3, 3) and positions (N, 3) [m] at q (N, n)."""
+        return self._on_body(*self.links.place(q))
+
+    def _on_body(self, rotation: Floats, position: Floats) -> tuple[Floats, Floats]:
+        R, p = rotation[:, -1], position[:, -1]
+        return R @ self.rotation, p + R @ self.translation
+
+    def motion(self, q: Floats) -> FrameMotion:
+        """The frame at q (N, n) with its derivatives."""
+        rotation, position = self.links.place(q)
+        R, p = self._on_body(rotation, position)
+        angular, linear = self.links.motions(rotation, p[:, None] - position)
+        return FrameMotion(R, p, angular, linear, self.links.gear)
+
+
+def frame_kinematics(robot: Robot, frame: str) -> FrameKinematics:
+    """A frame by its name.
+
+    Raises:
+        UnknownFrame: The robot has no such frame.
+        InputError: No joint moves it.
+    """
+    body, rotation, translation = frame_on_body(robot.free_model, frame, robot.name)
+    return FrameKinematics(frame, links(robot.tree, body), rotation, translation)
+
+
+@dataclass(frozen=True, eq=False)
+class CenterOfMass:
+    """The centre of mass of the links that joints move. Made by :func:`center_of_mass`.
+
+    Attributes:
+        links: All bodies.
+        center: Of each in its own frame (b, 3) [m].
+        share: Of the mass in each (b,).
+        after: Which bodies each joint moves (b, b): ones in row j for j and all after it.
+    """
+
+    links: Links
+    center: Floats
+    share: Floats
+    after: Floats
+
+    def position(self, q: Floats) -> Floats:
+        """In the world (N, 3) [m] at q (N, n)."""
+        total: Floats = self.share @ self._centers(*self.links.place(q))
+        return total
+
+    def _centers(self, rotation: Floats, position: Floats) -> Floats:
+        centers: Floats = position + (rotation @ self.center[:, :, None])[..., 0]
+        return centers
+
+    def motion(self, q: Floats) -> tuple[Floats, Floats]:
+        """Position (N, 3) and its derivative in q (N, 3, n)."""
+        rotation, position = self.links.place(q)
+        moments = self.share[:, None] * self._centers(rotation, position)
+        moved = self.after @ self.share  # the share of the mass that a joint moves
+        # The joint moves that part as one body: its share times the lever to its centre.
+        lever = self.after @ moments - moved[:, None] * position
+        _, linear = self.links.motions(rotation, lever)
+        linear = np.where(self.links.bodies.prismatic[:, None] == 0, linear, moved[:, None] * linear)
+        return moments.sum(axis=1), np.swapaxes(linear, 1, 2) @ self.links.gear
+
+
+def center_of_mass(robot: Robot) -> CenterOfMass:
+    """The centre of mass of the links that joints move.
+
+    Raises:
+        InputError: They have no mass.
+    """
+    tree = robot.tree
+    if not tree.mass.sum() > 0.0:
+        raise InputError(f"the links of robot {robot.name!r} have no mass, so no centre of it")
+    count = tree.parent.size
+    after = np.eye(count)
+    for body in range(count - 1, -1, -1):
+        if tree.parent[body] >= 0:
+            after[tree.parent[body]] += after[body]
+    return CenterOfMass(links(tree), tree.center, tree.mass / tree.mass.sum(), after)
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """The vector product a x b along the last axis, for many short vectors several times as fast as ``numpy.cross``."""
+    x, y = np.broadcast_arrays(a, b)
+    out = np.empty(x.shape)
+    out[..., 0] = x[..., 1] * y[..., 2] - x[..., 2] * y[..., 1]
+    out[..., 1] = x[..., 2] * y[..., 0] - x[..., 0] * y[..., 2]
+    out[..., 2] = x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]
+    return out

@@ -1,0 +1,552 @@
+"""Costs in the task: frames, the centre of mass, manipulability, and barriers at the limits of joints.
+
+All are least squares, weight . r^2 with a residual r, evaluated at all points at once. Their Hessians are those of
+Gauss and Newton, 2 J' weight J with J the residual's derivative: positive semidefinite, and exact where r is zero or
+linear.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from varpin.checks import as_floats, broadcast_array, checked_limits, positive, require_finite
+from varpin.costs import (
+    BoundCost,
+    Cost,
+    CostError,
+    Expansion,
+    Points,
+    Reference,
+    Scaled,
+    Terminal,
+    checked_weight,
+    sample,
+    weight_matrix,
+)
+from varpin.errors import InputError
+from varpin.robot import Robot
+from varpin.robot.kinematics import (
+    CenterOfMass,
+    FrameKinematics,
+    center_of_mass,
+    cross,
+    frame_kinematics,
+)
+
+Floats = NDArray[np.float64]
+
+
+class _Residual:
+    """A residual at given points; ``columns`` are those entries of z = (q, v, u) it depends on."""
+
+    columns: slice
+
+    @abstractmethod
+    def value(self, q: Floats, v: Floats) -> Floats:
+        """Its values (..., N, r) at q and v (..., N, n)."""
+
+    @abstractmethod
+    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
+        """Its values (N, r) and their derivatives in its columns (N, r, c)."""
+
+
+@dataclass(frozen=True, eq=False)
+class _BoundTask(BoundCost):
+    residual: _Residual
+    weight: Floats  # (r, r)
+    size: int
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
+        error = self.residual.value(q, v)
+        total: Floats = np.einsum("...i,...i->...", error @ self.weight, error)
+        return total
+
+    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:  # noqa: ARG002
+        error, J = self.residual.expand(q, v)
+        columns = self.residual.columns
+        WJ = 2.0 * (self.weight @ J)
+        gradient, hessian = np.zeros((len(q), self.size)), np.zeros((len(q), self.size, self.size))
+        gradient[:, columns] = (error[:, None, :] @ WJ)[:, 0]
+        hessian[:, columns, columns] = np.swapaxes(J, 1, 2) @ WJ
+        return Expansion(gradient, hessian)
+
+
+class _TaskCost(Cost):
+    """weight . r^2 with a residual of ``size`` entries."""
+
+    robot: Robot
+    weight: Floats
+    size: int
+
+    def __init__(self, robot: Robot, weight: ArrayLike) -> None:
+        if not isinstance(robot, Robot):
+            raise InputError(f"{type(self).__name__} takes a robot from load_robot, got {type(robot).__name__}")
+        self.robot = robot
+        self.weight = checked_weight(type(self).__name__, weight)
+        weight_matrix(type(self).__name__, self.weight, self.size)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self._subject()}weight={self.weight.tolist()})"
+
+    def _subject(self) -> str:
+        return ""
+
+    def bind(self, points: Points) -> BoundCost:
+        """See :meth:`varpin.costs.Cost.bind`."""
+        name = type(self).__name__
+        if points.dof != self.robot.dof:
+            raise InputError(
+                f"{name} is for robot {self.robot.name!r} with {self.robot.dof} coordinates; "
+                f"the problem has {points.dof}"
+            )
+        return _BoundTask(self._at(points), weight_matrix(name, self.weight, self.size), points.size)
+
+    @abstractmethod
+    def _at(self, points: Points) -> _Residual:
+        """The residual at given points."""
+
+
+class _FrameCost(_TaskCost):
+    frame: str
+
+    def __init__(self, robot: Robot, frame: str, weight: ArrayLike) -> None:
+        super().__init__(robot, weight)
+        self.frame = frame
+        self._kinematics = frame_kinematics(robot, frame)
+
+    def _subject(self) -> str:
+        return f"{self.frame!r}, "
+
+
+def _rows(x: Floats) -> Floats:
+    """(..., N, n) as (rows, n)."""
+    return x.reshape(-1, x.shape[-1])
+
+
+@dataclass(frozen=True, eq=False)
+class _Position(_Residual):
+    of: FrameKinematics
+    target: Floats  # (N, 3) or (1, 3)
+    columns: slice
+
+    def value(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
+        return self.of.placements(_rows(q))[1].reshape(*q.shape[:-1], 3) - self.target
+
+    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:  # noqa: ARG002
+        motion = self.of.motion(q)
+        return motion.position - self.target, motion.jacobian()[:, :3]
+
+
+class FramePositionCost(_FrameCost):
+    """weight . (p(q) - p_r(t))^2: bring the origin of a frame to a place, or along a path."""
+
+    size = 3
+
+    def __init__(self, robot: Robot, frame: str, target: Reference, weight: ArrayLike = 1.0) -> None:
+        """Describe the cost.
+
+        Args:
+            robot: The robot.
+            frame: Name of the frame.
+            target: p_r in the world [m]: a constant (3,), a function of the time [s] that returns (3,), or an array
+                (N + 1, 3) of its values at the problem's nodes, between which it is linear.
+            weight: One number, (3,), or a matrix (3, 3), positive semidefinite [cost / m^2].
+
+        Raises:
+            UnknownFrame: The robot has no such frame.
+            InputError: The frame is fixed to the base, or a weight is no such weight.
+        """
+        super().__init__(robot, frame, weight)
+        self.target = target if callable(target) else as_floats("FramePositionCost target", target)
+
+    def _at(self, points: Points) -> _Residual:
+        target = sample("FramePositionCost", self.target, points, 3)
+        return _Position(self._kinematics, target, slice(0, points.dof))
+
+
+@dataclass(frozen=True, eq=False)
+class _Orientation(_Residual):
+    of: FrameKinematics
+    target: Floats  # (N, 3, 3) or (1, 3, 3)
+    columns: slice
+
+    def value(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
+        R = self.of.placements(_rows(q))[0].reshape(*q.shape[:-1], 3, 3)
+        return rotation_vectors(np.swapaxes(self.target, 1, 2) @ R)
+
+    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:  # noqa: ARG002
+        motion = self.of.motion(q)
+        error = rotation_vectors(np.swapaxes(self.target, 1, 2) @ motion.rotation)
+        in_frame = np.swapaxes(motion.rotation, 1, 2) @ motion.jacobian()[:, 3:]
+        return error, _inverse_right_jacobian(error) @ in_frame
+
+
+class FrameOrientationCost(_FrameCost):
+    """weight . log(R_r(t)' R(q))^2: turn a frame.
+
+    The residual is the rotation vector [rad] from target to frame, in the frame's own axes. It is at most pi long, and
+    jumps there: a target half a turn away has no direction to turn in.
+    """
+
+    size = 3
+
+    def __init__(
+        self, robot: Robot, frame: str, target: ArrayLike | Callable[[float], ArrayLike], weight: ArrayLike = 1.0
+    ) -> None:
+        """Describe the cost.
+
+        Args:
+            robot: The robot.
+            frame: Name of the frame.
+            target: R_r from the frame's axes to the world's: a rotation matrix (3, 3), a function of the time [s]
+                that returns one, or an array (N + 1, 3, 3) of them at the problem's nodes, between which it turns
+                evenly.
+            weight: One number, (3,), or a matrix (3, 3), positive semidefinite [cost / rad^2].
+
+        Raises:
+            UnknownFrame: The robot has no such frame.
+            InputError: The frame is fixed to the base, or a weight is no such weight.
+        """
+        super().__init__(robot, frame, weight)
+        self.target = target if callable(target) else as_floats("FrameOrientationCost target", target)
+
+    def _at(self, points: Points) -> _Residual:
+        return _Orientation(self._kinematics, _sample_rotations(self.target, points), slice(0, points.dof))
+
+
+def rotation_vectors(R: Floats) -> Floats:
+    """The logarithm (..., 3) [rad] of rotation matrices (..., 3, 3)."""
+    vectors: Floats = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()
+    return vectors.reshape(*R.shape[:-2], 3)
+
+
+def _inverse_right_jacobian(r: Floats) -> Floats:
+    """J (N, 3, 3) with d log(R) = J w dt for a rotation R = exp(r) that turns with w in its own axes.
+
+    1 + [r]/2 + (1 - (a/2) cot(a/2)) [r]^2 / a^2 with a = |r| (Chirikjian, Stochastic Models, Information Theory, and
+    Lie Groups 2, 2011, 10.86).
+    """
+    square = np.einsum("Ni,Ni->N", r, r)
+    angle = np.sqrt(square)
+    small = angle < 1e-3
+    half = np.where(small, 1.0, 0.5 * angle)
+    factor = np.where(small, 1.0 / 12.0 + square / 720.0, (1.0 - half / np.tan(half)) / np.where(small, 1.0, square))
+    skew = cross(r[:, None, :], np.eye(3)).swapaxes(1, 2)
+    total: Floats = np.eye(3) + 0.5 * skew + factor[:, None, None] * (skew @ skew)
+    return total
+
+
+def _sample_rotations(target: Floats | Callable[[float], ArrayLike], points: Points) -> Floats:
+    """Rotation matrices at the points, (N, 3, 3), or (1, 3, 3) where they are constant."""
+    name = "FrameOrientationCost"
+    if callable(target):
+        found = []
+        for time in points.t.tolist():
+            try:
+                found.append(as_floats("the target", target(time)))
+                _require_rotations("the target", found[-1][None])
+            except Exception as error:
+                raise CostError(name, f"at t = {time:.6g} s: {error}") from error
+        return np.array(found)
+    if target.shape == (3, 3):
+        return _require_rotations(f"{name} target", target[None])
+    if target.shape != (points.steps + 1, 3, 3):
+        raise InputError(
+            f"{name} target must be a function of time, have shape (3, 3), or ({points.steps + 1}, 3, 3): one matrix "
+            f"for each of the problem's nodes; got {target.shape}"
+        )
+    nodes = np.linspace(0.0, points.duration, points.steps + 1)
+    turns = Slerp(nodes, Rotation.from_matrix(_require_rotations(f"{name} target", target)))
+    between: Floats = turns(np.clip(points.t, 0.0, points.duration)).as_matrix()
+    return between
+
+
+def _require_rotations(name: str, R: Floats) -> Floats:
+    if R.shape[1:] != (3, 3):
+        raise InputError(f"{name} must have shape (3, 3), got {R.shape[1:]}")
+    require_finite(name, R)
+    off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
+    wrong = (off > 1e-6) | (np.linalg.det(R) < 0.0)
+    if wrong.any():
+        which = "" if len(R) == 1 else f" number {int(np.argmax(wrong))}"
+        raise InputError(f"{name}{which} is no rotation matrix: R'R is {off.max():.3g} from 1, or R mirrors")
+    return R
+
+
+@dataclass(frozen=True, eq=False)
+class _Twist(_Residual):
+    of: FrameKinematics
+    target: Floats  # (N, 6) or (1, 6)
+    columns: slice
+
+    def value(self, q: Floats, v: Floats) -> Floats:
+        J = self.of.motion(_rows(q)).jacobian()
+        return (J @ _rows(v)[:, :, None]).reshape(*q.shape[:-1], 6) - self.target
+
+    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
+        motion = self.of.motion(q)
+        J = motion.jacobian()
+        return (J @ v[:, :, None])[..., 0] - self.target, np.concatenate([motion.twist_in_q(v), J], axis=2)
+
+
+class FrameVelocityCost(_FrameCost):
+    """weight . (J(q) v - V_r(t))^2: the velocity of a frame's origin, and its angular velocity, in world axes."""
+
+    size = 6
+
+    def __init__(self, robot: Robot, frame: str, target: Reference = 0.0, weight: ArrayLike = 1.0) -> None:
+        """Describe the cost.
+
+        Args:
+            robot: The robot.
+            frame: Name of the frame.
+            target: V_r, linear [m/s] over angular [rad/s] velocity (6,), as for :class:`FramePositionCost`.
+            weight: One number, (6,), or a matrix (6, 6), positive semidefinite; zeros leave directions out.
+
+        Raises:
+            UnknownFrame: The robot has no such frame.
+            InputError: The frame is fixed to the base, or a weight is no such weight.
+        """
+        super().__init__(robot, frame, weight)
+        self.target = target if callable(target) else as_floats("FrameVelocityCost target", target)
+
+    def _at(self, points: Points) -> _Residual:
+        target = sample("FrameVelocityCost", self.target, points, 6)
+        return _Twist(self._kinematics, target, slice(0, 2 * points.dof))
+
+
+@dataclass(frozen=True, eq=False)
+class _Center(_Residual):
+    of: CenterOfMass
+    target: Floats  # (N, 3) or (1, 3)
+    columns: slice
+
+    def value(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
+        return self.of.position(_rows(q)).reshape(*q.shape[:-1], 3) - self.target
+
+    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:  # noqa: ARG002
+        position, J = self.of.motion(q)
+        return position - self.target, J
+
+
+class CenterOfMassCost(_TaskCost):
+    """weight . (c(q) - c_r(t))^2 with c the centre of mass of the links that joints move."""
+
+    size = 3
+
+    def __init__(self, robot: Robot, target: Reference, weight: ArrayLike = 1.0) -> None:
+        """Describe the cost; see :class:`FramePositionCost`.
+
+        Raises:
+            InputError: The links have no mass, or a weight is no such weight.
+        """
+        super().__init__(robot, weight)
+        self._center = center_of_mass(robot)
+        self.target = target if callable(target) else as_floats("CenterOfMassCost target", target)
+
+    def _at(self, points: Points) -> _Residual:
+        return _Center(self._center, sample("CenterOfMassCost", self.target, points, 3), slice(0, points.dof))
+
+
+_DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
+_SETS = {"all": _DIRECTIONS, "linear": _DIRECTIONS[:3], "angular": _DIRECTIONS[3:]}
+
+
+@dataclass(frozen=True, eq=False)
+class _Dexterity(_Residual):
+    of: FrameKinematics
+    rows: list[int]
+    least: float
+    columns: slice
+
+    def value(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
+        J = self.of.motion(_rows(q)).jacobian()[:, self.rows]
+        w = np.linalg.svd(J, compute_uv=False).prod(axis=-1)
+        lack: Floats = np.maximum(0.0, self.least - w).reshape(*q.shape[:-1], 1)
+        return lack
+
+    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:  # noqa: ARG002
+        motion = self.of.motion(q)
+        U, s, Vt = np.linalg.svd(motion.jacobian()[:, self.rows], full_matrices=False)
+        # dw = sum_k (product of the other singular values) u_k' dJ v_k, which holds where some of them vanish, too.
+        others = np.stack([np.delete(s, k, axis=1).prod(axis=1) for k in range(s.shape[1])], axis=1)
+        weights = (U * others[:, None, :]) @ Vt
+        slope = np.einsum("Nirb,Nrb->Ni", motion.jacobian_in_q()[:, :, self.rows], weights)
+        lack = self.least - s.prod(axis=1)
+        return np.maximum(0.0, lack)[:, None], np.where(lack > 0.0, -1.0, 0.0)[:, None, None] * slope[:, None, :]
+
+
+class ManipulabilityCost(_FrameCost):
+    """weight (least - w(q))^2 where w < least: keep away from singular configurations.
+
+    w = sqrt(det(J J')) of the frame's Jacobian (Yoshikawa, "Manipulability of robotic mechanisms", 1985), zero where
+    the frame cannot move in some direction.
+    """
+
+    size = 1
+
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        least: float,
+        weight: float = 1.0,
+        directions: str | Sequence[str] = "all",
+    ) -> None:
+        """Describe the cost.
+
+        Args:
+            robot: The robot.
+            frame: Name of the frame.
+            least: The manipulability below which it costs, in the units of the directions' product [m or rad each].
+            weight: One number.
+            directions: Which velocities of the frame are to be possible: ``"all"`` six, ``"linear"``, ``"angular"``, or
+                some of x, y, z, rx, ry, rz, in world axes.
+
+        Raises:
+            UnknownFrame: The robot has no such frame.
+            InputError: More directions than coordinates, of which one is always impossible; or as for the others.
+        """
+        super().__init__(robot, frame, weight)
+        if self.weight.ndim:
+            raise InputError(f"ManipulabilityCost weight must be one number, got shape {self.weight.shape}")
+        chosen = _SETS.get(directions, ()) if isinstance(directions, str) else tuple(directions)
+        if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(_DIRECTIONS):
+            raise InputError(
+                "ManipulabilityCost directions must be 'all', 'linear', 'angular' or some of "
+                f"{', '.join(_DIRECTIONS)}; got {directions!r}"
+            )
+        if len(chosen) > robot.dof:
+            raise InputError(
+                f"ManipulabilityCost: with {robot.dof} coordinates no frame moves freely in {len(chosen)} directions"
+            )
+        self.least = positive("ManipulabilityCost least", least, "m or rad for each direction")
+        self.rows = [_DIRECTIONS.index(name) for name in chosen]
+
+    def _at(self, points: Points) -> _Residual:
+        return _Dexterity(self._kinematics, self.rows, self.least, slice(0, points.dof))
+
+
+@dataclass(frozen=True, eq=False)
+class _Excess(_Residual):
+    lower: Floats
+    upper: Floats
+    columns: slice
+    in_velocity: bool
+
+    def value(self, q: Floats, v: Floats) -> Floats:
+        y = v if self.in_velocity else q
+        return np.maximum(0.0, y - self.upper) - np.maximum(0.0, self.lower - y)
+
+    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
+        y = v if self.in_velocity else q
+        outside = ((y > self.upper) | (y < self.lower)).astype(np.float64)
+        return self.value(q, v), outside[:, :, None] * np.eye(y.shape[1])
+
+
+class _Barrier(_TaskCost):
+    limits: Floats
+    in_velocity: bool
+
+    def __init__(
+        self,
+        robot: Robot,
+        weight: ArrayLike,
+        margin: ArrayLike,
+        limits: tuple[ArrayLike, ArrayLike] | None,
+    ) -> None:
+        self.size = robot.dof if isinstance(robot, Robot) else 0
+        super().__init__(robot, weight)
+        name = type(self).__name__
+        self.limits = checked_limits(f"{name} limits", self._own(robot) if limits is None else limits, self.size)
+        if not np.isfinite(self.limits).any():
+            raise InputError(f"{name}: robot {robot.name!r} has no such limits; give limits=(lower, upper)")
+        self.margin = broadcast_array(f"{name} margin", margin, self.size)
+        if (self.margin < 0.0).any():
+            raise InputError(f"{name} margin must be >= 0, got {self.margin.min():g}")
+
+    @staticmethod
+    @abstractmethod
+    def _own(robot: Robot) -> tuple[Floats, Floats]:
+        """The robot's limits."""
+
+    def _at(self, points: Points) -> _Residual:
+        n = points.dof
+        columns = slice(n, 2 * n) if self.in_velocity else slice(0, n)
+        return _Excess(self.limits[0] + self.margin, self.limits[1] - self.margin, columns, self.in_velocity)
+
+
+class JointLimitBarrier(_Barrier):
+    """weight . (what q is beyond a limit less a margin)^2: keep joints within their limits.
+
+    A penalty that begins ``margin`` before the limit and is zero farther inside; it is finite beyond the limit, so that
+    a search may begin there. ``Solution.violations`` says what is left.
+    """
+
+    in_velocity = False
+
+    def __init__(
+        self,
+        robot: Robot,
+        weight: ArrayLike = 1.0,
+        margin: ArrayLike = 0.0,
+        limits: tuple[ArrayLike, ArrayLike] | None = None,
+    ) -> None:
+        """Describe the cost.
+
+        Args:
+            robot: The robot.
+            weight: One number, (n,), or a matrix (n, n), positive semidefinite.
+            margin: One number or (n,) >= 0 [rad or m].
+            limits: (lower, upper), each one number or (n,), infinite where there is none; the robot's if left out.
+
+        Raises:
+            InputError: There is no limit, or an argument has a wrong shape or value.
+        """
+        super().__init__(robot, weight, margin, limits)
+
+    @staticmethod
+    def _own(robot: Robot) -> tuple[Floats, Floats]:
+        return robot.position_limits
+
+
+class VelocityLimitBarrier(_Barrier):
+    """weight . (what v is beyond a limit less a margin)^2; see :class:`JointLimitBarrier`."""
+
+    in_velocity = True
+
+    def __init__(
+        self,
+        robot: Robot,
+        weight: ArrayLike = 1.0,
+        margin: ArrayLike = 0.0,
+        limits: tuple[ArrayLike, ArrayLike] | None = None,
+    ) -> None:
+        """Describe the cost; see :class:`JointLimitBarrier`, with velocities [rad/s or m/s]."""
+        super().__init__(robot, weight, margin, limits)
+
+    @staticmethod
+    def _own(robot: Robot) -> tuple[Floats, Floats]:
+        return -robot.velocity_limit, robot.velocity_limit
+
+
+def barriers_of(cost: Cost) -> tuple[list[JointLimitBarrier], list[VelocityLimitBarrier]]:
+    """The barriers among the terms of a cost."""
+    joints: list[JointLimitBarrier] = []
+    speeds: list[VelocityLimitBarrier] = []
+    for term in cost.terms:
+        inner = term
+        while isinstance(inner, Terminal | Scaled):
+            inner = inner.cost
+        for part in inner.terms:
+            if isinstance(part, JointLimitBarrier):
+                joints.append(part)
+            elif isinstance(part, VelocityLimitBarrier):
+                speeds.append(part)
+    return joints, speeds
