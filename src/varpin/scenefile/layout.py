@@ -90,7 +90,7 @@ class Layout:
             if space == "frame" and not joints_of_frame(robot, term.spec.frame).any():
                 continue
             index = driven if space == "u" else keep
-            costs.append(_part(term, index) if term.spec.term.by_name else term)
+            costs.append(_part(term, index) if term.spec.term.of_joints else term)
         noise = []
         for model in self.noise:
             index = driven if model.kind == "control" else keep
@@ -159,10 +159,9 @@ class Layout:
             spec, target = term.spec, term.target
             if term.hold is not None:
                 target = constant(holding_controls(scene, term.hold))
-            weight = term.weight if spec.term.by_name else float(term.weight[0])
-            if spec.term.by_name and not term.weight.any():
+            if not term.weight.any() or (spec.term.limits and not np.isfinite(spec.term.limits(self.robot)).any()):
                 continue
-            given = Given(self.robot, weight, target, spec.frame, spec.numbers)
+            given = Given(self.robot, term.weight, target, spec.frame, spec.numbers, spec.words)
             try:
                 made = spec.term.make(given)
             except VarpinError as error:
@@ -321,11 +320,14 @@ def _term(spec: CostSpec, robot: Robot, driven: Sequence[str], duration: float) 
     if term.frame and not robot.free_model.existFrame(spec.frame):
         names = [frame.name for frame in robot.free_model.frames]
         raise table.error("frame", f"there is no frame {spec.frame!r}; {suggestion(spec.frame, names, 'frames')}")
-    whose, what = (tuple(driven), "driven joint") if term.space == "u" else (robot.joint_names, "joint")
-    weight = table.spread("weight", spec.weight, whose, what) if term.by_name else np.array([float(spec.weight)])  # type: ignore[arg-type]
+    if term.limits and not np.isfinite(term.limits(robot)).any():
+        raise table.error("type", f"robot {robot.name!r} has no such limits")
+    joints, what = (tuple(driven), "driven joint") if term.space == "u" else (robot.joint_names, "joint")
+    axes, kind = (joints, what) if term.of_joints else (term.axes, "axis")
+    weight = table.spread("weight", spec.weight, axes, kind)
     target = None
     if spec.reference is not None:
-        components, kind = (term.components, "component") if term.components else (whose, what)
+        components, kind = (joints, what) if term.of_joints else (term.components, "component")
         target = spec.reference.timeline(components, duration, kind)
         if term.space == "q" and target.constant and term.reference is not None:
             _refuse_degrees(table, term.reference, target(0.0), robot)

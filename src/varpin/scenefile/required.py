@@ -108,6 +108,10 @@ def _costs(term: CostTerm, layout: Layout, scene: Scene, t: Floats) -> Mask:
     if space == "robot":
         return ~touched
     rest = {"q": layout.q0, "v": np.zeros(layout.robot.dof), "u": np.zeros(len(layout.actuated))}[space]
+    if term.spec.term.limits is not None:
+        lower, upper = term.spec.term.limits(layout.robot)
+        margin = term.spec.numbers["margin"]
+        return np.asarray((term.weight != 0.0) & ((rest > upper - margin) | (rest < lower + margin)))
     if term.hold is not None:
         wanted = holding_controls(scene, term.hold)[None]
     else:

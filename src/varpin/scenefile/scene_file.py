@@ -55,14 +55,6 @@ class SceneFile:
         """The robot that is computed."""
         return self.scene.robot
 
-    @property
-    def control_limits(self) -> tuple[Floats, Floats] | None:
-        """Lower and upper bounds of the controls (m,), (m,), from the torque limits; None if there are none."""
-        if not np.isfinite(self._layout.torque_limit).any():
-            return None
-        most = self._layout.torque_limit / np.abs(self._layout.gear)
-        return -most, most
-
     @cached_property
     def problem(self) -> OptimalControlProblem:
         """The optimal control problem of the file.
@@ -76,6 +68,7 @@ class SceneFile:
         spec = self.spec
         if not spec.costs:
             raise spec.root.error("cost", "is missing; a scene to solve has a [[cost]] at least")
+        most = layout.torque_limit / np.abs(layout.gear)
         try:
             return OptimalControlProblem(
                 scene,
@@ -87,6 +80,7 @@ class SceneFile:
                 integrator=spec.integrator,
                 sampling=spec.sampling,  # type: ignore[arg-type]
                 hold=spec.hold,
+                control_limits=(-most, most),
             )
         except (InputError, CostError) as error:
             raise spec.root.error("", str(error)) from None
@@ -206,7 +200,7 @@ def load_scene(source: str | Path, *, required_only: bool = True) -> SceneFile:
         stays = idle_joints(whole, scene)
         idle = [name for name, out in zip(whole.robot.joint_names, stays, strict=True) if out]
     layout = whole.without(idle)
-    return SceneFile(
+    file = SceneFile(
         spec=spec,
         required=requirements(layout, whole, idle),
         scene=scene if layout is whole else layout.scene(),
@@ -214,3 +208,7 @@ def load_scene(source: str | Path, *, required_only: bool = True) -> SceneFile:
         v0=layout.v0,
         _layout=layout,
     )
+    if spec.costs:
+        # So that every mistake in the file is said now.
+        file.problem  # noqa: B018
+    return file

@@ -68,6 +68,7 @@ class CostSpec:
         hold: A configuration whose holding torques are the reference, by joint; ``()`` for the initial one.
         frame: Name of a frame, for terms that have one.
         numbers: What else it takes.
+        words: What else it takes.
     """
 
     table: Table
@@ -78,6 +79,7 @@ class CostSpec:
     hold: ByName | None
     frame: str
     numbers: Mapping[str, float]
+    words: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -382,7 +384,7 @@ def _cost(table: Table, folder: Path, dt: float) -> CostSpec:
     terminal = ("terminal",) if term.can_end else ()
     if "terminal" in table and not terminal:
         raise table.error("terminal", f"a term {kind!r} has no meaning at the end: there is no control there")
-    table.allow("type", "weight", *reference, *frame, *held, *terminal, *term.numbers)
+    table.allow("type", "weight", *reference, *frame, *held, *terminal, *term.numbers, *term.words)
     hold: ByName | None = None
     if "hold" in table:
         table.one_of(*held, *reference)
@@ -392,7 +394,7 @@ def _cost(table: Table, folder: Path, dt: float) -> CostSpec:
         default = 0.0 if term.optional else None
         found = read_reference(table, term.reference, folder, dt, default)
     weight = table.by_name("weight", 1.0, least=0.0)
-    if not term.by_name and not isinstance(weight, float):
+    if len(term.axes) == 1 and not isinstance(weight, float):
         raise table.error("weight", "must be one number")
     return CostSpec(
         table=table,
@@ -402,7 +404,8 @@ def _cost(table: Table, folder: Path, dt: float) -> CostSpec:
         reference=found,
         hold=hold,
         frame=table.text("frame") if term.frame else "",
-        numbers={name: table.number(name, default, above=0.0) for name, default in term.numbers.items()},
+        numbers={name: table.number(name, default, least=0.0) for name, default in term.numbers.items()},
+        words={name: table.choice(name, options, options[0]) for name, options in term.words.items()},
     )
 
 

@@ -116,7 +116,7 @@ class Table:
         name: str,
         default: float | None = None,
         *,
-        unit: str = "1",
+        unit: str = "",
         above: float = -math.inf,
         least: float = -math.inf,
         most: float = math.inf,
@@ -124,10 +124,10 @@ class Table:
         """A finite number > ``above``, >= ``least`` and <= ``most``."""
         value = self.data.get(name, default)
         if value is None:
-            self.require(name, f"a number [{unit}]")
+            self.require(name, f"a number{_unit(unit)}")
         number = _number(value)
         if number is None:
-            raise self.error(name, f"must be a number [{unit}], got {shown(value)}")
+            raise self.error(name, f"must be a number{_unit(unit)}, got {shown(value)}")
         if not math.isfinite(number):
             raise self.error(name, f"must be finite, got {number}")
         if not (number > above and number >= least and number <= most):
@@ -140,7 +140,7 @@ class Table:
                 )
                 if given
             ]
-            raise self.error(name, f"must be {' and '.join(bounds)} [{unit}], got {number:g}")
+            raise self.error(name, f"must be {' and '.join(bounds)}{_unit(unit)}, got {number:g}")
         return number
 
     def whole(self, name: str, default: int | None = None, *, least: int = 0, most: int | None = None) -> int:
@@ -176,23 +176,25 @@ class Table:
             raise self.error(name, f"must have {length} numbers, got {len(found)}")
         return tuple(found)
 
-    def by_name(self, name: str, default: float | None = None, *, least: float = -math.inf, unit: str = "1") -> ByName:
+    def by_name(self, name: str, default: float | None = None, *, least: float = -math.inf, unit: str = "") -> ByName:
         """One number for all, a list of one for each, or a table by name."""
         value = self.data.get(name, default)
         if value is None:
-            self.require(name, f"a number for all, a list, or a table by name [{unit}]")
+            self.require(name, f"a number for all, a list, or a table by name{_unit(unit)}")
         if isinstance(value, dict):
             table = self.table(name)
             found: ByName = {entry: table.number(entry, unit=unit) for entry in value}
         elif isinstance(value, list):
             found = self.as_numbers(name, value)
         elif _number(value) is None:
-            raise self.error(name, f"must be a number for all, a list, or a table by name [{unit}], got {shown(value)}")
+            raise self.error(
+                name, f"must be a number for all, a list, or a table by name{_unit(unit)}, got {shown(value)}"
+            )
         else:
             found = self.number(name, default, unit=unit)
         for where, number in _entries(name, found):
             if number < least:
-                raise self.error(where, f"must be >= {least:g} [{unit}], got {number:g}")
+                raise self.error(where, f"must be >= {least:g}{_unit(unit)}, got {number:g}")
         return found
 
     def table(self, name: str) -> Table:
@@ -241,6 +243,10 @@ class Table:
                 )
             return np.array(value, dtype=np.float64)
         return np.full(len(names), float(value))
+
+
+def _unit(unit: str) -> str:
+    return f" [{unit}]" if unit else ""
 
 
 def _entries(name: str, value: ByName) -> list[tuple[str, float]]:
