@@ -308,7 +308,7 @@ def control_rows(scene: Scene, controls: ArrayLike | None, steps: int) -> Floats
     array = as_floats("controls", controls)
     if array.shape != shape and array.shape != shape[1:]:
         raise InputError(f"controls must have shape {shape}, one row a step, or {shape[1:]}, got {array.shape}")
-    return np.ascontiguousarray(np.broadcast_to(require_finite("controls", array), shape))
+    return np.array(np.broadcast_to(require_finite("controls", array), shape))
 
 
 def _next(commands: Commands, record: _Record) -> Commands:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +56,7 @@ class Layout:
         noise: Models.
         costs: Terms.
         controls: Of a simulation, over time; None for none, ``"hold"`` for holding ones.
+        held: Joints that are left out, and where [rad or m].
     """
 
     spec: SceneSpec
@@ -71,6 +72,7 @@ class Layout:
     noise: tuple[Noises, ...]
     costs: tuple[CostTerm, ...]
     controls: Timeline | str | None
+    held: Mapping[str, float]
 
     def without(self, joints: Sequence[str]) -> Layout:
         """The same scene with ``joints`` locked where they start, and only what is about the others.
@@ -80,7 +82,8 @@ class Layout:
         if not joints:
             return self
         own = self.robot.joint_names
-        robot = _load(self.spec, {name: float(self.q0[own.index(name)]) for name in joints})
+        held = {**self.held, **{name: float(self.q0[own.index(name)]) for name in joints}}
+        robot = _load(self.spec, held)
         keep = np.array([own.index(name) for name in robot.joint_names], dtype=np.int64)
         driven = np.flatnonzero(np.isin(self.actuated, keep))
         position = {int(joint): place for place, joint in enumerate(keep)}
@@ -110,6 +113,7 @@ class Layout:
             noise=tuple(noise),
             costs=tuple(costs),
             controls=self.controls.columns(driven.tolist()) if isinstance(self.controls, Timeline) else self.controls,
+            held=held,
         )
 
     @property
@@ -191,7 +195,7 @@ def joints_of_frame(robot: Robot, frame: str) -> NDArray[np.bool_]:
     return moved
 
 
-def _load(spec: SceneSpec, locked: dict[str, float] | None = None) -> Robot:
+def _load(spec: SceneSpec, held: Mapping[str, float]) -> Robot:
     own, table = spec.robot, spec.root.table("robot")
     for joint, value in own.lock.items():
         if degrees_for_radians(value):
@@ -200,7 +204,7 @@ def _load(spec: SceneSpec, locked: dict[str, float] | None = None) -> Robot:
         return load_robot(
             own.source,
             package_dirs=own.package_dirs,
-            lock={**own.lock, **(locked or {})},
+            lock={**own.lock, **held},
             mimic="free" if own.mimic == "free" else "tied",
             payload=own.payload,
         )
@@ -226,7 +230,7 @@ def lay_out(spec: SceneSpec) -> Layout:
     Raises:
         SceneFileError: Names, lengths or values that do not fit it.
     """
-    robot, root = _load(spec), spec.root
+    robot, root = _load(spec, {}), spec.root
     names = robot.joint_names
     springs, initial, actuation = root.table("springs"), root.table("initial"), root.table("actuation")
     rest = springs.spread("rest", spec.rest, names)
@@ -270,8 +274,9 @@ def lay_out(spec: SceneSpec) -> Layout:
         gear=gear,
         torque_limit=limit,
         noise=tuple(_noises(spec, names, driven)),
-        costs=tuple(_term(term, robot, driven, spec.duration) for term in spec.costs),
+        costs=tuple(_term(term, robot, driven, q0, spec.duration) for term in spec.costs),
         controls=timeline,
+        held={},
     )
 
 
@@ -315,7 +320,7 @@ def _noises(spec: SceneSpec, names: Sequence[str], driven: Sequence[str]) -> lis
     return found
 
 
-def _term(spec: CostSpec, robot: Robot, driven: Sequence[str], duration: float) -> CostTerm:
+def _term(spec: CostSpec, robot: Robot, driven: Sequence[str], q0: Floats, duration: float) -> CostTerm:
     table, term = spec.table, spec.term
     if term.frame and not robot.free_model.existFrame(spec.frame):
         names = [frame.name for frame in robot.free_model.frames]
@@ -331,8 +336,7 @@ def _term(spec: CostSpec, robot: Robot, driven: Sequence[str], duration: float) 
         target = spec.reference.timeline(components, duration, kind)
         if term.space == "q" and target.constant and term.reference is not None:
             _refuse_degrees(table, term.reference, target(0.0), robot)
-    hold = spec.hold
-    if hold is None:
-        return CostTerm(spec, weight, target, None)
-    at = spec.table.spread("hold", hold, robot.joint_names) if hold != () else None
-    return CostTerm(spec, weight, None, at)
+    hold = None
+    if spec.hold is not None:
+        hold = table.spread("hold", spec.hold, robot.joint_names) if spec.hold != () else q0
+    return CostTerm(spec, weight, target, hold)
