@@ -27,6 +27,9 @@ from varpin.simulation import simulate
 from varpin.solution import Solution
 from varpin.trajectory import Trajectory
 
+# Setting a part up takes as long as this much linear algebra, in cubes of joints times steps, measured.
+_SETUP = 200_000
+
 
 @dataclass(frozen=True, eq=False)
 class SceneFile:
@@ -118,6 +121,7 @@ class SceneFile:
         controls: LinearPolicy | Solution | Floats | None = None,
         *,
         resume: Solution | None = None,
+        apart: bool | None = None,
         **options: Any,
     ) -> Solution:
         """The optimal motion, by :func:`varpin.solve` with the options of ``[solve]``.
@@ -127,35 +131,50 @@ class SceneFile:
         Args:
             controls: To start from, as for :func:`varpin.solve`.
             resume: A solution to go on from.
+            apart: Whether to plan groups apart; where it pays if left out. With ``controls`` or ``resume`` never.
             **options: Of :func:`varpin.solve`, instead of the file's.
         """
         given = {**self.spec.options, **options}
-        if controls is None and resume is None and len(self.required.parts) > 1:
+        if controls is None and resume is None and (self._pays_apart() if apart is None else apart):
             controls = self._planned_apart(given)
         return solve(self.problem, controls, resume=resume, **given)
+
+    def _pays_apart(self) -> bool:
+        """Whether what planning apart saves in linear algebra is more than what it takes to set the parts up."""
+        parts = self.required.parts
+        saved = self.robot.dof**3 - sum(len(part) ** 3 for part in parts)
+        return len(parts) > 1 and self.spec.steps * saved > _SETUP * len(parts)
 
     def load_solution(self, path: str | Path) -> Solution:
         """Read a solution of this scene that :meth:`Solution.save` wrote; see :meth:`Solution.load`."""
         return Solution.load(path, self.problem)
 
-    def _planned_apart(self, options: dict[str, Any]) -> LinearPolicy | None:
-        """The policies of each group of joints side by side; None where a group has nothing that drives it."""
-        problem, driven = self.problem, self._layout.driven
-        names, n, m, R = self.robot.joint_names, self.robot.dof, self.scene.controls, problem.decisions
-        u, gains, reference = np.zeros((R, m)), np.zeros((R, m, 2 * n)), np.zeros((R, 2 * n))
-        policy = problem.holding_policy()
-        reference[:] = policy.reference
+    @cached_property
+    def _parts(self) -> tuple[tuple[Layout, OptimalControlProblem], ...]:
+        """Each group of joints by itself; none where a group has nothing that drives it, or costs nothing."""
+        names, parts = self.robot.joint_names, []
         for part in self.required.parts:
             layout = self._layout.without([name for name in names if name not in part])
             if not layout.driven or not layout.costs:
-                return None
-            plan = solve(self._problem(layout, layout.scene()), **options).policy
+                return ()
+            parts.append((layout, self._problem(layout, layout.scene())))
+        return tuple(parts)
+
+    def _planned_apart(self, options: dict[str, Any]) -> LinearPolicy | None:
+        """The policies of all groups of joints side by side; None where they cannot be planned apart."""
+        if not self._parts:
+            return None
+        problem, driven = self.problem, self._layout.driven
+        names, n, m, R = self.robot.joint_names, self.robot.dof, self.scene.controls, problem.decisions
+        u, gains, reference = np.zeros((R, m)), np.zeros((R, m, 2 * n)), np.zeros((R, 2 * n))
+        for layout, part in self._parts:
+            plan = solve(part, **options).policy
             rows = np.array([driven.index(name) for name in layout.driven])
-            own = np.array([names.index(name) for name in part])
+            own = np.array([names.index(name) for name in layout.robot.joint_names])
             x = np.concatenate([own, n + own])
             u[:, rows], reference[:, x] = plan.u, plan.reference
             gains[:, rows[:, None], x] = plan.gains
-        return LinearPolicy(u, gains, reference, hold=policy.hold, on=policy.on)
+        return LinearPolicy(u, gains, reference, hold=plan.hold, on=plan.on)
 
     def saving(self, *, steps: int = 200, repeats: int = 5) -> float:
         """How many times as long a step takes with all joints that the file does not lock, measured.
