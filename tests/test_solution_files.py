@@ -8,9 +8,9 @@ import pytest
 import varpin as vp
 
 
-def problem_of(*, noise=None, dt=0.02, weight=0.1, integrator=None, q0=(0.4, -0.3), robot=None):
+def problem_of(*, noise=None, damping=0.2, dt=0.02, weight=0.1, integrator=None, q0=(0.4, -0.3), robot=None):
     robot = vp.planar_chain(2) if robot is None else robot
-    scene = vp.Scene(robot, damping=0.2, noise=noise)
+    scene = vp.Scene(robot, damping=damping, noise=noise)
     cost = vp.TrackingCost([0.8, 0.1], 10.0) + vp.ControlCost(weight) + vp.Terminal(vp.VelocityCost(1.0))
     return vp.OptimalControlProblem(scene, cost, q0, [0.0, 0.0], dt=dt, steps=round(0.6 / dt), integrator=integrator)
 
@@ -83,6 +83,8 @@ def test_policy_of_a_loaded_solution_is_the_same(tmp_path):
         ({"dt": 0.03}, "steps = 30, not 20"),
         ({"q0": (0.4, -0.2)}, "q0 = "),
         ({"weight": 0.2}, "another cost"),
+        ({"damping": 0.3}, "another scene damping"),
+        ({"noise": vp.AdditiveNoise(0.1)}, "another noise constant"),
         ({"integrator": vp.Midpoint(alpha=0.4)}, "integrator"),
         ({"robot": vp.planar_chain(2, mass=2.0)}, "links weigh"),
     ],
@@ -124,6 +126,8 @@ def test_resume_of_something_else():
     plan = vp.solve(problem, max_iterations=1)
     with pytest.raises(vp.InputError, match=r"another problem: dt = 0\.02"):
         vp.solve(problem_of(dt=0.03), resume=plan)
+    with pytest.raises(vp.InputError, match="another cost"):
+        vp.solve(problem_of(weight=0.2), resume=plan)
     with pytest.raises(vp.InputError, match="leave out either"):
         vp.solve(problem, plan, resume=plan)
     with pytest.raises(vp.InputError, match="must be a Solution"):

@@ -152,6 +152,9 @@ def _search_of(problem: OptimalControlProblem, controls: object, resume: Solutio
     difference = problem.differs(resume.problem)
     if difference:
         raise InputError(f"resume: the solution is of another problem: {difference}; give it as controls")
+    found, known = problem.cost_of(resume.search.trajectory), resume.search.cost
+    if not abs(found - known) <= 1e-9 * max(abs(found), abs(known)):
+        raise InputError(f"resume: the solution is of another cost: {known:.9g}, and here {found:.9g}")
     return resume.search
 
 

@@ -286,6 +286,7 @@ class Solution:
         members |= {name: getattr(self, name) for name in (*_PLAN, *_NUMBERS)}
         members |= {name: getattr(self.problem, name) for name in _PROBLEM}
         members["problem.integrator"] = repr(self.problem.integrator)
+        members |= _surroundings(self.problem)
         if search is not None:
             members["search.history"] = len(search.history)
             members["search.merits"] = np.array(search.merits)
@@ -457,8 +458,16 @@ FORMAT = "varpin.solution/1"
 _PLAN = ("gains", "feedforward", "gradient")
 _NUMBERS = ("cost", "noise_cost")
 _PROBLEM = ("q0", "v0", "steps", "hold", "sampling", "control_limits")
+_SURROUNDINGS = ("gravity", "damping", "stiffness", "rest", "actuation")
 _SEARCH = ("cost", "first", "best_merit", "best_cost", "regularization", "growth")
 _COLUMNS = tuple(item.name for item in fields(Iteration))
+
+
+def _surroundings(problem: OptimalControlProblem) -> dict[str, Floats]:
+    """What of a problem's scene tells it from others; of a noise that only Python can evaluate nothing but its size."""
+    arrays = {f"scene.{name}": getattr(problem.scene, name) for name in _SURROUNDINGS}
+    fields_of_noise = problem.scene.mechanism.diffusion._asdict()
+    return arrays | {f"noise.{name}": array for name, array in fields_of_noise.items()}
 
 
 def _rows(history: tuple[Iteration, ...]) -> Floats:
@@ -486,6 +495,10 @@ class _Reader:
                 f"{self.source} is of a problem with integrator {members.get('problem.integrator')}, not {own}"
             )
 
+        for name, array in _surroundings(problem).items():
+            if name not in members or not np.array_equal(members[name], array, equal_nan=True):
+                raise FileError(f"{self.source} is of a problem with another {name.replace('.', ' ')}")
+
     def array(self, name: str, shape: tuple[int, ...], *, finite: bool = True) -> Floats:
         """A member of floats of the shape given, -1 for any length."""
         if name not in self.members:
@@ -503,10 +516,12 @@ class _Reader:
         if missing:
             raise FileError(f"{self.source} is not a varpin solution: it has no {prefix}{missing[0]}")
         motion = Trajectory.of_members(self.source, own, self.problem.scene.robot)
-        if motion.steps != self.problem.steps or motion.u.shape[1] != self.problem.scene.controls:
+        scene = self.problem.scene
+        found = motion.steps, motion.u.shape[1], motion.dw.shape[1]
+        if found != (self.problem.steps, scene.controls, scene.processes):
             raise FileError(
-                f"{self.source}: its motion has {motion.steps} steps and {motion.u.shape[1]} controls; the problem has "
-                f"{self.problem.steps} and {self.problem.scene.controls}"
+                f"{self.source}: its motion has {found[0]} steps, {found[1]} controls and {found[2]} noise processes; "
+                f"the problem has {self.problem.steps}, {scene.controls} and {scene.processes}"
             )
         return motion
 
