@@ -1,5 +1,9 @@
 """Scene files: what they may say, each mistake in its own words, and that they reach no further than what they name."""
 
+import copy
+import datetime
+import functools
+import itertools
 import re
 import tomllib
 from pathlib import Path
@@ -134,7 +138,7 @@ MISTAKES = {
     "no horizon": (GOOD[: GOOD.index("[horizon]")] + GOOD[GOOD.index("[integrator]") :], "horizon", "is missing"),
     "unknown robot": (changed('"finger"', '"fingr"'), "robot.source", "close matches: finger"),
     "unknown joint locked": (changed("dip = 0.2", "dop = 0.2"), "robot.lock.dop", "did you mean 'dip'"),
-    "locked joint used": (changed("damping = { mcp", "damping = { dip"), "damping.dip", "no such joint"),
+    "locked joint used": (changed("damping = { mcp", "damping = { dip"), "damping.dip", "the joint is locked at 0.2"),
     "unknown frame of a payload": (changed('"tip"', '"tipp"'), "robot.payload[0].frame", "did you mean 'tip'"),
     "payload on the base": (changed('"tip"', '"universe"'), "robot", "part of the base"),
     "negative mass": (changed("mass = 1e-3", "mass = -1e-3"), "robot.payload[0].mass", "must be > 0 [kg], got -0.001"),
@@ -275,6 +279,44 @@ def test_every_mistake_has_its_own_message(tmp_path):
             vp.load_scene(write(tmp_path, text))
         messages.add(str(caught.value))
     assert len(messages) == len(MISTAKES) >= 30
+
+
+ODD = [
+    *(None, True, -1, 0, 3, 2.5, 1e308, 1e-320, float("nan"), float("inf"), 10**400, "", "x", "\0", "a/b", "../x"),
+    *([], [1.0], [[1]], ["a"], [True], ["mcp", "mcp"], {}, {"a": 1}, {"file": "x"}, [{}], datetime.date(2020, 1, 1)),
+]
+
+
+def leaves(data, path=()):
+    if path:
+        yield path
+    for key in data if isinstance(data, dict) else range(len(data)) if isinstance(data, list) else ():
+        yield from leaves(data[key], (*path, key))
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
+def test_odd_values_anywhere_are_taken_or_refused_in_words(tmp_path, monkeypatch):
+    """Each value of a scene in turn is another: what comes of it is a scene or one line that names a key."""
+    path, whole = write(tmp_path, ""), tomllib.loads(GOOD)
+    odd = itertools.cycle(ODD)
+    refused = []
+    for place in leaves(whole):
+        for value in itertools.islice(odd, 7):
+            data = copy.deepcopy(whole)
+            table = functools.reduce(lambda t, key: t[key], place[:-1], data)
+            if value is None:
+                del table[place[-1]]
+            else:
+                table[place[-1]] = value
+            monkeypatch.setattr(tomllib, "loads", lambda _, data=data: data)
+            try:
+                vp.load_scene(path)
+            except vp.SceneFileError as error:
+                refused.append(error)
+    assert len(refused) > 300
+    for error in refused:
+        assert error.key, error
+        assert "\n" not in str(error)
 
 
 def tracked(reference):

@@ -16,7 +16,7 @@ from varpin.robot import Robot, load_robot
 from varpin.scene import Scene
 from varpin.scenefile.references import Timeline, constant
 from varpin.scenefile.spec import CostSpec, SceneSpec, degrees_for_radians
-from varpin.scenefile.table import Floats, suggestion
+from varpin.scenefile.table import Floats, SceneFileError, Table, suggestion
 from varpin.scenefile.terms import Given
 
 # Times at which it is looked whether a reference ever leaves a place.
@@ -230,8 +230,18 @@ def lay_out(spec: SceneSpec) -> Layout:
     Raises:
         SceneFileError: Names, lengths or values that do not fit it.
     """
-    robot, root = _load(spec, {}), spec.root
-    names = robot.joint_names
+    robot = _load(spec, {})
+    try:
+        return _on_robot(spec, robot)
+    except SceneFileError as error:
+        name = error.key.rpartition(".")[2]
+        if name not in robot.locked:
+            raise
+        raise SceneFileError(error.source, error.key, f"the joint is locked at {robot.locked[name]}") from None
+
+
+def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
+    names, root = robot.joint_names, spec.root
     springs, initial, actuation = root.table("springs"), root.table("initial"), root.table("actuation")
     rest = springs.spread("rest", spec.rest, names)
     q0 = initial.spread("q", spec.q0, names)
@@ -284,12 +294,12 @@ def _times(spec: SceneSpec) -> Floats:
     return np.linspace(0.0, spec.duration, min(spec.steps, _LOOKS) + 1)
 
 
-def _refuse_degrees(table: object, name: str, values: Floats, robot: Robot) -> None:
+def _refuse_degrees(table: Table, name: str, values: Floats, robot: Robot) -> None:
     slides = np.zeros(robot.dof, dtype=np.bool_)
     slides[robot.tree.coordinate[robot.tree.prismatic != 0]] = True
     for joint, value, slide in zip(robot.joint_names, values.tolist(), slides.tolist(), strict=True):
         if not slide and degrees_for_radians(value):
-            raise table.error(name, f"{value:g} of {joint!r} looks like degrees: angles are in rad")  # type: ignore[attr-defined]
+            raise table.error(name, f"{value:g} of {joint!r} looks like degrees: angles are in rad")
 
 
 def _torque_limit(spec: SceneSpec, robot: Robot, actuated: NDArray[np.int64], driven: Sequence[str]) -> Floats:

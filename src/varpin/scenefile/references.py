@@ -98,7 +98,11 @@ class Reference:
                         f"{self.name}.values[{index}]",
                         f"must have {len(names)} numbers, for {', '.join(names)}; got {len(row)}",
                     )
-            return _between(np.array(self.times), np.array(self.values), smooth=self.smooth)
+            try:
+                with np.errstate(all="ignore"):
+                    return _between(np.array(self.times), np.array(self.values), smooth=self.smooth)
+            except ValueError as error:
+                raise self.table.error(f"{self.name}.values", f"no smooth curve goes through them: {error}") from None
         where = f"{self.name}.offset" if self.sines else self.name
         offset = self.table.spread(where, self.offset, names, what)
         if not self.sines:

@@ -86,7 +86,7 @@ class SceneFile:
                 control_limits=(-most, most),
             )
         except (InputError, CostError) as error:
-            raise spec.root.error("", str(error)) from None
+            raise spec.root.error("cost", str(error)) from None
 
     def controls(self) -> Floats | None:
         """Controls of a simulation, (N, m) or (m,), or None for none."""
