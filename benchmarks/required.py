@@ -30,15 +30,15 @@ def simulation(
 
 
 def compare(title: str, runs: dict[str, Callable[[], object]]) -> None:
-    """Times of runs that take turns, the least and the median, and the ratio of the least to the first's."""
+    """Processor times of runs that take turns, the least and the median, and the ratio of the least to the first's."""
     times: dict[str, list[float]] = {name: [] for name in runs}
     for run in runs.values():
         run()
     for _ in range(ROUNDS):
         for name, run in runs.items():
-            begin = time.perf_counter()
+            begin = time.process_time()
             run()
-            times[name].append(time.perf_counter() - begin)
+            times[name].append(time.process_time() - begin)
     first = min(next(iter(times.values())))
     print(title)
     for name, own in times.items():

@@ -113,6 +113,26 @@ def test_cost_on_the_whole_robot_keeps_fingers_together(tmp_path):
     assert "center_of_mass" in file.required.coupled
 
 
+def test_saving_is_measured(tmp_path):
+    """A quarter of the joints takes far less than two thirds of the time."""
+    assert vp.load_scene(hand(tmp_path, ["joint_1.0"])).saving() > 1.5
+
+
+@pytest.mark.parametrize(
+    ("text", "integrator"),
+    [
+        ('type = "gauss"\nstages = 3\nkick = "split"', vp.Gauss(stages=3, kick="split")),
+        ('type = "explicit_euler"', vp.ExplicitEuler()),
+        ('type = "semi_implicit_euler"', vp.SemiImplicitEuler()),
+        ('type = "runge_kutta_4"', vp.RungeKutta4()),
+        ('alpha = 0.3\nkick = "split"', vp.Midpoint(alpha=0.3, kick="split")),
+    ],
+)
+def test_integrators(text, integrator, tmp_path):
+    file = vp.load_scene(hand(tmp_path, ["joint_1.0"], more=f"[integrator]\n{text}"))
+    assert file.problem.integrator == integrator
+
+
 def test_robot_at_rest_is_all_of_the_scene(tmp_path):
     assert vp.load_scene(hand(tmp_path, [])).robot.dof == 16
 
