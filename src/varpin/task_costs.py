@@ -470,6 +470,7 @@ class _Barrier(_TaskCost):
         self.margin = broadcast_array(f"{name} margin", margin, self.size)
         if (self.margin < 0.0).any():
             raise InputError(f"{name} margin must be >= 0, got {self.margin.min():g}")
+        self.margin = np.minimum(self.margin, 0.5 * (self.limits[1] - self.limits[0]))
 
     @staticmethod
     @abstractmethod
@@ -503,7 +504,7 @@ class JointLimitBarrier(_Barrier):
         Args:
             robot: The robot.
             weight: One number, (n,), or a matrix (n, n), positive semidefinite.
-            margin: One number or (n,) >= 0 [rad or m].
+            margin: One number or (n,) >= 0 [rad or m]; of it, at most half the way from limit to limit.
             limits: (lower, upper), each one number or (n,), infinite where there is none; the robot's if left out.
 
         Raises:

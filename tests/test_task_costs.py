@@ -1,0 +1,429 @@
+"""Costs in the task: kinematics against Pinocchio's, expansions against differences of its residuals, refusals."""
+
+import mechanisms
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import varpin as vp
+from varpin.costs import Points
+from varpin.robot.kinematics import center_of_mass, frame_kinematics, links
+
+N = 5
+STEP = 1e-2
+WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+FULL = np.array([[2.0, 0.3, -0.1], [0.3, 1.0, 0.2], [-0.1, 0.2, 0.5]])
+FULL6 = np.diag([1.0, 2.0, 0.5, 0.1, 0.2, 0.3]) + 0.02
+WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+
+
+def tree(seed):
+    """A random tree with a frame set apart on its deepest joint."""
+    model = mechanisms.random_tree(seed)
+    rng = np.random.default_rng(seed)
+    depths = [len(path) for path in model.supports]
+    placement = pin.SE3(mechanisms.random_rotation(rng), rng.normal(0, 0.3, 3))
+    model.addFrame(pin.Frame("hand", int(np.argmax(depths)), 0, placement, pin.FrameType.OP_FRAME))
+    return vp.load_robot(model)
+
+
+@pytest.fixture(params=["tree0", "tree1", "tree2", "ur5", "panda", "kinova"])
+def arm(request, load):
+    """A robot and the name of a frame; panda's fingers are tied to each other."""
+    if request.param.startswith("tree"):
+        return tree(int(request.param[4:])), "hand"
+    robot = load(request.param)
+    return robot, robot.end_effector
+
+
+def state(robot, seed=0, count=N):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-1.5, 1.5, (count, robot.dof)), rng.normal(size=(count, robot.dof))
+
+
+def pinocchio_frame(robot, frame, q, v):
+    """Rotation, position and twist (6,) in world axes, joint by joint in Pinocchio."""
+    model, data = robot.free_model, robot.free_model.createData()
+    pin.forwardKinematics(model, data, robot.free_positions(q), robot.free_velocities(v))
+    pin.updateFramePlacements(model, data)
+    index = model.getFrameId(frame)
+    placed = data.oMf[index]
+    return placed.rotation.copy(), placed.translation.copy(), pin.getFrameVelocity(model, data, index, WORLD).vector
+
+
+def differences(function, z):
+    """Derivative (N, ..., d) of a function of z (N, d), of eighth order."""
+    columns = []
+    for a in range(z.shape[1]):
+        e = STEP * np.eye(z.shape[1])[a]
+        columns.append(sum(w * (function(z + k * e) - function(z - k * e)) for k, w in WEIGHTS.items()) / STEP)
+    return np.stack(columns, axis=-1)
+
+
+def test_frames(arm):
+    robot, frame = arm
+    q, v = state(robot)
+    kinematics = frame_kinematics(robot, frame)
+    motion = kinematics.motion(q)
+    R, p = kinematics.placements(q)
+    J = motion.jacobian()
+    for k in range(N):
+        rotation, position, twist = pinocchio_frame(robot, frame, q[k], v[k])
+        np.testing.assert_allclose(R[k], rotation, atol=1e-13)
+        np.testing.assert_allclose(p[k], position, atol=1e-13)
+        np.testing.assert_allclose(J[k] @ v[k], twist, atol=1e-12)
+        whole = pin.computeFrameJacobian(
+            robot.free_model,
+            robot.free_model.createData(),
+            robot.free_positions(q[k]),
+            robot.free_model.getFrameId(frame),
+            WORLD,
+        )
+        np.testing.assert_allclose(J[k], whole @ robot.free_velocities(np.eye(robot.dof)).T, atol=1e-13)
+    np.testing.assert_array_equal(motion.rotation, R)
+    np.testing.assert_array_equal(motion.position, p)
+    jacobians = differences(lambda q: kinematics.motion(q).jacobian(), q)  # (N, 6, n, n)
+    np.testing.assert_allclose(np.moveaxis(motion.jacobian_in_q(), 1, 3), jacobians, atol=1e-10)
+    np.testing.assert_allclose(motion.twist_in_q(v), np.einsum("Nrba,Nb->Nra", jacobians, v), atol=1e-10)
+
+
+def test_center_of_mass(arm):
+    robot, _ = arm
+    q, _ = state(robot)
+    center = center_of_mass(robot)
+    position, J = center.motion(q)
+    np.testing.assert_allclose(center.position(q), position, atol=1e-14)
+    gear = robot.free_velocities(np.eye(robot.dof)).T
+    for k in range(N):
+        data, free = robot.free_model.createData(), robot.free_positions(q[k])
+        np.testing.assert_allclose(position[k], pin.centerOfMass(robot.free_model, data, free), atol=1e-13)
+        np.testing.assert_allclose(J[k], pin.jacobianCenterOfMass(robot.free_model, data, free) @ gear, atol=1e-13)
+
+
+def test_only_what_carries_a_frame_is_placed(load):
+    robot = load("panda")
+    assert len(links(robot.tree, 3).gear) == 4
+    assert len(links(robot.tree).gear) == robot.tree.parent.size == 9
+
+
+def turn(axis, angle):
+    return pin.exp3(angle * np.asarray(axis) / np.linalg.norm(axis))
+
+
+TARGET = turn([1, 2, 3], 0.8)
+
+
+def residual(kind, robot, frame, q, v):
+    """What the costs below weigh, by Pinocchio, at one state."""
+    R, p, twist = pinocchio_frame(robot, frame, q, v)
+    if kind == "position":
+        return p - [0.3, 0.2, 0.1]
+    if kind == "orientation":
+        return pin.log3(TARGET.T @ R)
+    if kind == "velocity":
+        return twist - np.arange(6) * 0.1
+    return pin.centerOfMass(robot.free_model, robot.free_model.createData(), robot.free_positions(q)) - [0.1, 0.2, 0.3]
+
+
+MADE = {
+    "position": (lambda robot, frame: vp.FramePositionCost(robot, frame, [0.3, 0.2, 0.1], FULL), FULL),
+    "orientation": (lambda robot, frame: vp.FrameOrientationCost(robot, frame, TARGET, FULL), FULL),
+    "velocity": (lambda robot, frame: vp.FrameVelocityCost(robot, frame, np.arange(6) * 0.1, FULL6), FULL6),
+    "center": (lambda robot, frame: vp.CenterOfMassCost(robot, [0.1, 0.2, 0.3], FULL), FULL),
+}
+
+
+@pytest.mark.parametrize("kind", MADE)
+def test_values_gradients_and_gauss_newton_hessians(arm, kind):
+    robot, frame = arm
+    n = robot.dof
+    make, W = MADE[kind]
+    points = Points(np.linspace(0.0, 1.0, N), 1.0, N - 1, n, 1)
+    bound = make(robot, frame).bind(points)
+    q, v = state(robot, 1)
+    z = np.hstack([q, v, np.zeros((N, 1))])
+
+    def r(z):
+        return np.array([residual(kind, robot, frame, row[:n], row[n : 2 * n]) for row in z])
+
+    error, J = r(z), differences(r, z)
+    if kind == "orientation":  # far from half a turn, where the logarithm jumps
+        assert np.linalg.norm(error, axis=1).min() < 3.0
+        keep = np.linalg.norm(error, axis=1) < 2.8
+    else:
+        keep = np.ones(N, dtype=bool)
+    np.testing.assert_allclose(bound.value(q, v, z[:, 2 * n :]), np.einsum("Ni,ij,Nj->N", error, W, error), rtol=1e-11)
+    given = bound.expand(q, v, z[:, 2 * n :])
+    gradient = 2.0 * np.einsum("Nra,rs,Ns->Na", J, W, error)
+    hessian = 2.0 * np.einsum("Nra,rs,Nsb->Nab", J, W, J)
+    assert keep.sum() >= 2
+    np.testing.assert_allclose(given.gradient[keep], gradient[keep], atol=1e-8 * np.abs(gradient).max())
+    np.testing.assert_allclose(given.hessian[keep], hessian[keep], atol=1e-8 * np.abs(hessian).max())
+    if keep.all():
+        slopes = differences(lambda z: bound.value(z[:, :n], z[:, n : 2 * n], z[:, 2 * n :]), z)
+        np.testing.assert_allclose(given.gradient, slopes, atol=1e-8 * np.abs(slopes).max())
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 9.9e-4, 1.01e-3, 0.5, 3.0, np.pi - 1e-5])
+def test_orientation_at_every_distance(load, angle):
+    """The rotation vector from the target is exact, and its derivative, near no turn and near half a turn, too."""
+    robot = load("ur5")
+    q, v = state(robot, 2, 1)
+    R = pinocchio_frame(robot, "tool0", q[0], v[0])[0]
+    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    target = R @ turn(axis, angle).T
+    bound = vp.FrameOrientationCost(robot, "tool0", target, np.diag([1.0, 2.0, 3.0])).bind(
+        Points(np.zeros(1), 1.0, 1, 6, 6)
+    )
+    u = np.zeros((1, 6))
+    assert bound.value(q, v, u)[0] == pytest.approx(angle**2 * (axis**2 @ [1, 2, 3]), rel=1e-6, abs=1e-28)
+    given = bound.expand(q, v, u)
+    J = pin.Jlog3(turn(axis, angle)) @ R.T @ frame_kinematics(robot, "tool0").motion(q).jacobian()[0, 3:]
+    W = np.diag([1.0, 2.0, 3.0])
+    np.testing.assert_allclose(given.gradient[0, :6], 2 * angle * J.T @ W @ axis, atol=1e-9 * max(angle, 1e-6))
+    hessian = 2 * J.T @ W @ J
+    np.testing.assert_allclose(given.hessian[0, :6, :6], hessian, atol=1e-8 * np.abs(hessian).max())
+
+
+def test_targets_in_time(load):
+    """Functions are sampled at the points, rows are linear between nodes, rotations turn evenly."""
+    robot = load("ur5")
+    steps = 4
+    t = (np.arange(steps) + 0.5) * 0.25
+    points = Points(t, 1.0, steps, 6, 6)
+    q, v = state(robot, 3, steps)
+    u = np.zeros((steps, 6))
+    nodes = np.linspace(0.0, 1.0, steps + 1)
+
+    def path(t):
+        return np.array([t, 1.0 - t, 0.3])
+
+    by_function = vp.FramePositionCost(robot, "tool0", path).bind(points)
+    by_rows = vp.FramePositionCost(robot, "tool0", np.array([path(time) for time in nodes])).bind(points)
+    at = np.array([pinocchio_frame(robot, "tool0", *row)[1] for row in zip(q, v, strict=True)])
+    expected = ((at - np.array([path(time) for time in t])) ** 2).sum(axis=1)
+    np.testing.assert_allclose(by_function.value(q, v, u), expected, rtol=1e-12)
+    np.testing.assert_allclose(by_rows.value(q, v, u), expected, rtol=1e-12)
+
+    def turning(t):
+        return turn([1, 1, 0], 2.0 * t)
+
+    by_function = vp.FrameOrientationCost(robot, "tool0", turning).bind(points)
+    by_rows = vp.FrameOrientationCost(robot, "tool0", np.array([turning(time) for time in nodes])).bind(points)
+    turns = [pinocchio_frame(robot, "tool0", *row)[0] for row in zip(q, v, strict=True)]
+    expected = [(pin.log3(turning(time).T @ R) ** 2).sum() for time, R in zip(t, turns, strict=True)]
+    np.testing.assert_allclose(by_function.value(q, v, u), expected, rtol=1e-10)
+    np.testing.assert_allclose(by_rows.value(q, v, u), expected, rtol=1e-10)
+
+
+def test_many_paths_at_once(load):
+    robot = load("ur5")
+    rng = np.random.default_rng(4)
+    points = Points(np.linspace(0, 1, N), 1.0, N - 1, 6, 6)
+    q, v, u = (rng.normal(size=(3, N, 6)) for _ in range(3))
+    rows = rng.normal(size=(N, 3))
+    for cost in (
+        vp.FramePositionCost(robot, "tool0", rows),
+        vp.FrameOrientationCost(robot, "tool0", TARGET),
+        vp.FrameVelocityCost(robot, "tool0"),
+        vp.CenterOfMassCost(robot, rows),
+        vp.ManipulabilityCost(robot, "tool0", 0.1),
+        vp.JointLimitBarrier(robot, limits=(-0.5, 0.5)),
+        vp.VelocityLimitBarrier(robot, limits=(-0.5, 0.5)),
+    ):
+        bound = cost.bind(points)
+        one_by_one = [bound.value(*path) for path in zip(q, v, u, strict=True)]
+        np.testing.assert_allclose(bound.value(q, v, u), one_by_one, rtol=1e-13, atol=1e-15)
+
+
+@pytest.mark.parametrize("directions", ["all", "linear", ("x", "z", "ry")])
+def test_manipulability(load, directions):
+    """Yoshikawa's measure by Pinocchio's Jacobian; its slope by differences; nothing where there is enough of it."""
+    robot = load("panda")
+    rows = {"all": range(6), "linear": range(3)}.get(directions, [0, 2, 4])
+    frame, n = robot.end_effector, robot.dof
+    q, v = state(robot, 5)
+    data = robot.free_model.createData()
+    gear = robot.free_velocities(np.eye(n)).T
+
+    def w(q):
+        index = robot.free_model.getFrameId(frame)
+        free = robot.free_positions(q)
+        Js = [(pin.computeFrameJacobian(robot.free_model, data, row, index, WORLD) @ gear)[list(rows)] for row in free]
+        return np.sqrt([np.linalg.det(J @ J.T) for J in Js])
+
+    measured = w(q)
+    least = float(np.median(measured))
+    points = Points(np.linspace(0, 1, N), 1.0, N - 1, n, 1)
+    bound = vp.ManipulabilityCost(robot, frame, least, 3.0, directions).bind(points)
+    u = np.zeros((N, 1))
+    lack = np.maximum(0.0, least - measured)
+    np.testing.assert_allclose(bound.value(q, v, u), 3.0 * lack**2, rtol=1e-9, atol=1e-14)
+    given = bound.expand(q, v, u)
+    slope = differences(w, q)
+    np.testing.assert_allclose(given.gradient[:, :n], -6.0 * lack[:, None] * slope, atol=1e-8 * np.abs(slope).max())
+    hessian = 6.0 * (lack > 0.0)[:, None, None] * slope[:, :, None] * slope[:, None, :]
+    below = measured < least * (1 - 1e-9)
+    assert below.sum() == 2
+    np.testing.assert_allclose(given.hessian[below][:, :n, :n], hessian[below], atol=1e-7 * np.abs(hessian).max())
+    assert not given.hessian[measured > least * (1 + 1e-9)].any()
+
+
+def test_manipulability_at_a_singular_configuration(load):
+    """A stretched arm has none, and the derivative of a determinant there: of w = |J| for six joints, to both sides."""
+    robot = load("ur5")
+    q = np.array([[0.3, -1.0, 0.0, 0.4, 0.9, 0.2]])
+    bound = vp.ManipulabilityCost(robot, "tool0", 0.05).bind(Points(np.zeros(1), 1.0, 1, 6, 6))
+    u = np.zeros((1, 6))
+    assert bound.value(q, q, u)[0] == pytest.approx(0.05**2, rel=1e-6)
+    given = bound.expand(q, q, u)
+
+    def determinant(q):
+        return np.linalg.det(frame_kinematics(robot, "tool0").motion(q).jacobian())
+
+    slope = differences(determinant, q)[0]
+    assert np.abs(slope).max() > 1e-2
+    np.testing.assert_allclose(np.abs(given.gradient[0, :6]), 0.1 * np.abs(slope), atol=1e-8)
+
+
+def test_barriers(load):
+    """By hand: nothing inside, the square of what is beyond limit less margin outside."""
+    robot = load("ur5")
+    points = Points(np.zeros(3), 1.0, 3, 6, 6)
+    q = np.zeros((3, 6))
+    q[0, 1], q[1, 2], q[2, 5] = 7.0, -3.1, 6.2
+    u = np.zeros((3, 6))
+    bound = vp.JointLimitBarrier(robot, [1, 2, 3, 4, 5, 6], margin=0.1).bind(points)
+    upper = 2 * np.pi - 0.1
+    np.testing.assert_allclose(
+        bound.value(q, u, u), [2 * (7.0 - upper) ** 2, 3 * (-3.1 + np.pi - 0.1) ** 2, 6 * (6.2 - upper) ** 2], rtol=1e-6
+    )
+    given = bound.expand(q, u, u)
+    np.testing.assert_allclose(
+        given.gradient[[0, 1, 2], [1, 2, 5]], [4 * (7.0 - upper), -6 * 0.05840735, 12 * 0.01681469], rtol=1e-6
+    )
+    assert np.count_nonzero(given.gradient) == 3
+    np.testing.assert_allclose(given.hessian[[0, 1, 2], [1, 2, 5], [1, 2, 5]], [4, 6, 12])
+    assert np.count_nonzero(given.hessian) == 3
+    bound = vp.VelocityLimitBarrier(robot, 2.0).bind(points)
+    v = np.zeros((3, 6))
+    v[0, 0], v[1, 3], v[2, 1] = -4.0, 3.3, 3.0
+    np.testing.assert_allclose(bound.value(q, v, u), [2 * 0.85**2, 2 * 0.1**2, 0.0], rtol=1e-6)
+    given = bound.expand(q, v, u)
+    np.testing.assert_allclose(given.gradient[[0, 1], [6, 9]], [-4 * 0.85, 4 * 0.1], rtol=1e-6)
+    assert np.count_nonzero(given.gradient) == np.count_nonzero(given.hessian) == 2
+
+
+def test_barriers_against_differences(load):
+    """Of a finger whose limits are closer than two margins, too: the barriers meet in the middle."""
+    robot = load("panda")
+    n = robot.dof
+    q, v = (1.5 * part for part in state(robot, 6))
+    points = Points(np.linspace(0, 1, N), 1.0, N - 1, n, 1)
+    W = np.diag(np.arange(1.0, n + 1)) + 0.1
+    cost = vp.JointLimitBarrier(robot, W, 0.2) + vp.VelocityLimitBarrier(robot, 0.5, limits=(-1.0, 0.7))
+    bound = cost.bind(points)
+    z = np.hstack([q, v])
+    u = np.zeros((N, 1))
+    # Second differences of a function with kinks in its slope hold where no kink is within their reach.
+    given = bound.expand(q, v, u)
+    h = 1e-6
+
+    def value(z):
+        return bound.value(z[:, :n], z[:, n:], u)
+
+    slopes = np.stack([(value(z + h * e) - value(z - h * e)) / (2 * h) for e in np.eye(2 * n)], axis=1)
+    assert np.count_nonzero(np.abs(slopes) > 1e-3) > 10
+    np.testing.assert_allclose(given.gradient[:, : 2 * n], slopes, atol=1e-7 * np.abs(slopes).max())
+
+    def gradient(z):
+        return bound.expand(z[:, :n], z[:, n:], u).gradient[:, : 2 * n]
+
+    curvature = np.stack([(gradient(z + h * e) - gradient(z - h * e)) / (2 * h) for e in np.eye(2 * n)], axis=2)
+    np.testing.assert_allclose(given.hessian[:, : 2 * n, : 2 * n], curvature, atol=1e-7 * np.abs(curvature).max())
+
+
+def test_as_terms_of_a_sum(load):
+    robot = load("ur5")
+    term = vp.FramePositionCost(robot, "tool0", [0.3, 0.2, 0.1], 2.0)
+    total = vp.Terminal(term) + 0.5 * term + vp.ControlCost(1e-3)
+    assert "FramePositionCost('tool0'" in repr(total)
+    points = Points(np.zeros(1), 1.0, 1, 6, 6)
+    q, v = state(robot, 7, 1)
+    u = np.zeros((1, 6))
+    first = term.bind(points).value(q, v, u)
+    np.testing.assert_allclose(total.bind(points).value(q, v, u), 1.5 * first)
+
+
+def test_what_is_refused(load):
+    robot = load("ur5")
+    with pytest.raises(vp.UnknownFrame, match=r"robot 'ur5' has no frame 'tool'; did you mean 'tool0'.* frames: ") as e:
+        vp.FramePositionCost(robot, "tool", [0, 0, 0])
+    assert "tool0" in e.value.matches
+    assert "wrist_3_link" in e.value.frames
+    with pytest.raises(vp.UnknownFrame):
+        robot.frame_positions(np.zeros((1, 6)), "nowhere")
+    with pytest.raises(vp.InputError, match="frame 'base_link' of robot 'ur5' is fixed to the base"):
+        vp.FrameVelocityCost(robot, "base_link")
+    with pytest.raises(vp.InputError, match="takes a robot from load_robot, got str"):
+        vp.FramePositionCost("ur5", "tool0", [0, 0, 0])
+    with pytest.raises(vp.InputError, match="takes a robot from load_robot, got str"):
+        vp.JointLimitBarrier("ur5")
+    with pytest.raises(vp.InputError, match="FramePositionCost weight must be one number or have 3 rows"):
+        vp.FramePositionCost(robot, "tool0", [0, 0, 0], [1, 2])
+    with pytest.raises(vp.InputError, match="FrameVelocityCost weight must be positive semidefinite"):
+        vp.FrameVelocityCost(robot, "tool0", 0.0, -1.0)
+    with pytest.raises(vp.InputError, match="ManipulabilityCost directions must be"):
+        vp.ManipulabilityCost(robot, "tool0", 0.1, directions=["x", "x"])
+    with pytest.raises(vp.InputError, match="ManipulabilityCost directions must be"):
+        vp.ManipulabilityCost(robot, "tool0", 0.1, directions="up")
+    with pytest.raises(vp.InputError, match="ManipulabilityCost least must be positive"):
+        vp.ManipulabilityCost(robot, "tool0", 0.0)
+    with pytest.raises(vp.InputError, match="weight must be one number"):
+        vp.ManipulabilityCost(robot, "tool0", 0.1, [1.0])
+    chain = vp.planar_chain(2)
+    with pytest.raises(vp.InputError, match="with 2 coordinates no frame moves freely in 3 directions"):
+        vp.ManipulabilityCost(chain, "tip", 0.1, directions="linear")
+    with pytest.raises(vp.InputError, match="JointLimitBarrier: robot 'chain2' has no such limits"):
+        vp.JointLimitBarrier(chain)
+    with pytest.raises(vp.InputError, match=r"margin must be >= 0, got -0\.1"):
+        vp.JointLimitBarrier(robot, margin=-0.1)
+    with pytest.raises(vp.InputError, match="VelocityLimitBarrier limits: nothing is within 1 and -1"):
+        vp.VelocityLimitBarrier(robot, limits=(1.0, -1.0))
+
+
+def test_targets_that_are_refused(load):
+    robot = load("ur5")
+    points = Points(np.zeros(2), 1.0, 2, 6, 6)
+
+    def bound(cost):
+        return cost.bind(points)
+
+    with pytest.raises(
+        vp.InputError, match=r"FramePositionCost reference must be a function of time, have shape \(3,\)"
+    ):
+        bound(vp.FramePositionCost(robot, "tool0", [0.0, 1.0]))
+    with pytest.raises(vp.CostError, match="FramePositionCost: the reference at t = 0 s must have shape"):
+        bound(vp.FramePositionCost(robot, "tool0", lambda t: [t]))
+    for wrong, message in (
+        (2.0 * np.eye(3), "no rotation matrix"),
+        (np.diag([1.0, 1.0, -1.0]), "no rotation matrix"),
+        (np.full((3, 3), np.nan), "must be finite"),
+        (np.eye(4), r"have shape \(3, 3\), or \(3, 3, 3\)"),
+        (np.array([np.eye(3), 2 * np.eye(3), np.eye(3)]), "number 1 is no rotation matrix"),
+    ):
+        with pytest.raises(vp.InputError, match=message):
+            bound(vp.FrameOrientationCost(robot, "tool0", wrong))
+    for wrong in (lambda t: np.eye(2), lambda t: 2 * np.eye(3), lambda t: 1 / 0, lambda t: "up"):
+        with pytest.raises(vp.CostError, match="FrameOrientationCost: at t = 0 s"):
+            bound(vp.FrameOrientationCost(robot, "tool0", wrong))
+    with pytest.raises(vp.InputError, match="for robot 'ur5' with 6 coordinates; the problem has 2"):
+        vp.CenterOfMassCost(robot, [0, 0, 0]).bind(Points(np.zeros(2), 1.0, 2, 2, 2))
+
+
+def test_a_robot_without_mass(tmp_path):
+    """Its links' inertia alone is enough to move it, but it has no centre of mass."""
+    inertia = '<inertial><mass value="0"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    robot = vp.load_robot(str(mechanisms.arm(tmp_path, inertia)))
+    with pytest.raises(vp.InputError, match="have no mass"):
+        vp.CenterOfMassCost(robot, [0, 0, 0])
