@@ -571,3 +571,81 @@ def test_advise_says_what_to_take(arm, capsys):
 
 def test_advise_needs_one_wish(arm, capsys):
     assert "one of the arguments --tolerance --budget is required" in usage_error(["advise", arm], capsys)
+
+
+SCENE = """
+title = "A finger straightens"
+gravity = false
+[robot]
+source = "finger"
+[initial]
+q = [0.5, 0.3, 0.2]
+[horizon]
+dt = 5e-3
+steps = 20
+[[cost]]
+type = "tracking"
+reference = 0.0
+weight = 10.0
+[[cost]]
+type = "control"
+weight = 1e3
+[outputs]
+save = "kept.npz"
+"""
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(SCENE)
+    return "scene.toml"
+
+
+def test_scene_is_simulated(scene, tmp_path, capsys):
+    assert main(["simulate", scene, "--plot", "motion.png"]) == 0
+    out = capsys.readouterr().out
+    assert "20, 0.005 s each" in out
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.toml", "kept.npz", "motion.png"}
+    assert vp.Trajectory.load("kept.npz").steps == 20
+
+
+def test_scene_is_solved_saved_and_resumed(scene, tmp_path, capsys):
+    assert main(["solve", scene, "--max-iterations", "1", "--save", "part.npz"]) == cli.STEP_FAILED
+    out, err = capsys.readouterr()
+    assert "3 of 3 computed" in out
+    assert "not converged" in err
+    assert main(["solve", scene, "--resume", "part.npz", "--html", "plan.html"]) == 0
+    assert "converged" in capsys.readouterr().out
+    file = vp.load_scene(scene)
+    whole, resumed = file.solve(), file.load_solution("kept.npz")
+    np.testing.assert_array_equal(whole.controls, resumed.controls)
+    assert (tmp_path / "plan.html").is_file()
+
+
+def test_scene_is_inspected(scene, capsys):
+    assert main(["inspect", "allegro_finger"]) == 0
+    out = capsys.readouterr().out
+    for words in ("4 of 16 joints computed", "left out: nothing touches", "joint_12.0 at 0.0", "98% of the linear"):
+        assert words in out
+    assert main(["inspect", scene]) == 0
+    assert re.search(r"gravity +│ none", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["simulate", "scene.toml", "--dt", "0.1"], "--dt has no place beside a scene file"),
+        (["simulate", "scene.toml", "--no-gravity"], "--no-gravity has no place"),
+        (["inspect", "scene.toml", "--lock", "dip=0"], "--lock has no place"),
+        (["solve", "finger"], "bundled scenes:"),
+        (["simulate", "scen.toml"], "no scene file 'scen.toml'"),
+        (["solve", "scene.toml", "--resume", "none.npz"], "there is no file none.npz"),
+        (["solve", "scene.toml", "--save", "no/plan.npz"], "there is no folder"),
+        (["solve", "broken.toml"], "broken.toml: robot.source: is missing"),
+    ],
+)
+def test_mistakes_about_scenes(arguments, words, scene, tmp_path, capsys):
+    (tmp_path / "broken.toml").write_text("[robot]\n[horizon]\ndt = 1\nsteps = 1\n")
+    assert main(arguments) == cli.MISTAKE
+    assert words in error_of(capsys)

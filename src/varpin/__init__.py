@@ -69,11 +69,16 @@ from varpin.noise import StateNoise as StateNoise
 from varpin.policy import LinearPolicy as LinearPolicy
 from varpin.problem import OptimalControlProblem as OptimalControlProblem
 from varpin.replay import replay as replay
+from varpin.robot import Payload as Payload
 from varpin.robot import Robot as Robot
 from varpin.robot import load_robot as load_robot
 from varpin.robot import planar_chain as planar_chain
 from varpin.robot import robot_names as robot_names
 from varpin.scene import Scene as Scene
+from varpin.scenefile import Required as Required
+from varpin.scenefile import SceneFile as SceneFile
+from varpin.scenefile import SceneFileError as SceneFileError
+from varpin.scenefile import load_scene as load_scene
 from varpin.sddp import solve as solve
 from varpin.simulation import ControlError as ControlError
 from varpin.simulation import Interrupted as Interrupted
@@ -83,6 +88,7 @@ from varpin.simulation import simulate as simulate
 from varpin.solution import Iteration as Iteration
 from varpin.solution import MonteCarlo as MonteCarlo
 from varpin.solution import MonteCarloInterrupted as MonteCarloInterrupted
+from varpin.solution import SearchState as SearchState
 from varpin.solution import Solution as Solution
 from varpin.solution import Status as Status
 from varpin.solution import Verification as Verification

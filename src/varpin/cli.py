@@ -1,4 +1,4 @@
-"""The ``varpin`` command: simulate a robot, look into its description, or choose an integrator for it.
+"""The ``varpin`` command: simulate a robot, plan its motion, look into its description, or choose an integrator for it.
 
 Exit status: 0 done, 1 a silent wrong result among extreme scenes, 2 a mistake in the request, 3 a step that could not
 be solved or an accuracy out of reach, 130 interrupted.
@@ -13,8 +13,9 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -30,12 +31,14 @@ from varpin._version import __version__
 from varpin.checks import count, positive, writable
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.inspection import JointReport, RobotReport, inspect_robot
-from varpin.integrators import Midpoint
+from varpin.integrators import Integrator, Midpoint
 from varpin.lagrangian import lagrangian_jet
 from varpin.replay import check_film, frame_names, replay
 from varpin.robot import Robot, build_robot, load_robot, robot_names
 from varpin.scene import Scene
+from varpin.scenefile import SceneFile, load_scene, scenes
 from varpin.simulation import Interrupted, StepFailure, simulate
+from varpin.solution import Solution, Status
 from varpin.tradeoff import advise, work_precision
 from varpin.tradeoff.setting import Setting
 from varpin.trajectory import Trajectory, atomic_file
@@ -50,6 +53,11 @@ PLOT_FORMATS = (".png", ".pdf", ".svg")
 MOST_STEPS = 10**9
 # The largest step is no limit beyond this [s].
 _ANY_STEP = 100.0
+# Options that a scene file leaves no room for.
+_OF_MOTIONS = (
+    *("lock", "package_dir", "dt", "duration", "steps", "alpha"),
+    *("q0", "v0", "gravity", "damping", "stiffness", "rest", "torque"),
+)
 # Width of tables in a pipe or a file, which have none of their own.
 _WIDTH = 140
 
@@ -60,6 +68,8 @@ examples:
   varpin simulate arm.urdf --dt 5e-4 --steps 4000 --damping 0.1 --torque 1 -2.5e-1
   varpin robots
   varpin inspect ur5 --q 0 -1.2 1 0 0 0
+  varpin solve finger_tracking --html finger.html --save plan.npz
+  varpin simulate scene.toml --plot motion.png
   varpin advise ur5 --tolerance 1e-6 --duration 1
   varpin tradeoff ur5 --duration 1 --out ur5-tradeoff
   varpin extremes finger --out finger-extremes
@@ -120,6 +130,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_simulate(commands.add_parser("simulate", help="integrate a robot in time", allow_abbrev=False))
     _add_robots(commands.add_parser("robots", help="list the robots that go by a name", allow_abbrev=False))
+    _add_solve(commands.add_parser("solve", help="plan the motion that a scene file asks for", allow_abbrev=False))
     _add_inspect(commands.add_parser("inspect", help="look into a robot description", allow_abbrev=False))
     _add_tradeoff(commands.add_parser("tradeoff", help="measure speed against accuracy", allow_abbrev=False))
     _add_advise(commands.add_parser("advise", help="find the cheapest integrator and step", allow_abbrev=False))
@@ -132,11 +143,12 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_simulate(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Integrate a robot in time with the midpoint variational integrator. Of numbers that belong to joints, one "
-        "alone is taken for all of them. Ctrl-C and a failed step keep what was computed before."
+        "Integrate a robot in time with the midpoint variational integrator; or a scene file, which says all of it "
+        "itself. Of numbers that belong to joints, one alone is taken for all of them. Ctrl-C and a failed step keep "
+        "what was computed before."
     )
     parser.set_defaults(run=_simulate, log_level=logging.WARNING)
-    _add_robot(parser)
+    _add_robot(parser, scenes=True)
     parser.add_argument("--dt", type=float, default=1e-3, metavar="S", help="time step [s]; default: %(default)g")
     length = parser.add_mutually_exclusive_group()
     length.add_argument(
@@ -150,8 +162,12 @@ def _add_simulate(parser: argparse.ArgumentParser) -> None:
         help="of the midpoint rule, in [0, 1]; second order at 0.5, first elsewhere; default: %(default)g",
     )
     _add_motion(parser)
+    _add_outputs(parser, "trajectory")
+
+
+def _add_outputs(parser: argparse.ArgumentParser, what: str) -> None:
     outputs = parser.add_argument_group("outputs")
-    outputs.add_argument("--save", type=Path, metavar="NPZ", help="write the trajectory, for Trajectory.load")
+    outputs.add_argument("--save", type=Path, metavar="NPZ", help=f"write the {what}, for {what.title()}.load")
     outputs.add_argument("--plot", type=Path, metavar="PNG", help="draw an overview, as png, pdf or svg")
     outputs.add_argument("--html", type=Path, metavar="HTML", help="write a replay that any browser opens")
     outputs.add_argument(
@@ -168,6 +184,18 @@ def _add_simulate(parser: argparse.ArgumentParser) -> None:
     outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
 
 
+def _add_solve(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Find the motion of least cost that a scene file asks for, by S-DDP. Ctrl-C keeps the best motion so far; "
+        "with --resume a saved solution goes on as if it had not stopped."
+    )
+    parser.set_defaults(run=_solve, log_level=logging.WARNING)
+    parser.add_argument("scene", metavar="SCENE", help="path of a scene file (TOML), or name of a scene of varpin")
+    parser.add_argument("--resume", type=Path, metavar="NPZ", help="go on from a solution that --save wrote")
+    parser.add_argument("--max-iterations", type=int, metavar="N", help="at most; default: the scene's, or 100")
+    _add_outputs(parser, "solution")
+
+
 def _add_inspect(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Print a robot's joints, links and masses, how well its mass matrix is conditioned, the largest step the "
@@ -175,7 +203,7 @@ def _add_inspect(parser: argparse.ArgumentParser) -> None:
     )
     # What loading warns of is among the report's own warnings.
     parser.set_defaults(run=_inspect, log_level=logging.ERROR)
-    _add_robot(parser)
+    _add_robot(parser, scenes=True)
     _add_vector(parser, "q", "configuration to look at [rad or m]; default: 0")
     _add_vector(parser, "v", "velocity there [rad/s or m/s]; default: 0")
     _add_gravity(parser)
@@ -257,13 +285,14 @@ def _add_extremes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="print nothing but what is silent wrong")
 
 
-def _add_robot(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
+def _add_robot(parser: argparse.ArgumentParser, *, optional: bool = False, scenes: bool = False) -> None:
     parser.add_argument(
         "robot",
         metavar="ROBOT",
         nargs="?" if optional else None,
         help="path of a URDF file, or name of a robot of varpin or of example-robot-data"
-        + ("; scenes made up for it if left out" if optional else ""),
+        + ("; scenes made up for it if left out" if optional else "")
+        + ("; or a scene file (TOML), or name of a scene of varpin" if scenes else ""),
     )
     parser.add_argument(
         "--lock",
@@ -412,29 +441,70 @@ def _motion(request: argparse.Namespace) -> tuple[Scene, ArrayLike, ArrayLike, N
     return scene, q0, v0, torque if torque.any() else None
 
 
+def _names_scene(word: str) -> bool:
+    return Path(word).suffix == ".toml" or word in scenes()
+
+
+def _scene_file(request: argparse.Namespace, word: str, *given: str) -> SceneFile:
+    """The scene file, whose outputs stand in for those not asked for; ``given`` are options it leaves no room for."""
+    command, default = given[0], _parser().parse_args([given[0], "robot"]) if len(given) > 1 else None
+    for name in given[1:]:
+        if getattr(request, name) != getattr(default, name):
+            option = name.replace("_", "-") if getattr(request, name) is not False else f"no-{name}"
+            raise InputError(f"--{option} has no place beside a scene file: {command} {word} takes it from the file")
+    scene = load_scene(word)
+    outputs = scene.spec.outputs
+    for name in ("save", "plot", "html"):
+        if hasattr(request, name) and getattr(request, name) is None:
+            setattr(request, name, getattr(outputs, name))
+    if getattr(request, "speed", None) == 1.0:
+        request.speed = outputs.speed
+    return scene
+
+
 def _simulate(request: argparse.Namespace, errors: Console) -> int:
+    if _names_scene(request.robot):
+        file = _scene_file(request, request.robot, "simulate", *_OF_MOTIONS)
+        driven = bool(file.scene.damping.any() or file.controls() is not None or file.spec.seed is not None)
+        _warm_up(file.scene, file.q0, file.v0, None, file.spec.integrator)
+        return _run(request, errors, file.scene, driven, file.spec.steps, lambda p: file.simulate(progress=p))
     outputs = _outputs(request)
     steps = _steps(request)
     scene, q0, v0, torque = _motion(request)
+    integrator = Midpoint(alpha=request.alpha)
+    _warm_up(scene, q0, v0, torque, integrator)
+
+    def run(progress: Callable[[int, int], None]) -> Trajectory:
+        return simulate(
+            scene, q0, v0, dt=request.dt, steps=steps, controls=torque, integrator=integrator, progress=progress
+        )
+
+    return _run(request, errors, scene, bool(scene.damping.any() or torque is not None), steps, run, outputs)
+
+
+def _warm_up(scene: Scene, q0: ArrayLike, v0: ArrayLike, torque: ArrayLike | None, integrator: Integrator) -> None:
+    """Compile what a run needs, which is no part of its wall time; damping is looked at through the jet."""
+    Setting.of(scene, q0, v0, torque, 1.0).warm_up(integrator)
+    lagrangian_jet(scene, q0, np.zeros(scene.robot.dof))
+
+
+def _run(
+    request: argparse.Namespace,
+    errors: Console,
+    scene: Scene,
+    driven: bool,
+    steps: int,
+    run: Callable[[Callable[[int, int], None]], Trajectory],
+    outputs: list[_Output] | None = None,
+) -> int:
+    """Simulate, and write and print what came out, a part of it if that is all."""
+    outputs = _outputs(request) if outputs is None else outputs
     robot = scene.robot
     frame_names("--trace", [robot], request.trace)
-    integrator = Midpoint(alpha=request.alpha)
-    # Compilation is no part of the wall time; damping is looked at through the jet.
-    Setting.of(scene, q0, v0, torque, request.dt).warm_up(integrator)
-    lagrangian_jet(scene, q0, np.zeros(robot.dof))
     status, complaint, begin = 0, "", time.perf_counter()
     try:
         with _progress(errors, steps, quiet=request.quiet) as progress:
-            trajectory = simulate(
-                scene,
-                q0,
-                v0,
-                dt=request.dt,
-                steps=steps,
-                controls=torque,
-                integrator=integrator,
-                progress=progress,
-            )
+            trajectory = run(progress)
     except Interrupted as interruption:
         trajectory, status = interruption.trajectory, INTERRUPTED
         complaint = f"interrupted after {trajectory.steps} of {steps} steps, which are kept"
@@ -443,17 +513,10 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
         complaint = str(failure).replace("is in error.trajectory", "is kept")
     wall_time = time.perf_counter() - begin
 
-    written = []
-    for output in outputs:
-        try:
-            output.write(robot, trajectory)
-        except (VarpinError, OSError) as error:
-            _complain(errors, f"{output.path} was not written: {error}")
-            status = status or MISTAKE
-        else:
-            written.append(output.path)
+    written = _write(errors, {output.path: partial(output.write, robot, trajectory) for output in outputs})
+    if len(written) < len(outputs):
+        status = status or MISTAKE
     if not request.quiet:
-        driven = bool(scene.damping.any() or torque is not None)
         tables = Console() if sys.stdout.isatty() else Console(width=_WIDTH)
         tables.print(_summary(robot, trajectory, steps, wall_time, driven, written))
     if status == INTERRUPTED:
@@ -461,6 +524,67 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
     elif complaint:
         _complain(errors, complaint)
     return status
+
+
+def _write(errors: Console, files: Mapping[Path, Callable[[], object]]) -> list[Path]:
+    """Write files, complain of those that cannot be, and return the others."""
+    written = []
+    for path, write in files.items():
+        try:
+            write()
+        except (VarpinError, OSError) as error:
+            _complain(errors, f"{path} was not written: {error}")
+        else:
+            written.append(path)
+    return written
+
+
+def _solve(request: argparse.Namespace, errors: Console) -> int:
+    file = _scene_file(request, request.scene, "solve")
+    outputs = _outputs(request)
+    options = {} if request.max_iterations is None else {"max_iterations": request.max_iterations}
+    resume = None if request.resume is None else file.load_solution(request.resume)
+    begin = time.perf_counter()
+    solution = file.solve(resume=resume, **options)
+    wall_time = time.perf_counter() - begin
+    status = 0 if solution.status.converged else STEP_FAILED
+    if solution.status is Status.INTERRUPTED:
+        status = INTERRUPTED
+    saved = None if request.save is None else writable(request.save)
+    writers: dict[Path, Callable[[], object]] = {
+        output.path: partial(solution.save, output.path)
+        if output.path == saved
+        else partial(output.write, file.robot, solution.trajectory)
+        for output in outputs
+    }
+    written = _write(errors, writers)
+    if len(written) < len(outputs):
+        status = status or MISTAKE
+    if not request.quiet:
+        console = Console() if sys.stdout.isatty() else Console(width=_WIDTH)
+        for line in solution.table().splitlines()[:-1]:
+            _say(console, line, prefix="")
+        console.print(_plan_table(file, solution, wall_time, written))
+    if not solution.status.converged:
+        _say(errors, solution.status.value, style="yellow")
+    return status
+
+
+def _plan_table(file: SceneFile, solution: Solution, wall_time: float, files: Iterable[Path]) -> Table:
+    table, problem = _facts(file.spec.title), solution.problem
+    apart = f", planned in {len(file.required.parts)} parts" if len(file.required.parts) > 1 else ""
+    _row(table, "joints", f"{file.robot.dof} of {file.required.described} computed{apart}")
+    _row(table, "horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}")
+    _row(table, "status", solution.status.value, style="" if solution.status.converged else "bold yellow")
+    noise = f", and {solution.noise_cost:.6g} by noise" if solution.noise_cost else ""
+    _row(table, "cost", f"{solution.cost:.6g}{noise}, after {solution.iterations} iterations")
+    _row(table, "wall time", f"{wall_time:.3g} s, loading of kernels included")
+    most = np.abs(solution.trajectory.u).max(axis=0, initial=0.0)
+    _row(table, "largest controls", "  ".join(f"{value:.4g}" for value in most))
+    _row(table, "q at the end [rad or m]", "  ".join(f"{value:.6g}" for value in solution.trajectory.q[-1]))
+    for path in files:
+        _row(table, "written", f"{path} ({_size(path.stat().st_size)})")
+    return table
 
 
 def _steps(request: argparse.Namespace) -> int:
@@ -549,7 +673,31 @@ def _size(size: int) -> str:
     return f"{size / 1e3:.1f} kB" if size < 1e6 else f"{size / 1e6:.1f} MB"
 
 
+def _inspect_scene(request: argparse.Namespace) -> int:
+    file = _scene_file(request, request.robot, "inspect", "lock", "package_dir", "gravity", "q", "v")
+    spec, required = file.spec, file.required
+    table = _facts(f"{spec.title} ({spec.path.name})")
+    _row(table, "robot", f"{file.robot.name}, {len(required.joints)} of {required.described} joints computed")
+    _row(table, "computed", ", ".join(required.joints))
+    for title, joints in (("locked", required.locked), ("left out: nothing touches", required.idle)):
+        if joints:
+            _row(table, title, ", ".join(f"{joint} at {at}" for joint, at in joints.items()), style="dim")
+    if len(required.parts) > 1:
+        _row(table, "planned apart", "; ".join(", ".join(part) for part in required.parts))
+    if required.coupled:
+        _row(table, "planned together", required.coupled)
+    for name, words in required.terms.items():
+        _row(table, name, words, style="dim" if words == "none" or name == "not modelled" else "")
+    _row(table, "horizon", f"{spec.steps} steps of {spec.dt:g} s, {spec.integrator}")
+    _row(table, "saved", f"{100 * required.saved:.0f}% of the linear algebra of a plan, by counting")
+    console = Console() if sys.stdout.isatty() else Console(width=_WIDTH)
+    console.print(table)
+    return 0
+
+
 def _inspect(request: argparse.Namespace, _errors: Console) -> int:
+    if _names_scene(request.robot):
+        return _inspect_scene(request)
     arguments = {"package_dirs": request.package_dir, "lock": dict(request.lock), "gravity": request.gravity}
     report = inspect_robot(request.robot, q=_one_or_all(request.q), v=_one_or_all(request.v), **arguments)
     console = Console() if sys.stdout.isatty() else Console(width=_WIDTH)

@@ -177,6 +177,22 @@ class OptimalControlProblem:
             control_limits=(self.control_limits[0], self.control_limits[1]),
         )
 
+    def differs(self, other: OptimalControlProblem) -> str:
+        """In words, what of two problems differs that can be told without comparing costs; empty if nothing."""
+        own, its = self.scene.robot, other.scene.robot
+        if own.joint_names != its.joint_names:
+            return f"joints {', '.join(its.joint_names)}, not {', '.join(own.joint_names)}"
+        if not np.array_equal(own.tree.mass, its.tree.mass):
+            return f"links of {its.tree.mass.sum():.6g} kg, not {own.tree.mass.sum():.6g} kg"
+        for name in ("dt", "steps", "hold", "sampling", "q0", "v0", "integrator", "control_limits"):
+            mine, theirs = getattr(self, name), getattr(other, name)
+            if not np.array_equal(mine, theirs):
+                return f"{name} = {theirs}, not {mine}"
+        for name in ("gravity", "damping", "stiffness", "rest", "actuation"):
+            if not np.array_equal(getattr(self.scene, name), getattr(other.scene, name)):
+                return f"another {name}"
+        return ""
+
     @property
     def limited(self) -> bool:
         """Whether any control has a limit."""

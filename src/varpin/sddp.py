@@ -21,7 +21,7 @@ from varpin.noise import NoiseFieldError
 from varpin.policy import LinearPolicy
 from varpin.problem import OptimalControlProblem
 from varpin.simulation import StepFailure, rollout
-from varpin.solution import Iteration, Solution, Status
+from varpin.solution import Iteration, SearchState, Solution, Status
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -56,6 +56,7 @@ def solve(
     backtracking: float = 0.25,
     regularization: float = 0.0,
     callback: Callback | None = None,
+    resume: Solution | None = None,
     progress: Progress | None = None,
 ) -> Solution:
     """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
@@ -97,6 +98,9 @@ def solve(
         callback: Called with each :class:`Iteration`; ``callback=print`` prints the rows of :meth:`Solution.table` as
             they come. The log has them too, at level INFO.
         progress: Called after each iteration with (iterations done, max_iterations); few searches need them all.
+        resume: A solution of this very problem, as solve returned it or as read from a file: the search goes on where
+            it stopped, for at most ``max_iterations`` more, as if it had not been interrupted. Give the other options
+            as before; ``regularization`` goes on by itself.
 
     Returns:
         The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers.
@@ -128,11 +132,15 @@ def solve(
             callback(item)
         if progress is not None:
             # Convergence may take a last look after the last iteration.
-            progress(min(item.index + 1, max_iterations), max_iterations)
+            progress(min(item.index + 1 - known, max_iterations), max_iterations)
 
     with announced_compilation(f"solve with {type(problem.integrator).__name__}"):
         search = _Search(problem, second_order, forward, armijo, backtracking, regularization)
-        search.begin(_first_commands(problem, controls))
+        if resume is None:
+            search.begin(_first_commands(problem, controls))
+        else:
+            search.resume(_search_of(problem, controls, resume))
+        known = len(search.history)
         try:
             status = search.run(tolerance, max_iterations, report)
         except KeyboardInterrupt:
@@ -157,6 +165,22 @@ def _first_commands(problem: OptimalControlProblem, controls: ArrayLike | Linear
     rows = as_floats("controls", controls)
     rows = finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m))
     return _held(np.broadcast_to(rows, (R, m)), problem)
+
+
+def _search_of(problem: OptimalControlProblem, controls: object, resume: Solution) -> SearchState:
+    if not isinstance(resume, Solution):
+        raise InputError(f"resume must be a Solution, got {type(resume).__name__}")
+    if controls is not None:
+        raise InputError("resume goes on from the solution's own controls: leave out either controls or resume")
+    if resume.search is None:
+        raise InputError("resume: the solution does not hold the state of its search; give it as controls")
+    difference = problem.differs(resume.problem)
+    if difference:
+        raise InputError(f"resume: the solution is of another problem: {difference}; give it as controls")
+    found, known = problem.cost_of(resume.search.trajectory), resume.search.cost
+    if not abs(found - known) <= 1e-9 * max(abs(found), abs(known)):
+        raise InputError(f"resume: the solution is of another cost: {known:.9g}, and here {found:.9g}")
+    return resume.search
 
 
 def _held(u: Floats, problem: OptimalControlProblem) -> Commands:
@@ -190,8 +214,9 @@ class _Search:
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
         self.trajectory: Trajectory
-        self.cost = np.inf
+        self.cost = self.first = np.inf
         self.reached = np.inf  # the expected cost of the last step taken, by the plan it was taken with
+        self.state: SearchState | None = None  # at the start of the last iteration, from where it can go on
         self.merits: list[float] = []  # the best so far, after each iteration
         self.best: tuple[float, float, Trajectory | None] = (np.inf, np.inf, None)
         self.reason = ""
@@ -206,10 +231,34 @@ class _Search:
         self.cost = self.problem.cost_of(trajectory)
         if not np.isfinite(self.cost):
             raise CostError(repr(self.problem.cost), f"the cost of the first motion is {self.cost}")
+        self.first = self.cost
+
+    def resume(self, state: SearchState) -> None:
+        """Stand where ``state`` was taken."""
+        self.trajectory, self.cost, self.first = state.trajectory, state.cost, state.first
+        self.merits, self.history = list(state.merits), list(state.history)
+        self.best = state.best_merit, state.best_cost, state.best
+        self.regularization, self.growth = state.regularization, state.growth
+
+    def _state(self) -> SearchState:
+        merit, cost, best = self.best
+        return SearchState(
+            trajectory=self.trajectory,
+            cost=self.cost,
+            first=self.first,
+            best=best,
+            best_merit=merit,
+            best_cost=cost,
+            merits=tuple(self.merits),
+            regularization=self.regularization,
+            growth=self.growth,
+            history=tuple(self.history),
+        )
 
     def run(self, tolerance: float, max_iterations: int, report: Callback) -> Status:
-        first = self.cost
+        last = len(self.history) + max_iterations
         while True:
+            self.state = self._state()
             started = time.perf_counter()
             try:
                 passes = self._plan()
@@ -227,7 +276,7 @@ class _Search:
                 self.best = merit, self.cost, self.trajectory
             self.merits.append(self.best[0])
             # Where the optimum costs nothing, there is nothing to be relative to but where it began.
-            scale = abs(merit) + 1e-9 * abs(first)
+            scale = abs(merit) + 1e-9 * abs(self.first)
             # Without costs on the controls the model may need regularization to have a minimum even there.
             nothing = self.problem.cost.nonnegative and merit <= tolerance * scale
             converged = nothing or self.plan.promise <= tolerance * scale
@@ -240,7 +289,7 @@ class _Search:
                     converged = False
             promised = f"the model promises a decrease of {self.plan.promise:.1e}"
             share = f"the tolerance of {tolerance:g} times the cost is {tolerance * scale:.1e}"
-            if converged or len(self.history) >= max_iterations:
+            if converged or len(self.history) >= last:
                 self._note(report, started, passes)
                 self.reason = f"{promised}; {share}"
                 return Status.CONVERGED if converged else Status.MAX_ITERATIONS
@@ -385,6 +434,7 @@ class _Search:
             status=status,
             reason=self.reason,
             history=tuple(self.history),
+            search=self.state,
         )
 
 

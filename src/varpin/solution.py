@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.checks import count, positive
+from varpin.checks import count, path_like, positive
 from varpin.costs import BoundSum
 from varpin.ensemble import simulate_ensemble
-from varpin.errors import InputError, VarpinError
+from varpin.errors import FileError, InputError, VarpinError
 from varpin.integrators import RungeKutta4
 from varpin.integrators.base import open_loop
 from varpin.kernels._compile import announced_compilation
@@ -24,7 +25,7 @@ from varpin.policy import LinearPolicy
 from varpin.problem import OptimalControlProblem, bind_cost
 from varpin.simulation import NoiseError, StepFailure, rollout, simulate
 from varpin.task_costs import barriers_of
-from varpin.trajectory import Trajectory
+from varpin.trajectory import MEMBERS, Trajectory, atomic_file, read_members
 from varpin.wiener import generator
 
 Floats = NDArray[np.float64]
@@ -34,7 +35,9 @@ class Status(Enum):
     """How a solver ended; its value says what that means and what to do."""
 
     CONVERGED = "converged"
-    MAX_ITERATIONS = "not converged: more iterations may help; go on from this solution with solve(problem, solution)"
+    MAX_ITERATIONS = (
+        "not converged: more iterations may help; go on from this solution with solve(problem, resume=solution)"
+    )
     STALLED = (
         "not converged: no step along the plan lowers the expected cost by more than the tolerance; if what it "
         "promises is little, that is as far as it goes; else a smaller dt, other first controls, right derivatives of "
@@ -93,6 +96,35 @@ class Iteration:
             f"{self.index:4d} {self.cost:12.6e} {self.noise_cost:12.4e} {self.promised_decrease:9.2e} "
             f"{self.decrease:9.2e} {self.gradient:9.2e} {self.regularization:8.1e} {self.step:9.2e} {self.rollouts:6d}"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class SearchState:
+    """Where a search stood at the start of its last iteration: all that it needs to go on.
+
+    Attributes:
+        trajectory: The motion then.
+        cost: Of it, without noise.
+        first: Cost of the first motion.
+        best: The motion of the least expected cost so far, if one was rated yet.
+        best_merit: Its expected cost.
+        best_cost: Its cost without noise.
+        merits: The least expected cost after each iteration.
+        regularization: Relative to the diagonal of Quu.
+        growth: Of the regularization.
+        history: Of the iterations before.
+    """
+
+    trajectory: Trajectory
+    cost: float
+    first: float
+    best: Trajectory | None
+    best_merit: float
+    best_cost: float
+    merits: tuple[float, ...]
+    regularization: float
+    growth: float
+    history: tuple[Iteration, ...]
 
 
 @dataclass(frozen=True)
@@ -267,6 +299,7 @@ class Solution:
         status: How the solver ended.
         reason: With which numbers.
         history: One entry for each iteration.
+        search: From where :func:`varpin.solve` can go on, with ``resume``.
     """
 
     problem: OptimalControlProblem
@@ -279,6 +312,7 @@ class Solution:
     status: Status
     reason: str
     history: tuple[Iteration, ...]
+    search: SearchState | None = None
 
     def __post_init__(self) -> None:
         for array in (self.gains, self.feedforward, self.gradient):
@@ -322,6 +356,53 @@ class Solution:
     def table(self) -> str:
         """The iterations, one row each, and how and why they ended; :class:`Solution` explains the columns."""
         return "\n".join([Iteration.HEADER, *map(str, self.history), self.status.value, f"({self.reason})"])
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the solution as a compressed npz file without pickle; returns its path.
+
+        The problem is not in it: :meth:`load` takes it. All that a search needs to go on is.
+
+        Raises:
+            FileError: The path cannot be written.
+        """
+        search = self.search
+        motions = {"": self.trajectory}
+        if search is not None:
+            motions |= {"search.": search.trajectory} | ({} if search.best is None else {"best.": search.best})
+        members: dict[str, Any] = {"status": self.status.name, "reason": self.reason, "history": _rows(self.history)}
+        # Motions are often one and the same: each is written once.
+        kept: dict[int, str] = {}
+        for prefix, motion in motions.items():
+            members[f"{prefix}motion"] = kept.setdefault(id(motion), prefix)
+            if kept[id(motion)] == prefix:
+                members |= {f"{prefix}{name}": value for name, value in motion.members().items()}
+        members |= {name: getattr(self, name) for name in (*_PLAN, *_NUMBERS)}
+        members |= {name: getattr(self.problem, name) for name in _PROBLEM}
+        members["problem.integrator"] = repr(self.problem.integrator)
+        members |= _surroundings(self.problem)
+        if search is not None:
+            members["search.history"] = len(search.history)
+            members["search.merits"] = np.array(search.merits)
+            members |= {f"search.{name}": getattr(search, name) for name in _SEARCH}
+        with atomic_file(path) as stream:
+            np.savez_compressed(stream, **members, format=FORMAT)
+        return Path(path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], problem: OptimalControlProblem) -> Solution:
+        """Read a solution of ``problem`` that :meth:`save` wrote.
+
+        Raises:
+            FileError: The file is missing, truncated, no npz, written by something else, holds pickled objects, arrays
+                that do not fit together or are not finite, or is of another problem.
+        """
+        if not isinstance(problem, OptimalControlProblem):
+            raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
+        source = path_like("path", path)
+        members = read_members(source, FORMAT, {*MEMBERS, *_PLAN, *_NUMBERS, *_PROBLEM, "status", "reason", "history"})
+        reader = _Reader(source, members, problem)
+        reader.check_problem()
+        return reader.solution()
 
     def shifted(self, decisions: int) -> LinearPolicy:
         """The policy from a later decision on, its last row repeated: what to start the next horizon with.
@@ -516,6 +597,128 @@ class Solution:
             predicted=self.expected_cost,
             paths=len(good),
             failures=len(values) - len(good),
+        )
+
+
+FORMAT = "varpin.solution/1"
+_PLAN = ("gains", "feedforward", "gradient")
+_NUMBERS = ("cost", "noise_cost")
+_PROBLEM = ("q0", "v0", "steps", "hold", "sampling", "control_limits")
+_SURROUNDINGS = ("gravity", "damping", "stiffness", "rest", "actuation")
+_SEARCH = ("cost", "first", "best_merit", "best_cost", "regularization", "growth")
+_COLUMNS = tuple(item.name for item in fields(Iteration))
+
+
+def _surroundings(problem: OptimalControlProblem) -> dict[str, Floats]:
+    """What of a problem's scene tells it from others; of a noise that only Python can evaluate nothing but its size."""
+    arrays = {f"scene.{name}": getattr(problem.scene, name) for name in _SURROUNDINGS}
+    fields_of_noise = problem.scene.mechanism.diffusion._asdict()
+    return arrays | {f"noise.{name}": array for name, array in fields_of_noise.items()}
+
+
+def _rows(history: tuple[Iteration, ...]) -> Floats:
+    """One row for each iteration, its fields in order."""
+    return np.array([[float(getattr(item, name)) for name in _COLUMNS] for item in history]).reshape(-1, len(_COLUMNS))
+
+
+@dataclass(frozen=True, eq=False)
+class _Reader:
+    """The members of a file of a solution, checked as they are taken out."""
+
+    source: Path
+    members: dict[str, NDArray[Any]]
+    problem: OptimalControlProblem
+
+    def check_problem(self) -> None:
+        problem, members = self.problem, self.members
+        given = {name: getattr(problem, name) for name in _PROBLEM} | {"dt": problem.dt}
+        for name, value in given.items():
+            if not np.array_equal(members[name], value):
+                raise FileError(f"{self.source} is of a problem with {name} = {members[name]}, not {value}")
+        own = repr(problem.integrator)
+        if str(members.get("problem.integrator")) != own:
+            raise FileError(
+                f"{self.source} is of a problem with integrator {members.get('problem.integrator')}, not {own}"
+            )
+
+        for name, array in _surroundings(problem).items():
+            if name not in members or not np.array_equal(members[name], array, equal_nan=True):
+                raise FileError(f"{self.source} is of a problem with another {name.replace('.', ' ')}")
+
+    def array(self, name: str, shape: tuple[int, ...], *, finite: bool = True) -> Floats:
+        """A member of floats of the shape given, -1 for any length."""
+        if name not in self.members:
+            raise FileError(f"{self.source} is not a varpin solution: it has no {name}")
+        array = self.members[name]
+        if array.ndim != len(shape) or any(b not in (-1, a) for a, b in zip(array.shape, shape, strict=True)):
+            raise FileError(f"{self.source}: {name} has shape {array.shape}, where {shape} belongs")
+        if array.dtype.kind not in "fi" or (finite and not np.isfinite(array).all()):
+            raise FileError(f"{self.source}: {name} holds values that are not finite numbers")
+        return np.array(array, dtype=np.float64, order="C")
+
+    def motion(self, prefix: str) -> Trajectory:
+        own = {name: self.members[prefix + name] for name in MEMBERS if prefix + name in self.members}
+        missing = sorted(MEMBERS - set(own))
+        if missing:
+            raise FileError(f"{self.source} is not a varpin solution: it has no {prefix}{missing[0]}")
+        motion = Trajectory.of_members(self.source, own, self.problem.scene.robot)
+        scene = self.problem.scene
+        found = motion.steps, motion.u.shape[1], motion.dw.shape[1]
+        if found != (self.problem.steps, scene.controls, scene.processes):
+            raise FileError(
+                f"{self.source}: its motion has {found[0]} steps, {found[1]} controls and {found[2]} noise processes; "
+                f"the problem has {self.problem.steps}, {scene.controls} and {scene.processes}"
+            )
+        return motion
+
+    def history(self) -> tuple[Iteration, ...]:
+        rows = self.array("history", (-1, len(_COLUMNS)), finite=False)
+        whole = {item.name for item in fields(Iteration) if item.type == "int"}
+        found = []
+        for row in rows.tolist():
+            values: dict[str, Any] = dict(zip(_COLUMNS, row, strict=True))
+            found.append(Iteration(**values | {name: int(values[name]) for name in whole}))
+        return tuple(found)
+
+    def solution(self) -> Solution:
+        problem, members = self.problem, self.members
+        R, m, n = problem.decisions, problem.scene.controls, problem.scene.robot.dof
+        status = str(members["status"])
+        if status not in Status.__members__:
+            raise FileError(f"{self.source}: there is no status {status!r}")
+        motions = {"": self.motion("")}
+        history = self.history()
+        cost = float(self.array("cost", ()))
+        found = problem.cost_of(motions[""])
+        if not abs(found - cost) <= 1e-9 * max(abs(found), abs(cost)):
+            raise FileError(f"{self.source} is of a problem with another cost: {cost:.9g}, and here {found:.9g}")
+        search = None
+        if "search.motion" in members:
+            names = {}
+            for name in ("search.", "best."):
+                names[name] = str(members.get(f"{name}motion", "none"))
+                if names[name] != "none" and names[name] not in motions:
+                    motions[names[name]] = self.motion(names[name])
+            numbers = {name: float(self.array(f"search.{name}", (), finite=False)) for name in _SEARCH}
+            search = SearchState(
+                trajectory=motions[names["search."]],
+                best=motions.get(names["best."]),
+                merits=tuple(self.array("search.merits", (-1,)).tolist()),
+                history=history[: int(self.array("search.history", ()))],
+                **numbers,
+            )
+        return Solution(
+            problem=problem,
+            trajectory=motions[""],
+            gains=self.array("gains", (R, m, 2 * n)),
+            feedforward=self.array("feedforward", (R, m)),
+            gradient=self.array("gradient", (R, m), finite=False),
+            cost=cost,
+            noise_cost=float(self.array("noise_cost", (), finite=False)),
+            status=Status[status],
+            reason=str(members["reason"]),
+            history=history,
+            search=search,
         )
 
 

@@ -6,7 +6,7 @@ import contextlib
 import os
 import reprlib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -166,14 +166,17 @@ class Trajectory:
         Raises:
             FileError: The path cannot be written.
         """
+        with atomic_file(path) as stream:
+            np.savez_compressed(stream, **self.members(), format=FORMAT)
+        return Path(path)
+
+    def members(self) -> dict[str, Any]:
+        """What an npz file holds of it, by name."""
         members: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
         members |= {f"statistics.{item.name}": getattr(self.statistics, item.name) for item in fields(StepStatistics)}
-        members |= {"format": FORMAT, "version": self.version, "integrator": self.integrator, "robot": self.robot}
-        members |= {"dt": self.dt, "joint_names": np.array(self.joint_names, dtype=str)}
+        members |= {"version": self.version, "integrator": self.integrator, "robot": self.robot}
         members |= {"warnings": np.array(self.warnings, dtype=str)}
-        with atomic_file(path) as stream:
-            np.savez_compressed(stream, **members)
-        return Path(path)
+        return members | {"dt": self.dt, "joint_names": np.array(self.joint_names, dtype=str)}
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], robot: Robot | None = None) -> Trajectory:
@@ -190,10 +193,15 @@ class Trajectory:
         source = path_like("path", path)
         if robot is not None and not isinstance(robot, Robot):
             raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
-        members = _read_members(source)
-        found = members["format"]
-        if found.shape != () or str(found) != FORMAT:
-            raise FileError(f"{source} is not a varpin trajectory: its format is {found}, not {FORMAT!r}")
+        return cls.of_members(source, read_members(source, FORMAT, MEMBERS), robot)
+
+    @classmethod
+    def of_members(cls, source: Path, members: Mapping[str, NDArray[Any]], robot: Robot | None) -> Trajectory:
+        """The trajectory that members of the file ``source`` describe, by the names that :meth:`members` gives.
+
+        Raises:
+            FileError: As for :meth:`load`.
+        """
         steps, n = members["t"].size - 1, members["joint_names"].size
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys("qvp", (steps + 1, n)) | dict.fromkeys(
             ("t", "energy"), (steps + 1,)
@@ -268,11 +276,21 @@ def require_motion(scene: Scene, trajectory: Trajectory) -> None:
         raise InputError(f"the trajectory has {trajectory.u.shape[1]} controls, the scene {scene.controls}")
 
 
-def _read_members(source: Path) -> dict[str, NDArray[Any]]:
-    """All arrays of a trajectory's file, or a FileError that says what is wrong with it."""
-    expected = {*_ARRAYS, "dt", "format", "version", "integrator", "robot", "joint_names", "warnings"}
-    expected |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
-    return read_npz(source, expected, "varpin trajectory")
+# What a file of a trajectory holds beside its format.
+MEMBERS = frozenset(_ARRAYS) | {"dt", "version", "integrator", "robot", "joint_names", "warnings"}
+MEMBERS |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
+
+
+def read_members(source: Path, kind: str, expected: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """The arrays of an npz file of format ``kind``, or a FileError that says what is wrong with it."""
+    what = f"varpin {kind.removeprefix('varpin.').partition('/')[0]}"
+    members = read_npz(source, what=what)
+    if missing := sorted({*expected, "format"} - set(members)):
+        raise FileError(f"{source} is not a {what}: it has no {', '.join(missing)}")
+    found = members["format"]
+    if found.shape != () or str(found) != kind:
+        raise FileError(f"{source} is not a {what}: its format is {found}, not {kind!r}")
+    return members
 
 
 @contextlib.contextmanager

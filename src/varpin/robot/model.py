@@ -16,6 +16,7 @@ from varpin.checks import as_floats, require_finite
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint
 from varpin.kernels.tree import Tree
 from varpin.robot.mimic import Tie, joint_index, rebuild, tied_model
+from varpin.robot.payload import Payload, carry
 from varpin.robot.sources import Description, describe, hang_shapes
 from varpin.robot.tree import flatten, frame_index, is_unbounded, joint_axis, to_pinocchio, tree_mass_matrix
 from varpin.robot.urdf import read_root
@@ -183,6 +184,7 @@ def load_robot(
     package_dirs: Sequence[str | os.PathLike[str]] | None = None,
     lock: Mapping[str, ArrayLike] | None = None,
     mimic: Literal["tied", "free"] = "tied",
+    payload: Payload | Sequence[Payload] = (),
 ) -> Robot:
     """Load an arm.
 
@@ -197,6 +199,7 @@ def load_robot(
     Other Args:
         package_dirs: Where ``package://`` mesh paths are looked up; the URDF's own folder is always searched.
         mimic: ``"tied"`` moves a mimic joint with its leader; ``"free"`` makes it a coordinate of its own.
+        payload: What the robot carries; it becomes part of the links that it hangs on.
 
     Returns:
         The robot, its geometry not yet read.
@@ -206,9 +209,10 @@ def load_robot(
         RobotError: The file is not a URDF, its XML is broken, or a link's inertia is not finite.
         UnsupportedJoint: A joint has no single axis (free-flyer, spherical, planar, screw).
         UnknownJoint: ``lock`` names a joint that is not there.
+        UnknownFrame: A payload hangs on a frame that is not there.
         SingularMassMatrix: A joint moves no inertia.
     """
-    robot = build_robot(source, package_dirs=package_dirs, lock=lock, mimic=mimic)
+    robot = build_robot(source, package_dirs=package_dirs, lock=lock, mimic=mimic, payload=payload)
     check_inertia(robot)
     return robot
 
@@ -219,11 +223,13 @@ def build_robot(
     package_dirs: Sequence[str | os.PathLike[str]] | None = None,
     lock: Mapping[str, ArrayLike] | None = None,
     mimic: Literal["tied", "free"] = "tied",
+    payload: Payload | Sequence[Payload] = (),
 ) -> Robot:
     """:func:`load_robot` without the check that every joint moves inertia, for looking into faulty models."""
     if mimic not in ("tied", "free"):
         raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
     description = describe(source, package_dirs, mimic=mimic == "tied")
+    carry(description.model, (payload,) if isinstance(payload, Payload) else payload, description.name)
     names = list(description.model.names)
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise RobotError(f"robot {description.name!r} has several joints named {', '.join(map(repr, twice))}")

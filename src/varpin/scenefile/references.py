@@ -1,0 +1,234 @@
+"""References in time as scene files write them: constants, sines, waypoints and files of numbers."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+
+from varpin.scenefile.table import ByName, Floats, Table, inside, suggestion
+
+Function = Callable[[float], Floats]
+KINDS = ("offset", "sines", "times", "values", "between", "file")
+
+
+@dataclass(frozen=True, eq=False)
+class Timeline:
+    """Values over time, one column for each component.
+
+    Attributes:
+        at: Takes times (N,) [s]; returns (N, c).
+        constant: Whether they are the same at all times.
+    """
+
+    at: Callable[[Floats], Floats]
+    constant: bool
+
+    def __call__(self, time: float) -> Floats:
+        """Values (c,) at one time [s]."""
+        row: Floats = self.at(np.array([time]))[0]
+        return row
+
+    def columns(self, keep: Sequence[int]) -> Timeline:
+        """Some of the components."""
+        index = np.array(keep, dtype=np.int64)
+        return Timeline(lambda t: self.at(t)[:, index], self.constant)
+
+
+def constant(values: Floats) -> Timeline:
+    """The same values at all times."""
+    return Timeline(lambda t: np.tile(values, (len(t), 1)), True)
+
+
+@dataclass(frozen=True, eq=False)
+class Sine:
+    """amplitude sin(2 pi frequency t + phase), added to one component."""
+
+    of: str
+    amplitude: float
+    frequency: float  # [Hz]
+    phase: float  # [rad]
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A reference as it stands in a file, not yet held against a robot.
+
+    Attributes:
+        table: Where it stands.
+        name: Under which key.
+        offset: Constant part, of constants and sines.
+        sines: What is added to it.
+        times: Of waypoints [s].
+        values: Waypoints, one row each.
+        smooth: Between waypoints: a monotone cubic instead of straight lines.
+        file: CSV or npz file.
+    """
+
+    table: Table
+    name: str
+    offset: ByName = 0.0
+    sines: tuple[Sine, ...] = ()
+    times: tuple[float, ...] = ()
+    values: tuple[tuple[float, ...], ...] = ()
+    smooth: bool = False
+    file: Path | None = None
+
+    def timeline(self, names: Sequence[str], duration: float, what: str) -> Timeline:
+        """Its values for the components ``names``.
+
+        Raises:
+            SceneFileError: It is for other components, of another length, or does not last for ``duration`` [s].
+        """
+        if self.file is not None:
+            return self._of_file(self.file, names, duration, what)
+        if self.times:
+            for index, row in enumerate(self.values):
+                if len(row) != len(names):
+                    raise self.table.error(
+                        f"{self.name}.values[{index}]",
+                        f"must have {len(names)} numbers, for {', '.join(names)}; got {len(row)}",
+                    )
+            try:
+                with np.errstate(all="ignore"):
+                    return _between(np.array(self.times), np.array(self.values), smooth=self.smooth)
+            except ValueError as error:
+                raise self.table.error(f"{self.name}.values", f"no smooth curve goes through them: {error}") from None
+        where = f"{self.name}.offset" if self.sines else self.name
+        offset = self.table.spread(where, self.offset, names, what)
+        if not self.sines:
+            return constant(offset)
+        for index, sine in enumerate(self.sines):
+            if sine.of not in names:
+                raise self.table.error(
+                    f"{self.name}.sines[{index}].of",
+                    f"there is no {what} {sine.of!r}; {suggestion(sine.of, names, what + 's')}",
+                )
+        place = [names.index(sine.of) for sine in self.sines]
+
+        def at(t: Floats) -> Floats:
+            total = np.tile(offset, (len(t), 1))
+            for column, sine in zip(place, self.sines, strict=True):
+                total[:, column] += sine.amplitude * np.sin(2.0 * math.pi * sine.frequency * t + sine.phase)
+            return total
+
+        return Timeline(at, constant=False)
+
+    def _of_file(self, path: Path, names: Sequence[str], duration: float, what: str) -> Timeline:
+        def wrong(problem: str) -> Exception:
+            return self.table.error(f"{self.name}.file", f"{path.name}: {problem}")
+
+        columns = _npz(path, wrong) if path.suffix == ".npz" else _csv(path, wrong)
+        if "t" not in columns:
+            raise wrong(f"it has no column t of times [s]; it has {', '.join(columns)}")
+        missing = [name for name in names if name not in columns]
+        if missing:
+            raise wrong(f"it has no column {missing[0]!r}; {what}s: {', '.join(names)}; columns: {', '.join(columns)}")
+        t = columns["t"]
+        rows = np.column_stack([columns[name] for name in names])
+        if len(t) < 2 or not (np.diff(t) > 0.0).all():
+            raise wrong("its times must be two or more, and increase")
+        if t[0] > 1e-9 * duration or t[-1] < duration * (1.0 - 1e-9):
+            raise wrong(f"its times go from {t[0]:g} to {t[-1]:g} s, and the scene from 0 to {duration:g} s")
+        return _between(t, rows, smooth=False)
+
+
+def _between(times: Floats, rows: Floats, *, smooth: bool) -> Timeline:
+    """Rows over time, the first and the last held before and after."""
+    if smooth:
+        curve = PchipInterpolator(times, rows)
+        return Timeline(lambda t: np.asarray(curve(np.clip(t, times[0], times[-1]))), constant=False)
+    return Timeline(lambda t: np.column_stack([np.interp(t, times, column) for column in rows.T]), constant=False)
+
+
+def _csv(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            rows = [row for row in csv.reader(stream) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise wrong(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if len(rows) < 2:
+        raise wrong("it must have a line of column names and lines of numbers")
+    head = [name.strip() for name in rows[0]]
+    found = np.empty((len(rows) - 1, len(head)))
+    for number, row in enumerate(rows[1:], start=2):
+        if len(row) != len(head):
+            raise wrong(f"row {number} has {len(row)} entries, and there are {len(head)} columns")
+        for column, word in enumerate(row):
+            try:
+                found[number - 2, column] = float(word)
+            except ValueError:
+                raise wrong(f"row {number}, column {head[column]!r}: {word.strip()!r} is no number") from None
+    if not np.isfinite(found).all():
+        line, place = (int(x) for x in np.argwhere(~np.isfinite(found))[0])
+        raise wrong(f"row {line + 2}, column {head[place]!r} is not finite")
+    return dict(zip(head, found.T, strict=True))
+
+
+def _npz(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
+    """The columns of an npz file: arrays of one length, or the joint positions of a saved trajectory."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays: dict[str, NDArray[Any]] = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        raise wrong(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if {"t", "q", "joint_names"} <= set(arrays) and arrays["q"].ndim == 2:
+        joints = [str(name) for name in arrays["joint_names"]]
+        if len(joints) == arrays["q"].shape[1]:
+            arrays = {"t": arrays["t"]} | dict(zip(joints, arrays["q"].T, strict=True))
+    length = arrays["t"].shape if "t" in arrays else ()
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fi" or array.ndim != 1 or array.shape != length:
+            raise wrong(f"its array {name!r} must be as many numbers as t, got shape {array.shape}")
+        if not np.isfinite(array).all():
+            raise wrong(f"its array {name!r} is not finite")
+    return {name: np.asarray(array, dtype=np.float64) for name, array in arrays.items()}
+
+
+def read_reference(table: Table, name: str, folder: Path, dt: float, default: float | None = None) -> Reference:
+    """The reference under ``name``: numbers, or a table of sines, waypoints or a file."""
+    value = table.data.get(name, default)
+    if not isinstance(value, dict) or not set(value) & set(KINDS):
+        return Reference(table, name, offset=table.by_name(name, default))
+    own = table.table(name).allow(*KINDS)
+    kind = own.one_of("sines", "times", "file")
+    if kind == "file":
+        own.allow("file")
+        path = inside(own, "file", own.text("file"), folder, "the scene's folder")
+        if path.suffix not in (".csv", ".npz"):
+            raise own.error("file", f"must be a .csv or .npz file, got {path.name!r}")
+        if not path.is_file():
+            raise own.error("file", f"there is no file {path}")
+        return Reference(table, name, file=path)
+    if kind == "times":
+        own.allow("times", "values", "between")
+        times = own.numbers("times")
+        if len(times) < 2 or not all(b > a for a, b in itertools.pairwise(times)):
+            raise own.error("times", f"must be two or more, and increase [s], got {list(times)}")
+        rows = own.require("values", "a list of rows, one for each of times")
+        if not isinstance(rows, list) or len(rows) != len(times):
+            got = f"{len(rows)} rows" if isinstance(rows, list) else "no list"
+            raise own.error("values", f"must have {len(times)} rows, one for each of times; got {got}")
+        values = tuple(own.as_numbers(f"values[{index}]", row) for index, row in enumerate(rows))
+        smooth = own.choice("between", ("lines", "smooth"), "lines") == "smooth"
+        return Reference(table, name, times=times, values=values, smooth=smooth)
+    own.allow("offset", "sines")
+    sines = []
+    for sine in own.tables("sines"):
+        sine.allow("of", "amplitude", "frequency", "phase")
+        frequency = sine.number("frequency", unit="Hz", above=0.0)
+        if frequency > 0.5 / dt:
+            raise sine.error(
+                "frequency", f"must be <= {0.5 / dt:g} [Hz], the most that dt = {dt:g} s resolves, got {frequency:g}"
+            )
+        sines.append(Sine(sine.text("of"), sine.number("amplitude"), frequency, sine.number("phase", 0.0, unit="rad")))
+    return Reference(table, name, offset=own.by_name("offset", 0.0), sines=tuple(sines))

@@ -1,0 +1,445 @@
+"""What a scene file says, read and checked as far as that goes without the robot."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from varpin.errors import FileError, InputError
+from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
+from varpin.robot import Payload, models_dir
+from varpin.scenefile.references import Reference, read_reference
+from varpin.scenefile.table import ByName, SceneFileError, Table, inside, suggestion
+from varpin.scenefile.terms import TERMS, Term
+
+# More than any horizon has, and still a number of steps that NumPy takes.
+MOST_STEPS = 10**9
+FIGURES = (".png", ".pdf", ".svg")
+
+
+@dataclass(frozen=True)
+class RobotSpec:
+    """Which robot, and how it is taken.
+
+    Attributes:
+        source: A name, or the path of a URDF file.
+        lock: Joints held still, and where [rad or m].
+        mimic: ``"tied"`` or ``"free"``.
+        package_dirs: Where meshes are looked up.
+        payload: What it carries.
+    """
+
+    source: str | Path
+    lock: Mapping[str, float]
+    mimic: str
+    package_dirs: tuple[str, ...]
+    payload: tuple[Payload, ...]
+
+
+@dataclass(frozen=True)
+class NoiseSpec:
+    """A noise model.
+
+    Attributes:
+        kind: ``"additive"``, ``"control"`` or ``"state"``.
+        intensity: By joint, or by control for ``"control"``.
+        center: Of state noise; None for where the motion starts.
+    """
+
+    kind: str
+    intensity: ByName
+    center: ByName | None
+
+
+@dataclass(frozen=True, eq=False)
+class CostSpec:
+    """A term of the cost.
+
+    Attributes:
+        table: Where it stands.
+        term: What kind it is.
+        weight: By component.
+        terminal: At the end, instead of its integral.
+        reference: Its target over time, if it has one.
+        hold: A configuration whose holding torques are the reference, by joint; ``()`` for the initial one.
+        frame: Name of a frame, for terms that have one.
+        numbers: What else it takes.
+        words: What else it takes.
+    """
+
+    table: Table
+    term: Term
+    weight: ByName
+    terminal: bool
+    reference: Reference | None
+    hold: ByName | None
+    frame: str
+    numbers: Mapping[str, float]
+    words: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Files to write, relative ones below the working directory.
+
+    Attributes:
+        save: Trajectory or solution, npz.
+        plot: Figure.
+        html: Replay.
+        speed: Of the replay.
+    """
+
+    save: Path | None
+    plot: Path | None
+    html: Path | None
+    speed: float
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSpec:
+    """A scene file.
+
+    Attributes:
+        name: Of the file, or of the bundled scene.
+        title: For people.
+        path: Of the file.
+        root: Its tables, for messages.
+        robot: See :class:`RobotSpec`.
+        gravity: [m/s^2], or whether there is any.
+        damping: By joint [N m s/rad or N s/m].
+        stiffness: Of joint springs, by joint [N m/rad or N/m].
+        rest: Where springs are slack, by joint [rad or m].
+        actuated: Joints that are driven; None for all.
+        gear: Generalized force per control, by driven joint.
+        torque_limit: By driven joint [N m or N]; ``"robot"`` for the robot description's; None for none.
+        noise: Models.
+        q0: Initial configuration by joint [rad or m].
+        v0: Initial velocity by joint.
+        dt: [s].
+        steps: N.
+        hold: Steps that share a control.
+        sampling: Of running costs.
+        integrator: The integrator.
+        costs: Terms.
+        controls: Of a simulation: None for none, ``"hold"`` for holding ones, or values over time.
+        seed: Of the noise of a simulation; without it there is none.
+        options: Of solve.
+        outputs: Files to write.
+    """
+
+    name: str
+    title: str
+    path: Path
+    root: Table
+    robot: RobotSpec
+    gravity: bool | tuple[float, ...]
+    damping: ByName
+    stiffness: ByName
+    rest: ByName
+    actuated: tuple[str, ...] | None
+    gear: ByName
+    torque_limit: ByName | str | None
+    noise: tuple[NoiseSpec, ...]
+    q0: ByName
+    v0: ByName
+    dt: float
+    steps: int
+    hold: int
+    sampling: str
+    integrator: Integrator
+    costs: tuple[CostSpec, ...]
+    controls: Reference | str | None
+    seed: int | None
+    options: Mapping[str, Any]
+    outputs: Outputs
+
+    @property
+    def duration(self) -> float:
+        """The horizon [s]."""
+        return self.dt * self.steps
+
+
+def scenes() -> dict[str, Path]:
+    """The scenes that come with varpin, by name."""
+    return {path.stem: path for path in sorted((models_dir() / "scenes").glob("*.toml"))}
+
+
+def find_scene(source: str | Path) -> Path:
+    """The scene file at a path, or of a bundled name.
+
+    Raises:
+        FileError: There is none; names that come close are listed.
+        InputError: Not a path.
+    """
+    if not isinstance(source, str | Path) or "\0" in str(source):
+        raise InputError(f"a scene must be the path of a TOML file or a name, got {type(source).__name__}")
+    bundled = scenes()
+    if str(source) in bundled:
+        return bundled[str(source)]
+    path = Path(source).expanduser()
+    if path.is_file():
+        return path
+    if path.is_dir():
+        raise FileError(f"{path} is a folder, not a scene file")
+    raise FileError(f"no scene file {str(source)!r}; {suggestion(path.stem, bundled, 'bundled scenes')}")
+
+
+def read_scene(path: Path, name: str | None = None) -> SceneSpec:
+    """Read a scene file.
+
+    Raises:
+        FileError: It cannot be read.
+        SceneFileError: A mistake in it.
+    """
+    source = path.name
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FileError(f"cannot read {path}: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise SceneFileError(source, "", "it is not a text in UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SceneFileError(source, "", f"it is not TOML: {error}") from None
+    except RecursionError:
+        raise SceneFileError(source, "", "it is nested too deeply") from None
+    return _scene(Table(source, "", data), path, path.stem if name is None else name)
+
+
+def _scene(root: Table, path: Path, name: str) -> SceneSpec:
+    root.allow(
+        *("title", "gravity", "damping", "robot", "springs", "actuation", "noise", "initial", "horizon", "integrator"),
+        *("cost", "simulate", "solve", "outputs"),
+    )
+    for required in ("robot", "horizon"):
+        root.require(required, f"the table [{required}]")
+    folder = path.resolve().parent
+    horizon = _horizon(root.table("horizon"))
+    springs = root.table("springs").allow("stiffness", "rest")
+    initial = root.table("initial").allow("q", "v")
+    actuation = root.table("actuation").allow("joints", "gear", "torque_limit")
+    simulation = root.table("simulate").allow("controls", "seed")
+    limit: ByName | str | None = None
+    if isinstance(actuation.data.get("torque_limit"), str):
+        limit = actuation.choice("torque_limit", ("robot",))
+    elif "torque_limit" in actuation:
+        limit = actuation.by_name("torque_limit", least=0.0, unit="N m or N")
+    controls: Reference | str | None = None
+    if isinstance(simulation.data.get("controls"), str):
+        controls = simulation.choice("controls", ("hold",))
+    elif "controls" in simulation:
+        controls = read_reference(simulation, "controls", folder, horizon["dt"])
+    joints = actuation.texts("joints")
+    if "joints" in actuation and not joints:
+        raise actuation.error("joints", "must name a joint at least; leave it out to drive all of them")
+    return SceneSpec(
+        name=name,
+        title=root.text("title", name),
+        path=path,
+        root=root,
+        robot=_robot(root.table("robot"), folder),
+        gravity=_gravity(root),
+        damping=root.by_name("damping", 0.0, least=0.0, unit="N m s/rad or N s/m"),
+        stiffness=springs.by_name("stiffness", 0.0, least=0.0, unit="N m/rad or N/m"),
+        rest=springs.by_name("rest", 0.0, unit="rad or m"),
+        actuated=joints or None,
+        gear=actuation.by_name("gear", 1.0),
+        torque_limit=limit,
+        noise=tuple(_noise(table) for table in root.tables("noise")),
+        q0=initial.by_name("q", 0.0, unit="rad or m"),
+        v0=initial.by_name("v", 0.0, unit="rad/s or m/s"),
+        **horizon,
+        integrator=_integrator(root.table("integrator")),
+        costs=tuple(_cost(table, folder, horizon["dt"]) for table in root.tables("cost")),
+        controls=controls,
+        seed=simulation.whole("seed") if "seed" in simulation else None,
+        options=_options(root.table("solve")),
+        outputs=_outputs(root.table("outputs")),
+    )
+
+
+def _robot(table: Table, folder: Path) -> RobotSpec:
+    table.allow("source", "lock", "mimic", "package_dirs", "payload")
+    text = table.text("source")
+    source: str | Path = text
+    if Path(text).suffix or "/" in text or "\\" in text:
+        source = inside(table, "source", text, folder, "the scene's folder")
+        if not source.is_file():
+            raise table.error("source", f"there is no file {source}")
+    lock = table.table("lock")
+    folders = tuple(
+        str(inside(table, f"package_dirs[{index}]", entry, folder, "the scene's folder"))
+        for index, entry in enumerate(table.texts("package_dirs"))
+    )
+    return RobotSpec(
+        source=source,
+        lock={joint: lock.number(joint, unit="rad or m") for joint in lock.data},
+        mimic=table.choice("mimic", ("tied", "free"), "tied"),
+        package_dirs=folders,
+        payload=tuple(_payload(entry) for entry in table.tables("payload")),
+    )
+
+
+def _payload(table: Table) -> Payload:
+    table.allow("frame", "mass", "com", "inertia")
+    inertia: Any = 0.0
+    if "inertia" in table:
+        inertia = table.numbers("inertia")
+        if len(inertia) == 6:
+            xx, xy, xz, yy, yz, zz = inertia
+            inertia = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+        elif len(inertia) != 3:
+            raise table.error(
+                "inertia", f"must be 3 principal moments or 6 entries ixx, ixy, ixz, iyy, iyz, izz; got {len(inertia)}"
+            )
+    try:
+        return Payload(
+            frame=table.text("frame"),
+            mass=table.number("mass", unit="kg", above=0.0),
+            center=table.numbers("com", 3) if "com" in table else (0.0, 0.0, 0.0),
+            inertia=inertia,
+        )
+    except InputError as error:
+        raise table.error("inertia", str(error).removeprefix("payload inertia ")) from None
+
+
+def _gravity(root: Table) -> bool | tuple[float, ...]:
+    if isinstance(root.data.get("gravity", True), bool):
+        return root.flag("gravity", True)
+    if not isinstance(root.data["gravity"], list):
+        raise root.error("gravity", "must be true, false or three numbers [m/s^2]")
+    return root.numbers("gravity", 3)
+
+
+def _noise(table: Table) -> NoiseSpec:
+    table.allow("type", "intensity", "center")
+    kind = table.choice("type", ("additive", "control", "state"))
+    if kind != "state" and "center" in table:
+        raise table.error("center", f"is of state noise alone, and this is {kind} noise")
+    return NoiseSpec(
+        kind=kind,
+        intensity=table.by_name("intensity", least=0.0),
+        center=table.by_name("center", unit="rad or m") if "center" in table else None,
+    )
+
+
+def _horizon(table: Table) -> dict[str, Any]:
+    table.allow("dt", "steps", "duration", "hold", "sampling")
+    dt = table.number("dt", unit="s", above=0.0)
+    if table.one_of("steps", "duration") == "steps":
+        steps = table.whole("steps", least=1, most=MOST_STEPS)
+    else:
+        duration = table.number("duration", unit="s", above=0.0)
+        steps = round(min(duration / dt, 2.0 * MOST_STEPS))
+        if steps < 1 or abs(steps * dt - duration) > 1e-9 * duration:
+            raise table.error("duration", f"{duration:g} s is no whole number of steps of dt = {dt:g} s")
+        if steps > MOST_STEPS:
+            raise table.error("duration", f"{duration:g} s has more than {MOST_STEPS} steps of {dt:g} s")
+    hold = table.whole("hold", 1, least=1)
+    if steps % hold:
+        raise table.error("hold", f"{steps} steps are no multiple of {hold}")
+    return {
+        "dt": dt,
+        "steps": steps,
+        "hold": hold,
+        "sampling": table.choice("sampling", ("midpoint", "gauss", "start"), "midpoint"),
+    }
+
+
+_INTEGRATORS: dict[str, tuple[Callable[..., Integrator], tuple[str, ...]]] = {
+    "midpoint": (Midpoint, ("alpha", "kick")),
+    "gauss": (Gauss, ("stages", "kick")),
+    "explicit_euler": (ExplicitEuler, ()),
+    "semi_implicit_euler": (SemiImplicitEuler, ()),
+    "runge_kutta_4": (RungeKutta4, ()),
+}
+
+
+def _integrator(table: Table) -> Integrator:
+    kind = table.choice("type", _INTEGRATORS, "midpoint")
+    make, names = _INTEGRATORS[kind]
+    table.allow("type", *names)
+    given: dict[str, Any] = {}
+    if "alpha" in table:
+        given["alpha"] = table.number("alpha", least=0.0, most=1.0)
+    if "stages" in table:
+        given["stages"] = table.whole("stages", least=1)
+    if "kick" in table:
+        given["kick"] = table.choice("kick", ("left", "split"))
+    try:
+        return make(**given)
+    except InputError as error:
+        raise table.error("", str(error)) from None
+
+
+def _cost(table: Table, folder: Path, dt: float) -> CostSpec:
+    kind = table.choice("type", TERMS)
+    term = TERMS[kind]
+    reference = () if term.reference is None else (term.reference,)
+    frame = ("frame",) if term.frame else ()
+    held = ("hold",) if term.hold else ()
+    terminal = ("terminal",) if term.can_end else ()
+    if "terminal" in table and not terminal:
+        raise table.error("terminal", f"a term {kind!r} has no meaning at the end: there is no control there")
+    table.allow("type", "weight", *reference, *frame, *held, *terminal, *term.numbers, *term.words)
+    hold: ByName | None = None
+    if "hold" in table:
+        table.one_of(*held, *reference)
+        hold = () if table.data["hold"] is True else table.by_name("hold", unit="rad or m")
+    found = None
+    if term.reference is not None and hold is None:
+        default = 0.0 if term.optional else None
+        found = read_reference(table, term.reference, folder, dt, default)
+    weight = table.by_name("weight", 1.0, least=0.0)
+    if len(term.axes) == 1 and not isinstance(weight, float):
+        raise table.error("weight", "must be one number")
+    return CostSpec(
+        table=table,
+        term=term,
+        weight=weight,
+        terminal=table.flag("terminal", False) if term.can_end else False,
+        reference=found,
+        hold=hold,
+        frame=table.text("frame") if term.frame else "",
+        numbers={name: table.number(name, default, least=0.0) for name, default in term.numbers.items()},
+        words={name: table.choice(name, options, options[0]) for name, options in term.words.items()},
+    )
+
+
+def _options(table: Table) -> dict[str, Any]:
+    table.allow("tolerance", "max_iterations", "second_order", "forward", "regularization")
+    options: dict[str, Any] = {}
+    if "tolerance" in table:
+        options["tolerance"] = table.number("tolerance", above=0.0)
+    if "max_iterations" in table:
+        options["max_iterations"] = table.whole("max_iterations")
+    if "second_order" in table:
+        options["second_order"] = table.flag("second_order", False)
+    if "forward" in table:
+        options["forward"] = table.choice("forward", ("closed", "open"))
+    if "regularization" in table:
+        options["regularization"] = table.number("regularization", least=0.0)
+    return options
+
+
+def _outputs(table: Table) -> Outputs:
+    table.allow("save", "plot", "html", "speed")
+    endings = {"save": (".npz",), "plot": FIGURES, "html": (".html",)}
+    paths: dict[str, Path | None] = {}
+    for name, allowed in endings.items():
+        if name not in table:
+            paths[name] = None
+            continue
+        path = inside(table, name, table.text(name), Path.cwd(), "the working directory")
+        if path.suffix.lower() not in allowed:
+            raise table.error(name, f"must end in {', '.join(allowed)}, got {path.name!r}")
+        paths[name] = path
+    return Outputs(**paths, speed=table.number("speed", 1.0, above=0.0))
+
+
+def degrees_for_radians(value: float) -> bool:
+    """Whether an angle is beyond two turns either way, as degrees written for radians are."""
+    return abs(value) > 4.0 * math.pi

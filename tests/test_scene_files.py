@@ -1,0 +1,480 @@
+"""Scene files: what they may say, each mistake in its own words, and that they reach no further than what they name."""
+
+import copy
+import datetime
+import functools
+import itertools
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin.scenefile import scenes
+from varpin.scenefile.terms import TERMS
+
+ROOT = Path(__file__).resolve().parents[1]
+
+GOOD = """
+title = "test"
+gravity = true
+damping = { mcp = 1e-5, pip = 2e-5 }
+
+[robot]
+source = "finger"
+lock = { dip = 0.2 }
+
+[[robot.payload]]
+frame = "tip"
+mass = 1e-3
+com = [0.0, 0.0, 1e-3]
+inertia = [1e-8, 1e-8, 1e-8]
+
+[springs]
+stiffness = 1e-3
+rest = [0.1, 0.2]
+
+[actuation]
+joints = ["mcp", "pip"]
+gear = { mcp = 2.0, pip = 1.0 }
+torque_limit = 0.5
+
+[[noise]]
+type = "state"
+intensity = 1e-4
+center = 0.1
+
+[initial]
+q = [0.5, 0.3]
+v = { mcp = 0.1 }
+
+[horizon]
+dt = 2e-3
+duration = 0.1
+
+[integrator]
+type = "midpoint"
+alpha = 0.5
+
+[[cost]]
+type = "tracking"
+weight = { mcp = 10.0 }
+reference = { offset = { mcp = 1.0 }, sines = [{ of = "mcp", amplitude = 0.2, frequency = 2.0 }] }
+
+[[cost]]
+type = "control"
+weight = 0.1
+hold = true
+
+[simulate]
+controls = [0.0, 0.0]
+seed = 3
+
+[solve]
+max_iterations = 5
+
+[outputs]
+save = "plan.npz"
+"""
+
+
+def write(folder, text, name="scene.toml"):
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def changed(old, new):
+    assert GOOD.count(old) == 1, old
+    return GOOD.replace(old, new)
+
+
+def test_everything_in_a_scene_arrives(tmp_path):
+    file = vp.load_scene(write(tmp_path, GOOD))
+    scene, problem = file.scene, file.problem
+    assert file.robot.joint_names == ("mcp", "pip")
+    assert dict(file.robot.locked) == {"dip": 0.2}
+    np.testing.assert_array_equal(scene.gravity, [0.0, 0.0, -9.81])
+    np.testing.assert_array_equal(scene.damping, [1e-5, 2e-5])
+    np.testing.assert_array_equal(scene.stiffness, [1e-3, 1e-3])
+    np.testing.assert_array_equal(scene.rest, [0.1, 0.2])
+    np.testing.assert_array_equal(scene.actuation, [[2.0, 0.0], [0.0, 1.0]])
+    np.testing.assert_array_equal(problem.control_limits, [[-0.25, -0.5], [0.25, 0.5]])
+    np.testing.assert_array_equal(
+        scene.noise.fields(np.ones((1, 2)), np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(2)).F[0],
+        np.diag([1e-4 * 0.81] * 2),
+    )
+    np.testing.assert_array_equal(file.q0, [0.5, 0.3])
+    np.testing.assert_array_equal(file.v0, [0.1, 0.0])
+    assert (problem.dt, problem.steps, problem.integrator) == (2e-3, 50, vp.Midpoint(alpha=0.5))
+    bare = vp.load_robot("finger", lock={"dip": 0.2})
+    assert file.robot.tree.mass.sum() == pytest.approx(bare.tree.mass.sum() + 1e-3, rel=1e-12)
+    assert file.spec.outputs.save == Path.cwd() / "plan.npz"
+
+
+def test_cost_of_a_scene_is_that_written_in_python(tmp_path):
+    file = vp.load_scene(write(tmp_path, GOOD))
+
+    def reference(t):
+        return [1.0 + 0.2 * np.sin(4.0 * np.pi * t), 0.0]
+
+    hold = np.linalg.solve(file.scene.actuation, -vp.lagrangian_jet(file.scene, file.q0, np.zeros(2)).Lq)
+    cost = vp.TrackingCost(reference, [10.0, 0.0]) + vp.ControlCost(0.1, hold)
+    problem = vp.OptimalControlProblem(file.scene, cost, file.q0, file.v0, dt=2e-3, steps=50)
+    rng = np.random.default_rng(0)
+    q, v, u = rng.normal(size=(3, 51, 2))
+    assert file.problem.costs(q, v, u[:50]) == pytest.approx(problem.costs(q, v, u[:50]), rel=1e-12)
+
+
+# What is wrong, where, and the words that say so.
+MISTAKES = {
+    "no TOML": (changed("gravity = true", "gravity ="), "", "not TOML"),
+    "key twice": (GOOD + "\n[robot]\nsource = 'ur5'\n", "", "not TOML"),
+    "unknown table": (changed("[springs]", "[spring]"), "spring", "did you mean 'springs'"),
+    "unknown key": (changed("mass = 1e-3", "mas = 1e-3"), "robot.payload[0].mas", "did you mean 'mass'"),
+    "no robot": (GOOD.replace('source = "finger"\n', ""), "robot.source", "is missing"),
+    "no horizon": (GOOD[: GOOD.index("[horizon]")] + GOOD[GOOD.index("[integrator]") :], "horizon", "is missing"),
+    "unknown robot": (changed('"finger"', '"fingr"'), "robot.source", "close matches: finger"),
+    "unknown joint locked": (changed("dip = 0.2", "dop = 0.2"), "robot.lock.dop", "did you mean 'dip'"),
+    "locked joint used": (changed("damping = { mcp", "damping = { dip"), "damping.dip", "the joint is locked at 0.2"),
+    "unknown frame of a payload": (changed('"tip"', '"tipp"'), "robot.payload[0].frame", "did you mean 'tip'"),
+    "payload on the base": (changed('"tip"', '"universe"'), "robot", "part of the base"),
+    "negative mass": (changed("mass = 1e-3", "mass = -1e-3"), "robot.payload[0].mass", "must be > 0 [kg], got -0.001"),
+    "impossible inertia": (
+        changed("[1e-8, 1e-8, 1e-8]", "[1e-8, 1e-8, 9e-8]"),
+        "robot.payload[0].inertia",
+        "of no rigid body",
+    ),
+    "com of two numbers": (
+        changed("[0.0, 0.0, 1e-3]", "[0.0, 1e-3]"),
+        "robot.payload[0].com",
+        "must have 3 numbers, got 2",
+    ),
+    "gravity as a number": (changed("gravity = true", "gravity = 9.81"), "gravity", "true, false or three numbers"),
+    "negative damping": (changed("mcp = 1e-5", "mcp = -1e-5"), "damping.mcp", "must be >= 0"),
+    "list of the wrong length": (
+        changed("rest = [0.1, 0.2]", "rest = [0.1]"),
+        "springs.rest",
+        "must have 2 numbers, for mcp, pip; got 1",
+    ),
+    "text for a number": (changed("stiffness = 1e-3", 'stiffness = "1e-3"'), "springs.stiffness", "got '1e-3'"),
+    "true for a number": (
+        changed("amplitude = 0.2", "amplitude = true"),
+        "cost[0].reference.sines[0].amplitude",
+        "got true",
+    ),
+    "not finite": (changed("dt = 2e-3", "dt = nan"), "horizon.dt", "must be finite"),
+    "dt of zero": (changed("dt = 2e-3", "dt = 0"), "horizon.dt", "must be > 0 [s], got 0"),
+    "steps and duration": (changed("duration = 0.1", "duration = 0.1\nsteps = 50"), "horizon", "exclude each other"),
+    "neither steps nor duration": (changed("duration = 0.1", ""), "horizon", "one of steps, duration is missing"),
+    "no whole number of steps": (
+        changed("duration = 0.1", "duration = 0.101"),
+        "horizon.duration",
+        "no whole number of steps",
+    ),
+    "degrees for radians": (changed("q = [0.5, 0.3]", "q = [30.0, 20.0]"), "initial.q", "looks like degrees"),
+    "locked in degrees": (changed("dip = 0.2", "dip = 20"), "robot.lock.dip", "looks like degrees"),
+    "unknown driven joint": (changed('["mcp", "pip"]', '["mcp", "pop"]'), "actuation.joints[1]", "did you mean 'pip'"),
+    "driven joint twice": (changed('["mcp", "pip"]', '["mcp", "mcp"]'), "actuation.joints[1]", "there twice"),
+    "no gear": (changed("mcp = 2.0, pip", "mcp = 0.0, pip"), "actuation.gear", "must not be 0"),
+    "no torque": (changed("torque_limit = 0.5", "torque_limit = 0.0"), "actuation.torque_limit", "must be > 0"),
+    "controls beyond the limit": (
+        changed("controls = [0.0, 0.0]", "controls = [0.0, 0.6]"),
+        "simulate.controls",
+        "torque_limit is 0.5",
+    ),
+    "unknown noise": (changed('type = "state"', '"type" = "white"'), "noise[0].type", "additive, control, state"),
+    "center of additive noise": (
+        changed('type = "state"', 'type = "additive"'),
+        "noise[0].center",
+        "of state noise alone",
+    ),
+    "unknown integrator": (
+        changed('type = "midpoint"', 'type = "mid_point"'),
+        "integrator.type",
+        "did you mean 'midpoint'",
+    ),
+    "alpha out of range": (changed("alpha = 0.5", "alpha = 1.5"), "integrator.alpha", "must be >= 0 and <= 1"),
+    "option of another integrator": (changed("alpha = 0.5", "stages = 2"), "integrator.stages", "unknown key"),
+    "unknown cost": (changed('"tracking"', '"traking"'), "cost[0].type", "did you mean 'tracking'"),
+    "cost as one table": (changed("[[noise]]", "[noise]"), "noise", "write [[noise]]"),
+    "negative weight": (changed("weight = 0.1", "weight = -0.1"), "cost[1].weight", "must be >= 0"),
+    "no reference": (changed("reference = { offset", "#"), "cost[0].reference", "is missing"),
+    "control cost at the end": (
+        changed("hold = true", "hold = true\nterminal = true"),
+        "cost[1].terminal",
+        "no meaning at the end",
+    ),
+    "hold and reference": (changed("hold = true", "hold = true\nreference = 0.0"), "cost[1]", "exclude each other"),
+    "frequency beyond the step": (
+        changed("frequency = 2.0", "frequency = 2000"),
+        "cost[0].reference.sines[0].frequency",
+        "dt = 0.002 s resolves",
+    ),
+    "sine of an unknown joint": (
+        changed('of = "mcp"', 'of = "dip"'),
+        "cost[0].reference.sines[0].of",
+        "no joint 'dip'",
+    ),
+    "unknown frame of a cost": (
+        changed(
+            'type = "control"\nweight = 0.1\nhold = true', 'type = "frame_position"\nframe = "top"\ntarget = [0, 0, 0]'
+        ),
+        "cost[1].frame",
+        "did you mean 'tip'",
+    ),
+    "target of two numbers": (
+        changed(
+            'type = "control"\nweight = 0.1\nhold = true', 'type = "frame_position"\nframe = "tip"\ntarget = [0, 0]'
+        ),
+        "cost[1].target",
+        "for x, y, z; got 2",
+    ),
+    "waypoints that go back": (
+        changed(
+            '{ offset = { mcp = 1.0 }, sines = [{ of = "mcp", amplitude = 0.2, frequency = 2.0 }] }',
+            "{ times = [0.1, 0.0], values = [[0, 0], [1, 1]] }",
+        ),
+        "cost[0].reference.times",
+        "must be two or more, and increase",
+    ),
+    "rows of waypoints": (
+        changed(
+            '{ offset = { mcp = 1.0 }, sines = [{ of = "mcp", amplitude = 0.2, frequency = 2.0 }] }',
+            "{ times = [0.0, 0.1], values = [[0, 0], [1]] }",
+        ),
+        "cost[0].reference.values[1]",
+        "must have 2 numbers",
+    ),
+    "seed as a number": (changed("seed = 3", "seed = 0.5"), "simulate.seed", "must be an integer"),
+    "unknown option of solve": (
+        changed("max_iterations", "max_iteration"),
+        "solve.max_iteration",
+        "did you mean 'max_iterations'",
+    ),
+    "output of another kind": (changed('"plan.npz"', '"plan.pkl"'), "outputs.save", "must end in .npz"),
+    "output outside": (changed('"plan.npz"', '"../plan.npz"'), "outputs.save", "leads out of the working directory"),
+    "date for a text": (changed('title = "test"', "title = 2020-01-01"), "title", "must be a text in quotes"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistake(mistake, tmp_path):
+    text, key, words = MISTAKES[mistake]
+    with pytest.raises(vp.SceneFileError) as caught:
+        vp.load_scene(write(tmp_path, text))
+    error = caught.value
+    assert error.key == key
+    assert words in error.problem
+    assert str(error).startswith(f"scene.toml: {key}")
+    assert "\n" not in str(error)
+
+
+def test_every_mistake_has_its_own_message(tmp_path):
+    messages = set()
+    for text, _, _ in MISTAKES.values():
+        with pytest.raises(vp.SceneFileError) as caught:
+            vp.load_scene(write(tmp_path, text))
+        messages.add(str(caught.value))
+    assert len(messages) == len(MISTAKES) >= 30
+
+
+ODD = [
+    *(None, True, -1, 0, 3, 2.5, 1e308, 1e-320, float("nan"), float("inf"), 10**400, "", "x", "\0", "a/b", "../x"),
+    *([], [1.0], [[1]], ["a"], [True], ["mcp", "mcp"], {}, {"a": 1}, {"file": "x"}, [{}], datetime.date(2020, 1, 1)),
+]
+
+
+def leaves(data, path=()):
+    if path:
+        yield path
+    for key in data if isinstance(data, dict) else range(len(data)) if isinstance(data, list) else ():
+        yield from leaves(data[key], (*path, key))
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
+def test_odd_values_anywhere_are_taken_or_refused_in_words(tmp_path, monkeypatch):
+    """Each value of a scene in turn is another: what comes of it is a scene or one line that names a key."""
+    path, whole = write(tmp_path, ""), tomllib.loads(GOOD)
+    odd = itertools.cycle(ODD)
+    refused = []
+    for place in leaves(whole):
+        for value in itertools.islice(odd, 7):
+            data = copy.deepcopy(whole)
+            table = functools.reduce(lambda t, key: t[key], place[:-1], data)
+            if value is None:
+                del table[place[-1]]
+            else:
+                table[place[-1]] = value
+            monkeypatch.setattr(tomllib, "loads", lambda _, data=data: data)
+            try:
+                vp.load_scene(path)
+            except vp.SceneFileError as error:
+                refused.append(error)
+    assert len(refused) > 300
+    for error in refused:
+        assert error.key, error
+        assert "\n" not in str(error)
+
+
+def tracked(reference):
+    return f"""
+[robot]
+source = "finger"
+[horizon]
+dt = 1e-2
+steps = 10
+[[cost]]
+type = "tracking"
+reference = {reference}
+"""
+
+
+def target_of(file):
+    return file._layout.costs[0].target
+
+
+def test_waypoints(tmp_path):
+    waypoints = "times = [0.0, 0.05, 0.1], values = [[0, 0, 0], [1, 2, 0], [1, 0, 0]]"
+    lines = target_of(vp.load_scene(write(tmp_path, tracked(f"{{ {waypoints} }}"))))
+    np.testing.assert_allclose(lines(0.025), [0.5, 1.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(lines(0.2), [1.0, 0.0, 0.0], atol=1e-15)
+    smooth = target_of(vp.load_scene(write(tmp_path, tracked(f'{{ {waypoints}, between = "smooth" }}'))))
+    np.testing.assert_allclose(smooth.at(np.array([0.0, 0.05, 0.1])), [[0, 0, 0], [1, 2, 0], [1, 0, 0]], atol=1e-15)
+    fine = smooth.at(np.linspace(0.0, 0.1, 1001))
+    assert fine.max() <= 2.0  # no overshoot
+
+
+def test_reference_from_files(tmp_path):
+    write(tmp_path, "t, dip, mcp, pip\n0, 1, 2, 3\n0.2, 3, 2, 1\n", "path.csv")
+    target = target_of(vp.load_scene(write(tmp_path, tracked('{ file = "path.csv" }'))))
+    np.testing.assert_allclose(target(0.1), [2.0, 2.0, 2.0])
+    np.testing.assert_allclose(target(0.0), [2.0, 3.0, 1.0])
+    motion = vp.simulate(vp.Scene(vp.load_robot("finger")), [0.1, 0.2, 0.3], np.zeros(3), dt=0.01, steps=10)
+    motion.save(tmp_path / "path.npz")
+    target = target_of(vp.load_scene(write(tmp_path, tracked('{ file = "path.npz" }'))))
+    np.testing.assert_array_equal(target.at(motion.t), motion.q)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("t, mcp, pip\n0,1,2\n1,2,3\n", "no column 'dip'"),
+        ("mcp, pip, dip\n0,1,2\n1,2,3\n", "no column t"),
+        ("t, mcp, pip, dip\n0,1,2,3\n0.05,2,3,4\n", "from 0 to 0.05 s"),
+        ("t, mcp, pip, dip\n0,1,2,3\n1,2,x,4\n", "row 3, column 'pip': 'x' is no number"),
+        ("t, mcp, pip, dip\n0,1,2,3\n1,2,4\n", "row 3 has 3 entries"),
+        ("t, mcp, pip, dip\n0,1,2,3\n1,2,nan,4\n", "row 3, column 'pip' is not finite"),
+        ("t, mcp, pip, dip\n1,1,2,3\n0,2,3,4\n", "must be two or more, and increase"),
+        ("", "a line of column names"),
+    ],
+)
+def test_faulty_csv(text, words, tmp_path):
+    write(tmp_path, text, "path.csv")
+    with pytest.raises(vp.SceneFileError, match=re.escape(words)) as caught:
+        vp.load_scene(write(tmp_path, tracked('{ file = "path.csv" }')))
+    assert caught.value.key == "cost[0].reference.file"
+
+
+class Bomb:
+    """Touches a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_pickled_file_is_not_run(tmp_path):
+    np.savez(tmp_path / "path.npz", t=np.array([Bomb(tmp_path / "run")], dtype=object))
+    with pytest.raises(vp.SceneFileError, match="cannot be read"):
+        vp.load_scene(write(tmp_path, tracked('{ file = "path.npz" }')))
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("name", ["../secret.csv", "sub/../../secret.csv", "link.csv", "linked/secret.csv"])
+def test_files_outside_are_out_of_reach(name, tmp_path):
+    """Relative paths stay below the scene's folder, links followed; an absolute path says what it means."""
+    inner = tmp_path / "inner"
+    (inner / "sub").mkdir(parents=True)
+    write(tmp_path, "t, mcp, pip, dip\n0,1,2,3\n1,2,3,4\n", "secret.csv")
+    (inner / "link.csv").symlink_to(tmp_path / "secret.csv")
+    (inner / "linked").symlink_to(tmp_path)
+    with pytest.raises(vp.SceneFileError, match="leads out of the scene's folder"):
+        vp.load_scene(write(inner, tracked(f'{{ file = "{name}" }}')))
+    with pytest.raises(vp.SceneFileError, match="leads out of the scene's folder"):
+        vp.load_scene(write(inner, f'[robot]\nsource = "{name}"\n[horizon]\ndt = 0.1\nsteps = 1\n'))
+    vp.load_scene(write(inner, tracked(f'{{ file = "{tmp_path / "secret.csv"}" }}')))
+
+
+def test_robot_beside_the_scene(tmp_path):
+    urdf = (ROOT / "models" / "finger.urdf").read_text(encoding="utf-8")
+    write(tmp_path, urdf, "my.urdf")
+    file = vp.load_scene(write(tmp_path, tracked("0.1").replace('"finger"', '"my.urdf"')))
+    assert file.robot.joint_names == ("mcp", "pip", "dip")
+    with pytest.raises(vp.SceneFileError, match="there is no file"):
+        vp.load_scene(write(tmp_path, tracked("0.1").replace('"finger"', '"our.urdf"')))
+
+
+def test_files_that_are_no_scenes(tmp_path):
+    with pytest.raises(vp.FileError, match="did you mean 'finger_tracking'"):
+        vp.load_scene("finger_trackin")
+    with pytest.raises(vp.FileError, match="is a folder"):
+        vp.load_scene(tmp_path)
+    with pytest.raises(vp.InputError, match="must be the path"):
+        vp.load_scene(3)
+    (tmp_path / "latin.toml").write_bytes(b'title = "\xe9"')
+    with pytest.raises(vp.SceneFileError, match="UTF-8"):
+        vp.load_scene(tmp_path / "latin.toml")
+    with pytest.raises(vp.SceneFileError, match="nested too deeply"):
+        vp.load_scene(write(tmp_path, f"a = {'[' * 100_000}{']' * 100_000}"))
+
+
+@pytest.mark.parametrize("name", scenes())
+def test_bundled_scene(name, monkeypatch):
+    """Each loads, simulates and, on a coarse and short horizon, lowers its cost; no shape is read for that."""
+
+    def no_shapes(*arguments):
+        raise AssertionError("geometry was read")
+
+    monkeypatch.setattr("varpin.robot.model.geometry", no_shapes)
+    monkeypatch.setattr("pinocchio.buildGeomFromUrdf", no_shapes)
+    file = vp.load_scene(name)
+    motion = file.simulate()
+    assert motion.steps == file.spec.steps
+    assert np.isfinite(motion.q).all()
+    problem = file.problem.at(steps=20)
+    begin = vp.solve(problem, max_iterations=0)
+    plan = vp.solve(problem, max_iterations=3)
+    assert plan.expected_cost < begin.expected_cost
+    assert not plan.violations.control.any()
+
+
+def documented():
+    text = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8")
+    return re.findall(r"^```toml\n(.*?)^```$", text, re.M | re.S)
+
+
+def test_the_documented_scene_is_one(tmp_path):
+    (whole, *parts) = documented()
+    file = vp.load_scene(write(tmp_path, whole))
+    assert file.problem.steps == file.spec.steps
+    # It has every key that there is.
+    data = tomllib.loads(whole)
+    assert set(data) == {
+        *("title", "gravity", "damping", "robot", "springs", "actuation", "noise", "initial", "horizon"),
+        *("integrator", "cost", "simulate", "solve", "outputs"),
+    }
+    for text in parts:
+        tomllib.loads(text)
+
+
+def test_every_term_is_documented():
+    text = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8")
+    for name in TERMS:
+        assert f"`{name}`" in text, name
+    for name in scenes():
+        assert f"`{name}`" in text, name

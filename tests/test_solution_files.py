@@ -1,0 +1,134 @@
+"""Solutions on disk: read back as they were, resumed as if nothing had happened, refused where they do not belong."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import varpin as vp
+
+
+def problem_of(*, noise=None, damping=0.2, dt=0.02, weight=0.1, integrator=None, q0=(0.4, -0.3), robot=None):
+    robot = vp.planar_chain(2) if robot is None else robot
+    scene = vp.Scene(robot, damping=damping, noise=noise)
+    cost = vp.TrackingCost([0.8, 0.1], 10.0) + vp.ControlCost(weight) + vp.Terminal(vp.VelocityCost(1.0))
+    return vp.OptimalControlProblem(scene, cost, q0, [0.0, 0.0], dt=dt, steps=round(0.6 / dt), integrator=integrator)
+
+
+def same(a, b):
+    """Whether two solutions are the same bit for bit, times apart."""
+    for name in ("gains", "feedforward", "gradient"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    for name in ("t", "q", "v", "p", "u", "dw", "energy", "masses"):
+        np.testing.assert_array_equal(getattr(a.trajectory, name), getattr(b.trajectory, name))
+    for item in dataclasses.fields(a.trajectory.statistics):
+        np.testing.assert_array_equal(
+            getattr(a.trajectory.statistics, item.name), getattr(b.trajectory.statistics, item.name)
+        )
+    assert (a.cost, a.noise_cost, a.status) == (b.cost, b.noise_cost, b.status)
+    without = [[dataclasses.replace(item, seconds=0.0) for item in s.history] for s in (a, b)]
+    assert without[0] == without[1]
+
+
+CASES = {
+    "plain": ({}, {}),
+    "noise": ({"noise": vp.StateNoise(0.3, center=0.0)}, {}),
+    "second order": ({}, {"second_order": True}),
+    "open": ({"integrator": vp.ExplicitEuler(), "dt": 0.01}, {"forward": "open", "regularization": 1.0}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("before", [0, 1, 3])
+def test_resumed_is_uninterrupted(case, before, tmp_path):
+    given, options = CASES[case]
+    problem = problem_of(**given)
+    whole = vp.solve(problem, max_iterations=7, tolerance=1e-13, **options)
+    assert len(whole.history) > before + 1  # there is something left to do
+    part = vp.solve(problem, max_iterations=before, tolerance=1e-13, **options)
+    path = part.save(tmp_path / "part.npz")
+    loaded = vp.Solution.load(path, problem_of(**given))
+    same(part, loaded)
+    same(whole, vp.solve(problem, resume=part, max_iterations=7 - before, tolerance=1e-13, **options))
+    same(whole, vp.solve(loaded.problem, resume=loaded, max_iterations=7 - before, tolerance=1e-13, **options))
+
+
+def test_interrupted_search_goes_on(tmp_path):
+    """Ctrl-C at any iteration leaves a solution that goes on to the same end."""
+    problem = problem_of()
+    whole = vp.solve(problem, max_iterations=6, tolerance=1e-13)
+
+    def stop(item):
+        if item.index == 2:
+            raise KeyboardInterrupt
+
+    part = vp.solve(problem, max_iterations=6, tolerance=1e-13, callback=stop)
+    assert part.status is vp.Status.INTERRUPTED
+    loaded = vp.Solution.load(part.save(tmp_path / "part.npz"), problem)
+    done = len(loaded.search.history)
+    same(whole, vp.solve(problem, resume=loaded, max_iterations=6 - done, tolerance=1e-13))
+
+
+def test_policy_of_a_loaded_solution_is_the_same(tmp_path):
+    problem = problem_of()
+    plan = vp.solve(problem, max_iterations=3)
+    loaded = vp.Solution.load(plan.save(tmp_path / "plan.npz"), problem)
+    np.testing.assert_array_equal(plan.policy.gains, loaded.policy.gains)
+    assert plan.verify(tolerance=1e-3) == loaded.verify(tolerance=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [
+        ({"dt": 0.03}, "steps = 30, not 20"),
+        ({"q0": (0.4, -0.2)}, "q0 = "),
+        ({"weight": 0.2}, "another cost"),
+        ({"damping": 0.3}, "another scene damping"),
+        ({"noise": vp.AdditiveNoise(0.1)}, "another noise constant"),
+        ({"integrator": vp.Midpoint(alpha=0.4)}, "integrator"),
+        ({"robot": vp.planar_chain(2, mass=2.0)}, "links weigh"),
+    ],
+)
+def test_solution_of_another_problem_is_refused(other, words, tmp_path):
+    path = vp.solve(problem_of(), max_iterations=1).save(tmp_path / "plan.npz")
+    with pytest.raises(vp.FileError, match=words):
+        vp.Solution.load(path, problem_of(**other))
+
+
+def test_files_that_are_no_solutions(tmp_path):
+    problem = problem_of()
+    plan = vp.solve(problem, max_iterations=1)
+    with pytest.raises(vp.FileError, match="there is no file"):
+        vp.Solution.load(tmp_path / "none.npz", problem)
+    motion = plan.trajectory.save(tmp_path / "motion.npz")
+    with pytest.raises(vp.FileError, match="not a varpin solution"):
+        vp.Solution.load(motion, problem)
+    whole = plan.save(tmp_path / "plan.npz")
+    with pytest.raises(vp.FileError, match="not a varpin trajectory"):
+        vp.Trajectory.load(whole)
+    (tmp_path / "cut.npz").write_bytes(whole.read_bytes()[:2000])
+    with pytest.raises(vp.FileError, match="truncated"):
+        vp.Solution.load(tmp_path / "cut.npz", problem)
+    with np.load(whole) as archive:
+        members = dict(archive)
+    members["gains"] = np.full_like(members["gains"], np.nan)
+    np.savez(tmp_path / "nan.npz", **members)
+    with pytest.raises(vp.FileError, match="gains holds values that are not finite"):
+        vp.Solution.load(tmp_path / "nan.npz", problem)
+    members["gains"] = np.array([{}], dtype=object)
+    np.savez(tmp_path / "pickled.npz", **members)
+    with pytest.raises(vp.FileError, match="unpickling"):
+        vp.Solution.load(tmp_path / "pickled.npz", problem)
+
+
+def test_resume_of_something_else():
+    problem = problem_of()
+    plan = vp.solve(problem, max_iterations=1)
+    with pytest.raises(vp.InputError, match=r"another problem: dt = 0\.02"):
+        vp.solve(problem_of(dt=0.03), resume=plan)
+    with pytest.raises(vp.InputError, match="another cost"):
+        vp.solve(problem_of(weight=0.2), resume=plan)
+    with pytest.raises(vp.InputError, match="leave out either"):
+        vp.solve(problem, plan, resume=plan)
+    with pytest.raises(vp.InputError, match="must be a Solution"):
+        vp.solve(problem, resume=plan.trajectory)
