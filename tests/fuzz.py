@@ -46,7 +46,7 @@ from varpin.tradeoff.optimal_control import OptimalControlRun
 from varpin.tradeoff.precision import WorkPrecisionRun
 
 MEMORY = 1_000_000_000  # bytes that a reader may take in all
-TIMEOUT = 40.0  # [s] that one input may take, on a busy machine
+TIMEOUT = 20.0  # [s] of processor time that one input may take; of wall time twenty times as much
 KINDS = ("urdf", "npz")
 
 NUMBERS = [
@@ -644,7 +644,7 @@ def run(kind: str, seed: int, begin: int, end: int, folder: Path | None = None, 
         number, problem, started = begin, "", False
         for line in _watched(kind, seed, begin, end):
             if line is None:
-                problem = f"hangs: more than {TIMEOUT:g} s"
+                problem = f"hangs: more than {TIMEOUT:g} s of processor time"
             elif line.startswith("["):
                 number, outcome, problem, took, peak = json.loads(line)
                 report.inputs += 1
@@ -681,21 +681,31 @@ def _watched(kind: str, seed: int, begin: int, end: int) -> Iterator[str | None]
         os.set_blocking(worker.stdout.fileno(), False)
         waiting, rest = selectors.DefaultSelector(), b""
         waiting.register(worker.stdout, selectors.EVENT_READ)
-        patience = 300.0  # until kernels are there
+        patience = 20.0  # in units of TIMEOUT, until kernels are there
+        used, silent = 0.0, time.monotonic()
         while True:
-            if not waiting.select(patience):
-                worker.kill()
-                yield None
-                return
+            if not waiting.select(1.0):
+                wall, busy = time.monotonic() - silent, _processor_time(worker.pid) - used
+                if busy > patience * TIMEOUT or wall > 20.0 * patience * TIMEOUT:
+                    worker.kill()
+                    yield None
+                    return
+                continue
             chunk = os.read(worker.stdout.fileno(), 1 << 16)
             if not chunk:
                 break
-            patience = TIMEOUT
+            patience, used, silent = 1.0, _processor_time(worker.pid), time.monotonic()
             *lines, rest = (rest + chunk).split(b"\n")
             for line in lines:
                 yield line.decode()
         if worker.wait() != 0:
             yield f"died: exit code {worker.returncode}"
+
+
+def _processor_time(pid: int) -> float:
+    """Of a process so far [s]."""
+    fields_of = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields_of[11]) + int(fields_of[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def main() -> int:

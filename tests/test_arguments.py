@@ -20,7 +20,8 @@ from varpin.noise import CompiledFields, Noise
 ROBOT = vp.planar_chain(2)
 SCENE = vp.Scene(ROBOT)
 
-numbers = st.floats() | st.sampled_from([0.0, -0.0, 1.0, -1.0, 1e-320, 1e-160, 1e160, -1e160, 1e308, np.inf, np.nan])
+extremes = [0.0, -0.0, 1.0, -1.0, 1e-320, 1e-160, 1e160, -1e160, 1e308, np.inf, np.nan]
+numbers = st.floats() | st.sampled_from(extremes)
 shapes = st.sampled_from(
     [(), (0,), (1,), (2,), (3,), (1, 2), (2, 1), (2, 2), (5, 2), (5, 1), (2, 5), (0, 2), (5, 2, 4)]
 )

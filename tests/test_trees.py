@@ -98,8 +98,17 @@ def runs_back(case: Case) -> None:
 
 def linearization_is_the_derivative(case: Case) -> None:
     scene, (q, v) = case.scene, case.state
-    noise = vp.AdditiveNoise(1e-2) + vp.ControlNoise(0.1)
-    scene = vp.Scene(scene.robot, gravity=scene.gravity, damping=0.01, stiffness=0.5, noise=noise)
+    # Forces of the size of what they move: differences see nothing below the rounding of its momentum.
+    size = max(1.0, case.ratio)
+    noise = vp.AdditiveNoise(1e-2 * size) + vp.ControlNoise(0.1)
+    scene = vp.Scene(
+        scene.robot,
+        gravity=scene.gravity,
+        damping=0.01,
+        stiffness=0.5,
+        actuation=size * np.eye(case.bodies),
+        noise=noise,
+    )
     u = case.rng.normal(size=case.bodies)
     found = vp.check_linearization(scene, q, v, u, dt=case.dt, integrator=case.integrator)
     assert found.worst < 1e-7

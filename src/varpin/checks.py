@@ -123,6 +123,11 @@ def fraction(name: str, value: float) -> float:
     return number
 
 
+def is_one_of(value: object, words: tuple[str, ...]) -> bool:
+    """Whether ``value`` is one of some words; an array, which compares entry by entry, is not."""
+    return isinstance(value, str) and value in words
+
+
 def count(name: str, value: Any, least: int = 0) -> int:
     """``value`` as an int >= ``least``.
 

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, checked_limits, count, finite_array
+from varpin.checks import as_floats, checked_limits, count, finite_array, is_one_of
 from varpin.errors import InputError
 from varpin.kernels.tree import Commands
 
@@ -75,7 +75,7 @@ class LinearPolicy:
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         object.__setattr__(self, "hold", count("hold", hold, least=1))
-        if on not in ("momentum", "velocity", None):
+        if on is not None and not is_one_of(on, ("momentum", "velocity")):
             raise InputError(f"on must be 'momentum', 'velocity' or None, got {on!r}")
         object.__setattr__(self, "on", on)
         object.__setattr__(self, "limits", checked_limits("limits", limits, m))

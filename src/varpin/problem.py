@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import checked_limits, count, finite_array, positive
+from varpin.checks import checked_limits, count, finite_array, is_one_of, positive
 from varpin.costs import BoundSum, Cost, Expansion, Points, Terminal
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint
@@ -99,7 +99,7 @@ class OptimalControlProblem:
         dt, steps, hold = positive("dt", dt, "s"), count("steps", steps, least=1), count("hold", hold, least=1)
         if steps % hold:
             raise InputError(f"steps = {steps} is no multiple of hold = {hold}")
-        if sampling not in ("midpoint", "gauss", "start"):
+        if not is_one_of(sampling, ("midpoint", "gauss", "start")):
             raise InputError(f"sampling must be 'midpoint', 'gauss' or 'start', got {sampling!r}")
         if integrator is not None and not isinstance(integrator, Integrator):
             raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.backward import Plan, backward, noise_cost
-from varpin.checks import as_floats, count, finite_array, fraction, positive, real
+from varpin.checks import as_floats, count, finite_array, fraction, is_one_of, positive, real
 from varpin.costs import CostError
 from varpin.errors import InputError, LinearizationError
 from varpin.integrators.base import open_loop
@@ -113,7 +113,7 @@ def solve(
     """
     if not isinstance(problem, OptimalControlProblem):
         raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
-    if forward not in ("closed", "open"):
+    if not is_one_of(forward, ("closed", "open")):
         raise InputError(f"forward must be 'closed' or 'open', got {forward!r}")
     if not 0.0 < real("backtracking", backtracking) < 1.0:
         raise InputError(f"backtracking must be in (0, 1), got {backtracking}")

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, count, finite_array, positive, require_finite
+from varpin.checks import as_floats, count, finite_array, is_one_of, positive, require_finite
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, open_loop, rows, steps_of
@@ -220,7 +220,7 @@ def simulate(
     n = require_scene(scene).robot.dof
     q0, v0 = finite_array("q0", q0, (n,)), finite_array("v0", v0, (n,))
     dt, steps = positive("dt", dt, "s"), count("steps", steps)
-    if sampling not in ("midpoint", "start"):
+    if not is_one_of(sampling, ("midpoint", "start")):
         raise InputError(f"sampling must be 'midpoint' or 'start', got {sampling!r}")
     integrator = Midpoint() if integrator is None else integrator
     if not isinstance(integrator, Integrator):

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.checks import count, path_like, positive
+from varpin.checks import count, is_one_of, path_like, positive
 from varpin.costs import BoundSum
 from varpin.ensemble import simulate_ensemble
 from varpin.errors import FileError, InputError, VarpinError
@@ -426,7 +426,7 @@ class Solution:
         Raises:
             InputError: ``x`` is neither "momentum" nor "velocity".
         """
-        if x not in ("momentum", "velocity"):
+        if not is_one_of(x, ("momentum", "velocity")):
             raise InputError(f"x must be 'momentum' or 'velocity', got {x!r}")
         gains, trajectory, hold = self.gains, self.trajectory, self.problem.hold
         rows, n = slice(0, -1, hold), self.problem.scene.robot.dof

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.checks import count, fraction, positive
+from varpin.checks import count, fraction, is_one_of, positive
 from varpin.errors import InputError, SingularMassMatrix
 from varpin.integrators.base import Integrator, Segment, control_of, diffusion_and_drift, open_loop, segments_of
 from varpin.kernels import midpoint as kernels
@@ -63,7 +63,7 @@ class Variational(Integrator):
             raise InputError("branch_margin must be in [0, 1), got 1")
         positive("energy_balance", self.energy_balance, "1")
         positive("energy_budget", self.energy_budget, "1")
-        if self.kick not in ("left", "split"):
+        if not is_one_of(self.kick, ("left", "split")):
             raise InputError(f"kick must be 'left' or 'split', got {self.kick!r}")
         if count("max_halvings", self.max_halvings) > 30:
             raise InputError(f"max_halvings must be at most 30, got {self.max_halvings}")

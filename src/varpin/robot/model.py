@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, require_finite
+from varpin.checks import as_floats, is_one_of, require_finite
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint
 from varpin.kernels.tree import Tree
 from varpin.robot.mimic import Tie, joint_index, rebuild, tied_model
@@ -226,7 +226,7 @@ def build_robot(
     payload: Payload | Sequence[Payload] = (),
 ) -> Robot:
     """:func:`load_robot` without the check that every joint moves inertia, for looking into faulty models."""
-    if mimic not in ("tied", "free"):
+    if not is_one_of(mimic, ("tied", "free")):
         raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
     description = describe(source, package_dirs, mimic=mimic == "tied")
     carry(description.model, (payload,) if isinstance(payload, Payload) else payload, description.name)
