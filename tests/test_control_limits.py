@@ -184,7 +184,7 @@ def terminal_hessian(scene, motion):
 
 
 def test_wide_limits_change_nothing():
-    """To the last bit of the controls."""
+    """But rounding."""
     free = vp.solve(pushed())
     wide = vp.solve(pushed((-1e6, 1e6)))
     np.testing.assert_allclose(wide.controls, free.controls, rtol=0, atol=1e-12)
