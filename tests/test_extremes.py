@@ -312,7 +312,7 @@ def test_the_command_writes_its_files(tmp_path, capsys, monkeypatch, load):
 def test_the_command_fails_where_anything_is_silent_wrong(capsys, monkeypatch):
     rod = vp.Scene(rod_chain([1.0], [1.0]))
     lie = Setup(rod, np.zeros(1), np.zeros(1), exact=lambda t: np.array([-7.0 * t * t]))
-    trial = Trial("a lie", "made up", lambda: lie, 1e-2, 50)
+    trial = Trial("a lie", "made up", lambda: lie, 1e-3, 500)
     monkeypatch.setattr("varpin.extremes.battery.TRIALS", (trial,))
     monkeypatch.setattr("varpin.extremes.battery.PLANS", ())
     assert main(["extremes", "--quiet"]) == 1

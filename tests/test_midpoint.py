@@ -392,7 +392,7 @@ def test_dampers_faster_than_the_step_are_reported(caplog):
     assert (np.diff(np.sign(motion.v[:, 0])) != 0).all()
     caplog.clear()
     vp.simulate(vp.Scene(vp.planar_chain(1), damping=1.0), [0.0], [1.0], dt=0.1, steps=5)
-    assert not caplog.text
+    assert "damping" not in caplog.text
 
 
 @pytest.mark.parametrize(

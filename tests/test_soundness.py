@@ -84,8 +84,9 @@ def test_energy_balance_of_explicit_methods(integrator):
         )
         np.testing.assert_array_equal(motion.statistics.energy_defect, energy_defects(scene, motion))
         off.append(np.abs(motion.statistics.energy_defect).max())
-    assert off[1] < 0.05
-    assert off[1] < 0.5 * off[0] or off[1] < 1e-4
+    # Forces, dampers and kicks account for most of what the energy does, and for all of it as dt shrinks.
+    assert off[1] < 0.1 * np.abs(motion.energy - motion.energy[0]).max()
+    assert off[1] < 0.4 * off[0]
 
 
 def test_energy_that_drifts_is_spoken_of():
