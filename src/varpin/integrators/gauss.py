@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 MOST_STAGES = 6
 # Of the energy errors that one stage is allowed, what is enough for more: steps of high order seldom need it.
-BALANCE_SHARE, BUDGET_SHARE = 1 / 25, 1 / 250
+BALANCE_SHARE, BUDGET_SHARE = 1 / 25, 1 / 100
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Gauss(Variational):
         energy_balance: Largest error in the energy balance of a substep, in units of the energy it turns over; of more
             than one stage 1/25 of it is asked.
         energy_budget: The errors of all substeps together, in units of the largest kinetic energy so far; of more than
-            one stage 1/250 of it is asked. That costs few substeps and keeps fifty times the energy: a chaotic
+            one stage 1/100 of it is asked. That costs few substeps and keeps fifty times the energy: a chaotic
             motion gathers its energy error in a few violent moments.
         max_halvings: A step is never cut into more than 2**max_halvings parts.
         kick: When noise kicks the momentum, ``"left"`` or ``"split"``.
@@ -61,7 +61,7 @@ class Gauss(Variational):
     tolerance: float = 0.5
     branch_margin: float = 0.5
     energy_balance: float = 0.005
-    energy_budget: float = 0.05
+    energy_budget: float = 0.02
     max_halvings: int = 12
     kick: Literal["left", "split"] = "left"
 

@@ -78,7 +78,7 @@ class Midpoint(Variational):
     tolerance: float = 0.5
     branch_margin: float = 0.5
     energy_balance: float = 0.005
-    energy_budget: float = 0.05
+    energy_budget: float = 0.02
     max_halvings: int = 12
     kick: Literal["left", "split"] = "left"
 
