@@ -60,6 +60,9 @@ from varpin.linearization import propagate_moments as propagate_moments
 from varpin.linearization import second_order as second_order
 from varpin.linearization_check import LinearizationCheck as LinearizationCheck
 from varpin.linearization_check import check_linearization as check_linearization
+from varpin.mpc import Mpc as Mpc
+from varpin.mpc import MpcRun as MpcRun
+from varpin.mpc import Plant as Plant
 from varpin.noise import AdditiveNoise as AdditiveNoise
 from varpin.noise import ControlNoise as ControlNoise
 from varpin.noise import CustomNoise as CustomNoise

@@ -45,6 +45,7 @@ class Points:
         steps: Of the problem's grid.
         dof: n.
         controls: m.
+        t0: When the horizon begins [s].
     """
 
     t: Floats
@@ -52,6 +53,12 @@ class Points:
     steps: int
     dof: int
     controls: int
+    t0: float = 0.0
+
+    @property
+    def elapsed(self) -> Floats:
+        """Times since the horizon began (N,) [s]."""
+        return self.t - self.t0
 
     @property
     def size(self) -> int:
@@ -373,7 +380,7 @@ def sample(name: str, reference: Reference, points: Points, size: int, *, held: 
         return np.array(np.broadcast_to(array, (1, size)))
     if held and array.shape == (points.steps, size):
         # Rounding must not put a time at a node into the step before it; the end belongs to the last step.
-        step = np.floor(points.t * (points.steps / points.duration) + 1e-6).astype(np.int64)
+        step = np.floor(points.elapsed * (points.steps / points.duration) + 1e-6).astype(np.int64)
         held_rows: Floats = array[np.minimum(step, points.steps - 1)]
         return held_rows
     if array.shape != (points.steps + 1, size):
@@ -383,7 +390,7 @@ def sample(name: str, reference: Reference, points: Points, size: int, *, held: 
             f"row for each of the problem's nodes{steps}; got {array.shape}"
         )
     nodes = np.linspace(0.0, points.duration, points.steps + 1)
-    return np.column_stack([np.interp(points.t, nodes, column) for column in array.T])
+    return np.column_stack([np.interp(points.elapsed, nodes, column) for column in array.T])
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ class StepModel(crocoddyl.ActionModelAbstract):
         self._problem = problem
         samples = len(problem.rule)
         times = problem.running.points.t[step * samples : (step + 1) * samples]
-        self._running, _ = bind_cost(problem.cost, times, problem.duration, problem.steps, n, m)
+        self._running, _ = bind_cost(problem.cost, times, problem.running.points)
         self._known: tuple[Floats, Floats, Trajectory] | None = None
 
     def calc(self, data: Any, x: Floats, u: Floats | None = None) -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import checked_limits, count, finite_array, is_one_of, positive
+from varpin.checks import checked_limits, count, finite_array, is_one_of, positive, real
 from varpin.costs import BoundSum, Cost, Expansion, Points, Terminal
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint
@@ -53,6 +53,7 @@ class OptimalControlProblem:
             ``"gauss"``: at its two Gauss points, the motion between the nodes taken for a cubic: of fourth order, for
             integrators that are. ``"start"``: at the node where it begins, a left sum as in the paper, of first order.
         hold: Steps that share one control: a digital controller's period over the integrator's step.
+        t0: When the horizon begins [s]; references that are functions of time see it.
         control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none.
     """
 
@@ -65,6 +66,7 @@ class OptimalControlProblem:
     integrator: Integrator
     sampling: Sampling
     hold: int
+    t0: float
     control_limits: Floats
     running: BoundSum = field(repr=False)
     terminal: BoundSum = field(repr=False)
@@ -82,6 +84,7 @@ class OptimalControlProblem:
         integrator: Integrator | None = None,
         sampling: Sampling = "midpoint",
         hold: int = 1,
+        t0: float = 0.0,
         control_limits: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
         """Describe a problem; the class says what each argument is.
@@ -107,7 +110,8 @@ class OptimalControlProblem:
             raise InputError("the scene has no controls, so there is nothing to optimize")
         places, rule = _rule(sampling, dt)
         times = ((np.arange(steps, dtype=np.float64)[:, None] + places) * dt).reshape(-1)
-        running, terminal = bind_cost(cost, times, dt * steps, steps, n, m)
+        t0 = real("t0", t0)
+        running, terminal = bind_cost(cost, t0 + times, Points(t0 + times, dt * steps, steps, n, m, t0))
         values = {
             "scene": scene,
             "cost": cost,
@@ -118,6 +122,7 @@ class OptimalControlProblem:
             "integrator": Midpoint() if integrator is None else integrator,
             "sampling": sampling,
             "hold": hold,
+            "t0": t0,
             "control_limits": checked_limits("control_limits", control_limits, m),
             "running": running,
             "terminal": terminal,
@@ -152,6 +157,7 @@ class OptimalControlProblem:
         integrator: Integrator | None = None,
         sampling: Sampling | None = None,
         hold: int | None = None,
+        t0: float | None = None,
     ) -> OptimalControlProblem:
         """The same problem, discretized otherwise or from another state.
 
@@ -174,6 +180,7 @@ class OptimalControlProblem:
             integrator=self.integrator if integrator is None else integrator,
             sampling=self.sampling if sampling is None else sampling,
             hold=self.hold if hold is None else hold,
+            t0=self.t0 if t0 is None else t0,
             control_limits=(self.control_limits[0], self.control_limits[1]),
         )
 
@@ -293,11 +300,9 @@ def _rule(sampling: str, dt: float) -> tuple[Floats, Floats]:
     return places, np.array(rows)
 
 
-def bind_cost(
-    cost: Cost, times: Floats, duration: float, steps: int, dof: int, controls: int
-) -> tuple[BoundSum, BoundSum]:
-    """The running costs at ``times`` (N,), and the terminal ones at the end."""
-    at, end = (Points(t, duration, steps, dof, controls) for t in (times, np.array([duration])))
+def bind_cost(cost: Cost, times: Floats, horizon: Points) -> tuple[BoundSum, BoundSum]:
+    """The running costs at ``times`` (N,) of a horizon, and the terminal ones at its end."""
+    at, end = (replace(horizon, t=t) for t in (times, np.array([horizon.t0 + horizon.duration])))
     terms = cost.terms
     running = BoundSum(tuple(term.bind(at) for term in terms if not isinstance(term, Terminal)), at)
     return running, BoundSum(tuple(term.bind(end) for term in terms if isinstance(term, Terminal)), end)

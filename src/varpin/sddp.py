@@ -55,6 +55,7 @@ def solve(
     armijo: float = 1e-5,
     backtracking: float = 0.25,
     regularization: float = 0.0,
+    time_limit: float = np.inf,
     callback: Callback | None = None,
     resume: Solution | None = None,
     progress: Progress | None = None,
@@ -95,6 +96,8 @@ def solve(
         armijo: The part of the promised slope that a step must keep (the paper's alpha).
         backtracking: Factor between the trials of the line search (the paper's beta), in (0, 1).
         regularization: To begin with, relative to the diagonal of Quu; it grows where needed, and shrinks again.
+        time_limit: No iteration begins when this time has passed since the call [s]. What is found then depends on the
+            machine.
         callback: Called with each :class:`Iteration`; ``callback=print`` prints the rows of :meth:`Solution.table` as
             they come. The log has them too, at level INFO.
         progress: Called after each iteration with (iterations done, max_iterations); few searches need them all.
@@ -124,6 +127,7 @@ def solve(
     if progress is not None and not callable(progress):
         raise InputError(f"progress must be a function of (iterations done, max_iterations), got {progress!r}")
     positive("tolerance", tolerance, "1")
+    deadline = time.perf_counter() + (np.inf if time_limit == np.inf else positive("time_limit", time_limit, "s"))
     fraction("armijo", armijo)
     max_iterations = count("max_iterations", max_iterations)
 
@@ -142,7 +146,7 @@ def solve(
             search.resume(_search_of(problem, controls, resume))
         known = len(search.history)
         try:
-            status = search.run(tolerance, max_iterations, report)
+            status = search.run(tolerance, max_iterations, deadline, report)
         except KeyboardInterrupt:
             status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
     return search.solution(status)
@@ -255,7 +259,7 @@ class _Search:
             history=tuple(self.history),
         )
 
-    def run(self, tolerance: float, max_iterations: int, report: Callback) -> Status:
+    def run(self, tolerance: float, max_iterations: int, deadline: float, report: Callback) -> Status:
         last = len(self.history) + max_iterations
         while True:
             self.state = self._state()
@@ -297,6 +301,10 @@ class _Search:
                 self._note(report, started, passes)
                 self.reason = f"{_PATIENCE} iterations brought less than the tolerance; {promised}; {share}"
                 return Status.STALLED
+            if time.perf_counter() > deadline:
+                self._note(report, started, passes)
+                self.reason = f"{promised}; {share}"
+                return Status.OUT_OF_TIME
             step, trials = self._line_search(merit)
             if step == 0.0 and self.exact:
                 passes += self._plan(exact=False)

@@ -51,6 +51,7 @@ class Status(Enum):
         "not converged: the derivatives of the dynamics or of the cost do not exist along the last motion; the log "
         "says where. A smaller dt, or a cost that is finite around the motion, may help"
     )
+    OUT_OF_TIME = "stopped at the time limit: this is the best motion so far"
     INTERRUPTED = "interrupted: this is the best motion so far"
 
     @property
@@ -603,7 +604,7 @@ class Solution:
 FORMAT = "varpin.solution/1"
 _PLAN = ("gains", "feedforward", "gradient")
 _NUMBERS = ("cost", "noise_cost")
-_PROBLEM = ("q0", "v0", "steps", "hold", "sampling", "control_limits")
+_PROBLEM = ("q0", "v0", "t0", "steps", "hold", "sampling", "control_limits")
 _SURROUNDINGS = ("gravity", "damping", "stiffness", "rest", "actuation")
 _SEARCH = ("cost", "first", "best_merit", "best_cost", "regularization", "growth")
 _COLUMNS = tuple(item.name for item in fields(Iteration))
@@ -736,8 +737,7 @@ _PATHS, _PATHS_PER_WORKER = 256, 32
 def _fine_costs(problem: OptimalControlProblem, substeps: int) -> tuple[BoundSum, BoundSum]:
     """Running and terminal costs at the nodes of a finer grid."""
     times = np.arange(problem.steps * substeps + 1, dtype=np.float64) * (problem.dt / substeps)
-    dof, controls = problem.scene.robot.dof, problem.scene.controls
-    return bind_cost(problem.cost, times, problem.duration, problem.steps, dof, controls)
+    return bind_cost(problem.cost, problem.t0 + times, problem.running.points)
 
 
 def accurate_cost(

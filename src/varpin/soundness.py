@@ -83,16 +83,15 @@ def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
     """
     if scene.noise.diffusion is None:
         return np.zeros(trajectory.steps)
-    work, heat = _works(scene, trajectory)
-    gained: Floats = trajectory.energy[1:] - trajectory.energy[0] - np.cumsum(work - heat)
-    if trajectory.dw.any():
-        gained = gained - np.cumsum(_kick_work(scene, trajectory))
+    kicked, given = _kicks(scene, trajectory)
+    work, heat = _works(scene, trajectory, kicked)
+    gained: Floats = trajectory.energy[1:] - trajectory.energy[0] - np.cumsum(work - heat + given)
     return np.nan_to_num(gained, nan=np.inf)
 
 
-def _works(scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
-    """Work of the controls, and what the dampers take, in each step (N,) [J]."""
-    h, before, after = trajectory.dt, trajectory.v[:-1], trajectory.v[1:]
+def _works(scene: Scene, trajectory: Trajectory, kicked: Floats | float = 0.0) -> tuple[Floats, Floats]:
+    """Work of the controls, and what the dampers take, in each step (N,) [J], which a kick of v (N, n) begins."""
+    h, before, after = trajectory.dt, trajectory.v[:-1] + kicked, trajectory.v[1:]
     force = trajectory.u @ scene.actuation.T
     with np.errstate(over="ignore", invalid="ignore"):
         work = 0.5 * h * np.einsum("ki,ki->k", force, before + after)
@@ -100,14 +99,15 @@ def _works(scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
     return work, heat
 
 
-def _kick_work(scene: Scene, trajectory: Trajectory) -> Floats:
-    """What the kick of each step does to the energy (N,) [J], if it comes all at once before the step."""
+def _kicks(scene: Scene, trajectory: Trajectory) -> tuple[Floats | float, Floats | float]:
+    """What the kick of each step does to v (N, n) and to the energy (N,) [J], if it comes all at once before the step."""
+    if not trajectory.dw.any():
+        return 0.0, 0.0
     q, v = trajectory.q[:-1], trajectory.v[:-1]
     fields = scene.noise.fields(q, v, trajectory.u, trajectory.q[0]).F
-    kick = np.einsum("kij,kj->ki", fields, trajectory.dw)
-    mobility = accelerations(scene, q, v, np.zeros_like(q))[3]
-    work: Floats = np.einsum("ki,ki->k", kick, v + 0.5 * np.einsum("kij,kj->ki", mobility, kick))
-    return work
+    impulse = np.einsum("kij,kj->ki", fields, trajectory.dw)
+    change = np.einsum("kij,kj->ki", accelerations(scene, q, v, np.zeros_like(q))[3], impulse)
+    return change, np.einsum("ki,ki->k", impulse, v + 0.5 * change)
 
 
 def step_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> StepError | None:

@@ -263,7 +263,7 @@ def _sample_rotations(target: Floats | Callable[[float], ArrayLike], points: Poi
         )
     nodes = np.linspace(0.0, points.duration, points.steps + 1)
     turns = Slerp(nodes, Rotation.from_matrix(_require_rotations(f"{name} target", target)))
-    between: Floats = turns(np.clip(points.t, 0.0, points.duration)).as_matrix()
+    between: Floats = turns(np.clip(points.elapsed, 0.0, points.duration)).as_matrix()
     return between
 
 

@@ -6,7 +6,7 @@ import contextlib
 import os
 import reprlib
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -257,6 +257,28 @@ class Trajectory:
             version=str(members["version"]),
             warnings=tuple(str(sentence) for sentence in members["warnings"]),
         )
+
+
+def chained(parts: Sequence[Trajectory]) -> Trajectory:
+    """Motions at one dt, each of which begins where the one before ended, as one that begins when the first does."""
+    first = parts[0]
+    steps = sum(part.steps for part in parts)
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(first, name)[:1], *(getattr(part, name)[1:] for part in parts)])
+        for name in ("q", "v", "p", "energy")
+    }
+    arrays |= {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("u", "dw")}
+    statistics = {
+        item.name: np.concatenate([getattr(part.statistics, item.name) for part in parts])
+        for item in fields(StepStatistics)
+    }
+    return replace(
+        first,
+        t=first.t[0] + np.arange(steps + 1) * first.dt,
+        **arrays,
+        statistics=StepStatistics(**statistics),
+        warnings=tuple(dict.fromkeys(sentence for part in parts for sentence in part.warnings)),
+    )
 
 
 def require_motion(scene: Scene, trajectory: Trajectory) -> None:

@@ -1,0 +1,233 @@
+"""Model predictive control: plan, apply the first decision, look where the robot is, plan again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import count, positive
+from varpin.errors import InputError
+from varpin.integrators import Integrator, RungeKutta4
+from varpin.integrators.base import Failure
+from varpin.problem import OptimalControlProblem
+from varpin.scene import Scene, require_scene
+from varpin.sddp import solve
+from varpin.simulation import Interrupted, StepFailure, simulate
+from varpin.solution import Solution
+from varpin.trajectory import Trajectory, chained
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Plant:
+    """The robot that is controlled, simulated in place of the real one.
+
+    Attributes:
+        scene: Its scene, which need not be the one planned with: other masses, friction, noise. It takes the same
+            controls.
+        integrator: Any of varpin's.
+        substeps: Steps to a decision of the controller.
+    """
+
+    scene: Scene
+    integrator: Integrator = field(default_factory=RungeKutta4)
+    substeps: int = 10
+
+    def __post_init__(self) -> None:
+        require_scene(self.scene)
+        if not isinstance(self.integrator, Integrator):
+            raise InputError(f"integrator must be one of varpin's, got {self.integrator!r}")
+        count("substeps", self.substeps, least=1)
+
+
+@dataclass(frozen=True, eq=False)
+class MpcRun:
+    """What a controller did with a plant.
+
+    Attributes:
+        motion: Of the plant, at its own steps.
+        plans: The plan of every tick, the one that acted (K,).
+        seconds: What planning took in every tick (K,) [s].
+        iterations: Of S-DDP in every tick (K,).
+        late: Ticks whose plan came after its budget (K,); the plan of the tick before acted on.
+        period: Of the ticks [s].
+        budget: For planning in a tick [s]; infinite for any.
+    """
+
+    motion: Trajectory
+    plans: tuple[Solution, ...]
+    seconds: Floats
+    iterations: NDArray[np.int64]
+    late: NDArray[np.bool_]
+    period: float
+    budget: float
+
+    @property
+    def misses(self) -> int:
+        """How many plans came late."""
+        return int(self.late.sum())
+
+    def __str__(self) -> str:
+        milliseconds = 1e3 * self.seconds
+        within = "" if self.budget == np.inf else f"; {self.misses} later than {1e3 * self.budget:.3g} ms"
+        return (
+            f"{len(self.plans)} ticks of {1e3 * self.period:.3g} ms: planning took {milliseconds.mean():.2f} ms in the "
+            f"mean, {np.quantile(milliseconds, 0.95):.2f} in 95%, {milliseconds.max():.2f} at most{within}; "
+            f"{self.iterations.mean():.2f} iterations a tick"
+        )
+
+
+@dataclass(frozen=True)
+class Mpc:
+    """A controller that solves an optimal control problem anew at every decision, from the state it finds.
+
+    Each tick's search starts from the last plan, moved on by a decision, with its feedback. Times of references are
+    those of the plant: the horizon recedes.
+
+    Main args:
+        problem: The problem; its horizon, discretization, noise and limits are those of every tick, its initial state
+            and ``t0`` those of the first.
+        iterations: Of S-DDP in a tick, at most.
+
+    Other Args:
+        tolerance: Of S-DDP; see :func:`varpin.solve`.
+        first_iterations: In the first tick, which has no plan to start from.
+        budget: For planning in a tick [s]: no iteration begins after it, and a plan that is late is not used: the plan
+            before acts on, with its feedback. What happens then depends on the machine. Infinite, nothing depends
+            on the clock.
+    """
+
+    problem: OptimalControlProblem
+    iterations: int = 2
+    tolerance: float = 1e-6
+    first_iterations: int = 100
+    budget: float = np.inf
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.problem, OptimalControlProblem):
+            raise InputError(f"problem must be an OptimalControlProblem, got {type(self.problem).__name__}")
+        count("iterations", self.iterations, least=1)
+        count("first_iterations", self.first_iterations, least=1)
+        positive("tolerance", self.tolerance, "1")
+        if self.budget != np.inf:
+            positive("budget", self.budget, "s")
+
+    @property
+    def period(self) -> float:
+        """Of the ticks: the time a decision holds [s]."""
+        return self.problem.dt * self.problem.hold
+
+    def plan(
+        self, t: float, q: ArrayLike, v: ArrayLike, previous: Solution | None = None, decisions: int = 1
+    ) -> Solution:
+        """The plan at time ``t`` [s] from configuration ``q`` (n,) and velocity ``v`` (n,).
+
+        Args:
+            t: Now.
+            q: [rad or m].
+            v: [rad/s or m/s].
+            previous: The plan to start from; None in the first tick.
+            decisions: How many decisions ago it was made.
+
+        Raises:
+            InputError: q or v of a wrong shape, or not finite.
+            StepFailure, CostError: The motion to start from cannot be integrated, or has no cost.
+        """
+        problem = self.problem.at(q0=q, v0=v, t0=t)
+        if previous is None:
+            return solve(problem, tolerance=self.tolerance, max_iterations=self.first_iterations)
+        start = previous.shifted(min(decisions, problem.decisions - 1))
+        return solve(problem, start, tolerance=self.tolerance, max_iterations=self.iterations, time_limit=self.budget)
+
+    def run(
+        self,
+        plant: Plant | None = None,
+        *,
+        duration: float,
+        rng: np.random.Generator | int | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> MpcRun:
+        """Control a simulated plant from the problem's initial state.
+
+        In each tick the plan's first decision acts, as computed from the state at its beginning. The first plan is
+        there before the clock starts.
+
+        Main args:
+            plant: None for the problem's own scene, integrated more finely.
+            duration: Of the run [s], rounded to whole ticks.
+            rng: Generator or seed of the plant's noise; without it there is none.
+
+        Other Args:
+            progress: Called with (ticks done, ticks in all).
+
+        Raises:
+            InputError: A plant with other controls or joints.
+            StepFailure: The plant's motion, or the first motion of a search, cannot be integrated; of the plant's it
+                holds what came before.
+            Interrupted: Ctrl-C; holds the plant's motion so far.
+        """
+        problem = self.problem
+        plant = Plant(problem.scene) if plant is None else plant
+        joints, controls = plant.scene.robot.joint_names, plant.scene.controls
+        if joints != problem.scene.robot.joint_names or controls != problem.scene.controls:
+            raise InputError(
+                f"the plant has joints {', '.join(joints)} and {controls} controls; the problem "
+                f"{', '.join(problem.scene.robot.joint_names)} and {problem.scene.controls}"
+            )
+        ticks = max(1, round(positive("duration", duration, "s") / self.period))
+        dt = self.period / plant.substeps
+        generator = None if rng is None else np.random.default_rng(rng)
+        q, v = problem.q0, problem.v0
+        active, age = self.plan(problem.t0, q, v), 0
+        parts: list[Trajectory] = []
+        plans, seconds, iterations, late = [], np.zeros(ticks), np.zeros(ticks, dtype=np.int64), np.zeros(ticks, bool)
+        try:
+            for tick in range(ticks):
+                if tick > 0:
+                    begin = time.perf_counter()
+                    fresh = self.plan(problem.t0 + tick * self.period, q, v, active, age + 1)
+                    seconds[tick] = time.perf_counter() - begin
+                    iterations[tick] = fresh.iterations
+                    late[tick] = seconds[tick] > self.budget
+                    active, age = (active, age + 1) if late[tick] else (fresh, 0)
+                plans.append(active)
+                parts.append(_simulated(plant, dt, q, v, _decision(active, age, q, v), generator, parts))
+                q, v = parts[-1].q[-1], parts[-1].v[-1]
+                if progress is not None:
+                    progress(tick + 1, ticks)
+        except KeyboardInterrupt:
+            if not parts:
+                raise
+            raise Interrupted(chained(parts)) from None
+        return MpcRun(chained(parts), tuple(plans), seconds, iterations, late, self.period, self.budget)
+
+
+def _decision(plan: Solution, age: int, q: Floats, v: Floats) -> Floats:
+    """What the plan does at its decision ``age``, with its feedback, at the state (q, v)."""
+    policy = plan.policy_on("velocity")
+    row = min(age, len(policy.u) - 1)
+    u = policy.u[row] + policy.gains[row] @ (np.concatenate([q, v]) - policy.reference[row])
+    return np.asarray(np.clip(u, *policy.limits), dtype=np.float64)
+
+
+def _simulated(
+    plant: Plant,
+    dt: float,
+    q: Floats,
+    v: Floats,
+    u: Floats,
+    rng: np.random.Generator | None,
+    before: Sequence[Trajectory],
+) -> Trajectory:
+    """The plant's motion of one tick; what came before is in its failure."""
+    steps, integrator = plant.substeps, plant.integrator
+    try:
+        return simulate(plant.scene, q, v, dt=dt, steps=steps, controls=u, integrator=integrator, rng=rng)
+    except StepFailure as failure:
+        whole = chained([*before, failure.trajectory])
+        raise StepFailure(whole.steps, whole.t[-1], Failure(failure.reason, failure.residual), whole) from None
