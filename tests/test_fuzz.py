@@ -11,7 +11,7 @@ import fuzz
 import numpy as np
 import pinocchio as pin
 import pytest
-from mechanisms import INERTIAL, joint, link, random_tree, write_urdf
+from mechanisms import INERTIAL, joint, link, mimic, random_tree, write_urdf
 
 import varpin as vp
 from varpin.archive import read_npz
@@ -129,6 +129,19 @@ class TestUrdf:
         self.refused(path, "the mass matrix of robot 'made_up' is not finite")
         with pytest.raises(vp.RobotError, match="not finite"):
             vp.inspect_robot(path)
+
+    @pytest.mark.parametrize("axis", ["1e-200 0 0", "0 1e-320 0"])
+    def test_axes_beyond_floating_point(self, tmp_path, axis):
+        # What is not normalised moves other inertia in Pinocchio than in varpin, whose rotations were NaN.
+        path = write_urdf(
+            tmp_path, link("l1"), link("l2"), joint("j1", "base", "l1"), joint("j2", "l1", "l2", axis=axis)
+        )
+        self.refused(path, "joint 'j2' has an axis of length .*, which Pinocchio makes no unit vector of")
+
+    def test_mimic_ratios_beyond_floating_point(self, tmp_path):
+        parts = [link("l1"), link("l2"), joint("j1", "base", "l1")]
+        path = write_urdf(tmp_path, *parts, joint("j2", "l1", "l2", inside=mimic("j1", "1e200")))
+        self.refused(path, "armature must be finite|mass matrix .* not finite")
 
     def test_dampers_beyond_floating_point(self):
         scene = vp.Scene(vp.planar_chain(2, mass=1e-150, length=1e-5), damping=1e160)

@@ -20,7 +20,7 @@ def joint_axis(model: pin.Model, joint: int) -> tuple[bool, Floats]:
     Raises:
         UnsupportedJoint: The joint has another number of degrees of freedom, screws, or is a composite with a
             placement of its own.
-        RobotError: Its axis is zero.
+        RobotError: Its axis is zero or no unit vector.
     """
     kind = model.joints[joint]
     name = model.names[joint]
@@ -36,7 +36,11 @@ def joint_axis(model: pin.Model, joint: int) -> tuple[bool, Floats]:
     axis = angular if angular.any() else linear
     if not (np.isfinite(axis).all() and axis.any()):
         raise RobotError(f"joint {name!r} has no axis: its direction is zero or not finite")
-    return bool(linear.any()), axis / np.linalg.norm(axis)
+    # Pinocchio makes unit vectors of axes, but not of those whose squares are beyond floating point.
+    length = float(np.linalg.norm(axis))
+    if abs(length - 1.0) > 1e-6:
+        raise RobotError(f"joint {name!r} has an axis of length {length:g}, which Pinocchio makes no unit vector of")
+    return bool(linear.any()), axis / length
 
 
 def is_unbounded(model: pin.Model, joint: int) -> bool:
@@ -166,7 +170,7 @@ def coordinate_armature(model: pin.Model, ties: tuple[Tie, ...], coordinates: tu
     own = np.asarray(model.armature, dtype=float)
     armature = np.array([own[model.joints[joint].idx_v] for joint in coordinates])
     for tie in ties:
-        armature[coordinates.index(tie.leader)] += tie.ratio**2 * own[model.joints[tie.follower].idx_v]
+        armature[coordinates.index(tie.leader)] += tie.ratio * tie.ratio * float(own[model.joints[tie.follower].idx_v])
     if not (np.isfinite(armature).all() and (armature >= 0.0).all()):
         raise RobotError(f"armature must be finite and >= 0, got {armature}")
     return armature
