@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -98,7 +100,8 @@ def attempt(plan: Plan, integrator: Integrator) -> dict[str, Any]:
     except VarpinError as error:
         return outcome | {"kind": Kind.REFUSED, "said": (_line(error),)}
     try:
-        solution = solve(problem, task.controls, max_iterations=plan.iterations)
+        with _heard() as warnings:
+            solution = solve(problem, task.controls, max_iterations=plan.iterations)
     except VarpinError as error:
         done = getattr(getattr(error, "trajectory", None), "steps", 0)
         return outcome | {"kind": Kind.STOPPED, "said": (_line(error),), "done": done}
@@ -113,8 +116,9 @@ def attempt(plan: Plan, integrator: Integrator) -> dict[str, Any]:
         found.append("the policy is not finite")
     if solution.status.converged and not (math.isnan(left) or left <= LEFT_LEVEL):
         found.append(f"single controls take {left:.2g} off the cost (wrong from {LEFT_LEVEL:g})")
-    said = () if solution.status.converged else (solution.status.value,)
-    kind = Kind.WRONG if found else Kind.DEGRADED if said else Kind.ACCURATE
+    said = (*(() if solution.status.converged else (solution.status.value,)), *warnings)
+    broken = found if not said else [text for text in found if not text.startswith("single")]
+    kind = Kind.WRONG if broken else Kind.DEGRADED if said else Kind.ACCURATE
     return outcome | {
         "kind": kind,
         "error": left,
@@ -123,6 +127,23 @@ def attempt(plan: Plan, integrator: Integrator) -> dict[str, Any]:
         "found": tuple(found),
         "done": plan.steps,
     }
+
+
+@contextlib.contextmanager
+def _heard() -> Iterator[list[str]]:
+    """What the solver warns of within this context."""
+    heard: list[str] = []
+
+    class Ear(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            heard.append(record.getMessage())
+
+    logger, ear = logging.getLogger("varpin.sddp"), Ear(logging.WARNING)
+    logger.addHandler(ear)
+    try:
+        yield heard
+    finally:
+        logger.removeHandler(ear)
 
 
 def cost_error(task: Task, solution: Solution) -> float:
