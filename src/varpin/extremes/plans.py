@@ -158,40 +158,47 @@ def part_left(task: Task, solution: Solution) -> float:
     """The part of the cost that changes of single controls would take off, by simulating them.
 
     Some controls spread over time are each put where a parabola through three costs has its least; what that takes off
-    stands for all. NaN where noise has a part in the cost, whose optimum is another, and where a motion fails.
+    stands for all. NaN where noise makes the expected cost another one, with its own optimum: where it has a part in
+    the cost, or depends on the controls; and where motions fail however little is changed.
     """
-    if solution.problem.scene.noise.processes and not solution.noise_cost <= _QUIET * solution.cost:
+    diffusion = solution.problem.scene.noise.diffusion
+    if diffusion is None or diffusion.control.any() or not solution.noise_cost <= _QUIET * abs(solution.cost):
         return math.nan
+    size = max(float(np.abs(solution.trajectory.u).max()), 1e-3)
+    for change in (1e-3 * size, 1e-6 * size):
+        with contextlib.suppress(VarpinError):
+            return _gain(task, solution, change)
+    return math.nan
+
+
+def _gain(task: Task, solution: Solution, change: float) -> float:
+    """:func:`part_left` with parabolas of this width in u."""
     problem, u = solution.problem, solution.trajectory.u
     cells = np.argwhere(np.ones(u.shape, dtype=bool))
     chosen = cells[np.unique(np.linspace(0, len(cells) - 1, _VARIED).astype(int))]
-    size = max(float(np.abs(u).max()), 1e-3)
 
-    def cost(controls: Floats) -> float:
+    def cost(cell: NDArray[np.int64] | None = None, by: float = 0.0) -> float:
+        controls = u.copy()
+        if cell is not None:
+            controls[tuple(cell)] += by
         motion = simulate(
-            problem.scene, problem.q0, problem.v0,
-            dt=problem.dt, steps=problem.steps, controls=controls, integrator=problem.integrator,
-        )  # fmt: skip
+            problem.scene,
+            problem.q0,
+            problem.v0,
+            dt=problem.dt,
+            steps=problem.steps,
+            controls=controls,
+            integrator=problem.integrator,
+        )
         return task.cost(motion.q, controls, problem.dt)
 
-    here = cost(u)
-    gain = 0.0
-    try:
-        for row, column in chosen:
-            sides = []
-            for sign in (1.0, -1.0):
-                moved = u.copy()
-                moved[row, column] += sign * 1e-3 * size
-                sides.append(cost(moved) - here)
-            slope, bend = 0.5 * (sides[0] - sides[1]), sides[0] + sides[1]
-            best = min(0.0, *sides)
-            if bend > 0.0:
-                moved = u.copy()
-                moved[row, column] -= 1e-3 * size * slope / bend
-                best = min(best, cost(moved) - here)
-            gain -= best
-    except VarpinError:
-        return math.nan
+    here, gain = cost(), 0.0
+    for cell in chosen:
+        more, less = cost(cell, change) - here, cost(cell, -change) - here
+        best = min(0.0, more, less)
+        if more + less > 0.0:
+            best = min(best, cost(cell, -0.5 * change * (more - less) / (more + less)) - here)
+        gain -= best
     return gain * len(cells) / len(chosen) / max(here, np.finfo(np.float64).tiny)
 
 
