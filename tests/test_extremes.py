@@ -233,6 +233,13 @@ def test_a_plan_of_nan_is_silent_wrong(monkeypatch, small_plan):
     assert "cost off by" in outcome["found"][0]
 
 
+def test_a_tolerance_that_hides_the_motion_is_spoken_of():
+    outcome = attempt(BY_NAME["added noise of 1e+06"], vp.Midpoint())
+    assert outcome["kind"] is Kind.DEGRADED
+    assert "the tolerance is on their sum" in outcome["said"][0]
+    assert attempt(BY_NAME["added noise of 1e-09"], vp.Midpoint())["kind"] is Kind.ACCURATE
+
+
 def test_the_cost_by_hand_has_the_weights():
     task = Task(vp.Scene(rod_chain([1.0], [1.0])), np.zeros(1), np.array([2.0]), tracking=3.0, effort=5.0, final=7.0)
     # One step of 1/2 from 0 to 1 under u = 4: off by 3/2 in the middle and by 1 at the end.

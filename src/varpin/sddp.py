@@ -40,6 +40,8 @@ _LOST = (CostError, NoiseFieldError, LinearizationError)
 _LITTLE = 1e-4
 # Iterations without a decrease worth the name before a search gives up: the cost jumps where guards cut steps.
 _PATIENCE = 15
+# Part of a motion's own cost that the tolerance on the expected cost may hide with nothing said.
+_HIDDEN = 1e-3
 # Trials of a line search: 0.25^10 is 1e-6.
 _TRIALS = 10
 
@@ -149,7 +151,15 @@ def solve(
             status = search.run(tolerance, max_iterations, deadline, report)
         except KeyboardInterrupt:
             status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
-    return search.solution(status)
+    solution = search.solution(status)
+    if status.converged and tolerance * solution.noise_cost > _HIDDEN * abs(solution.cost):
+        logger.warning(
+            "noise adds %.3g to a cost of %.3g: the tolerance is on their sum, and hides what the controls do to the "
+            "motion's own cost; a smaller tolerance searches on",
+            solution.noise_cost,
+            solution.cost,
+        )
+    return solution
 
 
 def _first_commands(problem: OptimalControlProblem, controls: ArrayLike | LinearPolicy | Solution | None) -> Commands:

@@ -100,7 +100,7 @@ def _works(scene: Scene, trajectory: Trajectory, kicked: Floats | float = 0.0) -
 
 
 def _kicks(scene: Scene, trajectory: Trajectory) -> tuple[Floats | float, Floats | float]:
-    """What the kick of each step does to v (N, n) and to the energy (N,) [J], if it comes all at once before the step."""
+    """What each step's kick does to v (N, n) and to the energy (N,) [J], if it comes all at once before the step."""
     if not trajectory.dw.any():
         return 0.0, 0.0
     q, v = trajectory.q[:-1], trajectory.v[:-1]

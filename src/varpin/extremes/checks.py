@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 # From here on a result is wrong. Accuracy in units of the motion itself, structure in units of rounding with room for
 # ill-conditioned mass matrices.
 LEVELS = {
-    "error": 0.1,
+    "error": 0.05,
     "energy": 0.1,
     "momentum": 0.1,
     "kept momentum": 1e-6,
@@ -170,6 +170,8 @@ def energy_error(scene: Scene, trajectory: Trajectory) -> float:
     scale = kinetic.max() + np.abs(work).max()
     # A robot at rest turns nothing over: there rounding of the potential is all there is.
     scale = max(scale, 1e-9 * np.abs(trajectory.energy).max())
+    if not np.isfinite(scale):
+        return math.inf
     return float(np.nan_to_num(off.max() / scale, nan=np.inf)) if scale > 0.0 else 0.0
 
 

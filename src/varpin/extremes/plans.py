@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -28,6 +30,8 @@ Floats = NDArray[np.float64]
 # Part of a plan's cost that single controls may still take off it, and relative error of the cost itself.
 LEFT_LEVEL, COST_LEVEL = 1e-2, 1e-6
 _PLANNERS = (Midpoint(), Gauss(stages=2), ExplicitEuler())
+# Part of a cost up to which noise does not move its optimum to speak of.
+_QUIET = 1e-4
 # Controls that are varied one by one.
 _VARIED = 12
 _UP = -0.5 * math.pi  # of a rod whose angle is 0 along x and turns down
@@ -98,7 +102,8 @@ def attempt(plan: Plan, integrator: Integrator) -> dict[str, Any]:
     except VarpinError as error:
         return outcome | {"kind": Kind.REFUSED, "said": (_line(error),)}
     try:
-        solution = solve(problem, task.controls, max_iterations=plan.iterations)
+        with _heard() as warnings:
+            solution = solve(problem, task.controls, max_iterations=plan.iterations)
     except VarpinError as error:
         done = getattr(getattr(error, "trajectory", None), "steps", 0)
         return outcome | {"kind": Kind.STOPPED, "said": (_line(error),), "done": done}
@@ -113,7 +118,7 @@ def attempt(plan: Plan, integrator: Integrator) -> dict[str, Any]:
         found.append("the policy is not finite")
     if solution.status.converged and not (math.isnan(left) or left <= LEFT_LEVEL):
         found.append(f"single controls take {left:.2g} off the cost (wrong from {LEFT_LEVEL:g})")
-    said = () if solution.status.converged else (solution.status.value,)
+    said = (*(() if solution.status.converged else (solution.status.value,)), *warnings)
     kind = Kind.WRONG if found else Kind.DEGRADED if said else Kind.ACCURATE
     return outcome | {
         "kind": kind,
@@ -123,6 +128,23 @@ def attempt(plan: Plan, integrator: Integrator) -> dict[str, Any]:
         "found": tuple(found),
         "done": plan.steps,
     }
+
+
+@contextlib.contextmanager
+def _heard() -> Iterator[list[str]]:
+    """What the solver warns of within this context."""
+    heard: list[str] = []
+
+    class Ear(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            heard.append(record.getMessage())
+
+    logger, ear = logging.getLogger("varpin.sddp"), Ear(logging.WARNING)
+    logger.addHandler(ear)
+    try:
+        yield heard
+    finally:
+        logger.removeHandler(ear)
 
 
 def cost_error(task: Task, solution: Solution) -> float:
@@ -136,41 +158,47 @@ def part_left(task: Task, solution: Solution) -> float:
     """The part of the cost that changes of single controls would take off, by simulating them.
 
     Some controls spread over time are each put where a parabola through three costs has its least; what that takes off
-    stands for all. NaN with noise in the controls, where the expected cost is another, and where a motion fails.
+    stands for all. NaN where noise makes the expected cost another one, with its own optimum: where it has a part in
+    the cost, or depends on the controls; and where motions fail however little is changed.
     """
     diffusion = solution.problem.scene.noise.diffusion
-    if diffusion is None or diffusion.control.any():
+    if diffusion is None or diffusion.control.any() or not solution.noise_cost <= _QUIET * abs(solution.cost):
         return math.nan
+    size = max(float(np.abs(solution.trajectory.u).max()), 1e-3)
+    for change in (1e-3 * size, 1e-6 * size):
+        with contextlib.suppress(VarpinError):
+            return _gain(task, solution, change)
+    return math.nan
+
+
+def _gain(task: Task, solution: Solution, change: float) -> float:
+    """:func:`part_left` with parabolas of this width in u."""
     problem, u = solution.problem, solution.trajectory.u
     cells = np.argwhere(np.ones(u.shape, dtype=bool))
     chosen = cells[np.unique(np.linspace(0, len(cells) - 1, _VARIED).astype(int))]
-    size = max(float(np.abs(u).max()), 1e-3)
 
-    def cost(controls: Floats) -> float:
+    def cost(cell: NDArray[np.int64] | None = None, by: float = 0.0) -> float:
+        controls = u.copy()
+        if cell is not None:
+            controls[tuple(cell)] += by
         motion = simulate(
-            problem.scene, problem.q0, problem.v0,
-            dt=problem.dt, steps=problem.steps, controls=controls, integrator=problem.integrator,
-        )  # fmt: skip
+            problem.scene,
+            problem.q0,
+            problem.v0,
+            dt=problem.dt,
+            steps=problem.steps,
+            controls=controls,
+            integrator=problem.integrator,
+        )
         return task.cost(motion.q, controls, problem.dt)
 
-    here = cost(u)
-    gain = 0.0
-    try:
-        for row, column in chosen:
-            sides = []
-            for sign in (1.0, -1.0):
-                moved = u.copy()
-                moved[row, column] += sign * 1e-3 * size
-                sides.append(cost(moved) - here)
-            slope, bend = 0.5 * (sides[0] - sides[1]), sides[0] + sides[1]
-            best = min(0.0, *sides)
-            if bend > 0.0:
-                moved = u.copy()
-                moved[row, column] -= 1e-3 * size * slope / bend
-                best = min(best, cost(moved) - here)
-            gain -= best
-    except VarpinError:
-        return math.nan
+    here, gain = cost(), 0.0
+    for cell in chosen:
+        more, less = cost(cell, change) - here, cost(cell, -change) - here
+        best = min(0.0, more, less)
+        if more + less > 0.0:
+            best = min(best, cost(cell, -0.5 * change * (more - less) / (more + less)) - here)
+        gain -= best
     return gain * len(cells) / len(chosen) / max(here, np.finfo(np.float64).tiny)
 
 
