@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+import varpin as vp
+
 INERTIAL = (
     '<inertial><origin xyz="0.02 0.05 0.1" rpy="0.3 0.2 0.1"/><mass value="1.3"/>'
     '<inertia ixx="0.02" iyy="0.03" izz="0.025" ixy="0.001" ixz="0.002" iyz="0.003"/></inertial>'
@@ -38,6 +40,14 @@ def write_urdf(folder: Path, *parts: str, name: str = "made_up", base: str = '<l
 def arm(folder: Path, inertial: str = INERTIAL, **joint_arguments: str) -> Path:
     """A robot of one joint ``j1`` that moves link ``l1``."""
     return write_urdf(folder, link("l1", inertial), joint("j1", "base", "l1", **joint_arguments))
+
+
+def slider(mass: float = 1.0) -> vp.Robot:
+    """A mass on a rail along x, nothing else."""
+    model = pin.Model()
+    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slide")
+    model.appendBodyToJoint(joint, pin.Inertia.FromSphere(mass, 0.1), pin.SE3.Identity())
+    return vp.load_robot(model)
 
 
 def random_inertia(rng: np.random.Generator) -> pin.Inertia:

@@ -6,6 +6,7 @@ import itertools
 import numpy as np
 import pinocchio as pin
 import pytest
+from mechanisms import slider
 from scipy.integrate import solve_ivp
 from scipy.optimize import root
 
@@ -201,19 +202,16 @@ def test_momentum_about_a_vertical_axis_is_conserved_to_rounding(stages):
     assert np.abs(about_axis - about_axis[0]).max() <= 4.0 * np.spacing(abs(about_axis[0]))
 
 
-def slider(stiffness):
+def oscillator(stiffness):
     """A mass of 1 kg on a spring, nothing else."""
-    model = pin.Model()
-    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slide")
-    model.appendBodyToJoint(joint, pin.Inertia.FromSphere(1.0, 0.1), pin.SE3.Identity())
-    return vp.Scene(vp.load_robot(model), stiffness=stiffness, gravity=False)
+    return vp.Scene(slider(), stiffness=stiffness, gravity=False)
 
 
 @pytest.mark.parametrize("stages", ALL)
 def test_a_spring_is_turned_by_the_pade_approximant(stages):
     """One step of the oscillator is the diagonal Pade approximant of exp(h [[0, 1], [-k, 0]]), stiff or not."""
     for product in (0.3, 5.0, 400.0):  # h sqrt(k)
-        motion = vp.simulate(slider(product**2), [1.0], [0.7], dt=1.0, steps=1, integrator=vp.Gauss(stages))
+        motion = vp.simulate(oscillator(product**2), [1.0], [0.7], dt=1.0, steps=1, integrator=vp.Gauss(stages))
         assert motion.statistics.split_steps == 0
         Z = np.array([[0.0, 1.0], [-(product**2), 0.0]])
         factors = [1.0]
@@ -233,7 +231,7 @@ def test_a_spring_is_turned_by_the_pade_approximant(stages):
 @pytest.mark.parametrize("stages", [2, 3])
 def test_energy_round_off_walks_at_random(stages):
     """A mass on a spring: Gauss collocation conserves quadratic energies exactly, so what is left is rounding."""
-    motion = vp.simulate(slider(3.0), [1.0], [0.3], dt=2e-2, steps=200_000, integrator=vp.Gauss(stages))
+    motion = vp.simulate(oscillator(3.0), [1.0], [0.3], dt=2e-2, steps=200_000, integrator=vp.Gauss(stages))
     assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 50 * np.finfo(float).eps
 
 

@@ -1,8 +1,8 @@
 """Wiener increments, and motions driven by them: replay, strong and weak order, the Stratonovich limit, Langevin."""
 
 import numpy as np
-import pinocchio as pin
 import pytest
+from mechanisms import slider
 from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_lyapunov
 
 import varpin as vp
@@ -10,13 +10,6 @@ from varpin.wiener import coarsen, refine, wiener_increments
 
 SPLIT = vp.Midpoint(kick="split")
 BOTH = pytest.mark.parametrize("kick", ["left", "split"])
-
-
-def slider(mass):
-    model = pin.Model()
-    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slide")
-    model.appendBodyToJoint(joint, pin.Inertia.FromSphere(mass, 0.1), pin.SE3.Identity())
-    return vp.load_robot(model)
 
 
 def noisy_chain(noise):

@@ -1,0 +1,174 @@
+"""Model predictive control: its plans are those of solve, its decisions those of its plans, its times the plant's."""
+
+import numpy as np
+import pytest
+from mechanisms import slider
+
+import varpin as vp
+from varpin.mpc import _decision
+
+
+def cart(steps=40, **options):
+    """A cart on a spring, which is to be at rest at 0."""
+    cost = vp.TrackingCost([0.0], 1.0) + vp.VelocityCost(0.1) + vp.ControlCost(1e-2)
+    return vp.OptimalControlProblem(
+        vp.Scene(slider(), stiffness=3.0, gravity=False), cost, [1.0], [0.3], dt=0.05, steps=steps, **options
+    )
+
+
+def wave(t):
+    return [0.3 * np.sin(2.0 * t), 0.2 * np.sin(3.0 * t), 0.1 * t]
+
+
+def tracking(integrator=None, **options):
+    robot = vp.planar_chain(3)
+    scene = vp.Scene(robot, damping=0.3)
+    cost = vp.TrackingCost(wave, 1e3) + vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
+    return vp.OptimalControlProblem(
+        scene, cost, np.zeros(3), np.zeros(3), dt=0.02, steps=20, integrator=integrator, **options
+    )
+
+
+def test_a_linear_system_under_a_quadratic_cost_is_a_linear_feedback():
+    """The horizon's gain is then the same in every tick, so the run is one under that gain."""
+    mpc = vp.Mpc(cart(), iterations=3, tolerance=1e-12)
+    plant = vp.Plant(vp.Scene(mpc.problem.scene.robot, gravity=False, stiffness=mpc.problem.scene.stiffness))
+    run = mpc.run(plant, duration=1.0)
+    first = run.plans[0].policy_on("velocity")
+    motion, x = [], np.array([1.0, 0.3])
+    for _ in range(20):
+        # About 0, where nothing is to be done: the feed-forward part is the gain's.
+        u = first.u[0] + first.gains[0] @ (x - first.reference[0])
+        part = vp.simulate(plant.scene, x[:1], x[1:], dt=5e-3, steps=10, controls=u, integrator=plant.integrator)
+        motion.append(part.q[1:, 0])
+        x = np.concatenate([part.q[-1], part.v[-1]])
+    np.testing.assert_allclose(run.motion.q[1:, 0], np.concatenate(motion), rtol=0, atol=1e-9)
+    assert run.motion.steps == 200
+    assert run.motion.t[-1] == pytest.approx(1.0)
+
+
+def test_without_surprises_the_plan_of_one_tick_is_that_of_the_next():
+    """Of a horizon that ends with the run, the rest of an optimum is the optimum of the rest."""
+    problem = cart(steps=20)
+    whole = vp.solve(problem, tolerance=1e-13)
+    later = problem.at(q0=whole.trajectory.q[5], v0=whole.trajectory.v[5], steps=15, t0=problem.dt * 5)
+    rest = vp.solve(later, tolerance=1e-13)
+    np.testing.assert_allclose(rest.trajectory.u, whole.trajectory.u[5:], rtol=0, atol=1e-6)
+
+
+def test_references_are_those_of_the_plants_time():
+    problem = tracking()
+    moved = problem.at(t0=0.5)
+    assert moved.t0 == 0.5
+    assert problem.at(t0=0.5).at(steps=10).t0 == 0.5
+    motion = vp.solve(problem, max_iterations=0).trajectory
+    times = 0.5 + (np.arange(20) + 0.5) * 0.02
+    q = 0.5 * (motion.q[1:] + motion.q[:-1])
+    v, u = np.diff(motion.q, axis=0) / 0.02, motion.u
+    own = 1e3 * ((q - np.array([wave(t) for t in times])) ** 2).sum(axis=1)
+    own += 1e-2 * (v**2).sum(axis=1) + 1e-4 * (u**2).sum(axis=1)
+    assert moved.cost_of(motion) == pytest.approx(0.02 * own.sum(), rel=1e-12)
+
+
+def test_arrays_of_references_belong_to_the_horizon():
+    rows = np.linspace(0.0, 1.0, 21)[:, None]
+    cost = vp.TrackingCost(rows) + vp.ControlCost(1e-2, np.linspace(0.0, 1.0, 20)[:, None])
+    costs = []
+    for t0 in (0.0, 7.3):
+        problem = vp.OptimalControlProblem(
+            vp.Scene(slider(), stiffness=3.0, gravity=False), cost, [0.0], [0.0], dt=0.05, steps=20, t0=t0
+        )
+        costs.append(problem.cost_of(vp.solve(problem, max_iterations=0).trajectory))
+    assert costs[1] == pytest.approx(costs[0], rel=1e-12)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.SemiImplicitEuler()], ids=str)
+def test_it_follows_a_target_on_another_plant(integrator):
+    """Wrong masses, friction unknown to it, noise, another integrator."""
+    mpc = vp.Mpc(tracking(integrator), iterations=1)
+    heavier = vp.load_robot(vp.planar_chain(3).model, payload=vp.Payload("tip", mass=0.1))
+    plant = vp.Plant(vp.Scene(heavier, damping=0.4, noise=vp.AdditiveNoise(0.05)))
+    run = mpc.run(plant, duration=1.0, rng=3)
+    error = run.motion.q - [wave(t) for t in run.motion.t]
+    assert np.abs(error[200:]).max() < 0.05
+    again = mpc.run(plant, duration=1.0, rng=3)
+    np.testing.assert_array_equal(run.motion.q, again.motion.q)
+    assert (run.iterations[1:] <= 1).all()
+    assert run.misses == 0
+
+
+def test_a_late_plan_leaves_the_one_before_to_act():
+    """With a budget that no plan meets, the first plan's feedback acts to the end of its horizon."""
+    mpc = vp.Mpc(tracking(), budget=1e-9)
+    run = mpc.run(duration=0.4)
+    assert run.late[1:].all()
+    assert run.misses == len(run.plans) - 1 == 19
+    policy = run.plans[0].policy_on("velocity", substeps=10)
+    plan = vp.simulate(
+        mpc.problem.scene,
+        np.zeros(3),
+        np.zeros(3),
+        dt=2e-3,
+        steps=200,
+        controls=policy,
+        integrator=vp.RungeKutta4(),
+    )
+    np.testing.assert_allclose(run.motion.q, plan.q, rtol=0, atol=1e-10)
+    assert "19 later than" in str(run)
+
+
+def test_controls_stay_within_their_limits():
+    problem = tracking(control_limits=(-12.0, 12.0))
+    run = vp.Mpc(problem, iterations=1).run(
+        vp.Plant(vp.Scene(problem.scene.robot, damping=0.3, noise=vp.AdditiveNoise(0.5))), duration=0.4, rng=0
+    )
+    assert np.abs(run.motion.u).max() <= 12.0
+    plan = run.plans[-1]
+    far = plan.trajectory.q[0] + 10.0
+    assert np.abs(_decision(plan, 0, far, plan.trajectory.v[0])).max() == 12.0
+
+
+def test_a_time_limit_ends_a_search_with_what_there_is():
+    problem = tracking()
+    whole = vp.solve(problem)
+    cut = vp.solve(problem, time_limit=1e-9)
+    assert cut.status is vp.Status.OUT_OF_TIME
+    assert cut.iterations < whole.iterations
+    assert cut.cost >= whole.cost
+    assert problem.cost_of(cut.trajectory) == pytest.approx(cut.cost)
+
+
+def test_interruption_keeps_the_motion():
+    def stop(done, total):
+        assert total == 50
+        if done == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(vp.Interrupted) as caught:
+        vp.Mpc(tracking()).run(duration=1.0, progress=stop)
+    assert caught.value.trajectory.steps == 70
+
+
+def test_a_plant_that_fails_keeps_the_motion():
+    mpc = vp.Mpc(tracking(), iterations=1)
+    plant = vp.Plant(vp.Scene(mpc.problem.scene.robot, gravity=(0, 0, -1e6)), vp.Midpoint(max_halvings=0), 1)
+    with pytest.raises(vp.StepFailure) as caught:
+        mpc.run(plant, duration=1.0)
+    assert caught.value.trajectory.dt == pytest.approx(0.02)
+
+
+def test_mistakes_are_named():
+    problem = tracking()
+    other = vp.Plant(vp.Scene(vp.planar_chain(2)))
+    for make, words in (
+        (lambda: vp.Mpc("x"), "problem must be an OptimalControlProblem, got str"),
+        (lambda: vp.Mpc(problem, iterations=0), "iterations must be"),
+        (lambda: vp.Mpc(problem, budget=-1.0), "budget must be positive"),
+        (lambda: vp.Mpc(problem).run(other, duration=1.0), "the plant has joints"),
+        (lambda: vp.Mpc(problem).run(duration=0.0), "duration must be positive"),
+        (lambda: vp.Mpc(problem).plan(0.0, [0.0], np.zeros(3)), "q0 must have shape"),
+        (lambda: vp.Plant(problem.scene, "rk"), "integrator must be one of varpin's"),
+        (lambda: vp.solve(problem, time_limit=0.0), "time_limit must be positive"),
+    ):
+        with pytest.raises(vp.InputError, match=words):
+            make()
