@@ -78,7 +78,10 @@ def work_precision(links: int) -> list[Point]:
             add(
                 f"varpin {str(integrator).replace('(alpha=0.5)', '').replace('stages=', '')}",
                 f"{1.0 / steps:.4g} s",
-                lambda i=integrator, n=steps: vp.simulate(scene, rest, rest, dt=1.0 / n, steps=n, integrator=i).q[-1],
+                # Nobody else looks at the finished motion either.
+                lambda i=integrator, n=steps: vp.simulate(
+                    scene, rest, rest, dt=1.0 / n, steps=n, integrator=i, check=False
+                ).q[-1],
             )
     for rtol in 10.0 ** -np.arange(3, 13):
         add("SciPy DOP853 on pin.aba", f"rtol {rtol:.0e}", peers.scipy_run(case, rtol))

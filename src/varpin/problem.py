@@ -35,8 +35,11 @@ class OptimalControlProblem:
     ``TrackingCost(q_r, weight)`` weight . (q - q_r(t))^2
     ``VelocityCost(weight, v_r)`` weight . (v - v_r(t))^2
     ``ControlCost(weight, u_r)``  weight . (u - u_r(t))^2; give every control some
-    ``FramePositionCost(...)``    in the task; and of a frame's orientation and velocity, the centre
-                                  of mass, manipulability, barriers at limits
+    ``FramePositionCost``         of a frame's place; of its ``FrameOrientationCost``,
+                                  ``FrameVelocityCost``
+    ``CenterOfMassCost``          of the robot's centre of mass
+    ``ManipulabilityCost``        keeps away from singular postures
+    ``JointLimitBarrier``         keeps joints within their limits; ``VelocityLimitBarrier``
     ``CustomCost(function)``      a function of one's own of (t, q, v, u)
     ``Terminal(cost)``            any of them but the control's, at the end instead of its integral
     ============================= ================================================================

@@ -183,6 +183,7 @@ def simulate(
     rng: np.random.Generator | int | None = None,
     increments: ArrayLike | None = None,
     sampling: Literal["midpoint", "start"] = "midpoint",
+    check: bool = True,
     progress: Progress | None = None,
 ) -> Trajectory:
     """Integrate a scene in time.
@@ -204,6 +205,8 @@ def simulate(
         sampling: Where a control function is evaluated, once a step. ``"midpoint"``: at the step's midpoint, at the
             state expected there, which keeps second order. ``"start"``: at the node where the step begins, as a
             digital controller with a zero-order hold would, at the price of first order.
+        check: Look at the finished motion, whether the balance of its energy closes and its steps resolve it, for
+            ``Trajectory.warnings`` and the log. It takes about half a millisecond.
         progress: Called now and then with (steps done, steps in all).
 
     Returns:
@@ -260,23 +263,26 @@ def simulate(
                 if progress is not None and (not stepwise or record.steps % chunk == 0 or record.steps == steps):
                     progress(record.steps, steps)
         except KeyboardInterrupt:
-            raise Interrupted(_told(scene, integrator, record.trajectory(), said)) from None
-        trajectory = _told(scene, integrator, record.trajectory(), said)
+            raise Interrupted(_told(scene, integrator, record.trajectory(), said, check=check)) from None
+        trajectory = _told(scene, integrator, record.trajectory(), said, check=check)
     for sentence in trajectory.warnings:
         logger.warning(sentence)
     return trajectory
 
 
-def _told(scene: Scene, integrator: Integrator, trajectory: Trajectory, said: tuple[str, ...]) -> Trajectory:
+def _told(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, said: tuple[str, ...], *, check: bool
+) -> Trajectory:
     """A whole motion with the balance of its energy, if the integrator keeps none, and with what is to be said."""
-    if not integrator.variational:
+    if check and not integrator.variational:
         own = replace(trajectory.statistics, energy_defect=energy_defects(scene, trajectory))
         trajectory = replace(trajectory, statistics=own)
     split = trajectory.statistics.split_steps
     if split:
         most, steps, dt = trajectory.statistics.substeps.max(), trajectory.steps, trajectory.dt
         said = (*said, f"{split} of {steps} steps were taken in up to {most} parts: dt = {dt:g} s is coarse here")
-    return replace(trajectory, warnings=(*said, *warnings_of(scene, integrator, trajectory)))
+    found = warnings_of(scene, integrator, trajectory) if check else ()
+    return replace(trajectory, warnings=(*said, *found))
 
 
 def _require_memory(scene: Scene, steps: int) -> None:

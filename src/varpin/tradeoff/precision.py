@@ -286,7 +286,7 @@ def _known(path: Path | None, setting: Setting, reference: Reference) -> WorkPre
     other = [part for part, own, found in zip(PARTS, here, there, strict=True) if own != found]
     other += ["reference"] if record.reference != str(reference) else []
     if other:
-        raise FileError(f"{path} holds runs of another {', '.join(other)}: choose another file")
+        raise FileError(f"{path} holds runs of another motion (not the same: {', '.join(other)}): choose another file")
     return record
 
 
