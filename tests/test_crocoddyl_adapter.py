@@ -1,5 +1,8 @@
 """Crocoddyl's solvers on varpin's steps find what varpin's own finds. Needs ``pip install "varpin[crocoddyl]"``."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -27,7 +30,7 @@ def reach(integrator, sampling="midpoint", steps=25):
 
 PROBLEMS = {
     "midpoint": lambda: reach(vp.Midpoint()),
-    "gauss": lambda: reach(vp.Gauss(2), "gauss", 10),
+    "gauss": lambda: reach(vp.Midpoint(), "gauss"),
     "start": lambda: reach(vp.Midpoint(), "start"),
     "euler": lambda: reach(vp.SemiImplicitEuler()),
 }
@@ -122,3 +125,9 @@ def test_a_step_that_fails_shortens_the_line_search(caplog):
     model.calc(data, np.full(12, np.nan), np.zeros(6))
     assert np.isnan(data.xnext).all()
     assert data.cost == np.inf
+
+
+def test_the_page_on_crocoddyl_runs():
+    page = (Path(__file__).parents[1] / "docs" / "crocoddyl.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S)
+    exec(block, {"problem": PROBLEMS["midpoint"]()})
