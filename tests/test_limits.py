@@ -184,3 +184,41 @@ def test_chains_at_coarse_steps_keep_their_energy(links, dt):
     error = np.abs(motion.energy - motion.energy[0]) / (GRAVITY * links**2 / 2)
     assert error.max() < 0.1
     assert error.max() < 0.02 or motion.statistics.split_steps > 0
+
+
+def mixed_chain(rng, heavy, light):
+    """Sliders and hinges about skew axes, the first ones ten thousand times as heavy as the others."""
+    kinds = [pin.JointModelPX, pin.JointModelPY, pin.JointModelPZ, pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ]
+    model = pin.Model()
+    for k in range(heavy + light):
+        parent = int(rng.integers(0, k + 1)) if rng.uniform() < 0.3 else k
+        place = pin.SE3(pin.exp3(rng.normal(size=3)), rng.normal(size=3))
+        joint = model.addJoint(parent, kinds[rng.integers(6)](), place, f"joint{k}")
+        scale = 1.0 if k < heavy else 1e-4
+        inertia = pin.Inertia(scale * rng.uniform(0.5, 2), 0.3 * rng.normal(size=3), scale * np.diag([0.1, 0.15, 0.2]))
+        model.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
+    return vp.load_robot(model)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)], ids=str)
+def test_light_parts_that_slide_and_turn_have_sound_balances(integrator):
+    """Small steps of whatever rides on whatever are accepted whole: the balance of a light part closes."""
+    rng, parts = np.random.default_rng(0), 0
+    for _ in range(40):
+        robot = mixed_chain(rng, int(rng.integers(1, 3)), int(rng.integers(1, 4)))
+        parts += robot.tree.loads.size
+        scene, n = vp.Scene(robot, gravity=6.0 * rng.normal(size=3), damping=1e-6), robot.dof
+        q, v = rng.uniform(-1.0, 1.0, (2, n))
+        motion = vp.simulate(scene, q, v, dt=1e-3, steps=20, integrator=integrator)
+        assert motion.statistics.split_steps == 0
+    assert parts > 20
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)], ids=str)
+@pytest.mark.parametrize("rate", [1.0, 2.5, 10.0])
+def test_what_dies_out_ends_at_rest(integrator, rate):
+    """Down through every power of ten to where squares underflow."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=rate * 100.0 / 3.0)
+    motion = vp.simulate(scene, [0.0], [100.0], dt=1e-2, steps=2000, integrator=integrator)
+    assert abs(motion.v[-1, 0]) < 1e-280
+    assert motion.q[-1, 0] == pytest.approx(1.0 / rate, rel=1e-9)

@@ -111,14 +111,6 @@ def test_warnings_survive_the_disk(tmp_path):
     assert vp.Trajectory.load(motion.save(tmp_path / "motion.npz")).warnings == motion.warnings
 
 
-def test_records_without_warnings_still_load(tmp_path):
-    _, motion = oscillator(1.5, vp.Midpoint())
-    with np.load(motion.save(tmp_path / "motion.npz")) as archive:
-        members = {name: archive[name] for name in archive.files if name != "warnings"}
-    np.savez(tmp_path / "old.npz", **members)
-    assert vp.Trajectory.load(tmp_path / "old.npz").warnings == ()
-
-
 def test_an_interrupted_motion_tells_too():
     def interrupt(done, steps):
         raise KeyboardInterrupt

@@ -27,8 +27,12 @@ _ENTRY = 1_000_000
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
-def read_npz(source: Path, names: Collection[str] | None = None, what: str = "npz file") -> dict[str, NDArray[Any]]:
-    """The arrays of an npz file, or those in ``names``, without which it is not ``what`` it should be.
+def read_npz(
+    source: Path, names: Collection[str] = (), what: str = "npz file", *, others: bool = True
+) -> dict[str, NDArray[Any]]:
+    """The arrays of an npz file; without those in ``names`` it is not ``what`` it should be.
+
+    With ``others`` off the rest is left unread.
 
     Arrays are C-contiguous and cannot be written to.
 
@@ -46,9 +50,9 @@ def read_npz(source: Path, names: Collection[str] | None = None, what: str = "np
                 raise FileError(f"{source} is not an npz file, or it is truncated")
         with zipfile.ZipFile(source) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            if names is not None:
-                if missing := sorted(set(names) - set(members)):
-                    raise FileError(f"{source} is not a {what}: it has no {', '.join(missing)}")
+            if missing := sorted(set(names) - set(members)):
+                raise FileError(f"{source} is not a {what}: it has no {', '.join(missing)}")
+            if not others:
                 members = {name: members[name] for name in names}
             size, limit = sum(info.file_size for info in members.values()), source.stat().st_size * MOST_RATIO
             if size > max(limit, MOST_BYTES):

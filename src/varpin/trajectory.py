@@ -306,9 +306,7 @@ MEMBERS |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
 def read_members(source: Path, kind: str, expected: Iterable[str]) -> dict[str, NDArray[Any]]:
     """The arrays of an npz file of format ``kind``, or a FileError that says what is wrong with it."""
     what = f"varpin {kind.removeprefix('varpin.').partition('/')[0]}"
-    members = read_npz(source, what=what)
-    if missing := sorted({*expected, "format"} - set(members)):
-        raise FileError(f"{source} is not a {what}: it has no {', '.join(missing)}")
+    members = read_npz(source, {*expected, "format"}, what)
     found = members["format"]
     if found.shape != () or str(found) != kind:
         raise FileError(f"{source} is not a {what}: its format is {found}, not {kind!r}")

@@ -24,6 +24,7 @@ from varpin.kernels.midpoint_equation import (
     FOLD,
     ITERATIONS,
     NOT_FINITE,
+    NOTHING,
     ROUNDING,
     SOLVED,
     Options,
@@ -150,7 +151,7 @@ def residuals(mechanism: Mechanism, tableau: Tableau, h: float, state: State, k:
             error = (state.p[r] - g.Lv[i, r]) + (state.p_low[r] + h * total)
             g.residual[i * n + r] = error
             scale = h * scale + abs(state.p[r]) + g.Lv_scale[i, r]
-            if scale > 0.0:
+            if scale > NOTHING:
                 error = abs(error) / (EPS * scale)
             if not error <= worst:  # NaN ends up in worst
                 worst = error

@@ -12,8 +12,8 @@ scenes in which such parts are found pay it.
 
 from varpin.kernels._compile import inlined
 from varpin.kernels.jet import dot6, first_order
-from varpin.kernels.midpoint_equation import Options, State, Work
-from varpin.kernels.tree import Floats, Mechanism
+from varpin.kernels.midpoint_equation import NOTHING, Options, State, Work
+from varpin.kernels.tree import Floats, Integers, Mechanism
 
 # Columns of a row for each part; L_q and L_v in all coordinates follow.
 JACOBI, POTENTIAL, SCALE, DEFECT, MOST, DRIVE = 0, 1, 2, 3, 4, 5
@@ -50,6 +50,14 @@ def varied(state: State, k: Work, i: int) -> float:
 
 
 @inlined
+def below(parent: Integers, body: int, top: int) -> bool:
+    """Whether ``body`` is ``top`` or hangs on it; parents come first."""
+    while body > top:
+        body = parent[body]
+    return body == top
+
+
+@inlined
 def load_energies(mechanism: Mechanism, place: Floats, p: Floats, v: Floats, k: Work) -> None:
     """Jacobi energy, potential energy and carrier's derivatives of each light part at a node, into ``k.loads``."""
     tree, g, w = mechanism.tree, mechanism.gravity, k.sweep
@@ -66,6 +74,16 @@ def load_energies(mechanism: Mechanism, place: Floats, p: Floats, v: Floats, k: 
         # Of what carries the part's origin up and down the carrier's L_q is spared too.
         potential = -(g[0] * hx + g[1] * hy + g[2] * hz)
         scale = strength * (abs(hx) + abs(hy) + abs(hz)) + abs(carried)
+        for b in range(j, tree.parent.size):
+            if tree.origin[b] and below(tree.parent, b, j):
+                # Moments past an origin are about it, and it slides.
+                if b > j:
+                    potential -= g[0] * Y[b, 1] + g[1] * Y[b, 2] + g[2] * Y[b, 3]
+                    scale += strength * (abs(Y[b, 1]) + abs(Y[b, 2]) + abs(Y[b, 3]))
+                if tree.prismatic[b]:
+                    slid = tree.ratio[b] * place[tree.coordinate[b]] + tree.offset[b]
+                    potential -= Y[b, 0] * slid * (g[0] * S[b, 0] + g[1] * S[b, 1] + g[2] * S[b, 2])
+                    scale += strength * Y[b, 0] * abs(slid)
         jacobi = -carried
         for c in range(n):
             row[DRIVE + c] = 0.0
@@ -111,7 +129,7 @@ def load_balanced(mechanism: Mechanism, options: Options, state: State, k: Work,
     exchanged += abs(new[POTENTIAL] - old[POTENTIAL]) + abs(work)
     limit = limit_of(options, error, old[DEFECT], moved, exchanged, LOAD_ROOM * old[MOST])
     new[DEFECT], new[MOST] = old[DEFECT] + error, max(old[MOST], moved)
-    return abs(error) <= LOAD_ROOM * limit + rounding * (old[SCALE] + new[SCALE] + exchanged)
+    return abs(error) <= LOAD_ROOM * limit + rounding * (old[SCALE] + new[SCALE] + exchanged) + NOTHING
 
 
 @inlined

@@ -22,6 +22,7 @@ from varpin.kernels.midpoint_equation import (
     ENERGY,
     FOLD,
     HISTORY,
+    NOTHING,
     SINGULAR,
     SOLVED,
     Options,
@@ -135,7 +136,8 @@ def balanced(options: Options, state: State, k: Work, r: int) -> bool:
     limit = limit_of(options, error, ledger[2], new[3], exchanged, ledger[3])
     scale = k.sweep.V_scale[r]
     off_middle = abs(1.0 - 2.0 * options.alpha)
-    return abs(error) <= limit + ENERGY_ROUNDING * (scale + new[0]) + 1e-3 * off_middle * scale
+    rounding = ENERGY_ROUNDING * (scale + new[0]) + 1e-3 * off_middle * scale
+    return abs(error) <= limit + rounding + NOTHING
 
 
 @inlined

@@ -27,6 +27,7 @@ SINGULAR = 5  # the mass matrix at the new node is singular
 
 EPS = float(np.finfo(np.float64).eps)
 ITERATIONS = 10
+NOTHING = 1e-290  # below, squares and products with EPS underflow: what dies out ends at rest
 ROUNDING = 100.0  # rounding units: a residual below may stagnate; without rounding's own scatter it would be 1
 HISTORY = 3
 
@@ -146,7 +147,7 @@ def residual(mechanism: Mechanism, a: float, h: float, state: State, k: Work) ->
         k.residual[i] = r
         scale = abs(state.p[i]) + w.Lv_scale[i]
         scale += 0.5 * h * (abs(k.force[i]) + abs(drag)) + h * (1.0 - a) * w.Lq_scale[i]
-        if scale > 0.0:
+        if scale > NOTHING:
             r = abs(r) / (EPS * scale)
         if not r <= worst:  # NaN ends up in worst
             worst = r

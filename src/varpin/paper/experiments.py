@@ -258,7 +258,7 @@ class Store:
         if not path.is_file():
             return None
         try:
-            members = read_npz(path, {"facts", *_ARRAYS}, "cell")
+            members = read_npz(path, {"facts", *_ARRAYS}, "cell", others=False)
             facts = _facts(path, members.pop("facts"))
             if facts is None:
                 return None
