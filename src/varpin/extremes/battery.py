@@ -43,6 +43,8 @@ _PATIENCE, _DEEP_PATIENCE = 20.0, 900.0
 _SAVED_EVERY = 2.0
 
 Progress = Callable[[int, int, str], None]
+# What no coarse step excuses: a record that contradicts itself, and derivatives without their structure.
+_STRUCTURE = ("record", "symplecticity")
 _MEASURES = ("error", "energy", "momentum", "reversal", "symplecticity", "record")
 
 
@@ -254,6 +256,8 @@ class Bench:
         wrong = findings(found, integrator, condition(self._setup))  # type: ignore[arg-type]
         if not finite(trajectory):
             kind, wrong = Kind.WRONG, ("the record is not finite", *wrong)
+        elif any(sentence.startswith(_STRUCTURE) for sentence in wrong):
+            kind = Kind.WRONG
         elif complaint is not None:
             kind = Kind.STOPPED
         elif trajectory.warnings:

@@ -29,7 +29,7 @@ INTEGRATORS: tuple[Integrator, ...] = (
     SemiImplicitEuler(),
     RungeKutta4(),
     Midpoint(),
-    *(Gauss(stages=stages) for stages in (2, 3, 4)),
+    *(Gauss(stages=stages) for stages in (2, 3, 4, 5)),
 )
 
 # Work between two chances for Ctrl-C, in steps of one joint.
