@@ -215,3 +215,14 @@ def test_an_optimum_at_extreme_weights_is_found_at_once():
     sol = vp.solve(problem)
     assert sol.status is vp.Status.CONVERGED, sol.reason
     assert np.abs(sol.trajectory.q[-1] - [1e-3, -1e-3]).max() < 1e-9
+
+
+def test_what_is_lost_is_told(caplog):
+    """Six decades of inertia under eighteen of weights: the plan, and what rounding may have done to it."""
+    sol = vp.solve(reach("finger", 1e-9, 1e-9, 1e9, integrator=vp.Midpoint(), sampling="midpoint"))
+    assert "rounding may have changed Quu" in sol.reason
+    assert any("cannot be trusted" in record.message for record in caplog.records)
+    caplog.clear()
+    ordinary = vp.solve(reach(vp.planar_chain(3), 1e-2, 1.0, 10.0))
+    assert "rounding" not in ordinary.reason
+    assert not any("cannot be trusted" in record.message for record in caplog.records)
