@@ -18,12 +18,16 @@ from varpin.linearization import (
     velocity_curvature,
 )
 from varpin.problem import OptimalControlProblem
+from varpin.square_root import RootPass, Squares, squares_of
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
 # Nodes that are linearized at a time: their derivatives are not kept.
 _BLOCK = 2048
+
+# A pass whose Quu rounding may have changed by more than this part is made anew on square roots.
+TRUSTED = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +43,7 @@ class Plan:
     jumps: Floats  # (N, 2n, n), empty without noise
     spread: Floats  # (N, 2n, 2n)
     limited: bool
+    loss: float  # about the part of Quu, or of its root, that rounding may have changed
 
     @property
     def promise(self) -> float:
@@ -131,11 +136,28 @@ def _pass(
     costates: bool = False,
     curvature: Floats | None = None,
 ) -> tuple[Plan | None, Floats]:
+    """The pass by the plain recursion, or, where that has lost its digits and the model is convex, on square roots."""
+    plain = _one_pass(problem, trajectory, regularization, costates, curvature, roots=False)
+    if curvature is not None or (plain[0] is not None and plain[0].loss <= TRUSTED):
+        return plain
+    by_roots = _one_pass(problem, trajectory, regularization, costates, None, roots=True)
+    return plain if by_roots[0] is None else by_roots
+
+
+def _one_pass(
+    problem: OptimalControlProblem,
+    trajectory: Trajectory,
+    regularization: float,
+    costates: bool,
+    curvature: Floats | None,
+    *,
+    roots: bool,
+) -> tuple[Plan | None, Floats]:
     scene = problem.scene
     n, m, k, N, R = scene.robot.dof, scene.controls, scene.processes, problem.steps, problem.decisions
     size = 2 * n + m
     value, room = kernels.new_value(n, m), kernels.new_room(n, m)
-    _set_terminal(problem, trajectory, value, curvature is not None)
+    terminal = _set_terminal(problem, trajectory, value, curvature is not None)
     running = problem.expand_running(trajectory)
     for name, array in (("gradient", running.gradient), ("Hessian", running.hessian)):
         if not np.isfinite(array).all():
@@ -145,6 +167,13 @@ def _pass(
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, 2 * n)), np.empty((R, m))
     costate = np.empty((N if costates else 0, 2 * n))
     hessian = running.hessian
+    by_roots, squares = None, None
+    if roots:
+        final, squares = squares_of(*terminal[:2]), squares_of(running.gradient, hessian)
+        if final is None or squares is None:
+            return None, costate
+        D = terminal[2]
+        by_roots = RootPass(Squares(final.root[0] @ D, final.shift[0], D.T @ final.linear[0]), value)
     in_velocity = bool(hessian[:, n : 2 * n].any())
     rule = problem.rule
     samples = len(rule)
@@ -163,34 +192,32 @@ def _pass(
             jumps[steps] = lin.J
         velocity = velocity_at_nodes(scene, part.q, part.v) if nodes else np.zeros((0, n, 2 * n))
         points = slice(begin * samples, end * samples)
-        failed = kernels.backward_pass(
-            problem.dt,
-            problem.hold,
-            in_velocity,
-            float(regularization),
-            kernels.Steps(
-                A=lin.A,
-                B=np.ascontiguousarray(lin.B),
-                G=lin.G,
-                Gx=lin.Gx,
-                Gu=lin.Gu,
-                rule=rule,
-                gradient=running.gradient[points],
-                hessian=hessian[points] if len(hessian) > 1 else hessian,
-                velocity=velocity,
-                curvature=np.zeros((0, size, size)) if curvature is None else curvature[steps],
-                slack=slack[rows],
-            ),
-            value,
-            kernels.Gains(
-                feedforward[rows],
-                feedback[rows],
-                gradient[rows],
-                costate[steps] if costates else costate,
-                spread[steps],
-            ),
-            room,
+        given = kernels.Steps(
+            A=lin.A,
+            B=np.ascontiguousarray(lin.B),
+            G=lin.G,
+            Gx=lin.Gx,
+            Gu=lin.Gu,
+            rule=rule,
+            gradient=running.gradient[points],
+            hessian=hessian[points] if len(hessian) > 1 else hessian,
+            velocity=velocity,
+            curvature=np.zeros((0, size, size)) if curvature is None else curvature[steps],
+            slack=slack[rows],
         )
+        gains = kernels.Gains(
+            feedforward[rows],
+            feedback[rows],
+            gradient[rows],
+            costate[steps] if costates else costate,
+            spread[steps],
+        )
+        if by_roots is not None and squares is not None:
+            failed = by_roots.run(problem.dt, problem.hold, regularization, given, squares[points], gains)
+        else:
+            failed = kernels.backward_pass(
+                problem.dt, problem.hold, in_velocity, float(regularization), given, value, gains, room
+            )
         if failed >= 0:
             return None, costate
     if not np.isfinite(value.decrease).all():
@@ -205,6 +232,7 @@ def _pass(
         jumps,
         spread,
         problem.limited,
+        float(value.loss[0]),
     )
     return plan, costate
 
@@ -217,14 +245,16 @@ def _linearize(problem: OptimalControlProblem, part: Trajectory, begin: int) -> 
         raise LinearizationError(step, step * problem.dt, error.reason) from None
 
 
-def _set_terminal(problem: OptimalControlProblem, trajectory: Trajectory, value: kernels.Value, exact: bool) -> None:
-    """The terminal cost in x."""
+def _set_terminal(
+    problem: OptimalControlProblem, trajectory: Trajectory, value: kernels.Value, exact: bool
+) -> tuple[Floats, Floats, Floats]:
+    """The terminal cost in x; returns gradient and Hessian in (q, v), with one axis before, and d(q, v)/dx."""
     n = problem.scene.robot.dof
     end = problem.expand_terminal(trajectory)
     x = slice(0, 2 * n)
-    g, H = end.gradient[0, x], end.hessian[0, x, x]
+    gradient, hessian, D = end.gradient[:1, x], end.hessian[:1, x, x], np.eye(2 * n)
+    g, H = gradient[0], hessian[0]
     if problem.integrator.variational:
-        D = np.eye(2 * n)
         D[n:] = velocity_at_nodes(problem.scene, trajectory.q[-1:], trajectory.v[-1:])[0]
         H = D.T @ H @ D
         if exact:
@@ -232,3 +262,5 @@ def _set_terminal(problem: OptimalControlProblem, trajectory: Trajectory, value:
         g = D.T @ g
     value.gradient[x] = value.costate[x] = g
     value.hessian[x, x] = H
+    value.scale[x] = np.sqrt(np.abs(np.diagonal(H)))
+    return gradient, hessian, D

@@ -38,6 +38,8 @@ _LONG, _SHORT = 0.5, 0.01
 _LOST = (CostError, NoiseFieldError, LinearizationError)
 # As much as this does not hide how far an optimum is; controls that do nothing need some.
 _LITTLE = 1e-4
+# Of Quu, what rounding may change without a word.
+_LOSSY = 1e-8
 # Iterations without a decrease worth the name before a search gives up: the cost jumps where guards cut steps.
 _PATIENCE = 15
 # Part of a motion's own cost that the tolerance on the expected cost may hide with nothing said.
@@ -440,6 +442,11 @@ class _Search:
             if best is not None and best is not self.trajectory and not (plan and self.cost + plan.noise <= merit):
                 self.trajectory, self.cost = best, cost
                 plan = self._last_plan()
+        reason = self.reason
+        if plan is not None and plan.loss > _LOSSY:
+            lost = f"rounding may have changed Quu by {plan.loss:.0e} of itself: weights or inertias are too far apart"
+            logger.warning("the gains cannot be trusted: %s", lost)
+            reason = f"{reason}; {lost}"
         R, m, n = problem.decisions, problem.scene.controls, problem.scene.robot.dof
         return Solution(
             problem=problem,
@@ -450,7 +457,7 @@ class _Search:
             cost=self.cost,
             noise_cost=(np.nan if problem.scene.processes else 0.0) if plan is None else plan.noise,
             status=status,
-            reason=self.reason,
+            reason=reason,
             history=tuple(self.history),
             search=self.state,
         )

@@ -18,6 +18,8 @@ from varpin.kernels.box import solve_box
 from varpin.kernels.linalg import factor_ldl, solve_ldl, solve_ldl_rows
 from varpin.kernels.tree import Floats
 
+EPS = float(np.finfo(np.float64).eps)
+
 
 class Steps(NamedTuple):
     """The linearized dynamics and the expanded costs of N steps."""
@@ -43,6 +45,8 @@ class Value(NamedTuple):
     costate: Floats  # (2n + m,) the gradient without feedback and feed-forward: of the cost itself
     noise: Floats  # (1,) what noise adds to the cost so far
     decrease: Floats  # (2,) sums of Qu . k and k . Quu k
+    scale: Floats  # (2n + m,) rounding has left entry (i, j) of the Hessian off by about eps scale_i scale_j
+    loss: Floats  # (1,) the largest relative error of a pivot of Quu so far, by these scales
 
 
 class Gains(NamedTuple):
@@ -68,6 +72,7 @@ class Room(NamedTuple):
     Quu: Floats  # (m, m)
     row: Floats  # (2n + m,)
     solved: Floats  # (2n + m,)
+    scale: Floats  # (2n + m,) of Q, as that of the value
     box: Floats  # (3, m) of the minimum within limits
     H: Floats  # (m, m) Quu, kept while Quu is factored
 
@@ -75,7 +80,9 @@ class Room(NamedTuple):
 def new_value(dof: int, controls: int) -> Value:
     """A value of zero."""
     size = 2 * dof + controls
-    return Value(np.zeros(size), np.zeros((size, size)), np.zeros(size), np.zeros(1), np.zeros(2))
+    return Value(
+        np.zeros(size), np.zeros((size, size)), np.zeros(size), np.zeros(1), np.zeros(2), np.zeros(size), np.zeros(1)
+    )
 
 
 def new_room(dof: int, controls: int) -> Room:
@@ -92,6 +99,7 @@ def new_room(dof: int, controls: int) -> Room:
         Quu=np.zeros((controls, controls)),
         row=np.zeros(size),
         solved=np.zeros(size),
+        scale=np.zeros(size),
         box=np.zeros((3, controls)),
         H=np.zeros((controls, controls)),
     )
@@ -244,11 +252,38 @@ def add_noise(steps: Steps, s: int, h: float, value: Value, gains: Gains, room: 
 
 
 @inlined
+def carry_scale(value: Value, room: Room) -> None:
+    """How large the terms are that cancel in J'WJ, whose entries are off by about eps scale_r scale_c."""
+    J, scale = room.J, room.scale
+    x, size = J.shape
+    for c in range(size):
+        scale[c] = 0.0
+    for i in range(x):
+        own = value.scale[i]
+        for c in range(size):
+            scale[c] += abs(J[i, c]) * own
+    for c in range(x, size):
+        scale[c] = np.sqrt(scale[c] * scale[c] + value.scale[c] * value.scale[c])
+
+
+@inlined
+def is_idle(i: int, room: Room) -> bool:
+    """Whether nothing depends on control ``i``."""
+    Q, Qz = room.Q, room.Qz
+    x, size = room.J.shape
+    total = abs(Qz[x + i])
+    for c in range(size):
+        total += abs(Q[x + i, c])
+    return total == 0.0
+
+
+@inlined
 def decide(regularization: float, r: int, slack: Floats, value: Value, gains: Gains, room: Room) -> bool:
     """Gains of decision ``r`` from Q and Qz, and the value under them; False where Quu is not positive definite.
 
     Within limits the feed-forward part minimizes the model there, and controls at a limit have no feedback (Tassa,
-    Mansard and Todorov 2014).
+    Mansard and Todorov 2014). Each control is regularized by its own diagonal entry, whatever the others' units; one
+    that nothing depends on stays as it is, if there are others.
     """
     Q, Qz, Quu, row, solved = room.Q, room.Qz, room.Quu, room.row, room.solved
     x, size = room.J.shape
@@ -259,8 +294,9 @@ def decide(regularization: float, r: int, slack: Floats, value: Value, gains: Ga
     for i in range(m):
         for j in range(m):
             Quu[i, j] = Q[x + i, x + j]
-        Quu[i, i] += regularization * max(abs(Q[x + i, x + i]), 1e-6 * largest)
-        # A pivot of rounding's size is no pivot.
+        Quu[i, i] += regularization * abs(Quu[i, i])
+        if largest > 0.0 and Quu[i, i] == 0.0 and is_idle(i, room):
+            Quu[i, i] = largest
         if not Quu[i, i] > 0.0:
             return False
     limited = slack.shape[0] > 0
@@ -278,6 +314,9 @@ def decide(regularization: float, r: int, slack: Floats, value: Value, gains: Ga
         return False
     for i in range(m):
         gains.feedforward[r, i] = solved[i]
+        if not limited or room.box[0, i] == 0.0:
+            terms = max(room.scale[x + i] * room.scale[x + i], abs(Q[x + i, x + i]))
+            value.loss[0] = max(value.loss[0], EPS * terms / Quu[i, i])
     K, k = gains.feedback[r], gains.feedforward[r]
     for i in range(m):
         for c in range(x):
@@ -308,6 +347,7 @@ def decide(regularization: float, r: int, slack: Floats, value: Value, gains: Ga
         for i in range(m):
             for c in range(x):
                 value.hessian[b, c] += K[i, b] * T[i, c] + Q[x + i, b] * K[i, c]
+        value.scale[b] = np.sqrt(abs(Q[b, b]))
     for c in range(x):
         for b in range(c):
             mean = 0.5 * (value.hessian[b, c] + value.hessian[c, b])
@@ -316,6 +356,7 @@ def decide(regularization: float, r: int, slack: Floats, value: Value, gains: Ga
     for c in range(x, size):
         value.gradient[c] = 0.0
         value.costate[c] = 0.0
+        value.scale[c] = 0.0
         for b in range(size):
             value.hessian[b, c] = 0.0
             value.hessian[c, b] = 0.0
@@ -348,6 +389,7 @@ def backward_pass(
                 J[i, c] = steps.A[s, i, c]
             for c in range(x, size):
                 J[i, c] = steps.B[s, i, c - x]
+        carry_scale(value, room)
         for c in range(size):
             Qz[c] = value.gradient[c] if c >= x else 0.0
             room.costate[c] = value.costate[c] if c >= x else 0.0
@@ -383,6 +425,7 @@ def backward_pass(
         for c in range(size):
             value.gradient[c] = Qz[c]
             value.costate[c] = room.costate[c]
+            value.scale[c] = np.sqrt(abs(Q[c, c])) if c < x else room.scale[c]
             for r in range(size):
                 value.hessian[r, c] = Q[r, c]
     return -1

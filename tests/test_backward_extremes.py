@@ -1,0 +1,228 @@
+"""The backward pass where weights and inertias lie many digits apart, against plain recursions in 60 digits."""
+
+from decimal import Decimal, localcontext
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin.backward import TRUSTED, _one_pass, backward
+from varpin.kernels import backward as kernels
+from varpin.linearization import linearize_steps
+from varpin.simulation import simulate
+from varpin.square_root import RootPass, squares_of
+
+INERTIAS = {"unit": np.ones(3), "finger": np.array([1e-5, 1e-6, 1e-7]), "mixed": np.array([1.0, 1e-3, 1e-6])}
+EXTREMES = (1e-9, 1.0, 1e9)
+
+
+def exact(array):
+    return np.vectorize(Decimal, otypes=[object])(np.asarray(array, dtype=float))
+
+
+def solved(A, B):
+    """Gaussian elimination, column by column."""
+    A, B, n = A.copy(), B.copy(), len(A)
+    for k in range(n):
+        for i in range(k + 1, n):
+            factor = A[i, k] / A[k, k]
+            A[i], B[i] = A[i] - factor * A[k], B[i] - factor * B[k]
+    for i in range(n - 1, -1, -1):
+        for j in range(i + 1, n):
+            B[i] = B[i] - A[i, j] * B[j]
+        B[i] = B[i] / A[i, i]
+    return B
+
+
+def riccati(A, B, gradient, hessian, end_gradient, end_hessian, h):
+    """Gains and feed-forward parts of the textbook recursion in 60 digits."""
+    x = A.shape[1]
+    with localcontext() as context:
+        context.prec = 60
+        W, w, h = exact(end_hessian), exact(end_gradient)[:, None], Decimal(h)
+        gains, changes = [], []
+        for k in range(len(A) - 1, -1, -1):
+            J = np.hstack([exact(A[k]), exact(B[k])])
+            Q = J.T.dot(W).dot(J) + h * exact(hessian[k])
+            g = J.T.dot(w) + h * exact(gradient[k])[:, None]
+            both = -solved(Q[x:, x:], np.hstack([Q[x:, :x], g[x:]]))
+            K = both[:, :x]
+            W, w = Q[:x, :x] + Q[:x, x:].dot(K), g[:x] + K.T.dot(g[x:])
+            gains.append(K.astype(float))
+            changes.append(both[:, x].astype(float))
+    return np.array(gains[::-1]), np.array(changes[::-1])
+
+
+def made_up(inertia, control, running, terminal, *, steps=20, h=1e-2):
+    """Three coupled springs, three controls: A, B, gradient and Hessian of the running cost and of the end's."""
+    n, rng = 3, np.random.default_rng(0)
+    scale = np.sqrt(np.outer(inertia, inertia))
+    A, B = np.zeros((steps, 2 * n, 2 * n)), np.zeros((steps, 2 * n, n))
+    for k in range(steps):
+        M = scale * (np.eye(n) + 0.1 * rng.uniform(-1.0, 1.0, (n, n)))
+        inverse = np.linalg.inv(0.5 * (M + M.T))
+        springs = scale * rng.normal(size=(n, n)) * 30.0
+        A[k] = np.eye(2 * n)
+        A[k, :n, n:] += h * np.eye(n)
+        A[k, n:] -= h * np.hstack([inverse @ springs, 0.1 * np.eye(n)])
+        B[k] = np.vstack([0.5 * h * h * inverse, h * inverse])
+    weights = np.repeat([running, 1e-3 * running, control], n)
+    gradient, hessian = rng.normal(size=(steps, 3 * n)) * weights, np.tile(np.diag(weights), (steps, 1, 1))
+    end = terminal * np.diag(np.repeat([1.0, 0.01], n))
+    return A, B, gradient, hessian, end @ rng.normal(size=2 * n), end, h
+
+
+def passes(A, B, gradient, hessian, end_gradient, end_hessian, h):
+    """(failed, gains, feed-forward, loss) of the compiled recursion and of the one on square roots."""
+    N, x, m = B.shape
+    rule = np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+    nothing = np.zeros((N, x, 0))
+    steps = kernels.Steps(
+        A, B, nothing, np.zeros((N, x, 0, x)), np.zeros((N, x, 0, m)), rule, gradient, hessian,
+        np.zeros((0, x // 2, x)), np.zeros((0, x + m, x + m)), np.zeros((0, 2, m)),
+    )  # fmt: skip
+    for roots in (False, True):
+        value, room = kernels.new_value(x // 2, m), kernels.new_room(x // 2, m)
+        value.gradient[:x] = value.costate[:x] = end_gradient
+        value.hessian[:x, :x] = end_hessian
+        value.scale[:x] = np.sqrt(np.diagonal(end_hessian))
+        empty = np.zeros((0, x)), np.zeros((0, x, x))
+        gains = kernels.Gains(np.zeros((N, m)), np.zeros((N, m, x)), np.zeros((N, m)), *empty)
+        if roots:
+            start = RootPass(squares_of(end_gradient[None], end_hessian[None])[0], value)
+            failed = start.run(h, 1, 0.0, steps, squares_of(gradient, hessian), gains)
+        else:
+            failed = kernels.backward_pass(h, 1, True, 0.0, steps, value, gains, room)
+        yield failed, gains.feedback, gains.feedforward, value.loss[0]
+
+
+def off(found, right):
+    """Largest error, for each node and each control in units of the largest entry of its own row over all states."""
+    size = np.abs(right).max(axis=-1, keepdims=True)
+    return (np.abs(found - right) / np.where(size > 0.0, size, 1.0)).max()
+
+
+def off_over_time(found, right):
+    """Largest error of feed-forward parts, each control in units of its own largest."""
+    return (np.abs(found - right) / np.abs(right).max(axis=0)).max()
+
+
+@pytest.mark.parametrize("control", [1e-9, 1e-3, 1.0, 1e9])
+@pytest.mark.parametrize("name", INERTIAS)
+def test_gains_over_eighteen_decades_of_weights(name, control):
+    lost = 0
+    for running in EXTREMES:
+        for terminal in EXTREMES:
+            given = made_up(INERTIAS[name], control, running, terminal)
+            K, k = riccati(*given)
+            plain, by_roots = passes(*given)
+            assert by_roots[0] == -1
+            assert off(by_roots[1], K) < 1e-10
+            assert off_over_time(by_roots[2], k) < 1e-10
+            if plain[0] >= 0 or plain[3] > TRUSTED:
+                lost += 1
+            else:
+                assert off(plain[1], K) < 1e-5
+                assert off_over_time(plain[2], k) < 1e-5
+    # With light controls the plain recursion has to know that it is lost, and with heavy ones that it is not.
+    assert control > 1e-9 or lost > 0
+    assert control < 1e9 or lost <= 2
+
+
+def reach(robot, control, running, terminal, **options):
+    robot = vp.load_robot(robot) if isinstance(robot, str) else robot
+    n = robot.dof
+    cost = vp.ControlCost(control) + vp.TrackingCost(np.linspace(0.2, -0.3, n), running)
+    cost += vp.Terminal(vp.TrackingCost(np.linspace(0.4, 0.1, n), terminal) + vp.VelocityCost(1e-2 * terminal))
+    options = {"dt": 0.01, "steps": 30, "sampling": "start", "integrator": vp.RungeKutta4()} | options
+    scene = vp.Scene(robot, noise=options.pop("noise", None), gravity=False)
+    return vp.OptimalControlProblem(scene, cost, np.linspace(0.1, 0.5, n), np.zeros(n), **options)
+
+
+@pytest.mark.parametrize(("running", "terminal"), [(1e-9, 1e9), (1.0, 1e9), (1e9, 1e-9), (1.0, 1.0)])
+@pytest.mark.parametrize("control", [1e-9, 1e-3])
+@pytest.mark.parametrize("robot", ["finger", "xarm7"])
+def test_plans_of_arms_have_the_gains_of_sixty_digits(robot, control, running, terminal):
+    problem = reach(robot, control, running, terminal)
+    n, m = problem.scene.robot.dof, problem.scene.controls
+    motion = simulate(problem.scene, problem.q0, problem.v0, dt=problem.dt, steps=30, integrator=problem.integrator)
+    plan = backward(problem, motion, 0.0)
+    lin = linearize_steps(problem.scene, motion, problem.integrator, problem.q0)
+    cost, end = problem.expand_running(motion), problem.expand_terminal(motion)
+    hessian = np.broadcast_to(cost.hessian, (30, 2 * n + m, 2 * n + m))
+    x = slice(0, 2 * n)
+    K, k = riccati(lin.A, lin.B, cost.gradient, hessian, end.gradient[0, x], end.hessian[0, x, x], problem.dt)
+    worst = max(off(plan.feedback, K), off_over_time(plan.feedforward, k))
+    assert worst < 1e-5
+    # What is worse than that would have been told.
+    assert worst < 1e-7 or plan.loss > 1e-13
+
+
+OPTIONS = {
+    "start": {},
+    "midpoint": {"sampling": "midpoint", "integrator": vp.Midpoint()},
+    "gauss": {"sampling": "gauss", "integrator": vp.Gauss(2)},
+    "held": {"sampling": "midpoint", "integrator": vp.Midpoint(), "hold": 5},
+    "noisy": {"sampling": "midpoint", "integrator": vp.Midpoint(), "noise": vp.ControlNoise(0.05)},
+    "split": {"integrator": vp.Midpoint(kick="split"), "noise": vp.AdditiveNoise(0.1)},
+    "limited": {"sampling": "midpoint", "integrator": vp.Midpoint(), "control_limits": (-0.5, 0.5)},
+    "held and limited": {"sampling": "midpoint", "hold": 3, "control_limits": (-0.5, 0.5)},
+}
+
+
+@pytest.mark.parametrize("regularization", [0.0, 0.1])
+@pytest.mark.parametrize("name", OPTIONS)
+def test_both_forms_agree_where_digits_are_plenty(name, regularization):
+    """Noise, held controls, limits and every sampling mean the same to both."""
+    problem = reach(vp.planar_chain(3), 1e-2, 1.0, 10.0, **OPTIONS[name])
+    controls = np.sin(np.arange(3 * problem.decisions)).reshape(-1, 3) * 0.4
+    motion = vp.solve(problem, controls, max_iterations=0).trajectory
+    (plain, first), (roots, second) = (
+        _one_pass(problem, motion, regularization, True, None, roots=roots) for roots in (False, True)
+    )
+    if problem.limited:
+        at_limits = np.isclose(np.abs(motion.u[:: problem.hold] + plain.feedforward), 0.5)
+        assert 0.0 < at_limits.mean() < 1.0
+    for field in ("feedforward", "feedback", "gradient", "spread", "slope", "curvature", "noise", "promise"):
+        right = getattr(plain, field)
+        near = 1e-9 * np.abs(right).max(initial=0.0)
+        np.testing.assert_allclose(getattr(roots, field), right, rtol=0, atol=near, err_msg=field)
+    np.testing.assert_allclose(second, first, rtol=0, atol=1e-11 * np.abs(first).max())
+
+
+@pytest.mark.parametrize("regularization", [0.0, 1e-3, 10.0])
+def test_units_of_controls_do_not_matter(regularization):
+    """Two motors in [N m], or one of them in units of 1e8 N m: the same plan, whatever the regularization."""
+    plans = []
+    for unit in (1.0, 1e8):
+        robot, scale = vp.planar_chain(2), np.array([1.0, unit])
+        cost = vp.ControlCost(1e-2 * scale**2) + vp.Terminal(vp.TrackingCost([0.4, 0.1], 10.0))
+        scene = vp.Scene(robot, gravity=False, actuation=np.diag(scale))
+        problem = vp.OptimalControlProblem(scene, cost, np.zeros(2), np.zeros(2), dt=0.01, steps=30)
+        motion = vp.solve(problem, np.tile([0.1, 0.2] / scale, (30, 1)), max_iterations=0).trajectory
+        plan = backward(problem, motion, regularization)
+        plans.append((plan.feedforward * scale, plan.feedback * scale[:, None]))
+    for one, other in zip(*plans, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-11 * np.abs(one).max())
+
+
+def test_an_optimum_at_extreme_weights_is_found_at_once():
+    """Springs without gravity are linear: one step of the search, where the plain recursion finds no minimum."""
+    robot = vp.planar_chain(2)
+    scene = vp.Scene(robot, gravity=False)
+    cost = vp.ControlCost(1e-9) + vp.Terminal(vp.TrackingCost([1e-3, -1e-3], 1e9) + vp.VelocityCost(1e7))
+    problem = vp.OptimalControlProblem(scene, cost, np.zeros(2), np.zeros(2), dt=0.01, steps=40)
+    sol = vp.solve(problem)
+    assert sol.status is vp.Status.CONVERGED, sol.reason
+    assert np.abs(sol.trajectory.q[-1] - [1e-3, -1e-3]).max() < 1e-9
+
+
+def test_what_is_lost_is_told(caplog):
+    """Six decades of inertia under eighteen of weights: the plan, and what rounding may have done to it."""
+    sol = vp.solve(reach("finger", 1e-9, 1e-9, 1e9, integrator=vp.Midpoint(), sampling="midpoint"))
+    assert "rounding may have changed Quu" in sol.reason
+    assert any("cannot be trusted" in record.message for record in caplog.records)
+    caplog.clear()
+    ordinary = vp.solve(reach(vp.planar_chain(3), 1e-2, 1.0, 10.0))
+    assert "rounding" not in ordinary.reason
+    assert not any("cannot be trusted" in record.message for record in caplog.records)
