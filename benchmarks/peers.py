@@ -8,6 +8,7 @@ and acceleration, with gravity, dampers, springs and torques. Robots of revolute
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import ModuleType
@@ -64,6 +65,13 @@ def available(name: str) -> ModuleType | None:
         return importlib.import_module(name)
     except ImportError:
         return None
+
+
+def version_of(module: str) -> str:
+    """Of the distribution that a module came with; empty where there is none."""
+    for name in importlib.metadata.packages_distributions().get(module, []):
+        return importlib.metadata.version(name)
+    return ""
 
 
 def bodies(robot: vp.Robot) -> list[Body]:
