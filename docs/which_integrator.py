@@ -257,16 +257,21 @@ def short(scale: Scale) -> tuple[str, Figure, list[tuple[str, Point]]]:
 
 def against_trep(rows: list[tuple[str, Point]]) -> list[str]:
     """A table of trep's midpoint integrator against the fastest of varpin that is as exact; nothing without trep."""
-    lines = ["", "| motion | error [rad] | trep midpoint [us] | varpin [us] | varpin / trep |", "|---|---|---|---|---|"]
+    heading = "| motion | error [rad] | trep midpoint [us] | varpin [us] | varpin / trep |"
+    lines = ["", heading, "|---|---|---|---|---|"]
     theirs = [(motion, point) for motion, point in rows if point.method == "trep midpoint"]
     for motion, point in theirs:
         good = [p for name, p in rows if name == motion and p.ours and p.error <= point.error]
         if good:
             own = min(good, key=lambda p: p.microseconds)
-            lines.append(
-                f"| {motion} | {point.error:.1e} | {point.microseconds:.0f} ({point.setting}) "
-                f"| {own.microseconds:.0f} ({own.method}, {own.setting}) | {own.microseconds / point.microseconds:.3f} |"
+            cells = (
+                motion,
+                f"{point.error:.1e}",
+                f"{point.microseconds:.0f} ({point.setting})",
+                f"{own.microseconds:.0f} ({own.method}, {own.setting})",
+                f"{own.microseconds / point.microseconds:.3f}",
             )
+            lines.append(f"| {' | '.join(cells)} |")
     return lines if theirs else []
 
 
