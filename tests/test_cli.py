@@ -552,7 +552,7 @@ def test_tradeoff_interrupted_is_status_130(arm, capsys, monkeypatch):
     assert "interrupted after 0 of " in capsys.readouterr().err
 
 
-def test_advise_says_what_to_take(arm, capsys):
+def test_advise_says_what_to_take(arm, tmp_path, capsys):
     options = ["--duration", "0.5", "--q0", "0.3", "--damping", "0.1"]
     assert main(["advise", arm, "--tolerance", "1e-6", *options]) == 0
     out, err = capsys.readouterr()
@@ -560,7 +560,13 @@ def test_advise_says_what_to_take(arm, capsys):
     assert re.match(
         r"\w+.* at dt = \S+ s: error \S+ in .*, the cheapest within an error of 1e-06 in q after 0.5 s\n", out
     )
-    assert main(["advise", arm, "--budget", "2e-3", *options]) == 0
+    assert out.count("│ Gauss") >= 2
+    assert main(["advise", arm, "--budget", "2e-3", "--out", str(tmp_path / "advice"), *options]) == 0
+    assert {path.name for path in (tmp_path / "advice").iterdir()} == {"advice.png", "advice.html"}
+    page = (tmp_path / "advice" / "advice.html").read_text()
+    assert "the most accurate after 0.5 s within 2 ms" in page
+    assert page.count("<tr class=front>") == 1
+    assert 'src="data:image/png;base64,' in page
     assert "the most accurate after 0.5 s within 2 ms" in capsys.readouterr().out
     assert main(["advise", arm, "--tolerance", "1e-20", *options]) == 3
     assert "not within reach" in capsys.readouterr().out

@@ -255,6 +255,8 @@ def _add_advise(parser: argparse.ArgumentParser) -> None:
         "--duration", type=float, default=1.0, metavar="S", help="of the motion [s]; default: %(default)g"
     )
     _add_motion(parser)
+    outputs = parser.add_argument_group("outputs")
+    outputs.add_argument("--out", type=Path, metavar="FOLDER", help="write advice.png and advice.html there")
 
 
 def _add_paper(parser: argparse.ArgumentParser) -> None:
@@ -753,6 +755,9 @@ def _folder(path: Path) -> Path:
 
 
 def _advise(request: argparse.Namespace, _errors: Console) -> int:
+    from varpin.tradeoff_report import ADVICE_COLUMNS, advice_cells, write_advice  # noqa: PLC0415 - as above
+
+    folder = None if request.out is None else _folder(request.out)
     scene, q0, v0, torque = _motion(request)
     advice = advise(
         scene,
@@ -766,7 +771,16 @@ def _advise(request: argparse.Namespace, _errors: Console) -> int:
     console = Console() if sys.stdout.isatty() else Console(width=_WIDTH)
     for line in advice.reason.splitlines():
         _say(console, line, prefix="")
+    table = _table("The best of each method", ADVICE_COLUMNS)
+    for choice in (advice.best, *advice.alternatives):
+        _row(table, *advice_cells(choice))
+    console.print(table)
     _say(console, f"(found in {advice.calibration:.2g} s)", prefix="")
+    if folder is not None:
+        wish = f"{advice.tolerance:g} in q" if advice.tolerance is not None else f"{advice.budget:g} s"
+        title = f"{scene.robot.name}: an integrator for {request.duration:g} s and {wish}"
+        for path in write_advice(folder, advice, title):
+            _say(console, str(path), prefix="written")
     return 0 if advice.reached else STEP_FAILED
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from varpin.errors import InputError
 from varpin.robot import Robot
-from varpin.tradeoff import OptimalControlTradeoff, WorkPrecision
+from varpin.tradeoff import Advice, OptimalControlTradeoff, WorkPrecision
 from varpin.tradeoff.precision import Quantity
 from varpin.trajectory import Trajectory
 
@@ -212,6 +212,38 @@ def plot_work_precision(
     return figure, axes
 
 
+def plot_advice(advice: Advice, axes: Axes | None = None) -> tuple[Figure | SubFigure, Axes]:
+    """Predicted error over predicted time of the advised choice, ringed, and of the best of every other method.
+
+    A grey line is the tolerance or the budget that was asked for.
+
+    Args:
+        advice: From :func:`varpin.advise`.
+        axes: Where to draw; a new figure if left out.
+
+    Returns:
+        The figure and its axes.
+
+    Raises:
+        InputError: No choice has a known error.
+    """
+    points = [
+        (f"{choice.integrator}, {choice.dt:.3g} s", choice.seconds, choice.error)
+        for choice in (advice.best, *advice.alternatives)
+        if np.isfinite(choice.error) and choice.error > 0.0
+    ]
+    best = [(seconds, error) for _, seconds, error in points[:1]]
+    figure, axes = _plot_trade(points, best, axes, "advised" if np.isfinite(advice.error) else "the most accurate")
+    axes.set_yscale("log")
+    if advice.tolerance is not None:
+        axes.axhline(advice.tolerance, color="0.6", linewidth=0.8, linestyle="--", zorder=1)
+    if advice.budget is not None:
+        axes.axvline(advice.budget, color="0.6", linewidth=0.8, linestyle="--", zorder=1)
+    axes.set_xlabel("predicted wall time [s]")
+    axes.set_ylabel("predicted error in q at the end [rad or m]")
+    return figure, axes
+
+
 def plot_optimal_control_tradeoff(
     record: OptimalControlTradeoff, axes: Axes | None = None
 ) -> tuple[Figure | SubFigure, Axes]:
@@ -228,7 +260,10 @@ def plot_optimal_control_tradeoff(
 
 
 def _plot_trade(
-    points: Sequence[tuple[str, float, float]], front: Sequence[tuple[float, float]], axes: Axes | None
+    points: Sequence[tuple[str, float, float]],
+    front: Sequence[tuple[float, float]],
+    axes: Axes | None,
+    front_name: str = "Pareto front",
 ) -> tuple[Figure | SubFigure, Axes]:
     """Points (integrator, seconds, value) as one line an integrator, and a front, over logarithmic time."""
     if not front:
@@ -240,7 +275,7 @@ def _plot_trade(
         axes.plot(*zip(*own, strict=True), label=name, marker="o", markersize=4, **style)
     axes.plot(
         *zip(*front, strict=True),
-        label="Pareto front",
+        label=front_name,
         color="0.3",
         linewidth=0.8,
         marker="o",
