@@ -86,7 +86,7 @@ def test_orders_are_visible():
     scene = vp.Scene(vp.load_robot("ur5"), damping=0.5, stiffness=8.0, rest=0.1)
     q0, v0 = np.linspace(0.2, 0.6, 6), np.linspace(0.5, -0.5, 6)
     controls = np.random.default_rng(0).normal(size=(4, 6))
-    counts = {1: (400, 800, 1600), 2: (100, 200, 400), 4: (48, 96, 192), 6: (16, 24, 32), 8: (8, 12, 16)}
+    counts = {1: (400, 800, 1600), 2: (100, 200, 400), 4: (48, 96, 192), 6: (16, 24, 32), 8: (8, 12, 16), 10: (4, 8)}
     for integrator in INTEGRATORS:
         steps = counts[integrator.order]
         record = vp.work_precision(
@@ -341,8 +341,8 @@ def test_figure_and_report(oscillator, tmp_path):
         _, axes = plot_work_precision(oscillator, quantity=quantity)
         names = [text.get_text() for text in axes.get_legend().get_texts()]
         assert names == [*(str(integrator) for integrator in INTEGRATORS), "Pareto front"]
-    colours = [line.get_color() for line in axes.get_lines()]
-    assert len(set(colours)) == len(colours)
+    strokes = [(line.get_color(), line.get_linestyle()) for line in axes.get_lines()]
+    assert len(set(strokes)) == len(strokes)
     paths = write_report(tmp_path, oscillator, "A <spring>")
     assert [path.name for path in paths] == ["tradeoff.csv", "tradeoff.png", "tradeoff.html"]
     page = paths[2].read_text()
