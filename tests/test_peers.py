@@ -68,6 +68,7 @@ def test_energies_of_mujoco_are_those_of_nodes(peers):
 
 
 def test_robots_that_peers_are_not_built_for_are_refused(peers, case):
+    pytest.importorskip("mujoco", reason="pip install 'varpin[peers]'")
     model = case.scene.robot.model.copy()
     model.armature = np.full(6, 0.1)
     with pytest.raises(ValueError, match="has armature"):
