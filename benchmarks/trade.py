@@ -23,7 +23,7 @@ import varpin as vp
 
 ROOT = Path(__file__).resolve().parents[1]
 CHAINS = (3, 7)
-REPEATS = 7
+REPEATS = 25
 WINDOWS = 200
 LEVELS = 10.0 ** -np.arange(2, 12)
 STEPS = {

@@ -281,8 +281,8 @@ def _told(
     if split:
         most, steps, dt = trajectory.statistics.substeps.max(), trajectory.steps, trajectory.dt
         said = (*said, f"{split} of {steps} steps were taken in up to {most} parts: dt = {dt:g} s is coarse here")
-    found = warnings_of(scene, integrator, trajectory) if check else ()
-    return replace(trajectory, warnings=(*said, *found))
+    sentences = (*said, *(warnings_of(scene, integrator, trajectory) if check else ()))
+    return replace(trajectory, warnings=sentences) if sentences else trajectory
 
 
 def _require_memory(scene: Scene, steps: int) -> None:
