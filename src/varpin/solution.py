@@ -400,7 +400,8 @@ class Solution:
         if not isinstance(problem, OptimalControlProblem):
             raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
         source = path_like("path", path)
-        members = read_members(source, FORMAT, {*MEMBERS, *_PLAN, *_NUMBERS, *_PROBLEM, "status", "reason", "history"})
+        expected = {*MEMBERS, *_PLAN, *_NUMBERS, *_PROBLEM, "status", "reason", "history"}
+        members = read_members(source, FORMAT, expected, others=True)
         reader = _Reader(source, members, problem)
         reader.check_problem()
         return reader.solution()

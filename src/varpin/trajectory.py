@@ -303,10 +303,14 @@ MEMBERS = frozenset(_ARRAYS) | {"dt", "version", "integrator", "robot", "joint_n
 MEMBERS |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
 
 
-def read_members(source: Path, kind: str, expected: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """The arrays of an npz file of format ``kind``, or a FileError that says what is wrong with it."""
+def read_members(source: Path, kind: str, expected: Iterable[str], *, others: bool = False) -> dict[str, NDArray[Any]]:
+    """The ``expected`` arrays of an npz file of format ``kind``, with ``others`` all of them.
+
+    Raises:
+        FileError: It says what is wrong with the file.
+    """
     what = f"varpin {kind.removeprefix('varpin.').partition('/')[0]}"
-    members = read_npz(source, {*expected, "format"}, what)
+    members = read_npz(source, {*expected, "format"}, what, others=others)
     found = members["format"]
     if found.shape != () or str(found) != kind:
         raise FileError(f"{source} is not a {what}: its format is {found}, not {kind!r}")
