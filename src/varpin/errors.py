@@ -14,6 +14,12 @@ class RobotError(VarpinError, ValueError):
     """A robot description cannot be used."""
 
 
+def _meant(name: str, known: tuple[str, ...]) -> tuple[list[str], str]:
+    """The known names that come close to ``name``, and a question that offers them; both empty if none does."""
+    matches = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    return matches, f"did you mean {' or '.join(map(repr, matches))}? " if matches else ""
+
+
 class RobotNotFound(RobotError):
     """No robot of that name, or no file at that path.
 
@@ -42,8 +48,7 @@ class UnknownJoint(RobotError):
     def __init__(self, joint: str, joints: Iterable[str], where: str) -> None:
         self.joint = joint
         self.joints = tuple(joints)
-        self.matches = difflib.get_close_matches(joint, self.joints, n=3, cutoff=0.4)
-        hint = f"did you mean {' or '.join(map(repr, self.matches))}? " if self.matches else ""
+        self.matches, hint = _meant(joint, self.joints)
         super().__init__(f"{where}: the robot has no joint {joint!r}; {hint}joints: {', '.join(self.joints)}")
 
 
@@ -97,8 +102,7 @@ class UnknownFrame(InputError):
     def __init__(self, frame: str, frames: Iterable[str], robot: str) -> None:
         self.frame = frame
         self.frames = tuple(frames)
-        self.matches = difflib.get_close_matches(frame, self.frames, n=3, cutoff=0.4)
-        hint = f"did you mean {' or '.join(map(repr, self.matches))}? " if self.matches else ""
+        self.matches, hint = _meant(frame, self.frames)
         super().__init__(f"robot {robot!r} has no frame {frame!r}; {hint}frames: {', '.join(self.frames)}")
 
 

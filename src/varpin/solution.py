@@ -583,6 +583,7 @@ class Solution:
                 controls=policy,
                 integrator=problem.integrator,
                 rng=child,
+                check=False,
             )
         except (StepFailure, NoiseError):
             return np.full(1, np.nan)

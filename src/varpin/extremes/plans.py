@@ -189,6 +189,7 @@ def _gain(task: Task, solution: Solution, change: float) -> float:
             steps=problem.steps,
             controls=controls,
             integrator=problem.integrator,
+            check=False,
         )
         return task.cost(motion.q, controls, problem.dt)
 
