@@ -37,8 +37,8 @@ from varpin.replay import check_film, frame_names, replay
 from varpin.robot import Robot, build_robot, load_robot, robot_names
 from varpin.scene import Scene
 from varpin.scenefile import SceneFile, load_scene, scenes
+from varpin.sddp import Solution, Status
 from varpin.simulation import Interrupted, StepFailure, simulate
-from varpin.solution import Solution, Status
 from varpin.tradeoff import advise, work_precision
 from varpin.tradeoff.setting import Setting
 from varpin.trajectory import Trajectory, atomic_file
