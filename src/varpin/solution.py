@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import Enum
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.archive import Header
 from varpin.checks import count, is_one_of, path_like, positive
 from varpin.costs import BoundSum
 from varpin.ensemble import simulate_ensemble
@@ -401,7 +402,17 @@ class Solution:
             raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
         source = path_like("path", path)
         expected = {*MEMBERS, *_PLAN, *_NUMBERS, *_PROBLEM, "status", "reason", "history"}
-        members = read_members(source, FORMAT, expected, others=True)
+        most = _most_bytes(problem)
+
+        def check(headers: Mapping[str, Header]) -> None:
+            size = sum(header.bytes for header in headers.values())
+            if size > most:
+                raise FileError(
+                    f"{source} unpacks to {size / 1e6:.6g} MB, and no solution of this problem to more than "
+                    f"{most / 1e6:.6g} MB"
+                )
+
+        members = read_members(source, FORMAT, expected, others=True, check=check)
         reader = _Reader(source, members, problem)
         reader.check_problem()
         return reader.solution()
@@ -617,6 +628,14 @@ def _surroundings(problem: OptimalControlProblem) -> dict[str, Floats]:
     arrays = {f"scene.{name}": getattr(problem.scene, name) for name in _SURROUNDINGS}
     fields_of_noise = problem.scene.mechanism.diffusion._asdict()
     return arrays | {f"noise.{name}": array for name, array in fields_of_noise.items()}
+
+
+def _most_bytes(problem: OptimalControlProblem) -> int:
+    """More than the file of any solution unpacks to: three motions, the plan, and some megabytes for all else."""
+    n, m, k = problem.scene.robot.dof, problem.scene.controls, problem.scene.processes
+    own = sum(array.nbytes for array in _surroundings(problem).values())
+    numbers = 3 * (problem.steps + 1) * (3 * n + m + k + 16) + problem.decisions * m * (2 * n + 2)
+    return 8 * numbers + own + 16_000_000
 
 
 def _rows(history: tuple[Iteration, ...]) -> Floats:

@@ -15,9 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import as_floats, is_one_of, require_finite
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint
 from varpin.kernels.tree import Tree
+from varpin.robot import example_robot_data
+from varpin.robot.meshes import mesh_problems
 from varpin.robot.mimic import Tie, joint_index, rebuild, tied_model
 from varpin.robot.payload import Payload, carry
-from varpin.robot.sources import Description, describe, hang_shapes
+from varpin.robot.sources import Description, describe, hang_shapes, models_dir
 from varpin.robot.tree import flatten, frame_index, is_unbounded, joint_axis, to_pinocchio, tree_mass_matrix
 from varpin.robot.urdf import read_root
 
@@ -356,7 +358,18 @@ def geometry(robot: Robot) -> pin.GeometryModel:
     if robot.urdf is None:
         return pin.GeometryModel()
     text = ET.tostring(read_root(robot.urdf), encoding="unicode")
+    (problem,) = _mesh_problems(robot, [text])
+    if problem is not None:
+        raise RobotError(f"the meshes of robot {robot.name!r} cannot be read: {problem}")
     return _visuals(robot, _whole_model(robot, text), text)
+
+
+def _mesh_problems(robot: Robot, texts: Sequence[str]) -> list[str | None]:
+    """What is wrong with the meshes in parts of a robot's URDF; nothing of robots that are published with varpin."""
+    assert robot.urdf is not None
+    if robot.urdf.is_relative_to(models_dir()) or example_robot_data.holds(robot.urdf):
+        return [None] * len(texts)
+    return mesh_problems(texts, robot.package_dirs)
 
 
 def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[int, str]]]:
@@ -376,13 +389,20 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
     for link, shapes in visuals.items():
         for shape in shapes:
             link.remove(shape)
+    shown = {link: shapes for link, shapes in visuals.items() if shapes}
+    alone = []
+    for link, shapes in shown.items():
+        single = ET.Element("robot", name="link")
+        single.extend(root.findall("material"))
+        ET.SubElement(single, "link", name=link.get("name", "")).extend(shapes)
+        alone.append(ET.tostring(single, encoding="unicode"))
     found, missing = pin.GeometryModel(), {}
-    for link, shapes in visuals.items():
-        if not shapes:
-            continue
-        link.extend(shapes)
+    for (link, shapes), problem in zip(shown.items(), _mesh_problems(robot, alone), strict=True):
         name = link.get("name", "")
+        link.extend(shapes)
         try:
+            if problem is not None:
+                raise RobotError(f"the meshes of link {name!r} cannot be read: {problem}")
             part = _visuals(robot, full, ET.tostring(root, encoding="unicode"))
         except RobotError as error:
             frame = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.BODY)]
