@@ -83,11 +83,11 @@ def read_npz(
         FileError: The file is missing, unreadable, no npz, truncated or damaged, lacks one of ``names``, holds pickled
             objects, or unpacks to more than :data:`MOST_BYTES` and :data:`MOST_RATIO` times its size.
     """
-    if source.is_dir():
-        raise FileError(f"{source} is a folder, not an npz file")
-    if not source.is_file():
-        raise FileError(f"there is no file {source}")
     try:
+        if source.is_dir():
+            raise FileError(f"{source} is a folder, not an npz file")
+        if not source.is_file():
+            raise FileError(f"there is no file {source}")
         with source.open("rb") as stream:
             if not zipfile.is_zipfile(stream):
                 raise FileError(f"{source} is not an npz file, or it is truncated")

@@ -8,8 +8,8 @@ import random
 import tempfile
 from pathlib import Path
 
-from fuzz.damage import Case, damaged_bytes, damaged_json
 import varpin as vp
+from fuzz.damage import Case, damaged_bytes, damaged_json
 from varpin import extremes, extremes_report
 from varpin.extremes.trial import Cell, Kind
 

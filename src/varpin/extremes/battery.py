@@ -16,7 +16,7 @@ from typing import Any
 
 import varpin
 from varpin._version import __version__
-from varpin.checks import path_like, positive, writable
+from varpin.checks import is_file, path_like, positive, writable
 from varpin.errors import FileError, VarpinError
 from varpin.extremes import plans
 from varpin.extremes.checks import Exact, condition, exact_motion, findings, finite, measures
@@ -103,8 +103,8 @@ class Record:
             FileError: The file is missing, damaged or something else.
         """
         source = path_like("path", path)
-        if not source.is_file():
-            raise FileError(f"{source} is a folder or a device" if source.exists() else f"there is no file {source}")
+        if not is_file(source):
+            raise FileError(f"there is no file {source}")
         try:
             with source.open("rb") as stream:
                 content = stream.read(_MOST_BYTES + 1)

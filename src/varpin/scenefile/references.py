@@ -15,8 +15,9 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from varpin.archive import Header, read_npz
+from varpin.checks import is_file
 from varpin.errors import FileError
-from varpin.scenefile.table import ByName, Floats, Table, inside, is_file, shown, suggestion
+from varpin.scenefile.table import ByName, Floats, Table, inside, shown, suggestion
 
 KINDS = ("offset", "sines", "times", "values", "between", "file")
 # Of a file: a motion of seven joints over a million steps has eight million.

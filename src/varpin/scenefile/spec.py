@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from varpin.checks import is_file
 from varpin.errors import FileError, InputError
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
 from varpin.robot import Payload, models_dir
 from varpin.scenefile.references import Reference, read_reference
-from varpin.scenefile.table import ByName, SceneFileError, Table, inside, is_file, shown, suggestion
+from varpin.scenefile.table import ByName, SceneFileError, Table, inside, shown, suggestion
 from varpin.scenefile.terms import TERMS, Term
 
 # A motion of seven joints over so many steps takes gigabytes.
@@ -191,7 +192,7 @@ def find_scene(source: str | Path) -> Path:
     if str(source) in bundled:
         return bundled[str(source)]
     path = Path(source).expanduser()
-    if path.is_file():
+    if is_file(path):
         return path
     if path.is_dir():
         raise FileError(f"{path} is a folder, not a scene file")
@@ -290,7 +291,7 @@ def _scene(root: Table, path: Path, name: str) -> SceneSpec:
     if horizon["steps"] * len(costs) > MOST_EVALUATIONS:
         raise root.table("horizon").error(
             "",
-            f"{horizon['steps']} steps are too many to plan with {len(costs)} costs: {MOST_EVALUATIONS} is the most of both",
+            f"{horizon['steps']} steps with {len(costs)} costs are too many: {MOST_EVALUATIONS} is the most of their product",
         )
     joints = actuation.texts("joints")
     if "joints" in actuation and not joints:

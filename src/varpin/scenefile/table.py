@@ -298,11 +298,3 @@ def inside(table: Table, name: str, text: str, folder: Path, what: str) -> Path:
     if not found.is_relative_to(root):
         raise table.error(name, f"{text!r} leads out of {what} {root}; name files below it, or give an absolute path")
     return found
-
-
-def is_file(path: Path) -> bool:
-    """Whether there is a file, and no folder or device; False of what cannot be the path of one."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 
 from varpin.archive import read_npz
-from varpin.checks import path_like
+from varpin.checks import is_file, path_like
 from varpin.errors import FileError
 from varpin.trajectory import atomic_file
 
@@ -92,7 +92,7 @@ def read_table(
         FileError: The file is missing, damaged, or something else.
     """
     source = path_like("path", path)
-    if not source.is_file():
+    if not is_file(source):
         raise FileError(f"there is no file {source}")
     try:
         members = read_npz(source)
