@@ -11,6 +11,7 @@ import fuzz
 import numpy as np
 import pinocchio as pin
 import pytest
+from fuzz import npz, runner
 from mechanisms import INERTIAL, joint, link, mimic, random_tree, write_urdf
 
 import varpin as vp
@@ -20,16 +21,41 @@ from varpin.robot.model import mass_matrix
 from varpin.robot.tree import tree_mass_matrix
 from varpin.robot.urdf import MAX_BYTES, MAX_DEPTH, MAX_JOINTS, MAX_LINKS
 
+# What takes some seconds each.
+INPUTS = {
+    "urdf": 400, "npz": 600, "solution": 150, "scene": 800, "reference": 800, "record": 1500, "mesh": 20, "command": 200,
+}  # fmt: skip
+
+
+def sound(kind, inputs):
+    report = fuzz.run(kind, seed=7, begin=0, end=inputs)
+    assert not report.findings, str(report)
+    assert report.inputs == inputs
+    assert report.largest < 7e8
+    return report
+
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", fuzz.KINDS)
-def test_no_input_kills_hangs_or_surprises(kind):
-    report = fuzz.run(kind, seed=7, begin=0, end=1000)
-    assert not report.findings, str(report)
-    assert report.inputs == 1000
+@pytest.mark.parametrize(("kind", "inputs"), INPUTS.items())
+def test_no_input_kills_hangs_or_surprises(kind, inputs):
+    outcomes = sound(kind, inputs).outcomes
     # Most damage is told, and some of it does none.
-    assert report.outcomes["taken"] > 20
-    assert report.outcomes["RobotError"] + report.outcomes["FileError"] > 300
+    harmless = sum(count for outcome, count in outcomes.items() if outcome.startswith(("taken", "status 0")))
+    assert harmless > inputs // 50
+    assert inputs - harmless > inputs // 10
+
+
+@pytest.mark.parametrize("kind", ["scene", "record"])
+def test_a_sample(kind):
+    sound(kind, 60)
+
+
+@pytest.mark.parametrize("kind", fuzz.KINDS)
+def test_an_input_follows_from_its_number(kind):
+    if kind in ("solution", "npz", "reference"):
+        pytest.skip("whose corpus has to be computed: the slow test looks at them")
+    corpus = runner.module(kind).corpus()
+    assert [runner.make(kind, n, 3, corpus) for n in range(5)] == [runner.make(kind, n, 3, corpus) for n in range(5)]
 
 
 def test_the_fuzzer_sees_what_it_is_there_for(monkeypatch):
@@ -42,10 +68,12 @@ def test_the_fuzzer_sees_what_it_is_there_for(monkeypatch):
         calls = []
 
         def watched(kind, seed, begin, end, line=line, calls=calls):
+            if begin == end:
+                return iter(())
             calls.append(begin)
             return iter(line if begin == 5 else [f'[{n}, "taken", "", 0.1, 1000]' for n in range(begin, end)])
 
-        monkeypatch.setattr(fuzz, "_watched", watched)
+        monkeypatch.setattr(runner, "_watched", watched)
         report = fuzz.run("urdf", 0, 5, 8)
         assert [(kind, number) for kind, number, _ in report.findings] == [("urdf", 5)]
         assert (report.inputs, calls) == (3, [5, 6])
@@ -245,7 +273,7 @@ class TestArchives:
             member.write(stream.getvalue())
             for _ in range(600):
                 member.write(bytes(10**6))
-        with pytest.raises(vp.FileError, match="unpacks to 600 MB, which is over 512 MB and over 100 times its size"):
+        with pytest.raises(vp.FileError, match="unpacks to 600 MB, which is over 400 MB and over 100 times its size"):
             read_npz(path)
 
     @pytest.mark.parametrize("order", ["C", "F"])
@@ -262,7 +290,7 @@ class TestArchives:
             assert (back[name].dtype, back[name].shape) == (array.dtype, array.shape)
             assert np.array_equal(back[name], array)
             assert back[name].flags.c_contiguous
-            assert not back[name].flags.writeable or order == "F"
+            assert not back[name].flags.writeable
 
     @pytest.mark.parametrize(
         ("change", "words"),
@@ -292,7 +320,7 @@ class TestArchives:
     )
     def test_records_of_other_shapes(self, tmp_path, change, words):
         path = tmp_path / "a.npz"
-        path.write_bytes(fuzz.npz_corpus()["tradeoff"][0])
+        path.write_bytes(npz.corpus()["tradeoff"][0])
         np.savez(path, **{**np.load(path), **change})
         with pytest.raises(vp.FileError, match=words):
             vp.OptimalControlTradeoff.load(path)

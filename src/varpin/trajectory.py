@@ -327,7 +327,7 @@ def read_members(
     found = read_npz(source, {"format"}, what, others=False)["format"]
     if found.shape != () or str(found) != kind:
         raise FileError(f"{source} is not a {what}: its format is {reprlib.repr(str(found))}, not {kind!r}")
-    return read_npz(source, expected, what, others=others, check=check)
+    return read_npz(source, set(expected), what, others=others, check=check)
 
 
 @contextlib.contextmanager

@@ -140,9 +140,9 @@ def _typed(what: str, found: Any, kinds: Mapping[str, type]) -> dict[str, Any]:
     values = {}
     for name, kind in kinds.items():
         value = found[name]
-        if kind is float and type(value) is int and abs(value) < 2**53:
+        if kind is float and isinstance(value, int) and abs(value) < 2**53:
             value = float(value)
-        if type(value) is not kind or (kind is int and not 0 <= value < 2**63):
+        if type(value) is not kind or (isinstance(value, int) and not 0 <= value < 2**63):
             raise ValueError(f"{name} of {what} is {reprlib.repr(value)}")
         values[name] = value
     return values

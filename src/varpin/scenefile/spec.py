@@ -291,7 +291,7 @@ def _scene(root: Table, path: Path, name: str) -> SceneSpec:
     if horizon["steps"] * len(costs) > MOST_EVALUATIONS:
         raise root.table("horizon").error(
             "",
-            f"{horizon['steps']} steps with {len(costs)} costs are too many: {MOST_EVALUATIONS} is the most of their product",
+            f"{horizon['steps']} steps times {len(costs)} costs are too many; {MOST_EVALUATIONS} are the most",
         )
     joints = actuation.texts("joints")
     if "joints" in actuation and not joints:
