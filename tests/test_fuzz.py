@@ -23,7 +23,8 @@ from varpin.robot.urdf import MAX_BYTES, MAX_DEPTH, MAX_JOINTS, MAX_LINKS
 
 # What takes some seconds each.
 INPUTS = {
-    "urdf": 400, "npz": 600, "solution": 150, "scene": 800, "reference": 800, "record": 1500, "mesh": 20, "command": 200,
+    "urdf": 400, "npz": 600, "solution": 150, "scene": 800,
+    "reference": 800, "record": 1500, "mesh": 20, "command": 200,
 }  # fmt: skip
 
 

@@ -69,13 +69,13 @@ def read_npz(
     names: Collection[str] = (),
     what: str = "npz file",
     *,
-    others: bool = True,
+    wanted: Collection[str] | None = None,
     check: Check | None = None,
 ) -> dict[str, NDArray[Any]]:
     """The arrays of an npz file; without those in ``names`` it is not ``what`` it should be.
 
-    With ``others`` off the rest is left unread. ``check`` is given the headers of what is to be read, and raises a
-    FileError where they do not fit.
+    Of others than ``wanted``, if given, nothing is read. ``check`` is given the headers of what is to be read, and
+    raises a FileError where they do not fit.
 
     Arrays are C-contiguous and cannot be written to.
 
@@ -95,8 +95,8 @@ def read_npz(
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             if missing := sorted(set(names) - set(members)):
                 raise FileError(f"{source} is not a {what}: it has no {', '.join(missing)}")
-            if not others:
-                members = {name: members[name] for name in names}
+            if wanted is not None:
+                members = {name: members[name] for name in wanted}
             _require_size(source, sum(info.file_size for info in members.values()))
             headers = {}
             for name, info in members.items():

@@ -324,10 +324,11 @@ def read_members(
         FileError: It says what is wrong with the file.
     """
     what = f"varpin {kind.removeprefix('varpin.').partition('/')[0]}"
-    found = read_npz(source, {"format"}, what, others=False)["format"]
+    names = {*expected, "format"}
+    found = read_npz(source, names, what, wanted={"format"})["format"]
     if found.shape != () or str(found) != kind:
-        raise FileError(f"{source} is not a {what}: its format is {reprlib.repr(str(found))}, not {kind!r}")
-    return read_npz(source, set(expected), what, others=others, check=check)
+        raise FileError(f"{source} is not a {what}: its format is {reprlib.repr(str(found))[1:-1]}, not {kind!r}")
+    return read_npz(source, names, what, wanted=None if others else names, check=check)
 
 
 @contextlib.contextmanager

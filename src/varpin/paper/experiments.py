@@ -257,7 +257,7 @@ class Store:
         if not path.is_file():
             return None
         try:
-            members = read_npz(path, {"facts", *_ARRAYS}, "cell", others=False)
+            members = read_npz(path, {"facts", *_ARRAYS}, "cell", wanted={"facts", *_ARRAYS})
             facts = _facts(path, members.pop("facts"))
             if facts is None:
                 return None
