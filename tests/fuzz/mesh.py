@@ -13,7 +13,9 @@ from mechanisms import INERTIAL, joint, link
 
 import varpin as vp
 from fuzz.damage import NUMBERS, WORDS, Case, Special, damaged_bytes
+from varpin.replay import picture
 from varpin.replay.page import Page
+from varpin.robot import readable_geometry
 from varpin.robot.example_robot_data import FIXED_BASE, locate
 
 STL = (
@@ -161,11 +163,21 @@ def extreme(rng: random.Random) -> tuple[bytes, str]:
 
 def read(path: Path, form: str) -> str:
     """Load the robot and write a replay of it."""
+    missing = {}
+
+    def noted(robot: vp.Robot) -> tuple[object, object]:
+        found = readable_geometry(robot)
+        missing.update(found[1])
+        return found
+
     try:
         robot = vp.load_robot(path)
-        with unittest.mock.patch.object(Page, "html", lambda page, title: "".join(map(repr, page.commands))):
+        with (
+            unittest.mock.patch.object(Page, "html", lambda page, title: "".join(map(repr, page.commands))),
+            unittest.mock.patch.object(picture, "readable_geometry", noted),
+        ):
             page = vp.replay(robot, np.zeros((1, robot.dof)), dt=1.0, html=path.with_suffix(".html"))
     except vp.VarpinError as error:
         return type(error).__name__
     assert base64.b64encode(SECRET) not in page.read_bytes()
-    return "taken"
+    return "taken, as a skeleton" if missing else "taken"

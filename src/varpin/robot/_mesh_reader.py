@@ -25,7 +25,7 @@ def main() -> None:
             for shape in shapes.geometryObjects:
                 shape.geometry.computeLocalAABB()
         except MemoryError:
-            answer = f"reading them takes more than {request['memory'] / 1e6:g} MB"
+            answer = f"reading takes more than {request['memory'] / 1e6:g} MB"
         except (ValueError, RuntimeError, IndexError) as error:
             answer = " ".join(str(error).split())
         answers.write(json.dumps(answer) + "\n")

@@ -19,8 +19,10 @@ from pathlib import Path
 MOST_BYTES = 100_000_000
 MEMORY = 500_000_000
 SECONDS = 8
-# Of wall time, for one that waits [s].
+# Of wall time, for one that waits [s]; how many readers may die; and how it is said that one took too long.
 _PATIENCE = 60.0
+_MOST_DEATHS = 5
+_SLOW = "reading takes more than"
 
 _READER = Path(__file__).with_name("_mesh_reader.py")
 
@@ -39,12 +41,17 @@ def mesh_problems(texts: Sequence[str], package_dirs: Sequence[str]) -> list[str
         problems[index] = next((said for name in names if (said := _odd_file(name, package_dirs))), None)
         if names and problems[index] is None:
             waiting.append(index)
+    deaths = 0
     while waiting:
         answers, said = _tried([texts[index] for index in waiting], package_dirs)
         problems |= dict(zip(waiting, answers, strict=False))
         if len(answers) < len(waiting):
             problems[waiting[len(answers)]] = said
+            deaths += _MOST_DEATHS if said.startswith(_SLOW) else 1
         waiting = waiting[len(answers) + 1 :]
+        if deaths >= _MOST_DEATHS:
+            problems |= dict.fromkeys(waiting, f"it was not tried, after others of which {said}")
+            waiting = []
     return [problems[index] for index in range(len(texts))]
 
 
@@ -81,10 +88,10 @@ def _tried(texts: Sequence[str], package_dirs: Sequence[str]) -> tuple[list[str 
             check=False,
         )
     except subprocess.TimeoutExpired as error:
-        return _answers(error.stdout or b""), f"reading them does not end in {_PATIENCE:g} s"
-    said = f"whoever reads them ends with code {ended.returncode}"
+        return _answers(error.stdout or b""), f"{_SLOW} {_PATIENCE:g} s"
+    said = f"the reader ends with code {ended.returncode}"
     if ended.returncode in (-9, -24):
-        said = f"reading them takes more than {SECONDS} s"
+        said = f"{_SLOW} {SECONDS} s of processor time"
     return _answers(ended.stdout), said
 
 

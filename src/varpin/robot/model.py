@@ -1,5 +1,6 @@
 """The robot: a Pinocchio model, its generalized coordinates, and the tree the kernels run on."""
 
+import contextlib
 import os
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
@@ -379,12 +380,11 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
         The shapes of the links that can be read; and by name of each other link, its joint in ``free_model`` and what
         is wrong with it.
     """
-    try:
+    if robot.visuals is not None or robot.urdf is None:
         return geometry(robot), {}
-    except RobotError:
-        assert robot.urdf is not None
     root = read_root(robot.urdf)
-    full = _whole_model(robot, ET.tostring(root, encoding="unicode"))
+    whole = ET.tostring(root, encoding="unicode")
+    full = _whole_model(robot, whole)
     visuals = {link: link.findall("visual") for link in root.iter("link")}
     for link, shapes in visuals.items():
         for shape in shapes:
@@ -396,8 +396,12 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
         single.extend(root.findall("material"))
         ET.SubElement(single, "link", name=link.get("name", "")).extend(shapes)
         alone.append(ET.tostring(single, encoding="unicode"))
+    problems = _mesh_problems(robot, alone)
+    if not any(problems):
+        with contextlib.suppress(RobotError):
+            return _visuals(robot, full, whole), {}
     found, missing = pin.GeometryModel(), {}
-    for (link, shapes), problem in zip(shown.items(), _mesh_problems(robot, alone), strict=True):
+    for (link, shapes), problem in zip(shown.items(), problems, strict=True):
         name = link.get("name", "")
         link.extend(shapes)
         try:
