@@ -472,7 +472,7 @@ class TestMeshes:
         reader = tmp_path / "reader.py"
         reader.write_text("import os; print('null', flush=True); os.abort()")
         monkeypatch.setattr(meshes, "_READER", reader)
-        text = '<robot name="a"><link name="b"><visual><geometry><mesh/></geometry></visual></link></robot>'
+        text = '<robot name="a"><link name="b"><visual><geometry><mesh filename="package://x"/></geometry></visual></link></robot>'
         assert meshes.mesh_problems([text] * 2, []) == [None, "the reader ends with code -6"]
         reader.write_text("import os; os.abort()")
         first, *_, last = meshes.mesh_problems([text] * 8, [])
@@ -487,7 +487,7 @@ class TestMeshes:
             "resource.setrlimit(resource.RLIMIT_CPU, (request['seconds'],) * 2)\nwhile True: pass\n"
         )
         monkeypatch.setattr(meshes, "_READER", reader)
-        text = '<robot name="a"><link name="b"><visual><geometry><mesh/></geometry></visual></link></robot>'
+        text = '<robot name="a"><link name="b"><visual><geometry><mesh filename="package://x"/></geometry></visual></link></robot>'
         first, second = meshes.mesh_problems([text] * 2, [])
         assert first == "reading takes more than 1 s of processor time"
         assert second.startswith("it was not tried")

@@ -70,18 +70,19 @@ def read_npz(
     what: str = "npz file",
     *,
     wanted: Collection[str] | None = None,
+    most: int | None = None,
     check: Check | None = None,
 ) -> dict[str, NDArray[Any]]:
     """The arrays of an npz file; without those in ``names`` it is not ``what`` it should be.
 
-    Of others than ``wanted``, if given, nothing is read. ``check`` is given the headers of what is to be read, and
-    raises a FileError where they do not fit.
+    Of others than ``wanted``, if given, nothing is read. ``most`` is how many bytes it may unpack to, if that is known.
+    ``check`` is given the headers of what is to be read, and raises a FileError where they do not fit.
 
     Arrays are C-contiguous and cannot be written to.
 
     Raises:
         FileError: The file is missing, unreadable, no npz, truncated or damaged, lacks one of ``names``, holds pickled
-            objects, or unpacks to more than :data:`MOST_BYTES` and :data:`MOST_RATIO` times its size.
+            objects, or unpacks to more than ``most``, or :data:`MOST_BYTES` and :data:`MOST_RATIO` times its size.
     """
     try:
         if source.is_dir():
@@ -97,7 +98,7 @@ def read_npz(
                 raise FileError(f"{source} is not a {what}: it has no {', '.join(missing)}")
             if wanted is not None:
                 members = {name: members[name] for name in wanted}
-            _require_size(source, sum(info.file_size for info in members.values()))
+            _require_size(source, what, sum(info.file_size for info in members.values()), most)
             headers = {}
             for name, info in members.items():
                 if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -106,7 +107,8 @@ def read_npz(
                     headers[name] = _read_header(stream, info, name, source)
             # What lies by columns is turned around, for which there has to be room.
             turned = [header for header in headers.values() if header.by_columns and header.ndim > 1]
-            _require_size(source, sum(h.bytes for h in headers.values()) + max((h.bytes for h in turned), default=0))
+            size = sum(header.bytes for header in headers.values())
+            _require_size(source, what, size + max((header.bytes for header in turned), default=0), most)
             if check is not None:
                 check(headers)
             arrays = {}
@@ -124,8 +126,10 @@ def read_npz(
         raise FileError(f"{source} is truncated or damaged: {error}") from None
 
 
-def _require_size(source: Path, size: int) -> None:
-    if size > max(source.stat().st_size * MOST_RATIO, MOST_BYTES):
+def _require_size(source: Path, what: str, size: int, most: int | None) -> None:
+    if most is not None and size > most:
+        raise FileError(f"{source} unpacks to {size / 1e6:.6g} MB, which no {what} does that fits here")
+    if most is None and size > max(source.stat().st_size * MOST_RATIO, MOST_BYTES):
         raise FileError(
             f"{source} unpacks to {size / 1e6:.6g} MB, which is over {MOST_BYTES / 1e6:g} MB and over "
             f"{MOST_RATIO} times its size: no motion or record does"

@@ -314,21 +314,27 @@ MEMBERS |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
 
 
 def read_members(
-    source: Path, kind: str, expected: Iterable[str], *, others: bool = False, check: Check | None = None
+    source: Path,
+    kind: str,
+    expected: Iterable[str],
+    *,
+    others: bool = False,
+    most: int | None = None,
+    check: Check | None = None,
 ) -> dict[str, NDArray[Any]]:
     """The ``expected`` arrays of an npz file of format ``kind``, with ``others`` all of them.
 
-    ``check`` looks at their headers before they are read.
+    ``most`` and ``check`` as for :func:`varpin.archive.read_npz`.
 
     Raises:
         FileError: It says what is wrong with the file.
     """
     what = f"varpin {kind.removeprefix('varpin.').partition('/')[0]}"
     names = {*expected, "format"}
-    found = read_npz(source, names, what, wanted={"format"})["format"]
+    found = read_npz(source, names, what, wanted={"format"}, most=_MOST_WORDS)["format"]
     if found.shape != () or str(found) != kind:
         raise FileError(f"{source} is not a {what}: its format is {reprlib.repr(str(found))[1:-1]}, not {kind!r}")
-    return read_npz(source, names, what, wanted=None if others else names, check=check)
+    return read_npz(source, names, what, wanted=None if others else names, most=most, check=check)
 
 
 @contextlib.contextmanager

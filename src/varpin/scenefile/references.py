@@ -6,7 +6,7 @@ import array
 import csv
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
@@ -14,7 +14,7 @@ from typing import TextIO
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from varpin.archive import Header, read_npz
+from varpin.archive import read_npz
 from varpin.checks import is_file
 from varpin.errors import FileError
 from varpin.scenefile.table import ByName, Floats, Table, inside, shown, suggestion
@@ -195,13 +195,8 @@ def _lines(stream: TextIO, wrong: Callable[[str], Exception]) -> Iterator[str]:
 
 def _npz(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
     """The columns of an npz file: arrays of one length, or the joint positions of a saved trajectory."""
-
-    def check(headers: Mapping[str, Header]) -> None:
-        if sum(header.size for header in headers.values()) > _MOST_NUMBERS:
-            raise FileError(f"it has more than {_MOST_NUMBERS} numbers")
-
     try:
-        arrays = read_npz(path, check=check)
+        arrays = read_npz(path, what="file of values", most=8 * _MOST_NUMBERS)
     except FileError as error:
         raise wrong(f"cannot be read: {error}") from None
     if {"t", "q", "joint_names"} <= set(arrays) and arrays["q"].ndim == 2:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.archive import Header
 from varpin.checks import path_like
 from varpin.errors import FileError
 from varpin.sddp.history import Iteration, SearchState, Status
@@ -66,17 +64,7 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     """The fields of the :class:`Solution` in a file; errors as :meth:`Solution.load` says."""
     source = path_like("path", path)
     expected = {*MEMBERS, *_PLAN, *_NUMBERS, *_PROBLEM, "status", "reason", "history"}
-    most = _most_bytes(problem)
-
-    def check(headers: Mapping[str, Header]) -> None:
-        size = sum(header.bytes for header in headers.values())
-        if size > most:
-            raise FileError(
-                f"{source} unpacks to {size / 1e6:.6g} MB, and no solution of this problem to more than "
-                f"{most / 1e6:.6g} MB"
-            )
-
-    members = read_members(source, _FORMAT, expected, others=True, check=check)
+    members = read_members(source, _FORMAT, expected, others=True, most=_most_bytes(problem))
     reader = _Reader(source, members, problem)
     reader.check_problem()
     return reader.fields()

@@ -22,6 +22,9 @@ Row = TypeVar("Row")
 # What numpy keeps the types of fields in.
 _DTYPES = {"int": "iu", "float": "fiu", "str": "U"}
 
+# No record unpacks to as much.
+_MOST_BYTES = 50_000_000
+
 # Costs closer than this, relative, are the same.
 MARGIN = 0.02
 
@@ -95,7 +98,7 @@ def read_table(
     if not is_file(source):
         raise FileError(f"there is no file {source}")
     try:
-        members = read_npz(source)
+        members = read_npz(source, what="record", most=_MOST_BYTES)
     except FileError as error:
         raise FileError(f"{source} is damaged, or no record of varpin.tradeoff: {error}") from None
     found = str(members.pop("format", "missing"))
