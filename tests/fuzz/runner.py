@@ -57,14 +57,13 @@ def work(kind: str, seed: int, begin: int, end: int) -> None:
         own.read(whole.write(Path(folder)), whole.form)
         _empty(Path(folder))
         base = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        with contextlib.suppress(OSError):
-            Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
         resource.setrlimit(resource.RLIMIT_AS, (base + MEMORY, base + MEMORY))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         for number in range(begin, end):
             report.write(f"{number}\n")
             case = make(kind, number, seed, corpus)
             path = case.write(Path(folder))
+            Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
             started, problem = time.perf_counter(), ""
             try:
                 outcome = own.read(path, case.form)
@@ -81,7 +80,7 @@ def work(kind: str, seed: int, begin: int, end: int) -> None:
 
 
 def _peak() -> int:
-    """The most memory that this process has had, in bytes."""
+    """The most memory that this process has had since its peak was last forgotten, in bytes."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmHWM:"):
             return int(line.split()[1]) * 1024

@@ -8,6 +8,7 @@ import json
 import random
 import re
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -125,34 +126,41 @@ def extreme(rng: random.Random) -> bytes:
     """Nested, long, of many tables, or of long keys."""
     size = int(10 ** rng.uniform(1.0, 5.3))
     base = '[robot]\nsource = "finger"\n[horizon]\ndt = 0.01\nsteps = 4\n'
-    sines = '[[cost]]\ntype = "tracking"\n[cost.reference]\n' + "[[cost.reference.sines]]\nof = 'mcp'\n" * size
-    waypoints = f"times = {list(range(size))}, values = {[[0, 0, 0]] * size}"
-    texts = [
-        base + "a" + ".a" * size + " = 1",
-        base + '"a b"' + '."a, b"' * size + " = 1",
-        base + "1.5" + "-1.5" * size + " = 1",
-        base + "[" + "a." * size + "a]",
-        base + "a = " + "[" * size + "]" * size,
-        base + "a = " + "{a = " * size + "1" + "}" * size,
-        base + '[[cost]]\ntype = "control"\n' * size,
-        base + '[[noise]]\ntype = "additive"\nintensity = 1.0\n' * size,
-        base + '[[robot.payload]]\nframe = "tip"\nmass = 1e-9\n' * size,
-        base + sines,
-        base + '[[cost]]\ntype = "tracking"\nreference = { ' + waypoints + " }",
-        base + "[actuation]\njoints = [" + ", ".join(f'"j{k}"' for k in range(size)) + "]",
-        base + "damping = {" + ", ".join(f"j{k} = 1.0" for k in range(size)) + "}",
-        base + f'title = "{"x" * size}"',
-        base + f'"{"k" * size}" = 1',
-        base + f"[simulate]\nseed = {'9' * size}",
-        base + f"[simulate]\nseed = 0x{'f' * size}",
-        base + f"[solve]\nmax_iterations = 0x{'f' * size}",
-        base.replace("steps = 4", f"steps = {size * 1000}") + '[[cost]]\ntype = "control"\n',
-        base.replace("steps = 4", f"duration = {size}.0") + '[[cost]]\ntype = "tracking"\nreference = 1.0\n',
-        base + "#" + "." * size,
-        base + "\n" * size * 10,
-        base + "x" * size * 10,
+    texts: list[Callable[[], str]] = [
+        lambda: base + "a" + ".a" * size + " = 1",
+        lambda: base + '"a b"' + '."a, b"' * size + " = 1",
+        lambda: base + "1.5" + "-1.5" * size + " = 1",
+        lambda: base + "[" + "a." * size + "a]",
+        lambda: base + "a = " + "[" * size + "]" * size,
+        lambda: base + "a = " + "{a = " * size + "1" + "}" * size,
+        lambda: base + '[[cost]]\ntype = "control"\n' * size,
+        lambda: base + '[[noise]]\ntype = "additive"\nintensity = 1.0\n' * size,
+        lambda: base + '[[robot.payload]]\nframe = "tip"\nmass = 1e-9\n' * size,
+        lambda: (
+            base + '[[cost]]\ntype = "tracking"\n[cost.reference]\n' + "[[cost.reference.sines]]\nof = 'mcp'\n" * size
+        ),
+        lambda: (
+            base
+            + '[[cost]]\ntype = "tracking"\nreference = '
+            + f"{{ times = {list(range(size))}, values = {[[0, 0, 0]] * size} }}"
+        ),
+        lambda: base + "[actuation]\njoints = [" + ", ".join(f'"j{k}"' for k in range(size)) + "]",
+        lambda: base + "damping = {" + ", ".join(f"j{k} = 1.0" for k in range(size)) + "}",
+        lambda: base + f'title = "{"x" * size}"',
+        lambda: base + f'"{"k" * size}" = 1',
+        lambda: base + f"[simulate]\nseed = {'9' * size}",
+        lambda: base + f"[simulate]\nseed = 0x{'f' * size}",
+        lambda: base + f"[solve]\nmax_iterations = 0x{'f' * size}",
+        lambda: base.replace("steps = 4", f"steps = {size * 1000}") + '[[cost]]\ntype = "control"\n',
+        lambda: base.replace("steps = 4", f"duration = {size}.0") + '[[cost]]\ntype = "tracking"\nreference = 1.0\n',
+        lambda: base + "#" + "." * size,
+        lambda: base + "\n" * size * 10,
+        lambda: base + "x" * size * 10,
+        lambda: "\0" * size,
+        lambda: rng.randbytes(size).decode("latin-1"),
+        lambda: "\ufeffa = 1",
     ]
-    return rng.choice([*(text.encode() for text in texts), b"\0" * size, rng.randbytes(size), b"\xef\xbb\xbf" + b"a=1"])
+    return rng.choice(texts)().encode(rng.choice(["utf-8", "utf-8", "utf-8", "latin-1", "utf-16"]), errors="replace")
 
 
 def read(path: Path, form: str) -> str:
