@@ -412,6 +412,26 @@ class TestScenes:
         self.refused(tmp_path, self.BASE + cost, "t has 8 bytes for shape")
 
 
+class TestSolutions:
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            # numpy compares no texts with numbers where NaN may be equal.
+            ({"scene.damping": np.array(["a", "b"])}, "another scene damping"),
+            ({"history": np.zeros((500_000, 11))}, "unpacks to 44.* MB, which no varpin solution does that fits here"),
+        ],
+    )
+    def test_with_other_members(self, tmp_path, change, words):
+        problem = vp.OptimalControlProblem(
+            vp.Scene(vp.planar_chain(2)), vp.ControlCost(1.0), [0.1, 0.2], [0.0, 0.0], dt=1e-2, steps=4
+        )
+        path = tmp_path / "a.npz"
+        vp.solve(problem, max_iterations=1).save(path)
+        np.savez(path, **{**np.load(path), **change})
+        with pytest.raises(vp.FileError, match=words):
+            vp.Solution.load(path, problem)
+
+
 class TestRecords:
     @pytest.mark.parametrize(
         ("change", "words"),

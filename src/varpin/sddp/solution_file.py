@@ -111,7 +111,8 @@ class _Reader:
             )
 
         for name, array in _surroundings(problem).items():
-            if name not in members or not np.array_equal(members[name], array, equal_nan=True):
+            found = members.get(name)
+            if found is None or found.dtype != array.dtype or not np.array_equal(found, array, equal_nan=True):
                 raise FileError(f"{self.source} is of a problem with another {name.replace('.', ' ')}")
 
     def array(self, name: str, shape: tuple[int, ...], *, finite: bool = True) -> Floats:
