@@ -48,6 +48,8 @@ def write(path: str | os.PathLike[str], solution: Solution) -> Path:
         if kept[id(motion)] == prefix:
             members |= {f"{prefix}{name}": value for name, value in motion.members().items()}
     members |= {name: getattr(solution, name) for name in (*_PLAN, *_NUMBERS)}
+    if solution.previous_gains is not None:
+        members["previous_gains"] = solution.previous_gains
     members |= {name: getattr(solution.problem, name) for name in _PROBLEM}
     members["problem.integrator"] = repr(solution.problem.integrator)
     members |= _surroundings(solution.problem)
@@ -180,4 +182,5 @@ class _Reader:
             "reason": str(members["reason"]),
             "history": history,
             "search": search,
+            "previous_gains": None if problem.rate is None else self.array("previous_gains", (R, m, m)),
         }
