@@ -138,12 +138,15 @@ class Mpc:
             v: [rad/s or m/s].
             previous: The plan to start from; None in the first tick.
             decisions: How many decisions ago it was made.
-            before: The control applied last (m,), where its changes cost something; what the problem says if left out.
+            before: The control applied last (m,), where changes of controls cost something. Left out, what ``previous``
+                meant to apply, and in the first tick what the problem says.
 
         Raises:
             InputError: q or v of a wrong shape, or not finite.
             StepFailure, CostError: The motion to start from cannot be integrated, or has no cost.
         """
+        if before is None and self.problem.rate is not None and previous is not None and decisions > 0:
+            before = previous.controls[min(decisions, len(previous.controls)) - 1]
         problem = self.problem.at(q0=q, v0=v, t0=t, before=before)
         if previous is None:
             return solve(problem, tolerance=self.tolerance, max_iterations=self.first_iterations)

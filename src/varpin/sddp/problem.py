@@ -69,6 +69,8 @@ class OptimalControlProblem:
         hold: Steps that share one control: a digital controller's period over the integrator's step.
         t0: When the horizon begins [s]; references that are functions of time see it.
         control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none.
+        rate: What changes of the controls cost: ``rate.weight`` (m, m) and ``rate.before``, the control before the
+            horizon (m,) or None; None where they cost nothing.
     """
 
     scene: Scene

@@ -178,6 +178,8 @@ def _first_commands(problem: OptimalControlProblem, controls: ArrayLike | Linear
         commands = controls.commands(problem.steps, m, problem.scene.robot.dof, variational)
         narrowed = np.clip(commands.limits, *problem.control_limits)
         narrowed.setflags(write=False)
+        if problem.rate is not None and problem.rate.before is not None:
+            commands = commands._replace(before=problem.rate.before[None].copy())
         return commands._replace(limits=narrowed)
     rows = as_floats("controls", controls)
     rows = finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m))
