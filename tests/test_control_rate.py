@@ -231,13 +231,13 @@ def test_noise_is_known_to_the_law():
     """The expected cost on a linear system is exact: against simulated paths, which feed the control before back."""
     problem = linear(vp.ControlRateCost(MATRIX, BEFORE), noise=vp.AdditiveNoise(0.3) + vp.ControlNoise(0.2), hold=2)
     sol = vp.solve(problem)
-    found = sol.monte_carlo(20_000, rng=0)
+    found = sol.monte_carlo(4000, rng=0)
     assert abs(found.cost - found.predicted) < 4.0 * found.standard_error
-    assert sol.noise_cost > 20.0 * found.standard_error
-    # Feedback on x alone would cost more than can be chance.
+    assert sol.noise_cost > 10.0 * found.standard_error
+    # Under the same noise feedback on x alone costs more.
     blind = dataclasses.replace(sol, previous_gains=np.zeros_like(sol.previous_gains))
-    lost = blind.monte_carlo(20_000, rng=0)
-    assert lost.cost > found.cost + 10.0 * found.standard_error
+    lost = blind.monte_carlo(4000, rng=0)
+    assert lost.cost > found.cost + 4.0 * found.standard_error
 
 
 @pytest.mark.parametrize("weight", [0.0, 1e-14])

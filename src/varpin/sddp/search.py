@@ -473,10 +473,10 @@ class _Search:
 
 
 def _previous_gains(problem: OptimalControlProblem, plan: Plan | None) -> Floats | None:
-    if problem.rate is None or (plan is not None and plan.previous is not None):
-        return None if plan is None else plan.previous
+    if problem.rate is None:
+        return None
     m = problem.scene.controls
-    return np.zeros((problem.decisions, m, m))
+    return np.zeros((problem.decisions, m, m)) if plan is None else plan.previous
 
 
 def states(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
