@@ -586,7 +586,7 @@ def test_documented_keys_of_costs_are_those_there_are(kind, tmp_path, monkeypatc
     scene = f'[robot]\nsource = "finger"\n[horizon]\ndt = 0.1\nsteps = 1\n[[cost]]\ntype = "{kind}"\n'
     allowed = allowed_keys(write(tmp_path, scene), monkeypatch)["cost"]
     assert allowed - {"type", "weight", "terminal"} == set(re.findall(r"`(\w+)`", row))
-    assert ("terminal" in allowed) == (kind != "control")
+    assert ("terminal" in allowed) == (kind not in ("control", "control_rate"))
 
 
 @settings(max_examples=50, deadline=None)

@@ -76,7 +76,7 @@ def _most_bytes(problem: OptimalControlProblem) -> int:
     """More than the file of any solution unpacks to: three motions, the plan, and some megabytes for all else."""
     n, m, k = problem.scene.robot.dof, problem.scene.controls, problem.scene.processes
     own = sum(array.nbytes for array in _surroundings(problem).values())
-    numbers = 3 * (problem.steps + 1) * (3 * n + m + k + 16) + problem.decisions * m * (2 * n + 2)
+    numbers = 3 * (problem.steps + 1) * (3 * n + m + k + 16) + problem.decisions * m * (2 * n + m + 2)
     return 8 * numbers + own + 16_000_000
 
 
