@@ -79,7 +79,8 @@ def passes(A, B, gradient, hessian, end_gradient, end_hessian, h):
     nothing = np.zeros((N, x, 0))
     steps = kernels.Steps(
         A, B, nothing, np.zeros((N, x, 0, x)), np.zeros((N, x, 0, m)), rule, gradient, hessian,
-        np.zeros((0, x // 2, x)), np.zeros((0, x + m, x + m)), np.zeros((0, 2, m)),
+        np.zeros((0, x // 2, x)), np.zeros((0, x + m, x + m)), np.zeros((0, 2, m)), np.zeros((0, m, m)),
+        np.zeros((0, m)),
     )  # fmt: skip
     for roots in (False, True):
         value, room = kernels.new_value(x // 2, m), kernels.new_room(x // 2, m)
@@ -87,7 +88,7 @@ def passes(A, B, gradient, hessian, end_gradient, end_hessian, h):
         value.hessian[:x, :x] = end_hessian
         value.scale[:x] = np.sqrt(np.diagonal(end_hessian))
         empty = np.zeros((0, x)), np.zeros((0, x, x))
-        gains = kernels.Gains(np.zeros((N, m)), np.zeros((N, m, x)), np.zeros((N, m)), *empty)
+        gains = kernels.Gains(np.zeros((N, m)), np.zeros((N, m, x)), np.zeros((0, m, m)), np.zeros((N, m)), *empty)
         if roots:
             start = RootPass(squares_of(end_gradient[None], end_hessian[None])[0], value)
             failed = start.run(h, 1, 0.0, steps, squares_of(gradient, hessian), gains)

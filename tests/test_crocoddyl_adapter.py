@@ -118,6 +118,15 @@ def test_held_controls_are_refused():
         shooting_problem(problem)
 
 
+def test_the_rate_of_controls_is_refused():
+    problem = PROBLEMS["midpoint"]()
+    rated = vp.OptimalControlProblem(
+        problem.scene, problem.cost + vp.ControlRateCost(), problem.q0, problem.v0, dt=problem.dt, steps=problem.steps
+    )
+    with pytest.raises(vp.InputError, match="leave the ControlRateCost out"):
+        shooting_problem(rated)
+
+
 def test_a_step_that_fails_shortens_the_line_search(caplog):
     problem = PROBLEMS["midpoint"]()
     model = shooting_problem(problem).runningModels[0]

@@ -135,8 +135,50 @@ def test_cost_of_a_scene_is_that_written_in_python(tmp_path):
     assert file.problem.costs(q, v, u[:50]) == pytest.approx(problem.costs(q, v, u[:50]), rel=1e-12)
 
 
+RATE = """
+[[cost]]
+type = "control_rate"
+weight = { mcp = 0.2, pip = 0.1 }
+"""
+
+
+@pytest.mark.parametrize(
+    ("start", "before"),
+    [
+        ("", None),
+        ("before = { mcp = 0.1, pip = -0.2 }", [0.1, -0.2]),
+        ("before = 0.3", [0.3, 0.3]),
+        ("hold = true", ()),
+    ],
+    ids=["free", "by name", "a number", "hold"],
+)
+def test_rate_of_controls(tmp_path, start, before):
+    file = vp.load_scene(write(tmp_path, GOOD + RATE + start))
+    if before == ():
+        before = np.linalg.solve(file.scene.actuation, -vp.lagrangian_jet(file.scene, file.q0, np.zeros(2)).Lq)
+    rate = file.problem.rate
+    np.testing.assert_array_equal(rate.weight, np.diag([0.2, 0.1]))
+    assert (rate.before is None) == (before is None)
+    if before is not None:
+        np.testing.assert_allclose(rate.before, before, rtol=1e-12)
+    bare = vp.load_scene(write(tmp_path, GOOD, "bare.toml")).problem
+    rng = np.random.default_rng(0)
+    q, v, u = rng.normal(size=(3, 51, 2))
+    own = np.diff(u[:50], axis=0) if before is None else np.diff(u[:50], axis=0, prepend=[before])
+    expected = (own**2 @ [0.2, 0.1]).sum() / 2e-3
+    assert file.problem.costs(q, v, u[:50]) - bare.costs(q, v, u[:50]) == pytest.approx(expected, rel=1e-9)
+
+
 # What is wrong, where, and the words that say so.
 MISTAKES = {
+    "rate at the end": (GOOD + RATE + "terminal = true", "cost[2].terminal", "no control there"),
+    "rate from a motion": (
+        GOOD + RATE + "before = { sines = [] }",
+        "cost[2].before.sines",
+        "must be a number, got []",
+    ),
+    "rate from two": (GOOD + RATE + "before = 0.0\nhold = true", "cost[2]", "exclude each other"),
+    "rate from another joint": (GOOD + RATE + "before = { dip = 0.0 }", "cost[2].before.dip", "locked at 0.2"),
     "no TOML": (changed("gravity = true", "gravity ="), "", "not TOML"),
     "key twice": (GOOD + "\n[robot]\nsource = 'ur5'\n", "", "not TOML"),
     "unknown table": (changed("[springs]", "[spring]"), "spring", "did you mean 'springs'"),
@@ -544,7 +586,7 @@ def test_documented_keys_of_costs_are_those_there_are(kind, tmp_path, monkeypatc
     scene = f'[robot]\nsource = "finger"\n[horizon]\ndt = 0.1\nsteps = 1\n[[cost]]\ntype = "{kind}"\n'
     allowed = allowed_keys(write(tmp_path, scene), monkeypatch)["cost"]
     assert allowed - {"type", "weight", "terminal"} == set(re.findall(r"`(\w+)`", row))
-    assert ("terminal" in allowed) == (kind != "control")
+    assert ("terminal" in allowed) == (kind not in ("control", "control_rate"))
 
 
 @settings(max_examples=50, deadline=None)

@@ -85,33 +85,43 @@ class Plain:
         self.dt = dt
 
 
-def riccati(plain, problem, noise):
-    """Affine policy u = k + K x in absolute coordinates, and its value at x0.
+class PlainCost:
+    """A quadratic cost as matrices of quadratic forms, written out by hand; terms on the rate of controls apart."""
 
-    ``noise(j)`` gives the columns (a, Gx, Gu) of each process at node j: dw is multiplied by a + Gx x + Gu u. Costs are
-    quadratic forms in (x, x', u, 1); the expectation over x' is taken last.
-    """
-    n, m, h, N = plain.n, problem.scene.controls, plain.dt, problem.steps
-    x, one = 2 * n, 4 * n + m
-    P = np.zeros((x + 1, x + 1))  # the value in (x, 1)
-    pick = {"q": np.hstack([np.eye(n), np.zeros((n, n))]), "v": plain.V}
+    def __init__(self, plain, problem):
+        self.plain, self.problem = plain, problem
+        n = plain.n
+        self.pick = {"q": np.hstack([np.eye(n), np.zeros((n, n))]), "v": plain.V}
 
+    @staticmethod
     def reference(term, time, size):
         return np.broadcast_to(term.reference(time) if callable(term.reference) else term.reference, (size,))
 
+    @staticmethod
     def matrix(term, size):
         return term.weight if term.weight.ndim == 2 else np.diag(np.broadcast_to(term.weight, (size,)))
 
-    for term in problem.cost.terms:
-        if isinstance(term, vp.Terminal):
-            for inner in term.cost.terms:
-                E = np.hstack([pick[inner.block], -reference(inner, N * h, n)[:, None]])
-                P += 2 * E.T @ matrix(inner, n) @ E
-    policies = []
-    for j in range(N - 1, -1, -1):
-        W = np.zeros((one + 1, one + 1))  # in (x, x', u, 1)
+    def end(self):
+        """In (x, 1)."""
+        n, plain, problem = self.plain.n, self.plain, self.problem
+        P = np.zeros((2 * n + 1, 2 * n + 1))
         for term in problem.cost.terms:
             if isinstance(term, vp.Terminal):
+                for inner in term.cost.terms:
+                    E = np.hstack(
+                        [self.pick[inner.block], -self.reference(inner, problem.steps * plain.dt, n)[:, None]]
+                    )
+                    P += 2 * E.T @ self.matrix(inner, n) @ E
+        return P
+
+    def step(self, j):
+        """Of step j, in (x, x', u, 1)."""
+        n, h, problem = self.plain.n, self.plain.dt, self.problem
+        m, x = problem.scene.controls, 2 * n
+        one = 2 * x + m
+        W = np.zeros((one + 1, one + 1))
+        for term in problem.cost.terms:
+            if isinstance(term, vp.Terminal | vp.ControlRateCost):
                 continue
             size = m if term.block == "u" else n
             for weight, place, in_q, in_v in samples_of_a_step(problem.sampling, h):
@@ -120,10 +130,26 @@ def riccati(plain, problem, noise):
                     E[:, 2 * x : one] = np.eye(m)
                 else:
                     q0, v0, q1, v1 = in_q if term.block == "q" else in_v
-                    E[:, :x] = q0 * pick["q"] + v0 * pick["v"]
-                    E[:, x : 2 * x] = q1 * pick["q"] + v1 * pick["v"]
-                E[:, one] = -reference(term, (j + place) * h, size)
-                W += 2 * h * weight * E.T @ matrix(term, size) @ E
+                    E[:, :x] = q0 * self.pick["q"] + v0 * self.pick["v"]
+                    E[:, x : 2 * x] = q1 * self.pick["q"] + v1 * self.pick["v"]
+                E[:, one] = -self.reference(term, (j + place) * h, size)
+                W += 2 * h * weight * E.T @ self.matrix(term, size) @ E
+        return W
+
+
+def riccati(plain, problem, noise):
+    """Affine policy u = k + K x in absolute coordinates, and its value at x0.
+
+    ``noise(j)`` gives the columns (a, Gx, Gu) of each process at node j: dw is multiplied by a + Gx x + Gu u. Costs are
+    quadratic forms in (x, x', u, 1); the expectation over x' is taken last.
+    """
+    n, m, h, N = plain.n, problem.scene.controls, plain.dt, problem.steps
+    x, one = 2 * n, 4 * n + m
+    cost = PlainCost(plain, problem)
+    P = cost.end()  # the value in (x, 1)
+    policies = []
+    for j in range(N - 1, -1, -1):
+        W = cost.step(j)
         after = [*range(x, 2 * x), one]
         W[np.ix_(after, after)] += P
         # x' = A x + B u + c + sum (a + Gx x + Gu u) dw: rows of (x, x', u, 1) in (x, u, 1).
@@ -142,10 +168,13 @@ def riccati(plain, problem, noise):
         policies.append(K)
         P = Q[np.ix_(rest, rest)] + Q[u][:, rest].T @ K
         P = 0.5 * (P + P.T)
-    start = np.concatenate(
-        [problem.q0, problem.v0 if not problem.integrator.variational else plain.M @ problem.v0, [1.0]]
-    )
-    return np.array(policies[::-1]), 0.5 * start @ P @ start
+    return np.array(policies[::-1]), 0.5 * start_of(plain, problem) @ P @ start_of(plain, problem)
+
+
+def start_of(plain, problem):
+    """(x0, 1)."""
+    second = plain.M @ problem.v0 if problem.integrator.variational else problem.v0
+    return np.concatenate([problem.q0, second, [1.0]])
 
 
 def noise_columns(plain, scene, motion):

@@ -14,6 +14,7 @@ from varpin._version import __version__ as __version__
 from varpin.costs import BoundCost as BoundCost
 from varpin.costs import CenterOfMassCost as CenterOfMassCost
 from varpin.costs import ControlCost as ControlCost
+from varpin.costs import ControlRateCost as ControlRateCost
 from varpin.costs import Cost as Cost
 from varpin.costs import CostError as CostError
 from varpin.costs import CustomCost as CustomCost

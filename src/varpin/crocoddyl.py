@@ -156,8 +156,10 @@ def shooting_problem(problem: OptimalControlProblem) -> crocoddyl.ShootingProble
     The actions are Python objects, so leave ``nthreads`` at 1.
 
     Raises:
-        InputError: Controls that are held over several steps.
+        InputError: Controls that are held over several steps, or whose changes cost something.
     """
+    if problem.rate is not None:
+        raise InputError("crocoddyl's actions know no control but their own: leave the ControlRateCost out")
     if problem.hold != 1:
         raise InputError(f"crocoddyl decides at every step; the problem holds its controls over {problem.hold}")
     x0 = _state(problem, problem.q0, problem.v0)

@@ -234,6 +234,8 @@ class _Run:
         self.alive = np.ones(self.paths, dtype=bool)
         self.failures: list[PathFailure] = []
         self.groups = [slice(a, min(a + _GROUP, self.paths)) for a in range(0, self.paths, _GROUP)]
+        # The control before, of each path; before the first there is none, if the policy does not say.
+        self.before = [np.repeat(commands.before, group.stop - group.start, axis=0) for group in self.groups]
         self.states = []
         self.first: list[list[Segment]] = []
         for group in self.groups:
@@ -249,10 +251,10 @@ class _Run:
 
     def advance(self, begin: int, end: int, collector: _Collector, pool: ThreadPoolExecutor) -> None:
         """Steps begin .. end of every path; a path that has failed does none."""
-        decisions = rows(self.commands, begin // self.commands.hold, end // self.commands.hold)
 
         def work(number: int) -> list[tuple[int, Failure | None]]:
-            group = self.groups[number]
+            group, hold = self.groups[number], self.commands.hold
+            decisions = rows(self.commands, begin // hold, end // hold, self.before[number])
             increments = np.empty((group.stop - group.start, end - begin, self.scene.processes))
             for drawn, child in zip(increments, self.generators[group], strict=True):
                 child.standard_normal(out=drawn)
@@ -260,6 +262,8 @@ class _Run:
             segments = self.integrator.rollout(self.scene, self.states[number], decisions, increments, self.dt)
             done = [len(segment.q) * int(alive) for segment, alive in zip(segments, self.alive[group], strict=True)]
             collector.put(begin + 1, number, segments, done)
+            lost = np.full(self.scene.controls, np.nan)
+            self.before[number] = np.array([segment.u[-1] if len(segment.u) else lost for segment in segments])
             return [(k, segment.failure) for k, segment in zip(done, segments, strict=True)]
 
         outcomes = [outcome for part in pool.map(work, range(len(self.groups))) for outcome in part]

@@ -85,7 +85,8 @@ class Mpc:
     """A controller that solves an optimal control problem anew at every decision, from the state it finds.
 
     Each tick's search starts from the last plan, moved on by a decision, with its feedback. Times of references are
-    those of the plant: the horizon recedes.
+    those of the plant: the horizon recedes. Where changes of controls cost something, each plan goes on from the
+    control that acted last.
 
     Main args:
         problem: The problem; its horizon, discretization, noise and limits are those of every tick, its initial state
@@ -121,7 +122,13 @@ class Mpc:
         return self.problem.dt * self.problem.hold
 
     def plan(
-        self, t: float, q: ArrayLike, v: ArrayLike, previous: Solution | None = None, decisions: int = 1
+        self,
+        t: float,
+        q: ArrayLike,
+        v: ArrayLike,
+        previous: Solution | None = None,
+        decisions: int = 1,
+        before: ArrayLike | None = None,
     ) -> Solution:
         """The plan at time ``t`` [s] from configuration ``q`` (n,) and velocity ``v`` (n,).
 
@@ -131,15 +138,19 @@ class Mpc:
             v: [rad/s or m/s].
             previous: The plan to start from; None in the first tick.
             decisions: How many decisions ago it was made.
+            before: The control applied last (m,), where changes of controls cost something. Left out, what ``previous``
+                meant to apply, and in the first tick what the problem says.
 
         Raises:
             InputError: q or v of a wrong shape, or not finite.
             StepFailure, CostError: The motion to start from cannot be integrated, or has no cost.
         """
-        problem = self.problem.at(q0=q, v0=v, t0=t)
+        if before is None and self.problem.rate is not None and previous is not None and decisions > 0:
+            before = previous.controls[min(decisions, len(previous.controls)) - 1]
+        problem = self.problem.at(q0=q, v0=v, t0=t, before=before)
         if previous is None:
             return solve(problem, tolerance=self.tolerance, max_iterations=self.first_iterations)
-        start = previous.shifted(min(decisions, problem.decisions - 1))
+        start = previous.shifted(min(decisions, problem.decisions - 1), before)
         return solve(problem, start, tolerance=self.tolerance, max_iterations=self.iterations, time_limit=self.budget)
 
     def run(
@@ -181,6 +192,7 @@ class Mpc:
         dt = self.period / plant.substeps
         generator = None if rng is None else np.random.default_rng(rng)
         q, v = problem.q0, problem.v0
+        before = None if problem.rate is None else problem.rate.before
         active, age = self.plan(problem.t0, q, v), 0
         parts: list[Trajectory] = []
         plans, seconds, iterations, late = [], np.zeros(ticks), np.zeros(ticks, dtype=np.int64), np.zeros(ticks, bool)
@@ -188,14 +200,16 @@ class Mpc:
             for tick in range(ticks):
                 if tick > 0:
                     begin = time.perf_counter()
-                    fresh = self.plan(problem.t0 + tick * self.period, q, v, active, age + 1)
+                    fresh = self.plan(problem.t0 + tick * self.period, q, v, active, age + 1, before)
                     seconds[tick] = time.perf_counter() - begin
                     iterations[tick] = fresh.iterations
                     late[tick] = seconds[tick] > self.budget
                     active, age = (active, age + 1) if late[tick] else (fresh, 0)
                 plans.append(active)
-                parts.append(_simulated(plant, dt, q, v, _decision(active, age, q, v), generator, parts))
+                u = _decision(active, age, q, v, before)
+                parts.append(_simulated(plant, dt, q, v, u, generator, parts))
                 q, v = parts[-1].q[-1], parts[-1].v[-1]
+                before = None if problem.rate is None else u
                 if progress is not None:
                     progress(tick + 1, ticks)
         except KeyboardInterrupt:
@@ -205,12 +219,10 @@ class Mpc:
         return MpcRun(chained(parts), tuple(plans), seconds, iterations, late, self.period, self.budget)
 
 
-def _decision(plan: Solution, age: int, q: Floats, v: Floats) -> Floats:
-    """What the plan does at its decision ``age``, with its feedback, at the state (q, v)."""
+def _decision(plan: Solution, age: int, q: Floats, v: Floats, before: Floats | None = None) -> Floats:
+    """What the plan does at its decision ``age``, with its feedback, at the state (q, v) after a control (m,)."""
     policy = plan.policy_on("velocity")
-    row = min(age, len(policy.u) - 1)
-    u = policy.u[row] + policy.gains[row] @ (np.concatenate([q, v]) - policy.reference[row])
-    return np.asarray(np.clip(u, *policy.limits), dtype=np.float64)
+    return policy.control(min(age, len(policy.u) - 1), np.concatenate([q, v]), before)
 
 
 def _simulated(

@@ -19,7 +19,9 @@ Floats = NDArray[np.float64]
 class LinearPolicy:
     """u = u_k + gains_k (x - x_k) within limits, evaluated at the start of each of N intervals and held over it.
 
-    x is (q, p) for variational integrators and (q, v) for the others.
+    x is (q, p) for variational integrators and (q, v) for the others. Where changes of the control cost something
+    (:class:`varpin.ControlRateCost`), the control of the interval before is fed back, too:
+    u = u_k + gains_k (x - x_k) + previous_gains_k (u_before - previous_k).
 
     Attributes:
         u: Feed-forward (N, m).
@@ -28,6 +30,9 @@ class LinearPolicy:
         hold: Steps that an interval has.
         on: What x is made for: ``"momentum"``, (q, p), ``"velocity"``, (q, v), or None where nobody said.
         limits: Least and greatest control (2, m), infinite where there is none.
+        previous_gains: On the control of the interval before (N, m, m), or None for none.
+        previous: What those gains expect it to be (N, m), or None.
+        before: The control before the first interval (m,); None where nobody said, and it counts as expected.
     """
 
     u: Floats
@@ -36,6 +41,9 @@ class LinearPolicy:
     hold: int
     on: Literal["momentum", "velocity"] | None
     limits: Floats
+    previous_gains: Floats | None
+    previous: Floats | None
+    before: Floats | None
 
     def __init__(
         self,
@@ -45,6 +53,10 @@ class LinearPolicy:
         hold: int = 1,
         on: Literal["momentum", "velocity"] | None = None,
         limits: tuple[ArrayLike, ArrayLike] | None = None,
+        *,
+        previous_gains: ArrayLike | None = None,
+        previous: ArrayLike | None = None,
+        before: ArrayLike | None = None,
     ) -> None:
         """Make a policy.
 
@@ -55,6 +67,10 @@ class LinearPolicy:
             hold: Steps of a simulation that each control is held over: the rate of a digital controller.
             on: Say what x is, and an integrator on the other x refuses the policy.
             limits: (lower, upper), each one number or (m,), of the whole control: feedback saturates there.
+            previous_gains: (N, m, m), on the control of the interval before.
+            previous: (N, m), what they expect it to be; left out, u of the interval before, and ``before`` for the
+                first.
+            before: The control before the first interval (m,).
 
         Raises:
             InputError: Shapes that do not fit each other, or values that are not finite.
@@ -79,6 +95,20 @@ class LinearPolicy:
             raise InputError(f"on must be 'momentum', 'velocity' or None, got {on!r}")
         object.__setattr__(self, "on", on)
         object.__setattr__(self, "limits", checked_limits("limits", limits, m))
+        start = None if before is None else finite_array("before", before, (m,))
+        own: Floats | None = None
+        expected: Floats | None = None
+        if previous_gains is not None:
+            own = finite_array("previous_gains", previous_gains, (steps, m, m))
+            expected = np.vstack([self.u[:1] if start is None else start[None], self.u[:-1]])[:steps]
+            if previous is not None:
+                expected = finite_array("previous", previous, (steps, m))
+        elif previous is not None:
+            raise InputError("previous is what previous_gains expect: give them too")
+        for name, array in {"previous_gains": own, "previous": expected, "before": start}.items():
+            if array is not None:
+                array.setflags(write=False)
+            object.__setattr__(self, name, array)
 
     def __repr__(self) -> str:
         steps, m, size = self.gains.shape
@@ -89,6 +119,22 @@ class LinearPolicy:
         """The controls alone."""
         limits = (self.limits[0], self.limits[1])
         return LinearPolicy(self.u, np.zeros_like(self.gains), self.reference, self.hold, self.on, limits)
+
+    def control(self, interval: int, x: ArrayLike, before: ArrayLike | None = None) -> Floats:
+        """The control (m,) of an interval at the state x (2n,), after the control ``before`` (m,).
+
+        Left out, that is what the policy expects.
+
+        Raises:
+            InputError: There is no such interval, or an argument of a wrong shape or value.
+        """
+        N, m, size = self.gains.shape
+        if not 0 <= count("interval", interval) < N:
+            raise InputError(f"interval must be from 0 to {N - 1}, got {interval}")
+        u = self.u[interval] + self.gains[interval] @ (finite_array("x", x, (size,)) - self.reference[interval])
+        if self.previous_gains is not None and self.previous is not None and before is not None:
+            u = u + self.previous_gains[interval] @ (finite_array("before", before, (m,)) - self.previous[interval])
+        return np.asarray(np.clip(u, *self.limits), dtype=np.float64)
 
     def commands(self, steps: int, controls: int, dof: int, variational: bool) -> Commands:
         """The policy as kernels take it, for an integrator on (q, p) if it is ``variational``, else on (q, v).
@@ -108,4 +154,12 @@ class LinearPolicy:
             )
         if self.gains.shape[1:] != (controls, 2 * dof):
             raise InputError(f"the policy's gains must have shape (N, {controls}, {2 * dof}), got {self.gains.shape}")
-        return Commands(self.u, self.gains, self.reference, self.hold, self.limits)
+        gains, reference = self.gains, self.reference
+        if self.previous_gains is not None and self.previous is not None:
+            gains = np.concatenate([gains, self.previous_gains], axis=2)
+            reference = np.concatenate([reference, self.previous], axis=1)
+            # To numba arrays that may be written to are of another type.
+            gains.setflags(write=False)
+            reference.setflags(write=False)
+        before = np.zeros((0, controls)) if self.before is None else self.before[None].copy()
+        return Commands(self.u, gains, reference, self.hold, self.limits, before)

@@ -249,7 +249,8 @@ def simulate(
                     block = _next(commands, record)
                 else:
                     first = record.steps // commands.hold
-                    block = rows(commands, first, first + max(1, chunk // commands.hold))
+                    before = record.u[None, record.steps - 1] if record.steps else None
+                    block = rows(commands, first, first + max(1, chunk // commands.hold), before)
                 drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
                 try:
                     (segment,) = integrator.rollout(scene, state, block, drawn, dt)
@@ -338,7 +339,8 @@ def _next(commands: Commands, record: _Record) -> Commands:
     decision, held = divmod(record.steps, commands.hold)
     if held:
         return open_loop(record.u[record.steps - 1 : record.steps])
-    return rows(commands, decision, decision + 1)._replace(hold=1)
+    before = record.u[None, record.steps - 1] if record.steps else None
+    return rows(commands, decision, decision + 1, before)._replace(hold=1)
 
 
 def _sample(law: ControlLaw, sampling: str, integrator: Integrator, state: Any, record: _Record) -> Floats:

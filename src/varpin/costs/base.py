@@ -239,10 +239,11 @@ class Terminal(Cost):
     """A cost at the final time instead of its integral: ``Terminal(TrackingCost(...))``.
 
     Attributes:
-        cost: The argument: any cost, a sum too, but no ``ControlCost``, since there is no control at the final time.
+        cost: The argument: any cost, a sum too, but no ``ControlCost`` or ``ControlRateCost``, since there is no
+            control at the final time.
 
     Raises:
-        InputError: It is no cost, is terminal already, or holds a ``ControlCost``.
+        InputError: It is no cost, is terminal already, or holds a ``ControlCost`` or a ``ControlRateCost``.
     """
 
     cost: Cost

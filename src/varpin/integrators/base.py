@@ -106,7 +106,7 @@ class Integrator(ABC):
             return self.rollout_compiled(scene, state, commands, increments, np.zeros((0, 0, scene.robot.dof)), dt)
         segments: list[Segment] = []
         for j in range(steps_of(commands)):
-            row = rows(commands, j // commands.hold, j // commands.hold + 1)
+            row = rows(commands, j // commands.hold, j // commands.hold + 1, segments[-1].u[None, -1] if j else None)
             if j % commands.hold > 0:
                 row = open_loop(segments[-1].u)
             segments.append(self.step_in_python(scene, state, row, increments[:, j : j + 1], dt))
@@ -215,7 +215,8 @@ def segments_of(nodes: Nodes, reasons: Mapping[int, str]) -> list[Segment]:
 
 def open_loop(u: Floats) -> Commands:
     """Controls (N, m) without feedback."""
-    return Commands(np.ascontiguousarray(u), np.zeros((0, u.shape[1], 0)), np.zeros((0, 0)), 1, no_limits(u.shape[1]))
+    m = u.shape[1]
+    return Commands(np.ascontiguousarray(u), np.zeros((0, m, 0)), np.zeros((0, 0)), 1, no_limits(m), np.zeros((0, m)))
 
 
 def no_limits(controls: int) -> Floats:
@@ -223,11 +224,17 @@ def no_limits(controls: int) -> Floats:
     return np.outer([-np.inf, np.inf], np.ones(controls))
 
 
-def control_of(commands: Commands, decision: int, x: Floats) -> Floats:
-    """The control (m,) of a decision at a state x (2n,), as kernels find it."""
+def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> Floats:
+    """The control (m,) of a decision at a state x (2n,), as kernels find it.
+
+    ``before`` is the control before (1, m), or (0, m) for what the reference has.
+    """
     u = commands.u[decision]
     if len(commands.gains):
-        u = u + commands.gains[decision] @ (x - commands.reference[decision])
+        gains, change = commands.gains[decision], x - commands.reference[decision, : x.size]
+        u = u + gains[:, : x.size] @ change
+        if len(before) and gains.shape[1] > x.size:
+            u = u + gains[:, x.size :] @ (before[0] - commands.reference[decision, x.size :])
     limited: Floats = np.clip(u, *commands.limits)
     return limited
 
@@ -237,7 +244,12 @@ def steps_of(commands: Commands) -> int:
     return len(commands.u) * commands.hold
 
 
-def rows(commands: Commands, begin: int, end: int) -> Commands:
-    """The commands of decisions begin .. end."""
+def rows(commands: Commands, begin: int, end: int, before: Floats | None = None) -> Commands:
+    """The commands of decisions begin .. end; with the control ``before`` of each path (P, m), if it is known."""
     part = slice(begin, end)
-    return commands._replace(u=commands.u[part], gains=commands.gains[part], reference=commands.reference[part])
+    return commands._replace(
+        u=commands.u[part],
+        gains=commands.gains[part],
+        reference=commands.reference[part],
+        before=commands.before if before is None else before.copy(),
+    )

@@ -77,7 +77,7 @@ class _Explicit(Integrator):
         is the same there, and as a jump of the velocity before the step for the others.
         """
         q, v = state.state.q[0], state.state.v[0]
-        control = control_of(command, 0, np.concatenate([q, v]))
+        control = control_of(command, 0, np.concatenate([q, v]), command.before)
         F, drift = diffusion_and_drift(scene, q, v, control, state.start[0])
         if len(increment):
             impulse = F @ increment[0, 0]

@@ -133,7 +133,8 @@ class Reference(Integrator):
         u = nodes.u[i]
         for s in range(len(u)):
             decision, held = divmod(s, commands.hold)
-            u[s] = u[s - 1] if held else control_of(commands, decision, state.x[i])
+            before = u[s - 1 : s] if s else commands.before[i : i + 1]
+            u[s] = before[0] if held else control_of(commands, decision, state.x[i], before)
             force = scene.actuation @ u[s] + (drift[i, s] if len(drift) else 0.0)
             try:
                 x, nodes.tally[i, s, 2] = self._step(scene, state, i, force, dt)

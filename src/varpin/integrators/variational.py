@@ -108,7 +108,7 @@ class Variational(Integrator):
     ) -> Segment:
         """One step of one path with diffusion fields that are evaluated in Python."""
         now = state.state
-        control = control_of(command, 0, np.concatenate([now.q[0], now.p[0]]))
+        control = control_of(command, 0, np.concatenate([now.q[0], now.p[0]]), command.before)
         F, drift = diffusion_and_drift(scene, now.q[0], now.v[0], control, state.start[0])
         if len(increment):
             kernels.apply_impulse(scene.mechanism, self.left * (F @ increment[0, 0]), now, state.work)

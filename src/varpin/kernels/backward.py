@@ -7,6 +7,9 @@ the cost of the step expanded at its sample z = D (x, u), and S = h Wxx,
     Q_x  = D'l_z + A'Wx + sum_i Gx_i' S g_i,        Q_xx = D'l_zz D + A'Wxx A + sum_i Gx_i' S Gx_i,
 
 and so on in u; v0 grows by (1/2) sum_i g_i' S g_i. Everything is symmetric and only dense products of small matrices.
+
+Where the change of the control costs (1/2) (u - w)' R (u - w), w the control before, the decision adds R to Q_uu and to
+Q_ww and -R to Q_uw: gains on w are those on x with -R in place of Q_ux, and the value before it is one of (x, w).
 """
 
 from typing import NamedTuple
@@ -35,10 +38,12 @@ class Steps(NamedTuple):
     velocity: Floats  # (N + 1, n, 2n) dv/dx at the nodes; (0, n, 2n) where x holds v itself, or no sample asks for it
     curvature: Floats  # (N, 2n + m, 2n + m) to be added to the Hessian in (x, u), or (0, 2n + m, 2n + m)
     slack: Floats  # (R, 2, m) least and greatest change of each control, or (0, 2, m) where controls have no limits
+    rate: Floats  # (R, m, m) Hessian of what the change from the control before costs, or (0, m, m) for nothing
+    pull: Floats  # (R, m) its gradient in the control, or (0, m)
 
 
 class Value(NamedTuple):
-    """Quadratic model of the cost to go, in (x, u) while u is held and in x alone otherwise."""
+    """Quadratic model of the cost to go, in (x, u) while u is held, and else in x alone, or with the control before."""
 
     gradient: Floats  # (2n + m,)
     hessian: Floats  # (2n + m, 2n + m)
@@ -54,6 +59,7 @@ class Gains(NamedTuple):
 
     feedforward: Floats  # (R, m)
     feedback: Floats  # (R, m, 2n)
+    previous: Floats  # (R, m, m) gains on the control before; (0, m, m) where its change costs nothing
     control_gradient: Floats  # (R, m) of the cost in each control
     costate: Floats  # (N, 2n) gradient of the cost after each step in the state there; (0, 2n) if not asked for
     spread: Floats  # (N, 2n, 2n) S; (0, 2n, 2n) without noise
@@ -267,6 +273,53 @@ def carry_scale(value: Value, room: Room) -> None:
 
 
 @inlined
+def add_rate(steps: Steps, r: int, room: Room) -> None:
+    """Add to Q and Qz what the change to control ``r`` costs, its part in that control."""
+    x, size = room.J.shape
+    for i in range(size - x):
+        room.Qz[x + i] += steps.pull[r, i]
+        room.costate[x + i] += steps.pull[r, i]
+        for j in range(size - x):
+            room.Q[x + i, x + j] += steps.rate[r, i, j]
+
+
+@inlined
+def value_of_previous(steps: Steps, r: int, value: Value, gains: Gains, room: Room) -> None:
+    """Rows and columns of the value in the control before decision ``r``, from its gains on it.
+
+    ``room.row`` holds Quu k + Qu and ``room.T`` the product Quu K + Qux.
+    """
+    Q, T = room.Q, room.T
+    x, size = room.J.shape
+    m = size - x
+    R, K, W, k = steps.rate[r], gains.feedback[r], gains.previous[r], gains.feedforward[r]
+    for c in range(m):
+        value.gradient[x + c] = -steps.pull[r, c]
+        value.costate[x + c] = -steps.pull[r, c]
+        value.scale[x + c] = np.sqrt(abs(R[c, c]))
+        for i in range(m):
+            value.gradient[x + c] += W[i, c] * room.row[i] - R[i, c] * k[i]
+    for c in range(m):
+        # V_xw = (Quu K + Qux)' W - K' R
+        for b in range(x):
+            total = 0.0
+            for i in range(m):
+                total += T[i, b] * W[i, c] - K[i, b] * R[i, c]
+            value.hessian[b, x + c] = total
+            value.hessian[x + c, b] = total
+        # V_ww = R + W' (Quu W - R) - R W
+        for b in range(c + 1):
+            total = R[b, c]
+            for i in range(m):
+                product = -R[i, c]
+                for j in range(m):
+                    product += Q[x + i, x + j] * W[j, c]
+                total += W[i, b] * product - R[i, b] * W[i, c]
+            value.hessian[x + b, x + c] = total
+            value.hessian[x + c, x + b] = total
+
+
+@inlined
 def is_idle(i: int, room: Room) -> bool:
     """Whether nothing depends on control ``i``."""
     Q, Qz = room.Q, room.Qz
@@ -278,16 +331,19 @@ def is_idle(i: int, room: Room) -> bool:
 
 
 @inlined
-def decide(regularization: float, r: int, slack: Floats, value: Value, gains: Gains, room: Room) -> bool:
+def decide(regularization: float, r: int, steps: Steps, value: Value, gains: Gains, room: Room) -> bool:
     """Gains of decision ``r`` from Q and Qz, and the value under them; False where Quu is not positive definite.
 
     Within limits the feed-forward part minimizes the model there, and controls at a limit have no feedback (Tassa,
     Mansard and Todorov 2014). Each control is regularized by its own diagonal entry, whatever the others' units; one
     that nothing depends on stays as it is, if there are others.
     """
-    Q, Qz, Quu, row, solved = room.Q, room.Qz, room.Quu, room.row, room.solved
+    Q, Qz, Quu, row, solved, slack = room.Q, room.Qz, room.Quu, room.row, room.solved, steps.slack
     x, size = room.J.shape
     m = size - x
+    rated = steps.rate.shape[0] > 0
+    if rated:
+        add_rate(steps, r, room)
     largest = 0.0
     for i in range(m):
         largest = max(largest, abs(Q[x + i, x + i]))
@@ -322,6 +378,12 @@ def decide(regularization: float, r: int, slack: Floats, value: Value, gains: Ga
         for c in range(x):
             K[i, c] = 0.0 if limited and room.box[0, i] != 0.0 else -Q[x + i, c]
     solve_ldl_rows(Quu, K)
+    if rated:
+        W = gains.previous[r]
+        for i in range(m):
+            for c in range(m):
+                W[i, c] = 0.0 if limited and room.box[0, i] != 0.0 else steps.rate[r, i, c]
+        solve_ldl_rows(Quu, W)
     for i in range(m):
         total = 0.0
         for j in range(m):
@@ -360,6 +422,8 @@ def decide(regularization: float, r: int, slack: Floats, value: Value, gains: Ga
         for b in range(size):
             value.hessian[b, c] = 0.0
             value.hessian[c, b] = 0.0
+    if rated:
+        value_of_previous(steps, r, value, gains, room)
     return True
 
 
@@ -380,6 +444,7 @@ def backward_pass(
     """
     J, Q, Qz = room.J, room.Q, room.Qz
     x, size = J.shape
+    rated = steps.rate.shape[0] > 0
     for s in range(steps.A.shape[0] - 1, -1, -1):
         if gains.costate.shape[0] > 0:
             for i in range(x):
@@ -405,7 +470,8 @@ def backward_pass(
                 for c in range(size):
                     Q[r, c] = steps.curvature[s, r, c]
         add_congruence(J, value.hessian, x, 1.0, room.T, Q)
-        if (s + 1) % hold != 0:  # the control is that of the next step: its own rows of the value
+        # The control is that of the next step, or what its change is counted from: its own rows of the value.
+        if rated or (s + 1) % hold != 0:
             for r in range(x, size):
                 for c in range(x, size):
                     Q[r, c] += value.hessian[r, c]
@@ -419,7 +485,7 @@ def backward_pass(
             add_noise(steps, s, h, value, gains, room)
         add_running_cost(steps, s, h, in_velocity, room)
         if s % hold == 0:
-            if not decide(regularization, s // hold, steps.slack, value, gains, room):
+            if not decide(regularization, s // hold, steps, value, gains, room):
                 return s // hold
             continue
         for c in range(size):

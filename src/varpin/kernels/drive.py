@@ -5,10 +5,11 @@ from varpin.kernels.tree import Commands, Floats, Mechanism
 
 
 @inlined
-def apply_policy(commands: Commands, s: int, first: Floats, second: Floats, u: Floats) -> None:
-    """Controls of step ``s`` into u (N, m): u = u_r + gains_r (x - x_r) with x = (first, second) and r = s // hold.
+def apply_policy(commands: Commands, i: int, s: int, first: Floats, second: Floats, u: Floats) -> None:
+    """Controls of step ``s`` of path ``i`` into u (N, m): u = u_r + gains_r (x - x_r), r = s // hold.
 
-    Without gains u = u_r; beyond a limit u is that limit; between two decisions the control before is held.
+    x is (first, second), or (first, second, the control before). Without gains u = u_r; beyond a limit u is that limit;
+    between two decisions the control before is held.
     """
     n = first.size
     if s % commands.hold != 0:
@@ -22,6 +23,10 @@ def apply_policy(commands: Commands, s: int, first: Floats, second: Floats, u: F
             for j in range(n):
                 total += commands.gains[r, c, j] * (first[j] - commands.reference[r, j])
                 total += commands.gains[r, c, n + j] * (second[j] - commands.reference[r, n + j])
+            if commands.gains.shape[2] > 2 * n and (s > 0 or commands.before.shape[0] > 0):
+                for j in range(u.shape[1]):
+                    before = u[s - 1, j] if s > 0 else commands.before[i, j]
+                    total += commands.gains[r, c, 2 * n + j] * (before - commands.reference[r, 2 * n + j])
         # Neither comparison is true of NaN, which stays; max and min need not keep it.
         if total < commands.limits[0, c]:  # noqa: PLR1730
             total = commands.limits[0, c]

@@ -105,7 +105,7 @@ def rollout(
         nodes.done[i] = 0
         regular, _ = node(mechanism, q, v, d)
         for s in range(nodes.u.shape[1]):
-            apply_policy(commands, s, q, v, nodes.u[i])
+            apply_policy(commands, i, s, q, v, nodes.u[i])
             constant_force(mechanism, drift, i, s, nodes.u[i, s], force)
             # From here d holds the node at (q, v): the first, or the one that ended the step before.
             if not regular:

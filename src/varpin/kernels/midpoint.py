@@ -446,7 +446,7 @@ def rollout(
         nodes.ended[i] = SOLVED
         nodes.done[i] = 0
         for s in range(nodes.u.shape[1]):
-            apply_policy(commands, s, state.q, state.p, nodes.u[i])
+            apply_policy(commands, i, s, state.q, state.p, nodes.u[i])
             if noisy:
                 kick(mechanism, options.left, nodes.u[i, s], increments[i, s], state, k)
             constant_force(mechanism, drift, i, s, nodes.u[i, s], k.force)

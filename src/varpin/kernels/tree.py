@@ -63,14 +63,16 @@ class Mechanism(NamedTuple):
 class Commands(NamedTuple):
     """R controls, each held over ``hold`` steps: u, or u + gains (x - reference) with x = (q, p) or (q, v).
 
-    What comes out is brought within the limits.
+    Where gains have 2n + m columns, the control before belongs to x: (q, p, u_before). What comes out is brought
+    within the limits.
     """
 
     u: Floats  # (R, m)
-    gains: Floats  # (R, m, 2n), or (0, m, 2n) for none
-    reference: Floats  # (R, 2n), or (0, 2n)
+    gains: Floats  # (R, m, 2n) or (R, m, 2n + m), or (0, m, 2n) for none
+    reference: Floats  # (R, 2n) or (R, 2n + m), or (0, 2n)
     hold: int  # steps between two looks at the state
     limits: Floats  # (2, m) least and greatest control, infinite where there is none
+    before: Floats  # (P, m) the control before the first of each path; (0, m) for what the reference has
 
 
 class Nodes(NamedTuple):

@@ -452,7 +452,10 @@ def _cost(table: Table, folder: Path, dt: float) -> CostSpec:
         table.one_of(*held, *reference)
         hold = () if table.data["hold"] is True else table.by_name("hold", unit="rad or m")
     found = None
-    if term.reference is not None and hold is None:
+    if term.reference is not None and term.initial:
+        if term.reference in table:
+            found = Reference(table, term.reference, offset=table.by_name(term.reference))
+    elif term.reference is not None and hold is None:
         default = 0.0 if term.optional else None
         found = read_reference(table, term.reference, folder, dt, default)
     weight = table.by_name("weight", 1.0, least=0.0)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from varpin.costs import (
     CenterOfMassCost,
     ControlCost,
+    ControlRateCost,
     Cost,
     FrameOrientationCost,
     FramePositionCost,
@@ -81,6 +82,7 @@ class Term:
         axes: Names of what may be weighed apart, where that is not joints; of one, the weight is a number.
         optional: Whether the target may be left out, and is 0 then.
         hold: Whether ``hold`` may stand for the reference.
+        initial: Whether the target is of the beginning alone: numbers, or none if it is left out.
         can_end: Whether it can be a terminal term.
         numbers: Other keys it takes, numbers >= 0, and their defaults, None where there is none.
         words: Other keys it takes, and the words allowed, the default first.
@@ -94,6 +96,7 @@ class Term:
     axes: tuple[str, ...] = ()
     optional: bool = False
     hold: bool = False
+    initial: bool = False
     can_end: bool = True
     numbers: Mapping[str, float | None] = field(default_factory=dict)
     words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -119,6 +122,14 @@ TERMS: dict[str, Term] = {
     "velocity": Term(lambda g: VelocityCost(g.weight, g.reference), "v", "reference", optional=True),
     "control": Term(
         lambda g: ControlCost(g.weight, g.reference), "u", "reference", optional=True, hold=True, can_end=False
+    ),
+    "control_rate": Term(
+        lambda g: ControlRateCost(g.weight, None if g.target is None else g.target(0.0)),
+        "u",
+        "before",
+        hold=True,
+        initial=True,
+        can_end=False,
     ),
     "frame_position": Term(
         lambda g: FramePositionCost(g.robot, g.frame, g.reference, g.weight), "frame", "target", _XYZ, _XYZ

@@ -36,6 +36,7 @@ class Plan:
 
     feedforward: Floats  # (R, m)
     feedback: Floats  # (R, m, 2n)
+    previous: Floats | None  # (R, m, m) gains on the control before, where its change costs something
     gradient: Floats  # (R, m)
     slope: float
     curvature: float
@@ -165,6 +166,10 @@ def _one_pass(
     noisy = N if k else 0
     jumps, spread = np.empty((noisy, 2 * n, n)), np.empty((noisy, 2 * n, 2 * n))
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, 2 * n)), np.empty((R, m))
+    rate, pull = np.zeros((0, m, m)), np.zeros((0, m))
+    if problem.rate is not None:
+        pull, rate = problem.rate.expand(trajectory.u[:: problem.hold], problem.period)
+    previous = np.empty(rate.shape)
     costate = np.empty((N if costates else 0, 2 * n))
     hessian = running.hessian
     by_roots, squares = None, None
@@ -204,10 +209,13 @@ def _one_pass(
             velocity=velocity,
             curvature=np.zeros((0, size, size)) if curvature is None else curvature[steps],
             slack=slack[rows],
+            rate=rate[rows],
+            pull=pull[rows],
         )
         gains = kernels.Gains(
             feedforward[rows],
             feedback[rows],
+            previous[rows],
             gradient[rows],
             costate[steps] if costates else costate,
             spread[steps],
@@ -225,6 +233,7 @@ def _one_pass(
     plan = Plan(
         feedforward,
         feedback,
+        None if problem.rate is None else previous,
         gradient,
         float(value.decrease[0]),
         float(value.decrease[1]),

@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import checked_limits, count, finite_array, is_one_of, positive, real
-from varpin.costs import BoundSum, Cost, Expansion, Points, Terminal
+from varpin.costs import (
+    BoundSum,
+    ControlRate,
+    Cost,
+    Expansion,
+    Points,
+    Terminal,
+    control_rate,
+    with_control_before,
+)
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint
 from varpin.lagrangian import lagrangian_jet
@@ -36,6 +45,7 @@ class OptimalControlProblem:
     ``TrackingCost(q_r, weight)`` weight . (q - q_r(t))^2
     ``VelocityCost(weight, v_r)`` weight . (v - v_r(t))^2
     ``ControlCost(weight, u_r)``  weight . (u - u_r(t))^2; give every control some
+    ``ControlRateCost(weight)``   weight . (du/dt)^2, which keeps controls smooth
     ``FramePositionCost``         of a frame's place; of its ``FrameOrientationCost``,
                                   ``FrameVelocityCost``
     ``CenterOfMassCost``          of the robot's centre of mass
@@ -59,6 +69,8 @@ class OptimalControlProblem:
         hold: Steps that share one control: a digital controller's period over the integrator's step.
         t0: When the horizon begins [s]; references that are functions of time see it.
         control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none.
+        rate: What changes of the controls cost: ``rate.weight`` (m, m) and ``rate.before``, the control before the
+            horizon (m,) or None; None where they cost nothing.
     """
 
     scene: Scene
@@ -75,6 +87,7 @@ class OptimalControlProblem:
     running: BoundSum = field(repr=False)
     terminal: BoundSum = field(repr=False)
     rule: Floats = field(repr=False)
+    rate: ControlRate | None = field(repr=False)
 
     def __init__(
         self,
@@ -131,6 +144,7 @@ class OptimalControlProblem:
             "running": running,
             "terminal": terminal,
             "rule": rule,
+            "rate": control_rate(cost, m),
         }
         for name, value in values.items():
             if isinstance(value, np.ndarray):
@@ -151,6 +165,11 @@ class OptimalControlProblem:
         """R, the number of controls to choose: steps / hold."""
         return self.steps // self.hold
 
+    @property
+    def period(self) -> float:
+        """The time that each control holds [s]."""
+        return self.dt * self.hold
+
     def at(
         self,
         *,
@@ -162,21 +181,26 @@ class OptimalControlProblem:
         sampling: Sampling | None = None,
         hold: int | None = None,
         t0: float | None = None,
+        before: ArrayLike | None = None,
     ) -> OptimalControlProblem:
         """The same problem, discretized otherwise or from another state.
 
-        With ``dt`` alone the horizon stays, and the number of steps follows.
+        With ``dt`` alone the horizon stays, and the number of steps follows. ``before`` is the control applied before
+        the horizon, one number or (m,), for its :class:`ControlRateCost`.
 
         Raises:
-            InputError: The horizon is no multiple of ``dt``; or as for the problem itself.
+            InputError: The horizon is no multiple of ``dt``, or ``before`` is given and changes of controls cost
+                nothing; or as for the problem itself.
         """
+        if before is not None and self.rate is None:
+            raise InputError("before is the control that a ControlRateCost begins with, and the cost has none")
         if dt is not None and steps is None:
             steps = round(self.duration / positive("dt", dt, "s"))
             if abs(steps * dt - self.duration) > 1e-9 * self.duration:
                 raise InputError(f"the horizon of {self.duration:g} s is no multiple of dt = {dt:g} s")
         return OptimalControlProblem(
             self.scene,
-            self.cost,
+            self.cost if before is None else with_control_before(self.cost, before),
             self.q0 if q0 is None else q0,
             self.v0 if v0 is None else v0,
             dt=self.dt if dt is None else dt,
@@ -260,7 +284,7 @@ class OptimalControlProblem:
         running = values.sum(axis=-1) * (self.dt * self.rule[0, 0])
         end = np.zeros((*u.shape[:-2], 1, u.shape[-1]))
         total: Floats = running + self.terminal.value(q[..., -1:, :], v[..., -1:, :], end)[..., 0]
-        return total
+        return total if self.rate is None else total + self.rate.value(u, self.period)
 
     def cost_of(self, trajectory: Trajectory) -> float:
         """The cost of one motion on the problem's grid.

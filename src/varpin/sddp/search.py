@@ -178,6 +178,8 @@ def _first_commands(problem: OptimalControlProblem, controls: ArrayLike | Linear
         commands = controls.commands(problem.steps, m, problem.scene.robot.dof, variational)
         narrowed = np.clip(commands.limits, *problem.control_limits)
         narrowed.setflags(write=False)
+        if problem.rate is not None and problem.rate.before is not None:
+            commands = commands._replace(before=problem.rate.before[None].copy())
         return commands._replace(limits=narrowed)
     rows = as_floats("controls", controls)
     rows = finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m))
@@ -420,8 +422,13 @@ class _Search:
         if self.forward == "open":
             commands = _held(u, problem)
         else:
-            reference = states(problem, here)[: -1 : problem.hold]
-            commands = Commands(u, self.plan.feedback, reference, problem.hold, problem.control_limits.copy())
+            gains, reference = self.plan.feedback, states(problem, here)[: -1 : problem.hold]
+            if self.plan.previous is not None:
+                before = here.u[: -problem.hold : problem.hold]
+                gains = np.concatenate([gains, self.plan.previous], axis=2)
+                # The first change is from a control that is given.
+                reference = np.hstack([reference, np.vstack([here.u[:1], before])])
+            commands = _held(u, problem)._replace(gains=gains, reference=reference)
         try:
             moved, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, problem.dt)
         except NoiseFieldError as error:
@@ -457,6 +464,7 @@ class _Search:
             problem=problem,
             trajectory=self.trajectory,
             gains=np.zeros((R, m, 2 * n)) if plan is None else plan.feedback,
+            previous_gains=_previous_gains(problem, plan),
             feedforward=np.zeros((R, m)) if plan is None else plan.feedforward,
             gradient=np.full((R, m), np.nan) if plan is None else plan.gradient,
             cost=self.cost,
@@ -466,6 +474,13 @@ class _Search:
             history=tuple(self.history),
             search=self.state,
         )
+
+
+def _previous_gains(problem: OptimalControlProblem, plan: Plan | None) -> Floats | None:
+    if problem.rate is None:
+        return None
+    m = problem.scene.controls
+    return np.zeros((problem.decisions, m, m)) if plan is None else plan.previous
 
 
 def states(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import count, is_one_of, positive
 from varpin.costs import barriers_of
@@ -73,6 +73,8 @@ class Solution:
         problem: What was solved.
         trajectory: The motion without noise.
         gains: Feedback (R, m, 2n) on x = (q, p) or (q, v), for each of R decisions.
+        previous_gains: Feedback (R, m, m) on the control of the decision before, where its changes cost something
+            (:class:`ControlRateCost`): u_k + gains_k (x - x_k) + previous_gains_k (u_before - u_(k-1)). Else None.
         feedforward: The change of the controls (R, m) that the last backward pass asked for; zero at an optimum.
         gradient: Of the expected cost in the controls (R, m), under the solver's model of the noise. At an optimum it
             is zero but where it pushes a control against its limit.
@@ -95,10 +97,12 @@ class Solution:
     reason: str
     history: tuple[Iteration, ...]
     search: SearchState | None = None
+    previous_gains: Floats | None = None
 
     def __post_init__(self) -> None:
-        for array in (self.gains, self.feedforward, self.gradient):
-            array.setflags(write=False)
+        for array in (self.gains, self.feedforward, self.gradient, self.previous_gains):
+            if array is not None:
+                array.setflags(write=False)
 
     @property
     def expected_cost(self) -> float:
@@ -161,18 +165,32 @@ class Solution:
             raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
         return cls(**read(path, problem))
 
-    def shifted(self, decisions: int) -> LinearPolicy:
+    def shifted(self, decisions: int, before: ArrayLike | None = None) -> LinearPolicy:
         """The policy from a later decision on, its last row repeated: what to start the next horizon with.
 
+        ``before`` is the control (m,) that has acted before that decision; left out, the plan's own.
+
         Raises:
-            InputError: Not from 0 to R - 1.
+            InputError: Not from 0 to R - 1, or a control of a wrong shape.
         """
         if not 0 <= count("decisions", decisions) < len(self.gains):
             raise InputError(f"decisions must be from 0 to {len(self.gains) - 1}, got {decisions}")
         own = self.policy
         rows = np.minimum(np.arange(len(self.gains)) + decisions, len(self.gains) - 1)
+        u, previous_gains, previous = own.u[rows], None, None
+        if own.previous_gains is not None and own.previous is not None:
+            # What is repeated expects itself before.
+            previous_gains, previous = own.previous_gains[rows], np.vstack([own.previous[rows[:1]], u[:-1]])
         return LinearPolicy(
-            own.u[rows], own.gains[rows], own.reference[rows], own.hold, own.on, (own.limits[0], own.limits[1])
+            u,
+            own.gains[rows],
+            own.reference[rows],
+            own.hold,
+            own.on,
+            (own.limits[0], own.limits[1]),
+            previous_gains=previous_gains,
+            previous=previous,
+            before=before,
         )
 
     def policy_on(self, x: Literal["momentum", "velocity"], substeps: int = 1) -> LinearPolicy:
@@ -198,8 +216,17 @@ class Solution:
                 gains = np.concatenate([gains[:, :, :n] + second @ by_q, second @ by_p], axis=2)
         nodes = trajectory.p if x == "momentum" else trajectory.v
         reference = np.hstack([trajectory.q[rows], nodes[rows]])
-        limits = self.problem.control_limits
-        return LinearPolicy(self.controls, gains, reference, hold * substeps, x, (limits[0], limits[1]))
+        limits, rate = self.problem.control_limits, self.problem.rate
+        return LinearPolicy(
+            self.controls,
+            gains,
+            reference,
+            hold * substeps,
+            x,
+            (limits[0], limits[1]),
+            previous_gains=self.previous_gains,
+            before=None if rate is None else rate.before,
+        )
 
     def verify(
         self, *, tolerance: float = 1e-10, max_substeps: int = 1024, progress: Callable[[int, int], None] | None = None

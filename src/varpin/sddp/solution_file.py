@@ -48,6 +48,8 @@ def write(path: str | os.PathLike[str], solution: Solution) -> Path:
         if kept[id(motion)] == prefix:
             members |= {f"{prefix}{name}": value for name, value in motion.members().items()}
     members |= {name: getattr(solution, name) for name in (*_PLAN, *_NUMBERS)}
+    if solution.previous_gains is not None:
+        members["previous_gains"] = solution.previous_gains
     members |= {name: getattr(solution.problem, name) for name in _PROBLEM}
     members["problem.integrator"] = repr(solution.problem.integrator)
     members |= _surroundings(solution.problem)
@@ -74,7 +76,7 @@ def _most_bytes(problem: OptimalControlProblem) -> int:
     """More than the file of any solution unpacks to: three motions, the plan, and some megabytes for all else."""
     n, m, k = problem.scene.robot.dof, problem.scene.controls, problem.scene.processes
     own = sum(array.nbytes for array in _surroundings(problem).values())
-    numbers = 3 * (problem.steps + 1) * (3 * n + m + k + 16) + problem.decisions * m * (2 * n + 2)
+    numbers = 3 * (problem.steps + 1) * (3 * n + m + k + 16) + problem.decisions * m * (2 * n + m + 2)
     return 8 * numbers + own + 16_000_000
 
 
@@ -189,4 +191,5 @@ class _Reader:
             "reason": str(members["reason"]),
             "history": history,
             "search": search,
+            "previous_gains": None if problem.rate is None else self.array("previous_gains", (R, m, m)),
         }

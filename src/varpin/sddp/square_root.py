@@ -9,8 +9,9 @@ brings their rows to
 
 (Kailath, Sayed and Hassibi, *Linear Estimation*, 2000, chapter 12). What is eps of the Hessian's largest terms to the
 plain recursion is eps of their root here, so that weights may be twice as many digits apart. Every Hessian must be
-positive semidefinite; the part of a gradient that it knows nothing of is carried along as it is. Node by node in NumPy,
-many times as slow as the compiled recursion.
+positive semidefinite; the part of a gradient that it knows nothing of is carried along as it is. Where the change of
+the control costs something, the control before is part of x. Node by node in NumPy, many times as slow as the compiled
+recursion.
 """
 
 from __future__ import annotations
@@ -95,9 +96,10 @@ class RootPass:
         for s in range(len(steps.A) - 1, -1, -1):
             if len(gains.costate):
                 gains.costate[s] = self.value.costate[: steps.A.shape[1]]
-            rows, linear, costate = self._step(h, s, (s + 1) % hold != 0, steps, running, gains)
+            held = len(steps.rate) > 0 or (s + 1) % hold != 0
+            rows, linear, costate = self._step(h, s, held, steps, running, gains)
             if s % hold == 0:
-                if not self._decide(regularization, s // hold, steps.slack, rows, linear, costate, gains):
+                if not self._decide(regularization, s // hold, steps, rows, linear, costate, gains):
                     return s // hold
                 continue
             self.root, self.linear = triangular(rows)[:-1], linear
@@ -144,12 +146,27 @@ class RootPass:
         return np.vstack(rows), linear, costate
 
     def _decide(
-        self, regularization: float, r: int, slack: Floats, rows: Floats, linear: Floats, costate: Floats, gains: Gains
+        self, regularization: float, r: int, steps: Steps, rows: Floats, linear: Floats, costate: Floats, gains: Gains
     ) -> bool:
-        value, m = self.value, gains.feedforward.shape[1]
+        value, m, slack, rated = self.value, gains.feedforward.shape[1], steps.slack, len(steps.rate) > 0
         x = rows.shape[1] - 1 - m
-        R = triangular(np.hstack([rows[:, x:-1], rows[:, :x], rows[:, -1:]]))
-        top, own = R[:m], np.sqrt((rows[:, x:-1] ** 2).sum(axis=0))
+        # Columns: of the control, of x, of the control before if its change costs something, and the shift.
+        stack = np.hstack([rows[:, x:-1], rows[:, :x], rows[:, -1:]])
+        if rated:
+            change = squares_of(steps.pull[r : r + 1], steps.rate[r : r + 1])
+            if change is None:
+                return False
+            L, shift = change.root[0], change.shift[0]
+            stack = np.vstack(
+                [
+                    np.hstack([stack[:, :-1], np.zeros((len(stack), m)), stack[:, -1:]]),
+                    np.hstack([L, np.zeros((m, x)), -L, shift[:, None]]),
+                ]
+            )
+            costate = np.append(costate[:x], costate[x:] + steps.pull[r])
+        size = stack.shape[1] - 1 - m
+        R = triangular(stack)
+        top, own = R[:m], np.sqrt((stack[:, :m] ** 2).sum(axis=0))
         if not own.any() or not np.isfinite(R).all():
             return False
         Qu = top[:, :m].T @ top[:, -1] + linear[x:]
@@ -157,8 +174,8 @@ class RootPass:
         weight = np.where(idle, own.max(), np.sqrt(regularization) * own)
         firm = top
         if weight.any():
-            firm = triangular(np.vstack([top, np.hstack([np.diag(weight), np.zeros((m, x + 1))])]))[:m]
-        k, K, free = np.zeros(m), np.zeros((m, x)), np.ones(m, dtype=bool)
+            firm = triangular(np.vstack([top, np.hstack([np.diag(weight), np.zeros((m, size + 1))])]))[:m]
+        k, K, free = np.zeros(m), np.zeros((m, size)), np.ones(m, dtype=bool)
         if len(slack):
             U, work = firm[:, :m], np.zeros((3, m))
             if not (np.diag(U) != 0.0).all() or not solve_box(U.T @ U, Qu, slack[r], k, np.zeros((m, m)), work):
@@ -178,15 +195,19 @@ class RootPass:
             value.loss[0] = max(value.loss[0], float(lost.max(initial=0.0)))
         if len(slack):
             k = np.clip(k, *slack[r])
-        gains.feedforward[r], gains.feedback[r], gains.control_gradient[r] = k, K, costate[x:]
+        gains.feedforward[r], gains.feedback[r], gains.control_gradient[r] = k, K[:, :x], costate[x:]
         moved = top[:, :m] @ k
         value.decrease[:] += np.array([Qu @ k, moved @ moved])
-        self.linear = np.concatenate([linear[:x] + K.T @ linear[x:], np.zeros(m)])
+        self.linear = np.concatenate([linear[:x] + K[:, :x].T @ linear[x:], np.zeros(m)])
         value.costate[:x], value.costate[x:] = costate[:x], 0.0
         value.scale[:x], value.scale[x:] = np.sqrt((rows[:, :x] ** 2).sum(axis=0)), 0.0
+        if rated:
+            gains.previous[r] = K[:, x:]
+            self.linear[x:] = K[:, x:].T @ linear[x:]
+            value.costate[x:], value.scale[x:] = -steps.pull[r], np.sqrt(np.diagonal(steps.rate[r]))
         # What no control takes away. Without regularization and limits it is zero, but for rounding.
         rest = R[m:-1]
         if weight.any() or not free.all():
             rest = np.vstack([top + np.hstack([np.zeros((m, m)), top[:, :m] @ K, moved[:, None]]), rest])
-        self.root = np.hstack([rest[:, m:-1], np.zeros((len(rest), m)), rest[:, -1:]])
+        self.root = np.hstack([rest[:, m:-1], np.zeros((len(rest), m + x - size)), rest[:, -1:]])
         return True

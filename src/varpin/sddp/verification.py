@@ -115,7 +115,9 @@ def verify(
         costs = _fine_costs(problem, substeps)
         opened = accurate_cost(problem, blind._replace(hold=problem.hold * substeps), substeps, costs)
         fed = policy(substeps)
-        feedback = Commands(fed.u, fed.gains, fed.reference, fed.hold, fed.limits)
+        feedback = fed.commands(
+            problem.steps * substeps, problem.scene.controls, problem.scene.robot.dof, variational=False
+        )
         closed = accurate_cost(problem, feedback, substeps, costs)
         changes = [
             abs(now[0] - then) / max(abs(now[0]), 1e-300)
@@ -162,7 +164,8 @@ def accurate_cost(
     before = running.value(motion.q, motion.v, np.vstack([motion.u[:1], motion.u]))
     integral = h / 3.0 * (after[:-1:2] + 4.0 * after[1::2] + before[2::2]).sum()
     end = terminal.value(motion.q[-1:], motion.v[-1:], np.zeros((1, m)))[0]
-    return float(integral + end), motion.q[-1]
+    smooth = 0.0 if problem.rate is None else problem.rate.value(motion.u, problem.period)
+    return float(integral + end + smooth), motion.q[-1]
 
 
 def _defect(problem: OptimalControlProblem, trajectory: Trajectory, substeps: int) -> float:

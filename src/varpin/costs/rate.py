@@ -1,0 +1,140 @@
+"""The cost of changing controls: what couples each decision to the one before."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import as_floats, finite_array, require_finite
+from varpin.costs.base import BoundCost, BoundSum, Cost, CostSum, Points, Scaled, checked_weight, weight_matrix
+from varpin.errors import InputError
+
+Floats = NDArray[np.float64]
+
+
+class ControlRateCost(Cost):
+    """weight . (du/dt)^2: keep controls smooth.
+
+    Controls are constant over a period T = hold dt and jump between them. The integral of the square of their rate is
+    that of the line through them, the sum over decisions of weight . (u_k - u_(k-1))^2 / T: it means the same at every
+    ``dt`` for controls that are smooth in time, up to a part of the size of T.
+    """
+
+    def __init__(self, weight: ArrayLike = 1.0, before: ArrayLike | None = None) -> None:
+        """Describe the cost.
+
+        Args:
+            weight: One number, (m,), or a matrix (m, m), positive semidefinite [cost s / control^2].
+            before: The control applied before the horizon, one number or (m,), from which the first change counts.
+                Left out, the first control is free.
+
+        Raises:
+            InputError: A weight that is not finite, indefinite, or neither number, vector nor square matrix; or a
+                control that is neither number nor vector, or not finite.
+        """
+        self.weight = checked_weight("ControlRateCost", weight)
+        self.before: Floats | None = None
+        if before is not None:
+            self.before = require_finite("ControlRateCost before", as_floats("ControlRateCost before", before))
+            if self.before.ndim > 1:
+                raise InputError(
+                    f"ControlRateCost before must be one number or a vector, got shape {self.before.shape}"
+                )
+            self.before.setflags(write=False)
+
+    def __repr__(self) -> str:
+        start = "" if self.before is None else f", before={self.before.tolist()}"
+        return f"ControlRateCost(weight={self.weight.tolist()}{start})"
+
+    @property
+    def of_controls(self) -> bool:
+        """See :attr:`Cost.of_controls`."""
+        return True
+
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`Cost.nonnegative`."""
+        return True
+
+    def bind(self, points: Points) -> BoundCost:
+        """Nothing at any single point in time: a problem takes it by :func:`control_rate`."""
+        control_rate(self, points.controls)
+        return BoundSum((), points)
+
+
+@dataclass(frozen=True, eq=False)
+class ControlRate:
+    """What changes of the controls cost in all.
+
+    Attributes:
+        weight: (m, m).
+        before: The control before the horizon (m,), or None where the first one is free.
+    """
+
+    weight: Floats
+    before: Floats | None
+
+    def changes(self, u: Floats) -> Floats:
+        """The change at each of N controls (..., N, m) from the one before; none at the first where it is free."""
+        start = u[..., :1, :] if self.before is None else np.broadcast_to(self.before, u[..., :1, :].shape)
+        return np.diff(u, axis=-2, prepend=start)
+
+    def value(self, u: Floats, period: float) -> Floats:
+        """The cost (...) of controls (..., N, m) that change every ``period`` [s]."""
+        change = self.changes(u)
+        total: Floats = np.einsum("...ki,...ki->...", change @ self.weight, change) / period
+        return total
+
+    def expand(self, u: Floats, period: float) -> tuple[Floats, Floats]:
+        """Gradients (N, m) in u_k, with u_(k-1) as it is, of each change of the controls (N, m); Hessians (N, m, m)."""
+        hessian = np.repeat(2.0 / period * self.weight[None], len(u), axis=0)
+        if self.before is None:
+            hessian[0] = 0.0
+        return 2.0 / period * (self.changes(u) @ self.weight), hessian
+
+
+def control_rate(cost: Cost, controls: int) -> ControlRate | None:
+    """All terms on the rate of controls in a cost together, for m controls; None if there is none.
+
+    Raises:
+        InputError: Weights or controls of a wrong size, or terms with different controls before.
+    """
+    terms = list(_terms(cost))
+    if not terms:
+        return None
+    name = "ControlRateCost"
+    weight = sum(factor * weight_matrix(name, term.weight, controls) for factor, term in terms)
+    starts: list[Floats | None] = []
+    for _, term in terms:
+        start = term.before
+        if start is not None and start.ndim == 0:
+            start = np.full(controls, float(start))
+        starts.append(None if start is None else finite_array(f"{name} before", start, (controls,)))
+    if len({None if start is None else tuple(start.tolist()) for start in starts}) > 1:
+        raise InputError(f"{name} terms of one cost must have the same control before")
+    return ControlRate(np.asarray(weight, dtype=np.float64), starts[0])
+
+
+def with_control_before(cost: Cost, before: ArrayLike) -> Cost:
+    """The same cost with another control before the horizon."""
+    if isinstance(cost, ControlRateCost):
+        return ControlRateCost(cost.weight, before)
+    if isinstance(cost, Scaled):
+        return Scaled(cost.factor, with_control_before(cost.cost, before))
+    if isinstance(cost, CostSum):
+        return CostSum(tuple(with_control_before(part, before) for part in cost.parts))
+    return cost
+
+
+def _terms(cost: Cost) -> Iterator[tuple[float, ControlRateCost]]:
+    """The terms on the rate of controls, each with what it is scaled by."""
+    if isinstance(cost, ControlRateCost):
+        yield 1.0, cost
+    elif isinstance(cost, Scaled):
+        yield from ((cost.factor * factor, term) for factor, term in _terms(cost.cost))
+    elif isinstance(cost, CostSum):
+        for part in cost.parts:
+            yield from _terms(part)

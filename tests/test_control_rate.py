@@ -1,0 +1,482 @@
+"""The cost of changing controls: dense minima, a plain Riccati recursion, simulated noise, and what hands it on."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy.optimize
+from scipy.optimize import lsq_linear
+from test_control_limits import transcribed
+from test_sddp import SAMPLINGS, Plain, PlainCost, noise_columns, run, sliders, start_of, state_rows
+from test_solution_files import same
+
+import varpin as vp
+from varpin.sddp.backward import _one_pass
+
+MATRIX = np.array([[2e-2, 5e-3], [5e-3, 1e-2]])
+BEFORE = np.array([0.7, -0.3])
+
+
+def linear(rate=None, integrator=None, sampling="midpoint", noise=None, steps=24, limits=None, hold=1, q0=(0.3, -0.4)):
+    """Two sliders with springs, which follow a wave and end at rest."""
+    scene = vp.Scene(
+        sliders(2), gravity=False, damping=[0.3, 0.1], stiffness=[1.0, 0.0], rest=[0.1, -0.2],
+        actuation=[[1.0, 0.4], [-0.2, 1.3]], noise=noise,
+    )  # fmt: skip
+    cost = vp.TrackingCost(lambda t: [np.sin(3 * t), 0.2], [[2.0, 0.3], [0.3, 1.0]])
+    cost += vp.ControlCost([0.05, 0.02], reference=[0.3, -0.1])
+    cost += vp.Terminal(vp.TrackingCost([1.0, 0.5], 3.0) + vp.VelocityCost(0.7))
+    return vp.OptimalControlProblem(
+        scene, cost if rate is None else cost + rate, q0, [0.5, 0.1], dt=0.05, steps=steps, integrator=integrator,
+        sampling=sampling, hold=hold, control_limits=limits,
+    )  # fmt: skip
+
+
+def finger(rate, integrator=None, steps=12, hold=1, noise=None, dt=8e-3):
+    scene = vp.Scene(vp.load_robot("finger"), damping=3e-5, noise=noise)
+    cost = vp.TrackingCost([0.8, 0.3, 0.2], 10.0) + vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost([0.8, 0.3, 0.2]))
+    return vp.OptimalControlProblem(
+        scene, cost + rate, [1.0, 0.0, 0.0], np.zeros(3), dt=dt, steps=steps, hold=hold, integrator=integrator
+    )
+
+
+def plain_rate(u, weight, before, period):
+    """Change by change."""
+    W = np.asarray(weight) * np.eye(u.shape[1]) if np.ndim(weight) < 2 else np.asarray(weight)
+    total, last = 0.0, before
+    for row in u:
+        if last is not None:
+            total += (row - last) @ W @ (row - last) / period
+        last = row
+    return total
+
+
+@pytest.mark.parametrize("hold", [1, 3])
+@pytest.mark.parametrize("before", [None, BEFORE], ids=["free", "given"])
+@pytest.mark.parametrize("weight", [0.3, [0.3, 0.1], MATRIX], ids=["number", "vector", "matrix"])
+def test_value(weight, before, hold):
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(24 // hold, 2))
+    bare, rated = linear(hold=hold), linear(vp.ControlRateCost(weight, before), hold=hold)
+    motion = run(bare, u)
+    expected = plain_rate(u, weight, before, 0.05 * hold)
+    assert rated.cost_of(motion) - bare.cost_of(motion) == pytest.approx(expected, rel=1e-11)
+    # Scaled and summed, and of many motions at once.
+    half = vp.ControlRateCost(np.multiply(0.25, weight), before)
+    parts = linear(2.0 * (half + 0.0 * vp.VelocityCost()) + 0.5 * vp.ControlRateCost(weight, before), hold=hold)
+    assert parts.cost_of(motion) == pytest.approx(rated.cost_of(motion), rel=1e-12)
+    many = [np.repeat(array[None], 3, axis=0) for array in (motion.q, motion.v, motion.u)]
+    np.testing.assert_allclose(rated.costs(*many), rated.cost_of(motion), rtol=1e-12)
+
+
+def test_it_means_the_same_at_every_step():
+    """For controls that are smooth in time, up to a part of the size of the step."""
+    exact = 0.3 * (2.4 + np.sin(4.8) / 2.0)  # of (2 cos 2t)^2, from 0 to 1.2
+    off = []
+    for steps in (24, 48, 96):
+        dt = 1.2 / steps
+        before = np.sin(2.0 * (-0.5 * dt)) * np.ones(2)
+        problem = linear(vp.ControlRateCost([0.3, 0.0], before)).at(dt=dt)
+        u = np.sin(2.0 * (np.arange(steps) + 0.5) * dt)[:, None] * np.ones(2)
+        off.append(problem.rate.value(u, dt) - exact)
+    # The changes are centred on the nodes 0 .. N - 1: half a period is missing at the end, half too much is before.
+    assert abs(off[2]) < 0.02 * exact
+    np.testing.assert_allclose(np.divide(off[:-1], off[1:]), 2.0, atol=0.1)
+
+
+def augmented_riccati(plain, problem, weight, before, noise):
+    """Gains on x and on the control before, and the value at the start, in absolute coordinates.
+
+    The value P is in (x, c, 1), where c is the control that acts, or acted last: a decision chooses u after c at the
+    price (u - c)' W (u - c) / T and eliminates it by a Schur complement; between decisions u is c.
+    """
+    n, m, h, hold = plain.n, problem.scene.controls, plain.dt, problem.hold
+    x, one = 2 * n, 4 * n + m
+    cost = PlainCost(plain, problem)
+    P = np.zeros((x + m + 1, x + m + 1))
+    end = [*range(x), x + m]
+    P[np.ix_(end, end)] = cost.end()
+    gains = []
+    for j in range(problem.steps - 1, -1, -1):
+        W = cost.step(j)
+        after = [*range(x, 2 * x), *range(2 * x, one), one]
+        W[np.ix_(after, after)] += P
+        T = np.zeros((one + 1, x + m + 1))  # (x, x', u, 1) in (x, u, 1)
+        T[:x, :x] = np.eye(x)
+        T[2 * x : one, x : x + m] = np.eye(m)
+        T[one, -1] = 1.0
+        T[x : 2 * x] = np.hstack([plain.A, plain.B, plain.c[:, None]])
+        P = T.T @ W @ T
+        S = W[x : 2 * x, x : 2 * x]
+        for a, Gx, Gu in noise(j):
+            g = np.hstack([Gx, Gu, a[:, None]])
+            P += h * g.T @ S @ g
+        if j % hold:
+            continue
+        R = 2.0 / (h * hold) * (np.zeros((m, m)) if j == 0 and before is None else np.asarray(weight))
+        Q = np.zeros((x + 2 * m + 1, x + 2 * m + 1))  # in (x, c, 1, u)
+        u, c = slice(x + m + 1, None), slice(x, x + m)
+        whole = [*range(x), *range(x + m + 1, x + 2 * m + 1), x + m]
+        Q[np.ix_(whole, whole)] = P
+        Q[u, u] += R
+        Q[c, c] += R
+        Q[u, c] -= R
+        Q[c, u] -= R
+        K = -np.linalg.solve(Q[u, u], Q[u, : x + m + 1])
+        P = Q[: x + m + 1, : x + m + 1] + Q[: x + m + 1, u] @ K
+        P = 0.5 * (P + P.T)
+        gains.append(K)
+    start = np.insert(start_of(plain, problem), x, np.zeros(m) if before is None else before)
+    return np.array(gains[::-1]), 0.5 * start @ P @ start
+
+
+@pytest.mark.parametrize("hold", [1, 3])
+@pytest.mark.parametrize("before", [None, BEFORE], ids=["free", "given"])
+@pytest.mark.parametrize(
+    ("integrator", "sampling"), [*((vp.Midpoint(), s) for s in SAMPLINGS), (vp.RungeKutta4(), "gauss")], ids=str
+)
+@pytest.mark.parametrize("roots", [False, True], ids=["plain", "square roots"])
+def test_riccati_on_the_augmented_state(integrator, sampling, before, hold, roots):
+    """Along any motion, under noise of every kind: both gains, the whole affine law, and the value."""
+    noise = vp.AdditiveNoise(0.2) + vp.ControlNoise(0.5) + vp.StateNoise(0.8, center=-0.1)
+    problem = linear(vp.ControlRateCost(MATRIX, before), integrator, sampling, noise, hold=hold)
+    motion = run(problem, np.random.default_rng(1).normal(size=(problem.decisions, 2)))
+    plan, _ = _one_pass(problem, motion, 0.0, False, None, roots=roots)
+    plain = Plain(problem.scene, problem.dt, integrator)
+    columns = noise_columns(plain, problem.scene, motion)(0.2, 0.5, 0.8, -0.1)
+    laws, value = augmented_riccati(plain, problem, MATRIX, before, columns)
+    found = np.concatenate([plan.feedback, plan.previous], axis=2)
+    np.testing.assert_allclose(found, laws[:, :, :-1], rtol=0, atol=1e-9 * np.abs(laws).max())
+    u = motion.u[::hold]
+    c = np.vstack([np.zeros(2) if before is None else before, u[:-1]])
+    y = np.hstack([state_rows(problem, motion)[:-1:hold], c])
+    law = u + plan.feedforward - np.einsum("Nij,Nj->Ni", found, y)
+    np.testing.assert_allclose(law, laws[:, :, -1], rtol=0, atol=1e-9 * np.abs(laws).max())
+    assert problem.cost_of(motion) + plan.noise + 0.5 * plan.slope == pytest.approx(value, rel=1e-9)
+    if before is None:
+        assert not plan.previous[0].any()
+
+
+@pytest.mark.parametrize("limits", [None, (np.array([-1.2, -0.8]), np.array([0.4, np.inf]))], ids=["free", "limited"])
+@pytest.mark.parametrize("hold", [1, 4])
+@pytest.mark.parametrize("before", [None, BEFORE], ids=["free start", "given start"])
+def test_the_minimum_over_all_controls_at_once(before, hold, limits):
+    """A quadratic program in a box, by SciPy; signs of the multipliers; no feedback on clamped controls."""
+    problem = linear(vp.ControlRateCost(MATRIX, before), steps=12 * hold, hold=hold, limits=limits).at(
+        dt=0.2 / hold, steps=12 * hold
+    )
+    sol = vp.solve(problem, tolerance=1e-15, max_iterations=300)
+    g, H = transcribed(problem)
+    L = np.linalg.cholesky(H)
+    R = problem.decisions
+    lower, upper = limits or (np.full(2, -np.inf), np.full(2, np.inf))
+    bounds = [np.tile(np.where(np.isfinite(limit), limit, sign * 1e9), R) for limit, sign in ((lower, -1), (upper, 1))]
+    method = {"method": "bvls", "tol": 1e-15, "max_iter": 1000}
+    reference = lsq_linear(L.T, -np.linalg.solve(L, g), bounds, **method).x
+    u = sol.controls
+    np.testing.assert_allclose(u.ravel(), reference, rtol=0, atol=1e-5)
+    slope = (g + H @ u.ravel()).reshape(R, 2)
+    np.testing.assert_allclose(sol.gradient, slope, rtol=0, atol=1e-6)
+    at_lower, at_upper = u <= lower, u >= upper
+    assert (sol.gradient[at_lower] > 0.0).all()
+    assert (sol.gradient[at_upper] < 0.0).all()
+    held = at_lower | at_upper
+    assert np.abs(sol.gradient[~held]).max() < 1e-5
+    if limits is not None:
+        assert at_lower.any()
+        assert at_upper.any()
+        assert not held.all()
+        assert not sol.gains[held].any()
+        assert not sol.previous_gains[held].any()
+    later = sol.previous_gains[1:][~held[1:]]
+    assert np.abs(later).max(axis=1).min() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("integrator", "second_order"), [(vp.Midpoint(), True), (vp.Gauss(2), False), (vp.SemiImplicitEuler(), False)]
+)
+def test_the_minimum_for_a_finger(integrator, second_order):
+    """Nonlinear: by BFGS over all controls at once, from the passive motion."""
+    problem = finger(vp.ControlRateCost(2e-3, before=[1e-3, 0.0, 0.0]), integrator, hold=3)
+    sol = vp.solve(problem, tolerance=1e-13, second_order=second_order)
+    assert sol.status.converged
+    scale, unit = sol.cost, np.abs(sol.controls).max()
+
+    def cost(u):
+        return problem.cost_of(run(problem, unit * u.reshape(4, 3))) / scale
+
+    found = scipy.optimize.minimize(cost, np.zeros(12), method="BFGS", options={"gtol": 1e-7})
+    assert sol.cost <= found.fun * scale * (1 + 1e-9)
+    assert found.fun == pytest.approx(1.0, rel=1e-6)
+    np.testing.assert_allclose(sol.controls, unit * found.x.reshape(4, 3), rtol=0, atol=2e-3 * unit)
+
+
+@pytest.mark.parametrize("roots", [False, True], ids=["plain", "square roots"])
+@pytest.mark.parametrize("before", [None, [1e-3, 0.0, 0.0]], ids=["free", "given"])
+def test_gradient_far_from_an_optimum(before, roots):
+    """Of a nonlinear motion's cost, against differences."""
+    problem = finger(vp.ControlRateCost(2e-3, before), steps=6, hold=2)
+    u = 1e-3 * np.random.default_rng(3).normal(size=(3, 3))
+    plan, _ = _one_pass(problem, run(problem, u), 0.0, False, None, roots=roots)
+    for r in range(3):
+        for i in range(3):
+            e = np.zeros((3, 3))
+            e[r, i] = 1e-5
+            costs = [problem.cost_of(run(problem, u + k * e)) for k in (-2, -1, 1, 2)]
+            slope = np.dot([1, -8, 8, -1], costs) / 1.2e-4
+            assert plan.gradient[r, i] == pytest.approx(slope, rel=1e-6, abs=1e-8 * np.abs(plan.gradient).max())
+
+
+def test_noise_is_known_to_the_law():
+    """The expected cost on a linear system is exact: against simulated paths, which feed the control before back."""
+    problem = linear(vp.ControlRateCost(MATRIX, BEFORE), noise=vp.AdditiveNoise(0.3) + vp.ControlNoise(0.2), hold=2)
+    sol = vp.solve(problem)
+    found = sol.monte_carlo(4000, rng=0)
+    assert abs(found.cost - found.predicted) < 4.0 * found.standard_error
+    assert sol.noise_cost > 10.0 * found.standard_error
+    # Under the same noise feedback on x alone costs more.
+    blind = dataclasses.replace(sol, previous_gains=np.zeros_like(sol.previous_gains))
+    lost = blind.monte_carlo(4000, rng=0)
+    assert lost.cost > found.cost + 4.0 * found.standard_error
+
+
+@pytest.mark.parametrize("weight", [0.0, 1e-14])
+def test_without_weight_it_is_not_there(weight):
+    options = {"noise": vp.ControlNoise(0.2), "hold": 2, "limits": (-0.9, 0.9)}
+    bare = vp.solve(linear(**options))
+    rated = vp.solve(linear(vp.ControlRateCost(weight), **options))
+    assert bare.previous_gains is None
+    assert bare.policy.previous_gains is None
+    assert rated.cost == pytest.approx(bare.cost, rel=1e-11)
+    np.testing.assert_allclose(rated.controls, bare.controls, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(rated.gains, bare.gains, rtol=0, atol=1e-9 * np.abs(bare.gains).max())
+    assert np.abs(rated.previous_gains).max() <= 1e4 * weight
+
+
+def random_policy(scene, steps, hold=1, before=None, limits=None):
+    rng = np.random.default_rng(5)
+    n, m = scene.robot.dof, scene.controls
+    return vp.LinearPolicy(
+        rng.normal(size=(steps, m)), -0.3 * rng.random(size=(steps, m, 2 * n)), rng.normal(size=(steps, 2 * n)), hold,
+        limits=limits, previous_gains=0.4 * rng.normal(size=(steps, m, m)), previous=rng.normal(size=(steps, m)),
+        before=before,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("before", [None, BEFORE], ids=["free", "given"])
+@pytest.mark.parametrize("limits", [None, (-0.8, 0.8)], ids=["free", "limited"])
+@pytest.mark.parametrize(
+    "integrator",
+    [vp.Midpoint(), vp.Midpoint(kick="split"), vp.Gauss(2), vp.RungeKutta4(), vp.ExplicitEuler(), vp.Reference()],
+    ids=str,
+)
+def test_policies_feed_the_control_before_back(monkeypatch, integrator, limits, before):
+    """In kernels, in SciPy's integrator, and across the pieces that a long simulation is made in."""
+    monkeypatch.setattr("varpin.simulation._CHUNK", 8)
+    scene = vp.Scene(sliders(2), gravity=False, damping=0.3)
+    policy = random_policy(scene, 10, 2, before, limits)
+    motion = vp.simulate(scene, [0.3, -0.4], [0.5, 0.1], dt=0.05, steps=20, controls=policy, integrator=integrator)
+    x = np.hstack([motion.q, motion.p if integrator.variational else motion.v])
+    last = None if before is None else before
+    for k in range(10):
+        u = policy.u[k] + policy.gains[k] @ (x[2 * k] - policy.reference[k])
+        if last is not None:
+            u = u + policy.previous_gains[k] @ (last - policy.previous[k])
+        u = np.clip(u, -0.8, 0.8) if limits else u
+        np.testing.assert_allclose(motion.u[2 * k : 2 * k + 2], [u, u], rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(policy.control(k, x[2 * k], last), u)
+        last = motion.u[2 * k]
+
+
+@pytest.mark.parametrize("before", [None, BEFORE], ids=["free", "given"])
+def test_ensembles_feed_the_control_before_of_each_path_back(monkeypatch, before):
+    """The same bytes as paths by themselves, over many blocks and groups."""
+    monkeypatch.setattr("varpin.ensemble._BLOCK", 5 * 45 * 8)
+    scene = vp.Scene(sliders(2), gravity=False, damping=0.3, noise=vp.AdditiveNoise(0.4))
+    policy = random_policy(scene, 20, before=before)
+    options = {"dt": 0.05, "steps": 20, "controls": policy}
+    paths = vp.simulate_ensemble(scene, [0.3, -0.4], [0.5, 0.1], paths=45, rng=3, **options)
+    assert np.ptp(paths.u[:, 5], axis=0).min() > 0.1
+    for path, child in enumerate(np.random.default_rng(3).spawn(45)):
+        if path % 11 == 0:
+            alone = vp.simulate(scene, [0.3, -0.4], [0.5, 0.1], rng=child, **options)
+            assert alone.u.tobytes() == paths.u[path].tobytes()
+            assert alone.q.tobytes() == paths.q[path].tobytes()
+
+
+def test_noise_of_ones_own_is_stepped_in_python_with_the_same_feedback():
+    """A field that only Python knows, and the same one compiled."""
+
+    policy = random_policy(vp.Scene(sliders(2)), 10, 2, BEFORE)
+    motions = []
+    for noise in (vp.AdditiveNoise(0.4), vp.CustomNoise(lambda q, v, u: 0.4 * np.eye(2), 2)):
+        scene = vp.Scene(sliders(2), gravity=False, damping=0.3, noise=noise)
+        for integrator in (vp.Midpoint(), vp.RungeKutta4()):
+            motions.append(
+                vp.simulate(scene, [0.3, -0.4], [0.5, 0.1], dt=0.05, steps=20, controls=policy, rng=2,
+                            integrator=integrator)
+            )  # fmt: skip
+    for compiled, own in zip(motions[:2], motions[2:], strict=True):
+        np.testing.assert_allclose(own.u, compiled.u, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("hold", [1, 3])
+def test_saved_and_resumed_bit_for_bit(tmp_path, hold):
+    problem = finger(vp.ControlRateCost(2e-3, [1e-3, 0.0, 0.0]), noise=vp.ControlNoise(0.05), hold=hold, steps=24)
+    whole = vp.solve(problem, max_iterations=6, tolerance=1e-14)
+    part = vp.solve(problem, max_iterations=2, tolerance=1e-14)
+    loaded = vp.Solution.load(part.save(tmp_path / "part.npz"), problem)
+    same(part, loaded)
+    np.testing.assert_array_equal(part.previous_gains, loaded.previous_gains)
+    done = len(loaded.search.history)
+    on = vp.solve(problem, resume=loaded, max_iterations=6 - done, tolerance=1e-14)
+    same(whole, on)
+    np.testing.assert_array_equal(whole.previous_gains, on.previous_gains)
+    with pytest.raises(vp.FileError, match="of a problem with another cost"):
+        vp.Solution.load(tmp_path / "part.npz", problem.at(before=[0.0, 0.0, 2e-3]))
+    with pytest.raises(vp.InputError, match="the solution is of another cost"):
+        vp.solve(problem.at(before=[0.0, 0.0, 2e-3]), resume=loaded)
+
+
+def test_the_rest_of_an_optimum_is_the_optimum_of_the_rest():
+    """From the control that acted before, and from no other."""
+    problem = linear(vp.ControlRateCost(MATRIX), hold=2)
+    whole = vp.solve(problem, tolerance=1e-14)
+    motion, j = whole.trajectory, 8
+    later = problem.at(q0=motion.q[j], v0=motion.v[j], steps=24 - j, t0=problem.dt * j)
+    rest = vp.solve(later.at(before=whole.controls[3]), tolerance=1e-14)
+    np.testing.assert_allclose(rest.controls, whole.controls[4:], rtol=0, atol=1e-7)
+    other = vp.solve(later, tolerance=1e-14)
+    assert np.abs(other.controls - whole.controls[4:]).max() > 1e-2
+
+
+def test_feedback_on_another_start_and_another_control_before():
+    """On a linear system the law is the optimum wherever it starts: shifted, with what acted before."""
+    problem = linear(vp.ControlRateCost(MATRIX), sampling="start", hold=2)
+    whole = vp.solve(problem, tolerance=1e-15)
+    motion, j = whole.trajectory, 8
+    applied = whole.controls[3] + [0.5, -0.4]
+    later = problem.at(q0=motion.q[j] + 0.1, v0=motion.v[j] - 0.2, steps=24 - j, t0=problem.dt * j, before=applied)
+    own = whole.shifted(4, applied)
+    rows = slice(0, 8)
+    policy = vp.LinearPolicy(
+        own.u[rows], own.gains[rows], own.reference[rows], own.hold, previous_gains=own.previous_gains[rows],
+        previous=own.previous[rows], before=own.before,
+    )  # fmt: skip
+    best = vp.solve(later, tolerance=1e-15)
+    np.testing.assert_allclose(later.simulate(policy).u[::2], best.controls, rtol=0, atol=1e-6)
+    # What is repeated at the end expects itself before, so that it goes on where nothing is off.
+    np.testing.assert_array_equal(own.previous[9:], own.u[8:-1])
+
+
+def test_the_torques_of_a_reach_become_smooth():
+    """From the best torques without that cost: jumps a ninth as large, for 3% of the rest of the cost."""
+    problem = vp.load_scene("ur5_reach").problem
+    start = problem.holding_controls()
+    rated = vp.OptimalControlProblem(
+        problem.scene, problem.cost + vp.ControlRateCost(1e-5, start), problem.q0, problem.v0, dt=problem.dt,
+        steps=problem.steps, control_limits=(problem.control_limits[0], problem.control_limits[1]),
+    )  # fmt: skip
+    rough = vp.solve(problem)
+    smooth = vp.solve(rated, rough)
+    assert smooth.status.converged
+    jumps = [np.abs(np.diff(sol.controls, axis=0, prepend=start[None])).max() for sol in (rough, smooth)]
+    assert jumps[1] < 0.12 * jumps[0]
+    assert problem.cost_of(smooth.trajectory) < 1.03 * rough.cost
+
+
+def test_mpc_joins_its_plans():
+    """Each tick's plan begins at the control that acted; its jumps are those of the cost, not of replanning."""
+
+    def largest(rate):
+        problem = linear(rate, noise=None, q0=(0.0, 0.0))
+        plant = vp.Plant(vp.Scene(problem.scene.robot, gravity=False, noise=vp.AdditiveNoise(0.5), damping=0.2,
+                                  actuation=problem.scene.actuation))  # fmt: skip
+        ran = vp.Mpc(problem).run(plant, duration=1.0, rng=1)
+        return ran, np.abs(np.diff(ran.motion.u[::10], axis=0)).max()
+
+    ran, smooth = largest(vp.ControlRateCost(0.1, BEFORE))
+    assert smooth < 0.5 * largest(None)[1]
+    acted = ran.motion.u[::10]
+    np.testing.assert_array_equal(ran.plans[0].problem.rate.before, BEFORE)
+    for plan, u in zip(ran.plans[1:], acted, strict=False):
+        np.testing.assert_array_equal(plan.problem.rate.before, u)
+    again = vp.Mpc(ran.plans[0].problem).plan(0.1, [0.1, 0.1], [0.0, 0.0], ran.plans[0], decisions=2)
+    np.testing.assert_array_equal(again.problem.rate.before, ran.plans[0].controls[1])
+    free, _ = largest(vp.ControlRateCost(0.1))
+    assert free.plans[0].problem.rate.before is None
+    np.testing.assert_array_equal(free.plans[1].problem.rate.before, free.motion.u[0])
+
+
+def test_late_plans_feed_the_control_before_back():
+    """With a budget that no plan meets the first plan acts on, as its own policy in a simulation."""
+    problem = linear(vp.ControlRateCost(MATRIX, BEFORE))
+    plant = vp.Scene(problem.scene.robot, gravity=False, damping=0.2, actuation=problem.scene.actuation)
+    ran = vp.Mpc(problem, budget=1e-9).run(vp.Plant(plant), duration=1.2)
+    policy = ran.plans[0].policy_on("velocity", substeps=10)
+    alone = vp.simulate(plant, problem.q0, problem.v0, dt=5e-3, steps=240, controls=policy, integrator=vp.RungeKutta4())
+    np.testing.assert_allclose(ran.motion.u, alone.u, rtol=0, atol=1e-9)
+
+
+def test_verification_counts_the_changes_that_are_made():
+    """RungeKutta4 on sliders without springs is exact, so the planned cost is the true one."""
+    scene = vp.Scene(sliders(2), gravity=False)
+    cost = vp.ControlCost(0.1) + vp.ControlRateCost(MATRIX, BEFORE) + vp.Terminal(vp.TrackingCost([1.0, -0.5], 10.0))
+    problem = vp.OptimalControlProblem(
+        scene, cost, [0, 0], [0, 0], dt=0.1, steps=12, hold=3, integrator=vp.RungeKutta4()
+    )
+    sol = vp.solve(problem, tolerance=1e-13)
+    found = sol.verify()
+    assert found.open_loop_cost == pytest.approx(sol.cost, rel=1e-11)
+    assert found.closed_loop_cost == pytest.approx(sol.cost, rel=1e-11)
+    bent = finger(vp.ControlRateCost(2e-3), hold=2, dt=2e-3, steps=48)
+    assert abs(vp.solve(bent).verify(tolerance=1e-6).closed_loop_loss) < 0.05
+
+
+def test_sums_scales_and_words():
+    own = vp.ControlRateCost(2.0)
+    assert own.of_controls
+    assert own.nonnegative
+    assert repr(0.5 * own + vp.ControlCost()) == "0.5 * ControlRateCost(weight=2.0) + ControlCost(weight=1.0)"
+    assert repr(vp.ControlRateCost([1.0, 2.0], 0.5)) == "ControlRateCost(weight=[1.0, 2.0], before=0.5)"
+    np.testing.assert_array_equal(linear(vp.ControlRateCost(1.0, 0.5)).rate.before, [0.5, 0.5])
+    np.testing.assert_array_equal(linear(2.0 * own + vp.ControlRateCost([1.0, 3.0])).rate.weight, np.diag([5.0, 7.0]))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: vp.ControlRateCost(-1.0), "ControlRateCost weight must be positive semidefinite"),
+        (lambda: vp.ControlRateCost(1.0, np.nan), "ControlRateCost before is nan; it must be finite"),
+        (
+            lambda: vp.ControlRateCost(1.0, np.zeros((2, 2))),
+            r"before must be one number or a vector, got shape \(2, 2\)",
+        ),
+        (lambda: vp.Terminal(vp.ControlRateCost()), "cannot be a terminal cost: there is no control at the final time"),
+        (lambda: vp.Terminal(2.0 * vp.ControlRateCost()), "cannot be a terminal cost"),
+        (lambda: linear(vp.ControlRateCost([1.0, 1.0, 1.0])), r"must be one number or have 2 rows, got shape \(3,\)"),
+        (lambda: linear(vp.ControlRateCost(1.0, np.zeros(3))), r"before must have shape \(2,\), got \(3,\)"),
+        (
+            lambda: linear(vp.ControlRateCost() + vp.ControlRateCost(1.0, BEFORE)),
+            "ControlRateCost terms of one cost must have the same control before",
+        ),
+        (lambda: linear().at(before=BEFORE), "before is the control that a ControlRateCost begins with"),
+        (lambda: linear(vp.ControlRateCost()).at(before=np.zeros(3)), r"before must have shape \(2,\), got \(3,\)"),
+        (
+            lambda: vp.LinearPolicy(np.zeros((3, 2)), np.zeros((3, 2, 4)), np.zeros((3, 4)), previous_gains=np.eye(2)),
+            r"previous_gains must have shape \(3, 2, 2\), got \(2, 2\)",
+        ),
+        (
+            lambda: vp.LinearPolicy(np.zeros((3, 2)), np.zeros((3, 2, 4)), np.zeros((3, 4)), previous=np.zeros((3, 2))),
+            "previous is what previous_gains expect: give them too",
+        ),
+        (
+            lambda: vp.LinearPolicy(np.zeros((3, 2)), np.zeros((3, 2, 4)), np.zeros((3, 4)), before=[0.0]),
+            r"before must have shape \(2,\), got \(1,\)",
+        ),
+        (lambda: random_policy(vp.Scene(sliders(2)), 4).control(4, np.zeros(4)), "interval must be from 0 to 3, got 4"),
+    ],
+)
+def test_mistakes_are_named(make, words):
+    with pytest.raises(vp.InputError, match=words):
+        make()
