@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import count, positive
+from varpin.checks import count, positive, real
 from varpin.errors import InputError
 from varpin.integrators import Integrator, RungeKutta4
 from varpin.integrators.base import Failure
@@ -66,6 +66,29 @@ class MpcRun:
     late: NDArray[np.bool_]
     period: float
     budget: float
+
+    def planned(self, ahead: float | None = None) -> Floats:
+        """Where the plans mean to be some time later: configurations (K + 1, n) [rad or m].
+
+        Row k is what the plan that acts in tick k has for ``ahead`` seconds after the tick's beginning, the last row
+        what the last plan has so long after the run's end.
+
+        Args:
+            ahead: [s]; the horizon if left out. Beyond its horizon a plan is taken to stay at its end.
+
+        Raises:
+            InputError: ``ahead`` is negative or not finite.
+        """
+        later = self.plans[0].problem.duration if ahead is None else real("ahead", ahead)
+        if not 0.0 <= later < np.inf:
+            raise InputError(f"ahead must be >= 0 [s], got {ahead!r}")
+        begin = self.plans[0].problem.t0
+        rows = []
+        for tick, plan in enumerate([*self.plans, self.plans[-1]]):
+            motion = plan.trajectory
+            since = begin + tick * self.period + later - plan.problem.t0
+            rows.append([np.interp(since, motion.t - motion.t[0], column) for column in motion.q.T])
+        return np.array(rows)
 
     @property
     def misses(self) -> int:
