@@ -384,7 +384,7 @@ def test_a_notebook_shows_the_page_in_a_frame(browser, finger, motion, tmp_path)
     browser.switch_to.frame(frame)
     wait_until(lambda: browser.execute_script("return document.documentElement.dataset.loaded"))
     assert browser.execute_script("return document.title") == "finger - varpin"
-    assert browser.execute_script("return Object.keys(viewer.scene_tree.find(['meshcat']).children)") == ["robot"]
+    assert browser.execute_script("return 'robot' in viewer.scene_tree.find(['meshcat']).children")
     browser.switch_to.default_content()
     assert [text.text for text in browser.find_elements("tag name", "p")] == ["above", "below"]
 
