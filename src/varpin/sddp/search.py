@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.backward import Plan, backward, noise_cost
 from varpin.checks import as_floats, count, finite_array, fraction, is_one_of, positive, real
 from varpin.costs import CostError
 from varpin.errors import InputError, LinearizationError
@@ -19,9 +18,11 @@ from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
 from varpin.noise import NoiseFieldError
 from varpin.policy import LinearPolicy
-from varpin.problem import OptimalControlProblem
+from varpin.sddp.backward import Plan, backward, noise_cost
+from varpin.sddp.history import Iteration, SearchState, Status
+from varpin.sddp.problem import OptimalControlProblem
+from varpin.sddp.solution import Solution
 from varpin.simulation import StepFailure, rollout
-from varpin.solution import Iteration, SearchState, Solution, Status
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
