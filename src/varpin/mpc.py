@@ -13,6 +13,7 @@ from varpin.checks import count, positive, real
 from varpin.errors import InputError
 from varpin.integrators import Integrator, RungeKutta4
 from varpin.integrators.base import Failure
+from varpin.markup import facts
 from varpin.scene import Scene, require_scene
 from varpin.sddp import OptimalControlProblem, Solution, solve
 from varpin.simulation import Interrupted, StepFailure, simulate
@@ -93,6 +94,22 @@ class MpcRun:
         """How many plans came late."""
         return int(self.late.sum())
 
+    def __repr__(self) -> str:
+        return f"MpcRun({self})"
+
+    def _repr_html_(self) -> str:
+        milliseconds = 1e3 * self.seconds
+        within = "any time" if self.budget == np.inf else f"{1e3 * self.budget:.3g} ms; {self.misses} later"
+        rows = [
+            ("ticks", f"{len(self.plans)} of {1e3 * self.period:.3g} ms"),
+            ("planning [ms]", f"{milliseconds.mean():.2f} in the mean, {np.quantile(milliseconds, 0.95):.2f} in 95%, "
+                              f"{milliseconds.max():.2f} at most"),
+            ("budget", within),
+            ("iterations", f"{self.iterations.mean():.2f} a tick"),
+            ("plant", self.motion),
+        ]  # fmt: skip
+        return facts(f"Run of a controller of {self.motion.robot}", rows)
+
     def __str__(self) -> str:
         milliseconds = 1e3 * self.seconds
         within = "" if self.budget == np.inf else f"; {self.misses} later than {1e3 * self.budget:.3g} ms"
@@ -137,6 +154,14 @@ class Mpc:
         positive("tolerance", self.tolerance, "1")
         if self.budget != np.inf:
             positive("budget", self.budget, "s")
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ("period", f"{1e3 * self.period:.3g} ms"),
+            ("iterations", f"{self.iterations} a tick, {self.first_iterations} in the first"),
+            ("budget", "any time" if self.budget == np.inf else f"{1e3 * self.budget:.3g} ms"),
+        ]
+        return facts("Model predictive control", rows, self.problem._repr_html_())
 
     @property
     def period(self) -> float:

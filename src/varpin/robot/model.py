@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import as_floats, is_one_of, require_finite
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint
 from varpin.kernels.tree import Tree
+from varpin.markup import facts, listed, table
 from varpin.robot.mimic import Tie, joint_index, rebuild, tied_model
 from varpin.robot.payload import Payload, carry
 from varpin.robot.sources import Description, describe, hang_shapes
@@ -62,6 +63,21 @@ class Robot:
     def __repr__(self) -> str:
         held = f", {len(self.locked)} locked" if self.locked else ""
         return f"Robot({self.name}: {', '.join(self.joint_names)}{held})"
+
+    def _repr_html_(self) -> str:
+        lower, upper = self.position_limits
+        columns = zip(self.joint_names, lower, upper, self.velocity_limit, self.effort_limit, strict=True)
+        rows: list[tuple[str, object]] = [
+            ("joints that move", self.dof),
+            ("mass that moves [kg]", float(self.tree.mass.sum())),
+        ]
+        if self.locked:
+            rows.append(("locked", listed(self.locked)))
+        if self.ties:
+            rows.append(("tied to others", listed(self.free_model.names[tie.follower] for tie in self.ties)))
+        rows.append(("end effector", self.end_effector))
+        head = ("joint", "lower [rad or m]", "upper", "velocity [1/s]", "torque [N m or N]")
+        return facts(f"Robot {self.name}", rows, table(head, [(name, *map(float, row)) for name, *row in columns]))
 
     @property
     def dof(self) -> int:

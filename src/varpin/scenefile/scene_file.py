@@ -13,6 +13,7 @@ import numpy as np
 
 from varpin.costs import CostError
 from varpin.errors import InputError
+from varpin.markup import facts
 from varpin.policy import LinearPolicy
 from varpin.robot import Robot
 from varpin.scene import Scene
@@ -50,6 +51,15 @@ class SceneFile:
 
     def __repr__(self) -> str:
         return f"SceneFile({self.spec.name}: {self.spec.title})"
+
+    def _repr_html_(self) -> str:
+        spec = self.spec
+        rows = [
+            ("file", spec.path.name),
+            ("robot", self.robot),
+            ("horizon", f"{spec.steps} steps of {spec.dt:g} s, {spec.integrator}"),
+        ]
+        return facts(spec.title, rows, self.required._repr_html_())
 
     @property
     def robot(self) -> Robot:
