@@ -14,7 +14,7 @@ _LEFT, _RIGHT = "text-align: left; vertical-align: top", "text-align: right; ver
 def facts(title: str, rows: Iterable[tuple[str, object]], *parts: str) -> str:
     """What an object is, a row each of a name and some text, and parts that are markup already below it."""
     body = "".join(
-        f'<tr><th style="{_LEFT}">{_text(name)}</th><td style="{_LEFT}">{_text(value)}</td></tr>'
+        f'<tr><th style="{_LEFT}; white-space: nowrap">{_text(name)}</th><td style="{_LEFT}">{_text(value)}</td></tr>'
         for name, value in rows
     )
     return f'<div class="varpin"><b>{_text(title)}</b><table>{body}</table>{"".join(parts)}</div>'
