@@ -230,6 +230,7 @@ class _Search:
         self.exact = second_order
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
+        self.planned: tuple[Trajectory, float, bool] | None = None  # what it is a plan for, and how it was made
         self.trajectory: Trajectory
         self.cost = self.first = np.inf
         self.reached = np.inf  # the expected cost of the last step taken, by the plan it was taken with
@@ -374,6 +375,7 @@ class _Search:
             passes += 1
             self.plan = backward(self.problem, self.trajectory, self.regularization, self.exact)
             if self.plan is not None:
+                self.planned = self.trajectory, self.regularization, self.exact
                 return passes
             if self.exact:
                 self.exact = False
@@ -428,6 +430,8 @@ class _Search:
         return moved if failure is None else None
 
     def _last_plan(self) -> Plan | None:
+        if self.plan is not None and self.planned == (self.trajectory, 0.0, self.second_order):
+            return self.plan
         try:
             return self._least_regularized()[0]
         except _LOST:
