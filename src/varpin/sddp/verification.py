@@ -66,7 +66,10 @@ class Verification:
         ]
         shown = [row if np.isfinite(row[1]) else (row[0], "runs away", "", "") for row in rows]
         head = ("", "cost", "loss", "end off by [rad or m]")
-        said = [("how to read it", str(self).splitlines()[-1].removeprefix("read it so: ")), ("a step is off by", f"{self.defect:.2e} rad or m")]
+        said = [
+            ("how to read it", str(self).splitlines()[-1].removeprefix("read it so: ")),
+            ("a step is off by", f"{self.defect:.2e} rad or m"),
+        ]
         return facts("Verification on the continuous system", said, table(head, shown))
 
     def __str__(self) -> str:
