@@ -72,14 +72,14 @@ def paths(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
     """Noisy paths under the plan's feedback."""
     problem, parts = plan.problem, figure.subplots(scene.robot.dof, 1, sharex=True)
     ensemble = vp.simulate_ensemble(
-        problem.scene, problem.q0, problem.v0, dt=problem.dt, steps=problem.steps, paths=20, rng=0, controls=plan.policy
+        problem.scene, problem.q0, problem.v0, dt=problem.dt, steps=problem.steps, paths=8, rng=0, controls=plan.policy
     )
     assert ensemble.q is not None
     for k, (axes, name) in enumerate(zip(parts, scene.robot.joint_names, strict=True)):
-        axes.plot(ensemble.t, 1e3 * (ensemble.q[:, :, k] - plan.trajectory.q[:, k]).T, linewidth=0.3)
+        axes.plot(ensemble.t, 1e3 * (ensemble.q[:, :, k] - plan.trajectory.q[:, k]).T, linewidth=0.3, color=f"C{k}")
         axes.set_ylabel(f"{name} [mrad]")
         axes.grid(color="0.92")
-    parts[0].set_title("20 noisy paths with feedback: how far they are from the plan", fontsize=10)
+    parts[0].set_title("8 noisy paths with feedback: how far they are from the plan", fontsize=10)
     parts[-1].set_xlabel("time [s]")
 
 
