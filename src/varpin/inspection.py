@@ -435,7 +435,12 @@ def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | Non
         if names:
             yield f"no {what} limit, or one of 0: {', '.join(map(repr, names))}"
     for joint in bounded:
-        if joint.lower >= joint.upper:
+        if joint.lower == joint.upper == 0.0:
+            yield (
+                f"joint {joint.name!r} has limits 0 and 0, as if none were given: they are taken for none; "
+                "lock a joint that is not to move"
+            )
+        elif joint.lower >= joint.upper:
             yield f"joint {joint.name!r} has no room to move: limits {joint.lower:g} and {joint.upper:g} {joint.unit}"
     if q is not None:
         for name, at, low, high in zip(robot.joint_names, q, *robot.position_limits, strict=True):

@@ -149,7 +149,10 @@ class Robot:
 
     @property
     def position_limits(self) -> tuple[Floats, Floats]:
-        """Lower and upper bounds (n,), (n,) [rad or m]; infinite where there are none."""
+        """Lower and upper bounds (n,), (n,) [rad or m]; infinite where there are none.
+
+        Where both are 0, which is how a URDF has it that gives none, there are none; to hold a joint still, lock it.
+        """
         lower, upper = np.full(self.dof, -np.inf), np.full(self.dof, np.inf)
         index = joint_index(self.model)
         for c, name in enumerate(self.joint_names):
@@ -159,14 +162,16 @@ class Robot:
                     self.model.lowerPositionLimit[joint.idx_q],
                     self.model.upperPositionLimit[joint.idx_q],
                 )
-        # Pinocchio writes the absence of a limit as the largest double.
-        lower[lower <= -1e300], upper[upper >= 1e300] = -np.inf, np.inf
+        # Pinocchio writes the absence of a limit as the largest double, a URDF as 0 and 0.
+        none = (lower == 0.0) & (upper == 0.0)
+        lower[none | (lower <= -1e300)], upper[none | (upper >= 1e300)] = -np.inf, np.inf
         return lower, upper
 
     @property
     def velocity_limit(self) -> Floats:
-        """Bound (n,) [rad/s or m/s]; infinite where there is none."""
-        return self._limit("velocityLimit")
+        """Bound (n,) [rad/s or m/s]; infinite where there is none, or one of 0."""
+        limit = self._limit("velocityLimit")
+        return np.where(limit == 0.0, np.inf, limit)
 
     @property
     def effort_limit(self) -> Floats:
