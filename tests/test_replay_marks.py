@@ -185,6 +185,19 @@ def test_a_controllers_run_shows_its_plans(browser, run, tmp_path):
             np.testing.assert_allclose(figure[max(figure)][:3, 3], moved, atol=1e-5)
 
 
+def test_a_run_may_have_another_ghost(run, tmp_path):
+    robot = run.plans[0].problem.scene.robot
+    page = replay(robot, run, html=tmp_path / "other.html", trace=True, ghost=np.array([[0.0, 1.0], [0.5, 0.5]]))
+    paths = [command["path"] for command in commands(page) if command["type"] == "set_object"]
+    assert {path.split("/")[4] for path in paths if "/traces/" in path} == {
+        f"0 motion {robot.end_effector}",
+        f"1 ghost {robot.end_effector}",
+    }
+    tracks, _ = animation(page)
+    (elbow,) = [path for path, _ in tracks if path.startswith("/meshcat/ghost/") and path.endswith("joint2/moving")]
+    assert tracks[elbow, ".rotation[z]"][1][-1] == pytest.approx(0.5)
+
+
 def test_plans_are_not_shown_where_nobody_wants_them(browser, run, tmp_path):
     robot = run.plans[0].problem.scene.robot
     visit(browser, replay(robot, run, html=tmp_path / "bare.html", trace=True, ahead=0))

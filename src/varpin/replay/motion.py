@@ -151,7 +151,8 @@ def replay(
     if ahead is not None and not any(runs):
         raise InputError("ahead is of the plans of an MpcRun; the motion is none")
     ghosts: list[tuple[Floats, Floats] | None] = []
-    for arm, run, look, given in zip(arms, runs, looks, _each("ghost", ghost, len(pairs)), strict=True):
+    beside = _each("ghost", ghost, len(pairs))
+    for arm, run, look, given in zip(arms, runs, looks, beside, strict=True):
         if given is not None:
             ghosts.append(_ghost(arm, given, end))
         elif run is not None and look > 0.0:
@@ -165,8 +166,8 @@ def replay(
     step = None if offset is None else finite_array("offset", offset, (3,))
 
     moving = [t for t, _, _ in tracks.values() if len(t) > 1]
-    beside = [second[0] for second in ghosts if second is not None]
-    times = _times([t for t, _ in motions], beside + moving, end, fps / speed, max_frames)
+    followed = [second[0] for second in ghosts if second is not None]
+    times = _times([t for t, _ in motions], followed + moving, end, fps / speed, max_frames)
     clock = times if growing else None
     actors = []
     for k, (arm, (t, q)) in enumerate(zip(arms, motions, strict=True)):
@@ -177,7 +178,8 @@ def replay(
         run = runs[k]
         if run is not None and looks[k] > 0.0:
             plans = outlooks(arm, traced[k], run, looks[k], np.minimum(times, t[-1]))
-        elif second is not None:
+        # A ghost that jumps from plan to plan leaves no trace.
+        if second is not None and beside[k] is not None:
             lines += traces("ghost", arm, traced[k], *second, end, clock)
         efforts = _efforts(arm, shares[k], t[-1], times)
         actors.append(Actor(arm, positions, tuple(lines), tuple(plans), triads[k], efforts))
