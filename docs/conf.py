@@ -10,6 +10,8 @@ release = version = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "sphinx_copybutton"]
 html_theme = "furo"
 html_title = f"varpin {version}"
+html_static_path = ["_static"]
+html_css_files = ["varpin.css"]
 exclude_patterns = ["build"]
 
 napoleon_numpy_docstring = False

@@ -1,4 +1,4 @@
-"""Pictures of replays: the finger beside its joint angles, and a reach with all that can be marked.
+"""Pictures of replays (a finger, a reach with all that can be marked, a run of a controller) and of a notebook.
 
 Needs Chromium and chromedriver (and ``pip install "varpin[test]"`` for selenium).
 
@@ -6,6 +6,7 @@ Needs Chromium and chromedriver (and ``pip install "varpin[test]"`` for selenium
 """
 
 import io
+import shutil
 import tempfile
 import time
 from pathlib import Path
@@ -14,16 +15,19 @@ import matplotlib.image
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 from selenium import webdriver
+from selenium.webdriver.chrome.service import Service
 
 import varpin as vp
 from varpin import plots
+from varpin.replay.video import film_frames
 
 IMAGES = Path(__file__).resolve().parent / "images"
 
 
-def screenshot(page: Path, seconds: float, size: tuple[int, int] = (800, 640), at: float = 0.0) -> bytes:
-    """A PNG of a replay some seconds after it has been opened, stopped at a time [s]."""
+def screenshot(page: Path, seconds: float, size: tuple[int, int] = (800, 640), at: float | None = 0.0) -> bytes:
+    """A PNG of a page some seconds after it has been opened; of a replay, stopped at a time [s]."""
     options = webdriver.ChromeOptions()
     for flag in ("--headless", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"):
         options.add_argument(flag)
@@ -31,13 +35,14 @@ def screenshot(page: Path, seconds: float, size: tuple[int, int] = (800, 640), a
     options.add_argument(f"--window-size={size[0]},{size[1]}")
     with tempfile.TemporaryDirectory() as profile:
         options.add_argument(f"--user-data-dir={profile}")
-        browser = webdriver.Chrome(options=options)
+        browser = webdriver.Chrome(options=options, service=Service(shutil.which("chromedriver")))
         try:
             browser.get(page.as_uri())
             time.sleep(seconds)
-            browser.execute_script("document.querySelectorAll('.dg').forEach(e => e.remove())")
-            browser.execute_script("viewer.animator.pause(); viewer.animator.seek(arguments[0])", at)
-            time.sleep(1.0)
+            if at is not None:
+                browser.execute_script("document.querySelectorAll('.dg').forEach(e => e.remove())")
+                browser.execute_script("viewer.animator.pause(); viewer.animator.seek(arguments[0])", at)
+                time.sleep(1.0)
             return browser.get_screenshot_as_png()
         finally:
             browser.quit()
@@ -71,6 +76,48 @@ def reach(folder: Path) -> bytes:
     return screenshot(page, 5.0, at=0.25)
 
 
+_NOTEBOOK = """<!DOCTYPE html><meta charset="utf-8"><style>
+body { font: 13px Helvetica, Arial, sans-serif; margin: 12px 20px; }
+table { border-collapse: collapse; font-size: 12px; }
+td, th { padding: 3px 8px; } tr:nth-child(even) { background: #f5f5f5; } .varpin { margin-bottom: 14px; }
+</style>"""
+
+
+def notebook(folder: Path) -> Image.Image:
+    """A plan and its motion as a notebook shows them."""
+    plan = vp.load_scene("ur5_reach").solve()
+    page = folder / "notebook.html"
+    page.write_text(_NOTEBOOK + plan._repr_html_() + plan.trajectory._repr_html_(), encoding="utf-8")
+    return Image.open(io.BytesIO(screenshot(page, 1.0, (760, 640), at=None)))
+
+
+def controller(folder: Path) -> Image.Image:
+    """A UR5 that follows a moving target, replanning: its trace so far, and where its plan means to go."""
+    robot = vp.load_robot("ur5")
+    scene = vp.Scene(robot, damping=0.05)
+    begin = np.array([0.0, -1.5, 1.2, -1.2, -1.5, 0.0])  # [rad]
+
+    def target(t: float) -> list[float]:
+        return [0.45 + 0.1 * np.sin(2.0 * t), 0.15 + 0.15 * np.cos(1.3 * t), 0.4 + 0.1 * np.sin(1.7 * t)]
+
+    hold = -vp.lagrangian_jet(scene, begin, np.zeros(6)).Lq
+    cost = vp.FramePositionCost(robot, "tool0", target, 1e3) + vp.VelocityCost(0.05) + vp.ControlCost(1e-4, hold)
+    problem = vp.OptimalControlProblem(scene, cost, begin, np.zeros(6), dt=1e-2, steps=50)
+    run = vp.Mpc(problem, iterations=1).run(duration=3.0)
+    marks = {"targets": {"target": [target(t) for t in np.linspace(0.0, 3.0, 150)]}, "trace": "tool0"}
+    page = vp.replay(robot, run, html=folder / "controller.html", growing=True, **marks)
+    (picture,) = film_frames(page, np.array([1.5]), (640, 480))
+    return Image.fromarray(picture)
+
+
+def small(image: Image.Image) -> bytes:
+    """A PNG with 256 colours."""
+    image, stream = image.convert("RGB"), io.BytesIO()
+    palette = image.quantize(256, Image.Quantize.MAXCOVERAGE)
+    image.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(stream, "png", optimize=True)
+    return stream.getvalue()
+
+
 def main() -> None:
     """Draw them."""
     finger = vp.load_robot("finger")
@@ -81,6 +128,8 @@ def main() -> None:
         page = vp.replay(finger, motion.q[:1], dt=1.0, html=Path(folder) / "finger.html")
         picture = matplotlib.image.imread(io.BytesIO(screenshot(page, 3.0)))
         (IMAGES / "replay.png").write_bytes(reach(Path(folder)))
+        (IMAGES / "notebook.png").write_bytes(small(notebook(Path(folder))))
+        (IMAGES / "controller.png").write_bytes(small(controller(Path(folder))))
     figure = Figure(figsize=(11, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.imshow(picture)

@@ -41,13 +41,9 @@ for name, integrator in (("midpoint", vp.Midpoint()), ("explicit Euler", vp.Expl
     print(f"{name}: {run}")
     print(f"    off the target by {1e3 * np.sqrt((settled**2).mean()):.2f} mm (rms after 1 s)")
 
-motion = runs["midpoint"].motion
-print(
-    vp.replay(
-        robot,
-        motion,
-        html=out / "mpc_moving_target.html",
-        trace="tool0",
-        targets={"target": [target(t) for t in np.linspace(0.0, 4.0, 200)]},
-    )
-)
+# The arm, where its plan means to be in half a second as a ghost, and the way there as beads.
+goal = {"target": [target(t) for t in np.linspace(0.0, 4.0, 200)]}
+marks = {"trace": "tool0", "growing": True, "targets": goal}
+print(vp.replay(robot, runs["midpoint"], html=out / "mpc_moving_target.html", **marks))
+both = [(robot, run) for run in runs.values()]
+print(vp.replay(both, html=out / "mpc_integrators.html", ahead=0.1, **marks))

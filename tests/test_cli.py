@@ -10,6 +10,7 @@ import time
 
 import numpy as np
 import pytest
+from chromium import commands
 from rich.console import Console
 
 import varpin as vp
@@ -625,6 +626,14 @@ def test_scene_is_solved_saved_and_resumed(scene, tmp_path, capsys):
     whole, resumed = file.solve(), file.load_solution("kept.npz")
     np.testing.assert_array_equal(whole.controls, resumed.controls)
     assert (tmp_path / "plan.html").is_file()
+
+
+def test_a_scenes_replay_shows_its_task(scene, tmp_path):
+    assert main(["solve", scene, "--html", "motion.html", "--trace", "pip", "--quiet"]) == 0
+    paths = [command["path"] for command in commands(tmp_path / "motion.html") if command["type"] == "set_object"]
+    assert any(path.startswith("/meshcat/ghost/") for path in paths)
+    traces = {path.split("/")[4] for path in paths if "/traces/" in path}
+    assert traces == {"0 motion pip"}  # and the ghost's joints stay
 
 
 def test_scene_is_inspected(scene, capsys):

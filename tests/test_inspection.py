@@ -147,7 +147,11 @@ def test_limits_that_are_missing_or_leave_no_room(tmp_path):
     bare = inspect_robot(write_arm(tmp_path, ROD, ROD, joint='<limit lower="0" upper="0" effort="0" velocity="0"/>'))
     assert "no velocity limit, or one of 0: 'joint1', 'joint2'" in bare.warnings
     assert "no effort limit, or one of 0: 'joint1', 'joint2'" in bare.warnings
-    assert "joint 'joint1' has no room to move: limits 0 and 0 rad" in bare.warnings
+    assert any("joint 'joint1' has limits 0 and 0, as if none were given" in warning for warning in bare.warnings)
+    tight = inspect_robot(
+        write_arm(tmp_path, ROD, ROD, joint='<limit lower="0.2" upper="0.2" effort="1" velocity="1"/>')
+    )
+    assert "joint 'joint1' has no room to move: limits 0.2 and 0.2 rad" in tight.warnings
     chain = inspect_robot(vp.planar_chain(2))
     assert "no position limit, or one of 0: 'joint1', 'joint2'" in chain.warnings
 

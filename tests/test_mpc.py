@@ -56,6 +56,25 @@ def test_without_surprises_the_plan_of_one_tick_is_that_of_the_next():
     np.testing.assert_allclose(rest.trajectory.u, whole.trajectory.u[5:], rtol=0, atol=1e-6)
 
 
+def test_what_is_planned_begins_where_the_plant_is():
+    run = vp.Mpc(tracking(t0=0.7)).run(vp.Plant(tracking().scene, substeps=4), duration=0.2)
+    assert len(run.plans) == 10
+    ticks = run.motion.q[::4]
+    np.testing.assert_allclose(run.planned(0.0)[:-1], ticks[:-1], rtol=0, atol=1e-12)
+    for k, plan in enumerate(run.plans):
+        np.testing.assert_allclose(run.planned(0.1)[k], plan.trajectory.q[5], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(run.planned()[k], plan.trajectory.q[-1], rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(run.planned(9.0)[k], plan.trajectory.q[-1])
+    np.testing.assert_allclose(run.planned(0.1)[-1], run.plans[-1].trajectory.q[6], rtol=0, atol=1e-12)
+
+
+def test_a_plan_that_acts_on_is_looked_at_later():
+    """Every plan but the first is late, so the first acts in every tick."""
+    run = vp.Mpc(tracking(), budget=1e-9).run(duration=0.2)
+    assert run.late[1:].all()
+    np.testing.assert_allclose(run.planned(0.0), run.plans[0].trajectory.q[:11], rtol=0, atol=1e-12)
+
+
 def test_references_are_those_of_the_plants_time():
     problem = tracking()
     moved = problem.at(t0=0.5)
@@ -165,6 +184,8 @@ def test_mistakes_are_named():
         (lambda: vp.Mpc(problem, iterations=0), "iterations must be"),
         (lambda: vp.Mpc(problem, budget=-1.0), "budget must be positive"),
         (lambda: vp.Mpc(problem).run(other, duration=1.0), "the plant has joints"),
+        (lambda: vp.Mpc(problem).run(duration=0.04).planned(-0.1), "ahead must be >= 0"),
+        (lambda: vp.Mpc(problem).run(duration=0.04).planned(np.nan), "ahead must be >= 0"),
         (lambda: vp.Mpc(problem).run(duration=0.0), "duration must be positive"),
         (lambda: vp.Mpc(problem).plan(0.0, [0.0], np.zeros(3)), "q0 must have shape"),
         (lambda: vp.Plant(problem.scene, "rk"), "integrator must be one of varpin's"),

@@ -373,6 +373,22 @@ def test_live_window(browser, finger, motion, monkeypatch, capfd):
         viewer.window.server_proc.wait()
 
 
+def test_a_notebook_shows_the_page_in_a_frame(browser, finger, motion, tmp_path):
+    shown = replay(finger, motion, inline=True, size=(600, 400))
+    assert repr(shown) == f"Inline(replay of finger, {len(shown.html) / 1e6:.1f} MB)"
+    page = tmp_path / "notebook.html"
+    page.write_text(f"<!DOCTYPE html><title>notebook</title><p>above</p>{shown._repr_html_()}<p>below</p>")
+    browser.get(page.as_uri())
+    frame = browser.find_element("tag name", "iframe")
+    assert frame.size == {"width": 600, "height": 400}
+    browser.switch_to.frame(frame)
+    wait_until(lambda: browser.execute_script("return document.documentElement.dataset.loaded"))
+    assert browser.execute_script("return document.title") == "finger - varpin"
+    assert browser.execute_script("return 'robot' in viewer.scene_tree.find(['meshcat']).children")
+    browser.switch_to.default_content()
+    assert [text.text for text in browser.find_elements("tag name", "p")] == ["above", "below"]
+
+
 def test_says_where_to_look_when_no_browser_opens(finger, motion, monkeypatch, caplog):
     monkeypatch.setattr(viewer_module.webbrowser, "open", lambda url, new=0: False)
     viewer = replay(finger, motion, open=True)

@@ -125,6 +125,89 @@ def test_a_trace_of_a_long_motion_stays_small_and_true(browser, ur5, tmp_path):
     assert farthest(points, placements(ur5, q, ur5.end_effector)[:, :3, 3]) < 1e-5
 
 
+def test_a_growing_trace_is_drawn_as_far_as_the_motion_has_come(browser, ur5, sweep, tmp_path):
+    # It rests from 0.5 s to 0.75 s, and its ghost goes the other way.
+    q = np.vstack([sweep[:11], np.repeat(sweep[10:11], 5, axis=0), sweep[11:]])
+    ghost = q[::-1]
+    page = replay(ur5, q, dt=0.05, ghost=ghost, html=tmp_path / "growing.html", trace=TIP, growing=True, fps=100.0)
+    visit(browser, page)
+    for name, rows in (("0 motion tool0", q), ("1 ghost tool0", ghost)):
+        points = along(browser, name)
+        lengths = []
+        for seconds in (0.0, 0.21, 0.52, 0.7, 0.93, 1.25):
+            seek(browser, seconds)
+            drawn = browser.execute_script(
+                "return viewer.scene_tree.find(['meshcat', 'notes', 'traces', arguments[0], '<object>'])"
+                ".object.geometry.drawRange.count",
+                name,
+            )
+            whole, part = divmod(drawn / 36.0, 1.0)
+            end = points[int(whole)]
+            if part > 1e-9:
+                end = (1.0 - part) * end + part * points[int(whole) + 1]
+            now = [np.interp(seconds, 0.05 * np.arange(len(q)), column) for column in rows.T]
+            np.testing.assert_allclose(end, placements(ur5, now, TIP)[0, :3, 3], atol=2e-3)
+            lengths.append(drawn)
+        assert lengths[0] == 0.0
+        assert lengths[-1] == pytest.approx(36.0 * (len(points) - 1))
+    assert_no_errors(browser)
+
+
+@pytest.fixture(scope="module")
+def run():
+    """A controller at work: six ticks of 0.02 s, looking 0.4 s ahead."""
+    robot = vp.planar_chain(2)
+    cost = vp.TrackingCost(lambda t: [np.sin(3.0 * t), np.cos(5.0 * t)], 1e3) + vp.ControlCost(1e-4)
+    problem = vp.OptimalControlProblem(vp.Scene(robot), cost, [0.0, 1.0], [0.0, 0.0], dt=0.02, steps=20, t0=0.3)
+    return vp.Mpc(problem).run(duration=0.12)
+
+
+def test_a_controllers_run_shows_its_plans(browser, run, tmp_path):
+    robot = run.plans[0].problem.scene.robot
+    tip = robot.end_effector
+    visit(browser, replay(robot, run, html=tmp_path / "run.html", trace=True, ahead=0.24, fps=1000.0))
+    assert_no_errors(browser)
+    assert names(browser, ["notes", "traces"]) == [f"0 motion {tip}"]
+    root, beads = ["notes", "plans", f"0 {tip}"], 12
+    assert len(names(browser, root)) == beads
+    for tick in (0, 1, 5):
+        seek(browser, tick * 0.02)
+        plan = run.plans[tick].trajectory
+        # 0.02 s from one bead to the next, as the plan's nodes are.
+        for k in range(beads):
+            place = placements(robot, plan.q[k + 1], tip)[0, :3, 3]
+            np.testing.assert_allclose(pose(browser, [*root, str(k)])[:3, 3], place, atol=1e-5)
+        now, then = shape_poses(browser, "robot"), shape_poses(browser, "ghost")
+        for figure, q in ((now, plan.q[0]), (then, plan.q[12])):
+            # The last shape is at the last link's centre of mass.
+            expected = placements(robot, q, robot.model.names[2])[0]
+            moved = robot.model.inertias[2].lever @ expected[:3, :3].T + expected[:3, 3]
+            np.testing.assert_allclose(figure[max(figure)][:3, 3], moved, atol=1e-5)
+
+
+def test_a_run_may_have_another_ghost(run, tmp_path):
+    robot = run.plans[0].problem.scene.robot
+    page = replay(robot, run, html=tmp_path / "other.html", trace=True, ghost=np.array([[0.0, 1.0], [0.5, 0.5]]))
+    paths = [command["path"] for command in commands(page) if command["type"] == "set_object"]
+    assert {path.split("/")[4] for path in paths if "/traces/" in path} == {
+        f"0 motion {robot.end_effector}",
+        f"1 ghost {robot.end_effector}",
+    }
+    tracks, _ = animation(page)
+    (elbow,) = [path for path, _ in tracks if path.startswith("/meshcat/ghost/") and path.endswith("joint2/moving")]
+    assert tracks[elbow, ".rotation[z]"][1][-1] == pytest.approx(0.5)
+
+
+def test_plans_are_not_shown_where_nobody_wants_them(browser, run, tmp_path):
+    robot = run.plans[0].problem.scene.robot
+    visit(browser, replay(robot, run, html=tmp_path / "bare.html", trace=True, ahead=0))
+    assert sorted(browser.execute_script("return Object.keys(viewer.scene_tree.find(['meshcat']).children)")) == [
+        "notes",
+        "robot",
+    ]
+    assert "plans" not in names(browser, ["notes"])
+
+
 def test_a_frame_that_stays_leaves_no_trace(browser, ur5, tmp_path):
     q = np.zeros((5, 6))
     q[:, -1] = np.linspace(0.0, 1.0, 5)
@@ -193,15 +276,16 @@ def test_targets_stand_or_move(browser, ur5, sweep, tmp_path):
     assert sorted(kinds["turns"]) == ["axes", "ball", "text of 256"]
 
 
-def link_colors(browser):
+def link_colors(browser, figure="robot"):
     return browser.execute_script(
         """
         const colors = {};
-        viewer.scene_tree.find(["meshcat", "robot"]).object.traverse(node => {
+        viewer.scene_tree.find(["meshcat", arguments[0]]).object.traverse(node => {
             if (node.isMesh && node.material.color && node.parent.parent.name == "shapes")
                 colors[node.parent.name.split(" ")[0]] = node.material.color.toArray();
         });
-        return colors;"""
+        return colors;""",
+        figure,
     )
 
 
@@ -278,6 +362,38 @@ def test_robots_side_by_side_keep_their_own_motions(browser, ur5, sweep, tmp_pat
     np.testing.assert_allclose(second[0], placements(ur5, sweep[-1], TIP)[0, :3, 3] + step, atol=1e-5)
 
 
+def test_each_of_several_robots_has_its_ghost_and_its_torques(browser, ur5, sweep, tmp_path):
+    finger = vp.load_robot("finger")
+    bend = np.linspace([0.0, 0.0, 0.0], [0.5, 0.6, 0.7], 21)
+    straight = np.array([[0.1, 0.2, 0.3]])
+    torques = np.tile([0.0, 1.0, 2.0], (20, 1))
+    step = np.array([0.0, 1.5, 0.0])
+    page = replay(
+        [(ur5, sweep), (finger, bend)],
+        dt=0.05,
+        ghost=[None, straight],
+        torques=[False, torques],
+        torque_limit=2.0,
+        offset=step,
+        html=tmp_path / "both.html",
+    )
+    visit(browser, page)
+    assert_no_errors(browser)
+    seek(browser, 0.5)
+    figures = browser.execute_script("return Object.keys(viewer.scene_tree.find(['meshcat']).children)")
+    assert {"robot", "robot 2", "ghost 2"} <= set(figures)
+    assert "ghost" not in figures
+    shapes, model = geometry(finger), finger.free_model
+    at, data = shapes.createData(), model.createData()
+    pin.updateGeometryPlacements(model, data, shapes, at, finger.free_positions(straight[0]))
+    for index, found in shape_poses(browser, "ghost 2").items():
+        np.testing.assert_allclose(found[:3, 3], at.oMg[index].translation + step, atol=2e-5)
+    colors = link_colors(browser, "robot 2")
+    for k, shape in enumerate(shapes.geometryObjects):
+        if shape.parentJoint:
+            np.testing.assert_allclose(colors[str(k)], [GREY, YELLOW, RED][shape.parentJoint - 1], atol=1e-5)
+
+
 def test_robots_beside_each_other_do_not_overlap(ur5, sweep, tmp_path):
     page = replay([(ur5, sweep), (ur5, sweep[::-1])], dt=0.05, html=tmp_path / "two.html")
     (move,) = [
@@ -346,6 +462,11 @@ def test_a_missing_mesh_costs_its_own_link_only(browser, tmp_path, caplog):
     assert len(places) == 4
 
 
+def test_refuses_a_look_behind(run, tmp_path):
+    robot = run.plans[0].problem.scene.robot
+    refused("ahead must be positive", robot, run, html=tmp_path / "page.html", ahead=-0.1)
+
+
 def refused(message, *arguments, **options):
     with pytest.raises(vp.InputError) as caught:
         replay(*arguments, **options)
@@ -376,7 +497,11 @@ def test_refuses_marks_it_cannot_show(ur5, sweep, tmp_path):
     no("offset must have shape (3,), got (2,)", offset=[1.0, 0.0])
     no("of several robots, give pairs", robot=[(ur5, sweep)])
     no("several robots must be pairs of a robot and its motion", robot=[ur5, ur5], motion=None)
-    no("a ghost, and torques that are not", robot=[(ur5, sweep), (ur5, sweep)], motion=None, ghost=sweep)
+    both = [(ur5, sweep), (ur5, sweep)]
+    no("ghost of several robots must be a list with one for each of the 2", robot=both, motion=None, ghost=sweep)
+    no("torques of several robots must be a list", robot=both, motion=None, torques=[np.ones((20, 6))])
+    no("torque_limit colours nothing without torques", robot=both, motion=None, torques=False, torque_limit=1.0)
+    no("ahead is of the plans of an MpcRun", ahead=0.1)
     no("motion 2 must have shape (N + 1, 6)", robot=[(ur5, sweep), (ur5, sweep[:, :3])], motion=None)
     no("give the robot's motion", motion=None)
     scene = vp.Scene(vp.planar_chain(2), actuation=["joint1"])

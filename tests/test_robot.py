@@ -535,6 +535,20 @@ class TestJoints:
             else:
                 assert (lower[c], upper[c]) == (float(entry.get("lower")), float(entry.get("upper")))
 
+    def test_limits_that_a_urdf_leaves_at_0_are_none(self, load):
+        robot = load("double_pendulum")
+        for entry in ET.parse(robot.urdf).getroot().findall("joint"):
+            if entry.get("name") in robot.joint_names:
+                assert {entry.find("limit").get(key) for key in ("lower", "upper", "velocity")} == {"0"}
+        lower, upper = robot.position_limits
+        assert (lower == -np.inf).all()
+        assert (upper == np.inf).all()
+        assert (robot.velocity_limit == np.inf).all()
+        held = robot.model.copy()
+        held.lowerPositionLimit[:], held.upperPositionLimit[:] = [0.0, 0.3], [0.5, 0.3]
+        lower, upper = vp.load_robot(held).position_limits
+        np.testing.assert_array_equal([lower, upper], [[0.0, 0.3], [0.5, 0.3]])
+
     def test_a_composite_of_one_joint_is_that_joint_unless_displaced(self):
         def of(placement: pin.SE3) -> pin.Model:
             model = pin.Model()

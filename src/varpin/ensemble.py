@@ -17,6 +17,7 @@ from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, rows
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
+from varpin.markup import facts, table
 from varpin.policy import LinearPolicy
 from varpin.scene import Scene, require_scene
 from varpin.simulation import commands_of
@@ -55,6 +56,10 @@ class EnsembleStatistics:
     energy_mean: Floats
     energy_deviation: Floats
     count: NDArray[np.int64]
+
+    def __repr__(self) -> str:
+        nodes, states = self.mean.shape
+        return f"EnsembleStatistics({nodes} nodes, {states // 2} joints, {len(self.levels)} quantiles)"
 
 
 @dataclass(frozen=True)
@@ -95,6 +100,23 @@ class Ensemble:
     u: Floats | None
     energy: Floats | None
     failures: tuple[PathFailure, ...]
+
+    def __repr__(self) -> str:
+        return f"Ensemble({self._size()})"
+
+    def _repr_html_(self) -> str:
+        own, half = self.statistics, self.statistics.mean.shape[1] // 2
+        deviation = np.sqrt(np.diagonal(own.covariance[-1]))
+        rows = [(j, float(own.mean[-1, j]), float(deviation[j])) for j in range(half)]
+        head = ("coordinate", "mean of q in the end [rad or m]", "standard deviation")
+        energy = f"{own.energy_mean[-1]:.4g} +- {own.energy_deviation[-1]:.2g} in the end"
+        return facts("Ensemble", [("of", self._size()), ("energy [J]", energy)], table(head, rows))
+
+    def _size(self) -> str:
+        counted = int(self.statistics.count[0])
+        kept = "" if self.q is not None else ", not stored"
+        lost = f", {len(self.failures)} stopped early" if self.failures else ""
+        return f"{counted} paths{kept} over {len(self.t) - 1} steps, {self.t[-1] - self.t[0]:g} s{lost}"
 
 
 class EnsembleInterrupted(KeyboardInterrupt):

@@ -16,6 +16,7 @@ from varpin.checks import broadcast_array
 from varpin.errors import InputError, RobotError, SingularMassMatrix
 from varpin.integrators import Midpoint, largest_step
 from varpin.lagrangian import lagrangian_jet
+from varpin.markup import facts, folded, table
 from varpin.robot import Robot, build_robot, check_inertia, read_root
 from varpin.robot.mimic import joint_index
 from varpin.robot.tree import is_unbounded, joint_axis
@@ -119,6 +120,32 @@ class RobotReport:
     largest_step: float | None
     branch_margin: float
     warnings: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        return (
+            f"RobotReport({self.robot.name}: {len(self.joints)} joints, {len(self.links)} links, "
+            f"{len(self.warnings)} warnings)"
+        )
+
+    def _repr_html_(self) -> str:
+        step = "undefined: M is singular" if self.largest_step is None else f"{self.largest_step:.3g} s"
+        rows: list[tuple[str, object]] = [
+            ("mass that moves [kg]", self.total_mass),
+            ("condition of M(q)", f"{self.condition:.3g}; {self.scaled_condition:.3g} with a unit diagonal"),
+            ("largest step the guard accepts", step),
+            *(("warning", warning) for warning in self.warnings),
+        ]
+        joints = [
+            (j.name, f"mimic: {j.follows}" if j.follows else j.kind, j.lower, j.upper, j.velocity, j.effort)
+            for j in self.joints
+        ]
+        links = [(x.name, x.joint or "the base", x.mass, "  ".join(f"{m:.3g}" for m in x.moments)) for x in self.links]
+        return facts(
+            f"Robot {self.robot.name}, looked into",
+            rows,
+            table(("joint", "kind", "lower [rad or m]", "upper", "velocity [1/s]", "effort [N m or N]"), joints),
+            folded("links", table(("link", "moved by", "mass [kg]", "principal moments [kg m^2]"), links)),
+        )
 
 
 def inspect_robot(
@@ -408,7 +435,12 @@ def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | Non
         if names:
             yield f"no {what} limit, or one of 0: {', '.join(map(repr, names))}"
     for joint in bounded:
-        if joint.lower >= joint.upper:
+        if joint.lower == joint.upper == 0.0:
+            yield (
+                f"joint {joint.name!r} has limits 0 and 0, as if none were given: they are taken for none; "
+                "lock a joint that is not to move"
+            )
+        elif joint.lower >= joint.upper:
             yield f"joint {joint.name!r} has no room to move: limits {joint.lower:g} and {joint.upper:g} {joint.unit}"
     if q is not None:
         for name, at, low, high in zip(robot.joint_names, q, *robot.position_limits, strict=True):

@@ -39,6 +39,9 @@ class LagrangianJet:
     Lvq: Floats
     Lvv: Floats
 
+    def __repr__(self) -> str:
+        return f"LagrangianJet({len(self.Lq)} joints, L = {self.L:.6g} J)"
+
 
 def lagrangian_jet(
     scene: Scene, q: ArrayLike, v: ArrayLike, *, backend: Literal["compiled", "pinocchio"] = "compiled"
@@ -153,6 +156,9 @@ class DiscreteLagrangian:
     D2D1: Floats
     D1D2: Floats
     D2D2: Floats
+
+    def __repr__(self) -> str:
+        return f"DiscreteLagrangian({len(self.D1)} joints, Ld = {self.Ld:.6g} J s)"
 
 
 def discrete_lagrangian(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from varpin.kernels._compile import announced_compilation
 from varpin.kernels.jet import jets
 from varpin.kernels.jet_tangent import momentum_curvatures, new_tangent
 from varpin.kernels.tree import new_sweep
+from varpin.markup import facts, table
 from varpin.noise import Fields
 from varpin.scene import Scene, require_scene
 from varpin.trajectory import Trajectory, require_motion
@@ -55,6 +57,21 @@ class Linearization:
     Gu: Floats
     dt: float
     variational: bool
+
+    def __repr__(self) -> str:
+        return f"Linearization({self._size()})"
+
+    def _repr_html_(self) -> str:
+        names = ("A", "B", "K", "J", "F", "G", "Gx", "Gu")
+        return facts("Linearization", [("of", self._size())], _sizes({name: getattr(self, name) for name in names}))
+
+    def _size(self) -> str:
+        states, controls = self.B.shape[1:]
+        x = "(q, p)" if self.variational else "(q, v)"
+        return (
+            f"{self.steps} steps of {self.dt:g} s, x = {x} of {states // 2} joints, {controls} controls, "
+            f"{self.F.shape[2]} noise processes"
+        )
 
     @property
     def steps(self) -> int:
@@ -156,6 +173,13 @@ class Curvature:
     xx: Floats
     ux: Floats
     uu: Floats
+
+    def __repr__(self) -> str:
+        steps, m, states = self.ux.shape
+        return f"Curvature({steps} steps, {states // 2} joints, {m} controls)"
+
+    def _repr_html_(self) -> str:
+        return facts("Curvature", [("steps", len(self.xx))], _sizes({"xx": self.xx, "ux": self.ux, "uu": self.uu}))
 
 
 def second_order(
@@ -358,6 +382,23 @@ class Moments:
 
     mean: Floats
     covariance: Floats
+
+    def __repr__(self) -> str:
+        nodes, states = self.mean.shape
+        return f"Moments({nodes} nodes, {states // 2} joints)"
+
+    def _repr_html_(self) -> str:
+        half = self.mean.shape[1] // 2
+        deviation = np.sqrt(np.diagonal(self.covariance[-1]))
+        rows = [(j, *(float(x) for x in (self.mean[-1, j], deviation[j]))) for j in range(half)]
+        head = ("coordinate", "mean of dq in the end [rad or m]", "standard deviation")
+        return facts("Moments", [("nodes", len(self.mean))], table(head, rows))
+
+
+def _sizes(arrays: Mapping[str, Floats]) -> str:
+    """Shapes and largest entries, as a notebook shows them."""
+    rows = [(name, str(array.shape), float(np.abs(array).max(initial=0.0))) for name, array in arrays.items()]
+    return table(("array", "shape", "largest entry"), rows)
 
 
 def propagate_moments(

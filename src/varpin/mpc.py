@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import count, positive
+from varpin.checks import count, positive, real
 from varpin.errors import InputError
 from varpin.integrators import Integrator, RungeKutta4
 from varpin.integrators.base import Failure
+from varpin.markup import facts
 from varpin.scene import Scene, require_scene
 from varpin.sddp import OptimalControlProblem, Solution, solve
 from varpin.simulation import Interrupted, StepFailure, simulate
@@ -65,10 +66,49 @@ class MpcRun:
     period: float
     budget: float
 
+    def planned(self, ahead: float | None = None) -> Floats:
+        """Where the plans mean to be some time later: configurations (K + 1, n) [rad or m].
+
+        Row k is what the plan that acts in tick k has for ``ahead`` seconds after the tick's beginning, the last row
+        what the last plan has so long after the run's end.
+
+        Args:
+            ahead: [s]; the horizon if left out. Beyond its horizon a plan is taken to stay at its end.
+
+        Raises:
+            InputError: ``ahead`` is negative or not finite.
+        """
+        later = self.plans[0].problem.duration if ahead is None else real("ahead", ahead)
+        if not 0.0 <= later < np.inf:
+            raise InputError(f"ahead must be >= 0 [s], got {ahead!r}")
+        begin = self.plans[0].problem.t0
+        rows = []
+        for tick, plan in enumerate([*self.plans, self.plans[-1]]):
+            motion = plan.trajectory
+            since = begin + tick * self.period + later - plan.problem.t0
+            rows.append([np.interp(since, motion.t - motion.t[0], column) for column in motion.q.T])
+        return np.array(rows)
+
     @property
     def misses(self) -> int:
         """How many plans came late."""
         return int(self.late.sum())
+
+    def __repr__(self) -> str:
+        return f"MpcRun({self})"
+
+    def _repr_html_(self) -> str:
+        milliseconds = 1e3 * self.seconds
+        within = "any time" if self.budget == np.inf else f"{1e3 * self.budget:.3g} ms; {self.misses} later"
+        rows = [
+            ("ticks", f"{len(self.plans)} of {1e3 * self.period:.3g} ms"),
+            ("planning [ms]", f"{milliseconds.mean():.2f} in the mean, {np.quantile(milliseconds, 0.95):.2f} in 95%, "
+                              f"{milliseconds.max():.2f} at most"),
+            ("budget", within),
+            ("iterations", f"{self.iterations.mean():.2f} a tick"),
+            ("plant", self.motion),
+        ]  # fmt: skip
+        return facts(f"Run of a controller of {self.motion.robot}", rows)
 
     def __str__(self) -> str:
         milliseconds = 1e3 * self.seconds
@@ -115,6 +155,14 @@ class Mpc:
         positive("tolerance", self.tolerance, "1")
         if self.budget != np.inf:
             positive("budget", self.budget, "s")
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ("period", f"{1e3 * self.period:.3g} ms"),
+            ("iterations", f"{self.iterations} a tick, {self.first_iterations} in the first"),
+            ("budget", "any time" if self.budget == np.inf else f"{1e3 * self.budget:.3g} ms"),
+        ]
+        return facts("Model predictive control", rows, self.problem._repr_html_())
 
     @property
     def period(self) -> float:

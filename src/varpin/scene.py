@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import as_floats, broadcast_array, finite_array
 from varpin.errors import InputError, RobotError
 from varpin.kernels.tree import Diffusion, Mechanism
+from varpin.markup import facts, listed
 from varpin.noise import BoundNoise, Noise, bind
 from varpin.robot import Robot, require_sound
 
@@ -97,6 +98,25 @@ class Scene:
         parts = [f"gravity {self.gravity.tolist()}" if self.gravity.any() else "no gravity"]
         parts += [name for name in ("damping", "stiffness") if getattr(self, name).any()]
         return f"Scene({self.robot.name}: {', '.join(parts)}, {self.controls} controls)"
+
+    def _repr_html_(self) -> str:
+        names, n = self.robot.joint_names, self.robot.dof
+
+        def of(values: Floats) -> str:
+            acting = [f"{name} {value:.4g}" for name, value in zip(names, values, strict=True) if value]
+            return f"{values[0]:.4g} on every joint" if len(acting) == n and np.ptp(values) == 0.0 else listed(acting)
+
+        pulls = "none" if not self.gravity.any() else ", ".join(f"{g:g}" for g in self.gravity)
+        driven = [name for name, row in zip(names, self.actuation, strict=True) if row.any()]
+        rows = [
+            ("joints", listed(names)),
+            ("gravity [m/s^2]", pulls),
+            ("damping [N m s/rad or N s/m]", of(self.damping)),
+            ("springs [N m/rad or N/m]", of(self.stiffness)),
+            ("driven", f"{listed(driven)} by {self.controls} controls" if driven else "none"),
+            ("noise", f"{self.processes} processes" if self.processes else "none"),
+        ]
+        return facts(f"Scene of {self.robot.name}", rows)
 
     @property
     def controls(self) -> int:

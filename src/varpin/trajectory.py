@@ -18,6 +18,7 @@ from varpin._version import __version__
 from varpin.archive import Check, Header, read_npz
 from varpin.checks import path_like, writable
 from varpin.errors import FileError, InputError
+from varpin.markup import facts, table
 from varpin.robot import MAX_JOINTS, Robot
 from varpin.scene import Scene
 
@@ -159,6 +160,27 @@ class Trajectory:
             f"Trajectory({self.robot}: {len(self.joint_names)} joints, {self.steps} steps of {self.dt:g} s, "
             f"{self.integrator}{flag})"
         )
+
+    def _repr_html_(self) -> str:
+        own = self.statistics
+        rows: list[tuple[str, object]] = [
+            ("steps", f"{self.steps} of {self.dt:g} s, {self.duration:g} s in all"),
+            ("integrator", self.integrator),
+            ("energy [J]", f"{self.energy[0]:.6g} at first, {self.energy[-1]:.6g} in the end"),
+            ("energy's largest change [J]", f"{np.abs(self.energy - self.energy[0]).max():.3g}"),
+        ]
+        if own.energy_defect.any():
+            rows.append(("of it, what no force accounts for [J]", f"{np.abs(own.energy_defect).max():.3g}"))
+        if own.newton_iterations.any():
+            rows.append(("Newton iterations", f"{own.newton_iterations.mean():.2f} a step"))
+        if own.split_steps:
+            rows.append(("split by the guards", f"{own.split_steps} steps"))
+        rows += [("warning", warning) for warning in self.warnings]
+        ends = zip(self.joint_names, self.q[0], self.q[-1], self.q.min(axis=0), self.q.max(axis=0), strict=True)
+        speeds = np.abs(self.v).max(axis=0)
+        joints = [(name, *map(float, row), float(speed)) for (name, *row), speed in zip(ends, speeds, strict=True)]
+        head = ("joint", "q at first [rad or m]", "in the end", "least", "most", "fastest [1/s]")
+        return facts(f"Trajectory of {self.robot}", rows, table(head, joints))
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the trajectory as a compressed npz file without pickle; returns its path.

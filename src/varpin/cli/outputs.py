@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -52,8 +52,15 @@ class Output:
     write: Callable[[Robot, Trajectory], None]
 
 
-def outputs_of(request: argparse.Namespace) -> list[Output]:
+Marks = Callable[[float], Mapping[str, Any]]
+
+
+def outputs_of(request: argparse.Namespace, marks: Marks | None = None) -> list[Output]:
     """The files asked for, in the order of their worth; what writes them is imported now and not after the run.
+
+    Args:
+        request: What was asked for.
+        marks: What a replay is to show of the task, for a motion of some duration [s].
 
     Raises:
         FileError: One of them cannot be written.
@@ -69,7 +76,8 @@ def outputs_of(request: argparse.Namespace) -> list[Output]:
         if path is not None:
             if film:
                 check_film(path)
-            outputs.append(_replay(writable(path), positive("--speed", request.speed, "1"), request.trace, film))
+            speed = positive("--speed", request.speed, "1")
+            outputs.append(_replay(writable(path), speed, request.trace, film, marks))
     paths = [output.path.resolve() for output in outputs]
     for path in paths:
         if paths.count(path) > 1:
@@ -97,10 +105,12 @@ def _figure(path: Path) -> Output:
     return Output(path, write)
 
 
-def _replay(path: Path, speed: float, frames: Sequence[str], film: bool) -> Output:
+def _replay(path: Path, speed: float, frames: Sequence[str], film: bool, marks: Marks | None) -> Output:
     def write(robot: Robot, trajectory: Trajectory) -> None:
         html, video = (None, path) if film else (path, None)
-        replay(robot, trajectory, html=html, video=video, speed=speed, trace=frames)
+        task = {} if marks is None else dict(marks(trajectory.duration))
+        trace = frames or task.pop("trace", ())
+        replay(robot, trajectory, html=html, video=video, speed=speed, **{**task, "trace": trace})
 
     return Output(path, write)
 

@@ -43,7 +43,7 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
 
 def _solve(request: argparse.Namespace, errors: Console) -> int:
     file = scene_file(request, request.scene, "solve")
-    outputs = outputs_of(request)
+    outputs = outputs_of(request, file.marks)
     options = {} if request.max_iterations is None else {"max_iterations": request.max_iterations}
     resume = None if request.resume is None else file.load_solution(request.resume)
     begin = time.perf_counter()

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, finite_array, require_finite
 from varpin.errors import InputError, VarpinError
+from varpin.markup import facts
 
 Floats = NDArray[np.float64]
 Reference = ArrayLike | Callable[[float], ArrayLike]
@@ -138,6 +139,10 @@ class Cost(ABC):
         return scaled[0] if len(scaled) == 1 else CostSum(tuple(scaled))
 
     __mul__ = __rmul__
+
+    def _repr_html_(self) -> str:
+        rows = [("at the end", t.cost) if isinstance(t, Terminal) else ("along the motion", t) for t in self.terms]
+        return facts("Cost", rows)
 
 
 @dataclass(frozen=True)

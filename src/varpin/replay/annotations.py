@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from varpin.checks import as_floats, broadcast_array, require_finite
 from varpin.errors import InputError
-from varpin.replay.script import Target, Trace
+from varpin.mpc import MpcRun
+from varpin.replay.script import Outlook, Target, Trace
 from varpin.robot import Robot
 from varpin.trajectory import Trajectory
 
@@ -22,6 +23,9 @@ Floats = NDArray[np.float64]
 
 # Points of a trace: a coarse motion's path is curved between its nodes, a long one's needs no more than so many.
 _FEWEST, _MOST = 200, 1000
+
+# Beads on the way that a plan means to take.
+_BEADS = 12
 
 
 def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequence[str]) -> list[tuple[str, ...]]:
@@ -51,7 +55,13 @@ def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequen
 
 
 def traces(
-    kind: Literal["motion", "ghost"], robot: Robot, names: Sequence[str], t: Floats, q: Floats, end: float
+    kind: Literal["motion", "ghost"],
+    robot: Robot,
+    names: Sequence[str],
+    t: Floats,
+    q: Floats,
+    end: float,
+    growing: Floats | None = None,
 ) -> list[Trace]:
     """The paths of frames along a motion up to a time; none of a frame that does not move.
 
@@ -62,6 +72,7 @@ def traces(
         t: Times (N + 1,) [s].
         q: Configurations (N + 1, n) [rad or m], linear in between as on the page.
         end: Of the motion that is shown [s].
+        growing: Times of the keyframes (K,) [s], to draw them as far as the motion has come.
     """
     times = np.append(t[t < end], min(end, t[-1]))
     if len(times) - 1 > _MOST:
@@ -70,9 +81,41 @@ def traces(
         parts = math.ceil(_FEWEST / (len(times) - 1))
         fine = np.arange((len(times) - 1) * parts + 1) / parts
         times = np.interp(fine, np.arange(len(times)), times)
-    rows = np.column_stack([np.interp(times, t, column) for column in q.T])
-    paths = [(name, _without_rests(robot.frame_positions(rows, name))) for name in names]
-    return [Trace(kind, name, points) for name, points in paths if len(points) > 1]
+    rows = _at(times, t, q)
+    found = []
+    for name in names:
+        points = robot.frame_positions(rows, name)
+        kept = _moves(points)
+        if kept.sum() > 1:
+            reached = None if growing is None else np.interp(growing, times, np.cumsum(kept) - 1.0)
+            found.append(Trace(kind, name, points[kept], reached))
+    return found
+
+
+def outlooks(robot: Robot, names: Sequence[str], run: MpcRun, ahead: float, times: Floats) -> list[Outlook]:
+    """Where a controller's plans mean to take frames.
+
+    Args:
+        robot: The arm.
+        names: Of its frames.
+        run: What the controller did.
+        ahead: How far to look [s].
+        times: Of the keyframes (K,) [s].
+    """
+    ticks = run.period * np.arange(len(run.plans) + 1, dtype=np.float64)
+    found = []
+    for name in names:
+        beads = [
+            robot.frame_positions(_at(times, ticks, run.planned(ahead * part)), name)
+            for part in np.arange(1, _BEADS + 1) / _BEADS
+        ]
+        found.append(Outlook(name, np.stack(beads, axis=1)))
+    return found
+
+
+def _at(times: Floats, t: Floats, rows: Floats) -> Floats:
+    """Rows (N, n) at times (N,), read off at others."""
+    return np.column_stack([np.interp(times, t, column) for column in rows.T])
 
 
 def references(given: ArrayLike | Mapping[str, ArrayLike] | None) -> tuple[Trace, ...]:
@@ -90,23 +133,24 @@ def references(given: ArrayLike | Mapping[str, ArrayLike] | None) -> tuple[Trace
         points = as_floats(what, value)
         if points.ndim != 2 or points.shape[1] != 3:
             raise InputError(f"{what} must have shape (K, 3), points on a path in the world [m], got {points.shape}")
-        points = _without_rests(require_finite(what, points))
+        points = points[_moves(require_finite(what, points))]
         if len(points) < 2:
             raise InputError(f"{what} stays in one place; give a place as a target")
         found.append(Trace("reference", str(name), points))
     return tuple(found)
 
 
-def _without_rests(points: Floats) -> Floats:
-    """The points (P, 3) of a path that are apart from the one before."""
+def _moves(points: Floats) -> NDArray[np.bool_]:
+    """Which points (P,) of a path (P, 3) are apart from the last one before that is."""
+    kept = np.zeros(len(points), dtype=np.bool_)
     if not len(points):
-        return points
+        return kept
     apart = 1e-5 * float(np.ptp(points, axis=0).max())
-    kept = [points[0]]
-    for point in points[1:]:
-        if np.linalg.norm(point - kept[-1]) > apart:
-            kept.append(point)
-    return np.array(kept)
+    last, kept[0] = points[0], True
+    for k, point in enumerate(points):
+        if np.linalg.norm(point - last) > apart:
+            last, kept[k] = point, True
+    return kept
 
 
 def target_tracks(given: Mapping[str, object] | None, end: float) -> dict[str, tuple[Floats, Floats, Floats | None]]:
@@ -160,7 +204,7 @@ def target(name: str, track: tuple[Floats, Floats, Floats | None], times: Floats
     t, places, turns = track
     if len(t) == 1:
         return Target(name, places, turns)
-    at = np.column_stack([np.interp(times, t, column) for column in places.T])
+    at = _at(times, t, places)
     if turns is None:
         return Target(name, at)
     quaternions = Slerp(t, Rotation.from_quat(turns))(np.minimum(times, t[-1])).as_quat()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from varpin.errors import InputError
 from varpin.replay import marks
 from varpin.replay.picture import Picture, label
-from varpin.replay.script import Actor, Script, Target, Trace
+from varpin.replay.script import Actor, Outlook, Script, Target, Trace
 from varpin.replay.shapes import GHOST_COLOR, ShapeLoader
 from varpin.replay.view import set_view, side_by_side, view_direction
 
@@ -30,7 +30,7 @@ EFFORT_COLORS = np.array([[0.72, 0.76, 0.8], [0.98, 0.75, 0.1], [0.8, 0.05, 0.05
 _FARTHEST = 1e18
 
 # Of marks, in sizes of a robot's motion.
-_TUBE, _BALL, _TRIAD, _LABEL = 0.003, 0.02, 0.1, 0.25
+_TUBE, _BEAD, _BALL, _TRIAD, _LABEL = 0.003, 0.006, 0.02, 0.1, 0.25
 
 
 def draw(viewer: meshcat.Visualizer, script: Script) -> None:
@@ -59,6 +59,7 @@ class _Drawing:
                 self._notes([*self.script.traces, *actor.traces], self.script.targets, f"notes{number}", place, size)
             else:
                 self._notes(actor.traces, [], f"notes{number}", place, size)
+            self._outlooks(actor.outlooks, f"notes{number}", size)
         if len(self.script.times) > 1:
             repetitions = math.inf if self.script.loop else 1
             self.viewer.set_animation(Animation(self.clips), play=True, repetitions=repetitions)
@@ -73,7 +74,9 @@ class _Drawing:
             positions = np.concatenate([_samples(rows) for rows in actor.positions.values()])
             points = picture.swept(positions)
             size = max(size, float(np.ptp(points, axis=0).max()))
-            extents.append(np.concatenate([points, *(trace.points for trace in actor.traces), *marked]))
+            lines = [trace.points for trace in actor.traces]
+            lines += [outlook.places.reshape(-1, 3) for outlook in actor.outlooks]
+            extents.append(np.concatenate([points, *lines, *marked]))
             axes.append(picture.body_poses(positions)[0][..., 2].reshape(-1, 3))
         if not np.abs(np.concatenate(extents)).max() < _FARTHEST:
             raise InputError(f"what is to be shown has sizes or places beyond {_FARTHEST:g} m, which no viewer draws")
@@ -131,6 +134,10 @@ class _Drawing:
         for k, trace in enumerate(traces):
             node = f"{root}/traces/{k} {trace.kind} {label(trace.name)}"
             self.viewer[node].set_object(marks.tube(trace.points, _TUBE * size, _TRACE_COLORS[trace.kind]))
+            if trace.reached is not None:
+                # three.js draws so many of its corners; a piece that is reached in part is drawn in part.
+                corners = marks.TUBE_PIECE * trace.reached
+                self._animate(f"{node}/<object>", "geometry[drawRange].count", "number", corners)
         for target in targets:
             node = f"{root}/targets/{label(target.name)}"
             pose = _translation(target.places[0])
@@ -147,6 +154,15 @@ class _Drawing:
             self.viewer[f"{node}/label"].set_object(marks.Label(target.name, _LABEL * size))
             # Which point of the label, from 0 to 1, is at the target: one below the text, so that the ball stays free.
             self.viewer[f"{node}/label/<object>"].set_property("center", {"x": 0.5, "y": 0.5 - 1.2 * _BALL / _LABEL})
+
+    def _outlooks(self, outlooks: Sequence[Outlook], root: str, size: float) -> None:
+        """Beads where plans mean to take frames."""
+        for k, outlook in enumerate(outlooks):
+            for b, places in enumerate(outlook.places.transpose(1, 0, 2)):
+                node = f"{root}/plans/{k} {label(outlook.name)}/{b}"
+                self.viewer[node].set_object(marks.bead(_BEAD * size, GHOST_COLOR))
+                self.viewer[node].set_transform(_translation(places[0]))
+                self._animate(node, "position", "vector3", places)
 
     def _animate(self, node: str, name: str, kind: str, values: Floats) -> None:
         """Give a property of a node its values (K, ...) at the keyframes."""

@@ -15,6 +15,9 @@ Floats = NDArray[np.float64]
 
 _SIDES = 6
 
+# Indices of a tube's corners that draw one of its pieces.
+TUBE_PIECE = 6 * _SIDES
+
 _AXES = np.array([[0.85, 0.15, 0.12], [0.15, 0.6, 0.15], [0.12, 0.3, 0.85]])
 
 
@@ -22,6 +25,11 @@ def tube(points: Floats, radius: float, color: int) -> Object:
     """A tube along a path (P, 3), P > 1; lines would be a pixel wide, whatever they are told."""
     vertices, faces = _swept(points, radius)
     return meshcat.geometry.Mesh(TriangularMeshGeometry(vertices, faces), MeshBasicMaterial(color=color))
+
+
+def bead(radius: float, color: int) -> Object:
+    """A small solid sphere."""
+    return meshcat.geometry.Mesh(meshcat.geometry.Sphere(radius), MeshBasicMaterial(color=color))
 
 
 def ball(radius: float, color: int) -> Object:

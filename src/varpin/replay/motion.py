@@ -8,14 +8,23 @@ import reprlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, count, finite_array, positive, require_finite, writable
 from varpin.errors import InputError
-from varpin.replay.annotations import frame_names, references, target, target_tracks, torque_shares, traces
+from varpin.mpc import MpcRun
+from varpin.replay.annotations import (
+    frame_names,
+    outlooks,
+    references,
+    target,
+    target_tracks,
+    torque_shares,
+    traces,
+)
 from varpin.replay.script import Actor, Script
 from varpin.replay.video import Film
 from varpin.robot import Robot
@@ -24,23 +33,29 @@ from varpin.trajectory import Trajectory
 if TYPE_CHECKING:
     import meshcat
 
+    from varpin.replay.page import Inline
+
 Floats = NDArray[np.float64]
+Motion: TypeAlias = Trajectory | MpcRun | ArrayLike
 
 
 def replay(
-    robot: Robot | Sequence[tuple[Robot, Trajectory | ArrayLike]],
-    motion: Trajectory | ArrayLike | None = None,
+    robot: Robot | Sequence[tuple[Robot, Motion]],
+    motion: Motion | None = None,
     *,
     html: str | os.PathLike[str] | None = None,
     open: bool = False,
     video: str | os.PathLike[str] | None = None,
+    inline: bool = False,
     dt: float | None = None,
-    ghost: Trajectory | ArrayLike | None = None,
+    ghost: Trajectory | ArrayLike | Sequence[Trajectory | ArrayLike | None] | None = None,
+    ahead: float | None = None,
     trace: bool | str | Sequence[str] = False,
+    growing: bool = False,
     reference: ArrayLike | Mapping[str, ArrayLike] | None = None,
     targets: Mapping[str, object] | None = None,
     frames: bool | str | Sequence[str] = False,
-    torques: bool | ArrayLike = False,
+    torques: bool | ArrayLike | Sequence[bool | ArrayLike] = False,
     torque_limit: ArrayLike | None = None,
     offset: ArrayLike | None = None,
     speed: float = 1.0,
@@ -48,31 +63,37 @@ def replay(
     fps: float = 30.0,
     max_frames: int = 10_000,
     size: tuple[int, int] = (800, 600),
-) -> Path | meshcat.Visualizer:
+) -> Path | meshcat.Visualizer | Inline:
     """Show a motion in meshcat, in the time it took.
 
     Main args:
         robot: The arm that moved; or pairs of an arm and its motion, to be shown side by side on one clock: a plan and
             its execution, two scenes. What is over before the others is held.
-        motion: A trajectory, or configurations (N + 1, n) [rad or m] with ``dt``. A single row shows a pose.
+        motion: A trajectory; a run of :class:`varpin.Mpc`, which is shown with its plans; or configurations (N + 1, n)
+            [rad or m] with ``dt``, of which a single row shows a pose.
         html: Write one self-contained HTML file here. It plays by itself, with neither server nor network.
         video: Write a film here, as ``.gif`` or ``.mp4``; with or without ``html``.
         open: Open a live window instead.
+        inline: Return the page instead, to be shown by a notebook as the value of its cell.
 
     Other Args:
         dt: Time between the rows of an array [s].
         ghost: A second motion of the same robot, drawn translucent in the same place: a reference, another plan. A
             trajectory of any time step, started together with the motion, cut at its end and held if it is over
             before; or configurations (K, n) [rad or m] spread evenly over the motion's time, of which a single row
-            stands still.
+            stands still. Of several robots, a list with one for each, or None. The ghost of a run of
+            :class:`varpin.Mpc`, if none is given, is where its plans mean to be.
+        ahead: How far ahead the plans of such a run are shown [s]: where they mean to be then, as the ghost, and the
+            way of each traced frame up to there, as beads. To the end of the horizon if left out, 0 for not at all.
         trace: Frames whose paths are drawn, the motion's and the ghost's; ``True`` for the end effector.
+        growing: Draw these paths as far as the motion has come.
         reference: A path (K, 3) in the world [m] to draw, or several by name.
         targets: What to reach, by name, which is shown: a point (3,) [m], a pose (4, 4) or ``pin.SE3``; or rows of
             them, (K, 3) or (K, 4, 4), spread evenly over the motion's time. In the world of each robot.
         frames: Frames to draw as triads, x red, y green, z blue; ``True`` for the end effector.
         torques: Colour each link by the torque of the joint that moves it, grey for none, red at its limit: ``True``
             for the controls of the trajectory, one a joint; or the torques (N, n) themselves [N m or N], of N steps
-            spread evenly over the motion's time.
+            spread evenly over the motion's time. Of several robots, that for all of them, or a list with one for each.
         torque_limit: One number or (n,) [N m or N]; the robot's effort limits if left out. A joint without one is red
             at its own largest torque.
         offset: From each of several robots to the next (3,) [m]; far enough to see them all if left out.
@@ -95,7 +116,8 @@ def replay(
     machine. A GIF's frames last whole hundredths of a second; ``fps`` is rounded to that.
 
     Returns:
-        The path of the film, if there is one, or of the page; or the ``meshcat.Visualizer`` of the window.
+        The path of the film, if there is one, or of the page; or the ``meshcat.Visualizer`` of the window; or the page,
+        as an object that notebooks show.
 
     Raises:
         InputError: Neither a file nor ``open``, or both; a motion or a ghost of another shape or another robot, or not
@@ -104,15 +126,20 @@ def replay(
         FileError: The file cannot be written.
         MissingDependency: A film needs imageio, selenium, Chromium or its driver, which are not there.
     """
-    pairs = _pairs(robot, motion)
-    several = len(pairs) > 1
-    if (html is None and video is None) != bool(open):
-        raise InputError("give either html=path, for a file, or open=True, for a window; or video=path, for a film")
-    own = [shown.dt for _, shown in pairs if isinstance(shown, Trajectory)]
+    shown = _pairs(robot, motion)
+    several = len(shown) > 1
+    if (html is not None or video is not None) + bool(open) + bool(inline) != 1:
+        raise InputError(
+            "give either html=path, for a file, or open=True, for a window; or video=path, for a film; or inline=True, "
+            "for a notebook"
+        )
+    runs = [run if isinstance(run, MpcRun) else None for _, run in shown]
+    pairs = [(arm, moved.motion if isinstance(moved, MpcRun) else moved) for arm, moved in shown]
+    own = [moved.dt for _, moved in pairs if isinstance(moved, Trajectory)]
     if dt is not None and len(own) == len(pairs):
         raise InputError(f"dt belongs to an array of configurations; this trajectory has its own, {own[0]:g} s")
     motions = [
-        _motion(arm, shown, dt, f"motion {k + 1}" if several else "motion") for k, (arm, shown) in enumerate(pairs)
+        _motion(arm, moved, dt, f"motion {k + 1}" if several else "motion") for k, (arm, moved) in enumerate(pairs)
     ]
     speed, fps = positive("speed", speed, "1"), positive("fps", fps, "1/s")
     max_frames = count("max_frames", max_frames, least=2)
@@ -120,28 +147,49 @@ def replay(
     film = None if video is None else Film.of(writable(video), size, fps, max_frames)
     end = max(t[-1] for t, _ in motions)
     arms = [arm for arm, _ in pairs]
-    if several and (ghost is not None or not isinstance(torques, bool)):
-        raise InputError("a ghost, and torques that are not those of the trajectory, are of one robot, not of several")
-    ghosts = [] if ghost is None else [_ghost(arms[0], ghost, end)]
+    looks = [_ahead(ahead, run) for run in runs]
+    if ahead is not None and not any(runs):
+        raise InputError("ahead is of the plans of an MpcRun; the motion is none")
+    ghosts: list[tuple[Floats, Floats] | None] = []
+    beside = _each("ghost", ghost, len(pairs))
+    for arm, run, look, given in zip(arms, runs, looks, beside, strict=True):
+        if given is not None:
+            ghosts.append(_ghost(arm, given, end))
+        elif run is not None and look > 0.0:
+            rows = run.planned(look)
+            ghosts.append((run.period * np.arange(len(rows), dtype=np.float64), rows))
+        else:
+            ghosts.append(None)
     traced, triads = frame_names("trace", arms, trace), frame_names("frames", arms, frames)
     paths, tracks = references(reference), target_tracks(targets, end)
-    shares = [torque_shares(arm, shown, torques, torque_limit) for arm, shown in pairs]
+    shares = _shares(pairs, _each("torques", torques, len(pairs)), torque_limit)
     step = None if offset is None else finite_array("offset", offset, (3,))
 
     moving = [t for t, _, _ in tracks.values() if len(t) > 1]
-    times = _times([t for t, _ in motions], [t for t, _ in ghosts] + moving, end, fps / speed, max_frames)
+    followed = [second[0] for second in ghosts if second is not None]
+    times = _times([t for t, _ in motions], followed + moving, end, fps / speed, max_frames)
+    clock = times if growing else None
     actors = []
     for k, (arm, (t, q)) in enumerate(zip(arms, motions, strict=True)):
-        positions, lines = {"robot": _positions(arm, t, q, times)}, traces("motion", arm, traced[k], t, q, end)
-        for ghost_t, ghost_q in ghosts:
-            positions["ghost"] = _positions(arm, ghost_t, ghost_q, times)
-            lines += traces("ghost", arm, traced[k], ghost_t, ghost_q, end)
-        actors.append(Actor(arm, positions, tuple(lines), triads[k], _efforts(arm, shares[k], t[-1], times)))
+        positions, lines = {"robot": _positions(arm, t, q, times)}, traces("motion", arm, traced[k], t, q, end, clock)
+        plans = []
+        if (second := ghosts[k]) is not None:
+            positions["ghost"] = _positions(arm, *second, times)
+        run = runs[k]
+        if run is not None and looks[k] > 0.0:
+            plans = outlooks(arm, traced[k], run, looks[k], np.minimum(times, t[-1]))
+        # A ghost that jumps from plan to plan leaves no trace.
+        if second is not None and beside[k] is not None:
+            lines += traces("ghost", arm, traced[k], *second, end, clock)
+        efforts = _efforts(arm, shares[k], t[-1], times)
+        actors.append(Actor(arm, positions, tuple(lines), tuple(plans), triads[k], efforts))
     marked = tuple(target(name, track, times) for name, track in tracks.items())
     script = Script(times / speed, tuple(actors), paths, marked, step, loop)
 
     from varpin.replay import viewer  # noqa: PLC0415 - meshcat is slow to import, and few runs show anything
 
+    if inline:
+        return viewer.inline(script, size)
     if page is None and film is None:
         return viewer.show(script)
     with tempfile.TemporaryDirectory() as folder:
@@ -149,9 +197,36 @@ def replay(
         return written if film is None else film.take(written, float(script.times[-1]))
 
 
-def _pairs(
-    robot: Robot | Sequence[tuple[Robot, Trajectory | ArrayLike]], motion: Trajectory | ArrayLike | None
-) -> list[tuple[Robot, Trajectory | ArrayLike]]:
+def _each(name: str, given: Any, robots: int) -> list[Any]:
+    """One for each robot: all of a list, or the same for all of what is no motion."""
+    if robots == 1:
+        return [given]
+    if given is None or isinstance(given, bool | np.bool_):
+        return [given] * robots
+    if not isinstance(given, list | tuple) or len(given) != robots:
+        raise InputError(f"{name} of several robots must be a list with one for each of the {robots}")
+    return list(given)
+
+
+def _ahead(ahead: float | None, run: MpcRun | None) -> float:
+    """How far ahead a run's plans are shown [s]; 0 for not at all."""
+    if run is None:
+        return 0.0
+    if ahead is None:
+        return run.plans[0].problem.duration
+    return ahead if isinstance(ahead, int | float) and ahead == 0 else positive("ahead", ahead, "s")
+
+
+def _shares(
+    pairs: Sequence[tuple[Robot, Trajectory | ArrayLike]], torques: Sequence[Any], limit: ArrayLike | None
+) -> list[Floats | None]:
+    """:func:`torque_shares` of each robot; the limit is of those that are coloured."""
+    hidden = [isinstance(own, bool | np.bool_) and not own for own in torques]
+    limits = [None if out and not all(hidden) else limit for out in hidden]
+    return [torque_shares(*pair, own, bound) for pair, own, bound in zip(pairs, torques, limits, strict=True)]
+
+
+def _pairs(robot: Robot | Sequence[tuple[Robot, Motion]], motion: Motion | None) -> list[tuple[Robot, Motion]]:
     """Each robot with its motion."""
     if isinstance(robot, Robot):
         if motion is None:

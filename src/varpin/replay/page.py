@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import html as markup
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,32 @@ class Page:
 </body>
 </html>
 """
+
+
+@dataclass(frozen=True, eq=False)
+class Inline:
+    """A page that a notebook shows as the value of a cell.
+
+    Attributes:
+        html: The whole page.
+        title: Its title.
+        size: Most of its width, and its height [pixels].
+    """
+
+    html: str
+    title: str
+    size: tuple[int, int]
+
+    def __repr__(self) -> str:
+        return f"Inline(replay of {self.title}, {len(self.html) / 1e6:.1f} MB)"
+
+    def _repr_html_(self) -> str:
+        """The page in a frame of its own, cut off from the notebook's."""
+        width, height = self.size
+        return (
+            f'<iframe srcdoc="{markup.escape(self.html)}" title="{markup.escape(self.title)}" sandbox="allow-scripts" '
+            f'style="width: 100%; max-width: {width}px; height: {height}px; border: 0"></iframe>'
+        )
 
 
 # The commands go to the viewer one after the other, for a property or an animation needs the object it speaks of.

@@ -22,11 +22,27 @@ class Trace:
         kind: Of what moves along it.
         name: Of the frame, or of the reference.
         points: On the path (P, 3) [m], P > 1, no two in a row the same.
+        reached: How many of its P - 1 pieces are behind what moves at the keyframes (K,), to be drawn as far as that;
+            None where it is to be drawn whole.
     """
 
     kind: Literal["motion", "ghost", "reference"]
     name: str
     points: Floats
+    reached: Floats | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """Where a plan means to take a frame, which changes with every plan.
+
+    Attributes:
+        name: Of the frame.
+        places: At the keyframes, evenly spaced in time from soon to as far as the plan is shown (K, B, 3) [m].
+    """
+
+    name: str
+    places: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +69,7 @@ class Actor:
         positions: Of every joint of the tree at the keyframes (K, b) [rad or m], of "robot" and, if there is one, of
             its "ghost".
         traces: Of its frames.
+        outlooks: Of its frames.
         frames: Names of those drawn as triads.
         effort: Share of the limit that the torque of each joint of the tree takes at the keyframes (K, b), in [0, 1];
             None for the robot in its own colours.
@@ -61,6 +78,7 @@ class Actor:
     robot: Robot
     positions: Mapping[str, Floats]
     traces: tuple[Trace, ...] = ()
+    outlooks: tuple[Outlook, ...] = ()
     frames: tuple[str, ...] = ()
     effort: Floats | None = None
 

@@ -9,7 +9,7 @@ import math
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -127,8 +127,8 @@ class Film:
                 str(draft), self.size, fps=rate, macro_block_size=2, ffmpeg_log_level="error", **options
             )
             writer.send(None)
-            with contextlib.closing(writer), _browser(self.size) as browser:
-                for frame in _frames(browser, page, times, self.size):
+            with contextlib.closing(writer):
+                for frame in film_frames(page, times, self.size):
                     writer.send(np.ascontiguousarray(frame))
             with atomic_file(self.path) as stream:
                 stream.write(draft.read_bytes())
@@ -186,8 +186,27 @@ def _browser(size: tuple[int, int]) -> Iterator[Chrome]:
             browser.quit()
 
 
-def _frames(browser: Chrome, page: Path, times: Floats, size: tuple[int, int]) -> Iterator[NDArray[np.uint8]]:
-    """The page's picture (height, width, 3) at each time."""
+def film_frames(
+    page: Path, times: Floats, size: tuple[int, int], scripts: Sequence[tuple[str, Sequence[float]]] = ()
+) -> Iterator[NDArray[np.uint8]]:
+    """A page's picture (height, width, 3) at each time.
+
+    Args:
+        page: To be shown.
+        times: [s of playback].
+        size: Width and height [pixels].
+        scripts: JavaScript to run before, with its arguments.
+
+    Raises:
+        VarpinError: The browser cannot show the page.
+    """
+    with _browser(size) as browser:
+        yield from _frames(browser, page, times, size, scripts)
+
+
+def _frames(
+    browser: Chrome, page: Path, times: Floats, size: tuple[int, int], scripts: Sequence[tuple[str, Sequence[float]]]
+) -> Iterator[NDArray[np.uint8]]:
     import imageio.v3 as imageio  # noqa: PLC0415 - of an extra
 
     browser.get(page.resolve().as_uri())
@@ -197,6 +216,8 @@ def _frames(browser: Chrome, page: Path, times: Floats, size: tuple[int, int]) -
             raise VarpinError(f"Chromium did not finish loading the motion within {_PATIENCE:g} s")
         time.sleep(0.05)
     browser.execute_script(_STOP, *size)
+    for script, arguments in scripts:
+        browser.execute_script(script, *arguments)
     for seconds in times:
         address = browser.execute_script(_DRAW, float(seconds))
         picture = base64.b64decode(address.partition(",")[2])

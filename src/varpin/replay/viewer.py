@@ -11,7 +11,7 @@ from pathlib import Path
 import meshcat
 
 from varpin.replay.drawing import draw
-from varpin.replay.page import Page
+from varpin.replay.page import Inline, Page
 from varpin.replay.script import Script
 from varpin.trajectory import atomic_file
 
@@ -20,11 +20,20 @@ logger = logging.getLogger(__name__)
 
 def write_page(path: Path, script: Script) -> Path:
     """Write a script as one self-contained HTML file."""
+    with atomic_file(path) as stream:
+        stream.write(_page(script).encode())
+    return path
+
+
+def inline(script: Script, size: tuple[int, int]) -> Inline:
+    """A script's page for a notebook, of a width and a height [pixels]."""
+    return Inline(_page(script), script.title, size)
+
+
+def _page(script: Script) -> str:
     page = Page()
     draw(meshcat.Visualizer(window=page), script)
-    with atomic_file(path) as stream:
-        stream.write(page.html(script.title).encode())
-    return path
+    return page.html(script.title)
 
 
 def show(script: Script) -> meshcat.Visualizer:

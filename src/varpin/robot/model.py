@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import as_floats, is_one_of, require_finite
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint
 from varpin.kernels.tree import Tree
+from varpin.markup import facts, listed, table
 from varpin.robot import example_robot_data
 from varpin.robot.meshes import mesh_problems
 from varpin.robot.mimic import Tie, joint_index, rebuild, tied_model
@@ -65,6 +66,21 @@ class Robot:
     def __repr__(self) -> str:
         held = f", {len(self.locked)} locked" if self.locked else ""
         return f"Robot({self.name}: {', '.join(self.joint_names)}{held})"
+
+    def _repr_html_(self) -> str:
+        lower, upper = self.position_limits
+        columns = zip(self.joint_names, lower, upper, self.velocity_limit, self.effort_limit, strict=True)
+        rows: list[tuple[str, object]] = [
+            ("joints that move", self.dof),
+            ("mass that moves [kg]", float(self.tree.mass.sum())),
+        ]
+        if self.locked:
+            rows.append(("locked", listed(self.locked)))
+        if self.ties:
+            rows.append(("tied to others", listed(self.free_model.names[tie.follower] for tie in self.ties)))
+        rows.append(("end effector", self.end_effector))
+        head = ("joint", "lower [rad or m]", "upper", "velocity [1/s]", "torque [N m or N]")
+        return facts(f"Robot {self.name}", rows, table(head, [(name, *map(float, row)) for name, *row in columns]))
 
     @property
     def dof(self) -> int:
@@ -136,7 +152,10 @@ class Robot:
 
     @property
     def position_limits(self) -> tuple[Floats, Floats]:
-        """Lower and upper bounds (n,), (n,) [rad or m]; infinite where there are none."""
+        """Lower and upper bounds (n,), (n,) [rad or m]; infinite where there are none.
+
+        Where both are 0, which is how a URDF has it that gives none, there are none; to hold a joint still, lock it.
+        """
         lower, upper = np.full(self.dof, -np.inf), np.full(self.dof, np.inf)
         index = joint_index(self.model)
         for c, name in enumerate(self.joint_names):
@@ -146,14 +165,16 @@ class Robot:
                     self.model.lowerPositionLimit[joint.idx_q],
                     self.model.upperPositionLimit[joint.idx_q],
                 )
-        # Pinocchio writes the absence of a limit as the largest double.
-        lower[lower <= -1e300], upper[upper >= 1e300] = -np.inf, np.inf
+        # Pinocchio writes the absence of a limit as the largest double, a URDF as 0 and 0.
+        none = (lower == 0.0) & (upper == 0.0)
+        lower[none | (lower <= -1e300)], upper[none | (upper >= 1e300)] = -np.inf, np.inf
         return lower, upper
 
     @property
     def velocity_limit(self) -> Floats:
-        """Bound (n,) [rad/s or m/s]; infinite where there is none."""
-        return self._limit("velocityLimit")
+        """Bound (n,) [rad/s or m/s]; infinite where there is none, or one of 0."""
+        limit = self._limit("velocityLimit")
+        return np.where(limit == 0.0, np.inf, limit)
 
     @property
     def effort_limit(self) -> Floats:

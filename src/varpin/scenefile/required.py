@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.lagrangian import lagrangian_jet
+from varpin.markup import facts, listed
 from varpin.scene import Scene
 from varpin.scenefile.layout import CostTerm, Layout, holding_controls, joints_of_frame
 from varpin.scenefile.references import Timeline
@@ -48,6 +49,20 @@ class Required:
     def saved(self) -> float:
         """The part of the linear algebra of a plan that is saved, by counting: it grows with the cube of joints."""
         return 1.0 - sum(len(part) ** 3 for part in self.parts) / self.described**3
+
+    def _repr_html_(self) -> str:
+        rows: list[tuple[str, object]] = [
+            ("computed", f"{len(self.joints)} of {self.described}: {listed(self.joints)}")
+        ]
+        for title, joints in (("locked", self.locked), ("nothing touches", self.idle)):
+            if joints:
+                rows.append((title, listed(f"{joint} at {at}" for joint, at in joints.items())))
+        if len(self.parts) > 1:
+            rows.append(("planned apart", "; ".join(listed(part) for part in self.parts)))
+        if self.coupled:
+            rows.append(("planned together", self.coupled))
+        rows += [*self.terms.items(), ("saved", f"{100 * self.saved:.0f}% of a plan's linear algebra, by counting")]
+        return facts("What is computed", rows)
 
     def __str__(self) -> str:
         lines = [f"joints: {len(self.joints)} of {self.described} computed: {', '.join(self.joints)}"]

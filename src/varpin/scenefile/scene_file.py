@@ -13,12 +13,14 @@ import numpy as np
 
 from varpin.costs import CostError
 from varpin.errors import InputError
+from varpin.markup import facts
 from varpin.policy import LinearPolicy
 from varpin.robot import Robot
 from varpin.scene import Scene
 from varpin.scenefile.layout import Layout, holding_controls, lay_out
 from varpin.scenefile.references import Timeline
 from varpin.scenefile.required import Required, idle_joints, requirements
+from varpin.scenefile.shown import marks_of
 from varpin.scenefile.spec import SceneSpec, find_scene, read_scene
 from varpin.scenefile.table import Floats
 from varpin.sddp import OptimalControlProblem, Solution, solve
@@ -50,6 +52,15 @@ class SceneFile:
 
     def __repr__(self) -> str:
         return f"SceneFile({self.spec.name}: {self.spec.title})"
+
+    def _repr_html_(self) -> str:
+        spec = self.spec
+        rows = [
+            ("file", spec.path.name),
+            ("robot", self.robot),
+            ("horizon", f"{spec.steps} steps of {spec.dt:g} s, {spec.integrator}"),
+        ]
+        return facts(spec.title, rows, self.required._repr_html_())
 
     @property
     def robot(self) -> Robot:
@@ -142,6 +153,17 @@ class SceneFile:
         parts = self.required.parts
         saved = self.robot.dof**3 - sum(len(part) ** 3 for part in parts)
         return len(parts) > 1 and self.spec.steps * saved > _SETUP * len(parts)
+
+    def marks(self, duration: float | None = None) -> dict[str, Any]:
+        """What :func:`varpin.replay` can mark of the task, as its options: ``replay(robot, motion, **scene.marks())``.
+
+        Targets and paths of the frames that the cost is about, with their traces; of a reference of joints, the robot
+        that follows it as a ghost.
+
+        Args:
+            duration: Of the motion that is shown [s]; the horizon if left out.
+        """
+        return marks_of(self._layout, self.spec.duration if duration is None else duration)
 
     def load_solution(self, path: str | Path) -> Solution:
         """Read a solution of this scene that :meth:`Solution.save` wrote; see :meth:`Solution.load`."""

@@ -103,3 +103,6 @@ class SearchState:
     regularization: float
     growth: float
     history: tuple[Iteration, ...]
+
+    def __repr__(self) -> str:
+        return f"SearchState(cost {self.cost:.6g}, after {len(self.history)} iterations)"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from varpin.checks import count
 from varpin.ensemble import simulate_ensemble
 from varpin.errors import InputError, VarpinError
+from varpin.markup import facts
 from varpin.policy import LinearPolicy
 from varpin.sddp.problem import OptimalControlProblem
 from varpin.sddp.verification import excess, percent
@@ -41,6 +42,15 @@ class MonteCarlo:
     predicted: float
     paths: int
     failures: int
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ("simulated", f"{self.cost:.6e} +- {self.standard_error:.1e}"),
+            ("predicted", f"{self.predicted:.6e}"),
+            ("paths", self.paths),
+            ("ran away", self.failures),
+        ]
+        return facts("Expected cost", rows)
 
     def __str__(self) -> str:
         gap = self.cost - self.predicted

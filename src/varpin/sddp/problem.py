@@ -22,6 +22,7 @@ from varpin.costs import (
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint
 from varpin.lagrangian import lagrangian_jet
+from varpin.markup import facts, listed
 from varpin.policy import LinearPolicy
 from varpin.scene import Scene, require_scene
 from varpin.simulation import simulate
@@ -154,6 +155,18 @@ class OptimalControlProblem:
     def __repr__(self) -> str:
         held = f", each control held over {self.hold}" if self.hold > 1 else ""
         return f"OptimalControlProblem({self.scene!r}, {self.steps} steps of {self.dt:g} s{held}, {self.integrator})"
+
+    def _repr_html_(self) -> str:
+        limited = int(np.isfinite(self.control_limits).any(axis=0).sum())
+        rows = [
+            ("scene", self.scene),
+            ("horizon", f"{self.steps} steps of {self.dt:g} s, {self.duration:g} s from t = {self.t0:g} s"),
+            ("decisions", f"{self.decisions} of {self.scene.controls} controls, {limited} of them with limits"),
+            ("integrator", f"{self.integrator}, the cost sampled by the rule {self.sampling!r}"),
+            ("from q [rad or m]", listed(f"{x:.4g}" for x in self.q0)),
+            ("at v [rad/s or m/s]", listed(f"{x:.4g}" for x in self.v0)),
+        ]
+        return facts("Optimal control problem", rows, self.cost._repr_html_())
 
     @property
     def duration(self) -> float:

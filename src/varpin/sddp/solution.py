@@ -16,6 +16,7 @@ from varpin.costs import barriers_of
 from varpin.errors import InputError
 from varpin.kernels._compile import announced_compilation
 from varpin.linearization import velocity_at_nodes
+from varpin.markup import facts, folded, listed, table
 from varpin.policy import LinearPolicy
 from varpin.sddp.history import Iteration, SearchState, Status
 from varpin.sddp.monte_carlo import MonteCarlo, monte_carlo
@@ -46,6 +47,11 @@ class Violations:
     def any(self) -> bool:
         """Whether there is one at all."""
         return bool(any(part.any() for part in (self.position, self.velocity, self.control)))
+
+    def __repr__(self) -> str:
+        parts = {"position": self.position, "velocity": self.velocity, "control": self.control}
+        beyond = [f"{name} by up to {part.max():.3g}" for name, part in parts.items() if part.any()]
+        return f"Violations({', '.join(beyond) or 'none'})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +144,35 @@ class Solution:
     def __repr__(self) -> str:
         noise = f" + {self.noise_cost:.4g} by noise" if self.noise_cost else ""
         return f"Solution(cost {self.cost:.6g}{noise}, {self.iterations} iterations, {self.status.value})"
+
+    def _repr_html_(self) -> str:
+        problem, beyond, motion = self.problem, self.violations, self.trajectory
+        rows: list[tuple[str, object]] = [
+            ("status", self.status.value),
+            ("why", self.reason),
+            ("cost", f"{self.cost:.6g}" + (f", and {self.noise_cost:.4g} by noise" if self.noise_cost else "")),
+            ("iterations", f"{self.iterations} in {sum(item.seconds for item in self.history):.3g} s"),
+            ("horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}"),
+        ]
+        if self.history:
+            rows.insert(4, ("gradient", f"{self.history[-1].gradient:.2e} at most in the end"))
+        names = problem.scene.robot.joint_names
+        for what, unit, part in (("position", "rad or m", beyond.position), ("velocity", "1/s", beyond.velocity)):
+            over = [f"{name} {value:.3g}" for name, value in zip(names, part, strict=True) if value]
+            if over:
+                rows.append((f"{what} beyond limits [{unit}]", listed(over)))
+        if beyond.control.any():
+            rows.append(("controls beyond limits", f"{beyond.control.max():.3g} at most"))
+        rows += [("warning", warning) for warning in motion.warnings]
+        most = np.abs(motion.u).max(axis=0, initial=0.0)
+        rows.append(("largest controls", listed(f"{value:.4g}" for value in most)))
+        columns = ("", "cost", "noise cost", "promise", "decrease", "gradient", "regularization", "step", "rollouts")
+        history = [
+            (x.index, f"{x.cost:.6e}", *map(float, (x.noise_cost, x.promised_decrease, x.decrease, x.gradient)),
+             x.regularization, x.step, x.rollouts)
+            for x in self.history
+        ]  # fmt: skip
+        return facts(f"Plan for {problem.scene.robot.name}", rows, folded("iterations", table(columns, history)))
 
     def table(self) -> str:
         """The iterations, one row each, and how and why they ended; :class:`Solution` explains the columns."""

@@ -13,6 +13,7 @@ from varpin.integrators import RungeKutta4
 from varpin.integrators.base import open_loop
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
+from varpin.markup import facts, table
 from varpin.policy import LinearPolicy
 from varpin.sddp.problem import OptimalControlProblem, bind_cost
 from varpin.simulation import rollout
@@ -56,6 +57,20 @@ class Verification:
     def closed_loop_loss(self) -> float:
         """The same with feedback."""
         return excess(self.closed_loop_cost, self.planned_cost)
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ("planned", self.planned_cost, "", ""),
+            ("controls alone", self.open_loop_cost, percent(self.open_loop_loss), f"{self.open_loop_gap:.2e}"),
+            ("with feedback", self.closed_loop_cost, percent(self.closed_loop_loss), f"{self.closed_loop_gap:.2e}"),
+        ]
+        shown = [row if np.isfinite(row[1]) else (row[0], "runs away", "", "") for row in rows]
+        head = ("", "cost", "loss", "end off by [rad or m]")
+        said = [
+            ("how to read it", str(self).splitlines()[-1].removeprefix("read it so: ")),
+            ("a step is off by", f"{self.defect:.2e} rad or m"),
+        ]
+        return facts("Verification on the continuous system", said, table(head, shown))
 
     def __str__(self) -> str:
         rows = [

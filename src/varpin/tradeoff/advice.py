@@ -21,6 +21,7 @@ from varpin.checks import positive
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Reference, largest_step
 from varpin.lagrangian import lagrangian_jet
+from varpin.markup import facts, table
 from varpin.scene import Scene
 from varpin.tradeoff.setting import Setting, integrators_of
 
@@ -102,6 +103,21 @@ class Advice:
     budget: float | None
     calibration: float
     reason: str = field(repr=False)
+
+    def __repr__(self) -> str:
+        return f"Advice({self.best}{'' if self.reached else ', which is not what was asked for'})"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (
+                str(choice.integrator), choice.dt, choice.steps, _time(choice.seconds),
+                f"{choice.error:.2e}" if math.isfinite(choice.error) else "unknown",
+                "" if choice.measured else "by the method's order",
+            )
+            for choice in (self.best, *self.alternatives)
+        ]  # fmt: skip
+        columns = ("integrator", "dt [s]", "steps", "time", "error [rad or m]", "")
+        return facts("Advice", [("", line) for line in self.reason.splitlines()], table(columns, rows, [0]))
 
     @property
     def integrator(self) -> Integrator:

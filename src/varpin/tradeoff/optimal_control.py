@@ -102,6 +102,7 @@ class OptimalControlTradeoff(Record):
     _run = OptimalControlRun
     _format = "varpin.optimal-control-tradeoff/2"
     _headings = HEADINGS
+    _shown = ("integrator", "dt", "seconds", "planned_cost", "open_loop_cost", "closed_loop_cost", "failure")
 
     runs: tuple[OptimalControlRun, ...]
     robot: str

@@ -121,6 +121,7 @@ class WorkPrecision(Record):
     _run = WorkPrecisionRun
     _format = "varpin.work-precision/2"
     _headings = HEADINGS
+    _shown = ("integrator", "dt", "seconds", "error", "energy_error", "tip_error", "failure")
 
     runs: tuple[WorkPrecisionRun, ...]
     robot: str

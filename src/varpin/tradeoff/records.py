@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import fields
@@ -12,6 +13,7 @@ from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
+from varpin import markup
 from varpin.archive import read_npz
 from varpin.checks import is_file, path_like
 from varpin.errors import FileError
@@ -32,13 +34,26 @@ MARGIN = 0.02
 class Record:
     """A frozen dataclass of ``runs`` and of the facts that belong to them all, kept as npz and written as CSV.
 
-    Whoever makes one of it says what a run is, what the file is called, and the headings of its columns.
+    Whoever makes one of it says what a run is, what the file is called, the headings of its columns, and which of
+    them a notebook shows.
     """
 
     runs: tuple[Any, ...]
     _run: ClassVar[type[Any]]
     _format: ClassVar[str]
     _headings: ClassVar[Mapping[str, str]]
+    _shown: ClassVar[Sequence[str]]
+
+    def pareto(self) -> tuple[Any, ...]:
+        """The runs that no other beats."""
+        raise NotImplementedError
+
+    def _repr_html_(self) -> str:
+        rows = [[_cell(getattr(run, name)) for name in self._shown] for run in self.runs]
+        front = self.pareto()
+        strong = [k for k, run in enumerate(self.runs) if run in front]
+        title = f"{self!r}; nothing beats the bold runs" if strong else repr(self)
+        return markup.facts(title, [], markup.table([self._headings[name] for name in self._shown], rows, strong))
 
     @classmethod
     def _facts(cls) -> list[str]:
@@ -70,6 +85,11 @@ class Record:
             FileError: The path cannot be written.
         """
         return write_csv(path, self.runs, self._headings)
+
+
+def _cell(value: object) -> object:
+    """A field as a notebook shows it."""
+    return "" if isinstance(value, float) and math.isnan(value) else value
 
 
 def write_table(path: str | os.PathLike[str], form: str, rows: Sequence[Any], kind: type[Any], **facts: Any) -> Path:

@@ -1,0 +1,53 @@
+"""What objects look like in a notebook: tables in HTML, of plain text that is escaped here."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Sequence
+
+# Longer tables say how much they leave out.
+_MOST = 50
+
+_LEFT, _RIGHT = "text-align: left; vertical-align: top", "text-align: right; vertical-align: top"
+
+
+def facts(title: str, rows: Iterable[tuple[str, object]], *parts: str) -> str:
+    """What an object is, a row each of a name and some text, and parts that are markup already below it."""
+    body = "".join(
+        f'<tr><th style="{_LEFT}; white-space: nowrap">{_text(name)}</th><td style="{_LEFT}">{_text(value)}</td></tr>'
+        for name, value in rows
+    )
+    return f'<div class="varpin"><b>{_text(title)}</b><table>{body}</table>{"".join(parts)}</div>'
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[object]], strong: Iterable[int] = ()) -> str:
+    """Rows under headings: text to the left, numbers to the right, some rows bold."""
+    every, bold = list(rows), set(strong)
+    head = "".join(f'<th style="{_LEFT}">{_text(name)}</th>' for name in columns)
+    body = ""
+    for k, row in enumerate(every[:_MOST]):
+        cells = ""
+        for value in row:
+            inner = f"<b>{_text(value)}</b>" if k in bold else _text(value)
+            cells += f'<td style="{_LEFT if isinstance(value, str) else _RIGHT}">{inner}</td>'
+        body += f"<tr>{cells}</tr>"
+    if len(every) > _MOST:
+        body += f'<tr><td colspan="{len(columns)}" style="{_LEFT}">and {len(every) - _MOST} more</td></tr>'
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def folded(title: str, part: str) -> str:
+    """A part that is markup already, shown on a click."""
+    return f"<details><summary>{_text(title)}</summary>{part}</details>"
+
+
+def listed(names: Iterable[object]) -> str:
+    """Names in a row of text; the first of many."""
+    every = [str(name) for name in names]
+    more = f" and {len(every) - _MOST} more" if len(every) > _MOST else ""
+    return ", ".join(every[:_MOST]) + more if every else "none"
+
+
+def _text(value: object) -> str:
+    """A value as markup: a number to four digits, anything else as its own text."""
+    return html.escape(f"{value:.4g}" if isinstance(value, float) else str(value))
