@@ -278,7 +278,7 @@ class TestLoading:
     @pytest.mark.parametrize("value", ["text", np.zeros((21, 2), dtype=complex), np.zeros((21, 2), dtype="M8[s]")])
     def test_values_that_are_no_numbers(self, saved, value):
         array = np.full((21, 2), value) if isinstance(value, str) else value
-        with pytest.raises(vp.FileError, match="q holds values that are not finite numbers"):
+        with pytest.raises(vp.FileError, match=r"q holds .*, where float64 belongs"):
             vp.Trajectory.load(tampered(saved, q=array))
 
     @pytest.mark.parametrize("dt", [0.0, -0.01])

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +16,6 @@ from varpin.errors import FileError
 from varpin.sddp.history import Iteration, SearchState, Status
 from varpin.sddp.problem import OptimalControlProblem
 from varpin.trajectory import MEMBERS, Trajectory, atomic_file, read_members
-
-if TYPE_CHECKING:
-    from varpin.sddp.solution import Solution
 
 Floats = NDArray[np.float64]
 
@@ -30,16 +28,17 @@ _SEARCH = ("cost", "first", "best_merit", "best_cost", "regularization", "growth
 _COLUMNS = tuple(item.name for item in fields(Iteration))
 
 
-def write(path: str | os.PathLike[str], solution: Solution) -> Path:
-    """As :meth:`Solution.save` says."""
-    search = solution.search
-    motions = {"": solution.trajectory}
+def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
+    """Write the fields of a :class:`Solution`, as :meth:`Solution.save` says."""
+    problem: OptimalControlProblem = solution["problem"]
+    search: SearchState | None = solution["search"]
+    motions: dict[str, Trajectory] = {"": solution["trajectory"]}
     if search is not None:
         motions |= {"search.": search.trajectory} | ({} if search.best is None else {"best.": search.best})
     members: dict[str, Any] = {
-        "status": solution.status.name,
-        "reason": solution.reason,
-        "history": _rows(solution.history),
+        "status": solution["status"].name,
+        "reason": solution["reason"],
+        "history": _rows(solution["history"]),
     }
     # Motions are often one and the same: each is written once.
     kept: dict[int, str] = {}
@@ -47,12 +46,12 @@ def write(path: str | os.PathLike[str], solution: Solution) -> Path:
         members[f"{prefix}motion"] = kept.setdefault(id(motion), prefix)
         if kept[id(motion)] == prefix:
             members |= {f"{prefix}{name}": value for name, value in motion.members().items()}
-    members |= {name: getattr(solution, name) for name in (*_PLAN, *_NUMBERS)}
-    if solution.previous_gains is not None:
-        members["previous_gains"] = solution.previous_gains
-    members |= {name: getattr(solution.problem, name) for name in _PROBLEM}
-    members["problem.integrator"] = repr(solution.problem.integrator)
-    members |= _surroundings(solution.problem)
+    members |= {name: solution[name] for name in (*_PLAN, *_NUMBERS)}
+    if solution["previous_gains"] is not None:
+        members["previous_gains"] = solution["previous_gains"]
+    members |= {name: getattr(problem, name) for name in _PROBLEM}
+    members["problem.integrator"] = repr(problem.integrator)
+    members |= _surroundings(problem)
     if search is not None:
         members["search.history"] = len(search.history)
         members["search.merits"] = np.array(search.merits)
