@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import ModuleType
@@ -209,7 +210,7 @@ def _mujoco_start(mujoco: ModuleType, model: Any, data: Any, case: Case) -> None
 
 @dataclass(frozen=True)
 class DrakeModel:
-    """A scene as a continuous MultibodyPlant."""
+    """A scene as a MultibodyPlant."""
 
     plant: Any
     case: Case
@@ -226,23 +227,24 @@ class DrakeModel:
         """Total energy [J]."""
         return float(self.plant.CalcPotentialEnergy(context) + self.plant.CalcKineticEnergy(context))
 
-    def simulator(self, scheme: str, accuracy: float) -> Any:
-        """At the case's initial state."""
+    def simulator(self, scheme: str | None, accuracy: float) -> Any:
+        """At the case's initial state; a plant in discrete steps has no scheme."""
         analysis = importlib.import_module("pydrake.systems.analysis")
         simulator = analysis.Simulator(self.plant, self.context(self.case.q0, self.case.v0))
-        integrator = analysis.ResetIntegratorFromFlags(simulator, scheme, 0.1)
-        integrator.set_target_accuracy(accuracy)
+        if scheme is not None:
+            integrator = analysis.ResetIntegratorFromFlags(simulator, scheme, 0.1)
+            integrator.set_target_accuracy(accuracy)
         simulator.Initialize()
         return simulator
 
 
-def drake_model(case: Case) -> DrakeModel | None:
-    """A case in Drake, or None without it."""
+def drake_model(case: Case, dt: float = 0.0) -> DrakeModel | None:
+    """A case in Drake, continuous or in steps of ``dt`` [s]; None without it."""
     if available("pydrake.multibody.plant") is None:
         return None
     rigid = importlib.import_module("pydrake.math")
     tree = importlib.import_module("pydrake.multibody.tree")
-    plant = importlib.import_module("pydrake.multibody.plant").MultibodyPlant(0.0)
+    plant = importlib.import_module("pydrake.multibody.plant").MultibodyPlant(dt)
     scene = case.scene
     links = [plant.world_body()]
     for k, body in enumerate(bodies(scene.robot)):
@@ -302,30 +304,156 @@ def drake_energies(case: Case, accuracy: float, every: float, scheme: str = "run
 # trep ---------------------------------------------------------------------------------------------------------------
 
 
-def trep_run(links: int, dt: float, duration: float = 1.0) -> Callable[[], np.ndarray] | None:
-    """A run of trep's midpoint integrator on the falling ``planar_chain`` that gives the last q; None without trep."""
+def trep_system(scene: vp.Scene) -> Any:
+    """A scene of links about parallel y axes as a trep.System, or None without trep."""
     trep = available("trep")
     if trep is None:
         return None
+    own = bodies(scene.robot)
+    if any((body.axis != [0.0, 1.0, 0.0]).any() or (body.placement.rotation != np.eye(3)).any() for body in own):
+        raise ValueError(f"{scene.robot.name} has joints that do not turn about y")
 
-    def rods(k: int) -> list[Any]:
-        rod = [trep.tx(0.5, name=f"m{k}", mass=(1.0, LEAST_INERTIA, 1.0 / 12.0, 1.0 / 12.0))]
-        rest = [trep.tx(1.0, name=f"e{k}"), rods(k + 1)] if k + 1 < links else []
-        return [trep.ry(f"q{k}"), rod + rest]
+    def frames(parent: int) -> list[Any]:
+        found: list[Any] = []
+        for k, body in enumerate(own):
+            if body.parent != parent:
+                continue
+            moments = np.maximum(np.diag(body.inertia.inertia), LEAST_INERTIA)
+            mass = trep.const_txyz(body.inertia.lever, name=f"m{k}", mass=(body.inertia.mass, *moments))
+            joint = [trep.ry(f"q{k}"), [mass, *frames(k + 1)]]
+            found += [trep.const_txyz(body.placement.translation, name=f"j{k}"), joint]
+        return found
 
     system = trep.System()
-    system.import_frames(rods(0))
-    trep.potentials.Gravity(system, (0.0, 0.0, -9.81))
-    rest, steps = np.zeros(links), round(duration / dt)
+    system.import_frames(frames(0))
+    trep.potentials.Gravity(system, tuple(scene.gravity))
+    for k in np.flatnonzero(scene.stiffness):
+        trep.potentials.ConfigSpring(system, f"q{k}", float(scene.stiffness[k]), float(scene.rest[k]))
+    for k in np.flatnonzero(scene.damping):
+        trep.forces.Damping(system, 0.0, {f"q{k}": float(scene.damping[k])})
+    return system
+
+
+def trep_run(case: Case, dt: float) -> Callable[[], np.ndarray] | None:
+    """A run of trep's midpoint integrator that gives the last q, without torques; None without trep."""
+    trep, system = available("trep"), trep_system(case.scene)
+    if trep is None:
+        return None
+    steps, p0 = round(case.duration / dt), vp.lagrangian_jet(case.scene, case.q0, case.v0).Lv
 
     def run() -> np.ndarray:
         integrator = trep.MidpointVI(system)
-        integrator.initialize_from_state(0.0, rest, rest)
+        integrator.initialize_from_state(0.0, case.q0, p0)
         for k in range(1, steps + 1):
             integrator.step(k * dt)
         return np.array(integrator.q2)
 
     return run
+
+
+# Whole motions ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What a simulator makes of a case, as far as it goes.
+
+    Attributes:
+        q: At every node (K + 1, n) [rad].
+        v: (K + 1, n) [rad/s].
+        said: What it says of it, or does to it; empty if nothing.
+    """
+
+    q: np.ndarray
+    v: np.ndarray
+    said: str = ""
+
+
+def mujoco_motion(case: Case, dt: float, integrator: str) -> Motion | None:
+    """A motion by MuJoCo, with what it sets back on the way; None without MuJoCo.
+
+    Where a position, a velocity or an acceleration is not finite or above 1e10, MuJoCo sets the whole state back to the
+    model's, which is q = 0 at rest at t = 0, and goes on. It counts that as a warning; other warnings change nothing.
+
+    Raises:
+        RuntimeError: What it calls a reset is none.
+    """
+    mujoco = available("mujoco")
+    if mujoco is None:
+        return None
+    model = mujoco_model(case.scene, dt, integrator)
+    data, steps = mujoco.MjData(model), round(case.duration / dt)
+    mujoco.set_mju_user_warning(lambda _: None)
+    fresh = mujoco.MjData(model)
+    mujoco.mj_step(model, fresh)
+    _mujoco_start(mujoco, model, data, case)
+    q, v, resets, others = [data.qpos.copy()], [data.qvel.copy()], [], set()
+    bad = {int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")}
+    for k in range(1, steps + 1):
+        before = data.time
+        mujoco.mj_step(model, data)
+        counted = np.flatnonzero(data.warning.number)
+        others |= {mujoco.mjtWarning(int(kind)).name for kind in counted if kind not in bad}
+        if data.time <= before:
+            back = np.array_equal(data.qpos, fresh.qpos) and np.array_equal(data.qvel, fresh.qvel)
+            if not (bad & set(counted.tolist()) and back):
+                raise RuntimeError(f"MuJoCo's clock went back in step {k}, but not to the model's own state")
+            resets.append(k * dt)
+        q.append(data.qpos.copy())
+        v.append(data.qvel.copy())
+    said = [f"set back to q = 0 {_often(len(resets))}, first after {resets[0]:.3g} s"] if resets else []
+    said += [f"warns of {name}" for name in sorted(others)]
+    return Motion(np.array(q), np.array(v), "; ".join(said))
+
+
+def _often(times: int) -> str:
+    return "once" if times == 1 else f"{times} times"
+
+
+def drake_motion(case: Case, dt: float, scheme: str | None = None, patience: float = 30.0) -> Motion | None:
+    """A motion by Drake, in discrete steps or by one of its error-controlled schemes at the default 1e-4.
+
+    None without Drake; cut where it takes longer than ``patience`` [s].
+    """
+    own = drake_model(case, dt if scheme is None else 0.0)
+    if own is None:
+        return None
+    q, v, begin = [case.q0], [case.v0], time.monotonic()
+    simulator = own.simulator(scheme, 1e-4)
+    context = simulator.get_context()
+    said = ""
+    for k in range(1, round(case.duration / dt) + 1):
+        try:
+            simulator.AdvanceTo(k * dt)
+        except RuntimeError as error:
+            said = f"gives up after {(k - 1) * dt:.3g} s: {str(error).splitlines()[0]}"
+            break
+        q.append(own.plant.GetPositions(context).copy())
+        v.append(own.plant.GetVelocities(context).copy())
+        if time.monotonic() - begin > patience:
+            said = f"comes to {k * dt:.3g} s in {patience:g} s of ours"
+            break
+    return Motion(np.array(q), np.array(v), said)
+
+
+def trep_motion(case: Case, dt: float) -> Motion | None:
+    """A motion by trep's midpoint integrator, without torques; None without trep."""
+    trep, system = available("trep"), trep_system(case.scene)
+    if trep is None:
+        return None
+    q, v, said = [case.q0], [case.v0], ""
+    integrator = trep.MidpointVI(system)
+    integrator.initialize_from_state(0.0, case.q0, vp.lagrangian_jet(case.scene, case.q0, case.v0).Lv)
+    for k in range(1, round(case.duration / dt) + 1):
+        try:
+            integrator.step(k * dt)
+        except (trep.ConvergenceError, ArithmeticError, ValueError) as error:
+            said = f"gives up after {(k - 1) * dt:.3g} s: {type(error).__name__}"
+            break
+        q.append(np.array(integrator.q2))
+        mass = vp.lagrangian_jet(case.scene, q[-1], np.zeros_like(q[-1])).Lvv
+        v.append(np.linalg.solve(mass, np.array(integrator.p2)))
+    return Motion(np.array(q), np.array(v), said)
 
 
 # The same mechanism? ------------------------------------------------------------------------------------------------

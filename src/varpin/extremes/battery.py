@@ -37,7 +37,7 @@ INTEGRATORS: tuple[Integrator, ...] = (
     RungeKutta4(),
 )
 
-# A motion gets this long, and the plain battery half a minute at most for one [s].
+# A motion or a plan gets this long, and the plain battery half a minute at most for one [s].
 _PATIENCE, _DEEP_PATIENCE = 20.0, 900.0
 # Between two looks at the disk [s].
 _SAVED_EVERY = 2.0
@@ -152,7 +152,7 @@ def run(
         trials: These instead.
         integrators: These instead of all.
         save: Keep the record in this JSON file; cells that it holds already are not run again.
-        patience: Time a motion may take before it is judged by what there is [s].
+        patience: Time a motion or a plan may take before it is judged by what there is [s].
         progress: Called with (cells done, cells in all, the next one's name).
 
     Returns:
@@ -229,7 +229,7 @@ class Bench:
         """The trial with one integrator."""
         begin = time.perf_counter()
         if isinstance(self.trial, Plan):
-            outcome = plans.attempt(self.trial, integrator)
+            outcome = plans.attempt(self.trial, integrator, patience)
         else:
             outcome = self._motion(self.trial, integrator, patience)
         return Cell(
