@@ -33,7 +33,7 @@ RATIOS = (1e-4, 1e-2, 1.0, 1e2, 1e4)
 # A tree gets each so many-th of the trials, and its neighbours the others.
 TURNS = 4
 # A motion or a plan may take this long before it is judged by what there is [s].
-PATIENCE = 2.0
+PATIENCE = 1.0
 
 
 def names() -> list[str]:

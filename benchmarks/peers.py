@@ -21,7 +21,7 @@ from scipy.integrate import solve_ivp
 
 import varpin as vp
 
-# The least moment of inertia that MuJoCo accepts [kg m^2]: a slender rod's own axis gets it, about which nothing turns.
+# MuJoCo accepts no moment of inertia of zero [kg m^2]: a slender rod's own axis gets this, about which nothing turns.
 LEAST_INERTIA = 1e-9
 
 
@@ -86,9 +86,14 @@ def bodies(robot: vp.Robot) -> list[Body]:
         raise ValueError(f"{robot.name} has armature")
     own = []
     for j in range(1, model.njoints):
-        column = pin.computeJointJacobian(model, data, pin.neutral(model), j)[3:, model.joints[j].idx_v]
+        column = pin.computeJointJacobian(model, data, pin.neutral(model), j).reshape(6, -1)[3:, model.joints[j].idx_v]
         own.append(Body(int(model.parents[j]), model.jointPlacements[j], column, model.inertias[j]))
     return own
+
+
+def moments_of(moments: np.ndarray) -> np.ndarray:
+    """Central moments of inertia, with something in place of those of slender axes."""
+    return np.where(moments <= 1e-9 * moments.max(), LEAST_INERTIA, moments)
 
 
 def forces(scene: vp.Scene, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -144,7 +149,7 @@ def mujoco_model(scene: vp.Scene, dt: float, integrator: str = "Euler", *, energ
             f'<joint type="hinge" axis="{_row(body.axis)}" damping="{float(scene.damping[k])!r}"'
             f' stiffness="{float(scene.stiffness[k])!r}" springref="{float(scene.rest[k])!r}"/>'
             f'<inertial pos="{_row(body.inertia.lever)}" quat="{_quaternion(axes)}" mass="{float(body.inertia.mass)!r}"'
-            f' diaginertia="{_row(np.maximum(moments, LEAST_INERTIA))}"/>'
+            f' diaginertia="{_row(moments_of(moments))}"/>'
         )
 
     def tree(parent: int) -> str:
@@ -318,7 +323,7 @@ def trep_system(scene: vp.Scene) -> Any:
         for k, body in enumerate(own):
             if body.parent != parent:
                 continue
-            moments = np.maximum(np.diag(body.inertia.inertia), LEAST_INERTIA)
+            moments = moments_of(np.diag(body.inertia.inertia))
             mass = trep.const_txyz(body.inertia.lever, name=f"m{k}", mass=(body.inertia.mass, *moments))
             joint = [trep.ry(f"q{k}"), [mass, *frames(k + 1)]]
             found += [trep.const_txyz(body.placement.translation, name=f"j{k}"), joint]
