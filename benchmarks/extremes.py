@@ -30,8 +30,8 @@ from mechanisms import random_tree  # noqa: E402
 DOCUMENT = ROOT / "docs" / "limits.md"
 TREES = 200
 RATIOS = (1e-4, 1e-2, 1.0, 1e2, 1e4)
-# A tree gets each so many-th of the trials, and its neighbours the others.
-TURNS = 4
+# A tree, or a robot of more joints than this, gets each so many-th of the trials, and its neighbours the others.
+SMALL, TURNS = 8, 6
 # A motion or a plan may take this long before it is judged by what there is [s].
 PATIENCE = 1.0
 
@@ -53,9 +53,10 @@ def robot_of(name: str) -> vp.Robot:
 
 
 def trials_of(name: str, robot: vp.Robot) -> list[extremes.Trial | extremes.Plan]:
-    """The whole battery of a robot; of a tree's a part."""
+    """The whole battery of a small robot that goes by a name; of others a part."""
     trials = extremes.trials_on(robot)
-    return trials[int(name.removeprefix("tree")) % TURNS :: TURNS] if name.startswith("tree") else trials
+    whole = not name.startswith("tree") and robot.dof <= SMALL
+    return trials if whole else trials[names().index(name) % TURNS :: TURNS]
 
 
 def judge(

@@ -92,8 +92,8 @@ def bodies(robot: vp.Robot) -> list[Body]:
 
 
 def moments_of(moments: np.ndarray) -> np.ndarray:
-    """Central moments of inertia, with something in place of those of slender axes."""
-    return np.where(moments <= 1e-9 * moments.max(), LEAST_INERTIA, moments)
+    """Central moments of inertia, with something in place of those of slender axes that cannot be told from it."""
+    return np.where(moments <= 1e-9 * moments.max(), min(LEAST_INERTIA, 1e-3 * moments.max()), moments)
 
 
 def forces(scene: vp.Scene, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -393,16 +393,18 @@ def mujoco_motion(case: Case, dt: float, integrator: str) -> Motion | None:
     mujoco.mj_step(model, fresh)
     _mujoco_start(mujoco, model, data, case)
     q, v, resets, others = [data.qpos.copy()], [data.qvel.copy()], [], set()
-    bad = {int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")}
+    bad = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
     for k in range(1, steps + 1):
-        before = data.time
+        # A reset clears every count but its own, which is 1 however many there were before.
+        for kind in bad:
+            data.warning[kind].number = 0
         mujoco.mj_step(model, data)
-        counted = np.flatnonzero(data.warning.number)
-        others |= {mujoco.mjtWarning(int(kind)).name for kind in counted if kind not in bad}
-        if data.time <= before:
+        counted = data.warning.number
+        others |= {mujoco.mjtWarning(int(kind)).name for kind in np.flatnonzero(counted) if kind not in bad}
+        if counted[bad].any():
             back = np.array_equal(data.qpos, fresh.qpos) and np.array_equal(data.qvel, fresh.qvel)
-            if not (bad & set(counted.tolist()) and back):
-                raise RuntimeError(f"MuJoCo's clock went back in step {k}, but not to the model's own state")
+            if not (back and data.time == fresh.time):
+                raise RuntimeError(f"MuJoCo warns in step {k} of what it sets back, and does not set it back")
             resets.append(k * dt)
         q.append(data.qpos.copy())
         v.append(data.qvel.copy())
@@ -418,7 +420,7 @@ def _often(times: int) -> str:
 def drake_motion(case: Case, dt: float, scheme: str | None = None, patience: float = 30.0) -> Motion | None:
     """A motion by Drake, in discrete steps or by one of its error-controlled schemes at the default 1e-4.
 
-    None without Drake; cut where it takes longer than ``patience`` [s].
+    None without Drake; given up where it takes longer than ``patience`` [s].
     """
     own = drake_model(case, dt if scheme is None else 0.0)
     if own is None:
@@ -426,6 +428,9 @@ def drake_motion(case: Case, dt: float, scheme: str | None = None, patience: flo
     q, v, begin = [case.q0], [case.v0], time.monotonic()
     simulator = own.simulator(scheme, 1e-4)
     context = simulator.get_context()
+    status = importlib.import_module("pydrake.systems.framework").EventStatus
+    late = status.ReachedTermination(own.plant, "out of patience")
+    simulator.set_monitor(lambda _: late if time.monotonic() - begin > patience else status.DidNothing())
     said = ""
     for k in range(1, round(case.duration / dt) + 1):
         try:
@@ -433,11 +438,11 @@ def drake_motion(case: Case, dt: float, scheme: str | None = None, patience: flo
         except RuntimeError as error:
             said = f"gives up after {(k - 1) * dt:.3g} s: {str(error).splitlines()[0]}"
             break
+        if time.monotonic() - begin > patience:
+            said = f"gives up after {(k - 1) * dt:.3g} s: its steps are too small to go on for {patience:g} s"
+            break
         q.append(own.plant.GetPositions(context).copy())
         v.append(own.plant.GetVelocities(context).copy())
-        if time.monotonic() - begin > patience:
-            said = f"comes to {k * dt:.3g} s in {patience:g} s of ours"
-            break
     return Motion(np.array(q), np.array(v), said)
 
 

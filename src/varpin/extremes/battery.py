@@ -152,7 +152,7 @@ def run(
         trials: These instead.
         integrators: These instead of all.
         save: Keep the record in this JSON file; cells that it holds already are not run again.
-        patience: Time a motion or a plan may take before it is judged by what there is [s].
+        patience: Processor time a motion may take, and time a plan may, before it is judged by what there is [s].
         progress: Called with (cells done, cells in all, the next one's name).
 
     Returns:
@@ -270,10 +270,10 @@ class Bench:
         """The motion, as far as it goes, and the named error that stopped it."""
         if self._setup is None:
             self._setup = trial.build()
-        setup, begin = self._setup, time.monotonic()
+        setup, begin = self._setup, time.process_time()
 
         def watch(done: int, steps: int) -> None:
-            if done < steps and time.monotonic() - begin > patience:
+            if done < steps and time.process_time() - begin > patience:
                 raise _OutOfTime
 
         try:
@@ -289,7 +289,7 @@ class Bench:
                 progress=watch,
             ), None
         except Interrupted as error:
-            if time.monotonic() - begin <= patience:
+            if time.process_time() - begin <= patience:
                 raise
             return error.trajectory, None
         except VarpinError as error:
