@@ -425,12 +425,12 @@ def drake_motion(case: Case, dt: float, scheme: str | None = None, patience: flo
     own = drake_model(case, dt if scheme is None else 0.0)
     if own is None:
         return None
-    q, v, begin = [case.q0], [case.v0], time.monotonic()
+    q, v, begin = [case.q0], [case.v0], time.process_time()
     simulator = own.simulator(scheme, 1e-4)
     context = simulator.get_context()
     status = importlib.import_module("pydrake.systems.framework").EventStatus
     late = status.ReachedTermination(own.plant, "out of patience")
-    simulator.set_monitor(lambda _: late if time.monotonic() - begin > patience else status.DidNothing())
+    simulator.set_monitor(lambda _: late if time.process_time() - begin > patience else status.DidNothing())
     said = ""
     for k in range(1, round(case.duration / dt) + 1):
         try:
@@ -438,7 +438,7 @@ def drake_motion(case: Case, dt: float, scheme: str | None = None, patience: flo
         except RuntimeError as error:
             said = f"gives up after {(k - 1) * dt:.3g} s: {str(error).splitlines()[0]}"
             break
-        if time.monotonic() - begin > patience:
+        if time.process_time() - begin > patience:
             said = f"gives up after {(k - 1) * dt:.3g} s: its steps are too small to go on for {patience:g} s"
             break
         q.append(own.plant.GetPositions(context).copy())
