@@ -17,7 +17,7 @@ from crocoddyl_reference import PROBLEMS, Problem, require_gravity, shooting
 
 import varpin as vp
 from varpin.integrators.base import open_loop
-from varpin.solution import accurate_cost
+from varpin.sddp.verification import accurate_cost
 
 ROUNDS = 15
 PASSES = 3

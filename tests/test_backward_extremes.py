@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import varpin as vp
-from varpin.backward import TRUSTED, _one_pass, backward
 from varpin.kernels import backward as kernels
 from varpin.linearization import linearize_steps
+from varpin.sddp.backward import TRUSTED, _one_pass, backward
+from varpin.sddp.square_root import RootPass, squares_of
 from varpin.simulation import simulate
-from varpin.square_root import RootPass, squares_of
 
 INERTIAS = {"unit": np.ones(3), "finger": np.array([1e-5, 1e-6, 1e-7]), "mixed": np.array([1.0, 1e-3, 1e-6])}
 EXTREMES = (1e-9, 1.0, 1e9)

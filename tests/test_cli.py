@@ -14,8 +14,7 @@ from rich.console import Console
 
 import varpin as vp
 import varpin_command
-from varpin import cli
-from varpin.cli import main
+from varpin.cli import console, exits, main
 from varpin.paper import Reproduction
 from varpin.paper.claims import Claim
 from varpin.robot import load_robot
@@ -253,7 +252,7 @@ def test_usage_errors_are_argparses_and_status_2(capsys, arguments, message):
 
 
 def test_outputs_are_checked_before_the_run(arm, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "simulate", lambda *_, **__: pytest.fail("the run must not start"))
+    monkeypatch.setattr("varpin.cli.simulate.simulate", lambda *_, **__: pytest.fail("the run must not start"))
     kept = str(tmp_path / "kept.npz")
     for option, path in (("--html", "/nowhere/a.html"), ("--plot", "/nowhere/a.png"), ("--save", str(tmp_path))):
         assert main(["simulate", arm, "--html", kept, option, path]) == 2
@@ -285,7 +284,7 @@ def test_failed_step_keeps_what_was_before_it(arm, tmp_path, capsys, monkeypatch
         failure = type("Failure", (), {"reason": "the step is at a fold", "residual": 3.5})
         raise vp.StepFailure(part.steps, part.t[-1], failure, part)
 
-    monkeypatch.setattr(cli, "simulate", failing)
+    monkeypatch.setattr("varpin.cli.simulate.simulate", failing)
     path = tmp_path / "a.npz"
     assert main(["simulate", arm, "--steps", "20", "--save", str(path)]) == 3
     out, err = capsys.readouterr()
@@ -307,7 +306,7 @@ def test_interrupted_run_keeps_its_data(arm, tmp_path, capsys, monkeypatch):
     def interrupt(self, done, steps):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli._Bar, "__call__", interrupt)
+    monkeypatch.setattr(console._Bar, "__call__", interrupt)
     path = tmp_path / "a.npz"
     assert main(["simulate", arm, "--dt", "1e-4", "--steps", "40000", "--save", str(path)]) == 130
     out, err = capsys.readouterr()
@@ -322,7 +321,7 @@ def test_interruption_outside_the_run_is_status_130(arm, capsys, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "load_robot", interrupt)
+    monkeypatch.setattr("varpin.cli.arguments.load_robot", interrupt)
     assert main(["simulate", arm]) == 130
     assert error_of(capsys) == "varpin: interrupted"
 
@@ -331,13 +330,13 @@ def test_lack_of_memory_is_no_traceback(arm, capsys, monkeypatch):
     def exhausted(*_, **__):
         raise MemoryError("Unable to allocate 7 TiB")
 
-    monkeypatch.setattr(cli, "simulate", exhausted)
+    monkeypatch.setattr("varpin.cli.simulate.simulate", exhausted)
     assert main(["simulate", arm]) == 2
     assert error_of(capsys) == "varpin: error: out of memory: Unable to allocate 7 TiB; take fewer steps"
 
 
 def test_long_run_without_a_terminal_says_how_far_it_is(arm, capsys, monkeypatch):
-    monkeypatch.setattr(cli._Bar, "PATIENCE", 0.0)
+    monkeypatch.setattr(console._Bar, "PATIENCE", 0.0)
     assert main(["simulate", arm, "--dt", "1e-4", "--steps", "40000"]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert "varpin: 15000 of 40000 steps" in lines
@@ -345,8 +344,8 @@ def test_long_run_without_a_terminal_says_how_far_it_is(arm, capsys, monkeypatch
 
 def test_progress_bar_on_a_terminal_vanishes_without_hiding_warnings():
     stream = io.StringIO()
-    console = Console(file=stream, force_terminal=True, width=80)
-    with cli._progress(console, 10, quiet=False) as progress, cli._logged(console, logging.WARNING):
+    terminal = Console(file=stream, force_terminal=True, width=80)
+    with console.progress_bar(terminal, 10, quiet=False) as progress, console.logged(terminal, logging.WARNING):
         progress(5, 10)
         logging.getLogger("varpin.simulation").warning("something [bold] happened")
     assert "varpin: warning: something [bold] happened" in stream.getvalue()
@@ -513,7 +512,7 @@ varpin_command.main()
 def test_installed_command_leaves_ctrl_c_to_the_command_line(monkeypatch):
     """What a run does at Ctrl-C is its own matter again once everything is imported."""
     before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(cli, "main", lambda: int(signal.getsignal(signal.SIGINT) is before))
+    monkeypatch.setattr("varpin.cli.main", lambda: int(signal.getsignal(signal.SIGINT) is before))
     assert varpin_command.main() == 1
 
 
@@ -616,7 +615,7 @@ def test_scene_is_simulated(scene, tmp_path, capsys):
 
 
 def test_scene_is_solved_saved_and_resumed(scene, tmp_path, capsys):
-    assert main(["solve", scene, "--max-iterations", "1", "--save", "part.npz"]) == cli.STEP_FAILED
+    assert main(["solve", scene, "--max-iterations", "1", "--save", "part.npz"]) == exits.STEP_FAILED
     out, err = capsys.readouterr()
     assert "3 of 3 computed" in out
     assert "not converged" in err
@@ -652,5 +651,5 @@ def test_scene_is_inspected(scene, capsys):
 )
 def test_mistakes_about_scenes(arguments, words, scene, tmp_path, capsys):
     (tmp_path / "broken.toml").write_text("[robot]\n[horizon]\ndt = 1\nsteps = 1\n")
-    assert main(arguments) == cli.MISTAKE
+    assert main(arguments) == exits.MISTAKE
     assert words in error_of(capsys)

@@ -6,9 +6,9 @@ from scipy.optimize import lsq_linear
 from test_sddp import sliders
 
 import varpin as vp
-from varpin.backward import backward
 from varpin.kernels.box import solve_box
 from varpin.robot.kinematics import frame_kinematics
+from varpin.sddp.backward import backward
 
 
 def quadratic(rng, m, condition):

@@ -23,8 +23,8 @@ from varpin.integrators.base import open_loop
 from varpin.lagrangian import lagrangian_jet
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.policy import LinearPolicy
-from varpin.problem import OptimalControlProblem, bind_cost
-from varpin.sddp import states
+from varpin.sddp.problem import OptimalControlProblem, bind_cost
+from varpin.sddp.search import states
 from varpin.simulation import StepFailure, rollout
 from varpin.trajectory import Trajectory
 

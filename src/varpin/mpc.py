@@ -13,11 +13,9 @@ from varpin.checks import count, positive
 from varpin.errors import InputError
 from varpin.integrators import Integrator, RungeKutta4
 from varpin.integrators.base import Failure
-from varpin.problem import OptimalControlProblem
 from varpin.scene import Scene, require_scene
-from varpin.sddp import solve
+from varpin.sddp import OptimalControlProblem, Solution, solve
 from varpin.simulation import Interrupted, StepFailure, simulate
-from varpin.solution import Solution
 from varpin.trajectory import Trajectory, chained
 
 Floats = NDArray[np.float64]

@@ -85,6 +85,11 @@ class LinearPolicy:
         on = "" if self.on is None else f" on (q, {'p' if self.on == 'momentum' else 'v'})"
         return f"LinearPolicy({steps} intervals of {self.hold} steps, {m} controls, {size // 2} joints{on})"
 
+    def without_feedback(self) -> LinearPolicy:
+        """The controls alone."""
+        limits = (self.limits[0], self.limits[1])
+        return LinearPolicy(self.u, np.zeros_like(self.gains), self.reference, self.hold, self.on, limits)
+
     def commands(self, steps: int, controls: int, dof: int, variational: bool) -> Commands:
         """The policy as kernels take it, for an integrator on (q, p) if it is ``variational``, else on (q, v).
 

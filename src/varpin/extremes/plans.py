@@ -17,13 +17,10 @@ from varpin.errors import VarpinError
 from varpin.extremes.trial import Kind
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint
 from varpin.noise import AdditiveNoise, ControlNoise, Noise
-from varpin.problem import OptimalControlProblem
 from varpin.robot import Robot
 from varpin.robot.chain import rod_chain
 from varpin.scene import Scene
-from varpin.sddp import solve
-from varpin.simulation import simulate
-from varpin.solution import Solution
+from varpin.sddp import OptimalControlProblem, Solution, solve
 
 Floats = NDArray[np.float64]
 
@@ -181,16 +178,7 @@ def _gain(task: Task, solution: Solution, change: float) -> float:
         controls = u.copy()
         if cell is not None:
             controls[tuple(cell)] += by
-        motion = simulate(
-            problem.scene,
-            problem.q0,
-            problem.v0,
-            dt=problem.dt,
-            steps=problem.steps,
-            controls=controls,
-            integrator=problem.integrator,
-            check=False,
-        )
+        motion = problem.simulate(controls)
         return task.cost(motion.q, controls, problem.dt)
 
     here, gain = cost(), 0.0

@@ -14,9 +14,9 @@ import numpy as np
 from varpin.costs import ControlCost, Cost, Terminal, TrackingCost
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint
 from varpin.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
-from varpin.problem import OptimalControlProblem
 from varpin.robot import Robot, load_robot
 from varpin.scene import Scene
+from varpin.sddp import OptimalControlProblem
 
 DURATION = 1.5
 STEPS = (1e-4, 5e-4, 1e-3, 2e-3, 4e-3, 6e-3, 1e-2, 2e-2)

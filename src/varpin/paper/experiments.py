@@ -21,8 +21,7 @@ from varpin.integrators import RungeKutta4
 from varpin.linearization import linearize
 from varpin.paper import cases
 from varpin.paper.cases import CASES, MAIN, METHODS, VARIATIONS, Case, Setting
-from varpin.sddp import solve
-from varpin.solution import Solution
+from varpin.sddp import Solution, solve
 from varpin.trajectory import atomic_file
 
 Floats = NDArray[np.float64]

@@ -14,7 +14,6 @@ import numpy as np
 from varpin.costs import CostError
 from varpin.errors import InputError
 from varpin.policy import LinearPolicy
-from varpin.problem import OptimalControlProblem
 from varpin.robot import Robot
 from varpin.scene import Scene
 from varpin.scenefile.layout import Layout, holding_controls, lay_out
@@ -22,9 +21,8 @@ from varpin.scenefile.references import Timeline
 from varpin.scenefile.required import Required, idle_joints, requirements
 from varpin.scenefile.spec import SceneSpec, find_scene, read_scene
 from varpin.scenefile.table import Floats
-from varpin.sddp import solve
+from varpin.sddp import OptimalControlProblem, Solution, solve
 from varpin.simulation import simulate
-from varpin.solution import Solution
 from varpin.trajectory import Trajectory
 
 # Setting a part up takes as long as this much linear algebra, in cubes of joints times steps, measured.

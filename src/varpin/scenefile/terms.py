@@ -9,19 +9,22 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from varpin.costs import ControlCost, Cost, TrackingCost, VelocityCost
-from varpin.robot import Robot
-from varpin.scenefile.references import Timeline
-from varpin.scenefile.table import Floats
-from varpin.task_costs import (
+from varpin.costs import (
     CenterOfMassCost,
+    ControlCost,
+    Cost,
     FrameOrientationCost,
     FramePositionCost,
     FrameVelocityCost,
     JointLimitBarrier,
     ManipulabilityCost,
+    TrackingCost,
+    VelocityCost,
     VelocityLimitBarrier,
 )
+from varpin.robot import Robot
+from varpin.scenefile.references import Timeline
+from varpin.scenefile.table import Floats
 
 Space = Literal["q", "v", "u", "frame", "robot"]
 

@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 from varpin.checks import count, positive, writable
 from varpin.errors import FileError, InputError
 from varpin.integrators import Integrator
-from varpin.problem import OptimalControlProblem
-from varpin.sddp import solve
-from varpin.solution import Solution
+from varpin.sddp import OptimalControlProblem, Solution, solve
 from varpin.tradeoff.records import Record, pareto_front
 from varpin.tradeoff.setting import Setting, fastest, integrators_of
 

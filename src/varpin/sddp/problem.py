@@ -15,6 +15,7 @@ from varpin.integrators import Integrator, Midpoint
 from varpin.lagrangian import lagrangian_jet
 from varpin.policy import LinearPolicy
 from varpin.scene import Scene, require_scene
+from varpin.simulation import simulate
 from varpin.trajectory import Trajectory, require_motion
 
 Floats = NDArray[np.float64]
@@ -275,6 +276,27 @@ class OptimalControlProblem:
                 f"the problem {self.steps} of {self.dt:g} s"
             )
         return float(self.costs(trajectory.q, trajectory.v, trajectory.u))
+
+    def simulate(
+        self, controls: ArrayLike | LinearPolicy, *, rng: np.random.Generator | int | None = None
+    ) -> Trajectory:
+        """The motion from (q0, v0) under some controls (N, m) or a policy, with the scene's noise if there is an rng.
+
+        Raises:
+            StepFailure: The motion cannot go on.
+            InputError: As :func:`varpin.simulate`.
+        """
+        return simulate(
+            self.scene,
+            self.q0,
+            self.v0,
+            dt=self.dt,
+            steps=self.steps,
+            controls=controls,
+            integrator=self.integrator,
+            rng=rng,
+            check=False,
+        )
 
     def expand_running(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the running costs along a motion, at their samples, in (q, v, u)."""

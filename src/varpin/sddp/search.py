@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.backward import Plan, backward, noise_cost
 from varpin.checks import as_floats, count, finite_array, fraction, is_one_of, positive, real
 from varpin.costs import CostError
 from varpin.errors import InputError, LinearizationError
@@ -19,9 +18,11 @@ from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
 from varpin.noise import NoiseFieldError
 from varpin.policy import LinearPolicy
-from varpin.problem import OptimalControlProblem
+from varpin.sddp.backward import Plan, backward, noise_cost
+from varpin.sddp.history import Iteration, SearchState, Status
+from varpin.sddp.problem import OptimalControlProblem
+from varpin.sddp.solution import Solution
 from varpin.simulation import StepFailure, rollout
-from varpin.solution import Iteration, SearchState, Solution, Status
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -229,6 +230,7 @@ class _Search:
         self.exact = second_order
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
+        self.planned: tuple[Trajectory, float, bool] | None = None  # what it is a plan for, and how it was made
         self.trajectory: Trajectory
         self.cost = self.first = np.inf
         self.reached = np.inf  # the expected cost of the last step taken, by the plan it was taken with
@@ -373,6 +375,7 @@ class _Search:
             passes += 1
             self.plan = backward(self.problem, self.trajectory, self.regularization, self.exact)
             if self.plan is not None:
+                self.planned = self.trajectory, self.regularization, self.exact
                 return passes
             if self.exact:
                 self.exact = False
@@ -427,6 +430,8 @@ class _Search:
         return moved if failure is None else None
 
     def _last_plan(self) -> Plan | None:
+        if self.plan is not None and self.planned == (self.trajectory, 0.0, self.second_order):
+            return self.plan
         try:
             return self._least_regularized()[0]
         except _LOST:

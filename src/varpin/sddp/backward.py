@@ -17,8 +17,8 @@ from varpin.linearization import (
     velocity_at_nodes,
     velocity_curvature,
 )
-from varpin.problem import OptimalControlProblem
-from varpin.square_root import RootPass, Squares, squares_of
+from varpin.sddp.problem import OptimalControlProblem
+from varpin.sddp.square_root import RootPass, Squares, squares_of
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]

@@ -1,13 +1,7 @@
-"""Costs in the task: frames, the centre of mass, manipulability, and barriers at the limits of joints.
-
-All are least squares, weight . r^2 with a residual r, evaluated at all points at once. Their Hessians are those of
-Gauss and Newton, 2 J' weight J with J the residual's derivative: positive semidefinite, and exact where r is zero or
-linear.
-"""
+"""Costs in the task: of frames, the centre of mass and manipulability."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -15,20 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from varpin.checks import as_floats, broadcast_array, checked_limits, positive, require_finite
-from varpin.costs import (
-    BoundCost,
-    Cost,
-    CostError,
-    Expansion,
-    Points,
-    Reference,
-    Scaled,
-    Terminal,
-    checked_weight,
-    sample,
-    weight_matrix,
-)
+from varpin.checks import as_floats, positive, require_finite
+from varpin.costs.base import CostError, Points, Reference, sample
+from varpin.costs.residual import Residual, TaskCost
 from varpin.errors import InputError
 from varpin.robot import Robot
 from varpin.robot.kinematics import (
@@ -42,77 +25,7 @@ from varpin.robot.kinematics import (
 Floats = NDArray[np.float64]
 
 
-class _Residual:
-    """A residual at given points; ``columns`` are those entries of z = (q, v, u) it depends on."""
-
-    columns: slice
-
-    @abstractmethod
-    def value(self, q: Floats, v: Floats) -> Floats:
-        """Its values (..., N, r) at q and v (..., N, n)."""
-
-    @abstractmethod
-    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
-        """Its values (N, r) and their derivatives in its columns (N, r, c)."""
-
-
-@dataclass(frozen=True, eq=False)
-class _BoundTask(BoundCost):
-    residual: _Residual
-    weight: Floats  # (r, r)
-    size: int
-
-    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
-        error = self.residual.value(q, v)
-        total: Floats = np.einsum("...i,...i->...", error @ self.weight, error)
-        return total
-
-    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:  # noqa: ARG002
-        error, J = self.residual.expand(q, v)
-        columns = self.residual.columns
-        WJ = 2.0 * (self.weight @ J)
-        gradient, hessian = np.zeros((len(q), self.size)), np.zeros((len(q), self.size, self.size))
-        gradient[:, columns] = (error[:, None, :] @ WJ)[:, 0]
-        hessian[:, columns, columns] = np.swapaxes(J, 1, 2) @ WJ
-        return Expansion(gradient, hessian)
-
-
-class _TaskCost(Cost):
-    """weight . r^2 with a residual of ``size`` entries."""
-
-    robot: Robot
-    weight: Floats
-    size: int
-
-    def __init__(self, robot: Robot, weight: ArrayLike) -> None:
-        if not isinstance(robot, Robot):
-            raise InputError(f"{type(self).__name__} takes a robot from load_robot, got {type(robot).__name__}")
-        self.robot = robot
-        self.weight = checked_weight(type(self).__name__, weight)
-        weight_matrix(type(self).__name__, self.weight, self.size)
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self._subject()}weight={self.weight.tolist()})"
-
-    def _subject(self) -> str:
-        return ""
-
-    def bind(self, points: Points) -> BoundCost:
-        """See :meth:`varpin.costs.Cost.bind`."""
-        name = type(self).__name__
-        if points.dof != self.robot.dof:
-            raise InputError(
-                f"{name} is for robot {self.robot.name!r} with {self.robot.dof} coordinates; "
-                f"the problem has {points.dof}"
-            )
-        return _BoundTask(self._at(points), weight_matrix(name, self.weight, self.size), points.size)
-
-    @abstractmethod
-    def _at(self, points: Points) -> _Residual:
-        """The residual at given points."""
-
-
-class _FrameCost(_TaskCost):
+class _FrameCost(TaskCost):
     frame: str
 
     def __init__(self, robot: Robot, frame: str, weight: ArrayLike) -> None:
@@ -130,7 +43,7 @@ def _rows(x: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class _Position(_Residual):
+class _Position(Residual):
     of: FrameKinematics
     target: Floats  # (N, 3) or (1, 3)
     columns: slice
@@ -165,13 +78,13 @@ class FramePositionCost(_FrameCost):
         super().__init__(robot, frame, weight)
         self.target = target if callable(target) else as_floats("FramePositionCost target", target)
 
-    def _at(self, points: Points) -> _Residual:
+    def _at(self, points: Points) -> Residual:
         target = sample("FramePositionCost", self.target, points, 3)
         return _Position(self._kinematics, target, slice(0, points.dof))
 
 
 @dataclass(frozen=True, eq=False)
-class _Orientation(_Residual):
+class _Orientation(Residual):
     of: FrameKinematics
     target: Floats  # (N, 3, 3) or (1, 3, 3)
     columns: slice
@@ -216,7 +129,7 @@ class FrameOrientationCost(_FrameCost):
         super().__init__(robot, frame, weight)
         self.target = target if callable(target) else as_floats("FrameOrientationCost target", target)
 
-    def _at(self, points: Points) -> _Residual:
+    def _at(self, points: Points) -> Residual:
         return _Orientation(self._kinematics, _sample_rotations(self.target, points), slice(0, points.dof))
 
 
@@ -280,7 +193,7 @@ def _require_rotations(name: str, R: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class _Twist(_Residual):
+class _Twist(Residual):
     of: FrameKinematics
     target: Floats  # (N, 6) or (1, 6)
     columns: slice
@@ -316,13 +229,13 @@ class FrameVelocityCost(_FrameCost):
         super().__init__(robot, frame, weight)
         self.target = target if callable(target) else as_floats("FrameVelocityCost target", target)
 
-    def _at(self, points: Points) -> _Residual:
+    def _at(self, points: Points) -> Residual:
         target = sample("FrameVelocityCost", self.target, points, 6)
         return _Twist(self._kinematics, target, slice(0, 2 * points.dof))
 
 
 @dataclass(frozen=True, eq=False)
-class _Center(_Residual):
+class _Center(Residual):
     of: CenterOfMass
     target: Floats  # (N, 3) or (1, 3)
     columns: slice
@@ -335,7 +248,7 @@ class _Center(_Residual):
         return position - self.target, J
 
 
-class CenterOfMassCost(_TaskCost):
+class CenterOfMassCost(TaskCost):
     """weight . (c(q) - c_r(t))^2 with c the centre of mass of the links that joints move."""
 
     size = 3
@@ -350,7 +263,7 @@ class CenterOfMassCost(_TaskCost):
         self._center = center_of_mass(robot)
         self.target = target if callable(target) else as_floats("CenterOfMassCost target", target)
 
-    def _at(self, points: Points) -> _Residual:
+    def _at(self, points: Points) -> Residual:
         return _Center(self._center, sample("CenterOfMassCost", self.target, points, 3), slice(0, points.dof))
 
 
@@ -359,7 +272,7 @@ _SETS = {"all": _DIRECTIONS, "linear": _DIRECTIONS[:3], "angular": _DIRECTIONS[3
 
 
 @dataclass(frozen=True, eq=False)
-class _Dexterity(_Residual):
+class _Dexterity(Residual):
     of: FrameKinematics
     rows: list[int]
     least: float
@@ -429,125 +342,5 @@ class ManipulabilityCost(_FrameCost):
         self.least = positive("ManipulabilityCost least", least, "m or rad for each direction")
         self.rows = [_DIRECTIONS.index(name) for name in chosen]
 
-    def _at(self, points: Points) -> _Residual:
+    def _at(self, points: Points) -> Residual:
         return _Dexterity(self._kinematics, self.rows, self.least, slice(0, points.dof))
-
-
-@dataclass(frozen=True, eq=False)
-class _Excess(_Residual):
-    lower: Floats
-    upper: Floats
-    columns: slice
-    in_velocity: bool
-
-    def value(self, q: Floats, v: Floats) -> Floats:
-        y = v if self.in_velocity else q
-        return np.maximum(0.0, y - self.upper) - np.maximum(0.0, self.lower - y)
-
-    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
-        y = v if self.in_velocity else q
-        outside = ((y > self.upper) | (y < self.lower)).astype(np.float64)
-        return self.value(q, v), outside[:, :, None] * np.eye(y.shape[1])
-
-
-class _Barrier(_TaskCost):
-    limits: Floats
-    in_velocity: bool
-
-    def __init__(
-        self,
-        robot: Robot,
-        weight: ArrayLike,
-        margin: ArrayLike,
-        limits: tuple[ArrayLike, ArrayLike] | None,
-    ) -> None:
-        self.size = robot.dof if isinstance(robot, Robot) else 0
-        super().__init__(robot, weight)
-        name = type(self).__name__
-        self.limits = checked_limits(f"{name} limits", self._own(robot) if limits is None else limits, self.size)
-        if not np.isfinite(self.limits).any():
-            raise InputError(f"{name}: robot {robot.name!r} has no such limits; give limits=(lower, upper)")
-        self.margin = broadcast_array(f"{name} margin", margin, self.size)
-        if (self.margin < 0.0).any():
-            raise InputError(f"{name} margin must be >= 0, got {self.margin.min():g}")
-        self.margin = np.minimum(self.margin, 0.5 * (self.limits[1] - self.limits[0]))
-
-    @staticmethod
-    @abstractmethod
-    def _own(robot: Robot) -> tuple[Floats, Floats]:
-        """The robot's limits."""
-
-    def _at(self, points: Points) -> _Residual:
-        n = points.dof
-        columns = slice(n, 2 * n) if self.in_velocity else slice(0, n)
-        return _Excess(self.limits[0] + self.margin, self.limits[1] - self.margin, columns, self.in_velocity)
-
-
-class JointLimitBarrier(_Barrier):
-    """weight . (what q is beyond a limit less a margin)^2: keep joints within their limits.
-
-    A penalty that begins ``margin`` before the limit and is zero farther inside; it is finite beyond the limit, so that
-    a search may begin there. ``Solution.violations`` says what is left.
-    """
-
-    in_velocity = False
-
-    def __init__(
-        self,
-        robot: Robot,
-        weight: ArrayLike = 1.0,
-        margin: ArrayLike = 0.0,
-        limits: tuple[ArrayLike, ArrayLike] | None = None,
-    ) -> None:
-        """Describe the cost.
-
-        Args:
-            robot: The robot.
-            weight: One number, (n,), or a matrix (n, n), positive semidefinite.
-            margin: One number or (n,) >= 0 [rad or m]; of it, at most half the way from limit to limit.
-            limits: (lower, upper), each one number or (n,), infinite where there is none; the robot's if left out.
-
-        Raises:
-            InputError: There is no limit, or an argument has a wrong shape or value.
-        """
-        super().__init__(robot, weight, margin, limits)
-
-    @staticmethod
-    def _own(robot: Robot) -> tuple[Floats, Floats]:
-        return robot.position_limits
-
-
-class VelocityLimitBarrier(_Barrier):
-    """weight . (what v is beyond a limit less a margin)^2; see :class:`JointLimitBarrier`."""
-
-    in_velocity = True
-
-    def __init__(
-        self,
-        robot: Robot,
-        weight: ArrayLike = 1.0,
-        margin: ArrayLike = 0.0,
-        limits: tuple[ArrayLike, ArrayLike] | None = None,
-    ) -> None:
-        """Describe the cost; see :class:`JointLimitBarrier`, with velocities [rad/s or m/s]."""
-        super().__init__(robot, weight, margin, limits)
-
-    @staticmethod
-    def _own(robot: Robot) -> tuple[Floats, Floats]:
-        return -robot.velocity_limit, robot.velocity_limit
-
-
-def barriers_of(cost: Cost) -> tuple[list[JointLimitBarrier], list[VelocityLimitBarrier]]:
-    """The barriers among the terms of a cost."""
-    joints: list[JointLimitBarrier] = []
-    speeds: list[VelocityLimitBarrier] = []
-    for term in cost.terms:
-        inner = term
-        while isinstance(inner, Terminal | Scaled):
-            inner = inner.cost
-        for part in inner.terms:
-            if isinstance(part, JointLimitBarrier):
-                joints.append(part)
-            elif isinstance(part, VelocityLimitBarrier):
-                speeds.append(part)
-    return joints, speeds

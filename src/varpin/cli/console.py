@@ -1,0 +1,132 @@
+"""What the command says: tables, progress, the log and complaints."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Callable, Iterator, Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+if TYPE_CHECKING:
+    pass
+
+
+# Width of tables in a pipe or a file, which have none of their own.
+WIDTH = 140
+
+
+def table_of(title: str, columns: Sequence[str]) -> Table:
+    """A table with a title and columns."""
+    table = Table(title=Text(title), title_justify="left")
+    for column in columns:
+        table.add_column(Text(column), overflow="fold")
+    return table
+
+
+def facts(title: str) -> Table:
+    """A table of two columns, names and values."""
+    table = Table(title=Text(title), title_justify="left", show_header=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    return table
+
+
+def add_row(table: Table, *cells: str, style: str = "") -> None:
+    """Add a row of plain words to a table."""
+    # As Text: rich takes what stands in brackets for markup, and units stand in brackets.
+    table.add_row(*(Text(cell) for cell in cells), style=style)
+
+
+def file_size(size: int) -> str:
+    """The size of a file in words."""
+    if size < 1000:
+        return f"{size} B"
+    return f"{size / 1e3:.1f} kB" if size < 1e6 else f"{size / 1e6:.1f} MB"
+
+
+class _Bar:
+    """A progress callback that draws a bar on a terminal and writes a line now and then elsewhere."""
+
+    PATIENCE = 10.0  # [s] between lines
+
+    def __init__(self, console: Console, steps: int, unit: str) -> None:
+        self._console = console
+        self._unit = unit
+        self._bar: Progress | None = None
+        self._task: TaskID | None = None
+        self._said = time.monotonic()
+        if console.is_terminal:
+            columns = (TextColumn("varpin"), BarColumn(), TextColumn(f"{{task.completed}}/{{task.total}} {unit}"))
+            self._bar = Progress(*columns, TimeRemainingColumn(), console=console, transient=True)
+            self._task = self._bar.add_task("", total=steps)
+
+    def __enter__(self) -> _Bar:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, done: int, steps: int) -> None:
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=done, total=steps)
+        elif time.monotonic() - self._said >= self.PATIENCE:
+            self._said = time.monotonic()
+            say(self._console, f"{done} of {steps} {self._unit}")
+
+
+@contextlib.contextmanager
+def progress_bar(
+    console: Console, steps: int, *, quiet: bool, unit: str = "steps"
+) -> Iterator[Callable[[int, int], None]]:
+    """A progress callback that shows on ``console`` how far something is, unless ``quiet``."""
+    if quiet:
+        yield lambda _done, _steps: None
+        return
+    with _Bar(console, steps, unit) as bar:
+        yield bar
+
+
+class _ConsoleHandler(logging.Handler):
+    """Log records as one readable line each, above a progress bar if there is one."""
+
+    def __init__(self, console: Console, level: int) -> None:
+        super().__init__(level)
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        say(self._console, record.getMessage(), prefix=f"varpin: {record.levelname.lower()}", style="yellow")
+
+
+@contextlib.contextmanager
+def logged(console: Console, level: int) -> Iterator[None]:
+    """The library's log from ``level`` on, on ``console`` within this context."""
+    logger, handler = logging.getLogger("varpin"), _ConsoleHandler(console, level)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+def complain(console: Console, error: object) -> None:
+    """Print an error as one line."""
+    # NumPy breaks the lines of long arrays, and an error is one line.
+    say(console, " ".join(str(error).split()), prefix="varpin: error", style="red")
+
+
+def say(console: Console, message: str, *, prefix: str = "varpin", style: str | None = None) -> None:
+    """Print a message as it is, after a prefix."""
+    text = f"{prefix}: {message}" if prefix else message
+    console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)

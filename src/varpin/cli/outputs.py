@@ -1,0 +1,128 @@
+"""Files that a command makes."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from varpin.checks import positive, writable
+from varpin.errors import FileError, InputError, VarpinError
+from varpin.replay import check_film, replay
+from varpin.robot import Robot
+from varpin.trajectory import Trajectory, atomic_file
+
+if TYPE_CHECKING:
+    pass
+
+from varpin.cli.console import complain
+
+PLOT_FORMATS = (".png", ".pdf", ".svg")
+
+
+def add_outputs(parser: argparse.ArgumentParser, what: str) -> None:
+    """Options for the files that can be made of a motion."""
+    outputs = parser.add_argument_group("outputs")
+    outputs.add_argument("--save", type=Path, metavar="NPZ", help=f"write the {what}, for {what.title()}.load")
+    outputs.add_argument("--plot", type=Path, metavar="PNG", help="draw an overview, as png, pdf or svg")
+    outputs.add_argument("--html", type=Path, metavar="HTML", help="write a replay that any browser opens")
+    outputs.add_argument(
+        "--video", type=Path, metavar="MP4", help="film the replay, as mp4 or gif; needs varpin[video]"
+    )
+    outputs.add_argument("--trace", nargs="+", default=[], metavar="FRAME", help="draw the paths of frames in it")
+    outputs.add_argument(
+        "--speed",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="of the replay; 0.1 is ten times slower; default: true speed",
+    )
+    outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
+
+
+@dataclass(frozen=True)
+class Output:
+    """A file to make of the trajectory."""
+
+    path: Path
+    write: Callable[[Robot, Trajectory], None]
+
+
+def outputs_of(request: argparse.Namespace) -> list[Output]:
+    """The files asked for, in the order of their worth; what writes them is imported now and not after the run.
+
+    Raises:
+        FileError: One of them cannot be written.
+        InputError: Two are the same file, or a format is unknown.
+        MissingDependency: A film needs what is not installed.
+    """
+    outputs = []
+    if request.save is not None:
+        outputs.append(_record(writable(request.save)))
+    if request.plot is not None:
+        outputs.append(_figure(writable(request.plot)))
+    for path, film in ((request.html, False), (request.video, True)):
+        if path is not None:
+            if film:
+                check_film(path)
+            outputs.append(_replay(writable(path), positive("--speed", request.speed, "1"), request.trace, film))
+    paths = [output.path.resolve() for output in outputs]
+    for path in paths:
+        if paths.count(path) > 1:
+            raise InputError(f"two outputs cannot be one file: {path}")
+    return outputs
+
+
+def _record(path: Path) -> Output:
+    def write(_robot: Robot, trajectory: Trajectory) -> None:
+        trajectory.save(path)
+
+    return Output(path, write)
+
+
+def _figure(path: Path) -> Output:
+    if path.suffix.lower() not in PLOT_FORMATS:
+        raise InputError(f"--plot must end in {', '.join(PLOT_FORMATS)}, got {path.name!r}")
+    from varpin.plots import plot_trajectory  # noqa: PLC0415 - matplotlib is slow to import
+
+    def write(robot: Robot, trajectory: Trajectory) -> None:
+        figure, _ = plot_trajectory(trajectory, robot=robot)
+        with atomic_file(path) as stream:
+            figure.savefig(stream, format=path.suffix[1:].lower(), dpi=150)  # type: ignore[union-attr]
+
+    return Output(path, write)
+
+
+def _replay(path: Path, speed: float, frames: Sequence[str], film: bool) -> Output:
+    def write(robot: Robot, trajectory: Trajectory) -> None:
+        html, video = (None, path) if film else (path, None)
+        replay(robot, trajectory, html=html, video=video, speed=speed, trace=frames)
+
+    return Output(path, write)
+
+
+def write_all(errors: Console, files: Mapping[Path, Callable[[], object]]) -> list[Path]:
+    """Write files, complain of those that cannot be, and return the others."""
+    written = []
+    for path, write in files.items():
+        try:
+            write()
+        except (VarpinError, OSError) as error:
+            complain(errors, f"{path} was not written: {error}")
+        else:
+            written.append(path)
+    return written
+
+
+def folder_at(path: Path) -> Path:
+    """``path`` as a folder, made if need be."""
+    folder = path.expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"cannot make the folder {folder}: {error.strerror or error}") from None
+    return folder

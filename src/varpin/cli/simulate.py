@@ -1,0 +1,194 @@
+"""``varpin simulate``: integrate a robot in time."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+import sys
+import time
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+from rich.console import Console
+from rich.table import Table
+
+from varpin.checks import count, positive
+from varpin.errors import InputError
+from varpin.integrators import Integrator, Midpoint
+from varpin.lagrangian import lagrangian_jet
+from varpin.replay import frame_names
+from varpin.robot import Robot
+from varpin.scene import Scene
+from varpin.simulation import Interrupted, StepFailure, simulate
+from varpin.tradeoff.setting import Setting
+from varpin.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    pass
+
+from varpin.cli.arguments import add_motion, add_robot, motion_of, names_scene, scene_file
+from varpin.cli.console import WIDTH, add_row, complain, facts, file_size, progress_bar, say
+from varpin.cli.exits import INTERRUPTED, MISTAKE, STEP_FAILED
+from varpin.cli.outputs import Output, add_outputs, outputs_of, write_all
+
+# More steps than anyone can hold in memory, said before NumPy says it in its own words.
+MOST_STEPS = 10**9
+# Options that a scene file leaves no room for.
+_OF_MOTIONS = (
+    *("lock", "package_dir", "dt", "duration", "steps", "alpha"),
+    *("q0", "v0", "gravity", "damping", "stiffness", "rest", "torque"),
+)
+
+
+def add_simulate(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``varpin simulate``."""
+    parser.description = (
+        "Integrate a robot in time with the midpoint variational integrator; or a scene file, which says all of it "
+        "itself. Of numbers that belong to joints, one alone is taken for all of them. Ctrl-C and a failed step keep "
+        "what was computed before."
+    )
+    parser.set_defaults(run=_simulate, log_level=logging.WARNING)
+    add_robot(parser, scenes=True)
+    parser.add_argument("--dt", type=float, default=1e-3, metavar="S", help="time step [s]; default: %(default)g")
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument(
+        "--duration", type=float, metavar="S", help="time to simulate [s], rounded to whole steps; default: 2"
+    )
+    length.add_argument("--steps", type=int, metavar="N", help="the number of steps instead")
+    parser.add_argument(
+        "--alpha",
+        type=float,
+        default=0.5,
+        help="of the midpoint rule, in [0, 1]; second order at 0.5, first elsewhere; default: %(default)g",
+    )
+    add_motion(parser)
+    add_outputs(parser, "trajectory")
+
+
+def _simulate(request: argparse.Namespace, errors: Console) -> int:
+    if names_scene(request.robot):
+        file = scene_file(request, request.robot, "simulate", *_OF_MOTIONS)
+        driven = bool(file.scene.damping.any() or file.controls() is not None or file.spec.seed is not None)
+        _warm_up(file.scene, file.q0, file.v0, None, file.spec.integrator)
+        return _run(request, errors, file.scene, driven, file.spec.steps, lambda p: file.simulate(progress=p))
+    outputs = outputs_of(request)
+    steps = _steps(request)
+    scene, q0, v0, torque = motion_of(request)
+    integrator = Midpoint(alpha=request.alpha)
+    _warm_up(scene, q0, v0, torque, integrator)
+
+    def run(progress: Callable[[int, int], None]) -> Trajectory:
+        return simulate(
+            scene, q0, v0, dt=request.dt, steps=steps, controls=torque, integrator=integrator, progress=progress
+        )
+
+    return _run(request, errors, scene, bool(scene.damping.any() or torque is not None), steps, run, outputs)
+
+
+def _warm_up(scene: Scene, q0: ArrayLike, v0: ArrayLike, torque: ArrayLike | None, integrator: Integrator) -> None:
+    """Compile what a run needs, which is no part of its wall time; damping is looked at through the jet."""
+    Setting.of(scene, q0, v0, torque, 1.0).warm_up(integrator)
+    lagrangian_jet(scene, q0, np.zeros(scene.robot.dof))
+
+
+def _run(
+    request: argparse.Namespace,
+    errors: Console,
+    scene: Scene,
+    driven: bool,
+    steps: int,
+    run: Callable[[Callable[[int, int], None]], Trajectory],
+    outputs: list[Output] | None = None,
+) -> int:
+    """Simulate, and write and print what came out, a part of it if that is all."""
+    outputs = outputs_of(request) if outputs is None else outputs
+    robot = scene.robot
+    frame_names("--trace", [robot], request.trace)
+    status, complaint, begin = 0, "", time.perf_counter()
+    try:
+        with progress_bar(errors, steps, quiet=request.quiet) as progress:
+            trajectory = run(progress)
+    except Interrupted as interruption:
+        trajectory, status = interruption.trajectory, INTERRUPTED
+        complaint = f"interrupted after {trajectory.steps} of {steps} steps, which are kept"
+    except StepFailure as failure:
+        trajectory, status = failure.trajectory, STEP_FAILED
+        complaint = str(failure).replace("is in error.trajectory", "is kept")
+    wall_time = time.perf_counter() - begin
+
+    written = write_all(errors, {output.path: partial(output.write, robot, trajectory) for output in outputs})
+    if len(written) < len(outputs):
+        status = status or MISTAKE
+    if not request.quiet:
+        tables = Console() if sys.stdout.isatty() else Console(width=WIDTH)
+        tables.print(_summary(robot, trajectory, steps, wall_time, driven, written))
+    if status == INTERRUPTED:
+        say(errors, complaint)
+    elif complaint:
+        complain(errors, complaint)
+    return status
+
+
+def _steps(request: argparse.Namespace) -> int:
+    dt = positive("--dt", request.dt, "s")
+    if request.steps is None:
+        ratio = positive("--duration", 2.0 if request.duration is None else request.duration, "s") / dt
+        if ratio < 0.5:
+            raise InputError(f"--duration {request.duration:g} s is less than one step of {dt:g} s")
+        steps = round(ratio) if math.isfinite(ratio) else MOST_STEPS + 1
+    else:
+        steps = count("--steps", request.steps, 1)
+    if steps > MOST_STEPS:
+        raise InputError(f"{steps} steps or more are asked for; a run has {MOST_STEPS} at most")
+    return steps
+
+
+def _summary(
+    robot: Robot, trajectory: Trajectory, asked: int, wall_time: float, driven: bool, files: Iterable[Path]
+) -> Table:
+    """What a run was, took and made."""
+    table = facts(f"{trajectory.robot}: {trajectory.integrator}")
+    statistics, steps = trajectory.statistics, trajectory.steps
+    of = f" of {asked}" if steps < asked else ""
+    add_row(table, "steps", f"{steps}{of}, {trajectory.dt:g} s each, {trajectory.duration:g} s in all")
+    add_row(table, "wall time", f"{wall_time:.3g} s, without compiling")
+    if steps:
+        newton, split = statistics.newton_iterations, statistics.split_steps
+        add_row(table, "Newton iterations", f"{newton.mean():.2f} a step, {newton.max()} at most")
+        if split:
+            add_row(
+                table,
+                "split steps",
+                f"{split} of {steps}, into up to {statistics.substeps.max()} parts: a smaller dt keeps the structure",
+                style="bold yellow",
+            )
+        else:
+            add_row(table, "split steps", "none")
+        add_row(table, "worst residual", f"{statistics.residual.max():.3g} rounding units")
+        add_row(table, "smallest branch margin", f"{statistics.branch_margin.min():.3g} (1 for dt -> 0, refused at 0)")
+    drift = np.abs(trajectory.energy - trajectory.energy[0]).max()
+    kinetic = 0.5 * (trajectory.p * trajectory.v).sum(axis=1).max()
+    if driven:
+        change = trajectory.energy[-1] - trajectory.energy[0]
+        add_row(table, "energy change", f"{change:+.3g} J from start to end, {drift:.3g} J at most in between")
+    else:
+        part = drift / kinetic if kinetic > 0.0 else 0.0
+        share = f"{part:.2g} of" if part < 1.0 else f"{part:.3g} times"
+        of_kinetic = f", {share} the largest kinetic energy" if part > 0.0 else ""
+        add_row(table, "energy error", f"{drift:.3g} J at most{of_kinetic}")
+    lower, upper = robot.position_limits
+    outside = np.any((trajectory.q < lower) | (trajectory.q > upper), axis=0)
+    if outside.any():
+        joints = ", ".join(name for name, out in zip(robot.joint_names, outside, strict=True) if out)
+        add_row(table, "beyond their limits", f"{joints} (limits are not modelled)")
+    names = "q at the end [rad or m]", "v at the end [rad/s or m/s]"
+    for name, values in zip(names, (trajectory.q[-1], trajectory.v[-1]), strict=True):
+        add_row(table, name, "  ".join(f"{value:.6g}" for value in values))
+    for path in files:
+        add_row(table, "written", f"{path} ({file_size(path.stat().st_size)})")
+    return table

@@ -1,0 +1,89 @@
+"""``varpin solve``: plan the motion that a scene file asks for."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from varpin.checks import writable
+from varpin.scenefile import SceneFile
+from varpin.sddp import Solution, Status
+
+if TYPE_CHECKING:
+    pass
+
+from varpin.cli.arguments import scene_file
+from varpin.cli.console import WIDTH, add_row, facts, file_size, say
+from varpin.cli.exits import INTERRUPTED, MISTAKE, STEP_FAILED
+from varpin.cli.outputs import add_outputs, outputs_of, write_all
+
+
+def add_solve(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``varpin solve``."""
+    parser.description = (
+        "Find the motion of least cost that a scene file asks for, by S-DDP. Ctrl-C keeps the best motion so far; "
+        "with --resume a saved solution goes on as if it had not stopped."
+    )
+    parser.set_defaults(run=_solve, log_level=logging.WARNING)
+    parser.add_argument("scene", metavar="SCENE", help="path of a scene file (TOML), or name of a scene of varpin")
+    parser.add_argument("--resume", type=Path, metavar="NPZ", help="go on from a solution that --save wrote")
+    parser.add_argument("--max-iterations", type=int, metavar="N", help="at most; default: the scene's, or 100")
+    add_outputs(parser, "solution")
+
+
+def _solve(request: argparse.Namespace, errors: Console) -> int:
+    file = scene_file(request, request.scene, "solve")
+    outputs = outputs_of(request)
+    options = {} if request.max_iterations is None else {"max_iterations": request.max_iterations}
+    resume = None if request.resume is None else file.load_solution(request.resume)
+    begin = time.perf_counter()
+    solution = file.solve(resume=resume, **options)
+    wall_time = time.perf_counter() - begin
+    status = 0 if solution.status.converged else STEP_FAILED
+    if solution.status is Status.INTERRUPTED:
+        status = INTERRUPTED
+    saved = None if request.save is None else writable(request.save)
+    writers: dict[Path, Callable[[], object]] = {
+        output.path: partial(solution.save, output.path)
+        if output.path == saved
+        else partial(output.write, file.robot, solution.trajectory)
+        for output in outputs
+    }
+    written = write_all(errors, writers)
+    if len(written) < len(outputs):
+        status = status or MISTAKE
+    if not request.quiet:
+        console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
+        for line in solution.table().splitlines()[:-1]:
+            say(console, line, prefix="")
+        console.print(_plan_table(file, solution, wall_time, written))
+    if not solution.status.converged:
+        say(errors, solution.status.value, style="yellow")
+    return status
+
+
+def _plan_table(file: SceneFile, solution: Solution, wall_time: float, files: Iterable[Path]) -> Table:
+    table, problem = facts(file.spec.title), solution.problem
+    apart = f", planned in {len(file.required.parts)} parts" if len(file.required.parts) > 1 else ""
+    add_row(table, "joints", f"{file.robot.dof} of {file.required.described} computed{apart}")
+    add_row(table, "horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}")
+    add_row(table, "status", solution.status.value, style="" if solution.status.converged else "bold yellow")
+    noise = f", and {solution.noise_cost:.6g} by noise" if solution.noise_cost else ""
+    add_row(table, "cost", f"{solution.cost:.6g}{noise}, after {solution.iterations} iterations")
+    add_row(table, "wall time", f"{wall_time:.3g} s, loading of kernels included")
+    most = np.abs(solution.trajectory.u).max(axis=0, initial=0.0)
+    add_row(table, "largest controls", "  ".join(f"{value:.4g}" for value in most))
+    add_row(table, "q at the end [rad or m]", "  ".join(f"{value:.6g}" for value in solution.trajectory.q[-1]))
+    for path in files:
+        add_row(table, "written", f"{path} ({file_size(path.stat().st_size)})")
+    return table

@@ -1,0 +1,218 @@
+"""``varpin tradeoff``, ``advise``, ``paper`` and ``extremes``: measurements of integrators."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.text import Text
+
+from varpin.robot import load_robot
+from varpin.tradeoff import advise, work_precision
+
+if TYPE_CHECKING:
+    from varpin.extremes import Cell
+
+from varpin.cli.arguments import add_motion, add_robot, motion_of
+from varpin.cli.console import WIDTH, add_row, progress_bar, say, table_of
+from varpin.cli.exits import FAULTY, INTERRUPTED, STEP_FAILED
+from varpin.cli.outputs import folder_at
+
+
+def add_tradeoff(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``varpin tradeoff``."""
+    parser.description = (
+        "Run a robot's motion with every integrator over many steps, and print and write their errors against an "
+        "accurate reference, and their wall times. What is in the folder already is not run again, so an interrupted "
+        "measurement goes on where it stopped."
+    )
+    parser.set_defaults(run=_tradeoff, log_level=logging.WARNING)
+    add_robot(parser)
+    parser.add_argument(
+        "--duration", type=float, default=1.0, metavar="S", help="of the motion [s]; default: %(default)g"
+    )
+    parser.add_argument("--dt", type=float, nargs="+", metavar="S", help="time steps [s]; default: 0.04 and its halves")
+    parser.add_argument("--repeats", type=int, default=3, metavar="N", help="of each run; default: %(default)d")
+    add_motion(parser)
+    outputs = parser.add_argument_group("outputs")
+    outputs.add_argument(
+        "--out",
+        type=Path,
+        metavar="FOLDER",
+        help="write a table (CSV), a figure (PNG), a page (HTML), the record (NPZ)",
+    )
+    outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
+
+
+def _tradeoff(request: argparse.Namespace, errors: Console) -> int:
+    from varpin.tradeoff_report import COLUMNS, cells, write_report  # noqa: PLC0415 - matplotlib is slow to import
+
+    folder = None if request.out is None else folder_at(request.out)
+    scene, q0, v0, torque = motion_of(request)
+    with progress_bar(errors, 1, quiet=request.quiet, unit="runs") as progress:
+        record = work_precision(
+            scene,
+            q0,
+            v0,
+            controls=torque,
+            duration=request.duration,
+            dts=request.dt,
+            repeats=request.repeats,
+            progress=progress,
+            save=None if folder is None else folder / "tradeoff.npz",
+        )
+    title = f"{record.robot}: speed against accuracy over {record.duration:g} s"
+    files = [] if folder is None else [folder / "tradeoff.npz", *write_report(folder, record, title)]
+    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
+    if not request.quiet:
+        table, front = table_of(title, COLUMNS), record.pareto()
+        for run in record.runs:
+            add_row(table, *cells(record, run, run in front), style="bold" if run in front else "")
+        console.print(table)
+        say(console, f"errors are against {record.reference}, good to {record.reference_error:.1e}", prefix="")
+        for path in files:
+            say(console, str(path), prefix="written")
+    return INTERRUPTED if record.missing else 0
+
+
+def add_advise(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``varpin advise``."""
+    parser.description = (
+        "Find the cheapest integrator and step that keep the error in q at the end of a robot's motion below a "
+        "tolerance, or the most accurate ones within a time, from short runs."
+    )
+    parser.set_defaults(run=_advise, log_level=logging.WARNING)
+    add_robot(parser)
+    wish = parser.add_mutually_exclusive_group(required=True)
+    wish.add_argument("--tolerance", type=float, metavar="E", help="the error to keep below [rad or m]")
+    wish.add_argument("--budget", type=float, metavar="S", help="the wall time to keep to [s]")
+    parser.add_argument(
+        "--duration", type=float, default=1.0, metavar="S", help="of the motion [s]; default: %(default)g"
+    )
+    add_motion(parser)
+    outputs = parser.add_argument_group("outputs")
+    outputs.add_argument("--out", type=Path, metavar="FOLDER", help="write advice.png and advice.html there")
+
+
+def _advise(request: argparse.Namespace, _errors: Console) -> int:
+    from varpin.tradeoff_report import ADVICE_COLUMNS, advice_cells, write_advice  # noqa: PLC0415 - as above
+
+    folder = None if request.out is None else folder_at(request.out)
+    scene, q0, v0, torque = motion_of(request)
+    advice = advise(
+        scene,
+        q0,
+        v0,
+        controls=torque,
+        duration=request.duration,
+        tolerance=request.tolerance,
+        budget=request.budget,
+    )
+    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
+    for line in advice.reason.splitlines():
+        say(console, line, prefix="")
+    table = table_of("The best of each method", ADVICE_COLUMNS)
+    for choice in (advice.best, *advice.alternatives):
+        add_row(table, *advice_cells(choice))
+    console.print(table)
+    say(console, f"(found in {advice.calibration:.2g} s)", prefix="")
+    if folder is not None:
+        wish = f"{advice.tolerance:g} in q" if advice.tolerance is not None else f"{advice.budget:g} s"
+        title = f"{scene.robot.name}: an integrator for {request.duration:g} s and {wish}"
+        for path in write_advice(folder, advice, title):
+            say(console, str(path), prefix="written")
+    return 0 if advice.reached else STEP_FAILED
+
+
+def add_paper(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``varpin paper``."""
+    parser.description = (
+        "Run the experiments of the paper on stochastic variational integrators and write tables (CSV), figures (PNG) "
+        "and a report (HTML) that holds each of its claims against what came out. What is in the folder already is not "
+        "computed again, so an interrupted run goes on where it stopped."
+    )
+    parser.set_defaults(run=_paper, log_level=logging.ERROR)
+    parser.add_argument("--quick", action="store_true", help="fewer time steps and one setting: about a minute")
+    parser.add_argument(
+        "--out", type=Path, default=Path("paper"), metavar="FOLDER", help="where to write; default: %(default)s"
+    )
+    parser.add_argument("--quiet", action="store_true", help="print nothing but the report's path")
+
+
+def _paper(request: argparse.Namespace, errors: Console) -> int:
+    from varpin.paper import reproduce  # noqa: PLC0415  (its figures need matplotlib, which takes long to import)
+
+    with progress_bar(errors, 1, quiet=request.quiet, unit="cells") as report:
+        result = reproduce(request.out, quick=request.quick, progress=lambda done, cells, _: report(done, cells))
+    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
+    if not request.quiet:
+        table = table_of("Claims", ("verdict", "sentence", "measured"))
+        for claim in result.claims:
+            add_row(table, claim.verdict, claim.sentence, claim.measured)
+        console.print(table)
+    say(console, str(result.page), prefix="")
+    return 0
+
+
+def add_extremes(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``varpin extremes``."""
+    parser.description = (
+        "Run scenes at the extremes with every integrator, and judge each result by independent checks: accurate; "
+        "degraded, and varpin says so; refused; stopped; or silent wrong, which is a fault of varpin's. What is in the "
+        "folder already is not run again, so an interrupted battery goes on where it stopped. Exit status 1 if "
+        "anything is silent wrong."
+    )
+    parser.set_defaults(run=_extremes, log_level=logging.CRITICAL)
+    add_robot(parser, optional=True)
+    parser.add_argument("--deep", action="store_true", help="the long scenes too: hours")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="write the record (JSON) and a heat map (HTML)")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but what is silent wrong")
+
+
+def _extremes(request: argparse.Namespace, errors: Console) -> int:
+    from varpin import extremes_report as report  # noqa: PLC0415 - most commands have no use for it
+    from varpin.extremes import Kind, run  # noqa: PLC0415
+
+    robot = None
+    if request.robot is not None:
+        robot = load_robot(request.robot, package_dirs=request.package_dir, lock=dict(request.lock))
+    folder = None if request.out is None else folder_at(request.out)
+    with progress_bar(errors, 1, quiet=request.quiet, unit="cells") as progress:
+        record = run(
+            robot,
+            deep=request.deep,
+            save=None if folder is None else folder / "extremes.json",
+            progress=lambda done, cells, _: progress(done, cells),
+        )
+    files = [] if folder is None else [folder / "extremes.json", report.write_page(folder / "extremes.html", record)]
+    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
+    columns, rows = report.grid(record)
+    if not request.quiet:
+        table = table_of(f"{record.robot} at the extremes", ("scene", *columns))
+        last = ""
+        for family, trial, cells in rows:
+            if family != last:
+                add_row(table, family, style="bold")
+                last = family
+            entries = (cells.get(name) for name in columns)
+            table.add_row(Text(f"  {trial}"), *(_extreme(cell) for cell in entries))
+        console.print(table)
+        for kind, count in record.counts().items():
+            say(console, f"{count} {kind.value}", prefix=report.LETTERS[kind])
+        for path in files:
+            say(console, str(path), prefix="written")
+    for cell in record.wrong():
+        say(console, f"{cell.trial}, {cell.integrator}: {'; '.join(cell.found)}", prefix=Kind.WRONG.value, style="red")
+    if record.missing:
+        return INTERRUPTED
+    return FAULTY if record.wrong() else 0
+
+
+def _extreme(cell: Cell | None) -> Text:
+    from varpin.extremes_report import STYLES, entry  # noqa: PLC0415
+
+    return Text("") if cell is None else Text(entry(cell), style=STYLES[cell.kind])

@@ -1,0 +1,137 @@
+"""Barriers at the limits of joints: their positions and their velocities."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import broadcast_array, checked_limits
+from varpin.costs.base import Cost, Points, Scaled, Terminal
+from varpin.costs.residual import Residual, TaskCost
+from varpin.errors import InputError
+from varpin.robot import Robot
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Excess(Residual):
+    lower: Floats
+    upper: Floats
+    columns: slice
+    in_velocity: bool
+
+    def value(self, q: Floats, v: Floats) -> Floats:
+        y = v if self.in_velocity else q
+        return np.maximum(0.0, y - self.upper) - np.maximum(0.0, self.lower - y)
+
+    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
+        y = v if self.in_velocity else q
+        outside = ((y > self.upper) | (y < self.lower)).astype(np.float64)
+        return self.value(q, v), outside[:, :, None] * np.eye(y.shape[1])
+
+
+class _Barrier(TaskCost):
+    limits: Floats
+    in_velocity: bool
+
+    def __init__(
+        self,
+        robot: Robot,
+        weight: ArrayLike,
+        margin: ArrayLike,
+        limits: tuple[ArrayLike, ArrayLike] | None,
+    ) -> None:
+        self.size = robot.dof if isinstance(robot, Robot) else 0
+        super().__init__(robot, weight)
+        name = type(self).__name__
+        self.limits = checked_limits(f"{name} limits", self._own(robot) if limits is None else limits, self.size)
+        if not np.isfinite(self.limits).any():
+            raise InputError(f"{name}: robot {robot.name!r} has no such limits; give limits=(lower, upper)")
+        self.margin = broadcast_array(f"{name} margin", margin, self.size)
+        if (self.margin < 0.0).any():
+            raise InputError(f"{name} margin must be >= 0, got {self.margin.min():g}")
+        self.margin = np.minimum(self.margin, 0.5 * (self.limits[1] - self.limits[0]))
+
+    @staticmethod
+    @abstractmethod
+    def _own(robot: Robot) -> tuple[Floats, Floats]:
+        """The robot's limits."""
+
+    def _at(self, points: Points) -> Residual:
+        n = points.dof
+        columns = slice(n, 2 * n) if self.in_velocity else slice(0, n)
+        return _Excess(self.limits[0] + self.margin, self.limits[1] - self.margin, columns, self.in_velocity)
+
+
+class JointLimitBarrier(_Barrier):
+    """weight . (what q is beyond a limit less a margin)^2: keep joints within their limits.
+
+    A penalty that begins ``margin`` before the limit and is zero farther inside; it is finite beyond the limit, so that
+    a search may begin there. ``Solution.violations`` says what is left.
+    """
+
+    in_velocity = False
+
+    def __init__(
+        self,
+        robot: Robot,
+        weight: ArrayLike = 1.0,
+        margin: ArrayLike = 0.0,
+        limits: tuple[ArrayLike, ArrayLike] | None = None,
+    ) -> None:
+        """Describe the cost.
+
+        Args:
+            robot: The robot.
+            weight: One number, (n,), or a matrix (n, n), positive semidefinite.
+            margin: One number or (n,) >= 0 [rad or m]; of it, at most half the way from limit to limit.
+            limits: (lower, upper), each one number or (n,), infinite where there is none; the robot's if left out.
+
+        Raises:
+            InputError: There is no limit, or an argument has a wrong shape or value.
+        """
+        super().__init__(robot, weight, margin, limits)
+
+    @staticmethod
+    def _own(robot: Robot) -> tuple[Floats, Floats]:
+        return robot.position_limits
+
+
+class VelocityLimitBarrier(_Barrier):
+    """weight . (what v is beyond a limit less a margin)^2; see :class:`JointLimitBarrier`."""
+
+    in_velocity = True
+
+    def __init__(
+        self,
+        robot: Robot,
+        weight: ArrayLike = 1.0,
+        margin: ArrayLike = 0.0,
+        limits: tuple[ArrayLike, ArrayLike] | None = None,
+    ) -> None:
+        """Describe the cost; see :class:`JointLimitBarrier`, with velocities [rad/s or m/s]."""
+        super().__init__(robot, weight, margin, limits)
+
+    @staticmethod
+    def _own(robot: Robot) -> tuple[Floats, Floats]:
+        return -robot.velocity_limit, robot.velocity_limit
+
+
+def barriers_of(cost: Cost) -> tuple[list[JointLimitBarrier], list[VelocityLimitBarrier]]:
+    """The barriers among the terms of a cost."""
+    joints: list[JointLimitBarrier] = []
+    speeds: list[VelocityLimitBarrier] = []
+    for term in cost.terms:
+        inner = term
+        while isinstance(inner, Terminal | Scaled):
+            inner = inner.cost
+        for part in inner.terms:
+            if isinstance(part, JointLimitBarrier):
+                joints.append(part)
+            elif isinstance(part, VelocityLimitBarrier):
+                speeds.append(part)
+    return joints, speeds

@@ -1,0 +1,339 @@
+"""Costs: integrals over time and terms at the end, which add up.
+
+A running cost l(t, q, v, u) stands for its integral over the motion, whatever the time step; ``Terminal`` makes it a
+term at the final time. All of them are evaluated and expanded over many points at once, with NumPy, so that a cost of
+one's own needs no compiled code.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from numbers import Real
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import as_floats, finite_array, require_finite
+from varpin.errors import InputError, VarpinError
+
+Floats = NDArray[np.float64]
+Reference = ArrayLike | Callable[[float], ArrayLike]
+
+
+class CostError(VarpinError, ValueError):
+    """A cost raised, or returned something that is no cost.
+
+    Attributes:
+        cost: Which one, as text.
+    """
+
+    def __init__(self, cost: str, problem: str) -> None:
+        self.cost = cost
+        super().__init__(f"{cost}: {problem}")
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Where costs are to be evaluated: N points in time on a horizon.
+
+    Attributes:
+        t: Times (N,) [s].
+        duration: Of the horizon [s].
+        steps: Of the problem's grid.
+        dof: n.
+        controls: m.
+        t0: When the horizon begins [s].
+    """
+
+    t: Floats
+    duration: float
+    steps: int
+    dof: int
+    controls: int
+    t0: float = 0.0
+
+    @property
+    def elapsed(self) -> Floats:
+        """Times since the horizon began (N,) [s]."""
+        return self.t - self.t0
+
+    @property
+    def size(self) -> int:
+        """2n + m, the length of z = (q, v, u)."""
+        return 2 * self.dof + self.controls
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """Gradient and Hessian of a cost at N points, in z = (q, v, u).
+
+    Attributes:
+        gradient: (N, 2n + m).
+        hessian: (N, 2n + m, 2n + m), or (1, 2n + m, 2n + m) where it is the same everywhere.
+    """
+
+    gradient: Floats
+    hessian: Floats
+
+
+class BoundCost(ABC):
+    """A cost at given points."""
+
+    @abstractmethod
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """Its values (..., N) at q (..., N, n), v (..., N, n) and u (..., N, m)."""
+
+    @abstractmethod
+    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
+        """Its expansion at q (N, n), v (N, n) and u (N, m)."""
+
+
+class Cost(ABC):
+    """A cost. Whoever adds one provides ``bind``; ``CustomCost`` is the shorter way."""
+
+    @abstractmethod
+    def bind(self, points: Points) -> BoundCost:
+        """The cost at given points.
+
+        Raises:
+            InputError: Its parameters do not fit the robot or the problem's grid.
+            CostError: A reference that is a function fails.
+        """
+
+    @property
+    def terms(self) -> tuple[Cost, ...]:
+        """What it is a sum of."""
+        return (self,)
+
+    @property
+    def of_controls(self) -> bool:
+        """Whether it is of the controls alone, which do not exist at the final time."""
+        return False
+
+    @property
+    def nonnegative(self) -> bool:
+        """Whether it is known never to be below zero: a motion that costs nothing is then an optimum."""
+        return False
+
+    def __add__(self, other: Cost) -> CostSum:
+        if not isinstance(other, Cost):
+            return NotImplemented
+        return CostSum((*self.terms, *other.terms))
+
+    def __radd__(self, other: int) -> Cost:
+        # The zero that sum() begins with.
+        return self if isinstance(other, int) and other == 0 else NotImplemented
+
+    def __rmul__(self, factor: float) -> Cost:
+        if not isinstance(factor, Real):
+            return NotImplemented
+        factor = float(factor)
+        if not 0.0 <= factor < np.inf:
+            raise InputError(f"a cost can be scaled by a finite number that is not negative, got {factor:g}")
+        # Term by term, so that a terminal cost stays one.
+        scaled = [Terminal(factor * t.cost) if isinstance(t, Terminal) else Scaled(factor, t) for t in self.terms]
+        return scaled[0] if len(scaled) == 1 else CostSum(tuple(scaled))
+
+    __mul__ = __rmul__
+
+
+@dataclass(frozen=True)
+class CostSum(Cost):
+    """A sum of costs, running and terminal ones."""
+
+    parts: tuple[Cost, ...]
+
+    @property
+    def terms(self) -> tuple[Cost, ...]:
+        """See :attr:`Cost.terms`."""
+        return self.parts
+
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`Cost.nonnegative`."""
+        return all(part.nonnegative for part in self.parts)
+
+    def bind(self, points: Points) -> BoundCost:
+        """See :meth:`Cost.bind`."""
+        return BoundSum(tuple(part.bind(points) for part in self.parts), points)
+
+    def __repr__(self) -> str:
+        return " + ".join(map(repr, self.parts))
+
+
+@dataclass(frozen=True, eq=False)
+class BoundSum(BoundCost):
+    """A sum of bound costs; of none, zero."""
+
+    parts: tuple[BoundCost, ...]
+    points: Points
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """See :meth:`BoundCost.value`."""
+        total = np.zeros(q.shape[:-1])
+        for part in self.parts:
+            total += part.value(q, v, u)
+        return total
+
+    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
+        """See :meth:`BoundCost.expand`."""
+        gradient = np.zeros((len(q), self.points.size))
+        hessian = np.zeros((1, self.points.size, self.points.size))
+        for part in self.parts:
+            own = part.expand(q, v, u)
+            # Kernels check no shapes, and a cost of one's own may be anything.
+            (N, size), found = gradient.shape, (np.shape(own.gradient), np.shape(own.hessian))
+            if found not in [((N, size), (rows, size, size)) for rows in (1, N)]:
+                raise CostError(
+                    type(part).__name__,
+                    f"its expansion has shapes {found}, where {(N, size)} and {(N, size, size)} belong",
+                )
+            gradient += own.gradient
+            hessian = hessian + own.hessian
+        return Expansion(gradient, hessian)
+
+
+@dataclass(frozen=True)
+class Scaled(Cost):
+    """A number times a running cost: ``2.0 * cost``."""
+
+    factor: float
+    cost: Cost
+
+    @property
+    def of_controls(self) -> bool:
+        """See :attr:`Cost.of_controls`."""
+        return self.cost.of_controls
+
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`Cost.nonnegative`."""
+        return self.cost.nonnegative
+
+    def bind(self, points: Points) -> BoundCost:
+        """See :meth:`Cost.bind`."""
+        return _BoundScaled(self.factor, self.cost.bind(points))
+
+    def __repr__(self) -> str:
+        return f"{self.factor:g} * {self.cost!r}"
+
+
+@dataclass(frozen=True, eq=False)
+class _BoundScaled(BoundCost):
+    factor: float
+    cost: BoundCost
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        return self.factor * self.cost.value(q, v, u)
+
+    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
+        own = self.cost.expand(q, v, u)
+        return Expansion(self.factor * own.gradient, self.factor * own.hessian)
+
+
+@dataclass(frozen=True)
+class Terminal(Cost):
+    """A cost at the final time instead of its integral: ``Terminal(TrackingCost(...))``.
+
+    Attributes:
+        cost: The argument: any cost, a sum too, but no ``ControlCost``, since there is no control at the final time.
+
+    Raises:
+        InputError: It is no cost, is terminal already, or holds a ``ControlCost``.
+    """
+
+    cost: Cost
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.cost, Cost):
+            raise InputError(f"Terminal takes a cost, got {type(self.cost).__name__}")
+        for term in self.cost.terms:
+            if isinstance(term, Terminal):
+                raise InputError(f"{term!r} is a terminal cost already: leave the outer Terminal out")
+            if term.of_controls:
+                raise InputError(f"{term!r} cannot be a terminal cost: there is no control at the final time")
+
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`Cost.nonnegative`."""
+        return self.cost.nonnegative
+
+    def bind(self, points: Points) -> BoundCost:
+        """See :meth:`Cost.bind`; the points must be the one at the end."""
+        return self.cost.bind(points)
+
+
+def checked_weight(name: str, weight: ArrayLike) -> Floats:
+    """A weight as given: one number, a vector or a symmetric matrix.
+
+    Raises:
+        InputError: Not finite, indefinite, or neither number, vector nor square matrix.
+    """
+    array = require_finite(f"{name} weight", as_floats(f"{name} weight", weight))
+    if array.ndim > 2 or (array.ndim == 2 and array.shape[0] != array.shape[1]):
+        raise InputError(f"{name} weight must be a number, a vector or a square matrix, got {array.shape}")
+    least = np.linalg.eigvalsh(0.5 * (array + array.T)).min() if array.ndim == 2 else array.min(initial=0.0)
+    if least < -1e-12 * np.abs(array).max(initial=0.0):
+        raise InputError(f"{name} weight must be positive semidefinite; its least value is {least:g}")
+    array = 0.5 * (array + array.T) if array.ndim == 2 else array
+    array.setflags(write=False)
+    return array
+
+
+def weight_matrix(name: str, weight: Floats, size: int) -> Floats:
+    """A weight as a matrix (size, size).
+
+    Raises:
+        InputError: It is for another size.
+    """
+    if weight.ndim > 0 and weight.shape[0] != size:
+        raise InputError(f"{name} weight must be one number or have {size} rows, got shape {weight.shape}")
+    return weight * np.eye(size) if weight.ndim < 2 else weight
+
+
+def sample(name: str, reference: Reference, points: Points, size: int, *, held: bool = False) -> Floats:
+    """A reference at the points, (N, size), or (1, size) where it is constant.
+
+    ``held`` says that an array of it may also have one row for each step, constant over the step.
+
+    Raises:
+        InputError: Its shape does not fit.
+        CostError: A function that raises, or returns another shape or values that are not finite.
+    """
+    if callable(reference):
+        values = []
+        for time in points.t.tolist():
+            try:
+                values.append(reference(time))
+            except Exception as error:
+                raise CostError(name, f"the reference raised {error!r} at t = {time:.6g} s") from error
+        # All at once, as there may be many thousands; one by one only to say which of them is wrong.
+        with contextlib.suppress(ValueError, TypeError, OverflowError):
+            rows = np.array(values)
+            if rows.shape == (len(values), size) and rows.dtype.kind in "fiu" and np.isfinite(rows).all():
+                return np.ascontiguousarray(rows, dtype=np.float64)
+        for time, value in zip(points.t, values, strict=True):
+            try:
+                finite_array(f"the reference at t = {time:.6g} s", value, (size,))
+            except InputError as error:
+                raise CostError(name, str(error)) from None
+        return np.array(values, dtype=np.float64)
+    array = require_finite(f"{name} reference", as_floats(f"{name} reference", reference))
+    if array.ndim < 2 and array.shape in ((), (size,)):
+        return np.array(np.broadcast_to(array, (1, size)))
+    if held and array.shape == (points.steps, size):
+        # Rounding must not put a time at a node into the step before it; the end belongs to the last step.
+        step = np.floor(points.elapsed * (points.steps / points.duration) + 1e-6).astype(np.int64)
+        held_rows: Floats = array[np.minimum(step, points.steps - 1)]
+        return held_rows
+    if array.shape != (points.steps + 1, size):
+        steps = f", or ({points.steps}, {size}): one for each of its steps" if held else ""
+        raise InputError(
+            f"{name} reference must be a function of time, have shape ({size},), or ({points.steps + 1}, {size}): one "
+            f"row for each of the problem's nodes{steps}; got {array.shape}"
+        )
+    nodes = np.linspace(0.0, points.duration, points.steps + 1)
+    return np.column_stack([np.interp(points.elapsed, nodes, column) for column in array.T])

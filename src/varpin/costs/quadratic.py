@@ -1,0 +1,114 @@
+"""Quadratic costs of positions, velocities and controls."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.checks import as_floats
+from varpin.costs.base import BoundCost, Cost, Expansion, Points, Reference, checked_weight, sample, weight_matrix
+
+Floats = NDArray[np.float64]
+
+
+class _Quadratic(Cost):
+    """weight . (y - y_r)^2 for one block y of z."""
+
+    weight: Floats
+    reference: Reference
+    block: str
+
+    def __init__(self, reference: Reference, weight: ArrayLike) -> None:
+        self.weight = checked_weight(type(self).__name__, weight)
+        self.reference = reference if callable(reference) else as_floats(f"{type(self).__name__} reference", reference)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(weight={self.weight.tolist()})"
+
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`Cost.nonnegative`."""
+        return True
+
+    def bind(self, points: Points) -> BoundCost:
+        """See :meth:`Cost.bind`."""
+        size = points.controls if self.block == "u" else points.dof
+        begin = {"q": 0, "v": points.dof, "u": 2 * points.dof}[self.block]
+        name = type(self).__name__
+        W = weight_matrix(name, self.weight, size)
+        hessian = np.zeros((1, points.size, points.size))
+        hessian[0, begin : begin + size, begin : begin + size] = 2.0 * W
+        reference = sample(name, self.reference, points, size, held=self.block == "u")
+        return _BoundQuadratic(self.block, begin, reference, W, hessian)
+
+
+@dataclass(frozen=True, eq=False)
+class _BoundQuadratic(BoundCost):
+    block: str
+    begin: int
+    reference: Floats  # (N, size) or (1, size)
+    weight: Floats  # (size, size)
+    hessian: Floats
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        error = {"q": q, "v": v, "u": u}[self.block] - self.reference
+        total: Floats = np.einsum("...i,...i->...", error @ self.weight, error)
+        return total
+
+    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
+        error = {"q": q, "v": v, "u": u}[self.block] - self.reference
+        gradient = np.zeros((len(q), self.hessian.shape[1]))
+        gradient[:, self.begin : self.begin + len(self.weight)] = 2.0 * (error @ self.weight)
+        return Expansion(gradient, self.hessian)
+
+
+class TrackingCost(_Quadratic):
+    """weight . (q - q_r(t))^2: follow a reference in joint space."""
+
+    block = "q"
+
+    def __init__(self, reference: Reference, weight: ArrayLike = 1.0) -> None:
+        """Describe the cost.
+
+        Args:
+            reference: q_r: a function of the time [s] that returns (n,), a constant (n,), or an array (N + 1, n) of
+                its values at the problem's nodes, between which it is linear [rad or m].
+            weight: One number, (n,), or a matrix (n, n), positive semidefinite.
+
+        Raises:
+            InputError: A weight that is not finite, indefinite, or neither number, vector nor square matrix.
+        """
+        super().__init__(reference, weight)
+
+
+class VelocityCost(_Quadratic):
+    """weight . (v - v_r(t))^2."""
+
+    block = "v"
+
+    def __init__(self, weight: ArrayLike = 1.0, reference: Reference = 0.0) -> None:
+        """Describe the cost; see :class:`TrackingCost`."""
+        super().__init__(reference, weight)
+
+
+class ControlCost(_Quadratic):
+    """weight . (u - u_r(t))^2."""
+
+    block = "u"
+
+    def __init__(self, weight: ArrayLike = 1.0, reference: Reference = 0.0) -> None:
+        """Describe the cost; see :class:`TrackingCost`, with m controls for n coordinates.
+
+        Args:
+            weight: One number, (m,), or a matrix (m, m), positive semidefinite.
+            reference: u_r: a function of the time [s], a constant, or an array of rows of m: N + 1 of them as there,
+                or N, one for each step and constant over it, as controls are; for example those of another solution.
+        """
+        super().__init__(reference, weight)
+
+    @property
+    def of_controls(self) -> bool:
+        """See :attr:`Cost.of_controls`."""
+        return True

@@ -1,0 +1,183 @@
+"""Solutions in files: npz without pickle, all that a search needs to go on but the problem."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.checks import path_like
+from varpin.errors import FileError
+from varpin.sddp.history import Iteration, SearchState, Status
+from varpin.sddp.problem import OptimalControlProblem
+from varpin.trajectory import MEMBERS, Trajectory, atomic_file, read_members
+
+if TYPE_CHECKING:
+    from varpin.sddp.solution import Solution
+
+Floats = NDArray[np.float64]
+
+_FORMAT = "varpin.solution/1"
+_PLAN = ("gains", "feedforward", "gradient")
+_NUMBERS = ("cost", "noise_cost")
+_PROBLEM = ("q0", "v0", "t0", "steps", "hold", "sampling", "control_limits")
+_SURROUNDINGS = ("gravity", "damping", "stiffness", "rest", "actuation")
+_SEARCH = ("cost", "first", "best_merit", "best_cost", "regularization", "growth")
+_COLUMNS = tuple(item.name for item in fields(Iteration))
+
+
+def write(path: str | os.PathLike[str], solution: Solution) -> Path:
+    """As :meth:`Solution.save` says."""
+    search = solution.search
+    motions = {"": solution.trajectory}
+    if search is not None:
+        motions |= {"search.": search.trajectory} | ({} if search.best is None else {"best.": search.best})
+    members: dict[str, Any] = {
+        "status": solution.status.name,
+        "reason": solution.reason,
+        "history": _rows(solution.history),
+    }
+    # Motions are often one and the same: each is written once.
+    kept: dict[int, str] = {}
+    for prefix, motion in motions.items():
+        members[f"{prefix}motion"] = kept.setdefault(id(motion), prefix)
+        if kept[id(motion)] == prefix:
+            members |= {f"{prefix}{name}": value for name, value in motion.members().items()}
+    members |= {name: getattr(solution, name) for name in (*_PLAN, *_NUMBERS)}
+    members |= {name: getattr(solution.problem, name) for name in _PROBLEM}
+    members["problem.integrator"] = repr(solution.problem.integrator)
+    members |= _surroundings(solution.problem)
+    if search is not None:
+        members["search.history"] = len(search.history)
+        members["search.merits"] = np.array(search.merits)
+        members |= {f"search.{name}": getattr(search, name) for name in _SEARCH}
+    with atomic_file(path) as stream:
+        np.savez_compressed(stream, **members, format=_FORMAT)
+    return Path(path)
+
+
+def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[str, Any]:
+    """The fields of the :class:`Solution` in a file; errors as :meth:`Solution.load` says."""
+    source = path_like("path", path)
+    expected = {*MEMBERS, *_PLAN, *_NUMBERS, *_PROBLEM, "status", "reason", "history"}
+    members = read_members(source, _FORMAT, expected, others=True)
+    reader = _Reader(source, members, problem)
+    reader.check_problem()
+    return reader.fields()
+
+
+def _surroundings(problem: OptimalControlProblem) -> dict[str, Floats]:
+    """What of a problem's scene tells it from others; of a noise that only Python can evaluate nothing but its size."""
+    arrays = {f"scene.{name}": getattr(problem.scene, name) for name in _SURROUNDINGS}
+    fields_of_noise = problem.scene.mechanism.diffusion._asdict()
+    return arrays | {f"noise.{name}": array for name, array in fields_of_noise.items()}
+
+
+def _rows(history: tuple[Iteration, ...]) -> Floats:
+    """One row for each iteration, its fields in order."""
+    return np.array([[float(getattr(item, name)) for name in _COLUMNS] for item in history]).reshape(-1, len(_COLUMNS))
+
+
+@dataclass(frozen=True, eq=False)
+class _Reader:
+    """The members of a file of a solution, checked as they are taken out."""
+
+    source: Path
+    members: dict[str, NDArray[Any]]
+    problem: OptimalControlProblem
+
+    def check_problem(self) -> None:
+        problem, members = self.problem, self.members
+        given = {name: getattr(problem, name) for name in _PROBLEM} | {"dt": problem.dt}
+        for name, value in given.items():
+            if not np.array_equal(members[name], value):
+                raise FileError(f"{self.source} is of a problem with {name} = {members[name]}, not {value}")
+        own = repr(problem.integrator)
+        if str(members.get("problem.integrator")) != own:
+            raise FileError(
+                f"{self.source} is of a problem with integrator {members.get('problem.integrator')}, not {own}"
+            )
+
+        for name, array in _surroundings(problem).items():
+            if name not in members or not np.array_equal(members[name], array, equal_nan=True):
+                raise FileError(f"{self.source} is of a problem with another {name.replace('.', ' ')}")
+
+    def array(self, name: str, shape: tuple[int, ...], *, finite: bool = True) -> Floats:
+        """A member of floats of the shape given, -1 for any length."""
+        if name not in self.members:
+            raise FileError(f"{self.source} is not a varpin solution: it has no {name}")
+        array = self.members[name]
+        if array.ndim != len(shape) or any(b not in (-1, a) for a, b in zip(array.shape, shape, strict=True)):
+            raise FileError(f"{self.source}: {name} has shape {array.shape}, where {shape} belongs")
+        if array.dtype.kind not in "fi" or (finite and not np.isfinite(array).all()):
+            raise FileError(f"{self.source}: {name} holds values that are not finite numbers")
+        return np.array(array, dtype=np.float64, order="C")
+
+    def motion(self, prefix: str) -> Trajectory:
+        own = {name: self.members[prefix + name] for name in MEMBERS if prefix + name in self.members}
+        missing = sorted(MEMBERS - set(own))
+        if missing:
+            raise FileError(f"{self.source} is not a varpin solution: it has no {prefix}{missing[0]}")
+        motion = Trajectory.of_members(self.source, own, self.problem.scene.robot)
+        scene = self.problem.scene
+        found = motion.steps, motion.u.shape[1], motion.dw.shape[1]
+        if found != (self.problem.steps, scene.controls, scene.processes):
+            raise FileError(
+                f"{self.source}: its motion has {found[0]} steps, {found[1]} controls and {found[2]} noise processes; "
+                f"the problem has {self.problem.steps}, {scene.controls} and {scene.processes}"
+            )
+        return motion
+
+    def history(self) -> tuple[Iteration, ...]:
+        rows = self.array("history", (-1, len(_COLUMNS)), finite=False)
+        whole = {item.name for item in fields(Iteration) if item.type == "int"}
+        found = []
+        for row in rows.tolist():
+            values: dict[str, Any] = dict(zip(_COLUMNS, row, strict=True))
+            found.append(Iteration(**values | {name: int(values[name]) for name in whole}))
+        return tuple(found)
+
+    def fields(self) -> dict[str, Any]:
+        problem, members = self.problem, self.members
+        R, m, n = problem.decisions, problem.scene.controls, problem.scene.robot.dof
+        status = str(members["status"])
+        if status not in Status.__members__:
+            raise FileError(f"{self.source}: there is no status {status!r}")
+        motions = {"": self.motion("")}
+        history = self.history()
+        cost = float(self.array("cost", ()))
+        found = problem.cost_of(motions[""])
+        if not abs(found - cost) <= 1e-9 * max(abs(found), abs(cost)):
+            raise FileError(f"{self.source} is of a problem with another cost: {cost:.9g}, and here {found:.9g}")
+        search = None
+        if "search.motion" in members:
+            names = {}
+            for name in ("search.", "best."):
+                names[name] = str(members.get(f"{name}motion", "none"))
+                if names[name] != "none" and names[name] not in motions:
+                    motions[names[name]] = self.motion(names[name])
+            numbers = {name: float(self.array(f"search.{name}", (), finite=False)) for name in _SEARCH}
+            search = SearchState(
+                trajectory=motions[names["search."]],
+                best=motions.get(names["best."]),
+                merits=tuple(self.array("search.merits", (-1,)).tolist()),
+                history=history[: int(self.array("search.history", ()))],
+                **numbers,
+            )
+        return {
+            "problem": problem,
+            "trajectory": motions[""],
+            "gains": self.array("gains", (R, m, 2 * n)),
+            "feedforward": self.array("feedforward", (R, m)),
+            "gradient": self.array("gradient", (R, m), finite=False),
+            "cost": cost,
+            "noise_cost": float(self.array("noise_cost", (), finite=False)),
+            "status": Status[status],
+            "reason": str(members["reason"]),
+            "history": history,
+            "search": search,
+        }

@@ -1,0 +1,180 @@
+"""A plan held against an accurate integration of the continuous system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.costs import BoundSum
+from varpin.integrators import RungeKutta4
+from varpin.integrators.base import open_loop
+from varpin.kernels._compile import announced_compilation
+from varpin.kernels.tree import Commands
+from varpin.policy import LinearPolicy
+from varpin.sddp.problem import OptimalControlProblem, bind_cost
+from varpin.simulation import rollout
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Verification:
+    """A plan held against an accurate integration of the continuous system.
+
+    Costs are integrals over the continuous motion, without noise; NaN where that motion runs away.
+
+    Attributes:
+        planned_cost: The solver's own.
+        open_loop_cost: Of the plan's controls alone.
+        closed_loop_cost: With the plan's feedback, at the plan's own rate.
+        open_loop_gap: Distance of the end from the plan's, in q, open loop [rad or m].
+        closed_loop_gap: The same with feedback.
+        defect: Largest distance in q of an accurately integrated step from the plan's [rad or m].
+        substeps: Of the accurate integration, in one step of the plan.
+        accuracy: Relative change over the last doubling of the substeps, of the cost that changed more.
+    """
+
+    planned_cost: float
+    open_loop_cost: float
+    closed_loop_cost: float
+    open_loop_gap: float
+    closed_loop_gap: float
+    defect: float
+    substeps: int
+    accuracy: float
+
+    @property
+    def open_loop_loss(self) -> float:
+        """What the controls alone cost above the plan, relative to the plan's cost; NaN where they run away."""
+        return excess(self.open_loop_cost, self.planned_cost)
+
+    @property
+    def closed_loop_loss(self) -> float:
+        """The same with feedback."""
+        return excess(self.closed_loop_cost, self.planned_cost)
+
+    def __str__(self) -> str:
+        rows = [
+            ("planned", self.planned_cost, "", ""),
+            ("controls alone", self.open_loop_cost, percent(self.open_loop_loss), f"{self.open_loop_gap:.2e}"),
+            ("with feedback", self.closed_loop_cost, percent(self.closed_loop_loss), f"{self.closed_loop_gap:.2e}"),
+        ]
+        lines = [f"{'':16}{'cost':>14}{'loss':>12}  end off by [rad or m]"]
+        for name, cost, loss, gap in rows:
+            shown = (f"{cost:14.6e}{loss:>12}  {gap}" if np.isfinite(cost) else f"{'runs away':>14}").rstrip()
+            lines.append(f"{name:16}{shown}")
+        good = f"{self.accuracy:.0e}" if np.isfinite(self.accuracy) else "nothing: no motion stays"
+        return "\n".join(
+            [
+                *lines,
+                f"a step is off by {self.defect:.2e} rad or m at most; costs are good to {good} of themselves "
+                f"({self.substeps} substeps a step)",
+                "read it so: where feedback loses some percent, the plan holds; where it loses much, dt is too coarse "
+                "(controls alone also lose much where a motion is unstable)",
+            ]
+        )
+
+
+def excess(cost: float, base: float) -> float:
+    """How far a cost is above another one, relative to it; infinite above nothing."""
+    if cost == base:
+        return 0.0
+    return (cost - base) / abs(base) if base != 0.0 else float(np.copysign(np.inf, cost - base))
+
+
+def percent(part: float) -> str:
+    """A part of something in words: in percent, or as a multiple where it is large."""
+    if abs(part) >= 1e4:
+        return f"{part:+.1e} x"
+    return f"{100.0 * part:+.2f} %" if abs(part) < 1.0 else f"{100.0 * part:+.0f} %"
+
+
+def verify(
+    problem: OptimalControlProblem,
+    plan: Trajectory,
+    planned_cost: float,
+    policy: Callable[[int], LinearPolicy],
+    *,
+    tolerance: float,
+    max_substeps: int,
+    progress: Callable[[int, int], None] | None,
+) -> Verification:
+    """Hold a plan, and its policy on (q, v) for a number of substeps, against accurate integrations.
+
+    The substeps double until neither cost changes by more than ``tolerance`` of itself.
+    """
+    substeps, before = 2, (np.nan, np.nan)
+    blind = open_loop(plan.u[:: problem.hold])
+    while True:
+        if progress is not None:
+            progress(substeps, max_substeps)
+        costs = _fine_costs(problem, substeps)
+        opened = accurate_cost(problem, blind._replace(hold=problem.hold * substeps), substeps, costs)
+        fed = policy(substeps)
+        feedback = Commands(fed.u, fed.gains, fed.reference, fed.hold, fed.limits)
+        closed = accurate_cost(problem, feedback, substeps, costs)
+        changes = [
+            abs(now[0] - then) / max(abs(now[0]), 1e-300)
+            for now, then in zip((opened, closed), before, strict=True)
+            if np.isfinite(now[0]) and np.isfinite(then)
+        ]
+        before = opened[0], closed[0]
+        accuracy = max(changes, default=np.inf)
+        if accuracy <= tolerance or substeps >= max_substeps:
+            break
+        substeps *= 2
+    end = plan.q[-1]
+    return Verification(
+        planned_cost=planned_cost,
+        open_loop_cost=opened[0],
+        closed_loop_cost=closed[0],
+        open_loop_gap=float(np.abs(opened[1] - end).max()),
+        closed_loop_gap=float(np.abs(closed[1] - end).max()),
+        defect=_defect(problem, plan, substeps),
+        substeps=substeps,
+        accuracy=accuracy,
+    )
+
+
+def _fine_costs(problem: OptimalControlProblem, substeps: int) -> tuple[BoundSum, BoundSum]:
+    """Running and terminal costs at the nodes of a finer grid."""
+    times = np.arange(problem.steps * substeps + 1, dtype=np.float64) * (problem.dt / substeps)
+    return bind_cost(problem.cost, problem.t0 + times, problem.running.points)
+
+
+def accurate_cost(
+    problem: OptimalControlProblem, commands: Commands, substeps: int, costs: tuple[BoundSum, BoundSum] | None = None
+) -> tuple[float, Floats]:
+    """True cost under given commands, and the end configuration; NaN where the motion runs away."""
+    scene, h = problem.scene, problem.dt / substeps
+    n, m = scene.robot.dof, scene.controls
+    with announced_compilation("accurate integration"):
+        motion, failure = rollout(scene, RungeKutta4(), problem.q0, problem.v0, commands, h)
+    if failure is not None:
+        return np.nan, np.full(n, np.nan)
+    running, terminal = _fine_costs(problem, substeps) if costs is None else costs
+    # Simpson's rule within each step of the plan: the control jumps between steps.
+    after = running.value(motion.q, motion.v, np.vstack([motion.u, motion.u[-1:]]))
+    before = running.value(motion.q, motion.v, np.vstack([motion.u[:1], motion.u]))
+    integral = h / 3.0 * (after[:-1:2] + 4.0 * after[1::2] + before[2::2]).sum()
+    end = terminal.value(motion.q[-1:], motion.v[-1:], np.zeros((1, m)))[0]
+    return float(integral + end), motion.q[-1]
+
+
+def _defect(problem: OptimalControlProblem, trajectory: Trajectory, substeps: int) -> float:
+    """Largest distance in q between the plan's steps and accurate ones from the same nodes."""
+    scene, h, n = problem.scene, problem.dt / substeps, problem.scene.robot.dof
+    integrator = RungeKutta4()
+    state, _ = integrator.start(scene, trajectory.q[:-1].copy(), trajectory.v[:-1].copy())
+    # Every step is a path of its own, with its own control handed over as a force.
+    commands = open_loop(np.zeros((1, scene.controls)))._replace(hold=substeps)
+    force = trajectory.u @ scene.actuation.T
+    forces = np.ascontiguousarray(np.broadcast_to(force[:, None], (trajectory.steps, substeps, n)))
+    segments = integrator.rollout_compiled(scene, state, commands, np.zeros((0, 0, scene.processes)), forces, h)
+    lost = np.full(n, np.nan)
+    ends = np.array([segment.q[-1] if segment.failure is None else lost for segment in segments])
+    return float(np.abs(ends - trajectory.q[1:]).max())
