@@ -31,7 +31,7 @@ DOCUMENT = ROOT / "docs" / "limits.md"
 TREES = 200
 RATIOS = (1e-4, 1e-2, 1.0, 1e2, 1e4)
 # A tree, or a robot of more joints than this, gets each so many-th of the trials, and its neighbours the others.
-SMALL, TURNS = 8, 6
+SMALL, TURNS = 4, 6
 # A motion or a plan may take this long before it is judged by what there is [s].
 PATIENCE = 1.0
 

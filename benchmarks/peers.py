@@ -417,7 +417,7 @@ def _often(times: int) -> str:
     return "once" if times == 1 else f"{times} times"
 
 
-def drake_motion(case: Case, dt: float, scheme: str | None = None, patience: float = 30.0) -> Motion | None:
+def drake_motion(case: Case, dt: float, scheme: str | None = None, patience: float = 10.0) -> Motion | None:
     """A motion by Drake, in discrete steps or by one of its error-controlled schemes at the default 1e-4.
 
     None without Drake; given up where it takes longer than ``patience`` [s].

@@ -317,6 +317,15 @@ def test_resumes_to_the_same_record(load, tmp_path):
     assert all(same(*pair) for pair in zip(again.cells, whole.cells, strict=True))
     # What was there was not run again: even its time stands.
     assert [cell.seconds for cell in again.cells[:7]] == [cell.seconds for cell in cut.cells]
+    # Nor is it lost where something else comes first, and is interrupted.
+    more = [Trial("made up", "made up", trials[0].build, 1e-3, 10), *trials]
+
+    def refuse(done, cells, name):
+        raise KeyboardInterrupt
+
+    kept = extremes.run(robot, trials=more, save=tmp_path / "cut.json", progress=refuse)
+    assert (len(kept.cells), kept.missing) == (len(whole.cells), len(INTEGRATORS))
+    assert len(extremes.Record.load(tmp_path / "cut.json").cells) == len(whole.cells)
 
 
 def test_a_record_survives_the_disk(tmp_path):

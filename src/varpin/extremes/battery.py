@@ -170,25 +170,29 @@ def run(
     path = None if save is None else writable(save)
     known = Record.load(path).cells if path is not None and path.exists() else ()
     done = {cell.fingerprint: cell for cell in known}
-    chores = [(trial, member) for trial in trials for member in members if trial.takes(member)]
-    cells: list[Cell] = []
+    chores = {
+        fingerprint(trial, member, name): (trial, member)
+        for trial in trials
+        for member in members
+        if trial.takes(member)
+    }
+    cells = {mark: done[mark] for mark in chores if mark in done}
     said = time.monotonic()
 
     def now() -> Record:
-        return Record(tuple(cells), name, deep, len(chores) - len(cells))
+        # What is known already stays known, however early an interruption comes.
+        return Record(tuple(cells[mark] for mark in chores if mark in cells), name, deep, len(chores) - len(cells))
 
     try:
         bench = None
-        for trial, member in chores:
+        for mark, (trial, member) in chores.items():
+            if mark in cells:
+                continue
             if progress is not None:
                 progress(len(cells), len(chores), f"{trial.name}, {member}")
-            mark = fingerprint(trial, member, name)
-            if mark in done:
-                cells.append(done[mark])
-                continue
             if bench is None or bench.trial is not trial:
                 bench = Bench(trial)
-            cells.append(bench.run(member, limit, mark))
+            cells[mark] = bench.run(member, limit, mark)
             if path is not None and time.monotonic() - said > _SAVED_EVERY:
                 now().save(path)
                 said = time.monotonic()
