@@ -37,7 +37,7 @@ INTEGRATORS: tuple[Integrator, ...] = (
     RungeKutta4(),
 )
 
-# A motion or a plan gets this long, and the plain battery half a minute at most for one [s].
+# A motion gets this long, and the plain battery half a minute at most for one [s].
 _PATIENCE, _DEEP_PATIENCE = 20.0, 900.0
 # Between two looks at the disk [s].
 _SAVED_EVERY = 2.0
@@ -152,7 +152,7 @@ def run(
         trials: These instead.
         integrators: These instead of all.
         save: Keep the record in this JSON file; cells that it holds already are not run again.
-        patience: Processor time a motion may take, and time a plan may, before it is judged by what there is [s].
+        patience: Processor time a motion may take before it is judged by what there is [s]; if given, plans get as much.
         progress: Called with (cells done, cells in all, the next one's name).
 
     Returns:
@@ -192,7 +192,8 @@ def run(
                 progress(len(cells), len(chores), f"{trial.name}, {member}")
             if bench is None or bench.trial is not trial:
                 bench = Bench(trial)
-            cells[mark] = bench.run(member, limit, mark)
+            # A plan cut short is another plan; it has its number of iterations.
+            cells[mark] = bench.run(member, limit if isinstance(trial, Trial) or patience else math.inf, mark)
             if path is not None and time.monotonic() - said > _SAVED_EVERY:
                 now().save(path)
                 said = time.monotonic()
