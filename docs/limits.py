@@ -2,6 +2,7 @@
 
     varpin extremes --out extremes
     python docs/limits.py extremes/extremes.json
+    python docs/limits.py --chains                  # the table of undamped chains: five minutes
 
 A record of ``varpin extremes --deep`` gives the table of the long scenes as well. Other simulators take part in theirs
 where they are installed (``pip install "varpin[peers]"``; trep has no release for Python 3).
@@ -9,6 +10,7 @@ where they are installed (``pip install "varpin[peers]"``; trep has no release f
 
 from __future__ import annotations
 
+import logging
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -17,8 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
+import varpin as vp
 from varpin.extremes import PLANS, TRIALS, Cell, Kind, Record, Trial
-from varpin.extremes.battery import families
+from varpin.extremes.battery import INTEGRATORS, families
 from varpin.extremes.checks import LEVELS, Exact, exact_motion
 from varpin.lagrangian import lagrangian_jet
 
@@ -34,6 +37,8 @@ MOTIONS: dict[str, Callable[[peers.Case, float], peers.Motion | None]] = {
     "Drake RK3, 1e-4": partial(peers.drake_motion, scheme="runge_kutta3"),
     "trep midpoint": peers.trep_motion,
 }
+GAUSS = tuple(vp.Gauss(stages) for stages in (2, 3, 4))
+CHAIN_STEPS = 100_000
 DEEP = {trial.name for trial in (*TRIALS, *PLANS) if trial.deep}
 # What others are asked to do as well: chains that all describe alike.
 SHARED = (
@@ -55,7 +60,10 @@ SHARED = (
 def main() -> None:
     """Rewrite the tables."""
     if len(sys.argv) != 2:
-        raise SystemExit("usage: limits.py RECORD")
+        raise SystemExit("usage: limits.py RECORD or limits.py --chains")
+    if sys.argv[1] == "--chains":
+        put("chains", list(chains()))
+        return
     record = Record.load(sys.argv[1])
     put("measured", list(measured([cell for cell in record.cells if cell.trial not in DEEP])))
     if record.deep:
@@ -153,6 +161,23 @@ def in_words(trial: Trial, motion: Callable[[peers.Case, float], peers.Motion | 
     return outcome(float(error), float(energy), found.said)
 
 
+def chains() -> Iterator[str]:
+    """A row for each undamped chain at each step: the energy error over 1e5 steps, and how many of them were split."""
+    logging.getLogger("varpin").setLevel(logging.CRITICAL)
+    yield f"| links | h [s] | {' | '.join(map(str, GAUSS))} |"
+    yield "|---" * (2 + len(GAUSS)) + "|"
+    for links in (2, 3, 5):
+        scene, rest = vp.Scene(vp.planar_chain(links)), np.zeros(links)
+        for dt in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5):
+            texts = []
+            for integrator in GAUSS:
+                motion = vp.simulate(scene, rest, rest, dt=dt, steps=CHAIN_STEPS, integrator=integrator)
+                error = np.abs(motion.energy - motion.energy[0]).max() / (9.81 * links**2 / 2)
+                texts.append(f"{error:.0e} ({motion.statistics.split_steps / CHAIN_STEPS:.0%})")
+            sys.stderr.write(f"{links} links, {dt:g} s: {', '.join(texts)}\n")
+            yield f"| {links} | {dt:g} | {' | '.join(texts)} |"
+
+
 @cache
 def truth(trial: Trial) -> Exact:
     """The exact motion of a trial, computed once."""
@@ -160,22 +185,23 @@ def truth(trial: Trial) -> Exact:
 
 
 def deep_table(record: Record) -> Iterator[str]:
-    """A row for each long scene: what came of it with every integrator, and how long that took."""
-    yield "| scene | steps | cells | accurate | degraded | stopped | silent wrong | most energy error | of | time [s] |"
-    yield "|---" * 10 + "|"
-    for family in families(record.cells).values():
-        for name in family:
-            cells = [cell for cell in record.cells if cell.trial == name]
-            if name not in DEEP:
-                continue
-            counts = [sum(cell.kind is kind for cell in cells) for kind in Kind if kind is not Kind.REFUSED]
-            going = [cell for cell in cells if cell.kind is not Kind.STOPPED and not math.isnan(cell.energy)]
-            worst = max(going, key=lambda cell: cell.energy, default=None)
-            text = "| |" if worst is None else f"{worst.energy:.1e} | {worst.integrator} |"
-            yield (
-                f"| {name} | {cells[0].steps} | {len(cells)} | {' | '.join(map(str, counts))} | {text}"
-                f" {sum(cell.seconds for cell in cells):.0f} |"
-            )
+    """A row for each long scene that was run with every integrator: kinds of cells, and some errors of energy."""
+    shown = ("Midpoint(alpha=0.5)", "Gauss(stages=2)", "Gauss(stages=3)", "Gauss(stages=4)", "RungeKutta4")
+    yield f"| scene | {' | '.join(kind.value for kind in Kind)} | {' | '.join(shown)} |"
+    yield "|---" * (1 + len(Kind) + len(shown)) + "|"
+    for trial in (*TRIALS, *PLANS):
+        cells = {cell.integrator: cell for cell in record.cells if cell.trial == trial.name}
+        if trial.deep and len(cells) == sum(trial.takes(member) for member in INTEGRATORS):
+            counts = [sum(cell.kind is kind for cell in cells.values()) for kind in Kind]
+            errors = [in_short(cells.get(name)) for name in shown]
+            yield f"| {trial.name} | {' | '.join(map(str, counts))} | {' | '.join(errors)} |"
+
+
+def in_short(cell: Cell | None) -> str:
+    """The energy error of a cell, or where it ended."""
+    if cell is None or math.isnan(cell.energy):
+        return ""
+    return f"stops at step {cell.done}" if cell.kind is Kind.STOPPED else f"{cell.energy:.0e}"
 
 
 if __name__ == "__main__":

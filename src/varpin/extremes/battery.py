@@ -152,7 +152,8 @@ def run(
         trials: These instead.
         integrators: These instead of all.
         save: Keep the record in this JSON file; cells that it holds already are not run again.
-        patience: Processor time a motion may take before it is judged by what there is [s]; if given, plans get as much.
+        patience: Processor time that a motion may take before it is judged by what there is [s]; if given, plans get
+            as much.
         progress: Called with (cells done, cells in all, the next one's name).
 
     Returns:
