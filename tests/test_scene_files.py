@@ -1,18 +1,25 @@
 """Scene files: what they may say, each mistake in its own words, and that they reach no further than what they name."""
 
+import contextlib
 import copy
 import datetime
 import functools
 import itertools
 import re
+import string
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzz.scene import toml
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 
 import varpin as vp
 from varpin.scenefile import scenes
+from varpin.scenefile.spec import read_scene
+from varpin.scenefile.table import Table
 from varpin.scenefile.terms import TERMS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -478,3 +485,84 @@ def test_every_term_is_documented():
         assert f"`{name}`" in text, name
     for name in scenes():
         assert f"`{name}`" in text, name
+
+
+def allowed_keys(path, monkeypatch):
+    """What reading a scene allows, by table: where it stands without indices, and the keys."""
+    found, plain = {}, Table.allow
+
+    def recording(table, *names):
+        found.setdefault(re.sub(r"\[\d+\]", "", table.key), set()).update(names)
+        return plain(table, *names)
+
+    with monkeypatch.context() as patch, contextlib.suppress(vp.SceneFileError):
+        patch.setattr(Table, "allow", recording)
+        read_scene(path)
+    return found
+
+
+def documented_sections():
+    """The lines of the documented scene, by the table they are about."""
+    sections, name = {"": []}, ""
+    for line in documented()[0].splitlines():
+        if header := re.match(r"\[+([\w.]+)\]+", line):
+            name = header[1]
+        sections.setdefault(name, []).append(line)
+    return {name: "\n".join(lines) for name, lines in sections.items()}
+
+
+def keys_of(data, path=""):
+    """The keys of each table of parsed TOML, by where it stands without indices."""
+    if isinstance(data, list):
+        return [entry for item in data for entry in keys_of(item, path)]
+    if not isinstance(data, dict):
+        return []
+    below = [keys_of(value, f"{path}.{key}" if path else key) for key, value in data.items()]
+    return [(path, set(data)), *itertools.chain.from_iterable(below)]
+
+
+def test_documented_keys_are_those_there_are(tmp_path, monkeypatch):
+    whole, references = documented()
+    allowed = allowed_keys(write(tmp_path, whole), monkeypatch)
+    used = keys_of(tomllib.loads(whole))
+    for path, keys in used:
+        assert keys <= allowed.get(path, keys), path
+    # A cost has the keys of its kind, and references are written of by themselves.
+    sections, kinds = documented_sections(), {"cost", "cost.reference", "cost.target"}
+    for path in allowed.keys() - kinds - {"cost.reference.sines"}:
+        written = set(re.findall(r"\w+", sections[path])) if path else set()
+        assert allowed[path] <= written.union(*(keys for place, keys in used if place == path)), path
+    kept = tomllib.loads(references)
+    named = {key for entry in kept.values() if isinstance(entry, dict) for _, keys in keys_of(entry) for key in keys}
+    assert named - {"mcp"} == allowed["cost.reference"] | allowed["cost.reference.sines"]
+
+
+@pytest.mark.parametrize("kind", TERMS)
+def test_documented_keys_of_costs_are_those_there_are(kind, tmp_path, monkeypatch):
+    text = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8")
+    (row,) = re.findall(rf"^\| `{kind}` \|.*\|(.*)\|$", text, re.M)
+    scene = f'[robot]\nsource = "finger"\n[horizon]\ndt = 0.1\nsteps = 1\n[[cost]]\ntype = "{kind}"\n'
+    allowed = allowed_keys(write(tmp_path, scene), monkeypatch)["cost"]
+    assert allowed - {"type", "weight", "terminal"} == set(re.findall(r"`(\w+)`", row))
+    assert ("terminal" in allowed) == (kind != "control")
+
+
+@settings(max_examples=50, deadline=None)
+@given(key=st.text(string.ascii_letters + string.digits + "_-", min_size=1, max_size=12), data=st.data())
+def test_no_other_key_is_taken(key, data, tmp_path_factory):
+    whole = tomllib.loads(GOOD)
+    free = ("damping", "lock", "gear", "v", "offset", "weight")
+    tables = [place for place in leaves(whole) if isinstance(at(whole, place), dict) and place[-1] not in free]
+    place = data.draw(st.sampled_from([(), *tables]))
+    known = {name for _, keys in keys_of(tomllib.loads(documented()[0])) for name in keys} | {"steps", "stages", "kick"}
+    assume(key not in known)
+    at(whole, place)[key] = 1
+    path = tmp_path_factory.mktemp("scene") / "scene.toml"
+    path.write_text(toml(whole), encoding="utf-8")
+    with pytest.raises(vp.SceneFileError, match="unknown key") as caught:
+        vp.load_scene(path)
+    assert caught.value.key.rpartition(".")[2] == key
+
+
+def at(data, place):
+    return functools.reduce(lambda table, key: table[key], place, data)

@@ -169,3 +169,11 @@ def writable(path: str | os.PathLike[str]) -> Path:
     if not os.access(target if target.exists() else target.parent, os.W_OK):
         raise FileError(f"cannot write {target}: permission denied")
     return target
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is a file, and no folder or device; False of what cannot be the path of one."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin._version import __version__
-from varpin.archive import read_npz
+from varpin.archive import Check, Header, read_npz
 from varpin.checks import path_like, writable
 from varpin.errors import FileError, InputError
 from varpin.robot import MAX_JOINTS, Robot
@@ -27,6 +27,8 @@ Integers = NDArray[np.int64]
 FORMAT = "varpin.trajectory/1"
 
 _ARRAYS = ("t", "q", "v", "p", "u", "dw", "energy", "masses")
+_TEXTS = ("version", "integrator", "robot", "joint_names", "warnings")
+_MOST_WORDS = 1_000_000  # bytes of what does not grow with the steps
 _COUNTS = {f"statistics.{name}" for name in ("newton_iterations", "jets", "sweeps", "substeps")}
 
 
@@ -193,7 +195,8 @@ class Trajectory:
         source = path_like("path", path)
         if robot is not None and not isinstance(robot, Robot):
             raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
-        return cls.of_members(source, read_members(source, FORMAT, MEMBERS), robot)
+        members = read_members(source, FORMAT, MEMBERS, check=lambda headers: require_layout(source, headers))
+        return cls.of_members(source, members, robot)
 
     @classmethod
     def of_members(cls, source: Path, members: Mapping[str, NDArray[Any]], robot: Robot | None) -> Trajectory:
@@ -202,29 +205,11 @@ class Trajectory:
         Raises:
             FileError: As for :meth:`load`.
         """
-        steps, n = members["t"].size - 1, members["joint_names"].size
-        shapes: dict[str, tuple[int, ...]] = dict.fromkeys("qvp", (steps + 1, n)) | dict.fromkeys(
-            ("t", "energy"), (steps + 1,)
-        )
-        shapes |= {"masses": (-1,), "u": (steps, -1), "dw": (steps, -1), "dt": (), "joint_names": (-1,)}
-        shapes |= {f"statistics.{item.name}": (steps,) for item in fields(StepStatistics)}
-        shapes |= dict.fromkeys(("version", "integrator", "robot"), ())
-        for name, shape in shapes.items():
-            array = members[name]
-            if array.ndim != len(shape) or any(b not in (-1, a) for a, b in zip(array.shape, shape, strict=True)):
-                raise FileError(f"{source}: {name} has shape {array.shape}, where {shape} belongs")
-            if name in ("joint_names", "version", "integrator", "robot"):
-                if array.dtype.kind != "U":
-                    raise FileError(f"{source}: {name} holds {array.dtype}, where text belongs")
-                continue
-            if array.dtype.kind not in "fi" or not np.isfinite(array).all():
+        require_layout(source, members)
+        steps = members["t"].size - 1
+        for name in (*_ARRAYS, "dt", *(f"statistics.{item.name}" for item in fields(StepStatistics))):
+            if not np.isfinite(members[name]).all():
                 raise FileError(f"{source}: {name} holds values that are not finite numbers")
-            if array.dtype != (np.int64 if name in _COUNTS else np.float64):
-                raise FileError(
-                    f"{source}: {name} holds {array.dtype}, where {'int64' if name in _COUNTS else 'float64'} belongs"
-                )
-        if n > MAX_JOINTS:
-            raise FileError(f"{source} is of {n} joints; varpin takes robots of at most {MAX_JOINTS}")
         if steps < 0 or not members["dt"] > 0.0:
             raise FileError(f"{source}: it has {steps + 1} nodes and dt = {members['dt']} s")
         expected = members["t"][0] + np.arange(steps + 1) * members["dt"]
@@ -236,8 +221,6 @@ class Trajectory:
                 f"{source} is of robot {members['robot']!s} with joints {', '.join(names)}; "
                 f"{robot.name!r} has joints {', '.join(robot.joint_names)}"
             )
-        if members["warnings"].ndim != 1 or members["warnings"].dtype.kind != "U":
-            raise FileError(f"{source}: warnings has no sentences, but {members['warnings'].dtype}")
         masses = members["masses"]
         if robot is not None and (
             masses.shape != robot.tree.mass.shape or not np.allclose(masses, robot.tree.mass, rtol=1e-6)
@@ -257,6 +240,33 @@ class Trajectory:
             version=str(members["version"]),
             warnings=tuple(str(sentence) for sentence in members["warnings"]),
         )
+
+
+def require_layout(source: Path, members: Mapping[str, NDArray[Any] | Header]) -> None:
+    """Refuse arrays, or headers of arrays, that are not those of one motion.
+
+    Raises:
+        FileError: It names the member, its shape or type, and what belongs there.
+    """
+    steps, n = members["t"].size - 1, members["joint_names"].size
+    nodes: tuple[int, ...] = (steps + 1,)
+    shapes = dict.fromkeys("qvp", (*nodes, n)) | dict.fromkeys(("t", "energy"), nodes) | {"masses": (-1,), "dt": ()}
+    shapes |= {"u": (steps, -1), "dw": (steps, -1), "joint_names": (-1,), "warnings": (-1,)}
+    shapes |= {f"statistics.{item.name}": (steps,) for item in fields(StepStatistics)}
+    shapes |= dict.fromkeys(_TEXTS[:3], ())
+    for name, shape in shapes.items():
+        found, kind = members[name].shape, members[name].dtype
+        if len(found) != len(shape) or any(b not in (-1, a) for a, b in zip(found, shape, strict=True)):
+            raise FileError(f"{source}: {name} has shape {found}, where {shape} belongs")
+        if name in _TEXTS:
+            if kind.kind != "U":
+                raise FileError(f"{source}: {name} holds {kind}, where text belongs")
+        elif kind != (np.int64 if name in _COUNTS else np.float64):
+            raise FileError(f"{source}: {name} holds {kind}, where {'int64' if name in _COUNTS else 'float64'} belongs")
+        if name in (*_TEXTS, "masses") and members[name].size * kind.itemsize > _MOST_WORDS:
+            raise FileError(f"{source}: {name} is longer than any: {found} of {kind}")
+    if n > MAX_JOINTS:
+        raise FileError(f"{source} is of {n} joints; varpin takes robots of at most {MAX_JOINTS}")
 
 
 def chained(parts: Sequence[Trajectory]) -> Trajectory:
@@ -303,18 +313,28 @@ MEMBERS = frozenset(_ARRAYS) | {"dt", "version", "integrator", "robot", "joint_n
 MEMBERS |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
 
 
-def read_members(source: Path, kind: str, expected: Iterable[str], *, others: bool = False) -> dict[str, NDArray[Any]]:
+def read_members(
+    source: Path,
+    kind: str,
+    expected: Iterable[str],
+    *,
+    others: bool = False,
+    most: int | None = None,
+    check: Check | None = None,
+) -> dict[str, NDArray[Any]]:
     """The ``expected`` arrays of an npz file of format ``kind``, with ``others`` all of them.
+
+    ``most`` and ``check`` as for :func:`varpin.archive.read_npz`.
 
     Raises:
         FileError: It says what is wrong with the file.
     """
     what = f"varpin {kind.removeprefix('varpin.').partition('/')[0]}"
-    members = read_npz(source, {*expected, "format"}, what, others=others)
-    found = members["format"]
+    names = {*expected, "format"}
+    found = read_npz(source, names, what, wanted={"format"}, most=_MOST_WORDS)["format"]
     if found.shape != () or str(found) != kind:
-        raise FileError(f"{source} is not a {what}: its format is {found}, not {kind!r}")
-    return members
+        raise FileError(f"{source} is not a {what}: its format is {reprlib.repr(str(found))[1:-1]}, not {kind!r}")
+    return read_npz(source, names, what, wanted=None if others else names, most=most, check=check)
 
 
 @contextlib.contextmanager

@@ -6,8 +6,9 @@ import hashlib
 import json
 import math
 import os
+import reprlib
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 
 import varpin
 from varpin._version import __version__
-from varpin.checks import path_like, positive, writable
+from varpin.checks import is_file, path_like, positive, writable
 from varpin.errors import FileError, VarpinError
 from varpin.extremes import plans
 from varpin.extremes.checks import Exact, condition, exact_motion, findings, finite, measures
@@ -102,18 +103,49 @@ class Record:
             FileError: The file is missing, damaged or something else.
         """
         source = path_like("path", path)
+        if not is_file(source):
+            raise FileError(f"there is no file {source}")
         try:
-            facts = json.loads(source.read_text(encoding="utf-8"))
+            with source.open("rb") as stream:
+                content = stream.read(_MOST_BYTES + 1)
+            if len(content) > _MOST_BYTES:
+                raise ValueError(f"it is larger than {_MOST_BYTES / 1e6:g} MB")
+            facts = _typed("the record", json.loads(content), _FACTS)
             if facts["format"] != FORMAT:
-                raise FileError(f"{source} is no record of varpin.extremes: its format is {facts['format']!r}")
+                raise ValueError(f"its format is {reprlib.repr(facts['format'])}, not {FORMAT!r}")
             cells = tuple(_cell(entry) for entry in facts["cells"])
-            return cls(cells, str(facts["robot"]), bool(facts["deep"]), int(facts["missing"]), str(facts["version"]))
         except OSError as error:
             raise FileError(f"cannot read {source}: {error.strerror or error}") from None
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            if isinstance(error, FileError):
-                raise
-            raise FileError(f"{source} is damaged, or no record of varpin.extremes: {error!r}") from None
+        except (ValueError, RecursionError) as error:
+            raise FileError(f"{source} is damaged, or no record of varpin.extremes: {error}") from None
+        return cls(cells, facts["robot"], facts["deep"], facts["missing"], facts["version"])
+
+
+# What a record's file holds; larger than that of any battery is none.
+_MOST_BYTES = 5_000_000
+_FACTS: dict[str, type] = {
+    "format": str, "version": str, "robot": str, "deep": bool, "missing": int, "cells": list,
+}  # fmt: skip
+_KINDS: dict[str, type] = {"str": str, "int": int, "float": float, "Kind": str, "tuple[str, ...]": list}
+
+
+def _typed(what: str, found: Any, kinds: Mapping[str, type]) -> dict[str, Any]:
+    """A table of JSON with a value of each kind and nothing else; whole numbers are taken for floats.
+
+    Raises:
+        ValueError: It says what is wrong.
+    """
+    if not isinstance(found, dict) or set(found) != set(kinds):
+        raise ValueError(f"{what} does not have {', '.join(kinds)}")
+    values = {}
+    for name, kind in kinds.items():
+        value = found[name]
+        if kind is float and isinstance(value, int) and abs(value) < 2**53:
+            value = float(value)
+        if type(value) is not kind or (isinstance(value, int) and not 0 <= value < 2**63):
+            raise ValueError(f"{name} of {what} is {reprlib.repr(value)}")
+        values[name] = value
+    return values
 
 
 def _plain(cell: Cell) -> dict[str, Any]:
@@ -124,12 +156,19 @@ def _plain(cell: Cell) -> dict[str, Any]:
     return entry
 
 
-def _cell(entry: dict[str, Any]) -> Cell:
-    values = dict(entry)
-    for name in _MEASURES:
-        values[name] = math.nan if values[name] is None else float(values[name])
-    values |= {"kind": Kind(values["kind"]), "said": tuple(values["said"]), "found": tuple(values["found"])}
-    return Cell(**values)
+def _cell(entry: Any) -> Cell:
+    if isinstance(entry, dict):
+        absent = [name for name in _MEASURES if name in entry and entry[name] is None]
+        endless = [name for name in _MEASURES if entry.get(name) == "inf"]
+        entry = entry | dict.fromkeys(absent, math.nan) | dict.fromkeys(endless, math.inf)
+    values = _typed("a cell", entry, {item.name: _KINDS[str(item.type)] for item in fields(Cell)})
+    for name in ("said", "found"):
+        if not all(isinstance(sentence, str) for sentence in values[name]):
+            raise ValueError(f"{name} of a cell is {reprlib.repr(values[name])}")
+        values[name] = tuple(values[name])
+    if not math.isfinite(values["seconds"]):
+        raise ValueError(f"seconds of a cell is {values['seconds']}")
+    return Cell(**values | {"kind": Kind(values["kind"])})
 
 
 def run(

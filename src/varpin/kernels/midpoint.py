@@ -9,7 +9,7 @@ import numpy as np
 from varpin.kernels._compile import inlined, kernel
 from varpin.kernels.drive import apply_policy, constant_force, noise_impulse
 from varpin.kernels.jet import mass_matrix, second_order
-from varpin.kernels.linalg import factor_ldl, solve_lower, solve_upper
+from varpin.kernels.linalg import factor_ldl, least_pivot_ratio, solve_lower, solve_upper
 from varpin.kernels.load import (
     enter_loads,
     limit_of,
@@ -52,15 +52,14 @@ def branch_margin(mechanism: Mechanism, options: Options, h: float, k: Work) -> 
     exaggerated = h * h * a * (1.0 - a) / (1.0 - options.margin)
     for i in range(n):
         for j in range(i + 1):
-            k.lu[i, j] = w.M[i, j] + h * (a - 0.5) * (w.A[i, j] + w.A[j, i]) - exaggerated * w.Lqq[i, j]
+            k.lu[i, j] = w.M[i, j] - exaggerated * w.Lqq[i, j]
             k.ldl[i, j] = w.M[i, j]
         k.lu[i, i] += 0.5 * h * mechanism.damping[i]
-    if not factor_ldl(k.ldl) or not factor_ldl(k.lu):
-        return 0.0
-    margin = np.inf
-    for i in range(n):
-        margin = min(margin, k.lu[i, i] / k.ldl[i, i])
-    return margin
+    if a != 0.5:
+        for i in range(n):
+            for j in range(i + 1):
+                k.lu[i, j] += h * (a - 0.5) * (w.A[i, j] + w.A[j, i])
+    return least_pivot_ratio(k.lu, k.ldl)
 
 
 @inlined

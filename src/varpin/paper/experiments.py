@@ -209,6 +209,10 @@ def _middle_gains(solution: Solution) -> Floats:
     return np.array(rows).T.reshape(len(GAIN_TIMES), *gains.shape[1:])
 
 
+# No cell unpacks to as much.
+_MOST_BYTES = 50_000_000
+
+
 def _facts(path: Path, text: NDArray[Any]) -> dict[str, Any] | None:
     """All of a cell that is no array, or None where another version wrote it."""
     try:
@@ -257,7 +261,7 @@ class Store:
         if not path.is_file():
             return None
         try:
-            members = read_npz(path, {"facts", *_ARRAYS}, "cell", others=False)
+            members = read_npz(path, {"facts", *_ARRAYS}, "cell", wanted={"facts", *_ARRAYS}, most=_MOST_BYTES)
             facts = _facts(path, members.pop("facts"))
             if facts is None:
                 return None

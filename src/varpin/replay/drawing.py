@@ -11,6 +11,7 @@ import pinocchio as pin
 from meshcat.animation import Animation, AnimationClip, AnimationTrack
 from numpy.typing import NDArray
 
+from varpin.errors import InputError
 from varpin.replay import marks
 from varpin.replay.picture import Picture, label
 from varpin.replay.script import Actor, Script, Target, Trace
@@ -24,6 +25,9 @@ _TARGET_COLOR = 0xC0187A
 
 # From no torque to all there is; linear in between.
 EFFORT_COLORS = np.array([[0.72, 0.76, 0.8], [0.98, 0.75, 0.1], [0.8, 0.05, 0.05]])
+
+# Viewers compute in single precision, and with squares [m].
+_FARTHEST = 1e18
 
 # Of marks, in sizes of a robot's motion.
 _TUBE, _BALL, _TRIAD, _LABEL = 0.003, 0.02, 0.1, 0.25
@@ -71,6 +75,10 @@ class _Drawing:
             size = max(size, float(np.ptp(points, axis=0).max()))
             extents.append(np.concatenate([points, *(trace.points for trace in actor.traces), *marked]))
             axes.append(picture.body_poses(positions)[0][..., 2].reshape(-1, 3))
+        if not np.abs(np.concatenate(extents)).max() < _FARTHEST:
+            raise InputError(f"what is to be shown has sizes or places beyond {_FARTHEST:g} m, which no viewer draws")
+        # A point, or what is too small to tell from one, is seen from a metre away.
+        size = size if size > 1.0 / _FARTHEST else 1.0
         toward = view_direction(np.concatenate(axes))
         offset = self.script.offset
         places = side_by_side(extents, toward) if offset is None else [k * offset for k in range(len(extents))]

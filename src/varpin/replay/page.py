@@ -11,6 +11,8 @@ from typing import Any
 import meshcat
 import umsgpack
 
+from varpin.errors import InputError
+
 
 class Page:
     """In place of meshcat's window: keeps the commands that a window would send to its server."""
@@ -21,7 +23,10 @@ class Page:
     def send(self, command: Any) -> None:
         """Keep a command."""
         # three.js computes in single precision; half the bytes say the same.
-        self.commands.append(umsgpack.packb(command.lower(), force_float_precision="single"))
+        try:
+            self.commands.append(umsgpack.packb(command.lower(), force_float_precision="single"))
+        except OverflowError:
+            raise InputError("what is to be shown has sizes or places beyond 3e38, which no viewer draws") from None
 
     def html(self, title: str) -> str:
         """The page: meshcat's viewer and the commands, compressed."""

@@ -37,6 +37,8 @@ class ShapeLoader(MeshcatVisualizer):
 
     def loadMeshFromFile(self, geometry_object: pin.GeometryObject) -> Any:
         """A mesh file, in a form that meshcat draws."""
+        if Path(geometry_object.meshPath).suffix.lower() == ".dae":
+            _require_pictures(Path(geometry_object.meshPath))
         mesh = super().loadMeshFromFile(geometry_object)
         if self.collada is not None:
             mesh.dae_raw = self.collada
@@ -103,6 +105,28 @@ class ShapeLoader(MeshcatVisualizer):
         return True
 
 
+# How files of pictures begin: PNG, JPEG, GIF, BMP, TIFF either way, WebP.
+_PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"BM", b"II*\0", b"MM\0*", b"RIFF")
+
+
+def _require_pictures(path: Path) -> None:
+    """Refuse a Collada file whose textures are something else: all of what it names would go into the page.
+
+    Raises:
+        ValueError: It names the file.
+    """
+    for element in ElementTree.parse(path).iter():
+        if element.tag.rpartition("}")[2] != "init_from" or not (element.text or "").strip():
+            continue
+        picture = path.parent / str(element.text)
+        if picture.is_file():
+            with picture.open("rb") as stream:
+                if not stream.read(4).startswith(_PICTURES):
+                    raise ValueError(f"its texture {element.text!r} is no picture")
+
+
+# A file whose parts would add up to more bytes, or whose elements are nested deeper, is taken whole.
+_MOST_COPIED, _NESTED = 100_000_000, 100
 _PRIMITIVES = frozenset(["lines", "linestrips", "polygons", "polylist", "triangles", "trifans", "tristrips"])
 
 
@@ -117,12 +141,18 @@ def _collada_parts(path: str) -> list[str | None]:
     except (OSError, ElementTree.ParseError):
         # Pinocchio's loader will say so in its own words.
         return [None]
+    level, depth = [root], 0
+    while level and depth <= _NESTED:
+        depth, level = depth + 1, [child for element in level for child in element]
+    if level:
+        return [None]
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
     instances = list(root.iter("instance_geometry"))
     meshes = [[child for child in mesh if child.tag in _PRIMITIVES] for mesh in root.iter("mesh")]
     kinds = {frozenset(x.get("semantic") for x in child.iter("input")) for mesh in meshes for child in mesh}
-    if len(instances) < 2 or (len(kinds) < 2 and max(map(len, meshes)) < 2):
+    copied = len(instances) * Path(path).stat().st_size
+    if len(instances) < 2 or copied > _MOST_COPIED or (len(kinds) < 2 and max(map(len, meshes)) < 2):
         return [None]
     parts: list[str | None] = []
     for kept in range(len(instances)):

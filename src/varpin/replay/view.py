@@ -37,6 +37,7 @@ def set_view(viewer: meshcat.Visualizer, points: Floats, toward: Floats, floor: 
     width, up, depth = (seen - middle).T
     tangent = math.tan(0.5 * _VERTICAL_VIEW)
     distance = _MARGIN * float(np.max(depth + np.maximum(np.abs(width) / (_ASPECT * tangent), np.abs(up) / tangent)))
+    distance = distance or size
 
     camera = meshcat.geometry.PerspectiveCamera(
         fov=math.degrees(_VERTICAL_VIEW), aspect=_ASPECT, near=0.01 * distance, far=100.0 * distance

@@ -127,3 +127,12 @@ def installed() -> tuple[str, ...]:
 def package_dir(urdf: Path) -> Path:
     """The folder below which ``package://example-robot-data/...`` paths of ``urdf`` are found."""
     return next(parent.parent for parent in urdf.parents if parent.name == "example-robot-data")
+
+
+def holds(urdf: Path) -> bool:
+    """Whether a file is one of the installed example-robot-data's."""
+    try:
+        files = metadata.files(DISTRIBUTION) or []
+    except metadata.PackageNotFoundError:
+        return False
+    return any(Path(str(file.locate())).resolve() == urdf for file in files if file.name == urdf.name)

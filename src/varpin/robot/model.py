@@ -1,5 +1,6 @@
 """The robot: a Pinocchio model, its generalized coordinates, and the tree the kernels run on."""
 
+import contextlib
 import os
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
@@ -15,9 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import as_floats, is_one_of, require_finite
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint
 from varpin.kernels.tree import Tree
+from varpin.robot import example_robot_data
+from varpin.robot.meshes import mesh_problems
 from varpin.robot.mimic import Tie, joint_index, rebuild, tied_model
 from varpin.robot.payload import Payload, carry
-from varpin.robot.sources import Description, describe, hang_shapes
+from varpin.robot.sources import Description, describe, hang_shapes, models_dir
 from varpin.robot.tree import flatten, frame_index, is_unbounded, joint_axis, to_pinocchio, tree_mass_matrix
 from varpin.robot.urdf import read_root
 
@@ -356,7 +359,18 @@ def geometry(robot: Robot) -> pin.GeometryModel:
     if robot.urdf is None:
         return pin.GeometryModel()
     text = ET.tostring(read_root(robot.urdf), encoding="unicode")
+    (problem,) = _mesh_problems(robot, [text])
+    if problem is not None:
+        raise RobotError(f"the meshes of robot {robot.name!r} cannot be read: {problem}")
     return _visuals(robot, _whole_model(robot, text), text)
+
+
+def _mesh_problems(robot: Robot, texts: Sequence[str]) -> list[str | None]:
+    """What is wrong with the meshes in parts of a robot's URDF; nothing of robots that are published with varpin."""
+    assert robot.urdf is not None
+    if robot.urdf.is_relative_to(models_dir()) or example_robot_data.holds(robot.urdf):
+        return [None] * len(texts)
+    return mesh_problems(texts, robot.package_dirs)
 
 
 def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[int, str]]]:
@@ -366,23 +380,33 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
         The shapes of the links that can be read; and by name of each other link, its joint in ``free_model`` and what
         is wrong with it.
     """
-    try:
+    if robot.visuals is not None or robot.urdf is None:
         return geometry(robot), {}
-    except RobotError:
-        assert robot.urdf is not None
     root = read_root(robot.urdf)
-    full = _whole_model(robot, ET.tostring(root, encoding="unicode"))
+    whole = ET.tostring(root, encoding="unicode")
+    full = _whole_model(robot, whole)
     visuals = {link: link.findall("visual") for link in root.iter("link")}
     for link, shapes in visuals.items():
         for shape in shapes:
             link.remove(shape)
+    shown = {link: shapes for link, shapes in visuals.items() if shapes}
+    alone = []
+    for link, shapes in shown.items():
+        single = ET.Element("robot", name="link")
+        single.extend(root.findall("material"))
+        ET.SubElement(single, "link", name=link.get("name", "")).extend(shapes)
+        alone.append(ET.tostring(single, encoding="unicode"))
+    problems = _mesh_problems(robot, alone)
+    if not any(problems):
+        with contextlib.suppress(RobotError):
+            return _visuals(robot, full, whole), {}
     found, missing = pin.GeometryModel(), {}
-    for link, shapes in visuals.items():
-        if not shapes:
-            continue
-        link.extend(shapes)
+    for (link, shapes), problem in zip(shown.items(), problems, strict=True):
         name = link.get("name", "")
+        link.extend(shapes)
         try:
+            if problem is not None:
+                raise RobotError(f"the meshes of link {name!r} cannot be read: {problem}")
             part = _visuals(robot, full, ET.tostring(root, encoding="unicode"))
         except RobotError as error:
             frame = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.BODY)]

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import array
 import csv
 import itertools
 import math
-import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from varpin.scenefile.table import ByName, Floats, Table, inside, suggestion
+from varpin.archive import read_npz
+from varpin.checks import is_file
+from varpin.errors import FileError
+from varpin.scenefile.table import ByName, Floats, Table, inside, shown, suggestion
 
-Function = Callable[[float], Floats]
 KINDS = ("offset", "sines", "times", "values", "between", "file")
+# Of a file: a motion of seven joints over a million steps has eight million.
+_MOST_NUMBERS = 20_000_000
+_LONGEST_LINE = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,47 +155,61 @@ def _between(times: Floats, rows: Floats, *, smooth: bool) -> Timeline:
 
 
 def _csv(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
+    numbers = array.array("d")
+    head: list[str] = []
     try:
         with path.open(newline="", encoding="utf-8") as stream:
-            rows = [row for row in csv.reader(stream) if row]
+            for number, row in enumerate(filter(None, csv.reader(_lines(stream, wrong))), start=1):
+                if not head:
+                    head = [name.strip() for name in row]
+                    continue
+                if len(row) != len(head):
+                    raise wrong(f"row {number} has {len(row)} entries, and there are {len(head)} columns")
+                for column, word in zip(head, row, strict=True):
+                    try:
+                        value = float(word)
+                    except ValueError:
+                        raise wrong(
+                            f"row {number}, column {shown(column)}: {shown(word.strip())} is no number"
+                        ) from None
+                    if not math.isfinite(value):
+                        raise wrong(f"row {number}, column {shown(column)} is not finite")
+                    numbers.append(value)
+                if len(numbers) > _MOST_NUMBERS:
+                    raise wrong(f"it has more than {_MOST_NUMBERS} numbers")
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise wrong(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    if len(rows) < 2:
+    if not len(numbers):
         raise wrong("it must have a line of column names and lines of numbers")
-    head = [name.strip() for name in rows[0]]
-    found = np.empty((len(rows) - 1, len(head)))
-    for number, row in enumerate(rows[1:], start=2):
-        if len(row) != len(head):
-            raise wrong(f"row {number} has {len(row)} entries, and there are {len(head)} columns")
-        for column, word in enumerate(row):
-            try:
-                found[number - 2, column] = float(word)
-            except ValueError:
-                raise wrong(f"row {number}, column {head[column]!r}: {word.strip()!r} is no number") from None
-    if not np.isfinite(found).all():
-        line, place = (int(x) for x in np.argwhere(~np.isfinite(found))[0])
-        raise wrong(f"row {line + 2}, column {head[place]!r} is not finite")
-    return dict(zip(head, found.T, strict=True))
+    if twice := [name for index, name in enumerate(head) if name in head[:index]]:
+        raise wrong(f"its column {shown(twice[0])} is there twice")
+    return dict(zip(head, np.array(numbers).reshape(-1, len(head)).T, strict=True))
+
+
+def _lines(stream: TextIO, wrong: Callable[[str], Exception]) -> Iterator[str]:
+    while line := stream.readline(_LONGEST_LINE):
+        if len(line) == _LONGEST_LINE:
+            raise wrong(f"it has a line of more than {_LONGEST_LINE} characters")
+        yield line
 
 
 def _npz(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
     """The columns of an npz file: arrays of one length, or the joint positions of a saved trajectory."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays: dict[str, NDArray[Any]] = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise wrong(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        arrays = read_npz(path, what="file of values", most=8 * _MOST_NUMBERS)
+    except FileError as error:
+        raise wrong(f"cannot be read: {error}") from None
     if {"t", "q", "joint_names"} <= set(arrays) and arrays["q"].ndim == 2:
-        joints = [str(name) for name in arrays["joint_names"]]
+        joints = [str(name) for name in arrays["joint_names"].reshape(-1)]
         if len(joints) == arrays["q"].shape[1]:
             arrays = {"t": arrays["t"]} | dict(zip(joints, arrays["q"].T, strict=True))
     length = arrays["t"].shape if "t" in arrays else ()
-    for name, array in arrays.items():
-        if array.dtype.kind not in "fi" or array.ndim != 1 or array.shape != length:
-            raise wrong(f"its array {name!r} must be as many numbers as t, got shape {array.shape}")
-        if not np.isfinite(array).all():
-            raise wrong(f"its array {name!r} is not finite")
-    return {name: np.asarray(array, dtype=np.float64) for name, array in arrays.items()}
+    for name, values in arrays.items():
+        if values.dtype.kind not in "fi" or values.ndim != 1 or values.shape != length:
+            raise wrong(f"its array {shown(name)} must be as many numbers as t, got shape {values.shape}")
+        if not np.isfinite(values).all():
+            raise wrong(f"its array {shown(name)} is not finite")
+    return {name: np.asarray(values, dtype=np.float64) for name, values in arrays.items()}
 
 
 def read_reference(table: Table, name: str, folder: Path, dt: float, default: float | None = None) -> Reference:
@@ -206,7 +224,7 @@ def read_reference(table: Table, name: str, folder: Path, dt: float, default: fl
         path = inside(own, "file", own.text("file"), folder, "the scene's folder")
         if path.suffix not in (".csv", ".npz"):
             raise own.error("file", f"must be a .csv or .npz file, got {path.name!r}")
-        if not path.is_file():
+        if not is_file(path):
             raise own.error("file", f"there is no file {path}")
         return Reference(table, name, file=path)
     if kind == "times":

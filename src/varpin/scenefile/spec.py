@@ -3,21 +3,33 @@
 from __future__ import annotations
 
 import math
+import os
+import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from varpin.checks import is_file
 from varpin.errors import FileError, InputError
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
 from varpin.robot import Payload, models_dir
 from varpin.scenefile.references import Reference, read_reference
-from varpin.scenefile.table import ByName, SceneFileError, Table, inside, suggestion
+from varpin.scenefile.table import ByName, SceneFileError, Table, inside, shown, suggestion
 from varpin.scenefile.terms import TERMS, Term
 
-# More than any horizon has, and still a number of steps that NumPy takes.
-MOST_STEPS = 10**9
+# A motion of seven joints over so many steps takes gigabytes.
+MOST_STEPS = 10**7
+# Steps times terms of a cost: references are evaluated for each.
+MOST_EVALUATIONS = 10**6
+# Of a file: bytes, dots outside numbers, tables within tables, characters of a word, tables or words of a list.
+_MOST_BYTES = 1_000_000
+_MOST_DOTS = 1000
+_NESTED = 20
+_LONGEST_WORD = 1000
+_MOST_TABLES = 300
+_FLOAT = re.compile(r"(?<![\w.+-])[+-]?[0-9][0-9_]*\.[0-9][0-9_]*(?:[eE][+-]?[0-9]+)?(?![\w.-])", re.ASCII)
 FIGURES = (".png", ".pdf", ".svg")
 
 
@@ -181,9 +193,9 @@ def find_scene(source: str | Path) -> Path:
     if str(source) in bundled:
         return bundled[str(source)]
     path = Path(source).expanduser()
-    if path.is_file():
+    if is_file(path):
         return path
-    if path.is_dir():
+    if os.path.isdir(path):  # noqa: PTH112 - of a path that is too long for any, pathlib raises an OSError
         raise FileError(f"{path} is a folder, not a scene file")
     raise FileError(f"no scene file {str(source)!r}; {suggestion(path.stem, bundled, 'bundled scenes')}")
 
@@ -197,16 +209,60 @@ def read_scene(path: Path, name: str | None = None) -> SceneSpec:
     """
     source = path.name
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        with path.open("rb") as stream:
+            content = stream.read(_MOST_BYTES + 1)
+        if len(content) > _MOST_BYTES:
+            raise SceneFileError(source, "", f"it is larger than {_MOST_BYTES / 1e6:g} MB, the largest that is read")
+        text = content.decode("utf-8")
+        # A key of n parts takes tomllib a time of n^2: minutes for 50 kB.
+        if text.count(".") - len(_FLOAT.findall(text)) > _MOST_DOTS:
+            raise SceneFileError(source, "", f"it has more than {_MOST_DOTS} dots that are not those of numbers")
+        data = tomllib.loads(text.replace("\r\n", "\n"))
     except OSError as error:
         raise FileError(f"cannot read {path}: {error.strerror or error}") from None
     except UnicodeDecodeError:
         raise SceneFileError(source, "", "it is not a text in UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise SceneFileError(source, "", f"it is not TOML: {error}") from None
     except RecursionError:
         raise SceneFileError(source, "", "it is nested too deeply") from None
+    except SceneFileError:
+        raise
+    except ValueError as error:  # of numbers that Python does not read, tomllib lets Python's own through
+        raise SceneFileError(source, "", f"it is not TOML: {error}") from None
+    _require_sane(source, data)
     return _scene(Table(source, "", data), path, path.stem if name is None else name)
+
+
+def _require_sane(source: str, data: Mapping[str, Any]) -> None:
+    """Refuse what no scene has and what makes messages and searches of any length.
+
+    Raises:
+        SceneFileError: Tables within tables without end, thousands of tables in a list, integers of more than 64 bits,
+            or words that are very long or cannot be printed.
+    """
+    waiting: list[tuple[str, int, Any]] = [("", 0, data)]
+    while waiting:
+        key, depth, value = waiting.pop()
+        if depth > _NESTED:
+            raise SceneFileError(source, key[:_LONGEST_WORD], f"is nested more than {_NESTED} deep")
+        if isinstance(value, str) and not _is_plain(value):
+            raise SceneFileError(
+                source, key, f"must be a text of one line and {_LONGEST_WORD} characters at most, got {shown(value)}"
+            )
+        if isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise SceneFileError(source, key, "is an integer of more than 64 bits")
+        if isinstance(value, dict):
+            for name, entry in value.items():
+                if not _is_plain(name):
+                    raise SceneFileError(source, key, f"has a key of no use, {shown(name)}")
+                waiting.append((f"{key}.{name}" if key else name, depth + 1, entry))
+        if isinstance(value, list):
+            if len(value) > _MOST_TABLES and any(isinstance(entry, dict | str) for entry in value):
+                raise SceneFileError(source, key, f"has {len(value)} entries; {_MOST_TABLES} are the most")
+            waiting += [(f"{key}[{index}]", depth + 1, entry) for index, entry in enumerate(value)]
+
+
+def _is_plain(word: str) -> bool:
+    return word.isprintable() and len(word) <= _LONGEST_WORD
 
 
 def _scene(root: Table, path: Path, name: str) -> SceneSpec:
@@ -232,6 +288,12 @@ def _scene(root: Table, path: Path, name: str) -> SceneSpec:
         controls = simulation.choice("controls", ("hold",))
     elif "controls" in simulation:
         controls = read_reference(simulation, "controls", folder, horizon["dt"])
+    costs = tuple(_cost(table, folder, horizon["dt"]) for table in root.tables("cost"))
+    if horizon["steps"] * len(costs) > MOST_EVALUATIONS:
+        raise root.table("horizon").error(
+            "",
+            f"{horizon['steps']} steps times {len(costs)} costs are too many; {MOST_EVALUATIONS} are the most",
+        )
     joints = actuation.texts("joints")
     if "joints" in actuation and not joints:
         raise actuation.error("joints", "must name a joint at least; leave it out to drive all of them")
@@ -253,7 +315,7 @@ def _scene(root: Table, path: Path, name: str) -> SceneSpec:
         v0=initial.by_name("v", 0.0, unit="rad/s or m/s"),
         **horizon,
         integrator=_integrator(root.table("integrator")),
-        costs=tuple(_cost(table, folder, horizon["dt"]) for table in root.tables("cost")),
+        costs=costs,
         controls=controls,
         seed=simulation.whole("seed") if "seed" in simulation else None,
         options=_options(root.table("solve")),
@@ -267,7 +329,7 @@ def _robot(table: Table, folder: Path) -> RobotSpec:
     source: str | Path = text
     if Path(text).suffix or "/" in text or "\\" in text:
         source = inside(table, "source", text, folder, "the scene's folder")
-        if not source.is_file():
+        if not is_file(source):
             raise table.error("source", f"there is no file {source}")
     lock = table.table("lock")
     folders = tuple(

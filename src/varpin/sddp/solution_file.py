@@ -64,10 +64,18 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     """The fields of the :class:`Solution` in a file; errors as :meth:`Solution.load` says."""
     source = path_like("path", path)
     expected = {*MEMBERS, *_PLAN, *_NUMBERS, *_PROBLEM, "status", "reason", "history"}
-    members = read_members(source, _FORMAT, expected, others=True)
+    members = read_members(source, _FORMAT, expected, others=True, most=_most_bytes(problem))
     reader = _Reader(source, members, problem)
     reader.check_problem()
     return reader.fields()
+
+
+def _most_bytes(problem: OptimalControlProblem) -> int:
+    """More than the file of any solution unpacks to: three motions, the plan, and some megabytes for all else."""
+    n, m, k = problem.scene.robot.dof, problem.scene.controls, problem.scene.processes
+    own = sum(array.nbytes for array in _surroundings(problem).values())
+    numbers = 3 * (problem.steps + 1) * (3 * n + m + k + 16) + problem.decisions * m * (2 * n + 2)
+    return 8 * numbers + own + 16_000_000
 
 
 def _surroundings(problem: OptimalControlProblem) -> dict[str, Floats]:
@@ -103,7 +111,8 @@ class _Reader:
             )
 
         for name, array in _surroundings(problem).items():
-            if name not in members or not np.array_equal(members[name], array, equal_nan=True):
+            found = members.get(name)
+            if found is None or found.dtype != array.dtype or not np.array_equal(found, array, equal_nan=True):
                 raise FileError(f"{self.source} is of a problem with another {name.replace('.', ' ')}")
 
     def array(self, name: str, shape: tuple[int, ...], *, finite: bool = True) -> Floats:

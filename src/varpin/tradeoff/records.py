@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 
 from varpin.archive import read_npz
-from varpin.checks import path_like
+from varpin.checks import is_file, path_like
 from varpin.errors import FileError
 from varpin.trajectory import atomic_file
 
@@ -21,6 +21,9 @@ Row = TypeVar("Row")
 
 # What numpy keeps the types of fields in.
 _DTYPES = {"int": "iu", "float": "fiu", "str": "U"}
+
+# No record unpacks to as much.
+_MOST_BYTES = 50_000_000
 
 # Costs closer than this, relative, are the same.
 MARGIN = 0.02
@@ -92,10 +95,10 @@ def read_table(
         FileError: The file is missing, damaged, or something else.
     """
     source = path_like("path", path)
-    if not source.is_file():
+    if not is_file(source):
         raise FileError(f"there is no file {source}")
     try:
-        members = read_npz(source)
+        members = read_npz(source, what="record", most=_MOST_BYTES)
     except FileError as error:
         raise FileError(f"{source} is damaged, or no record of varpin.tradeoff: {error}") from None
     found = str(members.pop("format", "missing"))
