@@ -273,9 +273,10 @@ def record_error(scene: Scene, trajectory: Trajectory) -> float:
         off = np.append(np.abs(momentum - trajectory.p[k]), abs(trajectory.energy[k] - energy - start))
         speed = np.abs(v).sum()
         sums = np.append(np.full(len(v), speed), speed**2)
-        off = np.maximum(off - _ROUNDING * np.diag(mass).max() * sums - _of_last_bits(scene, q, v), 0.0)
+        rounding = _ROUNDING * np.diag(mass).max() * sums + _of_last_bits(scene, q, v)
         # What overflows on the way there is not comparable.
-        known = (units > 0.0) & np.isfinite(units)
+        known = (units > 0.0) & np.isfinite(units) & np.isfinite(rounding)
+        off = np.maximum(off - rounding, 0.0)
         shares = off[known] / units[known]
         worst = max(worst, float(np.nan_to_num(shares, nan=np.inf).max(initial=0.0)))
     return worst
