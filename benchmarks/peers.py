@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import ModuleType
@@ -20,7 +21,7 @@ from scipy.integrate import solve_ivp
 
 import varpin as vp
 
-# The least moment of inertia that MuJoCo accepts [kg m^2]: a slender rod's own axis gets it, about which nothing turns.
+# MuJoCo accepts no moment of inertia of zero [kg m^2]: a slender rod's own axis gets this, about which nothing turns.
 LEAST_INERTIA = 1e-9
 
 
@@ -85,9 +86,14 @@ def bodies(robot: vp.Robot) -> list[Body]:
         raise ValueError(f"{robot.name} has armature")
     own = []
     for j in range(1, model.njoints):
-        column = pin.computeJointJacobian(model, data, pin.neutral(model), j)[3:, model.joints[j].idx_v]
+        column = pin.computeJointJacobian(model, data, pin.neutral(model), j).reshape(6, -1)[3:, model.joints[j].idx_v]
         own.append(Body(int(model.parents[j]), model.jointPlacements[j], column, model.inertias[j]))
     return own
+
+
+def moments_of(moments: np.ndarray) -> np.ndarray:
+    """Central moments of inertia, with something in place of those of slender axes that cannot be told from it."""
+    return np.where(moments <= 1e-9 * moments.max(), min(LEAST_INERTIA, 1e-3 * moments.max()), moments)
 
 
 def forces(scene: vp.Scene, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -143,7 +149,7 @@ def mujoco_model(scene: vp.Scene, dt: float, integrator: str = "Euler", *, energ
             f'<joint type="hinge" axis="{_row(body.axis)}" damping="{float(scene.damping[k])!r}"'
             f' stiffness="{float(scene.stiffness[k])!r}" springref="{float(scene.rest[k])!r}"/>'
             f'<inertial pos="{_row(body.inertia.lever)}" quat="{_quaternion(axes)}" mass="{float(body.inertia.mass)!r}"'
-            f' diaginertia="{_row(np.maximum(moments, LEAST_INERTIA))}"/>'
+            f' diaginertia="{_row(moments_of(moments))}"/>'
         )
 
     def tree(parent: int) -> str:
@@ -209,7 +215,7 @@ def _mujoco_start(mujoco: ModuleType, model: Any, data: Any, case: Case) -> None
 
 @dataclass(frozen=True)
 class DrakeModel:
-    """A scene as a continuous MultibodyPlant."""
+    """A scene as a MultibodyPlant."""
 
     plant: Any
     case: Case
@@ -226,23 +232,24 @@ class DrakeModel:
         """Total energy [J]."""
         return float(self.plant.CalcPotentialEnergy(context) + self.plant.CalcKineticEnergy(context))
 
-    def simulator(self, scheme: str, accuracy: float) -> Any:
-        """At the case's initial state."""
+    def simulator(self, scheme: str | None, accuracy: float) -> Any:
+        """At the case's initial state; a plant in discrete steps has no scheme."""
         analysis = importlib.import_module("pydrake.systems.analysis")
         simulator = analysis.Simulator(self.plant, self.context(self.case.q0, self.case.v0))
-        integrator = analysis.ResetIntegratorFromFlags(simulator, scheme, 0.1)
-        integrator.set_target_accuracy(accuracy)
+        if scheme is not None:
+            integrator = analysis.ResetIntegratorFromFlags(simulator, scheme, 0.1)
+            integrator.set_target_accuracy(accuracy)
         simulator.Initialize()
         return simulator
 
 
-def drake_model(case: Case) -> DrakeModel | None:
-    """A case in Drake, or None without it."""
+def drake_model(case: Case, dt: float = 0.0) -> DrakeModel | None:
+    """A case in Drake, continuous or in steps of ``dt`` [s]; None without it."""
     if available("pydrake.multibody.plant") is None:
         return None
     rigid = importlib.import_module("pydrake.math")
     tree = importlib.import_module("pydrake.multibody.tree")
-    plant = importlib.import_module("pydrake.multibody.plant").MultibodyPlant(0.0)
+    plant = importlib.import_module("pydrake.multibody.plant").MultibodyPlant(dt)
     scene = case.scene
     links = [plant.world_body()]
     for k, body in enumerate(bodies(scene.robot)):
@@ -302,30 +309,161 @@ def drake_energies(case: Case, accuracy: float, every: float, scheme: str = "run
 # trep ---------------------------------------------------------------------------------------------------------------
 
 
-def trep_run(links: int, dt: float, duration: float = 1.0) -> Callable[[], np.ndarray] | None:
-    """A run of trep's midpoint integrator on the falling ``planar_chain`` that gives the last q; None without trep."""
+def trep_system(scene: vp.Scene) -> Any:
+    """A scene of links about parallel y axes as a trep.System, or None without trep."""
     trep = available("trep")
     if trep is None:
         return None
+    own = bodies(scene.robot)
+    if any((body.axis != [0.0, 1.0, 0.0]).any() or (body.placement.rotation != np.eye(3)).any() for body in own):
+        raise ValueError(f"{scene.robot.name} has joints that do not turn about y")
 
-    def rods(k: int) -> list[Any]:
-        rod = [trep.tx(0.5, name=f"m{k}", mass=(1.0, LEAST_INERTIA, 1.0 / 12.0, 1.0 / 12.0))]
-        rest = [trep.tx(1.0, name=f"e{k}"), rods(k + 1)] if k + 1 < links else []
-        return [trep.ry(f"q{k}"), rod + rest]
+    def frames(parent: int) -> list[Any]:
+        found: list[Any] = []
+        for k, body in enumerate(own):
+            if body.parent != parent:
+                continue
+            moments = moments_of(np.diag(body.inertia.inertia))
+            mass = trep.const_txyz(body.inertia.lever, name=f"m{k}", mass=(body.inertia.mass, *moments))
+            joint = [trep.ry(f"q{k}"), [mass, *frames(k + 1)]]
+            found += [trep.const_txyz(body.placement.translation, name=f"j{k}"), joint]
+        return found
 
     system = trep.System()
-    system.import_frames(rods(0))
-    trep.potentials.Gravity(system, (0.0, 0.0, -9.81))
-    rest, steps = np.zeros(links), round(duration / dt)
+    system.import_frames(frames(0))
+    trep.potentials.Gravity(system, tuple(scene.gravity))
+    for k in np.flatnonzero(scene.stiffness):
+        trep.potentials.ConfigSpring(system, f"q{k}", float(scene.stiffness[k]), float(scene.rest[k]))
+    for k in np.flatnonzero(scene.damping):
+        trep.forces.Damping(system, 0.0, {f"q{k}": float(scene.damping[k])})
+    return system
+
+
+def trep_run(case: Case, dt: float) -> Callable[[], np.ndarray] | None:
+    """A run of trep's midpoint integrator that gives the last q, without torques; None without trep."""
+    trep, system = available("trep"), trep_system(case.scene)
+    if trep is None:
+        return None
+    steps, p0 = round(case.duration / dt), vp.lagrangian_jet(case.scene, case.q0, case.v0).Lv
 
     def run() -> np.ndarray:
         integrator = trep.MidpointVI(system)
-        integrator.initialize_from_state(0.0, rest, rest)
+        integrator.initialize_from_state(0.0, case.q0, p0)
         for k in range(1, steps + 1):
             integrator.step(k * dt)
         return np.array(integrator.q2)
 
     return run
+
+
+# Whole motions ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What a simulator makes of a case, as far as it goes.
+
+    Attributes:
+        q: At every node (K + 1, n) [rad].
+        v: (K + 1, n) [rad/s].
+        said: What it says of it, or does to it; empty if nothing.
+    """
+
+    q: np.ndarray
+    v: np.ndarray
+    said: str = ""
+
+
+def mujoco_motion(case: Case, dt: float, integrator: str) -> Motion | None:
+    """A motion by MuJoCo, with what it sets back on the way; None without MuJoCo.
+
+    Where a position, a velocity or an acceleration is not finite or above 1e10, MuJoCo sets the whole state back to the
+    model's, which is q = 0 at rest at t = 0, and goes on. It counts that as a warning; other warnings change nothing.
+
+    Raises:
+        RuntimeError: What it calls a reset is none.
+    """
+    mujoco = available("mujoco")
+    if mujoco is None:
+        return None
+    model = mujoco_model(case.scene, dt, integrator)
+    data, steps = mujoco.MjData(model), round(case.duration / dt)
+    mujoco.set_mju_user_warning(lambda _: None)
+    fresh = mujoco.MjData(model)
+    mujoco.mj_step(model, fresh)
+    _mujoco_start(mujoco, model, data, case)
+    q, v, resets, others = [data.qpos.copy()], [data.qvel.copy()], [], set()
+    bad = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
+    for k in range(1, steps + 1):
+        # A reset clears every count but its own, which is 1 however many there were before.
+        for kind in bad:
+            data.warning[kind].number = 0
+        mujoco.mj_step(model, data)
+        counted = data.warning.number
+        others |= {mujoco.mjtWarning(int(kind)).name for kind in np.flatnonzero(counted) if kind not in bad}
+        if counted[bad].any():
+            back = np.array_equal(data.qpos, fresh.qpos) and np.array_equal(data.qvel, fresh.qvel)
+            if not (back and data.time == fresh.time):
+                raise RuntimeError(f"MuJoCo warns in step {k} of what it sets back, and does not set it back")
+            resets.append(k * dt)
+        q.append(data.qpos.copy())
+        v.append(data.qvel.copy())
+    said = [f"set back to q = 0 {_often(len(resets))}, first after {resets[0]:.3g} s"] if resets else []
+    said += [f"warns of {name}" for name in sorted(others)]
+    return Motion(np.array(q), np.array(v), "; ".join(said))
+
+
+def _often(times: int) -> str:
+    return "once" if times == 1 else f"{times} times"
+
+
+def drake_motion(case: Case, dt: float, scheme: str | None = None, patience: float = 10.0) -> Motion | None:
+    """A motion by Drake, in discrete steps or by one of its error-controlled schemes at the default 1e-4.
+
+    None without Drake; given up where it takes longer than ``patience`` [s].
+    """
+    own = drake_model(case, dt if scheme is None else 0.0)
+    if own is None:
+        return None
+    q, v, begin = [case.q0], [case.v0], time.process_time()
+    simulator = own.simulator(scheme, 1e-4)
+    context = simulator.get_context()
+    status = importlib.import_module("pydrake.systems.framework").EventStatus
+    late = status.ReachedTermination(own.plant, "out of patience")
+    simulator.set_monitor(lambda _: late if time.process_time() - begin > patience else status.DidNothing())
+    said = ""
+    for k in range(1, round(case.duration / dt) + 1):
+        try:
+            simulator.AdvanceTo(k * dt)
+        except RuntimeError as error:
+            said = f"gives up after {(k - 1) * dt:.3g} s: {str(error).splitlines()[0]}"
+            break
+        if time.process_time() - begin > patience:
+            said = f"gives up after {(k - 1) * dt:.3g} s: its steps are too small to go on for {patience:g} s"
+            break
+        q.append(own.plant.GetPositions(context).copy())
+        v.append(own.plant.GetVelocities(context).copy())
+    return Motion(np.array(q), np.array(v), said)
+
+
+def trep_motion(case: Case, dt: float) -> Motion | None:
+    """A motion by trep's midpoint integrator, without torques; None without trep."""
+    trep, system = available("trep"), trep_system(case.scene)
+    if trep is None:
+        return None
+    q, v, said = [case.q0], [case.v0], ""
+    integrator = trep.MidpointVI(system)
+    integrator.initialize_from_state(0.0, case.q0, vp.lagrangian_jet(case.scene, case.q0, case.v0).Lv)
+    for k in range(1, round(case.duration / dt) + 1):
+        try:
+            integrator.step(k * dt)
+        except (trep.ConvergenceError, ArithmeticError, ValueError) as error:
+            said = f"gives up after {(k - 1) * dt:.3g} s: {type(error).__name__}"
+            break
+        q.append(np.array(integrator.q2))
+        mass = vp.lagrangian_jet(case.scene, q[-1], np.zeros_like(q[-1])).Lvv
+        v.append(np.linalg.solve(mass, np.array(integrator.p2)))
+    return Motion(np.array(q), np.array(v), said)
 
 
 # The same mechanism? ------------------------------------------------------------------------------------------------

@@ -1,28 +1,46 @@
-"""The tables of docs/limits.md, from a record that ``varpin extremes`` wrote; MuJoCo's rows if it is installed.
+"""The tables of docs/limits.md, from a record that ``varpin extremes`` wrote.
 
-varpin extremes --out extremes
-python docs/limits.py extremes/extremes.json
+    varpin extremes --out extremes
+    python docs/limits.py extremes/extremes.json
+    python docs/limits.py --chains                  # the table of undamped chains: five minutes
+
+A record of ``varpin extremes --deep`` gives the table of the long scenes as well. Other simulators take part in theirs
+where they are installed (``pip install "varpin[peers]"``; trep has no release for Python 3).
 """
 
 from __future__ import annotations
 
+import logging
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from varpin.extremes import TRIALS, Cell, Kind, Record, Trial
-from varpin.extremes.battery import families
-from varpin.extremes.checks import exact_motion
+import varpin as vp
+from varpin.extremes import PLANS, TRIALS, Cell, Kind, Record, Trial
+from varpin.extremes.battery import INTEGRATORS, families
+from varpin.extremes.checks import LEVELS, Exact, exact_motion
 from varpin.lagrangian import lagrangian_jet
-from varpin.scene import Scene
 
 DOCUMENT = Path(__file__).resolve().parent / "limits.md"
-VARIATIONAL = ("Midpoint", "Gauss")
-# What MuJoCo is asked to do as well: chains that both describe alike.
+sys.path.insert(0, str(DOCUMENT.parents[1] / "benchmarks"))
+import peers  # noqa: E402
+
+OWN = {"Midpoint": "Midpoint(alpha=0.5)", "Gauss(4)": "Gauss(stages=4)", "RungeKutta4": "RungeKutta4"}
+MOTIONS: dict[str, Callable[[peers.Case, float], peers.Motion | None]] = {
+    "MuJoCo Euler": partial(peers.mujoco_motion, integrator="Euler"),
+    "MuJoCo RK4": partial(peers.mujoco_motion, integrator="RK4"),
+    "Drake, discrete": peers.drake_motion,
+    "Drake RK3, 1e-4": partial(peers.drake_motion, scheme="runge_kutta3"),
+    "trep midpoint": peers.trep_motion,
+}
+GAUSS = tuple(vp.Gauss(stages) for stages in (2, 3, 4))
+CHAIN_STEPS = 100_000
+DEEP = {trial.name for trial in (*TRIALS, *PLANS) if trial.deep}
+# What others are asked to do as well: chains that all describe alike.
 SHARED = (
     "3 links, dt = 0.01 s",
     "3 links, dt = 0.05 s",
@@ -40,17 +58,21 @@ SHARED = (
 
 
 def main() -> None:
-    """Rewrite both tables."""
+    """Rewrite the tables."""
     if len(sys.argv) != 2:
-        raise SystemExit("usage: limits.py RECORD")
+        raise SystemExit("usage: limits.py RECORD or limits.py --chains")
+    if sys.argv[1] == "--chains":
+        put("chains", list(chains()))
+        return
     record = Record.load(sys.argv[1])
-    put("measured", list(measured(record)))
-    try:
-        import mujoco  # noqa: PLC0415,F401
-    except ImportError:
-        print("no mujoco: its table stays as it is")  # noqa: T201
+    put("measured", list(measured([cell for cell in record.cells if cell.trial not in DEEP])))
+    if record.deep:
+        put("deep", list(deep_table(record)))
+    missing = [name for name in ("mujoco", "pydrake", "trep") if peers.available(name) is None]
+    if missing:
+        sys.stderr.write(f"not installed: {', '.join(missing)}; the table of the others stays as it is\n")
     else:
-        put("mujoco", list(peers(record)))
+        put("peers", list(peers_table(record)))
 
 
 def put(name: str, lines: list[str]) -> None:
@@ -60,96 +82,126 @@ def put(name: str, lines: list[str]) -> None:
     DOCUMENT.write_text(before + begin + "\n".join(lines) + "\n" + end + rest.split(end)[1], encoding="utf-8")
 
 
-def measured(record: Record) -> Iterator[str]:
+def measured(cells: Sequence[Cell]) -> Iterator[str]:
     """A row for each family: how many cells of each kind, and the worst of those that varpin says nothing of."""
     yield "| extreme | cells | accurate | degraded | refused | stopped | silent wrong | worst unsaid error | of |"
     yield "|---|---|---|---|---|---|---|---|---|"
-    for family in families(record.cells):
-        cells = [cell for cell in record.cells if cell.family == family]
-        counts = [sum(cell.kind is kind for cell in cells) for kind in Kind]
-        quiet = [cell for cell in cells if cell.kind is Kind.ACCURATE and not math.isnan(cell.error)]
+    for family in families(cells):
+        members = [cell for cell in cells if cell.family == family]
+        counts = [sum(cell.kind is kind for cell in members) for kind in Kind]
+        quiet = [cell for cell in members if cell.kind is Kind.ACCURATE and not math.isnan(cell.error)]
         worst = max(quiet, key=lambda cell: cell.error, default=None)
         text = "| |" if worst is None else f"{worst.error:.1e} | {worst.trial}, {worst.integrator} |"
-        yield f"| {family} | {len(cells)} | " + " | ".join(map(str, counts)) + f" | {text}"
-    total = record.counts()
-    yield f"| all | {len(record.cells)} | " + " | ".join(str(total[kind]) for kind in Kind) + " | | |"
+        yield f"| {family} | {len(members)} | " + " | ".join(map(str, counts)) + f" | {text}"
+    total = [sum(cell.kind is kind for cell in cells) for kind in Kind]
+    yield f"| all | {len(cells)} | {' | '.join(map(str, total))} | | |"
 
 
-def peers(record: Record) -> Iterator[str]:
-    """A row for each shared scene: varpin's integrators, and what MuJoCo's two do and say."""
-    yield "| scene | Midpoint | Gauss(4) | RungeKutta4 | MuJoCo Euler | MuJoCo RK4 |"
-    yield "|---|---|---|---|---|---|"
+def peers_table(record: Record) -> Iterator[str]:
+    """A row for each shared scene: varpin's integrators, and what others make of it and say."""
     cells = {(cell.trial, cell.integrator): cell for cell in record.cells}
+    rows: dict[str, dict[str, str]] = {}
     for trial in TRIALS:
         if trial.name in SHARED:
-            own = (cells.get((trial.name, name)) for name in ("Midpoint(alpha=0.5)", "Gauss(stages=4)", "RungeKutta4"))
-            texts = [words(cell) for cell in own] + [in_mujoco(trial, method) for method in ("Euler", "RK4")]
-            yield f"| {trial.name} | " + " | ".join(texts) + " |"
+            sys.stderr.write(f"{trial.name}\n")
+            own = {name: in_varpin(cells[trial.name, text], trial) for name, text in OWN.items()}
+            rows[trial.name] = own | {name: in_words(trial, motion) for name, motion in MOTIONS.items()}
+    names = [name for name in next(iter(rows.values())) if any(row[name] for row in rows.values())]
+    yield f"| scene | {' | '.join(names)} |"
+    yield "|---" * (1 + len(names)) + "|"
+    for scene, row in rows.items():
+        yield f"| {scene} | {' | '.join(row[name] for name in names)} |"
 
 
-def words(cell: Cell | None) -> str:
+def in_varpin(cell: Cell, trial: Trial) -> str:
     """A cell in words."""
-    if cell is None:
-        return ""
-    error = "" if math.isnan(cell.error) else f" {cell.error:.0e}"
-    short = f" after {cell.done} of {cell.steps}" if cell.kind is Kind.STOPPED else ""
-    return f"{cell.kind.value}{error}{short}"
+    if cell.kind is Kind.REFUSED:
+        return "refused"
+    if cell.kind is Kind.STOPPED:
+        return f"stops at {cell.done * trial.dt:.2g} s"
+    return outcome(cell.error, cell.energy, "told" if cell.kind is Kind.DEGRADED else "")
 
 
-def in_mujoco(trial: Trial, method: str) -> str:
-    """Error of MuJoCo's motion from the exact one, its warnings and resets, and its energy error."""
-    import mujoco  # noqa: PLC0415
+def outcome(error: float, energy: float, said: str) -> str:
+    """Errors and what was said of them; in bold where a wrong motion comes without a word."""
+    wrong = not (error < LEVELS["error"] and energy < LEVELS["energy"])
+    text = f"{error:.0e}" + ("" if energy < LEVELS["energy"] else f", energy {energy:.0e}")
+    return f"{text}, {said}" if said else f"**{text}**" if wrong else text
 
+
+def in_words(trial: Trial, motion: Callable[[peers.Case, float], peers.Motion | None]) -> str:
+    """Error of another simulator's motion from the exact one, its energy error, and what it says."""
     setup = trial.build()
-    scene = setup.scene
-    try:
-        model = mujoco.MjModel.from_xml_string(mjcf(scene, trial.dt, method))
-    except ValueError as error:
-        return f"refused: {str(error).splitlines()[0]}"
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = setup.q0, setup.v0
-    q, v = [setup.q0.copy()], [setup.v0.copy()]
-    for _ in range(trial.steps):
-        mujoco.mj_step(model, data)
-        q.append(data.qpos.copy())
-        v.append(data.qvel.copy())
-    resets = sum(int(data.warning[kind].number) for kind in range(len(data.warning)))
-    exact = exact_motion(setup, trial.dt, trial.steps, trial.window)
-    off = np.array(q)[exact.nodes] - exact.q
-    error = np.abs(off).max() / exact.way
-    nodes = np.unique(np.linspace(0, trial.steps, 200).astype(int))
-    energies, kinetic = [], []
-    for k in nodes:
-        jet = lagrangian_jet(scene, q[k], v[k])
-        kinetic.append(0.5 * v[k] @ jet.Lv)
-        energies.append(v[k] @ jet.Lv - jet.L)
-    off = np.abs(np.array(energies) - energies[0]).max() / max(*kinetic, np.finfo(float).tiny)
-    said = f", {resets} warnings, set back to its start" if resets else ", nothing said"
-    return f"{error:.0e}, energy {off:.0e}{said}"
-
-
-def mjcf(scene: Scene, dt: float, method: str) -> str:
-    """The chain of a scene in MuJoCo's language, with contacts and limits off."""
-    bodies = ""
-    for k, inertia in enumerate(list(scene.robot.model.inertias)[1:]):
-        place = scene.robot.model.jointPlacements[k + 1].translation
-        moments = np.diag(inertia.inertia)[[1, 1, 2]]  # a rod has none about itself, which MuJoCo refuses
-        bodies += (
-            f'<body pos="{numbers(place)}">'
-            f'<joint axis="0 1 0" stiffness="{numbers(scene.stiffness[k])}" damping="{numbers(scene.damping[k])}"/>'
-            f'<inertial pos="{numbers(inertia.lever)}" mass="{numbers(inertia.mass)}" '
-            f'diaginertia="{numbers(moments)}"/>'
-        )
-    return (
-        f'<mujoco><compiler angle="radian"/><option timestep="{numbers(dt)}" gravity="{numbers(scene.gravity)}" '
-        f'integrator="{method}"><flag constraint="disable" contact="disable" limit="disable"/></option>'
-        f"<worldbody>{bodies}{'</body>' * scene.robot.dof}</worldbody></mujoco>"
+    case = peers.Case(
+        trial.name, setup.scene, setup.q0, setup.v0, np.zeros(setup.scene.controls), trial.dt * trial.steps
     )
+    try:
+        found = motion(case, trial.dt)
+    except (ValueError, RuntimeError) as error:
+        # The mechanism itself is refused, each library in its own words.
+        sys.stderr.write(f"  refused: {str(error).splitlines()[0]}\n")
+        return "refused"
+    if found is None:
+        return ""
+    if found.said.startswith(("set back", "gives up")):
+        return found.said
+    q, v = found.q, found.v
+    if not (np.isfinite(q).all() and np.isfinite(v).all()):
+        first = int(np.argmin(np.isfinite(q).all(axis=1) & np.isfinite(v).all(axis=1)))
+        return f"**not finite from {first * trial.dt:.2g} s**"
+    exact = truth(trial)
+    known = exact.nodes < len(q)
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(q[exact.nodes[known]] - exact.q[known]).max(initial=0.0) / exact.way
+        at = np.unique(np.linspace(0, len(q) - 1, 200).astype(int))
+        jets = [lagrangian_jet(setup.scene, q[k], v[k]) for k in at]
+        kinetic = np.array([0.5 * v[k] @ jet.Lv for k, jet in zip(at, jets, strict=True)])
+        total = 2.0 * kinetic - np.array([jet.L for jet in jets])
+        energy = np.nan_to_num(np.abs(total - total[0]).max() / max(kinetic.max(), np.finfo(float).tiny), nan=np.inf)
+    return outcome(float(error), float(energy), found.said)
 
 
-def numbers(values: ArrayLike) -> str:
-    """Numbers to the last bit, as XML takes them."""
-    return " ".join(repr(float(value)) for value in np.atleast_1d(values))
+def chains() -> Iterator[str]:
+    """A row for each undamped chain at each step: the energy error over 1e5 steps, and how many of them were split."""
+    logging.getLogger("varpin").setLevel(logging.CRITICAL)
+    yield f"| links | h [s] | {' | '.join(map(str, GAUSS))} |"
+    yield "|---" * (2 + len(GAUSS)) + "|"
+    for links in (2, 3, 5):
+        scene, rest = vp.Scene(vp.planar_chain(links)), np.zeros(links)
+        for dt in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5):
+            texts = []
+            for integrator in GAUSS:
+                motion = vp.simulate(scene, rest, rest, dt=dt, steps=CHAIN_STEPS, integrator=integrator)
+                error = np.abs(motion.energy - motion.energy[0]).max() / (9.81 * links**2 / 2)
+                texts.append(f"{error:.0e} ({motion.statistics.split_steps / CHAIN_STEPS:.0%})")
+            sys.stderr.write(f"{links} links, {dt:g} s: {', '.join(texts)}\n")
+            yield f"| {links} | {dt:g} | {' | '.join(texts)} |"
+
+
+@cache
+def truth(trial: Trial) -> Exact:
+    """The exact motion of a trial, computed once."""
+    return exact_motion(trial.build(), trial.dt, trial.steps, trial.window)
+
+
+def deep_table(record: Record) -> Iterator[str]:
+    """A row for each long scene that was run with every integrator: kinds of cells, and some errors of energy."""
+    shown = ("Midpoint(alpha=0.5)", "Gauss(stages=2)", "Gauss(stages=3)", "Gauss(stages=4)", "RungeKutta4")
+    yield f"| scene | {' | '.join(kind.value for kind in Kind)} | {' | '.join(shown)} |"
+    yield "|---" * (1 + len(Kind) + len(shown)) + "|"
+    for trial in (*TRIALS, *PLANS):
+        cells = {cell.integrator: cell for cell in record.cells if cell.trial == trial.name}
+        if trial.deep and len(cells) == sum(trial.takes(member) for member in INTEGRATORS):
+            counts = [sum(cell.kind is kind for cell in cells.values()) for kind in Kind]
+            errors = [in_short(cells.get(name)) for name in shown]
+            yield f"| {trial.name} | {' | '.join(map(str, counts))} | {' | '.join(errors)} |"
+
+
+def in_short(cell: Cell | None) -> str:
+    """The energy error of a cell, or where it ended."""
+    if cell is None or math.isnan(cell.energy):
+        return ""
+    return f"stops at step {cell.done}" if cell.kind is Kind.STOPPED else f"{cell.energy:.0e}"
 
 
 if __name__ == "__main__":

@@ -200,7 +200,7 @@ def short_entries(case: peers.Case, scale: Scale) -> list[Entry]:
         entries += [] if run is None else [Entry("Drake RK3", f"accuracy {accuracy:.0e}", run)]
     if case.name.startswith("chain"):
         for dt in (2e-2, 1e-2, 5e-3, 2e-3)[:: scale.thin]:
-            run = peers.trep_run(len(case.q0), dt, case.duration)
+            run = peers.trep_run(case, dt)
             entries += [] if run is None else [Entry("trep midpoint", f"{dt:g} s", run)]
     for rtol in (10.0 ** -np.arange(3.0, 13.0))[:: scale.thin]:
         entries.append(Entry("SciPy DOP853", f"rtol {rtol:.0e}", peers.scipy_run(case, rtol)))

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import math
+from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
+from mechanisms import slider
 
 import varpin as vp
 from varpin import extremes
@@ -16,6 +20,7 @@ from varpin.extremes import Kind, Setup, Trial, checks
 from varpin.extremes.battery import INTEGRATORS
 from varpin.extremes.plans import Task, attempt, cost_error, part_left
 from varpin.robot.chain import rod_chain
+from varpin.wiener import wiener_increments
 
 BY_NAME = {trial.name: trial for trial in (*extremes.TRIALS, *extremes.PLANS)}
 MEASURES = ("error", "energy", "momentum", "reversal", "symplecticity", "record")
@@ -153,6 +158,44 @@ def test_kicks_of_noise_are_in_the_reference():
     assert checks.reference_error(exact, quiet) > checks.LEVELS["error"]
 
 
+def test_kicks_come_before_or_after_their_steps():
+    # Explicit Euler makes of a mass that nothing but noise drives the very motion that is kicked after its steps.
+    scene = vp.Scene(slider(), gravity=False, noise=vp.AdditiveNoise(1.0))
+    setup = Setup(scene, np.zeros(1), np.zeros(1), increments=wiener_increments(1, 1e-2, 50, 0))
+    given = {"dt": 1e-2, "steps": 50, "increments": setup.increments}
+    motion = vp.simulate(scene, setup.q0, setup.v0, integrator=vp.ExplicitEuler(), **given)
+    assert checks.reference_error(checks.exact_motion(setup, 1e-2, 50, 1.0, late=True), motion) < 1e-9
+    assert checks.reference_error(checks.exact_motion(setup, 1e-2, 50, 1.0), motion) > 1e-2
+    assert run_one(setup, 1e-2, 50, vp.ExplicitEuler()).error < 1e-9
+    assert run_one(setup, 1e-2, 50, vp.Midpoint()).error < 1e-9
+
+
+def test_rounding_excuses_no_more_than_rounding():
+    # A slider 4e4 m out on a hinge, with a light hinge at its end: its own inertia is what is left of squared levers.
+    model = pin.Model()
+    parts = (pin.JointModelRZ(), 1.0), (pin.JointModelPX(), 1.0), (pin.JointModelRZ(), 1e-3)
+    for k, (kind, mass) in enumerate(parts):
+        joint = model.addJoint(k, kind, pin.SE3.Identity(), f"joint{k}")
+        model.appendBodyToJoint(joint, pin.Inertia(mass, np.full(3, 0.1), mass * np.eye(3)), pin.SE3.Identity())
+    scene, rest = vp.Scene(vp.load_robot(model)), np.zeros(3)
+
+    def found(place, part):
+        """What is found of the last joint's momentum that is off by a part of itself."""
+        motion = vp.simulate(scene, [0.3, place, 0.2], [1e-3, 0.0, 1.0], dt=1e-6, steps=20)
+        p = motion.p.copy()
+        p[-1, 2] *= 1.0 + part
+        return checks.record_error(scene, tampered(motion, p=p))
+
+    assert found(0.0, 0.0) < 1e-12
+    assert found(4e4, 0.0) < 1e-9
+    assert found(0.0, 3e-6) > checks.LEVELS["record"]
+    assert found(4e4, 3e-6) < checks.LEVELS["record"]
+    assert found(4e4, 0.1) > checks.LEVELS["record"]
+    motion = vp.simulate(scene, rest, [1.0, 1.0, 1.0], dt=1e-3, steps=20)
+    leak = motion.energy * np.linspace(1.0, 1.0 + 1e-5, 21)
+    assert checks.record_error(scene, tampered(motion, energy=leak)) > checks.LEVELS["record"]
+
+
 # --- the kinds -----------------------------------------------------------------------------------------------------
 
 
@@ -274,6 +317,15 @@ def test_resumes_to_the_same_record(load, tmp_path):
     assert all(same(*pair) for pair in zip(again.cells, whole.cells, strict=True))
     # What was there was not run again: even its time stands.
     assert [cell.seconds for cell in again.cells[:7]] == [cell.seconds for cell in cut.cells]
+    # Nor is it lost where something else comes first, and is interrupted.
+    more = [Trial("made up", "made up", trials[0].build, 1e-3, 10), *trials]
+
+    def refuse(done, cells, name):
+        raise KeyboardInterrupt
+
+    kept = extremes.run(robot, trials=more, save=tmp_path / "cut.json", progress=refuse)
+    assert (len(kept.cells), kept.missing) == (len(whole.cells), len(INTEGRATORS))
+    assert len(extremes.Record.load(tmp_path / "cut.json").cells) == len(whole.cells)
 
 
 def test_a_record_survives_the_disk(tmp_path):
@@ -334,3 +386,44 @@ def test_nothing_on_the_finger_is_silent_wrong(load):
     counts = record.counts()
     assert counts[Kind.ACCURATE] > 60
     assert counts[Kind.DEGRADED] > 30
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    path = Path(__file__).parents[1] / "benchmarks" / "extremes.py"
+    spec = importlib.util.spec_from_file_location("benchmark_extremes", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_random_trees_are_many_kinds(benchmark):
+    trees = [benchmark.robot_of(f"tree{seed}") for seed in range(benchmark.TREES)]
+    assert {tree.dof for tree in trees} == set(range(2, 9))
+    assert 0.1 < np.mean([bool((np.diff(tree.tree.parent) == 1).all()) for tree in trees]) < 0.9
+    assert len({benchmark.robot_of("tree3").tree.mass.tobytes(), trees[3].tree.mass.tobytes()}) == 1
+    every = {trial.name for trial in extremes.trials_on(trees[0])}
+    own = [{trial.name for trial in benchmark.trials_of(f"tree{k}", trees[k])} for k in range(benchmark.TURNS)]
+    assert set.union(*own) == every
+    assert sum(map(len, own)) == len(every)
+
+
+def test_the_table_of_robots_counts_every_cell(benchmark, load, tmp_path):
+    robot = load("finger")
+    record = extremes.run(robot, trials=small_battery(load)[:1])
+    rows = list(benchmark.table([("finger", robot, record), ("tree1", robot, record), ("twin", robot, "finger")]))
+    assert rows[2].startswith(f"| finger | 3 | {len(INTEGRATORS)} | ")
+    assert rows[3].startswith("| twin | 3 | the same mechanism as finger |")
+    assert rows[4].startswith("| 1 random trees | 3 |")
+    assert rows[5].startswith(f"| all |  | {2 * len(INTEGRATORS)} | ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["double_pendulum", "z1", "xarm7", *(f"tree{20 * k + k}" for k in range(10))])
+def test_nothing_on_robots_and_trees_is_silent_wrong(benchmark, name):
+    robot = benchmark.robot_of(name)
+    trials = benchmark.trials_of(name, robot)
+    record = extremes.run(robot, trials=trials if name.startswith("tree") else trials[:: benchmark.TURNS])
+    assert record.missing == 0
+    assert [(cell.trial, cell.integrator, cell.found) for cell in record.wrong()] == []
+    assert record.counts()[Kind.ACCURATE] > 0

@@ -73,3 +73,64 @@ def test_robots_that_peers_are_not_built_for_are_refused(peers, case):
     model.armature = np.full(6, 0.1)
     with pytest.raises(ValueError, match="has armature"):
         peers.require_same(dataclasses.replace(case, scene=vp.Scene(vp.load_robot(model))))
+
+
+def spring(peers, h_omega, dt=1e-2, steps=200):
+    """A rod on a spring that turns so far a step [rad]."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, stiffness=(h_omega / dt) ** 2 / 3.0)
+    return peers.Case("spring", scene, np.array([0.5]), np.zeros(1), np.zeros(1), dt * steps)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+def test_what_mujoco_sets_back_is_told(peers, integrator):
+    pytest.importorskip("mujoco")
+    calm = peers.mujoco_motion(spring(peers, 0.1), 1e-2, integrator)
+    assert calm.said == ""
+    assert calm.q.shape == calm.v.shape == (201, 1)
+    assert np.abs(calm.q).max() > 0.4
+    # In the first step of all there is no clock that goes back.
+    for h_omega, first in ((10.0, None), (1e4, 0.01)):
+        wild = peers.mujoco_motion(spring(peers, h_omega), 1e-2, integrator)
+        assert wild.said.startswith("set back to q = 0 once, first after ")
+        assert first is None or wild.said.endswith(f" {first:g} s")
+        # At rest where the spring is slack it stays.
+        assert not wild.q[-1].any()
+
+
+def test_a_warning_that_sets_nothing_back_is_no_reset(peers, monkeypatch):
+    mujoco = pytest.importorskip("mujoco")
+    case, step = spring(peers, 0.1), mujoco.mj_step
+
+    def warned(model, data):
+        step(model, data)
+        data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL].number += 1
+
+    monkeypatch.setattr(mujoco, "mj_step", warned)
+    motion = peers.mujoco_motion(case, 1e-2, "RK4")
+    assert motion.said == "warns of mjWARN_CONTACTFULL"
+    assert np.abs(motion.q[100:]).max() > 0.4
+
+    def lies(model, data):
+        step(model, data)
+        data.warning[mujoco.mjtWarning.mjWARN_BADQVEL].number += 1
+
+    monkeypatch.setattr(mujoco, "mj_step", lies)
+    with pytest.raises(RuntimeError, match="does not set it back"):
+        peers.mujoco_motion(case, 1e-2, "RK4")
+
+
+def test_whole_motions_of_peers_are_the_exact_one(peers):
+    rest = np.zeros(2)
+    case = peers.Case("chain", vp.Scene(vp.planar_chain(2)), rest, rest, rest, 0.5)
+    exact = vp.simulate(case.scene, rest, rest, dt=1e-2, steps=50, integrator=vp.Reference())
+    motions = {
+        "MuJoCo": (peers.mujoco_motion(case, 1e-2, "RK4"), 1e-4),
+        "Drake, discrete": (peers.drake_motion(case, 1e-2), 0.1),
+        "Drake": (peers.drake_motion(case, 1e-2, "runge_kutta3"), 1e-3),
+        "trep": (peers.trep_motion(case, 1e-2), 1e-2),
+    }
+    for name, (motion, level) in motions.items():
+        if motion is not None:
+            assert motion.said == ""
+            assert np.abs(motion.q - exact.q).max() < level, name
+            assert np.abs(motion.v - exact.v).max() < 10.0 * level, name

@@ -6,6 +6,7 @@ import logging
 import math
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import varpin as vp
@@ -87,6 +88,22 @@ def test_energy_balance_of_explicit_methods(integrator):
     # Forces, dampers and kicks account for most of what the energy does, and for all of it as dt shrinks.
     assert off[1] < 0.1 * np.abs(motion.energy - motion.energy[0]).max()
     assert off[1] < 0.4 * off[0]
+
+
+def test_a_slider_that_is_far_and_fast_does_not_hide_a_hinge():
+    """Metres per second and radians per second do not compare: what turns is judged by what turns."""
+    model = pin.Model()
+    for k, kind in enumerate((pin.JointModelRY(), pin.JointModelPX())):
+        joint = model.addJoint(0, kind, pin.SE3.Identity(), f"joint{k}")
+        model.appendBodyToJoint(joint, pin.Inertia(1.0, np.array([0.5, 0.0, 0.0]), 0.1 * np.eye(3)), pin.SE3.Identity())
+    scene = vp.Scene(vp.load_robot(model))
+    for integrator, coarse in ((vp.ExplicitEuler(), True), (vp.Gauss(3), False)):
+        calm, fast = (
+            vp.simulate(scene, np.zeros(2), [0.0, speed], dt=0.05, steps=20, integrator=integrator)
+            for speed in (0.0, 1e6)
+        )
+        said = [any("is coarse" in text for text in motion.warnings) for motion in (calm, fast)]
+        assert said == [coarse, coarse]
 
 
 def test_energy_that_drifts_is_spoken_of():

@@ -36,7 +36,8 @@ class StepError:
 
     Attributes:
         step: Its index.
-        error: The distance, in units of what the step does: of its way in q, or of its change of v.
+        error: The distance, in units of what the step does: of its way in q, or of its change of v; joints that turn
+            and joints that slide each by themselves.
     """
 
     step: int
@@ -115,8 +116,8 @@ def step_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
 
     It says nothing of how errors grow. None where nothing moves, and for an integrator that chooses its own steps.
     """
-    fastest = float(np.abs(trajectory.v).max())
-    if isinstance(integrator, Reference) or not fastest > _STILL:
+    fastest = _of_its_kind(scene, np.abs(trajectory.v).max(axis=0))
+    if isinstance(integrator, Reference) or not fastest.max() > _STILL:
         return None
     change = np.abs(np.diff(trajectory.v, axis=0)).max(axis=1)
     last = len(change) - 1
@@ -129,19 +130,29 @@ def step_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
         whole, halves = (_end(scene, integrator, q, v, force, h / parts, parts) for parts in (1, 2))
     except SingularMassMatrix:
         return None
+    moves = np.where(fastest > _STILL, fastest, np.inf)
     with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(whole - halves).max(axis=2)
-        turned = max(float(np.nanmax(np.abs(halves[1] - v), initial=0.0)), 1e-3 * fastest)
+        off = np.abs(whole - halves)
+        turned = _of_its_kind(scene, np.nan_to_num(np.abs(halves[1] - v)).max(axis=0))
         rounding = 1e3 * np.finfo(np.float64).eps * (1.0 + np.abs(q).max(axis=1)), 1e-12 * fastest
         error = np.maximum(
-            np.where(off[0] > rounding[0], off[0] / (h * fastest), 0.0),
-            np.where(off[1] > rounding[1], off[1] / turned, 0.0),
-        )
+            np.where(off[0] > rounding[0][:, None], off[0] / (h * moves), 0.0),
+            np.where(off[1] > rounding[1], off[1] / np.maximum(turned, 1e-3 * moves), 0.0),
+        ).max(axis=1)
     # A step that cannot be taken again, without the kick that came with it, says nothing.
     if np.isnan(error).all():
         return None
     worst = int(np.nanargmax(error))
     return StepError(int(at[worst]), float(error[worst]))
+
+
+def _of_its_kind(scene: Scene, values: Floats) -> Floats:
+    """For each coordinate (n,), the largest value of all that turn, or of all that slide: units do not compare."""
+    tree = scene.robot.tree
+    slides = np.zeros(len(values), dtype=bool)
+    slides[tree.coordinate[tree.prismatic > 0]] = True
+    largest: Floats = np.where(slides, values[slides].max(initial=0.0), values[~slides].max(initial=0.0))
+    return largest
 
 
 def _end(scene: Scene, integrator: Integrator, q: Floats, v: Floats, force: Floats, dt: float, steps: int) -> Floats:

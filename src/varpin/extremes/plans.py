@@ -88,8 +88,8 @@ class Plan:
         return integrator in _PLANNERS
 
 
-def attempt(plan: Plan, integrator: Integrator) -> dict[str, Any]:
-    """Solve it and judge the solution: what a cell holds."""
+def attempt(plan: Plan, integrator: Integrator, patience: float = math.inf) -> dict[str, Any]:
+    """Solve it, within about this time [s], and judge the solution: what a cell holds."""
     outcome: dict[str, Any] = dict.fromkeys(
         ("error", "energy", "momentum", "reversal", "symplecticity", "record"), math.nan
     ) | {"said": (), "found": (), "done": 0}
@@ -100,7 +100,7 @@ def attempt(plan: Plan, integrator: Integrator) -> dict[str, Any]:
         return outcome | {"kind": Kind.REFUSED, "said": (_line(error),)}
     try:
         with _heard() as warnings:
-            solution = solve(problem, task.controls, max_iterations=plan.iterations)
+            solution = solve(problem, task.controls, max_iterations=plan.iterations, time_limit=patience)
     except VarpinError as error:
         done = getattr(getattr(error, "trajectory", None), "steps", 0)
         return outcome | {"kind": Kind.STOPPED, "said": (_line(error),), "done": done}

@@ -22,6 +22,8 @@ Floats = NDArray[np.float64]
 
 _UP = -0.5 * math.pi  # of a rod whose angle is 0 along x and turns down
 _TURN = 2.0 * math.pi
+# Steps from rest that make a motion of which half a step is little.
+_FIRST = 40
 # Squared rate of a hanging rod of 1 m [1/s^2].
 _HANGING = 1.5 * 9.81
 
@@ -301,8 +303,10 @@ def trials_on(robot: Robot) -> list[Trial | Plan]:
 
         return build
 
+    # What starts to slide down is behind by half a step with any method of first order: much of its first steps, little
+    # of its motion.
     trials = [
-        Trial(f"falls, dt = {dt:g} s", "time step", still(), dt, steps, window=0.3)
+        Trial(f"falls, dt = {dt:g} s", "time step", still(), dt, steps, window=max(0.3, _FIRST * dt))
         for dt, steps in ((1e-6, 500), (1e-4, 1000), (1e-3, 1000), (0.01, 500), (0.1, 100), (0.5, 40))
     ]
     for rate in (10.0, 1e3):
@@ -312,7 +316,7 @@ def trials_on(robot: Robot) -> list[Trial | Plan]:
     trials += [Trial("after 1e6 turns", "turns", turned(1e6), 1e-3, 500, window=0.3)]
     trials += [
         Trial("no gravity", "gravity", still(v=1.0, gravity=False), 1e-2, 500, window=0.5),
-        Trial("gravity 1e4 m/s^2", "gravity", still(gravity=1e3 * np.array(EARTH)), 1e-3, 500, window=0.02),
+        Trial("gravity 1e4 m/s^2", "gravity", still(gravity=1e3 * np.array(EARTH)), 1e-3, 500, window=_FIRST * 1e-3),
     ]
     for turned_by in (0.1, 2.4, 50.0):
         stiff = still(stiffness=(turned_by / 1e-3) ** 2 * inertia)

@@ -1,0 +1,153 @@
+"""The battery of extreme scenes on every robot that goes by a name, and on random trees.
+
+Keeps a record for each robot (JSON) in a folder: what is there already is not run again, so an interrupted run goes on
+where it stopped; an edit of varpin's sources starts it anew. Writes the table of ``docs/limits.md`` between its
+markers, and exits with status 1 if anything is silent wrong.
+
+    python benchmarks/extremes.py FOLDER             # an hour of one core
+    python benchmarks/extremes.py FOLDER ur5 tree17  # these alone, and no table
+"""
+
+import argparse
+import logging
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+import varpin as vp
+from varpin import extremes
+from varpin.extremes import Kind, Record
+from varpin.robot import bundled_robots
+from varpin.robot.example_robot_data import installed
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+from mechanisms import random_tree  # noqa: E402
+
+DOCUMENT = ROOT / "docs" / "limits.md"
+TREES = 200
+RATIOS = (1e-4, 1e-2, 1.0, 1e2, 1e4)
+# A tree, or a robot of more joints than this, gets each so many-th of the trials, and its neighbours the others.
+SMALL, TURNS = 4, 6
+# A motion or a plan may take this long before it is judged by what there is [s].
+PATIENCE = 1.0
+
+
+def names() -> list[str]:
+    """Every robot that goes by a name, and the random trees."""
+    return [*bundled_robots(), *installed(), *(f"tree{seed}" for seed in range(TREES))]
+
+
+def robot_of(name: str) -> vp.Robot:
+    """A robot by its name; ``tree7`` is the random tree of seed 7."""
+    if not name.startswith("tree"):
+        return vp.load_robot(name)
+    seed = int(name.removeprefix("tree"))
+    rng = np.random.default_rng([seed, TREES])
+    joints, ratio = int(rng.integers(2, 9)), float(rng.choice(RATIOS))
+    model = random_tree(seed, joints, branching=rng.random() < 0.8, armature=rng.random() < 0.5, ratio=ratio)
+    return vp.load_robot(model)
+
+
+def trials_of(name: str, robot: vp.Robot) -> list[extremes.Trial | extremes.Plan]:
+    """The whole battery of a small robot that goes by a name; of others a part."""
+    trials = extremes.trials_on(robot)
+    whole = not name.startswith("tree") and robot.dof <= SMALL
+    return trials if whole else trials[names().index(name) % TURNS :: TURNS]
+
+
+def judge(
+    name: str, robot: vp.Robot, folder: Path | None = None, progress: extremes.battery.Progress | None = None
+) -> Record:
+    """The record of a robot, in a file of its name if a folder is given."""
+    return extremes.run(
+        robot,
+        trials=trials_of(name, robot),
+        save=None if folder is None else folder / f"{name}.json",
+        patience=PATIENCE,
+        progress=progress,
+    )
+
+
+def judged(chosen: Sequence[str], folder: Path) -> Iterator[tuple[str, vp.Robot, Record | str]]:
+    """Each robot, small ones first, with its record, or with the name of an earlier one that is the same mechanism."""
+    robots = {name: robot_of(name) for name in chosen}
+    seen: dict[tuple[bytes, ...], str] = {}
+    begin = time.monotonic()
+    for k, (name, robot) in enumerate(sorted(robots.items(), key=lambda item: item[1].dof)):
+        same = seen.setdefault(tuple(np.asarray(part).tobytes() for part in robot.tree), name)
+        if same != name:
+            yield name, robot, same
+            continue
+
+        def tell(done: int, cells: int, what: str, place: str = f"{k + 1}/{len(robots)} {name}") -> None:
+            text = f"{time.monotonic() - begin:6.0f} s  {place}  {done}/{cells} {what}"
+            sys.stderr.write(f"\r{text[:118]:118}")
+
+        record = judge(name, robot, folder, tell)
+        sys.stderr.write("\r" + " " * 118 + "\r")
+        yield name, robot, record
+        if record.missing:
+            return
+
+
+def table(results: Iterable[tuple[str, vp.Robot, Record | str]]) -> Iterator[str]:
+    """A row for each robot; trees by their number of joints."""
+    yield f"| robot | joints | cells | {' | '.join(kind.value for kind in Kind)} |"
+    yield "|---" * (3 + len(Kind)) + "|"
+    named, trees = [], {}
+    for name, robot, record in results:
+        if name.startswith("tree") and isinstance(record, Record):
+            trees.setdefault(robot.dof, []).append(record)
+        else:
+            named.append((name, robot.dof, record))
+    every = [record for _, _, record in named if isinstance(record, Record)]
+    for name, joints, record in named:
+        if isinstance(record, Record):
+            yield _row(name, joints, [record])
+        else:
+            yield f"| {name} | {joints} | the same mechanism as {record} |" + " |" * len(Kind)
+    for joints, records in sorted(trees.items()):
+        yield _row(f"{len(records)} random trees", joints, records)
+        every += records
+    yield _row("all", "", every)
+
+
+def _row(name: str, joints: int | str, records: Sequence[Record]) -> str:
+    counts = [sum(record.counts()[kind] for record in records) for kind in Kind]
+    return f"| {name} | {joints} | {sum(counts)} | {' | '.join(map(str, counts))} |"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("folder", type=Path, help="where the records are kept")
+    parser.add_argument("robots", nargs="*", help="these alone, and no table in the page")
+    options = parser.parse_args()
+    options.folder.mkdir(parents=True, exist_ok=True)
+    logging.getLogger("varpin").setLevel(logging.CRITICAL)
+    results = []
+    for name, robot, record in judged(options.robots or names(), options.folder):
+        results.append((name, robot, record))
+        if isinstance(record, Record):
+            print(f"{record}, {sum(cell.seconds for cell in record.cells):.0f} s", flush=True)
+            for cell in record.wrong():
+                print(f"  silent wrong: {cell.trial}, {cell.integrator}: {'; '.join(cell.found)}", flush=True)
+    lines = list(table(results))
+    print("\n".join(lines))
+    records = [record for _, _, record in results if isinstance(record, Record)]
+    if any(record.missing for record in records):
+        print("interrupted: the same command goes on from here")
+        return 130
+    if not options.robots:
+        text = DOCUMENT.read_text(encoding="utf-8")
+        begin, end = "<!-- robots:begin -->\n", "<!-- robots:end -->"
+        before, rest = text.split(begin)
+        DOCUMENT.write_text(before + begin + "\n".join(lines) + "\n" + end + rest.split(end)[1], encoding="utf-8")
+    return 1 if any(record.wrong() for record in records) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
