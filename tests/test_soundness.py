@@ -30,7 +30,7 @@ def oscillator(h_omega, integrator, steps=100, dt=1e-2, **scene):
         (vp.ExplicitEuler(), lambda z: z / 4),
         (vp.Midpoint(), lambda z: z**2 / 16),
     ],
-    ids=str,
+    ids=["Euler", "Midpoint"],
 )
 def test_the_error_of_a_step_is_what_theory_says(integrator, formula):
     for z in (0.02, 0.05, 0.1):
