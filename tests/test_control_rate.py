@@ -418,6 +418,29 @@ def test_late_plans_feed_the_control_before_back():
     np.testing.assert_allclose(ran.motion.u, alone.u, rtol=0, atol=1e-9)
 
 
+def test_the_last_decision_of_a_late_plan_expects_itself_before():
+    """A plan that is held beyond its end, on the plant that it was made for, repeats its last decision."""
+    problem = linear(vp.ControlRateCost(MATRIX, BEFORE), integrator=vp.RungeKutta4(), steps=6)
+    ran = vp.Mpc(problem, budget=1e-9).run(
+        vp.Plant(problem.scene, integrator=vp.RungeKutta4(), substeps=1), duration=0.5
+    )
+    plan = ran.plans[0].policy_on("velocity")
+    x = np.hstack([ran.motion.q, ran.motion.v])
+    for tick in range(6, 10):
+        own = plan.u[5] + plan.gains[5] @ (x[tick] - plan.reference[5])
+        expected = own + plan.previous_gains[5] @ (ran.motion.u[tick - 1] - plan.u[5])
+        np.testing.assert_allclose(ran.motion.u[tick], expected, rtol=0, atol=1e-12)
+
+
+def test_a_rate_within_a_cost_of_ones_own_is_refused():
+    class Wrapped(vp.Cost):
+        def bind(self, points):
+            return vp.ControlRateCost(1.0).bind(points)
+
+    with pytest.raises(vp.InputError, match="must be a term of a problem's cost"):
+        linear(Wrapped())
+
+
 def test_verification_counts_the_changes_that_are_made():
     """RungeKutta4 on sliders without springs is exact, so the planned cost is the true one."""
     scene = vp.Scene(sliders(2), gravity=False)

@@ -396,6 +396,7 @@ class TestScenes:
         [
             ("," * 200_000, "a line of more than 100000 characters"),
             ("t,mcp,pip,dip,mcp\n0,1,1,1,1\n1,1,1,1,1\n", "'mcp' is there twice"),
+            (",".join(f'"c{k:x}\n"' for k in range(200_000)) + ",c0\n", "'c0' is there twice"),
         ],
     )
     def test_tables_of_references(self, tmp_path, text, words):
@@ -418,6 +419,9 @@ class TestSolutions:
         [
             # numpy compares no texts with numbers where NaN may be equal.
             ({"scene.damping": np.array(["a", "b"])}, "another scene damping"),
+            ({"history": np.full((1, 11), np.nan)}, "history holds counts that are no whole numbers"),
+            ({"history": np.full((1, 11), np.inf)}, "history holds counts that are no whole numbers"),
+            ({"search.history": np.array(-1)}, "search.history is -1, where a whole number from 0 to"),
             ({"history": np.zeros((500_000, 11))}, "unpacks to 44.* MB, which no varpin solution does that fits here"),
         ],
     )
@@ -512,8 +516,9 @@ class TestMeshes:
         assert first == "reading takes more than 1 s of processor time"
         assert second.startswith("it was not tried")
 
-    def test_whose_textures_are_no_pictures(self, tmp_path, caplog):
-        page = self.drawn(tmp_path, mesh.DAE.encode())[-1]
+    @pytest.mark.parametrize("tag", ["init_from", "xinit_from"])
+    def test_whose_textures_are_no_pictures(self, tmp_path, caplog, tag):
+        page = self.drawn(tmp_path, mesh.DAE.replace("init_from", tag).encode())[-1]
         assert "texture 'texture.png' is no picture" in caplog.text
         commands = re.search(rb'<script id="commands" type="text/plain">(.*?)</script>', page)[1]
         assert base64.b64encode(mesh.SECRET) not in gzip.decompress(base64.b64decode(commands))

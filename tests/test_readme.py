@@ -57,7 +57,7 @@ def test_main_command(tmp_path):
 
 
 def test_the_second_command_runs_these_tests():
-    assert blocks("bash")[1].strip().endswith(".venv/bin/python -m pytest -q")
+    assert blocks("bash")[1].strip().endswith(".venv/bin/python -m pytest -q -n auto --dist loadfile")
 
 
 def test_links_lead_somewhere():

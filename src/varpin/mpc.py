@@ -51,8 +51,8 @@ class MpcRun:
     Attributes:
         motion: Of the plant, at its own steps.
         plans: The plan of every tick, the one that acted (K,).
-        seconds: What planning took in every tick (K,) [s].
-        iterations: Of S-DDP in every tick (K,).
+        seconds: What planning took in every tick (K,) [s]; 0 in the first, whose plan is there before.
+        iterations: Of S-DDP in every tick (K,), likewise.
         late: Ticks whose plan came after its budget (K,); the plan of the tick before acted on.
         period: Of the ticks [s].
         budget: For planning in a tick [s]; infinite for any.
@@ -97,27 +97,33 @@ class MpcRun:
     def __repr__(self) -> str:
         return f"MpcRun({self})"
 
+    @property
+    def _planning(self) -> str:
+        """What planning took, but for the first plan, which was there before."""
+        if len(self.seconds) < 2:
+            return "nothing, with the first plan there"
+        milliseconds = 1e3 * self.seconds[1:]
+        return (
+            f"{milliseconds.mean():.2f} ms in the mean, {np.quantile(milliseconds, 0.95):.2f} in 95%, "
+            f"{milliseconds.max():.2f} at most, for {self.iterations[1:].mean():.2f} iterations a tick"
+        )
+
+    @property
+    def _within(self) -> str:
+        return "no budget" if self.budget == np.inf else f"{self.misses} later than {1e3 * self.budget:.3g} ms"
+
     def _repr_html_(self) -> str:
-        milliseconds = 1e3 * self.seconds
-        within = "any time" if self.budget == np.inf else f"{1e3 * self.budget:.3g} ms; {self.misses} later"
         rows = [
             ("ticks", f"{len(self.plans)} of {1e3 * self.period:.3g} ms"),
-            ("planning [ms]", f"{milliseconds.mean():.2f} in the mean, {np.quantile(milliseconds, 0.95):.2f} in 95%, "
-                              f"{milliseconds.max():.2f} at most"),
-            ("budget", within),
-            ("iterations", f"{self.iterations.mean():.2f} a tick"),
+            ("planning took", self._planning),
+            ("late", self._within),
             ("plant", self.motion),
-        ]  # fmt: skip
+        ]
         return facts(f"Run of a controller of {self.motion.robot}", rows)
 
     def __str__(self) -> str:
-        milliseconds = 1e3 * self.seconds
-        within = "" if self.budget == np.inf else f"; {self.misses} later than {1e3 * self.budget:.3g} ms"
-        return (
-            f"{len(self.plans)} ticks of {1e3 * self.period:.3g} ms: planning took {milliseconds.mean():.2f} ms in the "
-            f"mean, {np.quantile(milliseconds, 0.95):.2f} in 95%, {milliseconds.max():.2f} at most{within}; "
-            f"{self.iterations.mean():.2f} iterations a tick"
-        )
+        ticks = f"{len(self.plans)} ticks of {1e3 * self.period:.3g} ms"
+        return f"{ticks}: planning took {self._planning}; {self._within}"
 
 
 @dataclass(frozen=True)
@@ -193,8 +199,10 @@ class Mpc:
             InputError: q or v of a wrong shape, or not finite.
             StepFailure, CostError: The motion to start from cannot be integrated, or has no cost.
         """
-        if before is None and self.problem.rate is not None and previous is not None and decisions > 0:
-            before = previous.controls[min(decisions, len(previous.controls)) - 1]
+        if before is None and self.problem.rate and previous is not None and previous.problem.rate:
+            before = previous.problem.rate.before
+            if decisions > 0:
+                before = previous.controls[min(decisions, len(previous.controls)) - 1]
         problem = self.problem.at(q0=q, v0=v, t0=t, before=before)
         if previous is None:
             return solve(problem, tolerance=self.tolerance, max_iterations=self.first_iterations)
@@ -269,8 +277,11 @@ class Mpc:
 
 def _decision(plan: Solution, age: int, q: Floats, v: Floats, before: Floats | None = None) -> Floats:
     """What the plan does at its decision ``age``, with its feedback, at the state (q, v) after a control (m,)."""
-    policy = plan.policy_on("velocity")
-    return policy.control(min(age, len(policy.u) - 1), np.concatenate([q, v]), before)
+    policy, last = plan.policy_on("velocity"), len(plan.gains) - 1
+    if age > last and before is not None and policy.previous is not None:
+        # The last decision is repeated, and expects itself before.
+        before = before - policy.u[last] + policy.previous[last]
+    return policy.control(min(age, last), np.concatenate([q, v]), before)
 
 
 def _simulated(

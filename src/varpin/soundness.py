@@ -136,8 +136,8 @@ def step_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
         turned = _of_its_kind(scene, np.nan_to_num(np.abs(halves[1] - v)).max(axis=0))
         rounding = 1e3 * np.finfo(np.float64).eps * (1.0 + np.abs(q).max(axis=1)), 1e-12 * fastest
         error = np.maximum(
-            np.where(off[0] > rounding[0][:, None], off[0] / (h * moves), 0.0),
-            np.where(off[1] > rounding[1], off[1] / np.maximum(turned, 1e-3 * moves), 0.0),
+            np.where(off[0] <= rounding[0][:, None], 0.0, off[0] / (h * moves)),
+            np.where(off[1] <= rounding[1], 0.0, off[1] / np.maximum(turned, 1e-3 * moves)),
         ).max(axis=1)
     # A step that cannot be taken again, without the kick that came with it, says nothing.
     if np.isnan(error).all():

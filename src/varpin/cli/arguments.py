@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,9 +13,6 @@ from varpin.errors import InputError
 from varpin.robot import Robot, load_robot
 from varpin.scene import Scene
 from varpin.scenefile import SceneFile, load_scene, scenes
-
-if TYPE_CHECKING:
-    pass
 
 
 def add_robot(parser: argparse.ArgumentParser, *, optional: bool = False, scenes: bool = False) -> None:

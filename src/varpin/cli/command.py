@@ -6,22 +6,17 @@ import argparse
 import difflib
 import sys
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 from varpin._version import __version__
-from varpin.errors import VarpinError
-
-if TYPE_CHECKING:
-    pass
-
 from varpin.cli.console import complain, logged, say
 from varpin.cli.exits import INTERRUPTED, MISTAKE
 from varpin.cli.inspect import add_inspect, add_robots
 from varpin.cli.simulate import add_simulate
 from varpin.cli.solve import add_solve
 from varpin.cli.studies import add_advise, add_extremes, add_paper, add_tradeoff
+from varpin.errors import VarpinError
 
 _EXAMPLES = """\
 examples:

@@ -6,19 +6,14 @@ import argparse
 import logging
 import math
 import sys
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
 
-from varpin.inspection import JointReport, RobotReport, inspect_robot
-from varpin.robot import build_robot, robot_names
-
-if TYPE_CHECKING:
-    pass
-
 from varpin.cli.arguments import add_gravity, add_robot, add_vector, names_scene, one_or_all, scene_file
 from varpin.cli.console import WIDTH, add_row, facts, say, table_of
+from varpin.inspection import JointReport, RobotReport, inspect_robot
+from varpin.robot import build_robot, robot_names
 
 # The largest step is no limit beyond this [s].
 _ANY_STEP = 100.0

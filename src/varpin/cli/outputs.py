@@ -6,20 +6,16 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 
 from varpin.checks import positive, writable
+from varpin.cli.console import complain
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.replay import check_film, replay
 from varpin.robot import Robot
 from varpin.trajectory import Trajectory, atomic_file
-
-if TYPE_CHECKING:
-    pass
-
-from varpin.cli.console import complain
 
 PLOT_FORMATS = (".png", ".pdf", ".svg")
 

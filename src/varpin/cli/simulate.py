@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +17,10 @@ from rich.console import Console
 from rich.table import Table
 
 from varpin.checks import count, positive
+from varpin.cli.arguments import add_motion, add_robot, motion_of, names_scene, scene_file
+from varpin.cli.console import WIDTH, add_row, complain, facts, file_size, progress_bar, say
+from varpin.cli.exits import INTERRUPTED, MISTAKE, STEP_FAILED
+from varpin.cli.outputs import Output, add_outputs, outputs_of, write_all
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint
 from varpin.lagrangian import lagrangian_jet
@@ -27,14 +30,6 @@ from varpin.scene import Scene
 from varpin.simulation import Interrupted, StepFailure, simulate
 from varpin.tradeoff.setting import Setting
 from varpin.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    pass
-
-from varpin.cli.arguments import add_motion, add_robot, motion_of, names_scene, scene_file
-from varpin.cli.console import WIDTH, add_row, complain, facts, file_size, progress_bar, say
-from varpin.cli.exits import INTERRUPTED, MISTAKE, STEP_FAILED
-from varpin.cli.outputs import Output, add_outputs, outputs_of, write_all
 
 # More steps than anyone can hold in memory, said before NumPy says it in its own words.
 MOST_STEPS = 10**9

@@ -9,23 +9,18 @@ import time
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from varpin.checks import writable
-from varpin.scenefile import SceneFile
-from varpin.sddp import Solution, Status
-
-if TYPE_CHECKING:
-    pass
-
 from varpin.cli.arguments import scene_file
 from varpin.cli.console import WIDTH, add_row, facts, file_size, say
 from varpin.cli.exits import INTERRUPTED, MISTAKE, STEP_FAILED
 from varpin.cli.outputs import add_outputs, outputs_of, write_all
+from varpin.scenefile import SceneFile
+from varpin.sddp import Solution, Status
 
 
 def add_solve(parser: argparse.ArgumentParser) -> None:

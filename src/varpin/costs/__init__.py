@@ -18,6 +18,7 @@ from varpin.costs.quadratic import VelocityCost as VelocityCost
 from varpin.costs.rate import ControlRate as ControlRate
 from varpin.costs.rate import ControlRateCost as ControlRateCost
 from varpin.costs.rate import control_rate as control_rate
+from varpin.costs.rate import is_control_rate as is_control_rate
 from varpin.costs.rate import with_control_before as with_control_before
 from varpin.costs.task import CenterOfMassCost as CenterOfMassCost
 from varpin.costs.task import FrameOrientationCost as FrameOrientationCost

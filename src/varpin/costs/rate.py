@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, finite_array, require_finite
-from varpin.costs.base import BoundCost, BoundSum, Cost, CostSum, Points, Scaled, checked_weight, weight_matrix
+from varpin.costs.base import BoundCost, Cost, CostSum, Points, Scaled, checked_weight, weight_matrix
 from varpin.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -59,10 +59,13 @@ class ControlRateCost(Cost):
         """See :attr:`Cost.nonnegative`."""
         return True
 
-    def bind(self, points: Points) -> BoundCost:
-        """Nothing at any single point in time: a problem takes it by :func:`control_rate`."""
-        control_rate(self, points.controls)
-        return BoundSum((), points)
+    def bind(self, points: Points) -> BoundCost:  # noqa: ARG002
+        """Refuse: it is nothing at any single point in time, and a problem takes it by :func:`control_rate`.
+
+        Raises:
+            InputError: It is part of another cost than a sum.
+        """
+        raise InputError(f"{self!r} must be a term of a problem's cost, scaled or not, and no part of another")
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +119,11 @@ def control_rate(cost: Cost, controls: int) -> ControlRate | None:
     if len({None if start is None else tuple(start.tolist()) for start in starts}) > 1:
         raise InputError(f"{name} terms of one cost must have the same control before")
     return ControlRate(np.asarray(weight, dtype=np.float64), starts[0])
+
+
+def is_control_rate(term: Cost) -> bool:
+    """Whether a term is on the rate of controls, scaled or not."""
+    return any(True for _ in _terms(term))
 
 
 def with_control_before(cost: Cost, before: ArrayLike) -> Cost:

@@ -211,7 +211,7 @@ def run(
     known = Record.load(path).cells if path is not None and path.exists() else ()
     done = {cell.fingerprint: cell for cell in known}
     chores = {
-        fingerprint(trial, member, name): (trial, member)
+        fingerprint(trial, member, name, limit): (trial, member)
         for trial in trials
         for member in members
         if trial.takes(member)
@@ -255,9 +255,9 @@ def _sources() -> str:
     return digest.hexdigest()
 
 
-def fingerprint(trial: Trial | Plan, integrator: Integrator, robot: str) -> str:
+def fingerprint(trial: Trial | Plan, integrator: Integrator, robot: str, patience: float) -> str:
     """What a cell is known by when a run goes on."""
-    parts = robot, trial.family, trial.name, trial.dt, trial.steps, repr(integrator), _sources()
+    parts = robot, patience, trial.family, trial.name, trial.dt, trial.steps, repr(integrator), _sources()
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
 
 

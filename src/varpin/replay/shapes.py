@@ -105,6 +105,7 @@ class ShapeLoader(MeshcatVisualizer):
         return True
 
 
+_LARGEST_PICTURE = 50_000_000  # [bytes]
 # How files of pictures begin: PNG, JPEG, GIF, BMP, TIFF either way, WebP.
 _PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"BM", b"II*\0", b"MM\0*", b"RIFF")
 
@@ -116,10 +117,13 @@ def _require_pictures(path: Path) -> None:
         ValueError: It names the file.
     """
     for element in ElementTree.parse(path).iter():
-        if element.tag.rpartition("}")[2] != "init_from" or not (element.text or "").strip():
+        # Pinocchio's viewer takes any element that has this in its name.
+        if "init_from" not in str(element.tag) or not (element.text or "").strip():
             continue
         picture = path.parent / str(element.text)
         if picture.is_file():
+            if picture.stat().st_size > _LARGEST_PICTURE:
+                raise ValueError(f"its texture {element.text!r} is larger than {_LARGEST_PICTURE / 1e6:g} MB")
             with picture.open("rb") as stream:
                 if not stream.read(4).startswith(_PICTURES):
                     raise ValueError(f"its texture {element.text!r} is no picture")

@@ -13,6 +13,8 @@ def main() -> None:
     """Take a request on stdin; answer with one line for each URDF text: null, or what is wrong with its meshes."""
     request = json.load(sys.stdin)
     answers = os.fdopen(os.dup(1), "w", buffering=1)
+    # Whatever libraries print is no answer.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     own = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (own + request["memory"],) * 2)
     resource.setrlimit(resource.RLIMIT_CPU, (request["seconds"],) * 2)

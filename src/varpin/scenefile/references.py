@@ -6,6 +6,7 @@ import array
 import csv
 import itertools
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -162,6 +163,9 @@ def _csv(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
             for number, row in enumerate(filter(None, csv.reader(_lines(stream, wrong))), start=1):
                 if not head:
                     head = [name.strip() for name in row]
+                    twice = [name for name, times in Counter(head).items() if times > 1]
+                    if twice:
+                        raise wrong(f"its column {shown(twice[0])} is there twice")
                     continue
                 if len(row) != len(head):
                     raise wrong(f"row {number} has {len(row)} entries, and there are {len(head)} columns")
@@ -181,8 +185,6 @@ def _csv(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
         raise wrong(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if not len(numbers):
         raise wrong("it must have a line of column names and lines of numbers")
-    if twice := [name for index, name in enumerate(head) if name in head[:index]]:
-        raise wrong(f"its column {shown(twice[0])} is there twice")
     return dict(zip(head, np.array(numbers).reshape(-1, len(head)).T, strict=True))
 
 

@@ -17,6 +17,7 @@ from varpin.costs import (
     Points,
     Terminal,
     control_rate,
+    is_control_rate,
     with_control_before,
 )
 from varpin.errors import InputError
@@ -365,6 +366,6 @@ def _rule(sampling: str, dt: float) -> tuple[Floats, Floats]:
 def bind_cost(cost: Cost, times: Floats, horizon: Points) -> tuple[BoundSum, BoundSum]:
     """The running costs at ``times`` (N,) of a horizon, and the terminal ones at its end."""
     at, end = (replace(horizon, t=t) for t in (times, np.array([horizon.t0 + horizon.duration])))
-    terms = cost.terms
+    terms = [term for term in cost.terms if not is_control_rate(term)]
     running = BoundSum(tuple(term.bind(at) for term in terms if not isinstance(term, Terminal)), at)
     return running, BoundSum(tuple(term.bind(end) for term in terms if isinstance(term, Terminal)), end)

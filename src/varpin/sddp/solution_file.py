@@ -142,9 +142,19 @@ class _Reader:
             )
         return motion
 
+    def count(self, name: str, most: int) -> int:
+        """A member that is a whole number from 0 to ``most``."""
+        value = float(self.array(name, ()))
+        if not (0.0 <= value <= most and value.is_integer()):
+            raise FileError(f"{self.source}: {name} is {value:g}, where a whole number from 0 to {most} belongs")
+        return int(value)
+
     def history(self) -> tuple[Iteration, ...]:
         rows = self.array("history", (-1, len(_COLUMNS)), finite=False)
         whole = {item.name for item in fields(Iteration) if item.type == "int"}
+        counts = rows[:, [_COLUMNS.index(name) for name in sorted(whole)]]
+        if not ((counts >= 0.0) & (counts < 2.0**53) & (counts == np.floor(counts))).all():
+            raise FileError(f"{self.source}: history holds counts that are no whole numbers")
         found = []
         for row in rows.tolist():
             values: dict[str, Any] = dict(zip(_COLUMNS, row, strict=True))
@@ -175,7 +185,7 @@ class _Reader:
                 trajectory=motions[names["search."]],
                 best=motions.get(names["best."]),
                 merits=tuple(self.array("search.merits", (-1,)).tolist()),
-                history=history[: int(self.array("search.history", ()))],
+                history=history[: self.count("search.history", len(history))],
                 **numbers,
             )
         return {
