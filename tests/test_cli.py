@@ -662,3 +662,12 @@ def test_mistakes_about_scenes(arguments, words, scene, tmp_path, capsys):
     (tmp_path / "broken.toml").write_text("[robot]\n[horizon]\ndt = 1\nsteps = 1\n")
     assert main(arguments) == exits.MISTAKE
     assert words in error_of(capsys)
+
+
+@pytest.mark.parametrize(("words", "speed"), [([], 0.5), (["--speed", "1"], 1.0), (["--speed", "0.25"], 0.25)])
+def test_speed_of_a_scene_s_replay(tmp_path, monkeypatch, words, speed):
+    """The file's own, 0.5, unless one is asked for."""
+    asked = []
+    monkeypatch.setattr("varpin.cli.outputs.replay", lambda *_, speed, html, **__: asked.append(speed) or html.touch())
+    assert main(["simulate", "ur5_reach", "--html", str(tmp_path / "a.html"), "--quiet", *words]) == 0
+    assert asked == [speed]

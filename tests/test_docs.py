@@ -25,6 +25,7 @@ def python_blocks(page):
         ("tutorial.md", 6, ["panda_reach.html"]),
         ("replay.md", 2, ["marks.html", "pair.html", "controller.html"]),
         ("notebooks.md", 2, []),
+        ("control-loop.md", 1, ["loop.html"]),
     ],
 )
 def test_a_page_runs_from_top_to_bottom(page, least, made, tmp_path):

@@ -203,3 +203,11 @@ def test_tables_say_how_much_they_leave_out():
 def test_everything_is_escaped():
     shown = facts("<t>", [("<a>", "<b>")], folded("<s>", table(("<h>",), [("<d>",), (1.23456,)])))
     assert Reader(shown).text == "<t><a><b><s><h><d>1.235"
+
+
+@pytest.mark.parametrize("size", [(-1, 3), (700,), 700, ("a", "b")])
+def test_a_frame_of_no_size_is_refused(size):
+    robot = vp.planar_chain(1)
+    motion = vp.simulate(vp.Scene(robot), [0.1], [0.0], dt=1e-2, steps=2)
+    with pytest.raises(vp.InputError, match="size must be"):
+        vp.replay(robot, motion, inline=True, size=size)

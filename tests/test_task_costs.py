@@ -60,6 +60,11 @@ def differences(function, z):
     return np.stack(columns, axis=-1)
 
 
+def test_a_frame_has_a_name():
+    with pytest.raises(vp.InputError, match="FramePositionCost frame must be the name of a frame, got \\[0, 0, 0\\]"):
+        vp.FramePositionCost(vp.planar_chain(2), [0, 0, 0], "tip")
+
+
 def test_frames(arm):
     robot, frame = arm
     q, v = state(robot)

@@ -25,6 +25,8 @@ from varpin.scene import Scene
 Floats = NDArray[np.float64]
 Kind = Literal["revolute", "prismatic", "continuous", "mimic"]
 
+# The largest step is no limit beyond this [s].
+_ANY_STEP = 100.0
 # Beyond what any of example-robot-data's arms shows: masses there differ by up to 320 between neighbours, principal
 # moments by 2e5, and M scaled to a unit diagonal has a condition number of up to 830.
 MASS_RATIO = 1e3
@@ -127,12 +129,20 @@ class RobotReport:
             f"{len(self.warnings)} warnings)"
         )
 
+    @property
+    def step_in_words(self) -> str:
+        """The largest step the guard accepts around (q, v)."""
+        if self.largest_step is None:
+            return "undefined: the mass matrix is singular"
+        # A description's own rounding, a frame turned by 1.5708, makes directions unstable that are not.
+        step = "any: nothing is unstable" if self.largest_step > _ANY_STEP else f"{self.largest_step:.3g} s"
+        return f"{step} at this q, {'at rest' if not self.v.any() else 'and this v'}"
+
     def _repr_html_(self) -> str:
-        step = "undefined: M is singular" if self.largest_step is None else f"{self.largest_step:.3g} s"
         rows: list[tuple[str, object]] = [
             ("mass that moves [kg]", self.total_mass),
             ("condition of M(q)", f"{self.condition:.3g}; {self.scaled_condition:.3g} with a unit diagonal"),
-            ("largest step the guard accepts", step),
+            ("largest step the guard accepts", self.step_in_words),
             *(("warning", warning) for warning in self.warnings),
         ]
         joints = [

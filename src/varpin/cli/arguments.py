@@ -127,11 +127,9 @@ def scene_file(request: argparse.Namespace, word: str, *given: str) -> SceneFile
             raise InputError(f"--{option} has no place beside a scene file: {command} {word} takes it from the file")
     scene = load_scene(word)
     outputs = scene.spec.outputs
-    for name in ("save", "plot", "html"):
+    for name in ("save", "plot", "html", "speed"):
         if hasattr(request, name) and getattr(request, name) is None:
             setattr(request, name, getattr(outputs, name))
-    if getattr(request, "speed", None) == 1.0:
-        request.speed = outputs.speed
     return scene
 
 

@@ -15,9 +15,6 @@ from varpin.cli.console import WIDTH, add_row, facts, say, table_of
 from varpin.inspection import JointReport, RobotReport, inspect_robot
 from varpin.robot import build_robot, robot_names
 
-# The largest step is no limit beyond this [s].
-_ANY_STEP = 100.0
-
 
 def add_inspect(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin inspect``."""
@@ -49,7 +46,8 @@ def _inspect_scene(request: argparse.Namespace) -> int:
     for name, words in required.terms.items():
         add_row(table, name, words, style="dim" if words == "none" or name == "not modelled" else "")
     add_row(table, "horizon", f"{spec.steps} steps of {spec.dt:g} s, {spec.integrator}")
-    add_row(table, "saved", f"{100 * required.saved:.0f}% of the linear algebra of a plan, by counting")
+    if required.saved:
+        add_row(table, "saved", f"{100 * required.saved:.0f}% of the linear algebra of a plan, by counting")
     console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
     console.print(table)
     return 0
@@ -126,14 +124,8 @@ def _report_table(report: RobotReport) -> Table:
     add_row(table, "mass of what moves", f"{report.total_mass:.5g} kg")
     add_row(table, "at q [rad or m]", "  ".join(f"{x:g}" for x in report.q))
     add_row(table, "condition of M(q)", f"{report.condition:.3g}; {report.scaled_condition:.3g} with a unit diagonal")
-    step = "undefined: the mass matrix is singular"
-    if report.largest_step is not None:
-        # A description's own rounding, a frame turned by 1.5708, makes directions unstable that are not.
-        step = "any: nothing is unstable" if report.largest_step > _ANY_STEP else f"{report.largest_step:.3g} s"
-        step += f" at this q, {'at rest' if not report.v.any() else 'and this v'}"
-    add_row(
-        table, "largest step accepted", f"{step} (branch margin {report.branch_margin:g}; says nothing of accuracy)"
-    )
+    remark = f"(branch margin {report.branch_margin:g}; says nothing of accuracy)"
+    add_row(table, "largest step accepted", f"{report.step_in_words} {remark}")
     return table
 
 

@@ -33,9 +33,8 @@ def add_outputs(parser: argparse.ArgumentParser, what: str) -> None:
     outputs.add_argument(
         "--speed",
         type=float,
-        default=1.0,
         metavar="X",
-        help="of the replay; 0.1 is ten times slower; default: true speed",
+        help="of the replay; 0.1 is ten times slower; default: the scene file's, or true speed",
     )
     outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
 
@@ -72,7 +71,7 @@ def outputs_of(request: argparse.Namespace, marks: Marks | None = None) -> list[
         if path is not None:
             if film:
                 check_film(path)
-            speed = positive("--speed", request.speed, "1")
+            speed = positive("--speed", 1.0 if request.speed is None else request.speed, "1")
             outputs.append(_replay(writable(path), speed, request.trace, film, marks))
     paths = [output.path.resolve() for output in outputs]
     for path in paths:

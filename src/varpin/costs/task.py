@@ -29,6 +29,8 @@ class _FrameCost(TaskCost):
     frame: str
 
     def __init__(self, robot: Robot, frame: str, weight: ArrayLike) -> None:
+        if not isinstance(frame, str):
+            raise InputError(f"{type(self).__name__} frame must be the name of a frame, got {frame!r}")
         super().__init__(robot, weight)
         self.frame = frame
         self._kinematics = frame_kinematics(robot, frame)

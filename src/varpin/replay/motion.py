@@ -26,7 +26,7 @@ from varpin.replay.annotations import (
     traces,
 )
 from varpin.replay.script import Actor, Script
-from varpin.replay.video import Film
+from varpin.replay.video import Film, frame_size
 from varpin.robot import Robot
 from varpin.trajectory import Trajectory
 
@@ -102,7 +102,7 @@ def replay(
         fps: Keyframes a second of playback, and frames of a film. Between them the page interpolates q linearly, and
             draws at the screen's own rate.
         max_frames: Most keyframes, and frames of a film; a longer motion gets fewer a second and keeps its speed.
-        size: Width and height of a film [pixels].
+        size: Width and height of a film, or at most of a frame in a notebook [pixels].
 
     The meshes are the robot's own. Where one cannot be read, its link becomes a skeleton, as the whole robot does where
     the source has none, and the log says why. The ghost leaves out what cannot move, and gives way to the robot where
@@ -189,7 +189,7 @@ def replay(
     from varpin.replay import viewer  # noqa: PLC0415 - meshcat is slow to import, and few runs show anything
 
     if inline:
-        return viewer.inline(script, size)
+        return viewer.inline(script, frame_size(size))
     if page is None and film is None:
         return viewer.show(script)
     with tempfile.TemporaryDirectory() as folder:

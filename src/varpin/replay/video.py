@@ -67,6 +67,18 @@ _FILTER = "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=new=1
 _GIF = {"codec": "gif", "pix_fmt_out": "pal8", "quality": None, "output_params": ["-filter_complex", _FILTER]}
 
 
+def frame_size(size: tuple[int, int]) -> tuple[int, int]:
+    """A width and a height [pixels].
+
+    Raises:
+        InputError: It is something else.
+    """
+    if not isinstance(size, tuple | list) or len(size) != 2:
+        raise InputError(f"size must be a width and a height [pixels], got {size!r}")
+    width, height = (count("size", number, least=16) for number in size)
+    return width, height
+
+
 @dataclass(frozen=True)
 class Film:
     """A film to be taken.
@@ -92,9 +104,7 @@ class Film:
             MissingDependency: A package or a program is not there.
         """
         check_film(path)
-        if not isinstance(size, tuple | list) or len(size) != 2:
-            raise InputError(f"size must be a width and a height [pixels], got {size!r}")
-        width, height = (count("size", number, least=16) for number in size)
+        width, height = frame_size(size)
         if width % 2 or height % 2:
             raise InputError(f"size must be even numbers of pixels, as films have them, got {width} x {height}")
         return cls(path, (width, height), 1.0 / fps, max_frames)

@@ -99,7 +99,7 @@ def describe(source: object, package_dirs: Sequence[str | os.PathLike[str]] | No
     if is_path and path.is_dir():
         raise RobotError(f"{path} is a folder, not a URDF file; it holds {_urdf_files(path)}")
     note = "" if path.suffix != ".urdf" else f" (looked in {path.absolute().parent})"
-    raise RobotNotFound(text, [*bundled, *example_robot_data.FIXED_BASE], note)
+    raise RobotNotFound(text, [*bundled, *example_robot_data.installed()], note)
 
 
 def _folders(package_dirs: Sequence[str | os.PathLike[str]] | str | os.PathLike[str] | None) -> tuple[str, ...]:
