@@ -49,7 +49,8 @@ def test_no_input_kills_hangs_or_surprises(kind, inputs):
     # Most damage is told, and some of it does none.
     harmless = sum(count for outcome, count in outcomes.items() if outcome.startswith(("taken", "status 0")))
     assert harmless > inputs // 50
-    assert inputs - harmless > inputs // 10
+    # A mesh that cannot be read leaves its link a skeleton, and the robot is taken all the same.
+    assert inputs - harmless > (0 if kind == "mesh" else inputs // 10)
 
 
 @pytest.mark.parametrize("kind", ["scene", "record"])
