@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from pages import fill
 
 import varpin as vp
 from varpin import extremes
@@ -142,10 +143,7 @@ def main() -> int:
         print("interrupted: the same command goes on from here")
         return 130
     if not options.robots:
-        text = DOCUMENT.read_text(encoding="utf-8")
-        begin, end = "<!-- robots:begin -->\n", "<!-- robots:end -->"
-        before, rest = text.split(begin)
-        DOCUMENT.write_text(before + begin + "\n".join(lines) + "\n" + end + rest.split(end)[1], encoding="utf-8")
+        fill(DOCUMENT, {"robots": "\n".join(lines)})
     return 1 if any(record.wrong() for record in records) else 0
 
 

@@ -16,7 +16,8 @@ from types import ModuleType
 from unittest import mock
 
 import numpy as np
-from guards import write_table
+from guards import DOCUMENT
+from pages import fill
 
 import varpin as vp
 from varpin.integrators import midpoint
@@ -134,7 +135,8 @@ def main() -> None:
         "|---|---|---|---|---|---|",
         *(row(name, whole, plain) for name in ROBOTS),
     ]
-    write_table("cost", table)
+    print("\n".join(table))
+    fill(DOCUMENT, {"cost": "\n".join(table)})
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import logging
 from pathlib import Path
 
 import numpy as np
+from pages import fill
 
 import varpin as vp
 
@@ -29,16 +30,6 @@ def row(links: int, dt: float) -> str:
     )
 
 
-def write_table(name: str, table: list[str]) -> None:
-    """Print a table, and put it between the markers of that name in the document."""
-    print("\n".join(table))
-    text = DOCUMENT.read_text(encoding="utf-8")
-    begin, end = f"<!-- {name}:begin -->\n", f"<!-- {name}:end -->"
-    before, rest = text.split(begin)
-    _, after = rest.split(end)
-    DOCUMENT.write_text(before + begin + "\n".join(table) + "\n" + end + after, encoding="utf-8")
-
-
 def main() -> None:
     logging.getLogger("varpin").setLevel(logging.ERROR)
     table = [
@@ -46,7 +37,8 @@ def main() -> None:
         "|---|---|---|---|---|---|---|---|",
         *(row(links, dt) for links in (2, 3, 5) for dt in (0.01, 0.05, 0.1, 0.2, 0.5)),
     ]
-    write_table("guards", table)
+    print("\n".join(table))
+    fill(DOCUMENT, {"guards": "\n".join(table)})
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from pages import fill
 
 import varpin as vp
 
@@ -83,11 +84,7 @@ def main() -> None:
         *(row(name, controller(robot, integrator), plants, robot) for name, integrator in integrators.items()),
     ]
     print("\n".join(table))
-    text = DOCUMENT.read_text(encoding="utf-8")
-    begin, end = "<!-- mpc:begin -->\n", "<!-- mpc:end -->"
-    before, rest = text.split(begin)
-    _, after = rest.split(end)
-    DOCUMENT.write_text(before + begin + "\n".join(table) + "\n" + end + after, encoding="utf-8")
+    fill(DOCUMENT, {"mpc": "\n".join(table)})
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ import numpy as np
 import peers
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from pages import fill
 
 import varpin as vp
 
@@ -173,10 +174,7 @@ def main() -> None:
     text = table(chains, curves)
     print(text)
     FigureCanvasAgg(draw(chains[CHAINS[0]], curves)).print_png(ROOT / "docs" / "images" / "trade.png")
-    readme = ROOT / "README.md"
-    begin, end = "<!-- trade:begin -->\n", "<!-- trade:end -->"
-    before, rest = readme.read_text(encoding="utf-8").split(begin)
-    readme.write_text(before + begin + text + "\n" + end + rest.split(end)[1], encoding="utf-8")
+    fill(ROOT / "README.md", {"trade": text})
 
 
 if __name__ == "__main__":

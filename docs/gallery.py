@@ -29,6 +29,9 @@ from varpin.replay.video import film_frames
 from varpin.scenefile import scenes
 
 HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent / "benchmarks"))
+from pages import fill  # noqa: E402
+
 SIZE = (600, 450)
 
 
@@ -206,11 +209,7 @@ def main() -> None:
         draw(name, scene, plan)
         lines.append(row(scene, plan))
     if not sys.argv[1:]:
-        page = HERE / "gallery.md"
-        before, rest = page.read_text(encoding="utf-8").split("<!-- table:begin -->\n")
-        after = rest.split("<!-- table:end -->")[1]
-        table = "\n".join(lines)
-        page.write_text(f"{before}<!-- table:begin -->\n{table}\n<!-- table:end -->{after}", encoding="utf-8")
+        fill(HERE / "gallery.md", {"table": "\n".join(lines)})
 
 
 if __name__ == "__main__":

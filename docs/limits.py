@@ -28,6 +28,7 @@ from varpin.lagrangian import lagrangian_jet
 DOCUMENT = Path(__file__).resolve().parent / "limits.md"
 sys.path.insert(0, str(DOCUMENT.parents[1] / "benchmarks"))
 import peers  # noqa: E402
+from pages import fill  # noqa: E402
 
 OWN = {"Midpoint": "Midpoint(alpha=0.5)", "Gauss(4)": "Gauss(stages=4)", "RungeKutta4": "RungeKutta4"}
 MOTIONS: dict[str, Callable[[peers.Case, float], peers.Motion | None]] = {
@@ -62,24 +63,17 @@ def main() -> None:
     if len(sys.argv) != 2:
         raise SystemExit("usage: limits.py RECORD or limits.py --chains")
     if sys.argv[1] == "--chains":
-        put("chains", list(chains()))
+        fill(DOCUMENT, {"chains": "\n".join(chains())})
         return
     record = Record.load(sys.argv[1])
-    put("measured", list(measured([cell for cell in record.cells if cell.trial not in DEEP])))
+    fill(DOCUMENT, {"measured": "\n".join(measured([cell for cell in record.cells if cell.trial not in DEEP]))})
     if record.deep:
-        put("deep", list(deep_table(record)))
+        fill(DOCUMENT, {"deep": "\n".join(deep_table(record))})
     missing = [name for name in ("mujoco", "pydrake", "trep") if peers.available(name) is None]
     if missing:
         sys.stderr.write(f"not installed: {', '.join(missing)}; the table of the others stays as it is\n")
     else:
-        put("peers", list(peers_table(record)))
-
-
-def put(name: str, lines: list[str]) -> None:
-    """Replace what stands between the markers of that name."""
-    begin, end = f"<!-- {name}:begin -->\n", f"<!-- {name}:end -->"
-    before, rest = DOCUMENT.read_text(encoding="utf-8").split(begin)
-    DOCUMENT.write_text(before + begin + "\n".join(lines) + "\n" + end + rest.split(end)[1], encoding="utf-8")
+        fill(DOCUMENT, {"peers": "\n".join(peers_table(record))})
 
 
 def measured(cells: Sequence[Cell]) -> Iterator[str]:

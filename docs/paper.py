@@ -10,6 +10,9 @@ import sys
 from pathlib import Path
 
 DOCUMENT = Path(__file__).resolve().parent / "paper.md"
+sys.path.insert(0, str(DOCUMENT.parents[1] / "benchmarks"))
+from pages import fill  # noqa: E402
+
 FIGURES = ("figure1", "figure2", "figure3", "figure4", "figure5", "truth", "noise")
 
 
@@ -24,9 +27,7 @@ def main() -> None:
         rows = list(csv.DictReader(stream))
     table = ["| verdict | source | sentence | measured |", "|---|---|---|---|"]
     table += [f"| {r['verdict']} | {r['source']} | {r['sentence']} | {r['measured']} |" for r in rows]
-    begin, end = "<!-- claims:begin -->\n", "<!-- claims:end -->"
-    before, rest = DOCUMENT.read_text(encoding="utf-8").split(begin)
-    DOCUMENT.write_text(before + begin + "\n".join(table) + "\n" + end + rest.split(end)[1], encoding="utf-8")
+    fill(DOCUMENT, {"claims": "\n".join(table)})
 
 
 if __name__ == "__main__":

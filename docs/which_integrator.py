@@ -32,6 +32,7 @@ from varpin.wiener import coarsen
 DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent / "benchmarks"))
 import peers  # noqa: E402
+from pages import fill  # noqa: E402
 
 PAGE = "which-integrator.md"
 Run = Callable[[], np.ndarray]
@@ -438,12 +439,12 @@ def control(scale: Scale) -> tuple[str, Figure]:
         for name in dict.fromkeys(name_of_text(run.integrator) for run in runs):
             colour, marker, _ = STYLES[name]
             own = [run for run in runs if name_of_text(run.integrator) == name and run.survived]
-            for cost, stroke, fill in (("open_loop_cost", "-", colour), ("closed_loop_cost", ":", "none")):
+            for cost, stroke, face in (("open_loop_cost", "-", colour), ("closed_loop_cost", ":", "none")):
                 pairs = [(1e3 * run.seconds, getattr(run, cost)) for run in own]
                 pairs = [(x, y) for x, y in pairs if np.isfinite(y)]
                 if pairs:
                     axes.loglog(
-                        *zip(*pairs, strict=True), color=colour, marker=marker, linestyle=stroke, markerfacecolor=fill,
+                        *zip(*pairs, strict=True), color=colour, marker=marker, linestyle=stroke, markerfacecolor=face,
                         label=f"{name}, {'open loop' if stroke == '-' else 'with feedback'}",
                     )  # fmt: skip
         axes.set(xlabel="solve time [ms]", title=f"finger, {start}", ylabel="true cost")
@@ -641,16 +642,6 @@ def machine(scale: Scale) -> str:
     if missing:
         text += f" Not installed, so their rows are left out: {', '.join(missing)}."
     return text + (" A quick run: shorter, with fewer settings." if scale is QUICK else "")
-
-
-def fill(page: Path, parts: dict[str, str]) -> None:
-    """Put texts between the page's markers."""
-    text = page.read_text(encoding="utf-8")
-    for name, own in parts.items():
-        begin, end = f"<!-- {name}:begin -->\n", f"<!-- {name}:end -->"
-        before, rest = text.split(begin)
-        text = before + begin + own + "\n" + end + rest.split(end, 1)[1]
-    page.write_text(text, encoding="utf-8")
 
 
 def main(arguments: Iterable[str] | None = None) -> None:

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import os
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -43,6 +45,14 @@ def robot(robot_name: str) -> vp.Robot:
 def load():
     """``varpin.load_robot`` for names, each loaded once a session."""
     return load_once
+
+
+@pytest.fixture(scope="session")
+def script():
+    """Modules of benchmarks by name, which find each other there as when they are run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).resolve().parents[1] / "benchmarks"))
+        yield importlib.import_module
 
 
 @pytest.fixture(scope="session")

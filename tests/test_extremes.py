@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -389,12 +387,8 @@ def test_nothing_on_the_finger_is_silent_wrong(load):
 
 
 @pytest.fixture(scope="module")
-def benchmark():
-    path = Path(__file__).parents[1] / "benchmarks" / "extremes.py"
-    spec = importlib.util.spec_from_file_location("benchmark_extremes", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def benchmark(script):
+    return script("extremes")
 
 
 def test_random_trees_are_many_kinds(benchmark):

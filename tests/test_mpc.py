@@ -1,8 +1,6 @@
 """Model predictive control: its plans are those of solve, its decisions those of its plans, its times the plant's."""
 
 import dataclasses
-import importlib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -200,10 +198,9 @@ def test_mistakes_are_named():
 
 
 @pytest.mark.slow
-def test_a_ur5_holds_its_tool_on_a_moving_target(monkeypatch):
+def test_a_ur5_holds_its_tool_on_a_moving_target(script):
     """Under noise, at 100 Hz, by the task that docs/control-loop.md measures; plans on Euler's map do worse."""
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / "benchmarks"))
-    task = importlib.import_module("mpc")
+    task = script("mpc")
     robot = vp.load_robot("ur5")
     plant = vp.Plant(vp.Scene(robot, damping=0.05, noise=task.NOISE))
     off = []

@@ -1,25 +1,16 @@
 """The other simulators that benchmarks race against are the same mechanism, and would not start if they were not."""
 
 import dataclasses
-import importlib.util
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import varpin as vp
 
-PATH = Path(__file__).parents[1] / "benchmarks" / "peers.py"
-
 
 @pytest.fixture(scope="module")
-def peers():
-    spec = importlib.util.spec_from_file_location("benchmark_peers", PATH)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+def peers(script):
+    return script("peers")
 
 
 @pytest.fixture

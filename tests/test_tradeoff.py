@@ -2,13 +2,10 @@
 
 import csv
 import dataclasses
-import importlib.util
 import logging
 import math
-import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -463,13 +460,9 @@ def test_wrong_wishes(change, message):
 
 
 @pytest.mark.slow
-def test_advice_on_a_random_set():
+def test_advice_on_a_random_set(script):
     """The benchmark's own cases, fewer of them: the tolerance met on 95 %, within 2x of the cheapest on 80 %."""
-    path = Path(__file__).parents[1] / "benchmarks" / "advise.py"
-    spec = importlib.util.spec_from_file_location("benchmark_of_advice", path)
-    benchmark = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = benchmark
-    spec.loader.exec_module(benchmark)
+    benchmark = script("advise")
     rng = np.random.default_rng(11)
     verdicts = [verdict for verdict in (benchmark.judge(rng) for _ in range(60)) if verdict is not None]
     assert len(verdicts) > 50

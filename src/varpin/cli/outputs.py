@@ -15,9 +15,8 @@ from varpin.cli.console import complain
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.replay import check_film, replay
 from varpin.robot import Robot
+from varpin.scenefile.spec import FIGURES
 from varpin.trajectory import Trajectory, atomic_file
-
-PLOT_FORMATS = (".png", ".pdf", ".svg")
 
 
 def add_outputs(parser: argparse.ArgumentParser, what: str) -> None:
@@ -88,8 +87,8 @@ def _record(path: Path) -> Output:
 
 
 def _figure(path: Path) -> Output:
-    if path.suffix.lower() not in PLOT_FORMATS:
-        raise InputError(f"--plot must end in {', '.join(PLOT_FORMATS)}, got {path.name!r}")
+    if path.suffix.lower() not in FIGURES:
+        raise InputError(f"--plot must end in {', '.join(FIGURES)}, got {path.name!r}")
     from varpin.plots import plot_trajectory  # noqa: PLC0415 - matplotlib is slow to import
 
     def write(robot: Robot, trajectory: Trajectory) -> None:
