@@ -41,10 +41,22 @@ class _Barrier(TaskCost):
     def __init__(
         self,
         robot: Robot,
-        weight: ArrayLike,
-        margin: ArrayLike,
-        limits: tuple[ArrayLike, ArrayLike] | None,
+        weight: ArrayLike = 1.0,
+        margin: ArrayLike = 0.0,
+        limits: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
+        """Describe the cost.
+
+        Args:
+            robot: The robot.
+            weight: One number, (n,), or a matrix (n, n), positive semidefinite.
+            margin: One number or (n,) >= 0, as limits; of it, at most half the way from limit to limit.
+            limits: (lower, upper), each one number or (n,), infinite where there is none; the robot's if left out
+                [rad or m; of velocities rad/s or m/s].
+
+        Raises:
+            InputError: There is no limit, or an argument has a wrong shape or value.
+        """
         self.size = robot.dof if isinstance(robot, Robot) else 0
         super().__init__(robot, weight)
         name = type(self).__name__
@@ -76,26 +88,6 @@ class JointLimitBarrier(_Barrier):
 
     in_velocity = False
 
-    def __init__(
-        self,
-        robot: Robot,
-        weight: ArrayLike = 1.0,
-        margin: ArrayLike = 0.0,
-        limits: tuple[ArrayLike, ArrayLike] | None = None,
-    ) -> None:
-        """Describe the cost.
-
-        Args:
-            robot: The robot.
-            weight: One number, (n,), or a matrix (n, n), positive semidefinite.
-            margin: One number or (n,) >= 0 [rad or m]; of it, at most half the way from limit to limit.
-            limits: (lower, upper), each one number or (n,), infinite where there is none; the robot's if left out.
-
-        Raises:
-            InputError: There is no limit, or an argument has a wrong shape or value.
-        """
-        super().__init__(robot, weight, margin, limits)
-
     @staticmethod
     def _own(robot: Robot) -> tuple[Floats, Floats]:
         return robot.position_limits
@@ -105,16 +97,6 @@ class VelocityLimitBarrier(_Barrier):
     """weight . (what v is beyond a limit less a margin)^2; see :class:`JointLimitBarrier`."""
 
     in_velocity = True
-
-    def __init__(
-        self,
-        robot: Robot,
-        weight: ArrayLike = 1.0,
-        margin: ArrayLike = 0.0,
-        limits: tuple[ArrayLike, ArrayLike] | None = None,
-    ) -> None:
-        """Describe the cost; see :class:`JointLimitBarrier`, with velocities [rad/s or m/s]."""
-        super().__init__(robot, weight, margin, limits)
 
     @staticmethod
     def _own(robot: Robot) -> tuple[Floats, Floats]:
