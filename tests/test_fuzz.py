@@ -523,3 +523,10 @@ class TestMeshes:
         assert "texture 'texture.png' is no picture" in caplog.text
         commands = re.search(rb'<script id="commands" type="text/plain">(.*?)</script>', page)[1]
         assert base64.b64encode(mesh.SECRET) not in gzip.decompress(base64.b64decode(commands))
+
+    def test_whose_textures_are_too_large(self, tmp_path, caplog):
+        with (tmp_path / "large.png").open("wb") as stream:
+            stream.write(b"\x89PNG")
+            stream.truncate(60_000_000)
+        self.drawn(tmp_path, mesh.DAE.replace("texture.png", "large.png").encode())
+        assert "texture 'large.png' is larger than 50 MB" in caplog.text
