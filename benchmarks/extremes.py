@@ -4,7 +4,8 @@ Keeps a record for each robot (JSON) in a folder: what is there already is not r
 where it stopped; an edit of varpin's sources starts it anew. Writes the table of ``docs/limits.md`` between its
 markers, and exits with status 1 if anything is silent wrong.
 
-    python benchmarks/extremes.py FOLDER             # an hour of one core
+    python benchmarks/extremes.py FOLDER             # some five hours of one core
+    python benchmarks/extremes.py FOLDER --turns 6   # an hour: larger robots and trees take turns at the trials
     python benchmarks/extremes.py FOLDER ur5 tree17  # these alone, and no table
 """
 
@@ -31,8 +32,8 @@ from mechanisms import random_tree  # noqa: E402
 DOCUMENT = ROOT / "docs" / "limits.md"
 TREES = 200
 RATIOS = (1e-4, 1e-2, 1.0, 1e2, 1e4)
-# A tree, or a robot of more joints than this, gets each so many-th of the trials, and its neighbours the others.
-SMALL, TURNS = 4, 6
+# A robot that goes by a name gets all trials up to this many joints, whatever the turns.
+SMALL = 4
 # A motion or a plan may take this long before it is judged by what there is [s].
 PATIENCE = 1.0
 
@@ -53,27 +54,31 @@ def robot_of(name: str) -> vp.Robot:
     return vp.load_robot(model)
 
 
-def trials_of(name: str, robot: vp.Robot) -> list[extremes.Trial | extremes.Plan]:
-    """The whole battery of a small robot that goes by a name; of others a part."""
+def trials_of(name: str, robot: vp.Robot, turns: int = 1) -> list[extremes.Trial | extremes.Plan]:
+    """The whole battery of a small robot that goes by a name; of others each so many-th trial, by turns."""
     trials = extremes.trials_on(robot)
     whole = not name.startswith("tree") and robot.dof <= SMALL
-    return trials if whole else trials[names().index(name) % TURNS :: TURNS]
+    return trials if whole else trials[names().index(name) % turns :: turns]
 
 
 def judge(
-    name: str, robot: vp.Robot, folder: Path | None = None, progress: extremes.battery.Progress | None = None
+    name: str,
+    robot: vp.Robot,
+    folder: Path | None = None,
+    turns: int = 1,
+    progress: extremes.battery.Progress | None = None,
 ) -> Record:
     """The record of a robot, in a file of its name if a folder is given."""
     return extremes.run(
         robot,
-        trials=trials_of(name, robot),
+        trials=trials_of(name, robot, turns),
         save=None if folder is None else folder / f"{name}.json",
         patience=PATIENCE,
         progress=progress,
     )
 
 
-def judged(chosen: Sequence[str], folder: Path) -> Iterator[tuple[str, vp.Robot, Record | str]]:
+def judged(chosen: Sequence[str], folder: Path, turns: int) -> Iterator[tuple[str, vp.Robot, Record | str]]:
     """Each robot, small ones first, with its record, or with the name of an earlier one that is the same mechanism."""
     robots = {name: robot_of(name) for name in chosen}
     seen: dict[tuple[bytes, ...], str] = {}
@@ -88,7 +93,7 @@ def judged(chosen: Sequence[str], folder: Path) -> Iterator[tuple[str, vp.Robot,
             text = f"{time.monotonic() - begin:6.0f} s  {place}  {done}/{cells} {what}"
             sys.stderr.write(f"\r{text[:118]:118}")
 
-        record = judge(name, robot, folder, tell)
+        record = judge(name, robot, folder, turns, tell)
         sys.stderr.write("\r" + " " * 118 + "\r")
         yield name, robot, record
         if record.missing:
@@ -126,11 +131,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("folder", type=Path, help="where the records are kept")
     parser.add_argument("robots", nargs="*", help="these alone, and no table in the page")
+    parser.add_argument("--turns", type=int, default=1, metavar="K", help="larger robots and trees get each K-th trial")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     logging.getLogger("varpin").setLevel(logging.CRITICAL)
     results = []
-    for name, robot, record in judged(options.robots or names(), options.folder):
+    for name, robot, record in judged(options.robots or names(), options.folder, options.turns):
         results.append((name, robot, record))
         if isinstance(record, Record):
             print(f"{record}, {sum(cell.seconds for cell in record.cells):.0f} s", flush=True)
