@@ -70,8 +70,7 @@ def test_frames(arm):
     q, v = state(robot)
     kinematics = frame_kinematics(robot, frame)
     motion = kinematics.motion(q)
-    R, p = kinematics.placements(q)
-    J = motion.jacobian()
+    R, p, J = kinematics.jacobians(q)
     for k in range(N):
         rotation, position, twist = pinocchio_frame(robot, frame, q[k], v[k])
         np.testing.assert_allclose(R[k], rotation, atol=1e-13)
@@ -85,9 +84,9 @@ def test_frames(arm):
             WORLD,
         )
         np.testing.assert_allclose(J[k], whole @ robot.free_velocities(np.eye(robot.dof)).T, atol=1e-13)
-    np.testing.assert_array_equal(motion.rotation, R)
-    np.testing.assert_array_equal(motion.position, p)
-    jacobians = differences(lambda q: kinematics.motion(q).jacobian(), q)  # (N, 6, n, n)
+    for placed, once_more in zip(kinematics.placements(q), (R, p), strict=True):
+        np.testing.assert_array_equal(placed, once_more)
+    jacobians = differences(lambda q: kinematics.jacobians(q)[2], q)  # (N, 6, n, n)
     np.testing.assert_allclose(np.moveaxis(motion.jacobian_in_q(), 1, 3), jacobians, atol=1e-10)
     np.testing.assert_allclose(motion.twist_in_q(v), np.einsum("Nrba,Nb->Nra", jacobians, v), atol=1e-10)
 
@@ -183,7 +182,7 @@ def test_orientation_at_every_distance(load, angle):
     u = np.zeros((1, 6))
     assert bound.value(q, v, u)[0] == pytest.approx(angle**2 * (axis**2 @ [1, 2, 3]), rel=1e-6, abs=1e-28)
     given = bound.expand(q, v, u)
-    J = pin.Jlog3(turn(axis, angle)) @ R.T @ frame_kinematics(robot, "tool0").motion(q).jacobian()[0, 3:]
+    J = pin.Jlog3(turn(axis, angle)) @ R.T @ frame_kinematics(robot, "tool0").jacobians(q)[2][0, 3:]
     W = np.diag([1.0, 2.0, 3.0])
     np.testing.assert_allclose(given.gradient[0, :6], 2 * angle * J.T @ W @ axis, atol=1e-9 * max(angle, 1e-6))
     hessian = 2 * J.T @ W @ J
@@ -284,7 +283,7 @@ def test_manipulability_at_a_singular_configuration(load):
     given = bound.expand(q, q, u)
 
     def determinant(q):
-        return np.linalg.det(frame_kinematics(robot, "tool0").motion(q).jacobian())
+        return np.linalg.det(frame_kinematics(robot, "tool0").jacobians(q)[2])
 
     slope = differences(determinant, q)[0]
     assert np.abs(slope).max() > 1e-2

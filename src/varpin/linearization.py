@@ -115,7 +115,7 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
     if scene.processes == 0:
         return Linearization(
             A=Jx,
-            B=Jf @ scene.actuation,
+            B=(Jf.reshape(-1, n) @ scene.actuation).reshape(steps, 2 * n, m),  # one product instead of many small ones
             K=_kick_columns(scene, trajectory, integrator, Jk),
             J=Jk,
             F=np.zeros((steps, n, 0)),

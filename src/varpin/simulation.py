@@ -29,6 +29,8 @@ Progress = Callable[[int, int], None]
 
 logger = logging.getLogger(__name__)
 
+# What a node has.
+_NODES = ("q", "v", "p", "energy")
 # Work between two looks at the progress callback and at Ctrl-C, in steps of one joint: some tens of milliseconds.
 _CHUNK = 30_000
 
@@ -141,34 +143,66 @@ class _Record:
         self.steps = now.stop
 
     def trajectory(self) -> Trajectory:
-        nodes = {name: array[: self.steps + 1] for name, array in self.nodes.items()}
-        return Trajectory(
-            t=np.arange(self.steps + 1, dtype=np.float64) * self.dt,
-            q=nodes["q"],
-            v=nodes["v"],
-            p=nodes["p"],
-            u=self.u[: self.steps],
-            dw=self.dw[: self.steps],
-            energy=nodes["energy"],
-            masses=self.scene.robot.tree.mass.copy(),
-            dt=self.dt,
-            integrator=str(self.integrator),
-            robot=self.scene.robot.name,
-            joint_names=self.scene.robot.joint_names,
-            statistics=StepStatistics(**{name: array[: self.steps] for name, array in self.statistics.items()}),
+        return _trajectory(
+            self.scene,
+            self.integrator,
+            self.dt,
+            {name: array[: self.steps + 1] for name, array in self.nodes.items()},
+            self.u[: self.steps],
+            self.dw[: self.steps],
+            StepStatistics(**{name: array[: self.steps] for name, array in self.statistics.items()}),
         )
+
+
+def _trajectory(
+    scene: Scene,
+    integrator: Integrator,
+    dt: float,
+    nodes: dict[str, Floats],
+    u: Floats,
+    dw: Floats,
+    statistics: StepStatistics,
+) -> Trajectory:
+    return Trajectory(
+        t=np.arange(len(u) + 1, dtype=np.float64) * dt,
+        q=nodes["q"],
+        v=nodes["v"],
+        p=nodes["p"],
+        energy=nodes["energy"],
+        u=u,
+        dw=dw,
+        masses=scene.robot.tree.mass.copy(),
+        dt=dt,
+        integrator=str(integrator),
+        robot=scene.robot.name,
+        joint_names=scene.robot.joint_names,
+        statistics=statistics,
+    )
+
+
+class Motions:
+    """Motions without noise from one state under commands of any kind; they share their work arrays."""
+
+    def __init__(self, scene: Scene, integrator: Integrator, q0: Floats, v0: Floats, dt: float) -> None:
+        self.scene, self.integrator, self.dt = scene, integrator, dt
+        self._state, (self._first,) = integrator.start(scene, q0[None], v0[None])
+
+    def under(self, commands: Commands) -> tuple[Trajectory, Failure | None]:
+        """The motion, and why it stopped early, if it did; nothing is checked."""
+        first, nothing = self._first, np.zeros((0, 0, self.scene.processes))
+        state = self.integrator.fork(self._state)
+        (steps,) = self.integrator.rollout(self.scene, state, commands, nothing, self.dt)
+        nodes = {name: np.concatenate([getattr(first, name), getattr(steps, name)]) for name in _NODES}
+        dw = np.zeros((len(steps.u), self.scene.processes))
+        made = _trajectory(self.scene, self.integrator, self.dt, nodes, steps.u, dw, steps.statistics)
+        return made, steps.failure
 
 
 def rollout(
     scene: Scene, integrator: Integrator, q0: Floats, v0: Floats, commands: Commands, dt: float
 ) -> tuple[Trajectory, Failure | None]:
-    """The motion without noise under given commands, and why it stopped early, if it did; nothing is checked."""
-    state, (start,) = integrator.start(scene, q0[None], v0[None])
-    nothing = np.zeros((0, scene.processes))
-    record = _Record(scene, integrator, dt, steps_of(commands), nothing, start)
-    (segment,) = integrator.rollout(scene, state, commands, nothing[None][:0], dt)
-    record.add(segment)
-    return record.trajectory(), segment.failure
+    """One of the :class:`Motions` from (q0, v0)."""
+    return Motions(scene, integrator, q0, v0, dt).under(commands)
 
 
 def simulate(

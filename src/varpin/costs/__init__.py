@@ -25,4 +25,3 @@ from varpin.costs.task import FrameOrientationCost as FrameOrientationCost
 from varpin.costs.task import FramePositionCost as FramePositionCost
 from varpin.costs.task import FrameVelocityCost as FrameVelocityCost
 from varpin.costs.task import ManipulabilityCost as ManipulabilityCost
-from varpin.costs.task import rotation_vectors as rotation_vectors

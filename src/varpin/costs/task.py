@@ -18,8 +18,8 @@ from varpin.robot.kinematics import (
     CenterOfMass,
     FrameKinematics,
     center_of_mass,
-    cross,
     frame_kinematics,
+    rotation_errors,
 )
 
 Floats = NDArray[np.float64]
@@ -54,8 +54,8 @@ class _Position(Residual):
         return self.of.placements(_rows(q))[1].reshape(*q.shape[:-1], 3) - self.target
 
     def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:  # noqa: ARG002
-        motion = self.of.motion(q)
-        return motion.position - self.target, motion.jacobian()[:, :3]
+        _, position, J = self.of.jacobians(q)
+        return position - self.target, J[:, :3]
 
 
 class FramePositionCost(_FrameCost):
@@ -93,13 +93,12 @@ class _Orientation(Residual):
 
     def value(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
         R = self.of.placements(_rows(q))[0].reshape(*q.shape[:-1], 3, 3)
-        return rotation_vectors(np.swapaxes(self.target, 1, 2) @ R)
+        return rotation_errors(self.target, R)[0]
 
     def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:  # noqa: ARG002
-        motion = self.of.motion(q)
-        error = rotation_vectors(np.swapaxes(self.target, 1, 2) @ motion.rotation)
-        in_frame = np.swapaxes(motion.rotation, 1, 2) @ motion.jacobian()[:, 3:]
-        return error, _inverse_right_jacobian(error) @ in_frame
+        R, _, J = self.of.jacobians(q)
+        error, turn = rotation_errors(self.target, R, derivative=True)
+        return error, turn @ np.swapaxes(R, 1, 2) @ J[:, 3:]
 
 
 class FrameOrientationCost(_FrameCost):
@@ -133,28 +132,6 @@ class FrameOrientationCost(_FrameCost):
 
     def _at(self, points: Points) -> Residual:
         return _Orientation(self._kinematics, _sample_rotations(self.target, points), slice(0, points.dof))
-
-
-def rotation_vectors(R: Floats) -> Floats:
-    """The logarithm (..., 3) [rad] of rotation matrices (..., 3, 3)."""
-    vectors: Floats = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()
-    return vectors.reshape(*R.shape[:-2], 3)
-
-
-def _inverse_right_jacobian(r: Floats) -> Floats:
-    """J (N, 3, 3) with d log(R) = J w dt for a rotation R = exp(r) that turns with w in its own axes.
-
-    1 + [r]/2 + (1 - (a/2) cot(a/2)) [r]^2 / a^2 with a = |r| (Chirikjian, Stochastic Models, Information Theory, and
-    Lie Groups 2, 2011, 10.86).
-    """
-    square = np.einsum("Ni,Ni->N", r, r)
-    angle = np.sqrt(square)
-    small = angle < 1e-3
-    half = np.where(small, 1.0, 0.5 * angle)
-    factor = np.where(small, 1.0 / 12.0 + square / 720.0, (1.0 - half / np.tan(half)) / np.where(small, 1.0, square))
-    skew = cross(r[:, None, :], np.eye(3)).swapaxes(1, 2)
-    total: Floats = np.eye(3) + 0.5 * skew + factor[:, None, None] * (skew @ skew)
-    return total
 
 
 def _sample_rotations(target: Floats | Callable[[float], ArrayLike], points: Points) -> Floats:
@@ -201,13 +178,12 @@ class _Twist(Residual):
     columns: slice
 
     def value(self, q: Floats, v: Floats) -> Floats:
-        J = self.of.motion(_rows(q)).jacobian()
+        J = self.of.jacobians(_rows(q))[2]
         return (J @ _rows(v)[:, :, None]).reshape(*q.shape[:-1], 6) - self.target
 
     def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
-        motion = self.of.motion(q)
-        J = motion.jacobian()
-        return (J @ v[:, :, None])[..., 0] - self.target, np.concatenate([motion.twist_in_q(v), J], axis=2)
+        J = self.of.jacobians(q)[2]
+        return (J @ v[:, :, None])[..., 0] - self.target, np.concatenate([self.of.motion(q).twist_in_q(v), J], axis=2)
 
 
 class FrameVelocityCost(_FrameCost):
@@ -281,18 +257,17 @@ class _Dexterity(Residual):
     columns: slice
 
     def value(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
-        J = self.of.motion(_rows(q)).jacobian()[:, self.rows]
+        J = self.of.jacobians(_rows(q))[2][:, self.rows]
         w = np.linalg.svd(J, compute_uv=False).prod(axis=-1)
         lack: Floats = np.maximum(0.0, self.least - w).reshape(*q.shape[:-1], 1)
         return lack
 
     def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:  # noqa: ARG002
-        motion = self.of.motion(q)
-        U, s, Vt = np.linalg.svd(motion.jacobian()[:, self.rows], full_matrices=False)
+        U, s, Vt = np.linalg.svd(self.of.jacobians(q)[2][:, self.rows], full_matrices=False)
         # dw = sum_k (product of the other singular values) u_k' dJ v_k, which holds where some of them vanish, too.
         others = np.stack([np.delete(s, k, axis=1).prod(axis=1) for k in range(s.shape[1])], axis=1)
         weights = (U * others[:, None, :]) @ Vt
-        slope = np.einsum("Nirb,Nrb->Ni", motion.jacobian_in_q()[:, :, self.rows], weights)
+        slope = np.einsum("Nirb,Nrb->Ni", self.of.motion(q).jacobian_in_q()[:, :, self.rows], weights)
         lack = self.least - s.prod(axis=1)
         return np.maximum(0.0, lack)[:, None], np.where(lack > 0.0, -1.0, 0.0)[:, None, None] * slope[:, None, :]
 

@@ -60,7 +60,8 @@ class Integrator(ABC):
 
     Whoever adds one provides
 
-    1. ``start``, which makes the state of a rollout at (q0, v0) and returns it with the first node;
+    1. ``start``, which makes the state of a rollout at (q0, v0) and returns it with the first node, and ``fork``, which
+       copies it;
     2. ``rollout_compiled`` and ``step_in_python``, which move a state on: many steps of many paths in a kernel, and one
        step of one path with noise that only Python can evaluate;
     3. ``predict``, the state to expect half a step ahead, to second order, at which feedback is evaluated;
@@ -95,6 +96,10 @@ class Integrator(ABC):
         Raises:
             SingularMassMatrix: M(q0) is not positive definite.
         """
+
+    @abstractmethod
+    def fork(self, state: Any) -> Any:
+        """A copy of a state, which moves on by itself; work arrays are shared."""
 
     def rollout(self, scene: Scene, state: Any, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
         """The steps of length ``dt`` [s] that the commands are for; ``state`` moves along.

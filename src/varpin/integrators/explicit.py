@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -67,6 +67,10 @@ class _Explicit(Integrator):
         if not kernels.first_nodes(scene.mechanism, run.state, run.dynamics, nodes):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         return run, segments_of(nodes, REASONS)
+
+    def fork(self, state: ExplicitRun) -> ExplicitRun:
+        """See :meth:`Integrator.fork`."""
+        return replace(state, state=kernels.ExplicitState._make(array.copy() for array in state.state))
 
     def step_in_python(
         self, scene: Scene, state: ExplicitRun, command: Commands, increment: Floats, dt: float

@@ -101,6 +101,10 @@ class Reference(Integrator):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         return run, segments_of(nodes, REASONS)
 
+    def fork(self, state: ReferenceRun) -> ReferenceRun:
+        """See :meth:`Integrator.fork`."""
+        return replace(state, x=state.x.copy(), last=state.last.copy())
+
     def step_in_python(
         self,
         scene: Scene,  # noqa: ARG002

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -102,6 +102,10 @@ class Variational(Integrator):
         nodes.energy[:, 0] = run.state.energy[:, :, :2].sum(axis=(1, 2))
         nodes.done[:] = 1
         return run, segments_of(nodes, REASONS)
+
+    def fork(self, state: VariationalRun) -> VariationalRun:
+        """See :meth:`Integrator.fork`."""
+        return replace(state, state=equation.State._make(array.copy() for array in state.state))
 
     def step_in_python(
         self, scene: Scene, state: VariationalRun, command: Commands, increment: Floats, dt: float

@@ -112,26 +112,34 @@ def new_room(dof: int, controls: int) -> Room:
 
 
 @inlined
+def add_two_rows(a: float, b: float, x: Floats, y: Floats, size: int, out: Floats) -> None:
+    """Add a x + b y to a row, which the processor loads and stores once for both; zeros cost nothing."""
+    if a == 0.0 and b == 0.0:
+        return
+    for c in range(size):
+        out[c] += a * x[c] + b * y[c]
+
+
+@inlined
 def add_congruence(J: Floats, W: Floats, rows: int, scale: float, T: Floats, Q: Floats) -> None:
     """Q += scale J' W J for the leading ``rows`` rows of J and of W.
 
-    Whole rows at a time, which the processor takes several entries of at once; zeros of W and J cost nothing.
+    Whole rows at a time, which the processor takes several entries of at once.
     """
     size = Q.shape[0]
     for i in range(rows):
         for c in range(size):
             T[i, c] = 0.0
-        for j in range(rows):
-            weight = scale * W[i, j]
-            if weight != 0.0:
-                for c in range(size):
-                    T[i, c] += weight * J[j, c]
-    for i in range(rows):
+        for j in range(0, rows - 1, 2):
+            add_two_rows(scale * W[i, j], scale * W[i, j + 1], J[j], J[j + 1], size, T[i])
+        if rows % 2 == 1:
+            add_two_rows(scale * W[i, rows - 1], 0.0, J[rows - 1], J[rows - 1], size, T[i])
+    for i in range(0, rows - 1, 2):
         for r in range(size):
-            factor = J[i, r]
-            if factor != 0.0:
-                for c in range(size):
-                    Q[r, c] += factor * T[i, c]
+            add_two_rows(J[i, r], J[i + 1, r], T[i], T[i + 1], size, Q[r])
+    if rows % 2 == 1:
+        for r in range(size):
+            add_two_rows(J[rows - 1, r], 0.0, T[rows - 1], T[rows - 1], size, Q[r])
 
 
 @inlined

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.errors import InputError
-from varpin.kernels.kinematics import Bodies, place
+from varpin.kernels.kinematics import Bodies, place, place_frame, rotation_logarithms
 from varpin.kernels.tree import Tree
 from varpin.robot.model import Robot
 from varpin.robot.tree import frame_on_body
@@ -67,27 +67,17 @@ def links(tree: Tree, body: int | None = None) -> Links:
 
 @dataclass(frozen=True, eq=False)
 class FrameMotion:
-    """A frame at N configurations, and how the c joints before it move it, from the root on.
+    """How the c joints before a frame move it at N configurations, from the root on.
 
     Attributes:
-        rotation: World orientation (N, 3, 3).
-        position: In the world (N, 3) [m].
         angular: Angular velocity that each joint gives it (N, c, 3), in world axes, per unit of the joint's rate.
         linear: Velocity of its origin likewise (N, c, 3).
         gear: From coordinates to joints (c, n).
     """
 
-    rotation: Floats
-    position: Floats
     angular: Floats
     linear: Floats
     gear: Floats
-
-    def jacobian(self) -> Floats:
-        """(N, 6, n): linear over angular velocity in world axes, in v."""
-        both = np.concatenate([self.linear, self.angular], axis=2)
-        total: Floats = np.swapaxes(both, 1, 2) @ self.gear
-        return total
 
     def twist_in_q(self, v: Floats) -> Floats:
         """Derivative (N, 6, n) in q of linear and angular velocity at velocities v (N, n).
@@ -136,18 +126,26 @@ class FrameKinematics:
 
     def placements(self, q: Floats) -> tuple[Floats, Floats]:
         """World rotations (N, 3, 3) and positions (N, 3) [m] at q (N, n)."""
-        return self._on_body(*self.links.place(q))
+        return self._placed(q, 0)[:2]
 
-    def _on_body(self, rotation: Floats, position: Floats) -> tuple[Floats, Floats]:
-        R, p = rotation[:, -1], position[:, -1]
-        return R @ self.rotation, p + R @ self.translation
+    def jacobians(self, q: Floats) -> tuple[Floats, Floats, Floats]:
+        """:meth:`placements`, and the frame's Jacobian (N, 6, n): linear over angular velocity in world axes, in v."""
+        return self._placed(q, len(q))
+
+    def _placed(self, q: Floats, wanted: int) -> tuple[Floats, Floats, Floats]:
+        N, count = len(q), len(self.links.gear)
+        q = np.array(q, order="C")
+        R, p, J = np.empty((N, 3, 3)), np.empty((N, 3)), np.empty((wanted, 6, q.shape[1]))
+        room = np.empty((N, count, 3, 3)), np.empty((N, count, 3))
+        place_frame(self.links.bodies, self.rotation, self.translation, q, *room, R, p, J)
+        return R, p, J
 
     def motion(self, q: Floats) -> FrameMotion:
-        """The frame at q (N, n) with its derivatives."""
+        """How each joint moves the frame at q (N, n)."""
         rotation, position = self.links.place(q)
-        R, p = self._on_body(rotation, position)
+        p = position[:, -1] + rotation[:, -1] @ self.translation
         angular, linear = self.links.motions(rotation, p[:, None] - position)
-        return FrameMotion(R, p, angular, linear, self.links.gear)
+        return FrameMotion(angular, linear, self.links.gear)
 
 
 def frame_kinematics(robot: Robot, frame: str) -> FrameKinematics:
@@ -213,6 +211,17 @@ def center_of_mass(robot: Robot) -> CenterOfMass:
         if tree.parent[body] >= 0:
             after[tree.parent[body]] += after[body]
     return CenterOfMass(links(tree), tree.center, tree.mass / tree.mass.sum(), after)
+
+
+def rotation_errors(target: Floats, R: Floats, *, derivative: bool = False) -> tuple[Floats, Floats]:
+    """Rotation vectors (..., 3) [rad] from targets (T, 3, 3) to rotations (..., T, 3, 3), in the latter's own axes.
+
+    With them, if asked for, their derivatives (N, 3, 3) in a turn of R (N, 3, 3) about its own axes; else (0, 3, 3).
+    """
+    rows = np.ascontiguousarray(R).reshape(-1, 3, 3)
+    r, D = np.empty((len(rows), 3)), np.empty((len(rows) if derivative else 0, 3, 3))
+    rotation_logarithms(np.ascontiguousarray(target), rows, np.empty((3, 3)), np.empty(4), r, D)
+    return r.reshape(*R.shape[:-2], 3), D
 
 
 def cross(a: Floats, b: Floats) -> Floats:

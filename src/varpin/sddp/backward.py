@@ -54,6 +54,8 @@ class Plan:
 
     def free_gradient(self, problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
         """The gradient (R, m) without what pushes controls against limits they are at: zero at an optimum."""
+        if not problem.limited:
+            return self.gradient
         u, (lower, upper) = trajectory.u[:: problem.hold], problem.control_limits
         held = ((u <= lower) & (self.gradient > 0.0)) | ((u >= upper) & (self.gradient < 0.0))
         return np.where(held, 0.0, self.gradient)

@@ -22,7 +22,7 @@ from varpin.sddp.backward import Plan, backward, noise_cost
 from varpin.sddp.history import Iteration, SearchState, Status
 from varpin.sddp.problem import OptimalControlProblem
 from varpin.sddp.solution import Solution
-from varpin.simulation import StepFailure, rollout
+from varpin.simulation import Motions, StepFailure
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -233,6 +233,7 @@ class _Search:
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
         self.planned: tuple[Trajectory, float, bool] | None = None  # what it is a plan for, and how it was made
+        self.motions = Motions(problem.scene, problem.integrator, problem.q0, problem.v0, problem.dt)
         self.trajectory: Trajectory
         self.cost = self.first = np.inf
         self.reached = np.inf  # the expected cost of the last step taken, by the plan it was taken with
@@ -242,9 +243,7 @@ class _Search:
         self.reason = ""
 
     def begin(self, commands: Commands) -> None:
-        trajectory, failure = rollout(
-            self.problem.scene, self.problem.integrator, self.problem.q0, self.problem.v0, commands, self.problem.dt
-        )
+        trajectory, failure = self.motions.under(commands)
         if failure is not None:
             raise StepFailure(trajectory.steps, trajectory.t[-1], failure, trajectory)
         self.trajectory = trajectory
@@ -418,7 +417,9 @@ class _Search:
         if self.plan is None:
             return None
         problem, here = self.problem, self.trajectory
-        u = _onto_limits(here.u[:: problem.hold] + step * self.plan.feedforward, problem.control_limits)
+        u = here.u[:: problem.hold] + step * self.plan.feedforward
+        if problem.limited:
+            u = _onto_limits(u, problem.control_limits)
         if self.forward == "open":
             commands = _held(u, problem)
         else:
@@ -430,7 +431,7 @@ class _Search:
                 reference = np.hstack([reference, np.vstack([here.u[:1], before])])
             commands = _held(u, problem)._replace(gains=gains, reference=reference)
         try:
-            moved, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, problem.dt)
+            moved, failure = self.motions.under(commands)
         except NoiseFieldError as error:
             logger.info("trial of length %g: %s", step, error)
             return None
