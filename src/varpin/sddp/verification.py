@@ -58,13 +58,16 @@ class Verification:
         """The same with feedback."""
         return excess(self.closed_loop_cost, self.planned_cost)
 
-    def _repr_html_(self) -> str:
-        rows = [
+    @property
+    def _rows(self) -> list[tuple[str, float, str, str]]:
+        return [
             ("planned", self.planned_cost, "", ""),
             ("controls alone", self.open_loop_cost, percent(self.open_loop_loss), f"{self.open_loop_gap:.2e}"),
             ("with feedback", self.closed_loop_cost, percent(self.closed_loop_loss), f"{self.closed_loop_gap:.2e}"),
         ]
-        shown = [row if np.isfinite(row[1]) else (row[0], "runs away", "", "") for row in rows]
+
+    def _repr_html_(self) -> str:
+        shown = [row if np.isfinite(row[1]) else (row[0], "runs away", "", "") for row in self._rows]
         head = ("", "cost", "loss", "end off by [rad or m]")
         said = [
             ("how to read it", str(self).splitlines()[-1].removeprefix("read it so: ")),
@@ -73,13 +76,8 @@ class Verification:
         return facts("Verification on the continuous system", said, table(head, shown))
 
     def __str__(self) -> str:
-        rows = [
-            ("planned", self.planned_cost, "", ""),
-            ("controls alone", self.open_loop_cost, percent(self.open_loop_loss), f"{self.open_loop_gap:.2e}"),
-            ("with feedback", self.closed_loop_cost, percent(self.closed_loop_loss), f"{self.closed_loop_gap:.2e}"),
-        ]
         lines = [f"{'':16}{'cost':>14}{'loss':>12}  end off by [rad or m]"]
-        for name, cost, loss, gap in rows:
+        for name, cost, loss, gap in self._rows:
             shown = (f"{cost:14.6e}{loss:>12}  {gap}" if np.isfinite(cost) else f"{'runs away':>14}").rstrip()
             lines.append(f"{name:16}{shown}")
         good = f"{self.accuracy:.0e}" if np.isfinite(self.accuracy) else "nothing: no motion stays"
