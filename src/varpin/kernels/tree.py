@@ -34,6 +34,7 @@ class Tree(NamedTuple):
     armature: Floats  # (n,) [kg m^2 or kg]
     group: Integers  # (n,) which of r mechanically independent groups a coordinate belongs to, from 0
     groups: int  # r; coordinates of different groups share neither inertia nor a mimic joint
+    cuts: Integers  # (c + 1,) first coordinates of the blocks outside of which M, L_vq and L_qq vanish, and n
 
 
 class Diffusion(NamedTuple):
