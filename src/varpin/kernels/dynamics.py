@@ -29,7 +29,7 @@ from varpin.kernels.jet import (
     times_inertia,
 )
 from varpin.kernels.linalg import factor_ldl, solve_ldl
-from varpin.kernels.tree import Floats, Mechanism, Sweep, new_sweep
+from varpin.kernels.tree import Floats, Mechanism, Sweep, block, new_sweep
 
 
 class Dynamics(NamedTuple):
@@ -151,7 +151,7 @@ def node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics) -> tuple[bool,
             potential += origin_potential(mechanism, j, q, w)
     regular = True
     for b in range(tree.cuts.size - 1):
-        begin, end = tree.cuts[b], tree.cuts[b + 1]
+        begin, end = block(tree.cuts, b)
         for i in range(begin, end):
             M[i, i] += tree.armature[i]
             for j in range(begin, i + 1):
@@ -164,8 +164,9 @@ def node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics) -> tuple[bool,
 def solve_mass(mechanism: Mechanism, b: Floats, d: Dynamics, x: Floats) -> None:
     """The x with M x = b from what :func:`node` left."""
     cuts = mechanism.tree.cuts
-    for block in range(cuts.size - 1):
-        solve_ldl(d.ldl, b, x, cuts[block], cuts[block + 1])
+    for r in range(cuts.size - 1):
+        begin, end = block(cuts, r)
+        solve_ldl(d.ldl, b, x, begin, end)
 
 
 @inlined
@@ -227,7 +228,7 @@ def inverse_dynamics_derivatives(
     bodies = tree.parent.size
     S, V, W, Y, F, R = w.axis, w.velocity, w.axis_rate, w.inertia, w.dual_axis, w.dual_rate
     for b in range(tree.cuts.size - 1):
-        begin, end = tree.cuts[b], tree.cuts[b + 1]
+        begin, end = block(tree.cuts, b)
         for i in range(begin, end):
             for j in range(begin, end):
                 d.dq[i, j] = 0.0
@@ -322,7 +323,7 @@ def forward_derivatives(
         acceleration_at_node(mechanism, force[s], d, a[s])
         inverse_dynamics_derivatives(mechanism, q[s], v[s], a[s], Z, P, Q, d)
         for b in range(cuts.size - 1):
-            begin, end = cuts[b], cuts[b + 1]
+            begin, end = block(cuts, b)
             for c in range(begin, end):
                 for i in range(begin, end):
                     d.column[i] = -d.dq[i, c]

@@ -11,7 +11,7 @@ import numpy as np
 from varpin.kernels._compile import inlined, kernel
 from varpin.kernels.drive import apply_policy, constant_force, noise_impulse
 from varpin.kernels.dynamics import Dynamics, acceleration_at_node, node, solve_mass
-from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes
+from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes, block
 
 EULER = 0
 SEMI_IMPLICIT = 1
@@ -44,9 +44,10 @@ def write_node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics, nodes: N
     kinetic = 0.0
     cuts = mechanism.tree.cuts
     for b in range(cuts.size - 1):
-        for r in range(cuts[b], cuts[b + 1]):
+        begin, end = block(cuts, b)
+        for r in range(begin, end):
             momentum = 0.0
-            for c in range(cuts[b], cuts[b + 1]):
+            for c in range(begin, end):
                 momentum += d.sweep.M[r, c] * v[c]
             kinetic += 0.5 * v[r] * momentum
             nodes.q[i, s, r], nodes.v[i, s, r], nodes.p[i, s, r] = q[r], v[r], momentum

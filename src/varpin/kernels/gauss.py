@@ -25,7 +25,7 @@ from varpin.kernels.midpoint import (
 from varpin.kernels.midpoint_equation import FOLD, SOLVED, Options, State, Work
 from varpin.kernels.midpoint_jacobian import chain
 from varpin.kernels.place import add
-from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes
+from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes, block
 
 
 @inlined
@@ -38,8 +38,9 @@ def average(mechanism: Mechanism, tableau: Tableau, k: Work, g: Stages) -> None:
     """
     w, cuts = k.sweep, mechanism.tree.cuts
     for b in range(cuts.size - 1):
-        for r in range(cuts[b], cuts[b + 1]):
-            for c in range(cuts[b], cuts[b + 1]):
+        begin, end = block(cuts, b)
+        for r in range(begin, end):
+            for c in range(begin, end):
                 mass, curvature = 0.0, 0.0
                 for i in range(g.V.shape[0]):
                     mass += tableau.b[i] * g.M[i, r, c]
@@ -103,7 +104,8 @@ def predict(mechanism: Mechanism, tableau: Tableau, h: float, state: State, k: W
         k.residual[r] = k.force[r] - past[force, r]
     cuts = mechanism.tree.cuts
     for b in range(cuts.size - 1):
-        solve_ldl(k.ldl, k.residual, k.delta, cuts[b], cuts[b + 1])
+        begin, end = block(cuts, b)
+        solve_ldl(k.ldl, k.residual, k.delta, begin, end)
     for i in range(stages):
         for r in range(n):
             total = state.v[r] - past[end, r]

@@ -32,7 +32,7 @@ from varpin.kernels.midpoint_equation import (
     Work,
     new_state,
 )
-from varpin.kernels.tree import Floats, Integers, Mechanism, Sweep
+from varpin.kernels.tree import Floats, Integers, Mechanism, Sweep, block
 
 SURE = 10.0  # a residual that is expected this far below the tolerance need not be looked at
 
@@ -197,7 +197,8 @@ def factor_stages(mechanism: Mechanism, tableau: Tableau, h: float, g: Stages) -
     cuts = mechanism.tree.cuts
     sign = 1
     for b in range(cuts.size - 1):
-        sign *= factor_lu_pivoting(g.lu, g.order, n, cuts[b], cuts[b + 1])
+        begin, end = block(cuts, b)
+        sign *= factor_lu_pivoting(g.lu, g.order, n, begin, end)
     return sign > 0
 
 
@@ -224,9 +225,10 @@ def correct_slopes(mechanism: Mechanism, tableau: Tableau, h: float, g: Stages) 
             g.residual[i * n + r] = h * total
     for i in range(stages):
         for b in range(cuts.size - 1):
-            for r in range(cuts[b], cuts[b + 1]):
+            begin, end = block(cuts, b)
+            for r in range(begin, end):
                 total = -mechanism.damping[r] * g.delta[i * n + r]
-                for c in range(cuts[b], cuts[b + 1]):
+                for c in range(begin, end):
                     total += g.Lqq[i, r, c] * g.residual[i * n + c] + g.A[i, c, r] * g.delta[i * n + c]
                 g.slope[i, r] += total
 
@@ -269,7 +271,8 @@ def newton_stages(
         if fresh and not factor_stages(mechanism, tableau, h, g):
             return FOLD
         for b in range(cuts.size - 1):
-            solve_lu_pivoting(g.lu, g.order, g.residual, g.delta, n, cuts[b], cuts[b + 1])
+            begin, end = block(cuts, b)
+            solve_lu_pivoting(g.lu, g.order, g.residual, g.delta, n, begin, end)
         size = size_of(mechanism, tableau, g, g.delta)
         if iteration >= ITERATIONS or not size <= 0.25 * before:
             break

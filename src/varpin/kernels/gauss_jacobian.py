@@ -13,7 +13,7 @@ from varpin.kernels._compile import inlined
 from varpin.kernels.gauss_equation import Stages, factor_stages
 from varpin.kernels.gauss_tableau import Tableau
 from varpin.kernels.linalg import solve_lu_pivoting
-from varpin.kernels.tree import Floats, Mechanism
+from varpin.kernels.tree import Floats, Mechanism, block
 
 
 @inlined
@@ -80,7 +80,7 @@ def stages_jacobian(mechanism: Mechanism, tableau: Tableau, h: float, g: Stages,
         Jf[:] = 0.0
     factor_stages(mechanism, tableau, h, g)
     for b in range(cuts.size - 1):
-        begin, end = cuts[b], cuts[b + 1]
+        begin, end = block(cuts, b)
         for kind in range(3):  # 0: of q0, 1: of p0, 2: of f
             for c in range(begin, end):
                 stages_column(mechanism, tableau, h, kind, c, begin, end, g, Jx, Jf)

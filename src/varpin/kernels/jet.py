@@ -19,7 +19,7 @@ d/dq_i - S_i x; under that, for j below i, dS_j = 0, dV_j = W_i, dH_j = Y_j W_i,
 import math
 
 from varpin.kernels._compile import inlined, kernel
-from varpin.kernels.tree import Floats, Mechanism, Sweep, Tree
+from varpin.kernels.tree import Floats, Mechanism, Sweep, Tree, block
 
 
 @inlined
@@ -352,7 +352,7 @@ def second_order(mechanism: Mechanism, q: Floats, v: Floats, w: Sweep) -> tuple[
     potential = 0.0
     clear_first(w)
     for b in range(tree.cuts.size - 1):
-        begin, end = tree.cuts[b], tree.cuts[b + 1]
+        begin, end = block(tree.cuts, b)
         for j in range(begin, end):
             for c in range(begin, end):
                 M[j, c] = 0.0
@@ -432,7 +432,7 @@ def add_mass(tree: Tree, j: int, w: Sweep) -> None:
 def clear_mass(tree: Tree, w: Sweep) -> None:
     """Zero the blocks of M; outside of them nothing is ever written."""
     for b in range(tree.cuts.size - 1):
-        begin, end = tree.cuts[b], tree.cuts[b + 1]
+        begin, end = block(tree.cuts, b)
         for i in range(begin, end):
             for j in range(begin, end):
                 w.M[i, j] = 0.0

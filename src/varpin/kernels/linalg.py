@@ -6,7 +6,7 @@ Each takes the rows and columns from ``begin`` up to ``end``: one block of a mat
 import numpy as np
 
 from varpin.kernels._compile import inlined
-from varpin.kernels.tree import Floats, Integers
+from varpin.kernels.tree import Floats, Integers, block
 
 
 @inlined
@@ -41,6 +41,23 @@ def solve_lu(lu: Floats, b: Floats, x: Floats, begin: int, end: int) -> None:
         for j in range(i + 1, end):
             total -= lu[i, j] * x[j]
         x[i] = total / lu[i, i]
+
+
+@inlined
+def solve_lu_twice(lu: Floats, b: Floats, x: Floats, c: Floats, y: Floats, begin: int, end: int) -> None:
+    """The x with L U x = b and the y with L U y = c: neither alone fills a processor's pipeline."""
+    for i in range(begin, end):
+        first, second = b[i], c[i]
+        for j in range(begin, i):
+            first -= lu[i, j] * x[j]
+            second -= lu[i, j] * y[j]
+        x[i], y[i] = first, second
+    for i in range(end - 1, begin - 1, -1):
+        first, second = x[i], y[i]
+        for j in range(i + 1, end):
+            first -= lu[i, j] * x[j]
+            second -= lu[i, j] * y[j]
+        x[i], y[i] = first / lu[i, i], second / lu[i, i]
 
 
 @inlined
@@ -213,9 +230,10 @@ def quadratic_form(a: Floats, x: Floats, cuts: Integers) -> float:
     """X' a x, with the blocks of ``a`` between ``cuts``."""
     total = 0.0
     for b in range(cuts.size - 1):
-        for i in range(cuts[b], cuts[b + 1]):
+        begin, end = block(cuts, b)
+        for i in range(begin, end):
             row = 0.0
-            for j in range(cuts[b], cuts[b + 1]):
+            for j in range(begin, end):
                 row += a[i, j] * x[j]
             total += x[i] * row
     return total

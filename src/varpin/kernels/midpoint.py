@@ -33,7 +33,7 @@ from varpin.kernels.midpoint_equation import (
 )
 from varpin.kernels.midpoint_jacobian import add_substep
 from varpin.kernels.place import add, put, show, unwind
-from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes
+from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes, block
 
 FADE = 1.0 / 256.0  # by which a substep forgets how far kinetic energies have varied
 ENERGY_ROUNDING = 1e-12  # of the magnitudes that make up an energy
@@ -52,7 +52,7 @@ def branch_margin(mechanism: Mechanism, options: Options, h: float, k: Work) -> 
     exaggerated = h * h * a * (1.0 - a) / (1.0 - options.margin)
     least = np.inf
     for b in range(cuts.size - 1):
-        begin, end = cuts[b], cuts[b + 1]
+        begin, end = block(cuts, b)
         for i in range(begin, end):
             for j in range(begin, i + 1):
                 k.lu[i, j] = w.M[i, j] - exaggerated * w.Lqq[i, j]
@@ -77,7 +77,7 @@ def kinetic_energy(mechanism: Mechanism, p: Floats, v: Floats, k: Work) -> None:
     for i in range(p.size):
         k.balance[i, 0] = 0.0
     for b in range(cuts.size - 1):
-        begin, end = cuts[b], cuts[b + 1]
+        begin, end = block(cuts, b)
         solve_lower(k.ldl, p, v, begin, end)
         for i in range(begin, end):
             v[i], y = v[i] / k.ldl[i, i], v[i]
@@ -96,7 +96,7 @@ def node_energy(mechanism: Mechanism, q: Floats, p: Floats, v: Floats, k: Work) 
     mass_matrix(mechanism, q, k.sweep)
     cuts = mechanism.tree.cuts
     for b in range(cuts.size - 1):
-        begin, end = cuts[b], cuts[b + 1]
+        begin, end = block(cuts, b)
         for i in range(begin, end):
             for j in range(begin, i + 1):
                 k.ldl[i, j] = k.sweep.M[i, j]
@@ -396,9 +396,10 @@ def begin_paths(mechanism: Mechanism, q: Floats, v: Floats, states: State, k: Wo
         state = path(states, i)
         mass_matrix(mechanism, q[i], k.sweep)
         for b in range(cuts.size - 1):
-            for r in range(cuts[b], cuts[b + 1]):
+            begin, end = block(cuts, b)
+            for r in range(begin, end):
                 total = 0.0
-                for c in range(cuts[b], cuts[b + 1]):
+                for c in range(begin, end):
                     total += k.sweep.M[r, c] * v[i, c]
                 k.delta[r] = total
         if not begin_at(mechanism, q[i], k.delta, state, k):

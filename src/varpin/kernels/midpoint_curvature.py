@@ -15,7 +15,7 @@ from varpin.kernels.jet_tangent import Tangent, third_order
 from varpin.kernels.midpoint import begin_at, path, step
 from varpin.kernels.midpoint_equation import SINGULAR, SOLVED, Options, State, Work
 from varpin.kernels.midpoint_jacobian import root_jacobian, solve_at
-from varpin.kernels.tree import Floats, Mechanism
+from varpin.kernels.tree import Floats, Mechanism, block
 
 
 @inlined
@@ -32,7 +32,7 @@ def substep_curvature(
     cuts = mechanism.tree.cuts
     root_jacobian(mechanism, options, h, k, dv)
     for b in range(cuts.size - 1):
-        begin, end = cuts[b], cuts[b + 1]
+        begin, end = block(cuts, b)
         for i in range(begin, end):
             for c in range(begin, end):
                 dv[i, 2 * n + c] = 0.5 * h * dv[i, n + c]
@@ -49,7 +49,7 @@ def substep_curvature(
             k.delta[i] = -total
     third_order(mechanism, k.qm, k.v, k.start, k.delta, w, t)
     for b in range(cuts.size - 1):
-        begin, end = cuts[b], cuts[b + 1]
+        begin, end = block(cuts, b)
         for third in range(3):
             for c in range(third * n + begin, third * n + end):
                 for i in range(begin, end):

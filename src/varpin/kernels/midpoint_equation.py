@@ -15,7 +15,7 @@ import numpy as np
 from varpin.kernels._compile import inlined
 from varpin.kernels.jet import first_order, second_order
 from varpin.kernels.linalg import factor_lu, quadratic_form, solve_lu
-from varpin.kernels.tree import Floats, Integers, Mechanism, Sweep, new_sweep
+from varpin.kernels.tree import Floats, Integers, Mechanism, Sweep, block, new_sweep
 
 # What an attempt at a step ends in.
 SOLVED = 0
@@ -167,7 +167,7 @@ def factor_newton(mechanism: Mechanism, a: float, h: float, k: Work) -> bool:
     w = k.sweep
     cuts = mechanism.tree.cuts
     for b in range(cuts.size - 1):
-        begin, end = cuts[b], cuts[b + 1]
+        begin, end = block(cuts, b)
         for i in range(begin, end):
             for j in range(begin, end):
                 k.lu[i, j] = w.M[i, j] + h * (a * w.A[i, j] - (1.0 - a) * w.A[j, i] - h * a * (1.0 - a) * w.Lqq[i, j])
@@ -205,7 +205,8 @@ def newton(mechanism: Mechanism, options: Options, h: float, state: State, k: Wo
         if fresh and not factor_newton(mechanism, a, h, k):
             return FOLD
         for b in range(cuts.size - 1):
-            solve_lu(k.lu, k.residual, k.delta, cuts[b], cuts[b + 1])
+            begin, end = block(cuts, b)
+            solve_lu(k.lu, k.residual, k.delta, begin, end)
         size = quadratic_form(k.sweep.M, k.delta, cuts)
         if iteration == ITERATIONS or not size <= 0.25 * before:
             break

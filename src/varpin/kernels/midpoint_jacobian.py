@@ -14,10 +14,10 @@ Lagrangian, but without their 1/h, so small steps lose no digits.
 
 from varpin.kernels._compile import inlined
 from varpin.kernels.jet import second_order
-from varpin.kernels.linalg import solve_lu
+from varpin.kernels.linalg import solve_lu_twice
 from varpin.kernels.midpoint_equation import SOLVED, Options, State, Work, factor_newton, newton
 from varpin.kernels.place import put
-from varpin.kernels.tree import Floats, Mechanism
+from varpin.kernels.tree import Floats, Mechanism, block
 
 
 @inlined
@@ -59,17 +59,14 @@ def root_jacobian(mechanism: Mechanism, options: Options, h: float, k: Work, dv:
     cuts = mechanism.tree.cuts
     factor_newton(mechanism, a, h, k)
     for b in range(cuts.size - 1):
-        begin, end = cuts[b], cuts[b + 1]
+        begin, end = block(cuts, b)
         for c in range(begin, end):
             for i in range(begin, end):
                 k.residual[i] = h * (1.0 - a) * w.Lqq[i, c] - w.A[i, c]
-            solve_lu(k.lu, k.residual, k.delta, begin, end)
+                k.delta[i] = 1.0 if i == c else 0.0
+            solve_lu_twice(k.lu, k.residual, k.residual, k.delta, k.delta, begin, end)
             for i in range(begin, end):
-                dv[i, c] = k.delta[i]
-                k.residual[i] = 1.0 if i == c else 0.0
-            solve_lu(k.lu, k.residual, k.delta, begin, end)
-            for i in range(begin, end):
-                dv[i, n + c] = k.delta[i]
+                dv[i, c], dv[i, n + c] = k.residual[i], k.delta[i]
 
 
 @inlined
@@ -84,31 +81,29 @@ def substep_jacobian(mechanism: Mechanism, options: Options, h: float, k: Work, 
         Jf[:] = 0.0
     root_jacobian(mechanism, options, h, k, Jx)
     for b in range(cuts.size - 1):
-        begin, end = cuts[b], cuts[b + 1]
-        for half in range(2):
-            for c in range(half * n + begin, half * n + end):
-                for i in range(begin, end):
-                    total = 0.0
-                    for j in range(begin, end):
-                        total += (a * h * w.Lqq[i, j] + w.A[j, i]) * Jx[j, c]
-                    total -= mechanism.damping[i] * Jx[i, c]
-                    if half == 0:
-                        total += w.Lqq[i, c]
-                    total *= h
-                    if c == n + i:
-                        total += 1.0
-                    Jx[n + i, c] = total
-        for c in range(begin, end):
-            for i in range(begin, end):
+        begin, end = block(cuts, b)
+        for i in range(begin, end):
+            for c in range(begin, end):
+                of_place, of_momentum = 0.0, 0.0
+                for j in range(begin, end):
+                    slope = a * h * w.Lqq[i, j] + w.A[j, i]
+                    of_place += slope * Jx[j, c]
+                    of_momentum += slope * Jx[j, n + c]
+                of_place = (of_place - mechanism.damping[i] * Jx[i, c]) + w.Lqq[i, c]
+                of_momentum -= mechanism.damping[i] * Jx[i, n + c]
+                Jx[n + i, c], Jx[n + i, n + c] = h * of_place, h * of_momentum
+                if i == c:
+                    Jx[n + i, n + c] += 1.0
+        for i in range(begin, end):
+            for c in range(begin, end):
                 # dp1 = dp0 + W dv + h df with dv = (h/2) Vp df; W Vp is what Jx[n:, n:] holds besides the identity.
                 Jf[i, c] = 0.5 * h * h * Jx[i, n + c]
                 Jf[n + i, c] = 0.5 * h * (Jx[n + i, n + c] + (1.0 if i == c else 0.0))
-        for half in range(2):
-            for c in range(half * n + begin, half * n + end):
-                for i in range(begin, end):
-                    Jx[i, c] *= h
-                    if c == i:
-                        Jx[i, c] += 1.0
+        for i in range(begin, end):
+            for c in range(begin, end):
+                Jx[i, c] *= h
+                Jx[i, n + c] *= h
+            Jx[i, i] += 1.0
 
 
 @inlined
@@ -137,7 +132,7 @@ def chain(mechanism: Mechanism, k: Work) -> None:
     Jx, Jf, product = k.part[: 2 * n], k.part[2 * n :, :n], k.part[2 * n :, n:]
     cuts = mechanism.tree.cuts
     for b in range(cuts.size - 1):
-        begin, end = cuts[b], cuts[b + 1]
+        begin, end = block(cuts, b)
         for half in range(2):
             for top in range(2):
                 for i in range(top * n + begin, top * n + end):
