@@ -104,8 +104,8 @@ def predict(mechanism: Mechanism, tableau: Tableau, h: float, state: State, k: W
         k.residual[r] = k.force[r] - past[force, r]
     cuts = mechanism.tree.cuts
     for b in range(cuts.size - 1):
-        begin, end = block(cuts, b)
-        solve_ldl(k.ldl, k.residual, k.delta, begin, end)
+        first, beyond = block(cuts, b)
+        solve_ldl(k.ldl, k.residual, k.delta, first, beyond)
     for i in range(stages):
         for r in range(n):
             total = state.v[r] - past[end, r]
