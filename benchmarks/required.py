@@ -3,6 +3,7 @@
 python benchmarks/required.py
 """
 
+import functools
 import logging
 import sys
 import tempfile
@@ -11,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 
 import varpin as vp
 
@@ -27,6 +29,40 @@ def simulation(
     """A run of STEPS steps."""
     v0 = np.full(len(q0), speed)
     return lambda: vp.simulate(scene, q0, v0, dt=DT, steps=STEPS, controls=controls, rng=rng)
+
+
+def fingers(copies: int) -> vp.Robot:
+    """So many fingers of three joints side by side, each on its own."""
+    model = pin.Model()
+    link = pin.Inertia(0.02, np.array([0.0, 0.0, -0.02]), np.diag([3e-6, 3e-6, 1e-6]))
+    for copy in range(copies):
+        at, offset = 0, np.array([0.05 * copy, 0.0, 0.0])
+        for k in range(3):
+            at = model.addJoint(at, pin.JointModelRY(), pin.SE3(np.eye(3), offset), f"finger{copy}_{k}")
+            model.appendBodyToJoint(at, link, pin.SE3.Identity())
+            offset = np.array([0.0, 0.0, -0.04])
+    return vp.load_robot(model)
+
+
+def side_by_side() -> None:
+    """Simulation and linearization of many fingers in one model, in multiples of as many times one."""
+    runs: dict[tuple[str, int], Callable[[], object]] = {}
+    for copies in (1, 2, 4, 8, 16):
+        scene, q0 = vp.Scene(fingers(copies)), np.tile([0.5, 0.3, 0.2], copies)
+        for integrator in (vp.Midpoint(), vp.Gauss(2)):
+            options = {"dt": DT, "steps": STEPS // 4, "integrator": integrator}
+            run = functools.partial(vp.simulate, scene, q0, np.zeros(len(q0)), check=False, **options)
+            linearize = functools.partial(vp.linearize, scene, run(), integrator=integrator)
+            runs |= {(f"{integrator} step", copies): run, (f"{integrator} linearization", copies): linearize}
+    least = dict.fromkeys(runs, np.inf)
+    for _ in range(ROUNDS):
+        for key, run in runs.items():
+            begin = time.process_time()
+            run()
+            least[key] = min(least[key], time.process_time() - begin)
+    print("fingers of three joints in one model, against as many times one")
+    for what, copies in runs:
+        print(f"    {what}, {copies:2} fingers {least[what, copies] / (copies * least[what, 1]):6.3f}")
 
 
 def compare(title: str, runs: dict[str, Callable[[], object]]) -> None:
@@ -105,6 +141,7 @@ def main() -> None:
                 "solve: all together": lambda: vp.solve(four.problem),
             },
         )
+    side_by_side()
 
 
 if __name__ == "__main__":

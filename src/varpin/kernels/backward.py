@@ -368,12 +368,12 @@ def decide(regularization: float, r: int, steps: Steps, value: Value, gains: Gai
         for i in range(m):
             for j in range(m):
                 room.H[i, j] = Quu[i, j]
-    if not factor_ldl(Quu):
+    if not factor_ldl(Quu, 0, m):
         return False
     for i in range(m):
         row[i] = -Qz[x + i]
         gains.control_gradient[r, i] = room.costate[x + i]
-    solve_ldl(Quu, row[:m], solved[:m])
+    solve_ldl(Quu, row[:m], solved[:m], 0, m)
     if limited and not solve_box(room.H, Qz[x:], slack[r], solved[:m], Quu, room.box):
         return False
     for i in range(m):

@@ -39,9 +39,9 @@ def solve_box(H: Floats, g: Floats, box: Floats, x: Floats, F: Floats, work: Flo
             if held[i] != 0.0:
                 F[i, i] = 1.0
                 downhill[i] = 0.0
-        if not factor_ldl(F):
+        if not factor_ldl(F, 0, m):
             return False
-        solve_ldl(F, downhill, step)
+        solve_ldl(F, downhill, step, 0, m)
         # As far as the free entries go before the first of them meets a side.
         length, first = 1.0, -1
         for i in range(m):

@@ -20,6 +20,7 @@ from varpin.kernels._compile import inlined, kernel
 from varpin.kernels.jet import (
     add_mass,
     body_inertia,
+    clear_mass,
     dot6,
     move_body,
     origin_potential,
@@ -28,7 +29,7 @@ from varpin.kernels.jet import (
     times_inertia,
 )
 from varpin.kernels.linalg import factor_ldl, solve_ldl
-from varpin.kernels.tree import Floats, Mechanism, Sweep, new_sweep
+from varpin.kernels.tree import Floats, Mechanism, Sweep, block, new_sweep
 
 
 class Dynamics(NamedTuple):
@@ -131,8 +132,7 @@ def node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics) -> tuple[bool,
         deflection = q[i] - mechanism.rest[i]
         potential += 0.5 * mechanism.stiffness[i] * deflection * deflection
         d.bias[i] = mechanism.damping[i] * v[i] + mechanism.stiffness[i] * deflection
-        for j in range(n):
-            M[i, j] = 0.0
+    clear_mass(tree, w)
     for j in range(bodies):
         place_body(tree, j, q, w)
         move_body(tree, j, v, w)
@@ -149,19 +149,32 @@ def node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics) -> tuple[bool,
                 d.force[k, i] += d.force[j, i]
         if tree.origin[j]:
             potential += origin_potential(mechanism, j, q, w)
-    for i in range(n):
-        M[i, i] += tree.armature[i]
-        for j in range(i + 1):
-            d.ldl[i, j] = M[i, j]
-    return factor_ldl(d.ldl), potential
+    regular = True
+    for b in range(tree.cuts.size - 1):
+        begin, end = block(tree.cuts, b)
+        for i in range(begin, end):
+            M[i, i] += tree.armature[i]
+            for j in range(begin, i + 1):
+                d.ldl[i, j] = M[i, j]
+        regular = factor_ldl(d.ldl, begin, end) and regular
+    return regular, potential
 
 
 @inlined
-def acceleration_at_node(force: Floats, d: Dynamics, a: Floats) -> None:
+def solve_mass(mechanism: Mechanism, b: Floats, d: Dynamics, x: Floats) -> None:
+    """The x with M x = b from what :func:`node` left."""
+    cuts = mechanism.tree.cuts
+    for r in range(cuts.size - 1):
+        begin, end = block(cuts, r)
+        solve_ldl(d.ldl, b, x, begin, end)
+
+
+@inlined
+def acceleration_at_node(mechanism: Mechanism, force: Floats, d: Dynamics, a: Floats) -> None:
     """Acceleration a = M^-1 (force - bias) from what :func:`node` left."""
     for i in range(force.size):
         d.column[i] = force[i] - d.bias[i]
-    solve_ldl(d.ldl, d.column, a)
+    solve_mass(mechanism, d.column, d, a)
 
 
 @inlined
@@ -214,13 +227,14 @@ def inverse_dynamics_derivatives(
     tree, w = mechanism.tree, d.sweep
     bodies = tree.parent.size
     S, V, W, Y, F, R = w.axis, w.velocity, w.axis_rate, w.inertia, w.dual_axis, w.dual_rate
-    n = q.size
-    for i in range(n):
-        for j in range(n):
-            d.dq[i, j] = 0.0
-            d.dv[i, j] = 0.0
-        d.dq[i, i] = mechanism.stiffness[i]
-        d.dv[i, i] = mechanism.damping[i]
+    for b in range(tree.cuts.size - 1):
+        begin, end = block(tree.cuts, b)
+        for i in range(begin, end):
+            for j in range(begin, end):
+                d.dq[i, j] = 0.0
+                d.dv[i, j] = 0.0
+            d.dq[i, i] = mechanism.stiffness[i]
+            d.dv[i, i] = mechanism.damping[i]
     for j in range(bodies):
         place_body(tree, j, q, w)
         move_body(tree, j, v, w)
@@ -298,27 +312,32 @@ def forward_derivatives(
     af: Floats,
 ) -> bool:
     """Acceleration a (N, n) at each row of q, v and force, and its derivatives (N, n, n); False where M is singular."""
-    n = q.shape[1]
+    cuts = mechanism.tree.cuts
+    aq[:] = 0.0
+    av[:] = 0.0
+    af[:] = 0.0
     for s in range(q.shape[0]):
         regular, _ = node(mechanism, q[s], v[s], d)
         if not regular:
             return False
-        acceleration_at_node(force[s], d, a[s])
+        acceleration_at_node(mechanism, force[s], d, a[s])
         inverse_dynamics_derivatives(mechanism, q[s], v[s], a[s], Z, P, Q, d)
-        for c in range(n):
-            for i in range(n):
-                d.column[i] = -d.dq[i, c]
-            solve_ldl(d.ldl, d.column, d.solution)
-            for i in range(n):
-                aq[s, i, c] = d.solution[i]
-                d.column[i] = -d.dv[i, c]
-            solve_ldl(d.ldl, d.column, d.solution)
-            for i in range(n):
-                av[s, i, c] = d.solution[i]
-                d.column[i] = 1.0 if i == c else 0.0
-            solve_ldl(d.ldl, d.column, d.solution)
-            for i in range(n):
-                af[s, i, c] = d.solution[i]
+        for b in range(cuts.size - 1):
+            begin, end = block(cuts, b)
+            for c in range(begin, end):
+                for i in range(begin, end):
+                    d.column[i] = -d.dq[i, c]
+                solve_ldl(d.ldl, d.column, d.solution, begin, end)
+                for i in range(begin, end):
+                    aq[s, i, c] = d.solution[i]
+                    d.column[i] = -d.dv[i, c]
+                solve_ldl(d.ldl, d.column, d.solution, begin, end)
+                for i in range(begin, end):
+                    av[s, i, c] = d.solution[i]
+                    d.column[i] = 1.0 if i == c else 0.0
+                solve_ldl(d.ldl, d.column, d.solution, begin, end)
+                for i in range(begin, end):
+                    af[s, i, c] = d.solution[i]
     return True
 
 
@@ -328,7 +347,7 @@ def forward_dynamics(mechanism: Mechanism, x: Floats, force: Floats, d: Dynamics
     n = force.size
     q, v = x[:n], x[n:]
     regular, _ = node(mechanism, q, v, d)
-    acceleration_at_node(force, d, rate[n:])
+    acceleration_at_node(mechanism, force, d, rate[n:])
     for i in range(n):
         rate[i] = v[i]
     return regular

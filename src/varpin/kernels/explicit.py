@@ -10,9 +10,8 @@ import numpy as np
 
 from varpin.kernels._compile import inlined, kernel
 from varpin.kernels.drive import apply_policy, constant_force, noise_impulse
-from varpin.kernels.dynamics import Dynamics, acceleration_at_node, node
-from varpin.kernels.linalg import solve_ldl
-from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes
+from varpin.kernels.dynamics import Dynamics, acceleration_at_node, node, solve_mass
+from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes, block
 
 EULER = 0
 SEMI_IMPLICIT = 1
@@ -43,12 +42,15 @@ def write_node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics, nodes: N
     """Enter (q, v) as node ``s`` of path ``i``; leaves its mass matrix and bias in ``d``."""
     regular, potential = node(mechanism, q, v, d)
     kinetic = 0.0
-    for r in range(q.size):
-        momentum = 0.0
-        for c in range(q.size):
-            momentum += d.sweep.M[r, c] * v[c]
-        kinetic += 0.5 * v[r] * momentum
-        nodes.q[i, s, r], nodes.v[i, s, r], nodes.p[i, s, r] = q[r], v[r], momentum
+    cuts = mechanism.tree.cuts
+    for b in range(cuts.size - 1):
+        begin, end = block(cuts, b)
+        for r in range(begin, end):
+            momentum = 0.0
+            for c in range(begin, end):
+                momentum += d.sweep.M[r, c] * v[c]
+            kinetic += 0.5 * v[r] * momentum
+            nodes.q[i, s, r], nodes.v[i, s, r], nodes.p[i, s, r] = q[r], v[r], momentum
     nodes.energy[i, s] = kinetic + potential
     if not abs(nodes.energy[i, s]) < np.inf:
         return NOT_FINITE
@@ -68,7 +70,7 @@ def runge_kutta(mechanism: Mechanism, h: float, q: Floats, v: Floats, force: Flo
             regular, _ = node(mechanism, at_q, at_v, d)
             if not regular:
                 return False
-        acceleration_at_node(force, d, a)
+        acceleration_at_node(mechanism, force, d, a)
         weight = h / 3.0 if stage in (1, 2) else h / 6.0
         ahead = h if stage == 2 else 0.5 * h
         for i in range(n):
@@ -116,7 +118,7 @@ def rollout(
                 jump[r] = 0.0
             if noisy:
                 noise_impulse(mechanism, 1.0, q, states.center[i], nodes.u[i, s], increments[i, s], a)
-                solve_ldl(d.ldl, a, jump)
+                solve_mass(mechanism, a, d, jump)
             if scheme != EULER and noisy:
                 for r in range(n):
                     v[r] += jump[r]
@@ -124,7 +126,7 @@ def rollout(
             if scheme == RUNGE_KUTTA:
                 regular = runge_kutta(mechanism, h, q, v, force, d, room)
             else:
-                acceleration_at_node(force, d, a)
+                acceleration_at_node(mechanism, force, d, a)
                 for r in range(n):
                     before = v[r]
                     v[r] += h * a[r]

@@ -25,26 +25,27 @@ from varpin.kernels.midpoint import (
 from varpin.kernels.midpoint_equation import FOLD, SOLVED, Options, State, Work
 from varpin.kernels.midpoint_jacobian import chain
 from varpin.kernels.place import add
-from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes
+from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes, block
 
 
 @inlined
-def average(tableau: Tableau, k: Work, g: Stages) -> None:
+def average(mechanism: Mechanism, tableau: Tableau, k: Work, g: Stages) -> None:
     """Put into the sweep what the branch guard of the midpoint rule is to see of the stages.
 
     Were M and L_qq the same at all stages, N would be M - h^2 a^2 L_qq apart from gyroscopic and damping forces. Where
     L_qq pulls the state back it never becomes singular (the method is A-stable); where it pushes it away the symmetric
     part, weighted with b, is at least M - h^2 x L_qq, with x from the numerical range of a^2: 1/4 for one stage.
     """
-    stages, n = g.V.shape
-    w = k.sweep
-    for r in range(n):
-        for c in range(n):
-            mass, curvature = 0.0, 0.0
-            for i in range(stages):
-                mass += tableau.b[i] * g.M[i, r, c]
-                curvature += tableau.b[i] * g.Lqq[i, r, c]
-            w.M[r, c], w.Lqq[r, c] = mass, 4.0 * tableau.reach * curvature
+    w, cuts = k.sweep, mechanism.tree.cuts
+    for b in range(cuts.size - 1):
+        begin, end = block(cuts, b)
+        for r in range(begin, end):
+            for c in range(begin, end):
+                mass, curvature = 0.0, 0.0
+                for i in range(g.V.shape[0]):
+                    mass += tableau.b[i] * g.M[i, r, c]
+                    curvature += tableau.b[i] * g.Lqq[i, r, c]
+                w.M[r, c], w.Lqq[r, c] = mass, 4.0 * tableau.reach * curvature
 
 
 @inlined
@@ -55,7 +56,7 @@ def attempt(
     outcome = newton_stages(mechanism, tableau, options, h, state, k, g)
     if outcome != SOLVED:
         return outcome
-    average(tableau, k, g)
+    average(mechanism, tableau, k, g)
     margin = branch_margin(mechanism, options, h, k)
     if not margin > 0.0:
         return FOLD
@@ -83,13 +84,13 @@ def attempt(
         return outcome
     if k.Jx.shape[0] > 0:
         stages_jacobian(mechanism, tableau, h, g, k.part[: 2 * n], k.part[2 * n :, :n])
-        chain(k)
+        chain(mechanism, k)
     advance(mechanism, margin, state, k)
     return SOLVED
 
 
 @inlined
-def predict(tableau: Tableau, h: float, state: State, k: Work, g: Stages) -> None:
+def predict(mechanism: Mechanism, tableau: Tableau, h: float, state: State, k: Work, g: Stages) -> None:
     """Extrapolate the last whole step into ``g.V``.
 
     The polynomial through its stage velocities and the velocity at its end goes on, moved by what a kick has since done
@@ -101,7 +102,10 @@ def predict(tableau: Tableau, h: float, state: State, k: Work, g: Stages) -> Non
     smooth = state.counters[0] > 1 and state.center.shape[1] == 0
     for r in range(n):
         k.residual[r] = k.force[r] - past[force, r]
-    solve_ldl(k.ldl, k.residual, k.delta)
+    cuts = mechanism.tree.cuts
+    for b in range(cuts.size - 1):
+        first, beyond = block(cuts, b)
+        solve_ldl(k.ldl, k.residual, k.delta, first, beyond)
     for i in range(stages):
         for r in range(n):
             total = state.v[r] - past[end, r]
@@ -143,7 +147,7 @@ def step(mechanism: Mechanism, tableau: Tableau, options: Options, h: float, sta
     place = 0  # in units of h / 2^level
     while place < 1 << level:
         if extrapolate:
-            predict(tableau, h, state, k, g)
+            predict(mechanism, tableau, h, state, k, g)
         else:
             for i in range(stages):
                 for r in range(n):

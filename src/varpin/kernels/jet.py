@@ -19,7 +19,7 @@ d/dq_i - S_i x; under that, for j below i, dS_j = 0, dV_j = W_i, dH_j = Y_j W_i,
 import math
 
 from varpin.kernels._compile import inlined, kernel
-from varpin.kernels.tree import Floats, Mechanism, Sweep, Tree
+from varpin.kernels.tree import Floats, Mechanism, Sweep, Tree, block
 
 
 @inlined
@@ -351,11 +351,13 @@ def second_order(mechanism: Mechanism, q: Floats, v: Floats, w: Sweep) -> tuple[
     gx, gy, gz = g[0], g[1], g[2]
     potential = 0.0
     clear_first(w)
-    for j in range(q.size):
-        for c in range(q.size):
-            M[j, c] = 0.0
-            A[j, c] = 0.0
-            Lqq[j, c] = 0.0
+    for b in range(tree.cuts.size - 1):
+        begin, end = block(tree.cuts, b)
+        for j in range(begin, end):
+            for c in range(begin, end):
+                M[j, c] = 0.0
+                A[j, c] = 0.0
+                Lqq[j, c] = 0.0
     for j in range(bodies):
         place_body(tree, j, q, w)
         move_body(tree, j, v, w)
@@ -427,6 +429,16 @@ def add_mass(tree: Tree, j: int, w: Sweep) -> None:
 
 
 @inlined
+def clear_mass(tree: Tree, w: Sweep) -> None:
+    """Zero the blocks of M; outside of them nothing is ever written."""
+    for b in range(tree.cuts.size - 1):
+        begin, end = block(tree.cuts, b)
+        for i in range(begin, end):
+            for j in range(begin, end):
+                w.M[i, j] = 0.0
+
+
+@inlined
 def mass_matrix(mechanism: Mechanism, q: Floats, w: Sweep) -> float:
     """M at q, left in ``w.M``; returns the potential energy [J]."""
     tree = mechanism.tree
@@ -436,8 +448,7 @@ def mass_matrix(mechanism: Mechanism, q: Floats, w: Sweep) -> float:
     for j in range(q.size):
         w.V[j] = 0.0
         w.V_scale[j] = 0.0
-        for c in range(q.size):
-            M[j, c] = 0.0
+    clear_mass(tree, w)
     for j in range(bodies):
         place_body(tree, j, q, w)
         body_inertia(tree, j, w)

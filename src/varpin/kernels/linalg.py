@@ -1,132 +1,175 @@
-"""Small dense factorisations, written out: at the size of an arm a LAPACK call costs more than its work."""
+"""Small dense factorisations, written out: at the size of an arm a LAPACK call costs more than its work.
+
+Each takes the rows and columns from ``begin`` up to ``end``: one block of a matrix that vanishes outside its blocks.
+"""
 
 import numpy as np
 
 from varpin.kernels._compile import inlined
-from varpin.kernels.tree import Floats, Integers
+from varpin.kernels.tree import Floats, Integers, block
 
 
 @inlined
-def factor_lu(a: Floats) -> bool:
-    """LU of ``a`` (n, n) in place, without pivoting; False at a pivot that is not positive.
+def factor_lu(a: Floats, begin: int, end: int) -> bool:
+    """LU of a block of ``a`` (n, n) in place, without pivoting; False at a pivot that is not positive.
 
     For a matrix whose symmetric part is positive definite every pivot is positive and none grows without bound.
     """
-    n = a.shape[0]
-    for k in range(n):
+    for k in range(begin, end):
         pivot = a[k, k]
         if not pivot > 0.0:
             return False
         inverse = 1.0 / pivot
-        for i in range(k + 1, n):
+        for i in range(k + 1, end):
             factor = a[i, k] * inverse
             a[i, k] = factor
-            for j in range(k + 1, n):
+            for j in range(k + 1, end):
                 a[i, j] -= factor * a[k, j]
     return True
 
 
 @inlined
-def solve_lu(lu: Floats, b: Floats, x: Floats) -> None:
+def solve_lu(lu: Floats, b: Floats, x: Floats, begin: int, end: int) -> None:
     """The x with L U x = b."""
-    n = lu.shape[0]
-    for i in range(n):
+    for i in range(begin, end):
         total = b[i]
-        for j in range(i):
+        for j in range(begin, i):
             total -= lu[i, j] * x[j]
         x[i] = total
-    for i in range(n - 1, -1, -1):
+    for i in range(end - 1, begin - 1, -1):
         total = x[i]
-        for j in range(i + 1, n):
+        for j in range(i + 1, end):
             total -= lu[i, j] * x[j]
         x[i] = total / lu[i, i]
 
 
 @inlined
-def factor_lu_pivoting(a: Floats, order: Integers) -> int:
-    """LU of the rows ``order`` of ``a`` (n, n) in place; the sign of the determinant, 0 where it is not finite."""
-    n = a.shape[0]
+def solve_lu_twice(lu: Floats, b: Floats, x: Floats, c: Floats, y: Floats, begin: int, end: int) -> None:
+    """The x with L U x = b and the y with L U y = c: neither alone fills a processor's pipeline."""
+    for i in range(begin, end):
+        first, second = b[i], c[i]
+        for j in range(begin, i):
+            first -= lu[i, j] * x[j]
+            second -= lu[i, j] * y[j]
+        x[i], y[i] = first, second
+    for i in range(end - 1, begin - 1, -1):
+        first, second = x[i], y[i]
+        for j in range(i + 1, end):
+            first -= lu[i, j] * x[j]
+            second -= lu[i, j] * y[j]
+        x[i], y[i] = first / lu[i, i], second / lu[i, i]
+
+
+@inlined
+def factor_lu_pivoting(a: Floats, order: Integers, repeat: int, begin: int, end: int) -> int:
+    """LU of the rows ``order`` of a block of ``a`` (n, n) in place; its determinant's sign, 0 where it is not finite.
+
+    The block's rows and columns are those from ``begin`` up to ``end`` of every ``repeat``.
+    """
+    width, repeats = end - begin, a.shape[0] // repeat
+    if width == repeat:
+        width, repeats = a.shape[0], 1
     sign = 1
-    for i in range(n):
-        order[i] = i
-    for k in range(n):
-        best = k
-        for i in range(k + 1, n):
-            if abs(a[i, k]) > abs(a[best, k]):
-                best = i
-        if best != k:
-            sign = -sign
-            order[k], order[best] = order[best], order[k]
-            for j in range(n):
-                a[k, j], a[best, j] = a[best, j], a[k, j]
-        pivot = a[k, k]
-        if not abs(pivot) > 0.0 or not abs(pivot) < np.inf:
-            return 0
-        if pivot < 0.0:
-            sign = -sign
-        inverse = 1.0 / pivot
-        # Slices, unlike indices from k + 1 on, let the compiler use vector instructions.
-        top = a[k, k + 1 :]
-        for i in range(k + 1, n):
-            factor = a[i, k] * inverse
-            a[i, k] = factor
-            row = a[i, k + 1 :]
-            for j in range(row.size):
-                row[j] -= factor * top[j]
+    for r in range(repeats):
+        for i in range(begin + r * repeat, begin + r * repeat + width):
+            order[i] = i
+    for s in range(repeats):
+        for k in range(begin + s * repeat, begin + s * repeat + width):
+            best = k
+            for r in range(s, repeats):
+                first = begin + r * repeat
+                for i in range(max(first, k + 1), first + width):
+                    if abs(a[i, k]) > abs(a[best, k]):
+                        best = i
+            if best != k:
+                sign = -sign
+                order[k], order[best] = order[best], order[k]
+                for r in range(repeats):
+                    first = begin + r * repeat
+                    for j in range(first, first + width):
+                        a[k, j], a[best, j] = a[best, j], a[k, j]
+            pivot = a[k, k]
+            if not abs(pivot) > 0.0 or not abs(pivot) < np.inf:
+                return 0
+            if pivot < 0.0:
+                sign = -sign
+            inverse = 1.0 / pivot
+            for r in range(s, repeats):
+                first = begin + r * repeat
+                for i in range(max(first, k + 1), first + width):
+                    a[i, k] *= inverse
+            # Slices, unlike indices from k + 1 on, let the compiler use vector instructions.
+            for c in range(s, repeats):
+                first = begin + c * repeat
+                top = a[k, max(first, k + 1) : first + width]
+                for r in range(s, repeats):
+                    last = begin + r * repeat + width
+                    for i in range(max(last - width, k + 1), last):
+                        factor = a[i, k]
+                        row = a[i, max(first, k + 1) : first + width]
+                        for j in range(row.size):
+                            row[j] -= factor * top[j]
     return sign
 
 
 @inlined
-def solve_lu_pivoting(lu: Floats, order: Integers, b: Floats, x: Floats) -> None:
-    """The x with a x = b for the ``a`` that :func:`factor_lu_pivoting` has factored."""
-    n = lu.shape[0]
-    for i in range(n):
-        total = b[order[i]]
-        for j in range(i):
-            total -= lu[i, j] * x[j]
-        x[i] = total
-    for i in range(n - 1, -1, -1):
-        total = x[i]
-        for j in range(i + 1, n):
-            total -= lu[i, j] * x[j]
-        x[i] = total / lu[i, i]
+def solve_lu_pivoting(lu: Floats, order: Integers, b: Floats, x: Floats, repeat: int, begin: int, end: int) -> None:
+    """The x with a x = b for the block of ``a`` that :func:`factor_lu_pivoting` has factored."""
+    width, repeats = end - begin, lu.shape[0] // repeat
+    if width == repeat:
+        width, repeats = lu.shape[0], 1
+    for s in range(repeats):
+        for i in range(begin + s * repeat, begin + s * repeat + width):
+            total = b[order[i]]
+            for r in range(s + 1):
+                first = begin + r * repeat
+                for j in range(first, min(first + width, i)):
+                    total -= lu[i, j] * x[j]
+            x[i] = total
+    for s in range(repeats - 1, -1, -1):
+        for i in range(begin + s * repeat + width - 1, begin + s * repeat - 1, -1):
+            total = x[i]
+            for r in range(s, repeats):
+                first = begin + r * repeat
+                for j in range(max(first, i + 1), first + width):
+                    total -= lu[i, j] * x[j]
+            x[i] = total / lu[i, i]
 
 
 @inlined
-def factor_ldl(a: Floats) -> bool:
-    """L D L' of the symmetric ``a`` (n, n) in place: pivots on the diagonal, unit L below it.
+def factor_ldl(a: Floats, begin: int, end: int) -> bool:
+    """L D L' of a block of the symmetric ``a`` (n, n) in place: pivots on the diagonal, unit L below it.
 
     Reads the lower triangle; False at a pivot that is not positive.
     """
-    n = a.shape[0]
-    for k in range(n):
+    for k in range(begin, end):
         pivot = a[k, k]
         if not pivot > 0.0:
             return False
         inverse = 1.0 / pivot
-        for i in range(k + 1, n):
+        for i in range(k + 1, end):
             factor = a[i, k] * inverse
             for j in range(k + 1, i + 1):
                 a[i, j] -= factor * a[j, k]
-        for i in range(k + 1, n):
+        for i in range(k + 1, end):
             a[i, k] *= inverse
     return True
 
 
 @inlined
-def least_pivot_ratio(a: Floats, b: Floats) -> float:
+def least_pivot_ratio(a: Floats, b: Floats, begin: int, end: int) -> float:
     """The smallest ratio of a pivot of the symmetric ``a`` (n, n) to the same pivot of ``b``; 0 if one is not positive.
 
-    Reads and overwrites the lower triangles. Both are factored at once, as neither fills a processor's pipeline.
+    Of a block of both. Reads and overwrites the lower triangles. Both are factored at once, as neither fills a
+    processor's pipeline.
     """
-    n = a.shape[0]
     least = np.inf
-    for k in range(n):
+    for k in range(begin, end):
         if not (a[k, k] > 0.0 and b[k, k] > 0.0):
             return 0.0
         least = min(least, a[k, k] / b[k, k])
         inverse_a, inverse_b = 1.0 / a[k, k], 1.0 / b[k, k]
-        for i in range(k + 1, n):
+        for i in range(k + 1, end):
             factor_a, factor_b = a[i, k] * inverse_a, b[i, k] * inverse_b
             for j in range(k + 1, i + 1):
                 a[i, j] -= factor_a * a[j, k]
@@ -135,33 +178,32 @@ def least_pivot_ratio(a: Floats, b: Floats) -> float:
 
 
 @inlined
-def solve_lower(ldl: Floats, b: Floats, x: Floats) -> None:
+def solve_lower(ldl: Floats, b: Floats, x: Floats, begin: int, end: int) -> None:
     """The x with L x = b."""
-    for i in range(ldl.shape[0]):
+    for i in range(begin, end):
         total = b[i]
-        for j in range(i):
+        for j in range(begin, i):
             total -= ldl[i, j] * x[j]
         x[i] = total
 
 
 @inlined
-def solve_upper(ldl: Floats, x: Floats) -> None:
+def solve_upper(ldl: Floats, x: Floats, begin: int, end: int) -> None:
     """The solution of L' y = x, in place of x."""
-    n = ldl.shape[0]
-    for i in range(n - 1, -1, -1):
+    for i in range(end - 1, begin - 1, -1):
         total = x[i]
-        for j in range(i + 1, n):
+        for j in range(i + 1, end):
             total -= ldl[j, i] * x[j]
         x[i] = total
 
 
 @inlined
-def solve_ldl(ldl: Floats, b: Floats, x: Floats) -> None:
+def solve_ldl(ldl: Floats, b: Floats, x: Floats, begin: int, end: int) -> None:
     """The x with L D L' x = b."""
-    solve_lower(ldl, b, x)
-    for i in range(ldl.shape[0]):
+    solve_lower(ldl, b, x, begin, end)
+    for i in range(begin, end):
         x[i] /= ldl[i, i]
-    solve_upper(ldl, x)
+    solve_upper(ldl, x, begin, end)
 
 
 @inlined
@@ -184,12 +226,14 @@ def solve_ldl_rows(ldl: Floats, b: Floats) -> None:
 
 
 @inlined
-def quadratic_form(a: Floats, x: Floats) -> float:
-    """X' a x."""
+def quadratic_form(a: Floats, x: Floats, cuts: Integers) -> float:
+    """X' a x, with the blocks of ``a`` between ``cuts``."""
     total = 0.0
-    for i in range(x.size):
-        row = 0.0
-        for j in range(x.size):
-            row += a[i, j] * x[j]
-        total += x[i] * row
+    for b in range(cuts.size - 1):
+        begin, end = block(cuts, b)
+        for i in range(begin, end):
+            row = 0.0
+            for j in range(begin, end):
+                row += a[i, j] * x[j]
+            total += x[i] * row
     return total

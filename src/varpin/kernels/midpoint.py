@@ -33,7 +33,7 @@ from varpin.kernels.midpoint_equation import (
 )
 from varpin.kernels.midpoint_jacobian import add_substep
 from varpin.kernels.place import add, put, show, unwind
-from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes
+from varpin.kernels.tree import Commands, Floats, Mechanism, Nodes, block
 
 FADE = 1.0 / 256.0  # by which a substep forgets how far kinetic energies have varied
 ENERGY_ROUNDING = 1e-12  # of the magnitudes that make up an energy
@@ -48,18 +48,22 @@ def branch_margin(mechanism: Mechanism, options: Options, h: float, k: Work) -> 
     """
     w = k.sweep
     a = options.alpha
-    n = k.v.size
+    cuts = mechanism.tree.cuts
     exaggerated = h * h * a * (1.0 - a) / (1.0 - options.margin)
-    for i in range(n):
-        for j in range(i + 1):
-            k.lu[i, j] = w.M[i, j] - exaggerated * w.Lqq[i, j]
-            k.ldl[i, j] = w.M[i, j]
-        k.lu[i, i] += 0.5 * h * mechanism.damping[i]
-    if a != 0.5:
-        for i in range(n):
-            for j in range(i + 1):
-                k.lu[i, j] += h * (a - 0.5) * (w.A[i, j] + w.A[j, i])
-    return least_pivot_ratio(k.lu, k.ldl)
+    least = np.inf
+    for b in range(cuts.size - 1):
+        begin, end = block(cuts, b)
+        for i in range(begin, end):
+            for j in range(begin, i + 1):
+                k.lu[i, j] = w.M[i, j] - exaggerated * w.Lqq[i, j]
+                k.ldl[i, j] = w.M[i, j]
+            k.lu[i, i] += 0.5 * h * mechanism.damping[i]
+        if a != 0.5:
+            for i in range(begin, end):
+                for j in range(begin, i + 1):
+                    k.lu[i, j] += h * (a - 0.5) * (w.A[i, j] + w.A[j, i])
+        least = min(least, least_pivot_ratio(k.lu, k.ldl, begin, end))
+    return least
 
 
 @inlined
@@ -69,15 +73,17 @@ def kinetic_energy(mechanism: Mechanism, p: Floats, v: Floats, k: Work) -> None:
     Leaves in ``k.share`` the terms of the kinetic energy 1/2 y' D^-1 y with L y = p, none of which is negative: what is
     each coordinate's own while those before it are free. Leaves in ``k.balance[:, 0]`` the sums of each group.
     """
-    n = p.size
-    solve_lower(k.ldl, p, v)
-    for i in range(n):
+    cuts = mechanism.tree.cuts
+    for i in range(p.size):
         k.balance[i, 0] = 0.0
-    for i in range(n):
-        v[i], y = v[i] / k.ldl[i, i], v[i]
-        k.share[i] = 0.5 * v[i] * y
-        k.balance[mechanism.tree.group[i], 0] += k.share[i]
-    solve_upper(k.ldl, v)
+    for b in range(cuts.size - 1):
+        begin, end = block(cuts, b)
+        solve_lower(k.ldl, p, v, begin, end)
+        for i in range(begin, end):
+            v[i], y = v[i] / k.ldl[i, i], v[i]
+            k.share[i] = 0.5 * v[i] * y
+            k.balance[mechanism.tree.group[i], 0] += k.share[i]
+        solve_upper(k.ldl, v, begin, end)
 
 
 @inlined
@@ -88,11 +94,14 @@ def node_energy(mechanism: Mechanism, q: Floats, p: Floats, v: Floats, k: Work) 
     in ``k.sweep.V``.
     """
     mass_matrix(mechanism, q, k.sweep)
-    for i in range(q.size):
-        for j in range(i + 1):
-            k.ldl[i, j] = k.sweep.M[i, j]
-    if not factor_ldl(k.ldl):
-        return False
+    cuts = mechanism.tree.cuts
+    for b in range(cuts.size - 1):
+        begin, end = block(cuts, b)
+        for i in range(begin, end):
+            for j in range(begin, i + 1):
+                k.ldl[i, j] = k.sweep.M[i, j]
+        if not factor_ldl(k.ldl, begin, end):
+            return False
     kinetic_energy(mechanism, p, v, k)
     return True
 
@@ -382,14 +391,17 @@ def begin_at(mechanism: Mechanism, q: Floats, p: Floats, state: State, k: Work) 
 def begin_paths(mechanism: Mechanism, q: Floats, v: Floats, states: State, k: Work) -> bool:
     """Put each path at its row of q and v (P, n); False where an M(q) is not positive definite."""
     n = q.shape[1]
+    cuts = mechanism.tree.cuts
     for i in range(q.shape[0]):
         state = path(states, i)
         mass_matrix(mechanism, q[i], k.sweep)
-        for r in range(n):
-            total = 0.0
-            for c in range(n):
-                total += k.sweep.M[r, c] * v[i, c]
-            k.delta[r] = total
+        for b in range(cuts.size - 1):
+            begin, end = block(cuts, b)
+            for r in range(begin, end):
+                total = 0.0
+                for c in range(begin, end):
+                    total += k.sweep.M[r, c] * v[i, c]
+                k.delta[r] = total
         if not begin_at(mechanism, q[i], k.delta, state, k):
             return False
         for r in range(n):

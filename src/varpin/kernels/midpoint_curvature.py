@@ -15,7 +15,7 @@ from varpin.kernels.jet_tangent import Tangent, third_order
 from varpin.kernels.midpoint import begin_at, path, step
 from varpin.kernels.midpoint_equation import SINGULAR, SOLVED, Options, State, Work
 from varpin.kernels.midpoint_jacobian import root_jacobian, solve_at
-from varpin.kernels.tree import Floats, Mechanism
+from varpin.kernels.tree import Floats, Mechanism, block
 
 
 @inlined
@@ -24,48 +24,55 @@ def substep_curvature(
 ) -> None:
     """Add z . d2(q1, p1)/d(q0, p0, f)2 to H (3n, 3n), at the root in ``k.v`` and the jet in the sweep.
 
-    Leaves dv/d(q0, p0, f) (n, 3n) in ``dv``.
+    Leaves the blocks of dv/d(q0, p0, f) (n, 3n) in ``dv``.
     """
     w = k.sweep
     a = options.alpha
     n = k.v.size
+    cuts = mechanism.tree.cuts
     root_jacobian(mechanism, options, h, k, dv)
-    for i in range(n):
-        for c in range(n):
-            dv[i, 2 * n + c] = 0.5 * h * dv[i, n + c]
-    for i in range(n):
-        total = z[i] - mechanism.damping[i] * z[n + i]
-        for j in range(n):
-            total += (a * h * w.Lqq[i, j] + w.A[i, j]) * z[n + j]
-        k.residual[i] = h * total
-    for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += dv[j, n + i] * k.residual[j]  # dv/dp0 is the inverse of N
-        k.start[i] = h * z[n + i] + h * (1.0 - a) * total
-        k.delta[i] = -total
-    third_order(mechanism, k.qm, k.v, k.start, k.delta, w, t)
-    for c in range(3 * n):
-        for i in range(n):
-            in_q, in_v = 0.0, 0.0
-            for j in range(n):
-                moved = a * h * dv[j, c]
-                if j == c:
-                    moved += 1.0
-                in_q += t.Lqq[i, j] * moved + t.A[j, i] * dv[j, c]
-                in_v += t.A[i, j] * moved + t.M[i, j] * dv[j, c]
-            k.residual[i] = in_q
-            k.delta[i] = in_v
-        for r in range(c + 1):
+    for b in range(cuts.size - 1):
+        begin, end = block(cuts, b)
+        for i in range(begin, end):
+            for c in range(begin, end):
+                dv[i, 2 * n + c] = 0.5 * h * dv[i, n + c]
+        for i in range(begin, end):
+            total = z[i] - mechanism.damping[i] * z[n + i]
+            for j in range(begin, end):
+                total += (a * h * w.Lqq[i, j] + w.A[i, j]) * z[n + j]
+            k.residual[i] = h * total
+        for i in range(begin, end):
             total = 0.0
-            for i in range(n):
-                moved = a * h * dv[i, r]
-                if i == r:
-                    moved += 1.0
-                total += moved * k.residual[i] + dv[i, r] * k.delta[i]
-            H[r, c] += total
-            if r != c:
-                H[c, r] += total
+            for j in range(begin, end):
+                total += dv[j, n + i] * k.residual[j]  # dv/dp0 is the inverse of N
+            k.start[i] = h * z[n + i] + h * (1.0 - a) * total
+            k.delta[i] = -total
+    third_order(mechanism, k.qm, k.v, k.start, k.delta, w, t)
+    for b in range(cuts.size - 1):
+        begin, end = block(cuts, b)
+        for third in range(3):
+            for c in range(third * n + begin, third * n + end):
+                for i in range(begin, end):
+                    in_q, in_v = 0.0, 0.0
+                    for j in range(begin, end):
+                        moved = a * h * dv[j, c]
+                        if j == c:
+                            moved += 1.0
+                        in_q += t.Lqq[i, j] * moved + t.A[j, i] * dv[j, c]
+                        in_v += t.A[i, j] * moved + t.M[i, j] * dv[j, c]
+                    k.residual[i] = in_q
+                    k.delta[i] = in_v
+                for before in range(third + 1):
+                    for r in range(before * n + begin, min(before * n + end, c + 1)):
+                        total = 0.0
+                        for i in range(begin, end):
+                            moved = a * h * dv[i, r]
+                            if i == r:
+                                moved += 1.0
+                            total += moved * k.residual[i] + dv[i, r] * k.delta[i]
+                        H[r, c] += total
+                        if r != c:
+                            H[c, r] += total
 
 
 @kernel

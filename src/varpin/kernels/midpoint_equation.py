@@ -15,7 +15,7 @@ import numpy as np
 from varpin.kernels._compile import inlined
 from varpin.kernels.jet import first_order, second_order
 from varpin.kernels.linalg import factor_lu, quadratic_form, solve_lu
-from varpin.kernels.tree import Floats, Integers, Mechanism, Sweep, new_sweep
+from varpin.kernels.tree import Floats, Integers, Mechanism, Sweep, block, new_sweep
 
 # What an attempt at a step ends in.
 SOLVED = 0
@@ -163,14 +163,18 @@ def set_midpoint(a: float, h: float, state: State, k: Work) -> None:
 
 @inlined
 def factor_newton(mechanism: Mechanism, a: float, h: float, k: Work) -> bool:
-    """Factor -dr/dv from the jet in the sweep."""
+    """Factor -dr/dv from the jet in the sweep, block by block: what else is in it stands on its diagonal."""
     w = k.sweep
-    n = k.v.size
-    for i in range(n):
-        for j in range(n):
-            k.lu[i, j] = w.M[i, j] + h * (a * w.A[i, j] - (1.0 - a) * w.A[j, i] - h * a * (1.0 - a) * w.Lqq[i, j])
-        k.lu[i, i] += 0.5 * h * mechanism.damping[i]
-    return factor_lu(k.lu)
+    cuts = mechanism.tree.cuts
+    for b in range(cuts.size - 1):
+        begin, end = block(cuts, b)
+        for i in range(begin, end):
+            for j in range(begin, end):
+                k.lu[i, j] = w.M[i, j] + h * (a * w.A[i, j] - (1.0 - a) * w.A[j, i] - h * a * (1.0 - a) * w.Lqq[i, j])
+            k.lu[i, i] += 0.5 * h * mechanism.damping[i]
+        if not factor_lu(k.lu, begin, end):
+            return False
+    return True
 
 
 @inlined
@@ -181,6 +185,7 @@ def newton(mechanism: Mechanism, options: Options, h: float, state: State, k: Wo
     of the one before (natural monotonicity, Deuflhard), unless the residual is down at its rounding floor.
     """
     a = options.alpha
+    cuts = mechanism.tree.cuts
     before = np.inf
     fresh = True
     worst = np.inf
@@ -199,15 +204,17 @@ def newton(mechanism: Mechanism, options: Options, h: float, state: State, k: Wo
             return NOT_FINITE
         if fresh and not factor_newton(mechanism, a, h, k):
             return FOLD
-        solve_lu(k.lu, k.residual, k.delta)
-        size = quadratic_form(k.sweep.M, k.delta)
+        for b in range(cuts.size - 1):
+            begin, end = block(cuts, b)
+            solve_lu(k.lu, k.residual, k.delta, begin, end)
+        size = quadratic_form(k.sweep.M, k.delta, cuts)
         if iteration == ITERATIONS or not size <= 0.25 * before:
             break
         for i in range(k.v.size):
             k.v[i] += k.delta[i]
         k.tally[0] += 1
         # The squared contraction to expect: seen, or guessed from the size of the first correction.
-        shrink = size / (quadratic_form(k.sweep.M, k.v) if before == np.inf else before)
+        shrink = size / (quadratic_form(k.sweep.M, k.v, cuts) if before == np.inf else before)
         fresh = not worst * shrink <= options.tolerance
         before = size
     if not worst <= max(ROUNDING, options.tolerance):

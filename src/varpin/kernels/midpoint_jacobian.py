@@ -14,10 +14,10 @@ Lagrangian, but without their 1/h, so small steps lose no digits.
 
 from varpin.kernels._compile import inlined
 from varpin.kernels.jet import second_order
-from varpin.kernels.linalg import solve_lu
+from varpin.kernels.linalg import solve_lu_twice
 from varpin.kernels.midpoint_equation import SOLVED, Options, State, Work, factor_newton, newton
 from varpin.kernels.place import put
-from varpin.kernels.tree import Floats, Mechanism
+from varpin.kernels.tree import Floats, Mechanism, block
 
 
 @inlined
@@ -49,21 +49,24 @@ def solve_at(
 
 @inlined
 def root_jacobian(mechanism: Mechanism, options: Options, h: float, k: Work, dv: Floats) -> None:
-    """dv/dq0 and dv/dp0, side by side in the first n rows of ``dv``, at the root in ``k.v``, the jet in the sweep."""
+    """dv/dq0 and dv/dp0, side by side in the first n rows of ``dv``, at the root in ``k.v``, the jet in the sweep.
+
+    Writes the blocks alone.
+    """
     w = k.sweep
     a = options.alpha
     n = k.v.size
+    cuts = mechanism.tree.cuts
     factor_newton(mechanism, a, h, k)
-    for c in range(n):
-        for i in range(n):
-            k.residual[i] = h * (1.0 - a) * w.Lqq[i, c] - w.A[i, c]
-        solve_lu(k.lu, k.residual, k.delta)
-        for i in range(n):
-            dv[i, c] = k.delta[i]
-            k.residual[i] = 1.0 if i == c else 0.0
-        solve_lu(k.lu, k.residual, k.delta)
-        for i in range(n):
-            dv[i, n + c] = k.delta[i]
+    for b in range(cuts.size - 1):
+        begin, end = block(cuts, b)
+        for c in range(begin, end):
+            for i in range(begin, end):
+                k.residual[i] = h * (1.0 - a) * w.Lqq[i, c] - w.A[i, c]
+                k.delta[i] = 1.0 if i == c else 0.0
+            solve_lu_twice(k.lu, k.residual, k.residual, k.delta, k.delta, begin, end)
+            for i in range(begin, end):
+                dv[i, c], dv[i, n + c] = k.residual[i], k.delta[i]
 
 
 @inlined
@@ -72,29 +75,35 @@ def substep_jacobian(mechanism: Mechanism, options: Options, h: float, k: Work, 
     w = k.sweep
     a = options.alpha
     n = k.v.size
+    cuts = mechanism.tree.cuts
+    if cuts.size > 2:
+        Jx[:] = 0.0
+        Jf[:] = 0.0
     root_jacobian(mechanism, options, h, k, Jx)
-    for c in range(2 * n):
-        for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += (a * h * w.Lqq[i, j] + w.A[j, i]) * Jx[j, c]
-            total -= mechanism.damping[i] * Jx[i, c]
-            if c < n:
-                total += w.Lqq[i, c]
-            total *= h
-            if c == n + i:
-                total += 1.0
-            Jx[n + i, c] = total
-    for c in range(n):
-        for i in range(n):
-            # dp1 = dp0 + W dv + h df with dv = (h/2) Vp df; W Vp is what Jx[n:, n:] holds besides the identity.
-            Jf[i, c] = 0.5 * h * h * Jx[i, n + c]
-            Jf[n + i, c] = 0.5 * h * (Jx[n + i, n + c] + (1.0 if i == c else 0.0))
-    for c in range(2 * n):
-        for i in range(n):
-            Jx[i, c] *= h
-            if c == i:
-                Jx[i, c] += 1.0
+    for b in range(cuts.size - 1):
+        begin, end = block(cuts, b)
+        for i in range(begin, end):
+            for c in range(begin, end):
+                of_place, of_momentum = 0.0, 0.0
+                for j in range(begin, end):
+                    slope = a * h * w.Lqq[i, j] + w.A[j, i]
+                    of_place += slope * Jx[j, c]
+                    of_momentum += slope * Jx[j, n + c]
+                of_place = (of_place - mechanism.damping[i] * Jx[i, c]) + w.Lqq[i, c]
+                of_momentum -= mechanism.damping[i] * Jx[i, n + c]
+                Jx[n + i, c], Jx[n + i, n + c] = h * of_place, h * of_momentum
+                if i == c:
+                    Jx[n + i, n + c] += 1.0
+        for i in range(begin, end):
+            for c in range(begin, end):
+                # dp1 = dp0 + W dv + h df with dv = (h/2) Vp df; W Vp is what Jx[n:, n:] holds besides the identity.
+                Jf[i, c] = 0.5 * h * h * Jx[i, n + c]
+                Jf[n + i, c] = 0.5 * h * (Jx[n + i, n + c] + (1.0 if i == c else 0.0))
+        for i in range(begin, end):
+            for c in range(begin, end):
+                Jx[i, c] *= h
+                Jx[i, n + c] *= h
+            Jx[i, i] += 1.0
 
 
 @inlined
@@ -113,30 +122,41 @@ def add_substep(mechanism: Mechanism, options: Options, h: float, k: Work) -> No
     """Let the substep at the root in ``k.v``, its jet in the sweep, follow those before."""
     n = k.v.size
     substep_jacobian(mechanism, options, h, k, k.part[: 2 * n], k.part[2 * n :, :n])
-    chain(k)
+    chain(mechanism, k)
 
 
 @inlined
-def chain(k: Work) -> None:
+def chain(mechanism: Mechanism, k: Work) -> None:
     """Let the substep whose derivatives stand in ``k.part`` follow those before: chain rule."""
     n = k.v.size
     Jx, Jf, product = k.part[: 2 * n], k.part[2 * n :, :n], k.part[2 * n :, n:]
-    for half in range(2):
-        for i in range(2 * n):
-            for j in range(n):
-                total = 0.0
-                for c in range(2 * n):
-                    total += Jx[i, c] * k.Jx[c, half * n + j]
-                product[i, j] = total
-        for i in range(2 * n):
-            for j in range(n):
-                k.Jx[i, half * n + j] = product[i, j]
-    for i in range(2 * n):
-        for j in range(n):
-            total = Jf[i, j]
-            for c in range(2 * n):
-                total += Jx[i, c] * k.Jf[c, j]
-            product[i, j] = total
-    for i in range(2 * n):
-        for j in range(n):
-            k.Jf[i, j] = product[i, j]
+    cuts = mechanism.tree.cuts
+    for b in range(cuts.size - 1):
+        begin, end = block(cuts, b)
+        for half in range(2):
+            for top in range(2):
+                for i in range(top * n + begin, top * n + end):
+                    for j in range(begin, end):
+                        total = 0.0
+                        for c in range(begin, end):
+                            total += Jx[i, c] * k.Jx[c, half * n + j]
+                        for c in range(n + begin, n + end):
+                            total += Jx[i, c] * k.Jx[c, half * n + j]
+                        product[i, j] = total
+            for top in range(2):
+                for i in range(top * n + begin, top * n + end):
+                    for j in range(begin, end):
+                        k.Jx[i, half * n + j] = product[i, j]
+        for top in range(2):
+            for i in range(top * n + begin, top * n + end):
+                for j in range(begin, end):
+                    total = Jf[i, j]
+                    for c in range(begin, end):
+                        total += Jx[i, c] * k.Jf[c, j]
+                    for c in range(n + begin, n + end):
+                        total += Jx[i, c] * k.Jf[c, j]
+                    product[i, j] = total
+        for top in range(2):
+            for i in range(top * n + begin, top * n + end):
+                for j in range(begin, end):
+                    k.Jf[i, j] = product[i, j]

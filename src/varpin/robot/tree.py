@@ -135,6 +135,7 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
         armature=coordinate_armature(model, ties, coordinates),
         group=group,
         groups=int(group.max()) + 1,
+        cuts=block_cuts(group),
     )
 
 
@@ -305,6 +306,9 @@ def require_sound(tree: Tree) -> None:
         values = getattr(tree, name)
         if ((values < low) | (values >= high)).any():
             raise RobotError(f"the robot's tree is damaged: its {name} points to what is not there")
+    cuts = tree.cuts
+    if not (isinstance(cuts, np.ndarray) and cuts.dtype == np.int64 and np.array_equal(cuts, block_cuts(tree.group))):
+        raise RobotError("the robot's tree is damaged: its cuts are not where groups end")
 
 
 def tree_mass_matrix(tree: Tree, q: Floats) -> Floats:
@@ -358,3 +362,18 @@ def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Inte
     links = coo_array((np.ones(tied.sum()), (coordinate[tied], coordinate[parent[tied]])), shape=(dof, dof))
     _, label = connected_components(links, directed=False)
     return np.asarray(label, dtype=np.int64)
+
+
+def block_cuts(group: Integers) -> Integers:
+    """Where runs of coordinates begin that hold whole groups (c + 1,), and n last.
+
+    Mostly each group is one run; groups whose coordinates take turns share one.
+
+    Args:
+        group: Of each coordinate (n,), from :func:`independent_groups`.
+    """
+    n = group.size
+    last = np.zeros(n, dtype=np.int64)
+    np.maximum.at(last, group, np.arange(n))
+    ends = np.flatnonzero(np.maximum.accumulate(last[group]) == np.arange(n)) + 1
+    return np.concatenate([[0], ends])
