@@ -5,7 +5,7 @@ where it stopped; an edit of varpin's sources starts it anew. Writes the table o
 markers, and exits with status 1 if anything is silent wrong.
 
     python benchmarks/extremes.py FOLDER             # some five hours of one core
-    python benchmarks/extremes.py FOLDER --turns 6   # an hour: larger robots and trees take turns at the trials
+    python benchmarks/extremes.py FOLDER --turns 6   # an hour: trees and larger robots take turns at the trials
     python benchmarks/extremes.py FOLDER ur5 tree17  # these alone, and no table
 """
 
@@ -32,8 +32,8 @@ from mechanisms import random_tree  # noqa: E402
 DOCUMENT = ROOT / "docs" / "limits.md"
 TREES = 200
 RATIOS = (1e-4, 1e-2, 1.0, 1e2, 1e4)
-# A robot that goes by a name gets all trials up to this many joints, whatever the turns.
-SMALL = 4
+# Robots of more joints than LARGE, whose motions take minutes, always take turns at the trials.
+LARGE, TURNS = 20, 6
 # A motion or a plan may take this long before it is judged by what there is [s].
 PATIENCE = 1.0
 
@@ -55,10 +55,13 @@ def robot_of(name: str) -> vp.Robot:
 
 
 def trials_of(name: str, robot: vp.Robot, turns: int = 1) -> list[extremes.Trial | extremes.Plan]:
-    """The whole battery of a small robot that goes by a name; of others each so many-th trial, by turns."""
+    """The battery, of which trees and robots of more than four joints may get each so many-th trial, by turns."""
     trials = extremes.trials_on(robot)
-    whole = not name.startswith("tree") and robot.dof <= SMALL
-    return trials if whole else trials[names().index(name) % turns :: turns]
+    if robot.dof > LARGE:
+        turns = max(turns, TURNS)
+    elif robot.dof <= 4 and not name.startswith("tree"):
+        turns = 1
+    return trials[names().index(name) % turns :: turns]
 
 
 def judge(
@@ -131,7 +134,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("folder", type=Path, help="where the records are kept")
     parser.add_argument("robots", nargs="*", help="these alone, and no table in the page")
-    parser.add_argument("--turns", type=int, default=1, metavar="K", help="larger robots and trees get each K-th trial")
+    parser.add_argument("--turns", type=int, default=1, metavar="K", help="trees and larger robots get each K-th trial")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     logging.getLogger("varpin").setLevel(logging.CRITICAL)
