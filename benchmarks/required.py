@@ -1,4 +1,6 @@
-"""What a scene does not require costs nothing: locked joints, idle fingers, terms that are off. Ratios within one run.
+"""What a scene does not require costs nothing: locked joints, idle fingers, terms that are off.
+
+And what fingers cost side by side that share no inertia. Ratios within one run.
 
 python benchmarks/required.py
 """

@@ -397,7 +397,10 @@ def test_random_trees_are_many_kinds(benchmark):
     assert 0.1 < np.mean([bool((np.diff(tree.tree.parent) == 1).all()) for tree in trees]) < 0.9
     assert len({benchmark.robot_of("tree3").tree.mass.tobytes(), trees[3].tree.mass.tobytes()}) == 1
     every = {trial.name for trial in extremes.trials_on(trees[0])}
-    own = [{trial.name for trial in benchmark.trials_of(f"tree{k}", trees[k], 6)} for k in range(6)]
+    own = [
+        {trial.name for trial in benchmark.trials_of(f"tree{k}", trees[k], benchmark.TURNS)}
+        for k in range(benchmark.TURNS)
+    ]
     assert set.union(*own) == every
     assert sum(map(len, own)) == len(every)
 
@@ -416,7 +419,11 @@ def test_the_table_of_robots_counts_every_cell(benchmark, load, tmp_path):
 @pytest.mark.parametrize("name", ["double_pendulum", "z1", "xarm7", *(f"tree{20 * k + k}" for k in range(10))])
 def test_nothing_on_robots_and_trees_is_silent_wrong(benchmark, name):
     robot = benchmark.robot_of(name)
-    trials = benchmark.trials_of(name, robot, 6) if name.startswith("tree") else extremes.trials_on(robot)[::6]
+    trials = (
+        benchmark.trials_of(name, robot, benchmark.TURNS)
+        if name.startswith("tree")
+        else extremes.trials_on(robot)[:: benchmark.TURNS]
+    )
     record = extremes.run(robot, trials=trials)
     assert record.missing == 0
     assert [(cell.trial, cell.integrator, cell.found) for cell in record.wrong()] == []

@@ -168,13 +168,14 @@ def test_values_gradients_and_gauss_newton_hessians(arm, kind):
         np.testing.assert_allclose(given.gradient, slopes, atol=1e-8 * np.abs(slopes).max())
 
 
+@pytest.mark.parametrize("axis", [(2, -1, 2), (-9, 2, 6), (2, 9, -6), (0, 0, 1)])
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 9.9e-4, 1.01e-3, 0.5, 3.0, np.pi - 1e-5])
-def test_orientation_at_every_distance(load, angle):
+def test_orientation_at_every_distance(load, angle, axis):
     """The rotation vector from the target is exact, and its derivative, near no turn and near half a turn, too."""
     robot = load("ur5")
     q, v = state(robot, 2, 1)
     R = pinocchio_frame(robot, "tool0", q[0], v[0])[0]
-    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    axis = np.array(axis) / np.linalg.norm(axis)
     target = R @ turn(axis, angle).T
     bound = vp.FrameOrientationCost(robot, "tool0", target, np.diag([1.0, 2.0, 3.0])).bind(
         Points(np.zeros(1), 1.0, 1, 6, 6)

@@ -137,7 +137,7 @@ class Gauss(Variational):
             p,
             self._guess(trajectory),
             force,
-            trajectory.statistics.substeps,
+            np.ascontiguousarray(trajectory.statistics.substeps),
             state,
             equation.new_work(scene.robot.tree.parent.size, n, scene.robot.tree.loads.size, derivatives=True),
             stages,

@@ -131,7 +131,7 @@ class Midpoint(Variational):
         force = trajectory.u @ scene.actuation.T
         if scene.noise.velocity_dependent:
             force = force + self.drift_share * drifts(scene, trajectory)
-        return q, p, guess, force, trajectory.statistics.substeps
+        return q, p, guess, force, np.ascontiguousarray(trajectory.statistics.substeps)
 
     def _loose(self) -> equation.Options:
         """A root that is known to 1e-10 is good enough for derivatives, and one jet for them."""

@@ -150,8 +150,8 @@ def node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics) -> tuple[bool,
         if tree.origin[j]:
             potential += origin_potential(mechanism, j, q, w)
     regular = True
-    for b in range(tree.cuts.size - 1):
-        begin, end = block(tree.cuts, b)
+    for b in range(len(tree.ends)):
+        begin, end = block(tree.ends, b)
         for i in range(begin, end):
             M[i, i] += tree.armature[i]
             for j in range(begin, i + 1):
@@ -163,9 +163,9 @@ def node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics) -> tuple[bool,
 @inlined
 def solve_mass(mechanism: Mechanism, b: Floats, d: Dynamics, x: Floats) -> None:
     """The x with M x = b from what :func:`node` left."""
-    cuts = mechanism.tree.cuts
-    for r in range(cuts.size - 1):
-        begin, end = block(cuts, r)
+    ends = mechanism.tree.ends
+    for r in range(len(ends)):
+        begin, end = block(ends, r)
         solve_ldl(d.ldl, b, x, begin, end)
 
 
@@ -227,8 +227,8 @@ def inverse_dynamics_derivatives(
     tree, w = mechanism.tree, d.sweep
     bodies = tree.parent.size
     S, V, W, Y, F, R = w.axis, w.velocity, w.axis_rate, w.inertia, w.dual_axis, w.dual_rate
-    for b in range(tree.cuts.size - 1):
-        begin, end = block(tree.cuts, b)
+    for b in range(len(tree.ends)):
+        begin, end = block(tree.ends, b)
         for i in range(begin, end):
             for j in range(begin, end):
                 d.dq[i, j] = 0.0
@@ -312,7 +312,7 @@ def forward_derivatives(
     af: Floats,
 ) -> bool:
     """Acceleration a (N, n) at each row of q, v and force, and its derivatives (N, n, n); False where M is singular."""
-    cuts = mechanism.tree.cuts
+    ends = mechanism.tree.ends
     aq[:] = 0.0
     av[:] = 0.0
     af[:] = 0.0
@@ -322,8 +322,8 @@ def forward_derivatives(
             return False
         acceleration_at_node(mechanism, force[s], d, a[s])
         inverse_dynamics_derivatives(mechanism, q[s], v[s], a[s], Z, P, Q, d)
-        for b in range(cuts.size - 1):
-            begin, end = block(cuts, b)
+        for b in range(len(ends)):
+            begin, end = block(ends, b)
             for c in range(begin, end):
                 for i in range(begin, end):
                     d.column[i] = -d.dq[i, c]

@@ -42,9 +42,9 @@ def write_node(mechanism: Mechanism, q: Floats, v: Floats, d: Dynamics, nodes: N
     """Enter (q, v) as node ``s`` of path ``i``; leaves its mass matrix and bias in ``d``."""
     regular, potential = node(mechanism, q, v, d)
     kinetic = 0.0
-    cuts = mechanism.tree.cuts
-    for b in range(cuts.size - 1):
-        begin, end = block(cuts, b)
+    ends = mechanism.tree.ends
+    for b in range(len(ends)):
+        begin, end = block(ends, b)
         for r in range(begin, end):
             momentum = 0.0
             for c in range(begin, end):

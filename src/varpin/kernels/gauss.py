@@ -36,9 +36,9 @@ def average(mechanism: Mechanism, tableau: Tableau, k: Work, g: Stages) -> None:
     L_qq pulls the state back it never becomes singular (the method is A-stable); where it pushes it away the symmetric
     part, weighted with b, is at least M - h^2 x L_qq, with x from the numerical range of a^2: 1/4 for one stage.
     """
-    w, cuts = k.sweep, mechanism.tree.cuts
-    for b in range(cuts.size - 1):
-        begin, end = block(cuts, b)
+    w, ends = k.sweep, mechanism.tree.ends
+    for b in range(len(ends)):
+        begin, end = block(ends, b)
         for r in range(begin, end):
             for c in range(begin, end):
                 mass, curvature = 0.0, 0.0
@@ -102,9 +102,9 @@ def predict(mechanism: Mechanism, tableau: Tableau, h: float, state: State, k: W
     smooth = state.counters[0] > 1 and state.center.shape[1] == 0
     for r in range(n):
         k.residual[r] = k.force[r] - past[force, r]
-    cuts = mechanism.tree.cuts
-    for b in range(cuts.size - 1):
-        first, beyond = block(cuts, b)
+    ends = mechanism.tree.ends
+    for b in range(len(ends)):
+        first, beyond = block(ends, b)
         solve_ldl(k.ldl, k.residual, k.delta, first, beyond)
     for i in range(stages):
         for r in range(n):

@@ -32,7 +32,7 @@ from varpin.kernels.midpoint_equation import (
     Work,
     new_state,
 )
-from varpin.kernels.tree import Floats, Integers, Mechanism, Sweep, block
+from varpin.kernels.tree import Floats, Integers, Mechanism, Sweep
 
 SURE = 10.0  # a residual that is expected this far below the tolerance need not be looked at
 
@@ -194,21 +194,16 @@ def factor_stages(mechanism: Mechanism, tableau: Tableau, h: float, g: Stages) -
                     g.lu[i * n + r, j * n + c] += factor * g.A[i, r, c]
             for c in range(n):
                 g.lu[i * n + r, i * n + c] += g.M[i, r, c]
-    cuts = mechanism.tree.cuts
-    sign = 1
-    for b in range(cuts.size - 1):
-        begin, end = block(cuts, b)
-        sign *= factor_lu_pivoting(g.lu, g.order, n, begin, end)
-    return sign > 0
+    return factor_lu_pivoting(g.lu, g.order) > 0
 
 
 @inlined
-def size_of(mechanism: Mechanism, tableau: Tableau, g: Stages, x: Floats) -> float:
+def size_of(tableau: Tableau, g: Stages, x: Floats) -> float:
     """The square of x (s n,) in the metric of the kinetic energy, averaged over the step."""
     stages, n = g.V.shape
     total = 0.0
     for i in range(stages):
-        total += tableau.b[i] * quadratic_form(g.M[i], x[i * n : (i + 1) * n], mechanism.tree.cuts)
+        total += tableau.b[i] * quadratic_form(g.M[i], x[i * n : (i + 1) * n], (n,))
     return total
 
 
@@ -216,7 +211,6 @@ def size_of(mechanism: Mechanism, tableau: Tableau, g: Stages, x: Floats) -> flo
 def correct_slopes(mechanism: Mechanism, tableau: Tableau, h: float, g: Stages) -> None:
     """Bring L_q + F to where the correction ``g.delta`` has taken the stages, to first order in it."""
     stages, n = g.V.shape
-    cuts = mechanism.tree.cuts
     for i in range(stages):
         for r in range(n):
             total = 0.0
@@ -224,13 +218,11 @@ def correct_slopes(mechanism: Mechanism, tableau: Tableau, h: float, g: Stages) 
                 total += tableau.a[i, j] * g.delta[j * n + r]
             g.residual[i * n + r] = h * total
     for i in range(stages):
-        for b in range(cuts.size - 1):
-            begin, end = block(cuts, b)
-            for r in range(begin, end):
-                total = -mechanism.damping[r] * g.delta[i * n + r]
-                for c in range(begin, end):
-                    total += g.Lqq[i, r, c] * g.residual[i * n + c] + g.A[i, c, r] * g.delta[i * n + c]
-                g.slope[i, r] += total
+        for r in range(n):
+            total = -mechanism.damping[r] * g.delta[i * n + r]
+            for c in range(n):
+                total += g.Lqq[i, r, c] * g.residual[i * n + c] + g.A[i, c, r] * g.delta[i * n + c]
+            g.slope[i, r] += total
 
 
 @inlined
@@ -247,7 +239,6 @@ def newton_stages(
     """
     stages, n = g.V.shape
     wanted = k.Jx.shape[0] > 0
-    cuts = mechanism.tree.cuts
     before = np.inf
     fresh = True
     worst = np.inf
@@ -270,10 +261,8 @@ def newton_stages(
             return NOT_FINITE
         if fresh and not factor_stages(mechanism, tableau, h, g):
             return FOLD
-        for b in range(cuts.size - 1):
-            begin, end = block(cuts, b)
-            solve_lu_pivoting(g.lu, g.order, g.residual, g.delta, n, begin, end)
-        size = size_of(mechanism, tableau, g, g.delta)
+        solve_lu_pivoting(g.lu, g.order, g.residual, g.delta)
+        size = size_of(tableau, g, g.delta)
         if iteration >= ITERATIONS or not size <= 0.25 * before:
             break
         for i in range(stages):

@@ -351,8 +351,8 @@ def second_order(mechanism: Mechanism, q: Floats, v: Floats, w: Sweep) -> tuple[
     gx, gy, gz = g[0], g[1], g[2]
     potential = 0.0
     clear_first(w)
-    for b in range(tree.cuts.size - 1):
-        begin, end = block(tree.cuts, b)
+    for b in range(len(tree.ends)):
+        begin, end = block(tree.ends, b)
         for j in range(begin, end):
             for c in range(begin, end):
                 M[j, c] = 0.0
@@ -431,8 +431,8 @@ def add_mass(tree: Tree, j: int, w: Sweep) -> None:
 @inlined
 def clear_mass(tree: Tree, w: Sweep) -> None:
     """Zero the blocks of M; outside of them nothing is ever written."""
-    for b in range(tree.cuts.size - 1):
-        begin, end = block(tree.cuts, b)
+    for b in range(len(tree.ends)):
+        begin, end = block(tree.ends, b)
         for i in range(begin, end):
             for j in range(begin, end):
                 w.M[i, j] = 0.0

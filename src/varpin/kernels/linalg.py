@@ -1,12 +1,13 @@
 """Small dense factorisations, written out: at the size of an arm a LAPACK call costs more than its work.
 
-Each takes the rows and columns from ``begin`` up to ``end``: one block of a matrix that vanishes outside its blocks.
+Where they take ``begin`` and ``end``, they are for the rows and columns from the one up to the other: one block of a
+matrix that vanishes outside its blocks.
 """
 
 import numpy as np
 
 from varpin.kernels._compile import inlined
-from varpin.kernels.tree import Floats, Integers, block
+from varpin.kernels.tree import Ends, Floats, Integers, block
 
 
 @inlined
@@ -61,79 +62,53 @@ def solve_lu_twice(lu: Floats, b: Floats, x: Floats, c: Floats, y: Floats, begin
 
 
 @inlined
-def factor_lu_pivoting(a: Floats, order: Integers, repeat: int, begin: int, end: int) -> int:
-    """LU of the rows ``order`` of a block of ``a`` (n, n) in place; its determinant's sign, 0 where it is not finite.
-
-    The block's rows and columns are those from ``begin`` up to ``end`` of every ``repeat``.
-    """
-    width, repeats = end - begin, a.shape[0] // repeat
-    if width == repeat:
-        width, repeats = a.shape[0], 1
+def factor_lu_pivoting(a: Floats, order: Integers) -> int:
+    """LU of the rows ``order`` of ``a`` (n, n) in place; the sign of the determinant, 0 where it is not finite."""
+    n = a.shape[0]
     sign = 1
-    for r in range(repeats):
-        for i in range(begin + r * repeat, begin + r * repeat + width):
-            order[i] = i
-    for s in range(repeats):
-        for k in range(begin + s * repeat, begin + s * repeat + width):
-            best = k
-            for r in range(s, repeats):
-                first = begin + r * repeat
-                for i in range(max(first, k + 1), first + width):
-                    if abs(a[i, k]) > abs(a[best, k]):
-                        best = i
-            if best != k:
-                sign = -sign
-                order[k], order[best] = order[best], order[k]
-                for r in range(repeats):
-                    first = begin + r * repeat
-                    for j in range(first, first + width):
-                        a[k, j], a[best, j] = a[best, j], a[k, j]
-            pivot = a[k, k]
-            if not abs(pivot) > 0.0 or not abs(pivot) < np.inf:
-                return 0
-            if pivot < 0.0:
-                sign = -sign
-            inverse = 1.0 / pivot
-            for r in range(s, repeats):
-                first = begin + r * repeat
-                for i in range(max(first, k + 1), first + width):
-                    a[i, k] *= inverse
-            # Slices, unlike indices from k + 1 on, let the compiler use vector instructions.
-            for c in range(s, repeats):
-                first = begin + c * repeat
-                top = a[k, max(first, k + 1) : first + width]
-                for r in range(s, repeats):
-                    last = begin + r * repeat + width
-                    for i in range(max(last - width, k + 1), last):
-                        factor = a[i, k]
-                        row = a[i, max(first, k + 1) : first + width]
-                        for j in range(row.size):
-                            row[j] -= factor * top[j]
+    for i in range(n):
+        order[i] = i
+    for k in range(n):
+        best = k
+        for i in range(k + 1, n):
+            if abs(a[i, k]) > abs(a[best, k]):
+                best = i
+        if best != k:
+            sign = -sign
+            order[k], order[best] = order[best], order[k]
+            for j in range(n):
+                a[k, j], a[best, j] = a[best, j], a[k, j]
+        pivot = a[k, k]
+        if not abs(pivot) > 0.0 or not abs(pivot) < np.inf:
+            return 0
+        if pivot < 0.0:
+            sign = -sign
+        inverse = 1.0 / pivot
+        # Slices, unlike indices from k + 1 on, let the compiler use vector instructions.
+        top = a[k, k + 1 :]
+        for i in range(k + 1, n):
+            factor = a[i, k] * inverse
+            a[i, k] = factor
+            row = a[i, k + 1 :]
+            for j in range(row.size):
+                row[j] -= factor * top[j]
     return sign
 
 
 @inlined
-def solve_lu_pivoting(lu: Floats, order: Integers, b: Floats, x: Floats, repeat: int, begin: int, end: int) -> None:
-    """The x with a x = b for the block of ``a`` that :func:`factor_lu_pivoting` has factored."""
-    width, repeats = end - begin, lu.shape[0] // repeat
-    if width == repeat:
-        width, repeats = lu.shape[0], 1
-    for s in range(repeats):
-        for i in range(begin + s * repeat, begin + s * repeat + width):
-            total = b[order[i]]
-            for r in range(s + 1):
-                first = begin + r * repeat
-                for j in range(first, min(first + width, i)):
-                    total -= lu[i, j] * x[j]
-            x[i] = total
-    for s in range(repeats - 1, -1, -1):
-        for i in range(begin + s * repeat + width - 1, begin + s * repeat - 1, -1):
-            total = x[i]
-            for r in range(s, repeats):
-                first = begin + r * repeat
-                for j in range(max(first, i + 1), first + width):
-                    total -= lu[i, j] * x[j]
-            x[i] = total / lu[i, i]
+def solve_lu_pivoting(lu: Floats, order: Integers, b: Floats, x: Floats) -> None:
+    """The x with a x = b for the ``a`` that :func:`factor_lu_pivoting` has factored."""
+    n = lu.shape[0]
+    for i in range(n):
+        total = b[order[i]]
+        for j in range(i):
+            total -= lu[i, j] * x[j]
+        x[i] = total
+    for i in range(n - 1, -1, -1):
+        total = x[i]
+        for j in range(i + 1, n):
+            total -= lu[i, j] * x[j]
+        x[i] = total / lu[i, i]
 
 
 @inlined
@@ -226,11 +201,11 @@ def solve_ldl_rows(ldl: Floats, b: Floats) -> None:
 
 
 @inlined
-def quadratic_form(a: Floats, x: Floats, cuts: Integers) -> float:
-    """X' a x, with the blocks of ``a`` between ``cuts``."""
+def quadratic_form(a: Floats, x: Floats, ends: Ends) -> float:
+    """X' a x, with the blocks of ``a`` that have these ends."""
     total = 0.0
-    for b in range(cuts.size - 1):
-        begin, end = block(cuts, b)
+    for b in range(len(ends)):
+        begin, end = block(ends, b)
         for i in range(begin, end):
             row = 0.0
             for j in range(begin, end):

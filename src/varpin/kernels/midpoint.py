@@ -48,11 +48,11 @@ def branch_margin(mechanism: Mechanism, options: Options, h: float, k: Work) -> 
     """
     w = k.sweep
     a = options.alpha
-    cuts = mechanism.tree.cuts
+    ends = mechanism.tree.ends
     exaggerated = h * h * a * (1.0 - a) / (1.0 - options.margin)
     least = np.inf
-    for b in range(cuts.size - 1):
-        begin, end = block(cuts, b)
+    for b in range(len(ends)):
+        begin, end = block(ends, b)
         for i in range(begin, end):
             for j in range(begin, i + 1):
                 k.lu[i, j] = w.M[i, j] - exaggerated * w.Lqq[i, j]
@@ -73,11 +73,11 @@ def kinetic_energy(mechanism: Mechanism, p: Floats, v: Floats, k: Work) -> None:
     Leaves in ``k.share`` the terms of the kinetic energy 1/2 y' D^-1 y with L y = p, none of which is negative: what is
     each coordinate's own while those before it are free. Leaves in ``k.balance[:, 0]`` the sums of each group.
     """
-    cuts = mechanism.tree.cuts
+    ends = mechanism.tree.ends
     for i in range(p.size):
         k.balance[i, 0] = 0.0
-    for b in range(cuts.size - 1):
-        begin, end = block(cuts, b)
+    for b in range(len(ends)):
+        begin, end = block(ends, b)
         solve_lower(k.ldl, p, v, begin, end)
         for i in range(begin, end):
             v[i], y = v[i] / k.ldl[i, i], v[i]
@@ -94,9 +94,9 @@ def node_energy(mechanism: Mechanism, q: Floats, p: Floats, v: Floats, k: Work) 
     in ``k.sweep.V``.
     """
     mass_matrix(mechanism, q, k.sweep)
-    cuts = mechanism.tree.cuts
-    for b in range(cuts.size - 1):
-        begin, end = block(cuts, b)
+    ends = mechanism.tree.ends
+    for b in range(len(ends)):
+        begin, end = block(ends, b)
         for i in range(begin, end):
             for j in range(begin, i + 1):
                 k.ldl[i, j] = k.sweep.M[i, j]
@@ -391,12 +391,12 @@ def begin_at(mechanism: Mechanism, q: Floats, p: Floats, state: State, k: Work) 
 def begin_paths(mechanism: Mechanism, q: Floats, v: Floats, states: State, k: Work) -> bool:
     """Put each path at its row of q and v (P, n); False where an M(q) is not positive definite."""
     n = q.shape[1]
-    cuts = mechanism.tree.cuts
+    ends = mechanism.tree.ends
     for i in range(q.shape[0]):
         state = path(states, i)
         mass_matrix(mechanism, q[i], k.sweep)
-        for b in range(cuts.size - 1):
-            begin, end = block(cuts, b)
+        for b in range(len(ends)):
+            begin, end = block(ends, b)
             for r in range(begin, end):
                 total = 0.0
                 for c in range(begin, end):

@@ -29,10 +29,10 @@ def substep_curvature(
     w = k.sweep
     a = options.alpha
     n = k.v.size
-    cuts = mechanism.tree.cuts
+    ends = mechanism.tree.ends
     root_jacobian(mechanism, options, h, k, dv)
-    for b in range(cuts.size - 1):
-        begin, end = block(cuts, b)
+    for b in range(len(ends)):
+        begin, end = block(ends, b)
         for i in range(begin, end):
             for c in range(begin, end):
                 dv[i, 2 * n + c] = 0.5 * h * dv[i, n + c]
@@ -48,8 +48,8 @@ def substep_curvature(
             k.start[i] = h * z[n + i] + h * (1.0 - a) * total
             k.delta[i] = -total
     third_order(mechanism, k.qm, k.v, k.start, k.delta, w, t)
-    for b in range(cuts.size - 1):
-        begin, end = block(cuts, b)
+    for b in range(len(ends)):
+        begin, end = block(ends, b)
         for third in range(3):
             for c in range(third * n + begin, third * n + end):
                 for i in range(begin, end):

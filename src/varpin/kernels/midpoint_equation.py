@@ -163,11 +163,11 @@ def set_midpoint(a: float, h: float, state: State, k: Work) -> None:
 
 @inlined
 def factor_newton(mechanism: Mechanism, a: float, h: float, k: Work) -> bool:
-    """Factor -dr/dv from the jet in the sweep, block by block: what else is in it stands on its diagonal."""
+    """Factor -dr/dv from the jet in the sweep, block by block: dampers stand on its diagonal."""
     w = k.sweep
-    cuts = mechanism.tree.cuts
-    for b in range(cuts.size - 1):
-        begin, end = block(cuts, b)
+    ends = mechanism.tree.ends
+    for b in range(len(ends)):
+        begin, end = block(ends, b)
         for i in range(begin, end):
             for j in range(begin, end):
                 k.lu[i, j] = w.M[i, j] + h * (a * w.A[i, j] - (1.0 - a) * w.A[j, i] - h * a * (1.0 - a) * w.Lqq[i, j])
@@ -185,7 +185,7 @@ def newton(mechanism: Mechanism, options: Options, h: float, state: State, k: Wo
     of the one before (natural monotonicity, Deuflhard), unless the residual is down at its rounding floor.
     """
     a = options.alpha
-    cuts = mechanism.tree.cuts
+    ends = mechanism.tree.ends
     before = np.inf
     fresh = True
     worst = np.inf
@@ -204,17 +204,17 @@ def newton(mechanism: Mechanism, options: Options, h: float, state: State, k: Wo
             return NOT_FINITE
         if fresh and not factor_newton(mechanism, a, h, k):
             return FOLD
-        for b in range(cuts.size - 1):
-            begin, end = block(cuts, b)
+        for b in range(len(ends)):
+            begin, end = block(ends, b)
             solve_lu(k.lu, k.residual, k.delta, begin, end)
-        size = quadratic_form(k.sweep.M, k.delta, cuts)
+        size = quadratic_form(k.sweep.M, k.delta, ends)
         if iteration == ITERATIONS or not size <= 0.25 * before:
             break
         for i in range(k.v.size):
             k.v[i] += k.delta[i]
         k.tally[0] += 1
         # The squared contraction to expect: seen, or guessed from the size of the first correction.
-        shrink = size / (quadratic_form(k.sweep.M, k.v, cuts) if before == np.inf else before)
+        shrink = size / (quadratic_form(k.sweep.M, k.v, ends) if before == np.inf else before)
         fresh = not worst * shrink <= options.tolerance
         before = size
     if not worst <= max(ROUNDING, options.tolerance):

@@ -56,10 +56,10 @@ def root_jacobian(mechanism: Mechanism, options: Options, h: float, k: Work, dv:
     w = k.sweep
     a = options.alpha
     n = k.v.size
-    cuts = mechanism.tree.cuts
+    ends = mechanism.tree.ends
     factor_newton(mechanism, a, h, k)
-    for b in range(cuts.size - 1):
-        begin, end = block(cuts, b)
+    for b in range(len(ends)):
+        begin, end = block(ends, b)
         for c in range(begin, end):
             for i in range(begin, end):
                 k.residual[i] = h * (1.0 - a) * w.Lqq[i, c] - w.A[i, c]
@@ -75,13 +75,13 @@ def substep_jacobian(mechanism: Mechanism, options: Options, h: float, k: Work, 
     w = k.sweep
     a = options.alpha
     n = k.v.size
-    cuts = mechanism.tree.cuts
-    if cuts.size > 2:
+    ends = mechanism.tree.ends
+    if len(ends) > 1:
         Jx[:] = 0.0
         Jf[:] = 0.0
     root_jacobian(mechanism, options, h, k, Jx)
-    for b in range(cuts.size - 1):
-        begin, end = block(cuts, b)
+    for b in range(len(ends)):
+        begin, end = block(ends, b)
         for i in range(begin, end):
             for c in range(begin, end):
                 of_place, of_momentum = 0.0, 0.0
@@ -130,9 +130,9 @@ def chain(mechanism: Mechanism, k: Work) -> None:
     """Let the substep whose derivatives stand in ``k.part`` follow those before: chain rule."""
     n = k.v.size
     Jx, Jf, product = k.part[: 2 * n], k.part[2 * n :, :n], k.part[2 * n :, n:]
-    cuts = mechanism.tree.cuts
-    for b in range(cuts.size - 1):
-        begin, end = block(cuts, b)
+    ends = mechanism.tree.ends
+    for b in range(len(ends)):
+        begin, end = block(ends, b)
         for half in range(2):
             for top in range(2):
                 for i in range(top * n + begin, top * n + end):

@@ -9,6 +9,8 @@ from varpin.kernels._compile import inlined
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+# Of one block a tuple, of more an array: kernels are compiled for either, and know that one block is all there is.
+Ends = Integers | tuple[int]
 
 
 class Tree(NamedTuple):
@@ -36,16 +38,16 @@ class Tree(NamedTuple):
     armature: Floats  # (n,) [kg m^2 or kg]
     group: Integers  # (n,) which of r mechanically independent groups a coordinate belongs to, from 0
     groups: int  # r; coordinates of different groups share neither inertia nor a mimic joint
-    cuts: Integers  # (c + 1,) first coordinates of the blocks outside of which M, L_vq and L_qq vanish, and n
+    ends: Ends  # (c,) one past the last coordinate of each block outside of which M, L_vq and L_qq vanish
 
 
 @inlined
-def block(cuts: Integers, b: int) -> tuple[int, int]:
+def block(ends: Ends, b: int) -> tuple[int, int]:
     """The first coordinate of block ``b``, and one past its last.
 
     That they fit 31 bits tells the compiler that none is negative; every access would else be tested for it.
     """
-    return cuts[b] & 0x7FFFFFFF, cuts[b + 1] & 0x7FFFFFFF
+    return (ends[b - 1] & 0x7FFFFFFF if b > 0 else 0), ends[b] & 0x7FFFFFFF
 
 
 class Diffusion(NamedTuple):

@@ -218,6 +218,8 @@ def rotation_errors(target: Floats, R: Floats, *, derivative: bool = False) -> t
 
     With them, if asked for, their derivatives (N, 3, 3) in a turn of R (N, 3, 3) about its own axes; else (0, 3, 3).
     """
+    if len(target) not in (1, R.shape[-3]):
+        raise InputError(f"{len(target)} targets do not go with {R.shape[-3]} rotations")
     rows = np.ascontiguousarray(R).reshape(-1, 3, 3)
     r, D = np.empty((len(rows), 3)), np.empty((len(rows) if derivative else 0, 3, 3))
     rotation_logarithms(np.ascontiguousarray(target), rows, np.empty((3, 3)), np.empty(4), r, D)

@@ -7,7 +7,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from varpin.errors import InputError, RobotError, UnknownFrame, UnsupportedJoint
-from varpin.kernels.tree import Tree
+from varpin.kernels.tree import Ends, Tree
 from varpin.robot.mimic import Tie
 
 Floats = NDArray[np.float64]
@@ -135,7 +135,7 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
         armature=coordinate_armature(model, ties, coordinates),
         group=group,
         groups=int(group.max()) + 1,
-        cuts=block_cuts(group),
+        ends=block_ends(group),
     )
 
 
@@ -306,9 +306,10 @@ def require_sound(tree: Tree) -> None:
         values = getattr(tree, name)
         if ((values < low) | (values >= high)).any():
             raise RobotError(f"the robot's tree is damaged: its {name} points to what is not there")
-    cuts = tree.cuts
-    if not (isinstance(cuts, np.ndarray) and cuts.dtype == np.int64 and np.array_equal(cuts, block_cuts(tree.group))):
-        raise RobotError("the robot's tree is damaged: its cuts are not where groups end")
+    ends, known = tree.ends, block_ends(tree.group)
+    indices = not isinstance(ends, np.ndarray) or ends.dtype == np.int64
+    if type(ends) is not type(known) or not indices or not np.array_equal(ends, known):
+        raise RobotError("the robot's tree is damaged: its blocks do not end where groups do")
 
 
 def tree_mass_matrix(tree: Tree, q: Floats) -> Floats:
@@ -364,8 +365,8 @@ def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Inte
     return np.asarray(label, dtype=np.int64)
 
 
-def block_cuts(group: Integers) -> Integers:
-    """Where runs of coordinates begin that hold whole groups (c + 1,), and n last.
+def block_ends(group: Integers) -> Ends:
+    """Where runs of coordinates end that hold whole groups (c,); a tuple if there is one.
 
     Mostly each group is one run; groups whose coordinates take turns share one.
 
@@ -376,4 +377,4 @@ def block_cuts(group: Integers) -> Integers:
     last = np.zeros(n, dtype=np.int64)
     np.maximum.at(last, group, np.arange(n))
     ends = np.flatnonzero(np.maximum.accumulate(last[group]) == np.arange(n)) + 1
-    return np.concatenate([[0], ends])
+    return ends if len(ends) > 1 else (n,)
