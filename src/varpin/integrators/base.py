@@ -244,6 +244,27 @@ def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> 
     return limited
 
 
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """A contiguous view that cannot be written to, or such a copy.
+
+    Kernels are compiled for each kind of array that they meet: of what comes from users and from trajectories they
+    shall meet one.
+    """
+    view = np.ascontiguousarray(array).view()
+    view.setflags(write=False)
+    return view
+
+
+def uniform(commands: Commands) -> Commands:
+    """Commands as kernels take them: arrays of one kind."""
+    return commands._replace(
+        u=read_only(commands.u),
+        gains=read_only(commands.gains),
+        reference=read_only(commands.reference),
+        limits=read_only(commands.limits),
+    )
+
+
 def steps_of(commands: Commands) -> int:
     """How many steps the commands are for."""
     return len(commands.u) * commands.hold

@@ -16,8 +16,10 @@ from varpin.integrators.base import (
     diffusion_and_drift,
     drifts,
     open_loop,
+    read_only,
     segments_of,
     steps_of,
+    uniform,
 )
 from varpin.kernels import explicit as kernels
 from varpin.kernels.dynamics import Dynamics, forward_derivatives, new_dynamics
@@ -102,7 +104,7 @@ class _Explicit(Integrator):
             scene.mechanism,
             self.scheme,
             dt,
-            commands,
+            uniform(commands),
             increments,
             drift,
             state.state,
@@ -133,7 +135,7 @@ def accelerations(scene: Scene, q: Floats, v: Floats, force: Floats) -> tuple[Fl
     bodies = scene.robot.tree.parent.size
     a, aq, av, af = np.empty((N, n)), np.empty((N, n, n)), np.empty((N, n, n)), np.empty((N, n, n))
     Z, P, Q = np.zeros((3, bodies, 6))
-    q, v, force = np.ascontiguousarray(q), np.ascontiguousarray(v), np.ascontiguousarray(force)
+    q, v, force = read_only(q), read_only(v), read_only(force)
     if not forward_derivatives(scene.mechanism, q, v, force, Z, P, Q, new_dynamics(bodies, n), a, aq, av, af):
         raise LinearizationError(0, 0.0, REASONS[kernels.SINGULAR])
     return a, aq, av, af

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from varpin.checks import count
 from varpin.errors import InputError, LinearizationError
-from varpin.integrators.base import Segment, drifts, segments_of, steps_of
+from varpin.integrators.base import Segment, drifts, read_only, segments_of, steps_of, uniform
 from varpin.integrators.variational import REASONS, Variational, VariationalRun
 from varpin.kernels import gauss as kernels
 from varpin.kernels import gauss_equation as stage_equation
@@ -107,7 +107,7 @@ class Gauss(Variational):
             tableau(int(self.stages)),
             self._gauss_options(),
             dt,
-            commands,
+            uniform(commands),
             increments,
             drift,
             state.state,
@@ -123,7 +123,7 @@ class Gauss(Variational):
         A step that was taken in parts is taken in parts again, and their derivatives are chained.
         """
         steps, n = trajectory.steps, scene.robot.dof
-        q, p = (np.ascontiguousarray(getattr(trajectory, name)[:-1]) for name in ("q", "p"))
+        q, p = (read_only(getattr(trajectory, name)[:-1]) for name in ("q", "p"))
         force = trajectory.u @ scene.actuation.T + self.drift_share * drifts(scene, trajectory)
         Jx, Jf = np.empty((steps, 2 * n, 2 * n)), np.empty((steps, 2 * n, n))
         state, stages = self._arrays(scene, 1)
@@ -135,9 +135,9 @@ class Gauss(Variational):
             trajectory.dt,
             q,
             p,
-            self._guess(trajectory),
-            force,
-            np.ascontiguousarray(trajectory.statistics.substeps),
+            read_only(self._guess(trajectory)),
+            read_only(force),
+            read_only(trajectory.statistics.substeps),
             state,
             equation.new_work(scene.robot.tree.parent.size, n, scene.robot.tree.loads.size, derivatives=True),
             stages,

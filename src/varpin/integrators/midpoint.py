@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 
 from varpin.checks import fraction
 from varpin.errors import LinearizationError
-from varpin.integrators.base import Segment, drifts, segments_of, steps_of
+from varpin.integrators.base import Segment, drifts, read_only, segments_of, steps_of, uniform
 from varpin.integrators.variational import REASONS, Variational, VariationalRun
 from varpin.kernels import midpoint as kernels
 from varpin.kernels import midpoint_equation as equation
@@ -111,7 +111,15 @@ class Midpoint(Variational):
         """See :meth:`Integrator.rollout_compiled`."""
         nodes = new_nodes(len(state.state.q), steps_of(commands), scene.robot.dof, scene.controls)
         kernels.rollout(
-            scene.mechanism, self._options(self.alpha), dt, commands, increments, drift, state.state, state.work, nodes
+            scene.mechanism,
+            self._options(self.alpha),
+            dt,
+            uniform(commands),
+            increments,
+            drift,
+            state.state,
+            state.work,
+            nodes,
         )
         return segments_of(nodes, REASONS)
 
@@ -125,13 +133,13 @@ class Midpoint(Variational):
 
     def _roots(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats, Integers]:
         """Of every step at dw = 0: q, p, a guess next to its velocity, the constant force, each (N, n); its parts."""
-        q, p, v = (np.ascontiguousarray(getattr(trajectory, name)[:-1]) for name in ("q", "p", "v"))
+        q, p, v = (read_only(getattr(trajectory, name)[:-1]) for name in ("q", "p", "v"))
         # Without noise the root is known; with it the step at dw = 0 starts from another momentum.
         guess = v if trajectory.dw.any() else np.diff(trajectory.q, axis=0) / trajectory.dt
         force = trajectory.u @ scene.actuation.T
         if scene.noise.velocity_dependent:
             force = force + self.drift_share * drifts(scene, trajectory)
-        return q, p, guess, force, np.ascontiguousarray(trajectory.statistics.substeps)
+        return q, p, guess, force, trajectory.statistics.substeps
 
     def _loose(self) -> equation.Options:
         """A root that is known to 1e-10 is good enough for derivatives, and one jet for them."""
@@ -143,6 +151,7 @@ class Midpoint(Variational):
         steps, n = q.shape
         Jx, Jf = np.empty((steps, 2 * n, 2 * n)), np.empty((steps, 2 * n, n))
         state, work = _room(scene, derivatives=True)
+        q, p, guess, force, substeps = (read_only(array) for array in (q, p, guess, force, substeps))
         outcome, done = linearize(scene.mechanism, self._loose(), dt, q, p, guess, force, substeps, state, work, Jx, Jf)
         if outcome != equation.SOLVED:
             raise LinearizationError(done, done * dt, REASONS[outcome])
