@@ -108,6 +108,7 @@ class Integrator(ABC):
         each path; with diffusion fields that only Python can evaluate there is one path.
         """
         if scene.noise.diffusion is not None:
+            commands = uniform(commands)
             return self.rollout_compiled(scene, state, commands, increments, np.zeros((0, 0, scene.robot.dof)), dt)
         segments: list[Segment] = []
         for j in range(steps_of(commands)):
@@ -221,7 +222,7 @@ def segments_of(nodes: Nodes, reasons: Mapping[int, str]) -> list[Segment]:
 def open_loop(u: Floats) -> Commands:
     """Controls (N, m) without feedback."""
     m = u.shape[1]
-    return Commands(np.ascontiguousarray(u), np.zeros((0, m, 0)), np.zeros((0, 0)), 1, no_limits(m), np.zeros((0, m)))
+    return uniform(Commands(u, np.zeros((0, m, 0)), np.zeros((0, 0)), 1, no_limits(m), np.zeros((0, m))))
 
 
 def no_limits(controls: int) -> Floats:

@@ -19,7 +19,6 @@ from varpin.integrators.base import (
     read_only,
     segments_of,
     steps_of,
-    uniform,
 )
 from varpin.kernels import explicit as kernels
 from varpin.kernels.dynamics import Dynamics, forward_derivatives, new_dynamics
@@ -104,7 +103,7 @@ class _Explicit(Integrator):
             scene.mechanism,
             self.scheme,
             dt,
-            uniform(commands),
+            commands,
             increments,
             drift,
             state.state,

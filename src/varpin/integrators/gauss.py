@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from varpin.checks import count
 from varpin.errors import InputError, LinearizationError
-from varpin.integrators.base import Segment, drifts, read_only, segments_of, steps_of, uniform
+from varpin.integrators.base import Segment, drifts, read_only, segments_of, steps_of
 from varpin.integrators.variational import REASONS, Variational, VariationalRun
 from varpin.kernels import gauss as kernels
 from varpin.kernels import gauss_equation as stage_equation
@@ -107,7 +107,7 @@ class Gauss(Variational):
             tableau(int(self.stages)),
             self._gauss_options(),
             dt,
-            uniform(commands),
+            commands,
             increments,
             drift,
             state.state,

@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 
 from varpin.checks import fraction
 from varpin.errors import LinearizationError
-from varpin.integrators.base import Segment, drifts, read_only, segments_of, steps_of, uniform
+from varpin.integrators.base import Segment, drifts, read_only, segments_of, steps_of
 from varpin.integrators.variational import REASONS, Variational, VariationalRun
 from varpin.kernels import midpoint as kernels
 from varpin.kernels import midpoint_equation as equation
@@ -111,15 +111,7 @@ class Midpoint(Variational):
         """See :meth:`Integrator.rollout_compiled`."""
         nodes = new_nodes(len(state.state.q), steps_of(commands), scene.robot.dof, scene.controls)
         kernels.rollout(
-            scene.mechanism,
-            self._options(self.alpha),
-            dt,
-            uniform(commands),
-            increments,
-            drift,
-            state.state,
-            state.work,
-            nodes,
+            scene.mechanism, self._options(self.alpha), dt, commands, increments, drift, state.state, state.work, nodes
         )
         return segments_of(nodes, REASONS)
 
