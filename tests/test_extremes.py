@@ -18,6 +18,7 @@ from varpin.extremes import Kind, Setup, Trial, checks
 from varpin.extremes.battery import INTEGRATORS
 from varpin.extremes.plans import Task, attempt, cost_error, part_left
 from varpin.robot.chain import rod_chain
+from varpin.soundness import Finding
 from varpin.wiener import wiener_increments
 
 BY_NAME = {trial.name: trial for trial in (*extremes.TRIALS, *extremes.PLANS)}
@@ -205,7 +206,7 @@ def test_what_is_wrong_and_unsaid_is_silent_wrong(monkeypatch):
     assert cell.kind is Kind.WRONG
     assert "error" in cell.found[0]
     # The same error, but spoken of.
-    monkeypatch.setattr("varpin.simulation.warnings_of", lambda *_: ("all is not well",))
+    monkeypatch.setattr("varpin.soundness._looked_for", lambda *_: (Finding("test", "all is not well"),))
     assert run_one(lie, window=0.5).kind is Kind.DEGRADED
 
 

@@ -135,3 +135,19 @@ def test_an_interrupted_motion_tells_too():
     with pytest.raises(vp.Interrupted) as caught:
         vp.simulate(vp.Scene(ROD), [0.0], [0.0], dt=0.3, steps=100_000, progress=interrupt, integrator=EXPLICIT[1])
     assert caught.value.trajectory.warnings
+
+
+def test_a_loop_logs_each_kind_of_warning_once_for_a_scene_and_a_step(caplog):
+    def logged(scene, dt, times):
+        caplog.clear()
+        with caplog.at_level(logging.WARNING, logger="varpin"):
+            said = [vp.simulate(scene, [1.0], [0.0], dt=dt, steps=20).warnings for _ in range(times)]
+        # The trajectories keep theirs, however often it was logged.
+        assert all(any("damping is faster" in sentence for sentence in each) for each in said)
+        return sum("damping is faster" in record.message for record in caplog.records)
+
+    scene = vp.Scene(vp.planar_chain(1), damping=1e3)
+    assert logged(scene, 1e-2, 5) == 1
+    assert logged(scene, 1e-2, 1) == 0
+    assert logged(scene, 2e-2, 1) == 1
+    assert logged(vp.Scene(vp.planar_chain(1), damping=1e3), 1e-2, 1) == 1

@@ -43,6 +43,8 @@ class Scene:
     rest: Floats
     actuation: Floats = field(repr=False)
     noise: BoundNoise = field(repr=False)
+    # Kinds of warnings that the log has had, and at which time step [s].
+    announced: set[tuple[str, float]] = field(repr=False)
 
     def __init__(
         self,
@@ -89,6 +91,7 @@ class Scene:
         }
         values["actuation"] = _actuation(robot, actuation)
         values["noise"] = bind(noise, values["actuation"])
+        values["announced"] = set()
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)

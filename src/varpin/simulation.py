@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any, Literal
 
 import numpy as np
@@ -16,10 +16,9 @@ from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, open_loop, rows, steps_of
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
-from varpin.lagrangian import lagrangian_jet
 from varpin.policy import LinearPolicy
 from varpin.scene import Scene, require_scene
-from varpin.soundness import energy_defects, warnings_of
+from varpin.soundness import Finding, announce, evident, examined, with_warnings
 from varpin.trajectory import StepStatistics, Trajectory
 from varpin.wiener import wiener_increments
 
@@ -269,7 +268,6 @@ def simulate(
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
     with announced_compilation(f"simulate with {type(integrator).__name__}"):
         state, (start,) = integrator.start(scene, q0[None], v0[None])
-        said = _ringing(scene, q0, dt)
         record = _Record(scene, integrator, dt, steps, dw, start)
         # A sweep takes as long as the robot has joints, an elimination as their cube.
         chunk = max(1, _CHUNK // (n + n**3 // 100))
@@ -298,26 +296,20 @@ def simulate(
                 if progress is not None and (not stepwise or record.steps % chunk == 0 or record.steps == steps):
                     progress(record.steps, steps)
         except KeyboardInterrupt:
-            raise Interrupted(_told(scene, integrator, record.trajectory(), said, check=check)) from None
-        trajectory = _told(scene, integrator, record.trajectory(), said, check=check)
-    for sentence in trajectory.warnings:
-        logger.warning(sentence)
+            raise Interrupted(_told(scene, integrator, record.trajectory(), check=check)[0]) from None
+        trajectory, found = _told(scene, integrator, record.trajectory(), check=check)
+    announce(logger, scene, dt, found)
     return trajectory
 
 
 def _told(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, said: tuple[str, ...], *, check: bool
-) -> Trajectory:
-    """A whole motion with the balance of its energy, if the integrator keeps none, and with what is to be said."""
-    if check and not integrator.variational:
-        own = replace(trajectory.statistics, energy_defect=energy_defects(scene, trajectory))
-        trajectory = replace(trajectory, statistics=own)
-    split = trajectory.statistics.split_steps
-    if split:
-        most, steps, dt = trajectory.statistics.substeps.max(), trajectory.steps, trajectory.dt
-        said = (*said, f"{split} of {steps} steps were taken in up to {most} parts: dt = {dt:g} s is coarse here")
-    sentences = (*said, *(warnings_of(scene, integrator, trajectory) if check else ()))
-    return replace(trajectory, warnings=sentences) if sentences else trajectory
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, *, check: bool
+) -> tuple[Trajectory, tuple[Finding, ...]]:
+    """A whole motion with what is to be said of it."""
+    if check:
+        return examined(scene, integrator, trajectory)
+    found = evident(scene, trajectory)
+    return with_warnings(trajectory, found), found
 
 
 def _require_memory(scene: Scene, steps: int) -> None:
@@ -327,20 +319,6 @@ def _require_memory(scene: Scene, steps: int) -> None:
         np.empty((steps + 1, columns))
     except (MemoryError, ValueError, OverflowError):
         raise InputError(f"steps = {steps} needs more memory than there is: {columns * 8} bytes a step") from None
-
-
-def _ringing(scene: Scene, q0: Floats, dt: float) -> tuple[str, ...]:
-    """Says if dampers are too fast for the step: the midpoint rule keeps stable, but turns velocities round."""
-    if not scene.damping.any():
-        return ()
-    rate = np.linalg.solve(lagrangian_jet(scene, q0, np.zeros_like(q0)).Lvv, np.diag(scene.damping))
-    fastest = float(np.abs(np.linalg.eigvals(rate)).max()) if np.isfinite(rate).all() else np.inf
-    if 0.5 * dt * fastest <= 1.0:
-        return ()
-    return (
-        f"damping is faster than the step (dt * {fastest:.3g}/s > 2): velocities that it should stop will ring; "
-        f"dt below {2.0 / fastest:.3g} s resolves it",
-    )
 
 
 def commands_of(

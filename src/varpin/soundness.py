@@ -1,12 +1,15 @@
 """What a finished motion says of itself: does its energy balance close, and do its steps resolve it?
 
 Both are asked of every integrator after the run, from its record and a few of its steps; what the guards of a step
-let pass, and integrators without guards, are told of here.
+let pass, and integrators without guards, are told of here. Whoever makes a motion that a user sees calls
+:func:`examined`, and :func:`announce` for the log.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +18,7 @@ from varpin.errors import SingularMassMatrix
 from varpin.integrators import Integrator, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
+from varpin.lagrangian import lagrangian_jet
 from varpin.scene import Scene
 from varpin.trajectory import Trajectory
 
@@ -31,6 +35,19 @@ _STILL = 1e-9
 
 
 @dataclass(frozen=True)
+class Finding:
+    """One thing to be said about a motion.
+
+    Attributes:
+        kind: What it is about, in a word or two; the log has each kind once for a scene and a time step.
+        sentence: For the user, with numbers.
+    """
+
+    kind: str
+    sentence: str
+
+
+@dataclass(frozen=True)
 class StepError:
     """How far a step is from the same in two halves, at its worst over the steps looked at.
 
@@ -44,8 +61,62 @@ class StepError:
     error: float
 
 
-def warnings_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[str, ...]:
-    """What is to be said about a motion, a sentence each; none if nothing is."""
+def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Trajectory, tuple[Finding, ...]]:
+    """A motion with its energy balance, if the integrator keeps none, and its warnings; and what was found."""
+    if not integrator.variational:
+        own = replace(trajectory.statistics, energy_defect=energy_defects(scene, trajectory))
+        trajectory = replace(trajectory, statistics=own)
+    found = (*evident(scene, trajectory), *_looked_for(scene, integrator, trajectory))
+    return with_warnings(trajectory, found), found
+
+
+def with_warnings(trajectory: Trajectory, found: Iterable[Finding]) -> Trajectory:
+    """The motion with what was found as its warnings."""
+    sentences = tuple(finding.sentence for finding in found)
+    return replace(trajectory, warnings=sentences) if sentences else trajectory
+
+
+def announce(logger: logging.Logger, scene: Scene, dt: float, found: Iterable[Finding]) -> None:
+    """Log what was found, each kind once for this scene and time step."""
+    for finding in found:
+        if (finding.kind, dt) not in scene.announced:
+            scene.announced.add((finding.kind, dt))
+            logger.warning(finding.sentence)
+
+
+def evident(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """What the record tells without taking steps again: dampers faster than the step, steps taken in parts."""
+    found = list(_ringing(scene, trajectory.q[0], trajectory.dt))
+    if split := trajectory.statistics.split_steps:
+        most, steps, dt = trajectory.statistics.substeps.max(), trajectory.steps, trajectory.dt
+        found.append(
+            Finding(
+                "split steps",
+                f"{split} of {steps} steps were taken in up to {most} parts: dt = {dt:g} s is coarse here",
+            )
+        )
+    return tuple(found)
+
+
+def _ringing(scene: Scene, q0: Floats, dt: float) -> tuple[Finding, ...]:
+    """Says if dampers are too fast for the step: the midpoint rule keeps stable, but turns velocities round."""
+    if not scene.damping.any():
+        return ()
+    rate = np.linalg.solve(lagrangian_jet(scene, q0, np.zeros_like(q0)).Lvv, np.diag(scene.damping))
+    fastest = float(np.abs(np.linalg.eigvals(rate)).max()) if np.isfinite(rate).all() else np.inf
+    if 0.5 * dt * fastest <= 1.0:
+        return ()
+    return (
+        Finding(
+            "fast damping",
+            f"damping is faster than the step (dt * {fastest:.3g}/s > 2): velocities that it should stop will ring; "
+            f"dt below {2.0 / fastest:.3g} s resolves it",
+        ),
+    )
+
+
+def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """What the balance of the energy and steps taken again tell."""
     if not trajectory.steps:
         return ()
     found = []
@@ -57,14 +128,20 @@ def warnings_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     if not defect[worst] <= ENERGY_BUDGET * scale + rounding:
         share = f", {100 * defect[worst] / scale:.3g}% of what there was to turn over" if scale > 0.0 else ""
         found.append(
-            f"the energy is off by {defect[worst]:.3g} J at t = {trajectory.t[worst + 1]:.4g} s{share}: "
-            f"dt = {trajectory.dt:g} s is too long for {integrator}"
+            Finding(
+                "energy",
+                f"the energy is off by {defect[worst]:.3g} J at t = {trajectory.t[worst + 1]:.4g} s{share}: "
+                f"dt = {trajectory.dt:g} s is too long for {integrator}",
+            )
         )
     step = step_error(scene, integrator, trajectory)
     if step is not None and not step.error <= COARSE:
         found.append(
-            f"dt = {trajectory.dt:g} s is coarse for {integrator} here: halving it moves the step at "
-            f"t = {trajectory.t[step.step]:.4g} s by {100 * step.error:.3g}% of what the step does"
+            Finding(
+                "coarse steps",
+                f"dt = {trajectory.dt:g} s is coarse for {integrator} here: halving it moves the step at "
+                f"t = {trajectory.t[step.step]:.4g} s by {100 * step.error:.3g}% of what the step does",
+            )
         )
     return tuple(found)
 
