@@ -56,7 +56,8 @@ varpin::Mechanism mechanism_of(Ints parent, Ints prismatic, In3 rotation, In2 tr
                                In2 inertia, Ints coordinate, In1 ratio, In1 offset, Ints origin, In1 armature,
                                Ints group, int groups, In1 gravity, In1 stiffness, In1 rest) {
     const std::size_t bodies = parent.shape(0), n = armature.shape(0);
-    for (const auto& [array, name] : {std::pair{&prismatic, "prismatic"}, {&coordinate, "coordinate"}, {&origin, "origin"}})
+    for (const auto& [array, name] :
+         {std::pair{&prismatic, "prismatic"}, {&coordinate, "coordinate"}, {&origin, "origin"}})
         require(*array, name, {bodies});
     for (const auto& [array, name] : {std::pair{&mass, "mass"}, {&ratio, "ratio"}, {&offset, "offset"}})
         require(*array, name, {bodies});
@@ -110,7 +111,7 @@ std::tuple<double, Out, Out, Out, Out, Out> jet(const varpin::Mechanism& mechani
     require(v, "v", {n});
     varpin::Jet<double> w(mechanism.tree);
     varpin::lagrangian_jet(mechanism, q.data(), v.data(), w);
-    return {w.kinetic - w.total_potential(), array_of(w.Lq.data(), {n}),       array_of(w.Lv.data(), {n}),
+    return {w.kinetic - w.total_potential(), array_of(w.Lq.data(), {n}),   array_of(w.Lv.data(), {n}),
             array_of(w.Lqq.data(), {n, n}),  array_of(w.A.data(), {n, n}), array_of(w.M.data(), {n, n})};
 }
 

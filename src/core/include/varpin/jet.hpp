@@ -1,13 +1,14 @@
-// The Lagrangian jet: one forward and one backward sweep over the tree give L and all its derivatives up to second order.
-// docs/mathematics.md, "The Lagrangian jet". With S the axis of a joint, V the velocity of its body, W = V x S, Y and H
-// inertia and momentum of all that it carries, F = Y S, B = Y W + S x* H, g gravity, i an ancestor of j or j itself:
+// The Lagrangian jet: one forward and one backward sweep over the tree give L and all its derivatives up to second
+// order. docs/mathematics.md, "The Lagrangian jet". With S the axis of a joint, V the velocity of its body, W = V x S,
+// Y and H inertia and momentum of all that it carries, F = Y S, B = Y W + S x* H, g gravity, i an ancestor of j or j
+// itself:
 //
 //     L_v[j] = S_j . H_j        M[i,j] = S_i . F_j        L_qq[i,j] = W_i . B_j - F_j . (S_i x g)
 //     L_q[j] = W_j . H_j + S_j . (Y_j g)                  A[i,j] = S_i . B_j,  A[j,i] = W_i . F_j
 //
 // Vectors are taken about the root of their branch, or the last joint of a run of sliders there: it moves with them, so
-// that what stands or slides far away keeps its digits. With T = Dual and (q, v) moving along a direction, the slopes of
-// M, A and L_qq are third derivatives of L, contracted with the direction.
+// that what stands or slides far away keeps its digits. With T = Dual and (q, v) moving along a direction, the slopes
+// of M, A and L_qq are third derivatives of L, contracted with the direction.
 #pragma once
 
 #include <algorithm>
@@ -45,7 +46,7 @@ struct Jet {
 
     std::vector<BodyState> body;
     std::size_t dof;
-    T kinetic{};                // [J]
+    T kinetic{};               // [J]
     std::vector<T> potential;  // of each group [J]
     std::vector<T> Lq, Lv, M, A, Lqq;
 

@@ -1,5 +1,5 @@
-// Spatial algebra (Featherstone 2008): motions and forces as (linear, angular) pairs, inertias as mass, first and second
-// moments, all about one point and in one set of axes. T is double, or Dual for derivatives along a direction.
+// Spatial algebra (Featherstone 2008): motions and forces as (linear, angular) pairs, inertias as mass, first and
+// second moments, all about one point and in one set of axes. T is double, or Dual for derivatives along a direction.
 #pragma once
 
 namespace varpin {
@@ -42,8 +42,7 @@ struct Mat3 {
 
 template <class T, class U>
 constexpr auto operator*(const Mat3<T>& R, const Vec3<U>& a) -> Vec3<decltype(R.x.x * a.x)> {
-    return {R.x.x * a.x + R.y.x * a.y + R.z.x * a.z,
-            R.x.y * a.x + R.y.y * a.y + R.z.y * a.z,
+    return {R.x.x * a.x + R.y.x * a.y + R.z.x * a.z, R.x.y * a.x + R.y.y * a.y + R.z.y * a.z,
             R.x.z * a.x + R.y.z * a.y + R.z.z * a.z};
 }
 template <class T, class U>
@@ -63,8 +62,7 @@ struct Sym3 {
 
 template <class T, class U>
 constexpr auto operator*(const Sym3<T>& I, const Vec3<U>& a) -> Vec3<decltype(I.xx * a.x)> {
-    return {I.xx * a.x + I.xy * a.y + I.xz * a.z,
-            I.xy * a.x + I.yy * a.y + I.yz * a.z,
+    return {I.xx * a.x + I.xy * a.y + I.xz * a.z, I.xy * a.x + I.yy * a.y + I.yz * a.z,
             I.xz * a.x + I.yz * a.y + I.zz * a.z};
 }
 template <class T>
@@ -143,8 +141,8 @@ constexpr Inertia<T> placed(const Mat3<T>& R, const Vec3<T>& p, double m, const 
     const Vec3<T> at = p + R * c;
     const Vec3<T> h = m * at;
     Sym3<T> second = rotated(R, I);
-    second += {h.y * at.y + h.z * at.z, -(h.x * at.y),           h.x * at.x + h.z * at.z,
-               -(h.x * at.z),           -(h.y * at.z),           h.x * at.x + h.y * at.y};
+    second += {h.y * at.y + h.z * at.z, -(h.x * at.y), h.x * at.x + h.z * at.z,
+               -(h.x * at.z),           -(h.y * at.z), h.x * at.x + h.y * at.y};
     return {T(m), h, second};
 }
 

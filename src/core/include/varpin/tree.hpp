@@ -12,11 +12,11 @@ namespace varpin {
 struct Body {
     int parent = -1;  // -1 at a root; parents come first
     bool prismatic = false;
-    Mat3<double> rotation{};       // of the joint's frame in its parent's, at joint position 0
-    Vec3<double> translation{};    // [m]
-    double mass = 0.0;             // [kg]
-    Vec3<double> center{};         // in the body's frame [m]
-    Sym3<double> inertia{};        // about the centre, in the body's axes [kg m^2]
+    Mat3<double> rotation{};     // of the joint's frame in its parent's, at joint position 0
+    Vec3<double> translation{};  // [m]
+    double mass = 0.0;           // [kg]
+    Vec3<double> center{};       // in the body's frame [m]
+    Sym3<double> inertia{};      // about the centre, in the body's axes [kg m^2]
     int coordinate = 0;
     double ratio = 1.0;
     double offset = 0.0;  // [rad or m]
