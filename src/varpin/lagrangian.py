@@ -11,9 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import finite_array, fraction, positive
 from varpin.errors import InputError
-from varpin.kernels._compile import announced_compilation
-from varpin.kernels.jet import lagrangian_sweep
-from varpin.kernels.tree import new_sweep
 from varpin.scene import Scene, require_scene
 from varpin.textbook import rigid_body_Lqq
 
@@ -69,10 +66,7 @@ def lagrangian_jet(
 
 
 def _compiled(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
-    w = new_sweep(scene.robot.tree.parent.size, scene.robot.dof)
-    with announced_compilation("lagrangian_jet"):
-        kinetic, potential = lagrangian_sweep(scene.mechanism, q, v, w)
-    return LagrangianJet(kinetic - potential, w.Lq, w.Lv, w.Lqq, w.A, w.M)
+    return LagrangianJet(*scene.core.jet(q, v))
 
 
 def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:

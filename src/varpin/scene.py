@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, broadcast_array, finite_array
+from varpin.core import Mechanism as Core
 from varpin.errors import InputError, RobotError
 from varpin.kernels.tree import Diffusion, Mechanism
 from varpin.markup import facts, listed
@@ -20,6 +21,11 @@ from varpin.robot import Robot, require_sound
 Floats = NDArray[np.float64]
 
 EARTH = (0.0, 0.0, -9.81)
+# Fields of the tree that the core takes.
+_TREE = (
+    "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio", "offset",
+    "origin", "armature", "group",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -130,6 +136,13 @@ class Scene:
     def processes(self) -> int:
         """k, the number of Wiener processes."""
         return self.noise.processes
+
+    @cached_property
+    def core(self) -> Core:
+        """The tree, gravity and springs as the compiled core takes them."""
+        tree = self.robot.tree
+        own = {name: getattr(tree, name) for name in _TREE}
+        return Core.make(**own, groups=tree.groups, gravity=self.gravity, stiffness=self.stiffness, rest=self.rest)
 
     @cached_property
     def mechanism(self) -> Mechanism:
