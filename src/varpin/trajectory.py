@@ -86,8 +86,8 @@ class Trajectory:
         energy: Kinetic and potential energy together (N + 1,) [J]; springs included.
         masses: Of the robot's bodies (b,) [kg]; they tell robots apart whose joints have the same names.
         dt: Time step [s].
-        integrator: What made it, as text with all its options but defaults; ``varpin.integrators.integrator_of`` makes it
-            again.
+        integrator: What made it, as text with all options that are not the default;
+            ``varpin.integrators.integrator_of`` makes it again.
         robot: The robot's name.
         joint_names: Names of the coordinates.
         statistics: What each step took.

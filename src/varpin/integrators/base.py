@@ -78,12 +78,14 @@ class Integrator(ABC):
 
         A trajectory keeps it as what made it.
         """
-        options = []
-        for item in fields(self) if is_dataclass(self) else ():
-            value = getattr(self, item.name)
-            if item.name in self.named or value != item.default:
-                options.append(f"{item.name}={_text(value)}")
-        return type(self).__name__ + (f"({', '.join(options)})" if options else "")
+        name = type(self).__name__
+        given: dict[str, Any] = {item.name: item.default for item in fields(self)} if is_dataclass(self) else {}
+        options = [
+            f"{option}={_text(getattr(self, option))}"
+            for option, default in given.items()
+            if option in self.named or getattr(self, option) != default
+        ]
+        return f"{name}({', '.join(options)})" if options else name
 
     def same_map(self, other: Integrator) -> bool:
         """Whether ``other`` takes the same steps, wherever both take them whole."""
