@@ -379,7 +379,7 @@ def test_strong_order(integrator):
     in_place = vp.CustomNoise(
         lambda q, v, u: [[0.3 * M * np.sin(q[0])]], 1, dq=lambda q, v, u: [[[0.3 * M * np.cos(q[0])]]]
     )
-    ratios = {}
+    orders = {}
     for name, noise, paths in (("velocity", in_velocity, 60), ("place", in_place, 12)):
         scene = vp.Scene(vp.planar_chain(1), noise=noise, gravity=(0.0, 0.0, 0.0))
         errors = []
@@ -397,6 +397,6 @@ def test_strong_order(integrator):
             exact = np.exp(0.3 * fine.sum()) if name == "velocity" else end(1)
             errors.append([end(4) - exact, end(64) - exact])
         small, large = np.sqrt(np.mean(np.square(errors), axis=0))
-        ratios[name] = np.log(large / small) / np.log(16.0)
-    assert 0.35 < ratios["velocity"] < 0.7
-    assert 0.8 < ratios["place"] < 1.3
+        orders[name] = np.log(large / small) / np.log(16.0)
+    assert 0.35 < orders["velocity"] < 0.7
+    assert 0.8 < orders["place"] < 1.3
