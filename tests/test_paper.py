@@ -489,7 +489,10 @@ def test_quick_reproduction_by_the_command_line(tmp_path):
     assert verdict_of("figure 1") == "holds"
     assert verdict_of("equivalent to the classic DDP") == "holds"
     assert verdict_of("table 1 and figure 5, case 1") == "holds"
-    assert verdict_of("table 1 and figure 5, case 2") == "holds"
+    assert verdict_of("figure 5b, case 2") == "holds"
+    assert verdict_of("table 1, case 3") == "does not hold"
+    assert verdict_of("algorithm iterations") == "holds in part"
+    assert verdict_of("gains, referred to the middle") == "not measured"
     assert verdict_of("true cost is never above Euler's") == "holds"
 
     kept = {path: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
