@@ -153,6 +153,38 @@ def test_velocity_dependent_fields():
     np.testing.assert_allclose(lin.Gx[0], in_fields, rtol=0, atol=1e-8 * np.abs(in_fields).max())
 
 
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
+def test_a_kick_leaves_the_drift_as_it_is(integrator):
+    """K is what a kick does; dx1/dp0 has the drift's derivative too, and is in A."""
+    plain = vp.Scene(vp.load_robot("ur5"), damping=0.1)
+    noisy = vp.Scene(plain.robot, damping=0.1, noise=friction_noise(6, 0.3))
+    q, v, u = np.random.default_rng(0).uniform(-1, 1, (3, 6))
+    M = vp.lagrangian_jet(plain, q, v).Lvv
+    for scene in (plain, noisy):
+        motion = vp.simulate(scene, q, v, dt=1e-3, steps=1, controls=u, integrator=integrator)
+        lin = vp.linearize(scene, motion)
+        in_p = lin.A[0][:, 6:] if integrator.variational else lin.A[0][:, 6:] @ np.linalg.inv(M)
+        off = np.abs(lin.K[0] - in_p).max() / np.abs(in_p).max()
+        assert off < 1e-9 if scene is plain else off > 1e-7
+    # Differences in the increment of one process, whose kick is F dw, with the drift of the state before it.
+    eighth = (
+        sum(
+            c * (_kicked(noisy, q, v, u, k, integrator) - _kicked(noisy, q, v, u, -k, integrator))
+            for k, c in WEIGHTS.items()
+        )
+        / 1e-3
+    )
+    np.testing.assert_allclose(lin.K[0] @ lin.F[0, :, 0], eighth, rtol=0, atol=1e-8 * np.abs(eighth).max())
+
+
+def _kicked(scene, q, v, u, k, integrator):
+    """Where a step ends whose first process has an increment of k thousandths."""
+    dw = np.zeros((1, 6))
+    dw[0, 0] = 1e-3 * k
+    end = vp.simulate(scene, q, v, dt=1e-3, steps=1, controls=u, increments=dw, integrator=integrator)
+    return np.concatenate([end.q[1], end.p[1] if integrator.variational else end.v[1]])
+
+
 @pytest.mark.parametrize("speed", [0.0, 1.0, 5.0])
 @pytest.mark.parametrize(
     "integrator",

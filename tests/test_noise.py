@@ -6,6 +6,7 @@ import pytest
 import varpin as vp
 from varpin.noise import bind
 from varpin.simulation import NoiseError
+from varpin.wiener import coarsen, wiener_increments
 
 # Three coordinates, two controls: one joint is not actuated, and a control moves two joints.
 ACTUATION = np.array([[1.0, 0.0], [0.0, 0.0], [0.5, 2.0]])
@@ -368,3 +369,34 @@ def test_python_and_compiled_fields_give_the_same_motion(kick, feedback):
         for name in ("q", "v", "p", "u", "energy"):
             np.testing.assert_allclose(getattr(other, name), getattr(one, name), rtol=0, atol=1e-10)
     assert one.statistics.split_steps == 0
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Midpoint(kick="split")], ids=str)
+def test_strong_order(integrator):
+    """1, and 1/2 where the field depends on the velocity: the same paths at steps sixteen times as long."""
+    M = vp.lagrangian_jet(vp.Scene(vp.planar_chain(1)), [0.0], [0.0]).Lvv[0, 0]
+    in_velocity = vp.CustomNoise(lambda q, v, u: [[0.3 * M * v[0]]], 1, dv=lambda q, v, u: [[[0.3 * M]]])
+    in_place = vp.CustomNoise(
+        lambda q, v, u: [[0.3 * M * np.sin(q[0])]], 1, dq=lambda q, v, u: [[[0.3 * M * np.cos(q[0])]]]
+    )
+    orders = {}
+    for name, noise, paths in (("velocity", in_velocity, 60), ("place", in_place, 12)):
+        scene = vp.Scene(vp.planar_chain(1), noise=noise, gravity=(0.0, 0.0, 0.0))
+        errors = []
+        for path in range(paths):
+            fine = wiener_increments(1, 1.0 / 256, 256, path)
+
+            def end(factor, scene=scene, fine=fine):
+                motion = vp.simulate(
+                    scene, [0.5], [1.0], dt=factor / 256, steps=256 // factor, integrator=integrator,
+                    increments=coarsen(fine, factor), check=False,
+                )  # fmt: skip
+                return motion.v[-1, 0]
+
+            # Without gravity and with M constant, v is exactly v0 exp(0.3 w) in the one case.
+            exact = np.exp(0.3 * fine.sum()) if name == "velocity" else end(1)
+            errors.append([end(4) - exact, end(64) - exact])
+        small, large = np.sqrt(np.mean(np.square(errors), axis=0))
+        orders[name] = np.log(large / small) / np.log(16.0)
+    assert 0.35 < orders["velocity"] < 0.7
+    assert 0.8 < orders["place"] < 1.3

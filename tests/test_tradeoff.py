@@ -4,6 +4,8 @@ import csv
 import dataclasses
 import logging
 import math
+import subprocess
+import sys
 import time
 from dataclasses import dataclass
 
@@ -371,6 +373,58 @@ def test_true_costs_of_plans(problem, tmp_path, monkeypatch):
     with pytest.raises(vp.FileError, match="holds runs of another problem"):
         vp.optimal_control_tradeoff(problem.at(q0=[0.1]), members, dts, save=path)
     assert len(list(csv.reader(record.to_csv(tmp_path / "a.csv").open()))) == 7
+
+
+_ANOTHER_PROCESS = """
+import sys
+import numpy as np
+import varpin as vp
+from varpin.tradeoff import optimal_control
+
+cost = vp.TrackingCost([1.0]) + vp.ControlCost(1e-2)
+problem = vp.OptimalControlProblem(
+    vp.Scene(vp.planar_chain(1)), cost, [0.0], [0.0], dt=0.05, steps=20, integrator=vp.Midpoint(), sampling="midpoint"
+)
+if len(sys.argv) > 2:
+    def fail(*_):
+        raise SystemExit("it is there already")
+    optimal_control._measured = fail
+room = [bytearray(1000 * k) for k in range(len(sys.argv))]  # functions have other addresses
+record = vp.optimal_control_tradeoff(
+    problem, [vp.Midpoint()], [0.05], save=sys.argv[1], callback=lambda _: None, controls=np.zeros(1), armijo=1e-4
+)
+print(record.fingerprint)
+"""
+
+
+def test_a_run_with_a_callback_goes_on_in_another_process(tmp_path):
+    command = [sys.executable, "-c", _ANOTHER_PROCESS, str(tmp_path / "a.npz")]
+    first, second = (
+        subprocess.run([*command, *extra], capture_output=True, text=True, check=False, timeout=600)
+        for extra in ([], ["again"])
+    )
+    assert first.returncode == 0, first.stderr
+    assert second.returncode == 0, second.stderr
+    assert first.stdout == second.stdout
+
+
+def test_a_record_knows_the_options_that_matter(problem):
+    def mark(**options):
+        return optimal_control._fingerprint(problem, options)
+
+    assert mark() == mark(callback=print) == mark(progress=print, callback=None)
+    plan = vp.solve(problem, max_iterations=1)
+    marks = [
+        mark(), mark(armijo=1e-3), mark(forward="open"), mark(controls=np.zeros(1)), mark(controls=np.zeros((20, 1))),
+        mark(controls=np.ones(1)), mark(controls=plan), mark(max_iterations=1),
+    ]  # fmt: skip
+    assert len(set(marks)) == len(marks)
+    # Long arrays are told apart in the middle, too.
+    rows = np.zeros((5000, 1))
+    rows[2500] = 1e-9
+    assert mark(controls=rows) != mark(controls=np.zeros((5000, 1)))
+    with pytest.raises(vp.InputError, match="function cannot be told from others in a saved record"):
+        mark(controls=lambda t: t)
 
 
 def test_plans_that_fail_do_not_stop_the_others(problem):

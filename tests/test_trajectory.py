@@ -66,6 +66,28 @@ class TestRoundTrip:
         loaded = vp.Trajectory.load(named.save(tmp_path / "ünï.npz"))
         assert (loaded.robot, loaded.joint_names) == (named.robot, named.joint_names)
 
+    @pytest.mark.parametrize("speed", [1.0, 1e155, 1e300])
+    @pytest.mark.parametrize("integrator", [vp.ExplicitEuler(), vp.Midpoint()], ids=str)
+    def test_holds_for_motions_that_run_away(self, tmp_path, speed, integrator):
+        """Energies overflow long before velocities do."""
+        scene = vp.Scene(vp.planar_chain(2))
+        try:
+            motion = vp.simulate(scene, [0.1, 0.2], [speed, -speed], dt=1e-3, steps=3, integrator=integrator)
+        except vp.StepFailure as error:
+            motion = error.trajectory
+        assert np.isfinite(motion.energy).all() == (speed == 1.0)
+        loaded = vp.Trajectory.load(motion.save(tmp_path / "away.npz"))
+        for name in NODES:
+            assert getattr(loaded, name).tobytes() == getattr(motion, name).tobytes(), name
+
+    @pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
+    @pytest.mark.parametrize("name", ["energy_defect", "residual", "branch_margin"])
+    def test_holds_for_infinite_statistics(self, trajectory, tmp_path, name, value):
+        statistics = dataclasses.replace(trajectory.statistics, **{name: np.full(trajectory.steps, value)})
+        away = dataclasses.replace(trajectory, statistics=statistics)
+        loaded = vp.Trajectory.load(away.save(tmp_path / "away.npz"))
+        assert getattr(loaded.statistics, name).tobytes() == getattr(statistics, name).tobytes()
+
     def test_returns_the_path_as_given(self, trajectory, tmp_path):
         path = tmp_path / "no_suffix"
         assert trajectory.save(str(path)) == path
@@ -266,7 +288,7 @@ class TestLoading:
         with pytest.raises(vp.FileError, match=r" has shape \("):
             vp.Trajectory.load(tampered(saved, **{name: value}))
 
-    @pytest.mark.parametrize("name", ["t", "q", "v", "p", "u", "energy", "statistics.residual", "dt"])
+    @pytest.mark.parametrize("name", ["t", "q", "v", "p", "u", "dt"])
     @pytest.mark.parametrize("value", [np.nan, np.inf])
     def test_values_that_are_not_finite(self, saved, name, value):
         with np.load(saved) as archive:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, finite_array
 from varpin.errors import InputError, LinearizationError
-from varpin.integrators import Integrator, Midpoint
+from varpin.integrators import Integrator, integrator_of
 from varpin.integrators.base import diffusion_and_drift, open_loop
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.jet_tangent import momentum_curvatures, new_tangent
@@ -36,8 +36,11 @@ class Linearization:
     Attributes:
         A: dx1/dx0 (N, 2n, 2n); symplectic where nothing is forced or damped.
         B: dx1/du (N, 2n, m).
-        K: dx1/dp0 (N, 2n, n): what a kick of the momentum at the start of the step does.
-        J: What a jump of x's second half at the start of the step does (N, 2n, n): of p, which is K, or of v.
+        K: What a kick does to x1 (N, 2n, n): a jump of the momentum at the start of the step, under an unchanged drift.
+            It is dx1/dp0 where no diffusion field depends on the velocity. Where one does, the drift from Stratonovich
+            to Ito, (1/2) sum_i (dF_i/dv) M^-1 F_i, is that of the state before the kick; dx1/dp0 has its derivative
+            too, and is A[:, :, n:], or A[:, :, n:] M^-1 for integrators on (q, v).
+        J: The same for a jump of x's second half (N, 2n, n): of p, which is K, or of v.
         F: Diffusion fields (N, n, k).
         G: dx1/dw (N, 2n, k); K F where the whole kick comes before the step.
         Gx: Derivative of G in x0 through the fields (N, 2n, k, 2n).
@@ -93,15 +96,16 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
         trajectory: From :func:`varpin.simulate`.
 
     Other Args:
-        integrator: What made it; ``Midpoint()`` if left out. Must print as ``trajectory.integrator`` does.
+        integrator: What made it; read from ``trajectory.integrator`` if left out. It has to be given where that is no
+            integrator of varpin's own; other guards than those of the simulation may be given too.
 
     Raises:
-        InputError: The trajectory is of another robot, another number of controls or processes, or another integrator.
+        InputError: The trajectory is of another robot, another number of controls or processes, or another integrator;
+            or nobody knows the integrator that made it.
         LinearizationError: A step has no solution at dw = 0.
     """
     require_scene(scene)
-    integrator = Midpoint() if integrator is None else integrator
-    _require_match(scene, trajectory, integrator)
+    integrator = _matching(scene, trajectory, integrator)
     with announced_compilation(f"linearize with {type(integrator).__name__}"):
         return linearize_steps(scene, trajectory, integrator, trajectory.q[0])
 
@@ -195,7 +199,7 @@ def second_order(
         z: One vector for each step (N, 2n), or one for all of them (2n,).
 
     Other Args:
-        integrator: What made it; ``Midpoint()`` if left out. Others do not provide second derivatives.
+        integrator: As for :func:`linearize`. Only :class:`Midpoint` provides second derivatives.
 
     Raises:
         InputError: As for :func:`linearize`; an integrator that has no second derivatives; noise fields that depend on
@@ -203,8 +207,7 @@ def second_order(
         LinearizationError: A step has no solution at dw = 0.
     """
     require_scene(scene)
-    integrator = Midpoint() if integrator is None else integrator
-    _require_match(scene, trajectory, integrator)
+    integrator = _matching(scene, trajectory, integrator)
     n, steps = scene.robot.dof, trajectory.steps
     rows = as_floats("z", z)
     if rows.shape == (2 * n,):
@@ -225,7 +228,7 @@ def second_order_steps(scene: Scene, trajectory: Trajectory, z: Floats, integrat
 
 
 def _kick_columns(scene: Scene, trajectory: Trajectory, integrator: Integrator, Jk: Floats) -> Floats:
-    """dx1/dp0: what a jump does itself where it is one of the momentum."""
+    """What a jump of the momentum does: ``Jk`` itself for integrators on (q, p)."""
     if integrator.variational:
         return Jk
     M, _ = node_jets(scene, trajectory.q[:-1], trajectory.v[:-1])
@@ -359,12 +362,31 @@ def _quiet_ends(scene: Scene, trajectory: Trajectory, integrator: Integrator, fi
     return np.concatenate([end.q for end in ends]), np.concatenate([end.v for end in ends])
 
 
-def _require_match(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> None:
+def _matching(scene: Scene, trajectory: Trajectory, given: Integrator | None) -> Integrator:
+    """The integrator that made the trajectory, which has to be one of the scene."""
     require_motion(scene, trajectory)
-    if trajectory.integrator != str(integrator):
-        raise InputError(f"the trajectory was made with {trajectory.integrator}, not {integrator}: give integrator=")
     if trajectory.dw.shape[1] != scene.processes:
         raise InputError(f"the trajectory has {trajectory.dw.shape[1]} processes, the scene {scene.processes}")
+    made: Integrator | None = None
+    problem = ""
+    try:
+        made = integrator_of(trajectory.integrator)
+    except InputError as error:
+        problem = str(error)
+    if given is None:
+        if made is None:
+            raise InputError(
+                f"the trajectory was made with {trajectory.integrator}, which cannot be made again ({problem}): "
+                "give integrator="
+            )
+        return made
+    if not isinstance(given, Integrator):
+        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {given!r}")
+    if str(given) != trajectory.integrator and (made is None or not given.same_map(made)):
+        raise InputError(
+            f"the trajectory was made with {trajectory.integrator}, not {given}: leave integrator out, or give that one"
+        )
+    return given
 
 
 @dataclass(frozen=True, eq=False)

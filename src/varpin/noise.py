@@ -2,6 +2,9 @@
 
 In the equations of motion they add the generalized force sum_i F_i o dw_i / dt (Stratonovich). Models add up:
 ``AdditiveNoise(1e-3) + ControlNoise(0.1)`` has the processes of both, independent of each other.
+
+Motions follow the paths of the noise with strong order 1 in the time step: the error of a path halves with it. Where a
+field depends on the velocity (:class:`CustomNoise` alone can) the strong order is 1/2.
 """
 
 from __future__ import annotations
@@ -266,7 +269,7 @@ class CustomNoise(Noise):
         processes: k.
         dq: The same for dF/dq (n, k, n); None where F does not depend on q.
         dv: dF/dv (n, k, n); None where F does not depend on v. With it the drift (1/2) sum_i (dF_i/dv) M^-1 F_i
-            takes the Stratonovich equation to the Ito one that is stepped.
+            takes the Stratonovich equation to the Ito one that is stepped, with strong order 1/2 instead of 1.
         du: dF/du (n, k, m); None where F does not depend on u.
         check: Hold the derivatives against differences when the noise is given to a scene.
     """

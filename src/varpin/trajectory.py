@@ -86,7 +86,8 @@ class Trajectory:
         energy: Kinetic and potential energy together (N + 1,) [J]; springs included.
         masses: Of the robot's bodies (b,) [kg]; they tell robots apart whose joints have the same names.
         dt: Time step [s].
-        integrator: What made it, as text.
+        integrator: What made it, as text with all options that are not the default;
+            ``varpin.integrators.integrator_of`` makes it again.
         robot: The robot's name.
         joint_names: Names of the coordinates.
         statistics: What each step took.
@@ -212,7 +213,8 @@ class Trajectory:
 
         Raises:
             FileError: The file is missing, truncated, no npz, written by something else, holds pickled objects,
-                arrays that do not fit together or are not finite, or is of another robot.
+                arrays that do not fit together, a state that is not finite, or is of another robot. Energies and
+                statistics may be infinite or NaN, where the motion's own were.
         """
         source = path_like("path", path)
         if robot is not None and not isinstance(robot, Robot):
@@ -229,8 +231,11 @@ class Trajectory:
         """
         require_layout(source, members)
         steps = members["t"].size - 1
-        for name in (*_ARRAYS, "dt", *(f"statistics.{item.name}" for item in fields(StepStatistics))):
-            if not np.isfinite(members[name]).all():
+        # Energies, momenta with them, and what is said of steps overflow before q and v do, and are saved as they are.
+        held = np.isfinite(members["energy"])
+        given = {name: members[name] for name in ("t", "q", "v", "u", "dw", "masses", "dt")} | {"p": members["p"][held]}
+        for name, values in given.items():
+            if not np.isfinite(values).all():
                 raise FileError(f"{source}: {name} holds values that are not finite numbers")
         if steps < 0 or not members["dt"] > 0.0:
             raise FileError(f"{source}: it has {steps + 1} nodes and dt = {members['dt']} s")

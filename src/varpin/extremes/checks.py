@@ -73,7 +73,8 @@ def exact_motion(setup: Setup, dt: float, steps: int, window: float, *, late: bo
 
     In closed form where there is one; else by DOP853 at a tolerance of 1e-11, kicks of additive noise in between; it
     ends early where that takes too long, or cannot be integrated. A kick comes before its step, or after it if
-    ``late``: to strong order one, which is what is promised of noise, that is the same motion.
+    ``late``: to strong order one, which is what is promised of additive noise, that is the same
+    motion.
 
     Raises:
         VarpinError: There is none at all.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +70,26 @@ class Integrator(ABC):
     """
 
     variational: bool
+    # Options that its text names even where they are the default.
+    named: ClassVar[tuple[str, ...]] = ()
+
+    def __str__(self) -> str:
+        """Its name and options, without those that are the default: :func:`varpin.integrators.integrator_of` reads it.
+
+        A trajectory keeps it as what made it.
+        """
+        name = type(self).__name__
+        given: dict[str, Any] = {item.name: item.default for item in fields(self)} if is_dataclass(self) else {}
+        options = [
+            f"{option}={_text(getattr(self, option))}"
+            for option, default in given.items()
+            if option in self.named or getattr(self, option) != default
+        ]
+        return f"{name}({', '.join(options)})" if options else name
+
+    def same_map(self, other: Integrator) -> bool:
+        """Whether ``other`` takes the same steps, wherever both take them whole."""
+        return str(self) == str(other)
 
     @property
     @abstractmethod
@@ -153,6 +173,17 @@ class Integrator(ABC):
     @abstractmethod
     def predict(self, state: Any, dt: float) -> tuple[Floats, Floats]:
         """Q (n,) and v (n,) expected in the middle of the next step."""
+
+
+def _text(value: object) -> str:
+    """A number in as few digits as tell it from others; a word as it is."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, (float, np.floating)):
+        number = float(value)
+        short = f"{number:g}"
+        return short if float(short) == number else repr(number)
+    return str(value)
 
 
 def join(segments: Sequence[Segment]) -> Segment:

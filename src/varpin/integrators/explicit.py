@@ -52,9 +52,6 @@ class _Explicit(Integrator):
     scheme: ClassVar[int]
     variational = False
 
-    def __str__(self) -> str:
-        return type(self).__name__
-
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[ExplicitRun, list[Segment]]:
         """See :meth:`Integrator.start`."""
         paths, n = q0.shape

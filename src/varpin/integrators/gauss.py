@@ -65,14 +65,12 @@ class Gauss(Variational):
     max_halvings: int = 12
     kick: Literal["left", "split"] = "left"
 
+    named = ("stages",)
+
     def __post_init__(self) -> None:
         if count("stages", self.stages, 1) > MOST_STAGES:
             raise InputError(f"stages must be at most {MOST_STAGES}, got {self.stages}")
         super().__post_init__()
-
-    def __str__(self) -> str:
-        kick = "" if self.kick == "left" else f", kick={self.kick}"
-        return f"Gauss(stages={self.stages}{kick})"
 
     @property
     def order(self) -> int:

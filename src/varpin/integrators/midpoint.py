@@ -82,13 +82,11 @@ class Midpoint(Variational):
     max_halvings: int = 12
     kick: Literal["left", "split"] = "left"
 
+    named = ("alpha",)
+
     def __post_init__(self) -> None:
         fraction("alpha", self.alpha)
         super().__post_init__()
-
-    def __str__(self) -> str:
-        kick = "" if self.kick == "left" else f", kick={self.kick}"
-        return f"Midpoint(alpha={self.alpha:g}{kick})"
 
     @property
     def order(self) -> int:

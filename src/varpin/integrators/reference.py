@@ -68,6 +68,7 @@ class Reference(Integrator):
     atol: float | None = None
 
     variational = False
+    named = ("rtol",)
     order = 8
 
     def __post_init__(self) -> None:
@@ -75,10 +76,6 @@ class Reference(Integrator):
             raise InputError(f"rtol must be from {TIGHTEST:.2g}, where rounding begins, to 0.01, got {self.rtol}")
         if self.atol is not None:
             positive("atol", self.atol, "rad or m")
-
-    def __str__(self) -> str:
-        atol = "" if self.atol is None else f", atol={self.atol:g}"
-        return f"Reference(rtol={self.rtol:g}{atol})"
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[ReferenceRun, list[Segment]]:
         """See :meth:`Integrator.start`.

@@ -45,6 +45,9 @@ class VariationalRun:
     start: Floats
 
 
+_GUARDS = ("tolerance", "branch_margin", "energy_balance", "energy_budget", "max_halvings")
+
+
 class Variational(Integrator):
     """A variational integrator on (q, p) whose steps are guarded, cut and kicked."""
 
@@ -56,6 +59,11 @@ class Variational(Integrator):
     kick: Literal["left", "split"]
 
     variational = True
+
+    def same_map(self, other: Integrator) -> bool:
+        """See :meth:`Integrator.same_map`: guards decide which steps are cut, not what a step is."""
+        own, others = ({k: v for k, v in vars(x).items() if k not in _GUARDS} for x in (self, other))
+        return type(self) is type(other) and own == others
 
     def __post_init__(self) -> None:
         positive("tolerance", self.tolerance, "rounding units")

@@ -24,6 +24,8 @@ QUICK_STEPS = (1e-3, 2e-3, 6e-3, 2e-2)
 FINE, COARSE, COARSEST = 1e-4, 6e-3, 2e-2
 ON_REFERENCE = (1.0, 0.0, 0.0)
 OFF_REFERENCE = (0.7, 0.2, -0.1)
+# q0 [rad] and v0 [rad/s] of figure 1.
+FREE_START = ((np.pi / 2.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 # In the vertical plane, the finger hanging down at theta = 0.
 HANGING = (9.81, 0.0, 0.0)
 

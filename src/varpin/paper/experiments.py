@@ -148,7 +148,9 @@ def _optimum(task: Task) -> Cell:
     """The optimum over controls that are held for dt, with an accurate integrator inside each interval."""
     hold = max(8, int(np.ceil(task.dt / FINEST)))
     base = cases.problem(task.setting, None, "variational", task.dt)
-    problem = base.at(dt=task.dt / hold, steps=base.steps * hold, hold=hold, integrator=RungeKutta4())
+    problem = base.at(
+        dt=task.dt / hold, steps=base.steps * hold, hold=hold, integrator=RungeKutta4(), sampling="midpoint"
+    )
     started = time.perf_counter()
     solution = solve(problem, tolerance=1e-9, max_iterations=SEARCH["max_iterations"])  # type: ignore[arg-type]
     return _cell(task, solution, time.perf_counter() - started, (np.nan, np.nan))

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
-from numpy.typing import NDArray
 
 from varpin.paper import cases
 from varpin.paper.cases import CASES, COARSE, COARSEST, MAIN
-from varpin.paper.claims import Cells, cell, series, series_of_noise
+from varpin.paper.claims import REFERENCE, Cells, Motions, cell, series, series_of_noise
 from varpin.paper.experiments import OPTIMUM, PLAIN, STOCHASTIC
 from varpin.plots import COLORS
-
-Floats = NDArray[np.float64]
-Motions = Mapping[tuple[str, str, float], tuple[Floats, Floats]]
 
 # Tracking errors are linear below this [rad] and logarithmic beyond: a start away from the optimum outweighs the rest a
 # hundredfold.
@@ -34,7 +30,10 @@ def draw(cells: Cells, motions: Motions) -> dict[str, tuple[Figure, str]]:
     steps = sorted({c.dt for c in cells.values() if c.setting == MAIN.key})
     fine = steps[0]
     return {
-        "figure1": (_free(motions), "Figure 1 (b), (c): θ₁ without controls in the vertical plane."),
+        "figure1": (
+            _free(motions),
+            "Figure 1 (b), (c): θ₁ without controls from θ = [π/2, 0, 0] at [0, 0, 1] rad/s, in the horizontal plane.",
+        ),
         "figure2": (
             _tracking(cells, "1", fine, _cost_over_time),
             f"Figure 2, case 1: tracking errors at dt = {fine:g} s (dotted) and {COARSE:g} s; cost over time.",
@@ -63,22 +62,15 @@ def draw(cells: Cells, motions: Motions) -> dict[str, tuple[Figure, str]]:
 def _free(motions: Motions) -> Figure:
     figure = Figure(figsize=(10, 4.0), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
-    for panel, axes in zip("bc", panels, strict=True):
-        for (own, method, dt), (t, q) in motions.items():
-            if own != panel or method == "reference":
-                continue
-            axes.plot(
-                t, q, ":" if dt == cases.FINE else "-", color=_METHOD_COLOR[method], label=f"{method}, dt = {dt:g} s"
-            )
-        reference = motions[panel, "reference", cases.FINE][1]
-        span = np.ptp(reference)
-        axes.set_ylim(reference.min() - 0.4 * span, reference.max() + 0.4 * span)
-        axes.set(
-            xlabel="time [s]",
-            ylabel=r"$\theta_1$ [rad]",
-            title=f"({panel}) from {'rest' if panel == 'b' else 'velocity [0, 0, 1] rad/s'}",
-        )
-    _legend(panels[0], "outside lower center", 4)
+    for panel, axes, method in zip("bc", panels, ("Euler", "variational"), strict=True):
+        for dt, dash in ((cases.FINE, ":"), (COARSEST, "-")):
+            own = motions[method, dt]
+            axes.plot(own.t, own.theta, dash, color=_METHOD_COLOR[method], label=f"{method}, dt = {dt:g} s")
+        exact = motions[REFERENCE, cases.FINE].theta
+        span = np.ptp(exact)
+        axes.set_ylim(exact.min() - 0.4 * span, exact.max() + 0.4 * span)
+        axes.set(xlabel="time [s]", ylabel=r"$\theta_1$ [rad]", title=f"({panel}) {method}")
+        _legend(axes, "outside lower left" if panel == "b" else "outside lower right", 2)
     return figure
 
 

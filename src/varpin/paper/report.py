@@ -42,6 +42,7 @@ td.text, th { text-align: left; }
 img { max-width: 100%; }
 figure { margin: 1.5rem 0; }
 .holds { background: #dff2e1; } .holds-in-part { background: #fff3d6; } .does-not-hold { background: #fbdedb; }
+.not-measured { background: #ececec; }
 """
 
 
@@ -117,7 +118,8 @@ the tolerance relative to the cost; feedback in the line search, where the paper
 <ul>{settings}</ul><ul>{noises}</ul>
 <p>Nothing was tuned until a figure looked like the paper's. The optimizer's own cost is what the paper reports. The
 true cost is that of its controls on the continuous system, integrated by a fourth-order method with the substeps
-doubled until the cost stands still: that is what a user gets. The optimum over held controls is computed with that
+doubled until the cost stands still, open loop and with the plan's feedback; where one number stands for both it is the
+better of the two, what a user gets who chooses well. The optimum over held controls is computed with that
 method inside each interval: what it costs to decide only every dt, whatever the integrator.</p>
 <h2>Claim by claim</h2>
 <table><tr><th>source</th><th>sentence</th><th>measured</th><th>verdict</th></tr>

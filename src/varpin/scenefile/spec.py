@@ -13,7 +13,7 @@ from typing import Any
 
 from varpin.checks import is_file
 from varpin.errors import FileError, InputError
-from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
+from varpin.integrators import BY_NAME, Integrator, options_of
 from varpin.robot import Payload, models_dir
 from varpin.scenefile.references import Reference, read_reference
 from varpin.scenefile.table import ByName, SceneFileError, Table, inside, shown, suggestion
@@ -411,12 +411,14 @@ def _horizon(table: Table) -> dict[str, Any]:
     }
 
 
+# By their names in scene files, RungeKutta4 as runge_kutta_4, with the options that can be given there.
 _INTEGRATORS: dict[str, tuple[Callable[..., Integrator], tuple[str, ...]]] = {
-    "midpoint": (Midpoint, ("alpha", "kick")),
-    "gauss": (Gauss, ("stages", "kick")),
-    "explicit_euler": (ExplicitEuler, ()),
-    "semi_implicit_euler": (SemiImplicitEuler, ()),
-    "runge_kutta_4": (RungeKutta4, ()),
+    re.sub(r"(?<!^)([A-Z0-9])", r"_\1", name).lower(): (
+        kind,
+        tuple(option for option in options_of(kind) if option in ("alpha", "stages", "kick")),
+    )
+    for name, kind in BY_NAME.items()
+    if name != "Reference"
 }
 
 

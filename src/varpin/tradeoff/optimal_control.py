@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import math
 import os
@@ -19,12 +18,15 @@ from varpin.errors import FileError, InputError
 from varpin.integrators import Integrator
 from varpin.sddp import OptimalControlProblem, Solution, solve
 from varpin.tradeoff.records import Record, pareto_front
-from varpin.tradeoff.setting import Setting, fastest, integrators_of
+from varpin.tradeoff.setting import Setting, digest, fastest, integrators_of
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 logger = logging.getLogger(__name__)
+
+# Options of solve that are told of a search and change nothing in it.
+_ONLOOKERS = ("callback", "progress")
 
 HEADINGS = {
     "integrator": "integrator",
@@ -147,7 +149,8 @@ def optimal_control_tradeoff(
         repeats: Of each solution; the fastest counts. One more goes before them where they are short.
         progress: Called with (runs done, runs in all).
         save: Keep the record in this npz, run by run; runs that it holds already are not run again.
-        options: Handed on to :func:`varpin.solve`.
+        options: Handed on to :func:`varpin.solve`. Runs with other options are other runs; ``callback`` and
+            ``progress`` do not count.
 
     Raises:
         InputError: Wrong arguments.
@@ -212,8 +215,12 @@ def _fingerprint(problem: OptimalControlProblem, options: dict[str, Any]) -> str
     u = rng.normal(size=(steps, scene.controls))
     costs = problem.at(dt=problem.duration / steps, steps=steps, hold=1).costs(q, v, u)
     quiet = Setting(scene, problem.q0, problem.v0, np.zeros((1, scene.controls)), problem.duration).fingerprint
-    text = f"{quiet} {float(costs):.12e} {problem.sampling} {sorted(options.items())!r}"
-    return hashlib.sha256(text.encode()).hexdigest()
+    given = {
+        name: value.policy if isinstance(value, Solution) else value
+        for name, value in sorted(options.items())
+        if name not in _ONLOOKERS
+    }
+    return digest((quiet, f"{float(costs):.12e}", problem.sampling, given))
 
 
 def _solved(problem: OptimalControlProblem, options: dict[str, Any]) -> tuple[Solution, float]:

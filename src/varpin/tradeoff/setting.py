@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import reprlib
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -120,7 +121,7 @@ class Setting:
     def fingerprint(self) -> str:
         """SHA-256 over each part that the motion depends on, by :data:`PARTS`."""
         parts = self.scene.mechanism, (self.q0, self.v0), self.controls, self.duration
-        return " ".join(_digest(part) for part in parts)
+        return " ".join(digest(part) for part in parts)
 
     def run(self, integrator: Integrator, steps: int, *, samples: int = 1, repeats: int = 0) -> Outcome:
         """The motion in ``steps`` steps, a multiple of R and of ``samples``: once, or the fastest of ``repeats``."""
@@ -186,12 +187,17 @@ def fastest(
     return result, seconds, float(np.median([done[1] for done in runs])) - seconds
 
 
-def _digest(part: Any) -> str:
-    digest = hashlib.sha256()
-    for array in _arrays(part if isinstance(part, tuple) else (part,)):
-        digest.update(str(array.shape).encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+def digest(part: Any) -> str:
+    """SHA-256 over numbers, words, arrays, and tuples, mappings and dataclasses of them; the same in every process.
+
+    Raises:
+        InputError: Something else is in it, of which only its address could be told.
+    """
+    total = hashlib.sha256()
+    for array in _arrays(part):
+        total.update(str(array.shape).encode())
+        total.update(np.ascontiguousarray(array).tobytes())
+    return total.hexdigest()
 
 
 def _tally(segment: Segment) -> NDArray[np.int64]:
@@ -200,12 +206,19 @@ def _tally(segment: Segment) -> NDArray[np.int64]:
 
 
 def _arrays(value: Any) -> Iterator[NDArray[Any]]:
-    """All arrays and numbers of nested tuples."""
+    """All arrays, numbers and words in ``value``, names of fields among them."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = {item.name: getattr(value, item.name) for item in fields(value)}
+    if isinstance(value, Mapping):
+        value = tuple(value.items())
     if isinstance(value, tuple):
         for part in value:
             yield from _arrays(part)
-    else:
-        yield np.asarray(value)
+        return
+    array = np.asarray("none" if value is None else value)
+    if array.dtype.hasobject:
+        raise InputError(f"{type(value).__name__} cannot be told from others in a saved record: {reprlib.repr(value)}")
+    yield array
 
 
 def integrators_of(integrators: Sequence[Integrator] | None) -> tuple[Integrator, ...]:

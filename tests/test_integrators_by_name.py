@@ -1,0 +1,112 @@
+"""Integrators as text: made again with all their options, from the record of a motion too."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import varpin as vp
+from varpin.integrators import BY_NAME, integrator_of, options_of
+from varpin.scenefile.spec import _INTEGRATORS
+
+MADE = [
+    vp.Midpoint(),
+    vp.Midpoint(alpha=1 / 3, kick="split", max_halvings=3),
+    vp.Gauss(),
+    vp.Gauss(4, energy_budget=1e-3, kick="split"),
+    vp.ExplicitEuler(),
+    vp.SemiImplicitEuler(),
+    vp.RungeKutta4(),
+    vp.Reference(),
+    vp.Reference(rtol=1e-9, atol=2.5e-10),
+]
+
+
+@pytest.mark.parametrize("made", MADE, ids=str)
+def test_text_makes_it_again(made):
+    assert integrator_of(str(made)) == made
+    assert integrator_of(repr(made)) == made
+    assert type(made) is BY_NAME[type(made).__name__]
+
+
+@given(
+    alpha=st.floats(0.0, 1.0),
+    tolerance=st.floats(1e-300, 1e300),
+    halvings=st.integers(0, 30),
+    kick=st.sampled_from(["left", "split"]),
+)
+def test_no_digit_is_lost(alpha, tolerance, halvings, kick):
+    made = vp.Midpoint(alpha=alpha, tolerance=tolerance, max_halvings=halvings, kick=kick)
+    assert integrator_of(str(made)) == made
+
+
+def test_every_integrator_is_known_and_has_a_name_in_scene_files():
+    own = {kind for kind in vars(vp).values() if isinstance(kind, type) and issubclass(kind, vp.Integrator)}
+    assert set(BY_NAME.values()) == own - {vp.Integrator}
+    assert list(_INTEGRATORS) == ["midpoint", "gauss", "explicit_euler", "semi_implicit_euler", "runge_kutta_4"]
+    assert _INTEGRATORS["gauss"] == (vp.Gauss, ("stages", "kick"))
+    assert options_of(vp.Reference) == ("rtol", "atol")
+    assert integrator_of(" Gauss(3, kick='split') ") == vp.Gauss(3, kick="split")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "is written as a name, or a name with options such as"),
+        ("Gauss(", "is written as"),
+        ("os.system('x')", "is written as"),
+        ("Verlet", "no integrator 'Verlet'; it has Midpoint, Gauss, Expl"),
+        ("Gauss(alpha=0.5)", "Gauss has no option 'alpha'; its options are stages, "),
+        ("RungeKutta4(4)", "RungeKutta4 has no room for all of these options; it has none"),
+        ("Gauss(2, stages=3)", "no room for all"),
+        ("Gauss(stages=9)", "stages must be at most 6, got 9"),
+        ("Gauss(stages=len([]))", "numbers and words, got 'len"),
+    ],
+)
+def test_other_texts_are_refused(text, words):
+    with pytest.raises(vp.InputError, match=words):
+        integrator_of(text)
+
+
+@pytest.mark.parametrize("made", MADE, ids=str)
+def test_linearization_is_of_the_integrator_that_made_the_motion(made, tmp_path):
+    scene = vp.Scene(vp.planar_chain(2), damping=0.1)
+    motion = vp.simulate(scene, [0.4, 0.3], [1.0, -1.0], dt=0.01, steps=5, integrator=made, check=False)
+    read = vp.Trajectory.load(motion.save(tmp_path / "motion.npz"))
+    told = vp.linearize(scene, motion, integrator=made)
+    assert told.variational == made.variational
+    for own in (motion, read):
+        found = vp.linearize(scene, own)
+        for name in ("A", "B", "K"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(told, name))
+    if isinstance(made, vp.Midpoint):
+        z = np.arange(4.0)
+        expected = vp.second_order(scene, motion, z, integrator=made).xx
+        np.testing.assert_array_equal(vp.second_order(scene, read, z).xx, expected)
+    else:
+        with pytest.raises(vp.InputError, match="has no second-order linearization"):
+            vp.second_order(scene, motion, np.zeros(4))
+
+
+class Own(vp.Midpoint):
+    """Somebody's integrator, which nobody else can make."""
+
+
+def test_what_made_a_motion_is_held_against_what_is_given():
+    scene = vp.Scene(vp.planar_chain(1))
+    motion = vp.simulate(scene, [0.4], [1.0], dt=0.01, steps=3)
+    # Guards decide which steps are cut, not what a step is.
+    strict = vp.linearize(scene, motion, integrator=vp.Midpoint(max_halvings=0))
+    np.testing.assert_array_equal(strict.A, vp.linearize(scene, motion).A)
+    for other in (vp.Gauss(), vp.Midpoint(alpha=0.4), vp.Midpoint(kick="split"), vp.RungeKutta4()):
+        with pytest.raises(vp.InputError, match=r"was made with Midpoint\(alpha=0\.5\), not"):
+            vp.linearize(scene, motion, integrator=other)
+    with pytest.raises(vp.InputError, match=r"integrator must be one of varpin's"):
+        vp.linearize(scene, motion, integrator="midpoint")
+
+    foreign = dataclasses.replace(motion, integrator=str(Own()))
+    with pytest.raises(vp.InputError, match=r"made with Own\(alpha=0\.5\), which cannot be made again .*integrator="):
+        vp.linearize(scene, foreign)
+    np.testing.assert_array_equal(vp.linearize(scene, foreign, integrator=Own()).A, vp.linearize(scene, motion).A)
