@@ -339,7 +339,7 @@ def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[str
     for link in links:
         if not link.joint or not link.inertia.any():
             continue
-        if said := fault(link.name, link.moments):
+        if said := fault(link.name, link.mass, link.moments):
             yield said
         elif link.mass > 0.0:
             # A ball has the least inertia of all bodies of a given mass and density.

@@ -12,10 +12,14 @@ Floats = NDArray[np.float64]
 
 # Rounded figures of a thin plate may miss the triangle inequality, which holds for it with equality, by this much.
 TRIANGLE_TOLERANCE = 1e-3
+# Of less than a micrometre's radius of gyration [m^2], a link is a point mass, and what there is of moments is rounding.
+POINT = 1e-12
 
 
-def fault(link: str, moments: Floats) -> str:
+def fault(link: str, mass: float, moments: Floats) -> str:
     """What is wrong with a link's principal moments (3,), ascending [kg m^2]; empty if a body can have them."""
+    if np.abs(moments).max() <= POINT * mass:
+        return ""
     low, middle, high = moments
     shown = ", ".join(f"{moment:.3g}" for moment in moments)
     if low < -TRIANGLE_TOLERANCE * abs(high):
@@ -38,10 +42,10 @@ def faults(model: pin.Model, inertials: Iterable[Inertial]) -> Iterator[str]:
         inertials: Of links of a URDF; without any, the bodies of the model are looked at.
     """
     links = {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
-    if not (found := [(x.link, x.inertia) for x in inertials if links.get(x.link, 0)]):
+    if not (found := [(x.link, x.mass, x.inertia) for x in inertials if links.get(x.link, 0)]):
         names = {joint: name for name, joint in reversed(links.items())}
-        bodies = [(j, np.array(model.inertias[j].inertia)) for j in range(1, model.njoints)]
-        found = [(names.get(joint, model.names[joint]), inertia) for joint, inertia in bodies]
-    for name, inertia in found:
-        if inertia.any() and np.isfinite(inertia).all() and (said := fault(name, np.linalg.eigvalsh(inertia))):
+        bodies = [(names.get(j, model.names[j]), model.inertias[j]) for j in range(1, model.njoints)]
+        found = [(name, body.mass, np.array(body.inertia)) for name, body in bodies]
+    for name, mass, inertia in found:
+        if np.isfinite(inertia).all() and (said := fault(name, mass, np.linalg.eigvalsh(inertia))):
             yield said

@@ -176,7 +176,10 @@ def build_shapes(
     Raises:
         RobotError: A mesh is missing or cannot be read; the message names it.
     """
-    text = urdf.text if urdf.root is None else _written(urdf, _looks(urdf.root, link))
+    text, textures = urdf.text, dict[str, str]()
+    if urdf.root is not None:
+        looks, textures = _looks(urdf.root, link)
+        text = _written(urdf, looks)
 
     def read() -> pin.GeometryModel:
         return pin.buildGeomFromUrdfString(
@@ -191,6 +194,9 @@ def build_shapes(
             raise RobotError(f"the meshes{whose} in {urdf.path} cannot be read: {error}") from None
         for line in complaints():
             logger.warning("%s: %s", urdf.path, line)
+    for shape in shapes.geometryObjects:
+        if shape.name in textures:
+            shape.meshTexturePath = _texture(textures[shape.name], urdf.path, package_dirs)
     return shapes
 
 
@@ -361,15 +367,48 @@ def _dynamics(root: ET.Element) -> ET.Element:
     return small
 
 
-def _looks(root: ET.Element, only: str | None) -> ET.Element:
-    """What Pinocchio makes shapes of: links with their visuals, of all or of one, and joints."""
+def _looks(root: ET.Element, only: str | None) -> tuple[ET.Element, dict[str, str]]:
+    """What Pinocchio makes shapes of: links with their visuals, of all or of one, and joints; and shapes' textures.
+
+    Pinocchio knows no textures, and takes a material without a colour for black. Such a material is left out, as is
+    black beside a texture, where a converter had no colour: the mesh then keeps the colours of its file.
+    """
     small = ET.Element("robot", {"name": root.get("name", "")})
-    small.extend(root.findall("material"))
+    shared = {material.get("name"): material for material in root.findall("material")}
+    small.extend(material for material in shared.values() if _has_color(material))
+    textures = {}
     for link in root.findall("link"):
         part = ET.SubElement(small, "link", _named(link))
-        part.extend(link.findall("visual") if only in (None, link.get("name")) else ())
+        for k, visual in enumerate(link.findall("visual") if only in (None, link.get("name")) else ()):
+            own = visual.find("material")
+            material = own if own is None or len(own) else shared.get(own.get("name"), own)
+            texture = None if material is None else material.find("texture")
+            if texture is not None and texture.get("filename"):
+                # Pinocchio's name of the shape.
+                textures[f"{link.get('name')}_{k}"] = texture.get("filename", "")
+            plain = ET.SubElement(part, "visual", visual.attrib)
+            plain.extend(child for child in visual if child is not own or (material is not None and _has_color(material)))
     small.extend(root.findall("joint"))
-    return small
+    return small, textures
+
+
+def _has_color(material: ET.Element) -> bool:
+    color = material.find("color")
+    if color is None:
+        return False
+    return material.find("texture") is None or any(word.strip("0.") for word in color.get("rgba", "").split()[:3])
+
+
+def _texture(name: str, urdf: Path, package_dirs: Sequence[str]) -> str:
+    """The file of a texture; empty, with a warning in the log, if it is not there."""
+    scheme, separator, rest = name.partition("://")
+    places = [Path(folder, rest) for folder in package_dirs] if scheme == "package" else [urdf.parent / name]
+    places = [Path(rest)] if separator and scheme == "file" else places
+    for place in places:
+        if place.is_file():
+            return str(place)
+    logger.warning("%s: texture %r is not there", urdf, name)
+    return ""
 
 
 def _named(link: ET.Element) -> dict[str, str]:
