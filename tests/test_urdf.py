@@ -231,7 +231,7 @@ class TestInertia:
 
 
 class TestMany:
-    @pytest.mark.parametrize("joints", [300, 1000])
+    @pytest.mark.parametrize("joints", [300, pytest.param(1000, marks=pytest.mark.slow)])
     def test_joints_load_and_step(self, joints):
         robot = vp.planar_chain(joints, length=1.0 / joints, mass=1.0 / joints)
         assert robot.dof == joints
@@ -241,9 +241,15 @@ class TestMany:
         assert np.linalg.norm(robot.frame_positions(bent)) == pytest.approx(2**1.5 / np.pi, rel=1e-5)
         scene = vp.Scene(robot)
         motion = vp.simulate(scene, np.zeros(joints), np.zeros(joints), dt=1e-5, steps=1)
-        # It falls: the whole moves down by g dt^2 / 2, as the first joint holds it at one end only.
         assert np.isfinite(motion.q).all()
         assert abs(motion.energy[-1] - motion.energy[0]) < 1e-9
+
+    def test_joints_of_a_file(self, tmp_path):
+        parts = [link(f"l{k}") + joint(f"j{k}", f"l{k - 1}" if k else "base", f"l{k}") for k in range(300)]
+        path = write_urdf(tmp_path, *parts)
+        robot = vp.load_robot(path)
+        assert robot.dof == 300
+        assert_same(robot.free_model, pin.buildModelFromUrdf(str(path)))
 
     def test_links_without_number(self, tmp_path):
         parts = [f'<link name="l{k}"/>' for k in range(12_000)]

@@ -17,7 +17,7 @@ from varpin.integrators import Midpoint, largest_step
 from varpin.lagrangian import lagrangian_jet
 from varpin.markup import facts, folded, table
 from varpin.robot import Robot, build_robot, check_inertia
-from varpin.robot.inertia import fault
+from varpin.robot.inertia import fault, principal_moments
 from varpin.robot.mimic import joint_index
 from varpin.robot.tree import is_unbounded, joint_axis
 from varpin.robot.urdf import Urdf, read_urdf
@@ -294,7 +294,7 @@ def _links(robot: Robot, urdf: Urdf | None) -> tuple[LinkReport, ...]:
             mass=link.mass,
             center=link.center,
             inertia=link.inertia,
-            moments=np.linalg.eigvalsh(link.inertia),
+            moments=principal_moments(link.inertia),
         )
         for link in urdf.inertials
         if link.link in joints
@@ -436,9 +436,7 @@ def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | Non
                 yield f"q puts joint {name!r} at {at:g}, outside its limits {low:g} and {high:g}"
 
 
-def _mimic_warnings(
-    robot: Robot, urdf: Urdf | None, joints: Sequence[JointReport], *, tied: bool
-) -> Iterator[str]:
+def _mimic_warnings(robot: Robot, urdf: Urdf | None, joints: Sequence[JointReport], *, tied: bool) -> Iterator[str]:
     for joint in joints:
         if joint.follows:
             yield f"mimic joint {joint.name!r} is tied to its leader, as {joint.follows}; it is no coordinate"

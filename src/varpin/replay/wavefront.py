@@ -83,7 +83,7 @@ def parts(path: Path) -> list[Part]:
 
 def _corner(text: str, mesh: _Mesh) -> Corner:
     found = []
-    for word, points in zip((text.split("/") + ["", ""])[:3], mesh.points.values(), strict=True):
+    for word, points in zip(([*text.split("/"), "", ""])[:3], mesh.points.values(), strict=True):
         number = int(word) if word.strip("-").isdigit() else 0
         # Negative numbers count back from the last point so far.
         found.append(None if number == 0 else number - 1 if number > 0 else len(points) + number)
@@ -145,7 +145,7 @@ def _material(entries: dict[str, str], library: Path) -> Material:
         elif Path(texture).suffix.lower() not in _PICTURES:
             logger.warning("%s: its texture %r is of a kind that browsers do not show", library, names[0])
             texture = ""
-    return Material(color if len(color) == 3 else None, *opacity or [1.0], texture)
+    return Material(color if len(color) == 3 else None, (opacity or [1.0])[0], texture)
 
 
 def _numbers(words: Iterable[str]) -> list[float]:

@@ -138,4 +138,3 @@ def _files() -> list[str]:
 def package_dir(urdf: Path) -> Path:
     """The folder below which ``package://example-robot-data/...`` paths of ``urdf`` are found."""
     return next(parent.parent for parent in urdf.parents if parent.name == "example-robot-data")
-

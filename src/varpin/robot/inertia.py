@@ -12,8 +12,13 @@ Floats = NDArray[np.float64]
 
 # Rounded figures of a thin plate may miss the triangle inequality, which holds for it with equality, by this much.
 TRIANGLE_TOLERANCE = 1e-3
-# Of less than a micrometre's radius of gyration [m^2], a link is a point mass, and what there is of moments is rounding.
+# With a radius of gyration below a micrometre [m^2], a link is a point mass, and its moments are rounding.
 POINT = 1e-12
+
+
+def principal_moments(inertia: Floats) -> Floats:
+    """Of an inertia (3, 3): (3,), ascending [kg m^2]."""
+    return np.asarray(np.linalg.eigvalsh(inertia), dtype=np.float64)
 
 
 def fault(link: str, mass: float, moments: Floats) -> str:
@@ -47,5 +52,5 @@ def faults(model: pin.Model, inertials: Iterable[Inertial]) -> Iterator[str]:
         bodies = [(names.get(j, model.names[j]), model.inertias[j]) for j in range(1, model.njoints)]
         found = [(name, body.mass, np.array(body.inertia)) for name, body in bodies]
     for name, mass, inertia in found:
-        if np.isfinite(inertia).all() and (said := fault(name, mass, np.linalg.eigvalsh(inertia))):
+        if np.isfinite(inertia).all() and (said := fault(name, mass, principal_moments(inertia))):
             yield said

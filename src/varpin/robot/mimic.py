@@ -87,7 +87,7 @@ def _require_usable(tie: Tie, model: pin.Model) -> None:
         return
     raise RobotError(
         f"joint {model.names[tie.follower]!r} mimics {model.names[tie.leader]!r} with multiplier {tie.ratio:g} and "
-        f"offset {tie.offset:g}: the offset must be finite, and so must the multiplier's square, by which inertia counts"
+        f"offset {tie.offset:g}: the offset must be finite, and the multiplier's square, by which inertia counts"
     )
 
 

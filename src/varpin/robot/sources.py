@@ -228,9 +228,7 @@ def _of_urdf(path: Path, name: str, folders: tuple[str, ...], *, mimic: bool) ->
         order = depth_first(model, ties)
         if order != sorted(order):
             model, ties = reordered(model, ties, order)
-    return Description(
-        name, model, ties, path, (*folders, str(path.parent)), inertials=urdf.inertials, remarks=remarks
-    )
+    return Description(name, model, ties, path, (*folders, str(path.parent)), inertials=urdf.inertials, remarks=remarks)
 
 
 def _mimics_of(model: pin.Model) -> dict[str, Mimic]:

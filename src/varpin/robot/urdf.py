@@ -182,9 +182,7 @@ def build_shapes(
         text = _written(urdf, looks)
 
     def read() -> pin.GeometryModel:
-        return pin.buildGeomFromUrdfString(
-            model, text, pin.GeometryType.VISUAL, None, list(package_dirs), loader
-        )
+        return pin.buildGeomFromUrdfString(model, text, pin.GeometryType.VISUAL, None, list(package_dirs), loader)
 
     with _captured_stderr() as complaints:
         try:
@@ -387,7 +385,9 @@ def _looks(root: ET.Element, only: str | None) -> tuple[ET.Element, dict[str, st
                 # Pinocchio's name of the shape.
                 textures[f"{link.get('name')}_{k}"] = texture.get("filename", "")
             plain = ET.SubElement(part, "visual", visual.attrib)
-            plain.extend(child for child in visual if child is not own or (material is not None and _has_color(material)))
+            plain.extend(
+                child for child in visual if child is not own or (material is not None and _has_color(material))
+            )
     small.extend(root.findall("joint"))
     return small, textures
 
