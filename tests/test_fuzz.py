@@ -2,35 +2,30 @@
 
 from __future__ import annotations
 
-import base64
-import gzip
 import io
 import os
-import re
-import resource
 import struct
 import threading
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 
 import fuzz
 import numpy as np
 import pinocchio as pin
 import pytest
-from fuzz import mesh, npz, record, runner
-from mechanisms import INERTIAL, joint, link, mimic, random_tree, write_urdf
+from fuzz import npz, record, runner
+from mechanisms import INERTIAL, joint, link, mass_matrix, random_tree, write_urdf
 
 import varpin as vp
 from varpin import extremes
 from varpin.archive import read_npz
-from varpin.robot import geometry, meshes, readable_geometry
-from varpin.robot.model import mass_matrix
+from varpin.robot import geometry
 from varpin.robot.tree import tree_mass_matrix
-from varpin.robot.urdf import MAX_BYTES, MAX_DEPTH, MAX_JOINTS, MAX_LINKS
 
 # What takes some seconds each.
 INPUTS = {
     "urdf": 400, "npz": 600, "solution": 150, "scene": 800,
-    "reference": 800, "record": 1500, "mesh": 20, "command": 200,
+    "reference": 800, "record": 1500, "command": 200,
 }  # fmt: skip
 
 
@@ -49,8 +44,7 @@ def test_no_input_kills_hangs_or_surprises(kind, inputs):
     # Most damage is told, and some of it does none.
     harmless = sum(count for outcome, count in outcomes.items() if outcome.startswith(("taken", "status 0")))
     assert harmless > inputs // 50
-    # A mesh that cannot be read leaves its link a skeleton, and the robot is taken all the same.
-    assert inputs - harmless > (0 if kind == "mesh" else inputs // 10)
+    assert inputs - harmless > inputs // 10
 
 
 @pytest.mark.parametrize("kind", ["scene", "record"])
@@ -99,43 +93,30 @@ class TestUrdf:
             vp.load_robot(path)
 
     def test_deeper_than_the_parser_s_stack(self, tmp_path):
-        # At 5000 links Pinocchio ends the process.
-        self.refused(self.chain(tmp_path, 5001), f"is {MAX_DEPTH + 1} joints from its root; {MAX_DEPTH} are the most")
-
-    def test_as_deep_as_allowed(self, tmp_path):
-        path = self.chain(tmp_path, MAX_DEPTH + 1)
-        text = path.read_text().replace('name="j1" type="fixed"', 'name="j1" type="continuous"')
-        path.write_text(text)
+        # At 4000 links Pinocchio ends the process, on a stack of the usual size.
+        path = self.chain(tmp_path, 5001)
+        path.write_text(path.read_text().replace('name="j1" type="fixed"', 'name="j1" type="continuous"'))
+        before = threading.stack_size()
         assert vp.load_robot(path).joint_names == ("j1",)
-        # Also on the smaller stack of a thread.
-        done = []
-        worker = threading.Thread(target=lambda: done.append(vp.load_robot(path).dof))
-        worker.start()
-        worker.join()
-        assert done == [1]
+        # Also from a thread.
+        with ThreadPoolExecutor(1) as thread:
+            assert thread.submit(vp.load_robot, path).result().dof == 1
+        assert threading.stack_size() == before
 
-    def test_too_many_joints(self, tmp_path):
-        self.refused(
-            self.chain(tmp_path, MAX_JOINTS + 2, "continuous"), f"has {MAX_JOINTS + 1} moving joints; .* {MAX_JOINTS}"
-        )
-
-    def test_too_many_links(self, tmp_path):
-        path = write_urdf(tmp_path, *(f'<link name="l{k}"/>' for k in range(MAX_LINKS + 1)))
-        self.refused(path, f"has {MAX_LINKS + 2} links")
-
-    def test_too_large(self, tmp_path):
-        path = tmp_path / "a.urdf"
-        path.write_text("<robot name='a'>" + " " * MAX_BYTES + "</robot>")
-        self.refused(path, "is larger than 10 MB")
-
-    def test_entities(self, tmp_path):
+    def test_entities_that_expand_without_bound(self, tmp_path):
         laughs = "".join(f'<!ENTITY e{k} "{f"&e{k - 1};" * 10}">' for k in range(1, 12))
         path = tmp_path / "a.urdf"
         path.write_text(f'<!DOCTYPE robot [<!ENTITY e0 "ha">{laughs}]><robot name="a"><link name="&e11;"/></robot>')
-        self.refused(path, "declares XML entities")
+        with pytest.raises(vp.RobotError):
+            vp.load_robot(path)
 
     def test_nested_elements(self, tmp_path):
-        self.refused(write_urdf(tmp_path, "<a>" * 20_000 + "</a>" * 20_000), "nested more than 100 deep")
+        self.refused(
+            write_urdf(tmp_path, "<a>" * 20_000 + "</a>" * 20_000, link("l1", extra="<a>" * 5000 + "</a>" * 5000)),
+            "Two root links|no joint that moves",
+        )
+        nested = joint("j1", "base", "l1", inside="<a>" * 5000 + "</a>" * 5000)
+        self.refused(write_urdf(tmp_path, link("l1"), nested), "its elements are nested too deep")
 
     def test_numbers_that_only_one_of_the_parsers_reads(self, tmp_path):
         # Pinocchio dropped the inertial, or the whole link, without a word.
@@ -173,11 +154,6 @@ class TestUrdf:
             tmp_path, link("l1"), link("l2"), joint("j1", "base", "l1"), joint("j2", "l1", "l2", axis=axis)
         )
         self.refused(path, "joint 'j2' has an axis of length .*, which Pinocchio makes no unit vector of")
-
-    def test_mimic_ratios_beyond_floating_point(self, tmp_path):
-        parts = [link("l1"), link("l2"), joint("j1", "base", "l1")]
-        path = write_urdf(tmp_path, *parts, joint("j2", "l1", "l2", inside=mimic("j1", "1e200")))
-        self.refused(path, "armature must be finite|mass matrix .* not finite")
 
     def test_dampers_beyond_floating_point(self):
         scene = vp.Scene(vp.planar_chain(2, mass=1e-150, length=1e-5), damping=1e160)
@@ -218,13 +194,6 @@ class TestModels:
         change(model)
         with pytest.raises(vp.RobotError, match=words):
             vp.load_robot(model)
-
-    def test_of_too_many_joints(self):
-        with pytest.raises(vp.RobotError, match=f"has {MAX_JOINTS + 1} joints; .* at most {MAX_JOINTS}"):
-            vp.planar_chain(MAX_JOINTS + 1)
-
-    def test_as_long_as_allowed(self):
-        assert vp.planar_chain(MAX_JOINTS).dof == MAX_JOINTS
 
     @pytest.mark.parametrize("seed", range(5))
     def test_mass_matrix_in_numpy_is_pinocchio_s(self, seed):
@@ -465,68 +434,3 @@ class TestRecords:
         for path in (tmp_path, tmp_path / "fifo", tmp_path / ("x" * 300)):
             with pytest.raises(vp.FileError, match="there is no file"):
                 extremes.Record.load(path)
-
-
-class TestMeshes:
-    def drawn(self, folder, content, name="mesh.dae", filename=None):
-        """The shapes of a robot with a mesh, and what is missing; and its page."""
-        case = mesh._case(name, content, f'<mesh filename="{filename or f"package://{name}"}"/>')
-        robot = vp.load_robot(case.write(folder))
-        page = vp.replay(robot, [[0.1]], dt=1.0, html=folder / "a.html").read_bytes()
-        assert page
-        return *readable_geometry(robot), page
-
-    def test_that_are_whole(self, tmp_path):
-        shapes, missing, _ = self.drawn(tmp_path, mesh.DAE.replace("texture.png", "nowhere.png").encode())
-        assert (shapes.ngeoms, missing) == (1, {})
-
-    @pytest.mark.parametrize("name", ["package://fifo.stl", "package://folder.stl", "/dev/zero", "file:///dev/zero"])
-    def test_that_are_no_files(self, tmp_path, name):
-        shapes, missing, _ = self.drawn(tmp_path, b"", filename=name)
-        assert shapes.ngeoms == 0
-        assert "is a folder or a device" in missing["l1"][1]
-
-    def test_that_take_more_memory_than_there_is(self, tmp_path):
-        # Assimp makes room for a count.
-        text = mesh.DAE.replace('count="12"', 'count="4000000000"')
-        _, missing, _ = self.drawn(tmp_path, text.encode())
-        assert "cannot be read" in missing["l1"][1]
-        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 4e6  # kB
-
-    def test_that_end_their_reader(self, tmp_path, monkeypatch):
-        reader = tmp_path / "reader.py"
-        reader.write_text("import os; print('null', flush=True); os.abort()")
-        monkeypatch.setattr(meshes, "_READER", reader)
-        text = '<robot name="a"><link name="b"><visual><geometry><mesh filename="package://x"/></geometry></visual></link></robot>'
-        assert meshes.mesh_problems([text] * 2, []) == [None, "the reader ends with code -6"]
-        reader.write_text("import os; os.abort()")
-        first, *_, last = meshes.mesh_problems([text] * 8, [])
-        assert first == "the reader ends with code -6"
-        assert last == "it was not tried, after others of which the reader ends with code -6"
-
-    def test_that_take_too_long(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(meshes, "SECONDS", 1)
-        reader = tmp_path / "reader.py"
-        reader.write_text(
-            "import json, resource, sys\nrequest = json.load(sys.stdin)\n"
-            "resource.setrlimit(resource.RLIMIT_CPU, (request['seconds'],) * 2)\nwhile True: pass\n"
-        )
-        monkeypatch.setattr(meshes, "_READER", reader)
-        text = '<robot name="a"><link name="b"><visual><geometry><mesh filename="package://x"/></geometry></visual></link></robot>'
-        first, second = meshes.mesh_problems([text] * 2, [])
-        assert first == "reading takes more than 1 s of processor time"
-        assert second.startswith("it was not tried")
-
-    @pytest.mark.parametrize("tag", ["init_from", "xinit_from"])
-    def test_whose_textures_are_no_pictures(self, tmp_path, caplog, tag):
-        page = self.drawn(tmp_path, mesh.DAE.replace("init_from", tag).encode())[-1]
-        assert "texture 'texture.png' is no picture" in caplog.text
-        commands = re.search(rb'<script id="commands" type="text/plain">(.*?)</script>', page)[1]
-        assert base64.b64encode(mesh.SECRET) not in gzip.decompress(base64.b64decode(commands))
-
-    def test_whose_textures_are_too_large(self, tmp_path, caplog):
-        with (tmp_path / "large.png").open("wb") as stream:
-            stream.write(b"\x89PNG")
-            stream.truncate(60_000_000)
-        self.drawn(tmp_path, mesh.DAE.replace("texture.png", "large.png").encode())
-        assert "texture 'large.png' is larger than 50 MB" in caplog.text

@@ -99,22 +99,6 @@ def test_duration_is_the_motions(browser, finger, tmp_path, dt, steps):
     assert [values[-1] for _, values in tracks.values()] == pytest.approx([1.0, 0.5, 0.2], rel=1e-6)
 
 
-def test_wavefront_faces_lose_texture_coordinates_only():
-    text = """
-mtllib a.mtl
-o part
-v 0 0 0
-vt 0 1
-vn 0 0 1
-usemtl red
-f 1/2/3 4/5/6 -7/-8/-9
-f 1//3 2//3 4//3
-f 1/2 2/2 3/2
-f 1 2 3"""
-    expected = ["v 0 0 0", "vn 0 0 1", "f 1//3 4//6 -7//-9", "f 1//3 2//3 4//3", "f 1 2 3", "f 1 2 3"]
-    assert shape_module._plain_obj(text).splitlines() == expected
-
-
 def test_plays_in_real_time(browser, finger, tmp_path):
     visit(browser, replay(finger, np.zeros((201, 3)), dt=0.05, html=tmp_path / "clock.html"))
     look = "return [viewer.animator.time, performance.now() / 1000]"

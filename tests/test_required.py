@@ -3,9 +3,9 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from mechanisms import mass_matrix
 
 import varpin as vp
-from varpin.robot import mass_matrix
 
 HAND = """
 gravity = {gravity}

@@ -138,6 +138,13 @@ class TestSaving:
             trajectory.save(pipe)
         assert pipe.is_fifo()
 
+    def test_does_not_touch_the_umask_which_other_threads_share(self, trajectory, tmp_path, monkeypatch):
+        def touched(mask):
+            raise AssertionError(mask)
+
+        monkeypatch.setattr(os, "umask", touched)
+        assert trajectory.save(tmp_path / "a.npz").is_file()
+
     def test_replaces_and_keeps_the_umask(self, trajectory, saved):
         old = os.umask(0o027)
         try:

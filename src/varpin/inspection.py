@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -17,9 +16,11 @@ from varpin.errors import InputError, RobotError, SingularMassMatrix
 from varpin.integrators import Midpoint, largest_step
 from varpin.lagrangian import lagrangian_jet
 from varpin.markup import facts, folded, table
-from varpin.robot import Robot, build_robot, check_inertia, read_root
+from varpin.robot import Robot, build_robot, check_inertia
+from varpin.robot.inertia import fault, principal_moments
 from varpin.robot.mimic import joint_index
 from varpin.robot.tree import is_unbounded, joint_axis
+from varpin.robot.urdf import Urdf, read_urdf
 from varpin.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -32,8 +33,6 @@ _ANY_STEP = 100.0
 MASS_RATIO = 1e3
 INERTIA_RATIO = 1e6
 CONDITION = 1e6
-# Rounded figures of a thin plate may miss the triangle inequality, which holds for it with equality, by this much.
-TRIANGLE_TOLERANCE = 1e-3
 # Lengths of a link's inertia in units of the arm's reach, and [m] where there is no reach to compare with.
 LENGTH_RATIO = 2.0
 LENGTH = 10.0
@@ -203,14 +202,16 @@ def inspect_robot(
         )
     margin = Midpoint().branch_margin
     condition, scaled = _condition_numbers(jet.Lvv)
-    joints, links = _joints(robot), _links(robot)
+    urdf = None if robot.urdf is None else read_urdf(robot.urdf)
+    joints, links = _joints(robot), _links(robot, urdf)
     warnings = [
+        *(() if urdf is None else urdf.remarks),
         *_mass_warnings(robot),
         *_inertia_warnings(robot, links),
         *_ratio_warnings(robot),
         *_matrix_warnings(robot, scaled),
         *_limit_warnings(joints, robot, None if q is None else configuration),
-        *_mimic_warnings(robot, joints, tied=mimic == "tied"),
+        *_mimic_warnings(robot, urdf, joints, tied=mimic == "tied"),
         *_damping_warnings(robot),
         *(f"joint {name!r} is locked at {_position(at)}" for name, at in robot.locked.items()),
     ]
@@ -279,39 +280,25 @@ def _limit(value: float) -> float:
     return float(np.copysign(np.inf, value)) if abs(value) >= 1e300 else float(value)
 
 
-def _links(robot: Robot) -> tuple[LinkReport, ...]:
-    if robot.urdf is None:
+def _links(robot: Robot, urdf: Urdf | None) -> tuple[LinkReport, ...]:
+    if urdf is None or urdf.root is None:
         bodies = range(1, robot.free_model.njoints)
         return tuple(_body(robot, joint) for joint in bodies)
     # Pinocchio merges links on fixed joints into one body, in which a faulty inertia can hide.
-    model, reports = robot.free_model, []
-    for link in read_root(robot.urdf).findall("link"):
-        inertial, name = link.find("inertial"), link.get("name", "")
-        if inertial is None or not model.existBodyName(name):
-            continue
-        mass, inertia = _attributes(inertial, "mass"), _attributes(inertial, "inertia")
-        xx, xy, xz, yy, yz, zz = (float(inertia.get(key, "0")) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
-        origin = _attributes(inertial, "origin")
-        roll, pitch, yaw = np.array(origin.get("rpy", "0 0 0").split(), dtype=float)
-        turn = pin.rpy.rpyToMatrix(roll, pitch, yaw)
-        matrix = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
-        joint = model.frames[model.getBodyId(name)].parentJoint
-        reports.append(
-            LinkReport(
-                name=name,
-                joint=model.names[joint] if joint else "",
-                mass=float(mass.get("value", "0")),
-                center=np.array(origin.get("xyz", "0 0 0").split(), dtype=float),
-                inertia=matrix,
-                moments=np.linalg.eigvalsh(matrix),
-            )
+    model = robot.free_model
+    joints = {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
+    return tuple(
+        LinkReport(
+            name=link.link,
+            joint=model.names[joints[link.link]] if joints[link.link] else "",
+            mass=link.mass,
+            center=link.center,
+            inertia=link.inertia,
+            moments=principal_moments(link.inertia),
         )
-    return tuple(reports)
-
-
-def _attributes(element: ET.Element, tag: str) -> dict[str, str]:
-    child = element.find(tag)
-    return {} if child is None else child.attrib
+        for link in urdf.inertials
+        if link.link in joints
+    )
 
 
 def _body(robot: Robot, joint: int) -> LinkReport:
@@ -352,22 +339,13 @@ def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[str
     for link in links:
         if not link.joint or not link.inertia.any():
             continue
-        low, middle, high = link.moments
-        moments = ", ".join(f"{moment:.3g}" for moment in link.moments)
-        if low < -TRIANGLE_TOLERANCE * abs(high):
-            yield (
-                f"link {link.name!r} has a non-physical inertia: it is not positive definite "
-                f"(principal moments {moments} kg m^2)"
-            )
-        elif high > (1.0 + TRIANGLE_TOLERANCE) * (low + middle):
-            yield (
-                f"link {link.name!r} has a non-physical inertia: its principal moments {moments} kg m^2 violate the "
-                f"triangle inequality, {high:.3g} > {low:.3g} + {middle:.3g}"
-            )
+        if said := fault(link.name, link.mass, link.moments):
+            yield said
         elif link.mass > 0.0:
             # A ball has the least inertia of all bodies of a given mass and density.
+            moments = ", ".join(f"{moment:.3g}" for moment in link.moments)
             radius = (3.0 * link.mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
-            gyration = float(np.sqrt(high / link.mass))
+            gyration = float(np.sqrt(link.moments[-1] / link.mass))
             if link.moments.sum() < 1.2 * link.mass * radius**2:
                 yield (
                     f"link {link.name!r} has an implausibly small inertia: {link.mass:g} kg with principal moments "
@@ -458,24 +436,21 @@ def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | Non
                 yield f"q puts joint {name!r} at {at:g}, outside its limits {low:g} and {high:g}"
 
 
-def _mimic_warnings(robot: Robot, joints: Sequence[JointReport], *, tied: bool) -> Iterator[str]:
+def _mimic_warnings(robot: Robot, urdf: Urdf | None, joints: Sequence[JointReport], *, tied: bool) -> Iterator[str]:
     for joint in joints:
         if joint.follows:
             yield f"mimic joint {joint.name!r} is tied to its leader, as {joint.follows}; it is no coordinate"
-    if robot.urdf is None:
+    if urdf is None:
         return
     index = joint_index(robot.free_model)
-    elements = read_root(robot.urdf).findall("joint")
-    moving = {element.get("name", "") for element in elements if element.get("type") not in (None, "fixed")}
-    for element in elements:
-        mimic, name = element.find("mimic"), element.get("name", "")
-        if mimic is None or name not in index:
+    moving = {joint.get("name") for joint in urdf.elements("joint") if joint.get("type") not in (None, "fixed")}
+    for name, mimic in urdf.mimics.items():
+        if name not in index:
             continue
-        leader = mimic.get("joint", "")
-        if leader not in moving:
-            yield f"joint {name!r} mimics {leader!r}, which is not a moving joint of the robot: it stays free"
+        if mimic.leader not in moving:
+            yield f"joint {name!r} mimics {mimic.leader!r}, which is not a moving joint of the robot: it stays free"
         elif not tied:
-            yield f"joint {name!r} mimics {leader!r}, but was asked to be free"
+            yield f"joint {name!r} mimics {mimic.leader!r}, but was asked to be free"
 
 
 def _damping_warnings(robot: Robot) -> Iterator[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import reprlib
-import tempfile
+import secrets
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ from varpin.archive import Check, Header, read_npz
 from varpin.checks import path_like, writable
 from varpin.errors import FileError, InputError
 from varpin.markup import facts, table
-from varpin.robot import MAX_JOINTS, Robot
+from varpin.robot import Robot
 from varpin.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -292,8 +292,6 @@ def require_layout(source: Path, members: Mapping[str, NDArray[Any] | Header]) -
             raise FileError(f"{source}: {name} holds {kind}, where {'int64' if name in _COUNTS else 'float64'} belongs")
         if name in (*_TEXTS, "masses") and members[name].size * kind.itemsize > _MOST_WORDS:
             raise FileError(f"{source}: {name} is longer than any: {found} of {kind}")
-    if n > MAX_JOINTS:
-        raise FileError(f"{source} is of {n} joints; varpin takes robots of at most {MAX_JOINTS}")
 
 
 def chained(parts: Sequence[Trajectory]) -> Trajectory:
@@ -372,18 +370,14 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         FileError: The path cannot be written.
     """
     target = writable(path)
-    name = None
+    # Not by tempfile, which gives files to their owner alone.
+    own = target.with_name(f".{target.name}.{secrets.token_hex(8)}")
     try:
-        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-        with os.fdopen(handle, "wb") as stream:
+        with own.open("xb") as stream:
             yield stream
-        mask = os.umask(0)
-        os.umask(mask)
-        Path(name).chmod(0o666 & ~mask)
-        Path(name).replace(target)
+        own.replace(target)
     except BaseException as error:
-        if name is not None:
-            Path(name).unlink(missing_ok=True)
+        own.unlink(missing_ok=True)
         if isinstance(error, OSError) and not isinstance(error, FileError):
             raise FileError(f"cannot write {target}: {error.strerror or error}") from None
         raise

@@ -31,7 +31,7 @@ from fuzz.damage import Case
 
 MEMORY = 1_000_000_000  # bytes that a reader may take in all
 TIMEOUT = 10.0  # [s] of processor time that one input may take; of wall time twenty times as much
-KINDS = ("urdf", "npz", "solution", "scene", "reference", "record", "mesh", "command")
+KINDS = ("urdf", "npz", "solution", "scene", "reference", "record", "command")
 
 
 def module(kind: str) -> ModuleType:

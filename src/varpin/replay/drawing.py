@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from varpin.errors import InputError
 from varpin.replay import marks
-from varpin.replay.picture import Picture, label
+from varpin.replay.picture import Picture, label, labels
 from varpin.replay.script import Actor, Outlook, Script, Target, Trace
 from varpin.replay.shapes import GHOST_COLOR, ShapeLoader
 from varpin.replay.view import set_view, side_by_side, view_direction
@@ -116,9 +116,9 @@ class _Drawing:
                     self._color(f"{node}/<object>", actor.effort[:, body])
                 else:
                     self.loader.load(shape, placement, node)
-            for name in actor.frames if kind == "robot" else ():
+            for name, step in zip(actor.frames, labels(actor.frames), strict=True) if kind == "robot" else ():
                 body, placement = picture.frame(name)
-                node = f"{nodes[body] if body >= 0 else f'{root}/base'}/frames/{label(name)}"
+                node = f"{nodes[body] if body >= 0 else f'{root}/base'}/frames/{step}"
                 self.viewer[node].set_transform(placement.homogeneous)
                 self.viewer[node].set_object(marks.triad(_TRIAD * size))
 
@@ -138,8 +138,8 @@ class _Drawing:
                 # three.js draws so many of its corners; a piece that is reached in part is drawn in part.
                 corners = marks.TUBE_PIECE * trace.reached
                 self._animate(f"{node}/<object>", "geometry[drawRange].count", "number", corners)
-        for target in targets:
-            node = f"{root}/targets/{label(target.name)}"
+        for target, step in zip(targets, labels(target.name for target in targets), strict=True):
+            node = f"{root}/targets/{step}"
             pose = _translation(target.places[0])
             if target.turns is not None:
                 pose[:3, :3] = pin.Quaternion(target.turns[0]).toRotationMatrix()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,7 +69,7 @@ class Picture:
 
     def moving_nodes(self, root: str) -> list[str]:
         """Scene path of each body (b,) below a root."""
-        names = [label(name) for name in self.robot.free_model.names[1:]]
+        names = labels(self.robot.free_model.names[1:])
         nodes: list[str] = []
         for name, parent in zip(names, self.robot.tree.parent, strict=True):
             nodes.append(f"{nodes[parent] if parent >= 0 else root}/{name}/moving")
@@ -125,6 +125,21 @@ def _turns(robot: Robot) -> list[pin.SE3]:
 def label(name: str) -> str:
     """A name as one step of a scene path."""
     return name.replace("/", "_") or "_"
+
+
+# Steps of scene paths that are not of joints.
+_TAKEN = ("base", "shapes", "frames", "<object>")
+
+
+def labels(names: Iterable[str]) -> list[str]:
+    """Names as steps of scene paths, no two the same."""
+    found: dict[str, None] = dict.fromkeys(_TAKEN)
+    for name in names:
+        step, count = label(name), 2
+        while step in found:
+            step, count = f"{label(name)} {count}", count + 1
+        found[step] = None
+    return list(found)[len(_TAKEN) :]
 
 
 def _skeleton(robot: Robot) -> list[pin.GeometryObject]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import logging
-import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -16,10 +15,15 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 from pinocchio.visualize.meshcat_visualizer import MeshcatVisualizer, hasMeshFileInfo, loadMesh
 
+from varpin.replay import wavefront
+
 logger = logging.getLogger(__name__)
 
 # A colour that neither robots nor the background have.
 GHOST_COLOR, _GHOST_OPACITY = 0x1450D2, 0.35
+_WHITE = 0xFFFFFF
+# three.js's word for textures that go on beyond their edges.
+_REPEAT = 1000
 
 
 class ShapeLoader(MeshcatVisualizer):
@@ -37,19 +41,21 @@ class ShapeLoader(MeshcatVisualizer):
 
     def loadMeshFromFile(self, geometry_object: pin.GeometryObject) -> Any:
         """A mesh file, in a form that meshcat draws."""
-        if Path(geometry_object.meshPath).suffix.lower() == ".dae":
-            _require_pictures(Path(geometry_object.meshPath))
         mesh = super().loadMeshFromFile(geometry_object)
         if self.collada is not None:
             mesh.dae_raw = self.collada
-        elif isinstance(mesh, meshcat.geometry.MeshGeometry) and mesh.mesh_format == "obj":
-            mesh.contents = _plain_obj(mesh.contents)
         return mesh
 
     def load(self, shape: pin.GeometryObject, placement: pin.SE3, node: str) -> None:
         """Send a shape and where it sits in its parent node."""
+        suffix = Path(shape.meshPath).suffix.lower()
+        if suffix == ".obj":
+            self._load_obj(shape, placement, node)
+            return
+        if shape.meshTexturePath and not suffix and self._load_textured(shape, placement, node):
+            return
         parts: list[str | None] = [None]
-        if Path(shape.meshPath).suffix.lower() == ".dae":
+        if suffix == ".dae":
             parts = [*_collada_parts(shape.meshPath)]
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -68,6 +74,27 @@ class ShapeLoader(MeshcatVisualizer):
         else:
             logger.warning("%s; it is not drawn", " ".join(problems))
         self.viewer[node].set_transform(placement.homogeneous @ np.diag([*scale, 1.0]))
+
+    def _load_obj(self, shape: pin.GeometryObject, placement: pin.SE3, node: str) -> None:
+        """Send a Wavefront file, each of its materials as a mesh of its own."""
+        parts = wavefront.parts(Path(shape.meshPath))
+        for k, part in enumerate(parts):
+            own = node if len(parts) == 1 else f"{node}/{k}"
+            color = _hex(shape.meshColor if shape.overrideMaterial or part.color is None else part.color)
+            opacity = float(shape.meshColor[3]) if shape.overrideMaterial else part.opacity
+            texture = shape.meshTexturePath or ("" if shape.overrideMaterial else part.texture)
+            material = meshcat.geometry.MeshPhongMaterial(
+                color=color, opacity=opacity, transparent=opacity < 1.0, vertexColors=part.colored
+            )
+            if texture and part.mapped:
+                material.map, material.color = _picture(texture), _WHITE
+            self.viewer[own].set_object(meshcat.geometry.MeshGeometry(part.text, "obj"), material)
+        self.viewer[node].set_transform(placement.homogeneous @ np.diag([*shape.meshScale, 1.0]))
+
+    def _load_textured(self, shape: pin.GeometryObject, placement: pin.SE3, node: str) -> bool:
+        """Send a box, ball or cylinder with its texture, if there is a way to draw it."""
+        material = meshcat.geometry.MeshPhongMaterial(color=_WHITE, map=_picture(shape.meshTexturePath))
+        return self._load_form(shape, placement, node, material)
 
     def load_plain(self, shape: pin.GeometryObject, placement: pin.SE3, node: str) -> None:
         """Send a shape in one colour that can be animated; those of mesh files cannot."""
@@ -105,32 +132,6 @@ class ShapeLoader(MeshcatVisualizer):
         return True
 
 
-_LARGEST_PICTURE = 50_000_000  # [bytes]
-# How files of pictures begin: PNG, JPEG, GIF, BMP, TIFF either way, WebP.
-_PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"BM", b"II*\0", b"MM\0*", b"RIFF")
-
-
-def _require_pictures(path: Path) -> None:
-    """Refuse a Collada file whose textures are something else: all of what it names would go into the page.
-
-    Raises:
-        ValueError: It names the file.
-    """
-    for element in ElementTree.parse(path).iter():
-        # Pinocchio's viewer takes any element that has this in its name.
-        if "init_from" not in str(element.tag) or not (element.text or "").strip():
-            continue
-        picture = path.parent / str(element.text)
-        if picture.is_file():
-            if picture.stat().st_size > _LARGEST_PICTURE:
-                raise ValueError(f"its texture {element.text!r} is larger than {_LARGEST_PICTURE / 1e6:g} MB")
-            with picture.open("rb") as stream:
-                if not stream.read(4).startswith(_PICTURES):
-                    raise ValueError(f"its texture {element.text!r} is no picture")
-
-
-# A file whose parts would add up to more bytes, or whose elements are nested deeper, is taken whole.
-_MOST_COPIED, _NESTED = 100_000_000, 100
 _PRIMITIVES = frozenset(["lines", "linestrips", "polygons", "polylist", "triangles", "trifans", "tristrips"])
 
 
@@ -145,19 +146,19 @@ def _collada_parts(path: str) -> list[str | None]:
     except (OSError, ElementTree.ParseError):
         # Pinocchio's loader will say so in its own words.
         return [None]
-    level, depth = [root], 0
-    while level and depth <= _NESTED:
-        depth, level = depth + 1, [child for element in level for child in element]
-    if level:
-        return [None]
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
     instances = list(root.iter("instance_geometry"))
     meshes = [[child for child in mesh if child.tag in _PRIMITIVES] for mesh in root.iter("mesh")]
     kinds = {frozenset(x.get("semantic") for x in child.iter("input")) for mesh in meshes for child in mesh}
-    copied = len(instances) * Path(path).stat().st_size
-    if len(instances) < 2 or copied > _MOST_COPIED or (len(kinds) < 2 and max(map(len, meshes)) < 2):
+    if len(instances) < 2 or (len(kinds) < 2 and max(map(len, meshes)) < 2):
         return [None]
+    # Geometries are most of a file: each goes only where it is used.
+    geometries = {}
+    for library in root.iter("library_geometries"):
+        for geometry in library.findall("geometry"):
+            geometries[geometry.get("id")] = geometry
+            library.remove(geometry)
     parts: list[str | None] = []
     for kept in range(len(instances)):
         part = copy.deepcopy(root)
@@ -167,21 +168,15 @@ def _collada_parts(path: str) -> list[str | None]:
             for other in node.findall("instance_geometry"):
                 if other is not here[kept]:
                     node.remove(other)
-        for library in part.iter("library_geometries"):
-            for mesh in library.findall("geometry"):
-                if mesh.get("id") != used:
-                    library.remove(mesh)
+        for library in [*part.iter("library_geometries")][:1]:
+            library.extend([geometries[used]] if used in geometries else [])
         parts.append(ElementTree.tostring(part, encoding="unicode"))
     return parts
 
 
-def _plain_obj(text: str) -> str:
-    """A Wavefront file's vertices, normals and faces alone, as one mesh.
-
-    meshcat gives it one colour without texture anyway, and stops on parts of which only some have texture coordinates.
-    """
-    lines = (line for line in text.splitlines() if line.startswith(("v ", "vn ", "f ")))
-    return "\n".join(re.sub(r"(\d+)/-?\d*(/?)", r"\1\2\2", line) if line[0] == "f" else line for line in lines)
+def _picture(path: str) -> Any:
+    """The picture in a file, as a texture."""
+    return meshcat.geometry.ImageTexture(meshcat.geometry.PngImage(Path(path).read_bytes()), wrap=[_REPEAT, _REPEAT])
 
 
 def _hex(color: ArrayLike) -> int:

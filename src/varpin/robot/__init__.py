@@ -6,12 +6,9 @@ from varpin.robot.model import build_robot as build_robot
 from varpin.robot.model import check_inertia as check_inertia
 from varpin.robot.model import geometry as geometry
 from varpin.robot.model import load_robot as load_robot
-from varpin.robot.model import mass_matrix as mass_matrix
 from varpin.robot.model import readable_geometry as readable_geometry
 from varpin.robot.payload import Payload as Payload
 from varpin.robot.sources import bundled_robots as bundled_robots
 from varpin.robot.sources import models_dir as models_dir
 from varpin.robot.sources import robot_names as robot_names
 from varpin.robot.tree import require_sound as require_sound
-from varpin.robot.urdf import MAX_JOINTS as MAX_JOINTS
-from varpin.robot.urdf import read_root as read_root

@@ -3,6 +3,7 @@
 Its 6.x wheels carry the data alone, so the files are found through the installed distribution's metadata.
 """
 
+import csv
 from importlib import metadata
 from pathlib import Path
 
@@ -103,36 +104,37 @@ def locate(relative: str) -> Path:
         RobotError: example-robot-data is not installed, or its version does not hold the file.
     """
     try:
-        files = metadata.files(DISTRIBUTION) or []
+        files = _files()
     except metadata.PackageNotFoundError:
         raise RobotError(
             f"{relative} belongs to {DISTRIBUTION}, which is not installed: pip install {DISTRIBUTION}"
         ) from None
     for file in files:
-        if file.as_posix().endswith(f"example-robot-data/robots/{relative}"):
-            return Path(str(file.locate())).resolve()
+        if file.endswith(f"example-robot-data/robots/{relative}"):
+            return Path(str(metadata.distribution(DISTRIBUTION).locate_file(file))).resolve()
     raise RobotError(f"the installed {DISTRIBUTION} {metadata.version(DISTRIBUTION)} does not hold {relative}")
 
 
 def installed() -> tuple[str, ...]:
     """Names of the fixed-base robots that the installed example-robot-data holds; none without it."""
     try:
-        files = metadata.files(DISTRIBUTION) or []
+        files = _files()
     except metadata.PackageNotFoundError:
         return ()
-    held = {file.as_posix().rpartition("example-robot-data/robots/")[2] for file in files if file.suffix == ".urdf"}
+    held = {file.rpartition("example-robot-data/robots/")[2] for file in files}
     return tuple(name for name, relative in FIXED_BASE.items() if relative in held)
+
+
+def _files() -> list[str]:
+    """Its files as the installer recorded them; ``metadata.files`` makes a path of each first, which takes long.
+
+    Raises:
+        PackageNotFoundError: It is not installed.
+    """
+    record = metadata.distribution(DISTRIBUTION).read_text("RECORD") or ""
+    return [row[0] for row in csv.reader(record.splitlines()) if row]
 
 
 def package_dir(urdf: Path) -> Path:
     """The folder below which ``package://example-robot-data/...`` paths of ``urdf`` are found."""
     return next(parent.parent for parent in urdf.parents if parent.name == "example-robot-data")
-
-
-def holds(urdf: Path) -> bool:
-    """Whether a file is one of the installed example-robot-data's."""
-    try:
-        files = metadata.files(DISTRIBUTION) or []
-    except metadata.PackageNotFoundError:
-        return False
-    return any(Path(str(file.locate())).resolve() == urdf for file in files if file.name == urdf.name)

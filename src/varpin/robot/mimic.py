@@ -5,6 +5,7 @@ joint stands on its own beside the one in which followers are tied to their lead
 """
 
 import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -73,10 +74,21 @@ def _to_the_end(tie: Tie, ties: dict[int, Tie], model: pin.Model) -> Tie:
     """The tie to the free joint at the end of a chain of leaders."""
     for _ in range(len(ties) + 1):
         if tie.leader not in ties:
+            _require_usable(tie, model)
             return tie
         after = ties[tie.leader]
         tie = Tie(tie.follower, after.leader, tie.ratio * after.ratio, tie.ratio * after.offset + tie.offset)
     raise RobotError(f"joint {model.names[tie.follower]!r} mimics itself through a loop of mimic joints")
+
+
+def _require_usable(tie: Tie, model: pin.Model) -> None:
+    """Refuse a tie that takes inertias, which count by the square of its ratio, beyond floating-point numbers."""
+    if math.isfinite(tie.ratio * tie.ratio) and math.isfinite(tie.offset):
+        return
+    raise RobotError(
+        f"joint {model.names[tie.follower]!r} mimics {model.names[tie.leader]!r} with multiplier {tie.ratio:g} and "
+        f"offset {tie.offset:g}: the offset must be finite, and the multiplier's square, by which inertia counts"
+    )
 
 
 def tied_model(model: pin.Model, ties: Sequence[Tie]) -> pin.Model:
@@ -166,7 +178,9 @@ def untied_model(model: pin.Model) -> tuple[pin.Model, tuple[Tie, ...]]:
         subspace = np.asarray(data.S, dtype=float).reshape(6)
         slides = bool(subspace[:3].any())
         axis = (subspace[:3] if slides else subspace[3:]) / follower.scaling
-        ties.append(Tie(joint, leaders[joint], float(follower.scaling), float(follower.offset)))
+        tie = Tie(joint, leaders[joint], float(follower.scaling), float(follower.offset))
+        _require_usable(tie, model)
+        ties.append(tie)
         return pin.JointModelPrismaticUnaligned(axis) if slides else pin.JointModelRevoluteUnaligned(axis)
 
     return rebuild(model, range(1, model.njoints), free_joint), tuple(ties)

@@ -1,8 +1,7 @@
 """The robot: a Pinocchio model, its generalized coordinates, and the tree the kernels run on."""
 
-import contextlib
+import logging
 import os
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,18 +16,25 @@ from varpin.checks import as_floats, is_one_of, require_finite
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint
 from varpin.kernels.tree import Tree
 from varpin.markup import facts, listed, table
-from varpin.robot import example_robot_data
-from varpin.robot.meshes import mesh_problems
+from varpin.robot.inertia import faults
 from varpin.robot.mimic import Tie, joint_index, rebuild, tied_model
 from varpin.robot.payload import Payload, carry
-from varpin.robot.sources import Description, describe, hang_shapes, models_dir
-from varpin.robot.tree import flatten, frame_index, is_unbounded, joint_axis, to_pinocchio, tree_mass_matrix
-from varpin.robot.urdf import read_root
+from varpin.robot.sources import Description, describe, hang_shapes
+from varpin.robot.tree import (
+    flatten,
+    frame_index,
+    frame_on_body,
+    is_unbounded,
+    joint_axis,
+    place_on_body,
+    to_pinocchio,
+    tree_mass_matrix,
+)
+from varpin.robot.urdf import build_model, build_shapes, read_urdf
 
 Floats = NDArray[np.float64]
 
-# Joints up to which a robot is checked with Pinocchio's algorithms.
-_FEW = 128
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,12 +141,11 @@ class Robot:
         if q.ndim != 2 or q.shape[1] != self.dof:
             raise InputError(f"q must have shape (N, {self.dof}), got {q.shape}")
         name = self.end_effector if frame is None else frame
-        index, data = frame_index(self.free_model, name, self.name), self.free_model.createData()
-        positions = np.empty((len(q), 3))
-        for k, row in enumerate(self.free_positions(q)):
-            pin.forwardKinematics(self.free_model, data, row)
-            positions[k] = pin.updateFramePlacement(self.free_model, data, index).translation
-        return positions
+        found = self.free_model.frames[frame_index(self.free_model, name, self.name)]
+        if found.parentJoint == 0:
+            return np.tile(found.placement.translation, (len(q), 1))
+        body, _, place = frame_on_body(self.free_model, name, self.name)
+        return place_on_body(self.tree, q, body, place)
 
     @property
     def unbounded(self) -> NDArray[np.bool_]:
@@ -212,6 +217,9 @@ def load_robot(
 ) -> Robot:
     """Load an arm.
 
+    Any URDF that Pinocchio reads will do. What a file leaves out, and inertias that no body can have, are told in the
+    log with the link and its numbers.
+
     Main args:
         source: Path of a URDF file; name of a bundled robot (``"finger"``); name of a fixed-base robot of
             example-robot-data (``"ur5"``); a ``pin.Model``; or a ``RobotWrapper``. :func:`varpin.robot_names` lists
@@ -230,13 +238,16 @@ def load_robot(
 
     Raises:
         RobotNotFound: No such file or name; close matches are listed.
-        RobotError: The file is not a URDF, its XML is broken, or a link's inertia is not finite.
+        RobotError: The file is not a URDF, its XML is broken, or a mass, an inertia or a mimic multiplier is no
+            number of use.
         UnsupportedJoint: A joint has no single axis (free-flyer, spherical, planar, screw).
         UnknownJoint: ``lock`` names a joint that is not there.
         UnknownFrame: A payload hangs on a frame that is not there.
         SingularMassMatrix: A joint moves no inertia.
     """
-    robot = build_robot(source, package_dirs=package_dirs, lock=lock, mimic=mimic, payload=payload)
+    robot, description = _built(source, package_dirs, lock, mimic, payload)
+    for remark in (*description.remarks, *faults(robot.free_model, description.inertials)):
+        logger.warning("robot %r: %s", robot.name, remark)
     check_inertia(robot)
     return robot
 
@@ -249,7 +260,18 @@ def build_robot(
     mimic: Literal["tied", "free"] = "tied",
     payload: Payload | Sequence[Payload] = (),
 ) -> Robot:
-    """:func:`load_robot` without the check that every joint moves inertia, for looking into faulty models."""
+    """:func:`load_robot` without its checks of inertia, for looking into faulty models."""
+    return _built(source, package_dirs, lock, mimic, payload)[0]
+
+
+def _built(
+    source: object,
+    package_dirs: Sequence[str | os.PathLike[str]] | None,
+    lock: Mapping[str, ArrayLike] | None,
+    mimic: Literal["tied", "free"],
+    payload: Payload | Sequence[Payload],
+) -> tuple[Robot, Description]:
+    """The robot, and what its source says."""
     if not is_one_of(mimic, ("tied", "free")):
         raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
     description = describe(source, package_dirs, mimic=mimic == "tied")
@@ -269,7 +291,7 @@ def build_robot(
     if not coordinates:
         raise RobotError(f"robot {description.name!r} has no joint that moves")
     tree = flatten(model, ties, coordinates)
-    return Robot(
+    robot = Robot(
         name=description.name,
         model=tied_model(model, ties),
         joint_names=tuple(model.names[joint] for joint in coordinates),
@@ -281,6 +303,7 @@ def build_robot(
         package_dirs=description.package_dirs,
         visuals=visuals,
     )
+    return robot, description
 
 
 def _lock(
@@ -379,19 +402,9 @@ def geometry(robot: Robot) -> pin.GeometryModel:
         return robot.visuals
     if robot.urdf is None:
         return pin.GeometryModel()
-    text = ET.tostring(read_root(robot.urdf), encoding="unicode")
-    (problem,) = _mesh_problems(robot, [text])
-    if problem is not None:
-        raise RobotError(f"the meshes of robot {robot.name!r} cannot be read: {problem}")
-    return _visuals(robot, _whole_model(robot, text), text)
-
-
-def _mesh_problems(robot: Robot, texts: Sequence[str]) -> list[str | None]:
-    """What is wrong with the meshes in parts of a robot's URDF; nothing of robots that are published with varpin."""
-    assert robot.urdf is not None
-    if robot.urdf.is_relative_to(models_dir()) or example_robot_data.holds(robot.urdf):
-        return [None] * len(texts)
-    return mesh_problems(texts, robot.package_dirs)
+    urdf = read_urdf(robot.urdf)
+    full = build_model(urdf)
+    return _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, pin.coal.MeshLoader()))
 
 
 def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[int, str]]]:
@@ -403,67 +416,45 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
     """
     if robot.visuals is not None or robot.urdf is None:
         return geometry(robot), {}
-    root = read_root(robot.urdf)
-    whole = ET.tostring(root, encoding="unicode")
-    full = _whole_model(robot, whole)
-    visuals = {link: link.findall("visual") for link in root.iter("link")}
-    for link, shapes in visuals.items():
-        for shape in shapes:
-            link.remove(shape)
-    shown = {link: shapes for link, shapes in visuals.items() if shapes}
-    alone = []
-    for link, shapes in shown.items():
-        single = ET.Element("robot", name="link")
-        single.extend(root.findall("material"))
-        ET.SubElement(single, "link", name=link.get("name", "")).extend(shapes)
-        alone.append(ET.tostring(single, encoding="unicode"))
-    problems = _mesh_problems(robot, alone)
-    if not any(problems):
-        with contextlib.suppress(RobotError):
-            return _visuals(robot, full, whole), {}
+    urdf = read_urdf(robot.urdf)
+    full = build_model(urdf)
+    # Reads no mesh twice.
+    loader = pin.coal.CachedMeshLoader()
+    try:
+        return _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, loader)), {}
+    except RobotError as error:
+        problem = str(error)
     found, missing = pin.GeometryModel(), {}
-    for (link, shapes), problem in zip(shown.items(), problems, strict=True):
+    for link in urdf.elements("link"):
         name = link.get("name", "")
-        link.extend(shapes)
+        if link.find("visual") is None:
+            continue
         try:
-            if problem is not None:
-                raise RobotError(f"the meshes of link {name!r} cannot be read: {problem}")
-            part = _visuals(robot, full, ET.tostring(root, encoding="unicode"))
+            part = _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, loader, name))
         except RobotError as error:
             frame = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.BODY)]
             missing[name] = frame.parentJoint, str(error)
         else:
             for shape in part.geometryObjects:
                 found.addGeometryObject(shape)
-        for shape in shapes:
-            link.remove(shape)
+    if urdf.root is None:
+        missing = {frame.name: (frame.parentJoint, problem) for frame in _links(robot.free_model)}
     return found, missing
 
 
-def _whole_model(robot: Robot, text: str) -> pin.Model:
-    """The model of a robot's URDF, nothing locked."""
-    try:
-        return pin.buildModelFromXML(text)
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise RobotError(f"robot {robot.name!r} cannot be read again: {error}") from None
+def _links(model: pin.Model) -> list[pin.Frame]:
+    return [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
 
 
-def _visuals(robot: Robot, full: pin.Model, text: str) -> pin.GeometryModel:
-    """The visual geometry in a URDF's text, on the joints of the robot.
+def _on_joints(robot: Robot, full: pin.Model, visuals: pin.GeometryModel) -> pin.GeometryModel:
+    """The shapes of a robot's file on the joints of the robot.
 
     Args:
-        robot: Its meshes are looked up in its folders.
+        robot: Some of its joints may be locked, or in another order than in the file.
         full: Its URDF's model, nothing locked.
-        text: Of the URDF, or of a part of it.
-
-    Raises:
-        RobotError: A mesh is missing or cannot be read; the message names it.
+        visuals: Shapes on ``full``.
     """
-    try:
-        visuals = pin.buildGeomFromUrdfString(full, text, pin.GeometryType.VISUAL, None, list(robot.package_dirs))
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise RobotError(f"the meshes of robot {robot.name!r} cannot be read: {error}") from None
-    # Attach to the joints of the model the robot moves with: by name, and locked joints through their frame.
+    # By name, and locked joints through their frame.
     index = joint_index(robot.free_model)
     for shape in visuals.geometryObjects:
         link = full.frames[shape.parentFrame]
@@ -487,15 +478,13 @@ def check_inertia(robot: Robot) -> None:
         RobotError: It is not finite.
     """
     rng = np.random.default_rng(0)
-    # Pinocchio's data take 64 n^3 bytes.
-    data = robot.free_model.createData() if robot.free_model.nv <= _FEW else None
     for q in [np.zeros(robot.dof), *rng.uniform(-np.pi, np.pi, (3, robot.dof))]:
         with np.errstate(all="ignore"):
-            M = tree_mass_matrix(robot.tree, q) if data is None else mass_matrix(robot, q, data)
+            M = tree_mass_matrix(robot.tree, q)
         if not np.isfinite(M).all():
             raise RobotError(
-                f"the mass matrix of robot {robot.name!r} is not finite at q = {q}: masses, inertias or distances are "
-                "beyond the range of floating-point numbers"
+                f"the mass matrix of robot {robot.name!r} is not finite at q = {q}: masses, inertias, distances or "
+                "mimic multipliers are beyond the range of floating-point numbers"
             )
         scale = np.sqrt(np.diag(M))
         if not (np.diag(M) > 0.0).all():
@@ -508,11 +497,3 @@ def check_inertia(robot: Robot) -> None:
             raise SingularMassMatrix(
                 [name for name, x in zip(robot.joint_names, worst, strict=True) if x >= 0.5 * worst.max()], q
             )
-
-
-def mass_matrix(robot: Robot, q: ArrayLike, data: pin.Data) -> Floats:
-    """M(q) (n, n) by Pinocchio's composite rigid body algorithm, armature included [kg m^2, kg m or kg]."""
-    full = pin.crba(robot.free_model, data, robot.free_positions(q))
-    full = np.triu(full) + np.triu(full, 1).T
-    G = robot.free_velocities(np.eye(robot.dof)).T
-    return np.asarray(G.T @ full @ G)

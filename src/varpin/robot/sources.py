@@ -21,7 +21,7 @@ from varpin.robot.mimic import (
     ties_of,
     untied_model,
 )
-from varpin.robot.urdf import MAX_JOINTS, read_urdf
+from varpin.robot.urdf import Inertial, Mimic, build_model, read_urdf
 
 logger = logging.getLogger(__name__)
 
@@ -37,6 +37,8 @@ class Description:
         urdf: The file, if there is one.
         package_dirs: Where ``package://`` paths are looked up.
         visuals: Geometry handed over with a RobotWrapper.
+        inertials: Of the links in a URDF, which the model has merged into bodies.
+        remarks: What the source leaves out, in words.
     """
 
     name: str
@@ -45,6 +47,8 @@ class Description:
     urdf: Path | None = None
     package_dirs: tuple[str, ...] = ()
     visuals: pin.GeometryModel | None = None
+    inertials: tuple[Inertial, ...] = ()
+    remarks: tuple[str, ...] = ()
 
 
 def models_dir() -> Path:
@@ -156,8 +160,6 @@ def _check_model(model: pin.Model, name: str) -> None:
         RobotError: Naming the part.
     """
     n, nq, nv = model.njoints, model.nq, model.nv
-    if n - 1 > MAX_JOINTS:
-        raise RobotError(f"model {name!r} has {n - 1} joints; varpin takes robots of at most {MAX_JOINTS}")
     sizes = dict.fromkeys(("joints", "names", "parents", "inertias", "jointPlacements"), n)
     sizes |= dict.fromkeys(("lowerPositionLimit", "upperPositionLimit"), nq)
     sizes |= dict.fromkeys(JOINT_PARAMETERS, nv)
@@ -215,11 +217,21 @@ def _of_example(name: str, folders: tuple[str, ...], *, mimic: bool) -> Descript
 
 
 def _of_urdf(path: Path, name: str, folders: tuple[str, ...], *, mimic: bool) -> Description:
-    model, mimics = read_urdf(path)
+    urdf = read_urdf(path)
+    model, mimics, remarks = build_model(urdf), urdf.mimics, urdf.remarks
+    if urdf.root is None:
+        remarks = (*remarks, f"{urdf.fault}; varpin has it as Pinocchio's parser, which is more lenient, reads it")
+        mimics = _mimics_of(build_model(urdf, mimic=True))
     ties: tuple[Tie, ...] = ()
     if mimic:
         ties = ties_of(mimics, model)
         order = depth_first(model, ties)
         if order != sorted(order):
             model, ties = reordered(model, ties, order)
-    return Description(name, model, ties, path, (*folders, str(path.parent)))
+    return Description(name, model, ties, path, (*folders, str(path.parent)), inertials=urdf.inertials, remarks=remarks)
+
+
+def _mimics_of(model: pin.Model) -> dict[str, Mimic]:
+    """The mimic joints of a model by name."""
+    free, ties = untied_model(model)
+    return {free.names[tie.follower]: Mimic(free.names[tie.leader], tie.ratio, tie.offset) for tie in ties}

@@ -1,5 +1,7 @@
 """From a Pinocchio model to flat arrays: every joint turned so that it moves about or along its own z axis."""
 
+import math
+
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
@@ -50,10 +52,11 @@ def is_unbounded(model: pin.Model, joint: int) -> bool:
 
 def z_to(axis: Floats) -> Floats:
     """A rotation matrix (3, 3) whose third column is ``axis``, exact for the coordinate axes."""
-    helper = np.eye(3)[np.argmin(np.abs(axis))]
-    x = np.cross(helper, axis)
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(axis, x), axis])
+    a, b, c = (float(part) for part in axis)
+    # Across the coordinate axis that is farthest from this one.
+    x = [(0.0, -c, b), (c, 0.0, -a), (-b, a, 0.0)][int(np.argmin(np.abs(axis)))]
+    u, v, w = (part / math.hypot(*x) for part in x)
+    return np.array([[u, b * w - c * v, a], [v, c * u - a * w, b], [w, a * v - b * u, c]])
 
 
 def _is_rigid(placement: pin.SE3) -> bool:
@@ -205,6 +208,15 @@ def origins(parent: Integers, prismatic: Integers) -> Integers:
 LIGHT = 0.005
 
 
+def ancestors(parent: Integers) -> NDArray[np.bool_]:
+    """Which bodies are on the way from the root to each (b, b), itself included: [j, a] for a on the way to j."""
+    on_way = np.eye(len(parent), dtype=bool)
+    for body, above in enumerate(parent):
+        if above >= 0:
+            on_way[body] |= on_way[above]
+    return on_way
+
+
 def light_parts(
     parent: Integers,
     coordinate: Integers,
@@ -233,35 +245,37 @@ def light_parts(
         The bodies with which they begin (l,), and which coordinates move with each (l, n): 1 or 0.
     """
     bodies = len(parent)
-    about = np.zeros((bodies, bodies))  # [a, b]: inertia of body b about the joint of its ancestor a
-    below = np.zeros((bodies, bodies), dtype=bool)
+    on_way = ancestors(parent)
+    way = np.zeros(bodies)  # along the offsets between joints, from the root
     for b in range(bodies):
-        reach, a = float(np.linalg.norm(center[b])), b
-        while a >= 0:
-            below[a, b] = True
-            about[a, b] = mass[b] * (1.0 if prismatic[a] else reach**2)
-            if not prismatic[a]:
-                about[a, b] += inertia[b, [0, 2, 5]].sum() / 2.0
-            reach += float(np.linalg.norm(translation[a]))
-            a = parent[a]
+        way[b] = np.linalg.norm(translation[b]) + (way[parent[b]] if parent[b] >= 0 else 0.0)
+    # [a, b]: inertia of body b about the joint of its ancestor a.
+    with np.errstate(over="ignore", invalid="ignore"):
+        reach = np.linalg.norm(center, axis=1) + way - way[:, None]
+        slides = prismatic[:, None] == 1
+        about = mass * np.where(slides, 1.0, reach**2)
+        about += np.where(slides, 0.0, inertia[:, [0, 2, 5]].sum(axis=1) / 2.0)
+        about[~on_way.T] = 0.0
+        # [a, j]: of all that joint j carries.
+        carries = about @ on_way
+        light = carries < LIGHT * np.diag(carries)[:, None]
     carrier = np.full(bodies, -1)  # the light part a body is in
     loads, rows = [], []
+    movers = np.zeros((bodies, dof))
+    movers[np.arange(bodies), coordinate] = 1.0
+    moved = on_way.T.astype(float) @ movers  # [j, c]: how many bodies that joint j carries coordinate c moves
+    elsewhere = movers.sum(axis=0) - moved
     for j in range(bodies):
-        a = parent[j]
-        if a < 0:
+        if parent[j] < 0:
             continue
-        carrier[j] = carrier[a]
-        moved = np.zeros(dof, dtype=bool)
-        moved[coordinate[below[j]]] = True
-        if moved[coordinate[~below[j]]].any():  # a mimic joint elsewhere moves along
+        carrier[j] = carrier[parent[j]]
+        if ((moved[j] > 0) & (elsewhere[j] > 0)).any():  # a mimic joint elsewhere moves along
             continue
-        while a >= 0 and carrier[a] == carrier[j]:
-            if about[a, below[j]].sum() < LIGHT * about[a, below[a]].sum():
-                carrier[j] = j
-                loads.append(j)
-                rows.append(moved)
-                break
-            a = parent[a]
+        above = np.flatnonzero(on_way[j])[:-1]
+        if light[above[carrier[above] == carrier[j]], j].any():
+            carrier[j] = j
+            loads.append(j)
+            rows.append(moved[j] > 0)
     shape = (len(loads), dof)
     return np.array(loads, dtype=np.int64), np.array(rows, dtype=np.int64).reshape(shape)
 
@@ -315,40 +329,61 @@ def require_sound(tree: Tree) -> None:
 def tree_mass_matrix(tree: Tree, q: Floats) -> Floats:
     """M(q) (n, n), armature included: M_ij = S_i . Y_j S_j for an ancestor i of j, or j itself; see kernels.jet.
 
-    In plain NumPy and n^2 memory, for robots whose data in Pinocchio would not fit.
+    In plain NumPy and n^2 memory, where Pinocchio's data take n^3.
     """
     bodies = tree.parent.size
     rotation, position = np.empty((bodies, 3, 3)), np.empty((bodies, 3))
-    axis, inertia = np.zeros((bodies, 6)), np.zeros((bodies, 6, 6))
-    M = np.zeros((bodies, bodies))
     for j, s in enumerate(tree.ratio * q[tree.coordinate] + tree.offset):
         up = tree.parent[j]
         R, p = (rotation[up], position[up]) if up >= 0 else (np.eye(3), np.zeros(3))
-        p, R = p + R @ tree.translation[j], R @ tree.rotation[j]
-        z = R[:, 2]
+        rotation[j], position[j] = R @ tree.rotation[j], p + R @ tree.translation[j]
         if tree.prismatic[j]:
-            p = p + s * z
-            axis[j, :3] = z
+            position[j] += s * rotation[j, :, 2]
         else:
-            R = R @ np.array([[np.cos(s), -np.sin(s), 0.0], [np.sin(s), np.cos(s), 0.0], [0.0, 0.0, 1.0]])
-            axis[j, :3], axis[j, 3:] = np.cross(p, z), z
-        rotation[j], position[j] = R, p
-        x, y, w = p + R @ tree.center[j]
-        cross = np.array([[0.0, -w, y], [w, 0.0, -x], [-y, x, 0.0]])
-        xx, xy, yy, xz, yz, zz = tree.inertia[j]
-        own = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
-        m = tree.mass[j]
-        inertia[j] = np.block([[m * np.eye(3), -m * cross], [m * cross, own - m * cross @ cross]])
+            rotation[j] = rotation[j] @ _turn(s)
+    turns = (tree.prismatic == 0)[:, None]
+    z = rotation[:, :, 2]
+    axis = np.hstack([np.where(turns, np.cross(position, z), z), np.where(turns, z, 0.0)])
+    center = position + np.einsum("bij,bj->bi", rotation, tree.center)
+    lever = np.zeros((bodies, 3, 3))  # across a centre of mass
+    lever[:, [2, 0, 1], [1, 2, 0]] = center
+    lever -= lever.transpose(0, 2, 1)
+    own = tree.inertia[:, [[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
+    m = tree.mass[:, None, None]
+    inertia = np.empty((bodies, 6, 6))
+    inertia[:, :3, :3], inertia[:, :3, 3:], inertia[:, 3:, :3] = m * np.eye(3), -m * lever, m * lever
+    inertia[:, 3:, 3:] = rotation @ own @ rotation.transpose(0, 2, 1) - m * lever @ lever
     for j in range(bodies - 1, -1, -1):
-        dual, i = inertia[j] @ axis[j], j
-        while i >= 0:
-            M[i, j] = M[j, i] = axis[i] @ dual
-            i = tree.parent[i]
         if tree.parent[j] >= 0:
             inertia[tree.parent[j]] += inertia[j]
+    dual = np.einsum("bij,bj->bi", inertia, axis)
+    M = np.where(ancestors(tree.parent), dual @ axis.T, 0.0)
+    M += np.tril(M, -1).T
     G = np.zeros((bodies, tree.armature.size))
     G[np.arange(bodies), tree.coordinate] = tree.ratio
     return np.asarray(G.T @ M @ G + np.diag(tree.armature))
+
+
+def _turn(angle: float) -> Floats:
+    """Rotation (3, 3) about z."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def place_on_body(tree: Tree, q: Floats, body: int, place: Floats) -> Floats:
+    """Where a place (3,) on a body is in the world (N, 3) [m], at configurations q (N, n)."""
+    at = q[:, tree.coordinate] * tree.ratio + tree.offset
+    point = np.broadcast_to(place, (len(q), 3))
+    while body >= 0:
+        if tree.prismatic[body]:
+            point = point + np.stack([np.zeros(len(q)), np.zeros(len(q)), at[:, body]], axis=1)
+        else:
+            c, s = np.cos(at[:, body]), np.sin(at[:, body])
+            x, y, z = point.T
+            point = np.stack([c * x - s * y, s * x + c * y, z], axis=1)
+        point = point @ tree.rotation[body].T + tree.translation[body]
+        body = int(tree.parent[body])
+    return point
 
 
 def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Integers:

@@ -1,9 +1,11 @@
-"""Reading a URDF file, and saying in words what is wrong with it.
+"""Reading a URDF file: Pinocchio's parser makes the model, and what it drops is read here or told of.
 
-Pinocchio's parser drops what it cannot read (an inertia that is not a number, a joint that closes a loop) with at
-most a line on stderr, and goes on with another robot than the file describes.
+Pinocchio drops what it cannot read (an inertia that is not a number, a joint that closes a loop) with at most a line on
+stderr, and goes on with another robot than the file describes. It merges links on fixed joints into one body, and it
+refuses some mimic elements that are of use.
 """
 
+import codecs
 import contextlib
 import logging
 import math
@@ -12,30 +14,46 @@ import re
 import reprlib
 import sys
 import tempfile
+import threading
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
+from xml.parsers import expat
 
+import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from varpin.errors import FileError, RobotError
 
 logger = logging.getLogger(__name__)
 
-_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+T = TypeVar("T")
 
-# What is read. Pinocchio's parser goes down a tree by recursion and ends the process some 3500 links deep, and its data
-# of a robot of n joints take 64 n^3 bytes: a gigabyte at the limit.
-MAX_BYTES = 10_000_000
-MAX_LINKS = 10_000
-MAX_DEPTH = 1000
-MAX_JOINTS = 256
-# Elements within elements; a URDF has half a dozen.
-_NESTED = 100
+_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 # The numbers that Python and C++ read alike.
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+
+_BYTE_ORDER_MARKS = (
+    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+    (codecs.BOM_UTF8, "utf-8-sig"),
+)
+_DECLARED = re.compile(rb"\s*<\?xml[^>]*?encoding\s*=\s*[\"']([\w.:-]+)[\"']")
+_COMMENT = re.compile(r"<!--.*?-->|(<!\[CDATA\[.*?\]\]>)", re.DOTALL)
+
+# Pinocchio's parser goes down a tree by recursion, and takes some 2.5 kB of stack a link. Trees of more links than
+# _DEEP get a stack of their own.
+_DEEP, _STACK_OF_LINK = 1000, 10_000
+
+# Threads take turns at the process's stderr.
+_STDERR = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -47,82 +65,216 @@ class Mimic:
     offset: float
 
 
-def read_urdf(path: Path) -> tuple[pin.Model, dict[str, Mimic]]:
-    """The model of a URDF file with every joint on its own, and its mimic elements by joint.
+@dataclass(frozen=True, eq=False)
+class Inertial:
+    """Mass and inertia of a link, as Pinocchio reads them.
+
+    Attributes:
+        link: Its name.
+        mass: [kg].
+        center: Centre of mass (3,) in the link's frame [m].
+        inertia: (3, 3) about the centre of mass, in the link's axes [kg m^2].
+    """
+
+    link: str
+    mass: float
+    center: NDArray[np.float64]
+    inertia: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Urdf:
+    """A URDF file, read by :func:`read_urdf`.
+
+    Attributes:
+        path: Of the file.
+        text: Its content.
+        root: Its ``<robot>`` element, with names as they are written, prefix and all. None if the text is no
+            well-formed XML, which Pinocchio's parser may read all the same; nothing below is known then.
+        inertials: Of the links that have one.
+        mimics: Mimic elements by joint.
+        remarks: What the file leaves out, and what it is read as, in words.
+        fault: What is wrong with the XML, if something is.
+    """
+
+    path: Path
+    text: str = field(repr=False)
+    root: ET.Element | None = field(repr=False)
+    inertials: tuple[Inertial, ...] = ()
+    mimics: Mapping[str, Mimic] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    fault: str = ""
+
+    def elements(self, tag: str) -> list[ET.Element]:
+        """The children of the root with a tag."""
+        return [] if self.root is None else self.root.findall(tag)
+
+
+def read_urdf(path: Path) -> Urdf:
+    """Read a URDF file.
+
+    XML is read leniently: prefixes need no namespace, and comments may hold ``--``.
 
     Raises:
         FileError: The file cannot be read.
-        RobotError: It is not a URDF, or not one of a tree of bodies with finite masses and inertias.
+        RobotError: It is no URDF, or not one of a tree of bodies with finite masses and inertias.
     """
-    root = read_root(path)
-    _check_tree(root, path)
-    for link in root.findall("link"):
-        _check_inertial(link, path)
+    text, remarks = _decoded(path)
+    if not text.strip("\0 \t\r\n"):
+        raise RobotError(f"{path} is not a URDF: it is empty")
+    try:
+        root = _parsed(text)
+    except expat.ExpatError as error:
+        if text[:200].lower().startswith(("<!doctype html", "<html")):
+            raise RobotError(f"{path} is a web page, not a URDF") from None
+        return Urdf(path, text, None, remarks=tuple(remarks), fault=f"it is not well-formed XML: {error}")
+    _require_robot(root, path)
+    _require_tree(root, path)
+    inertials = [_inertial(link, path, remarks) for link in root.findall("link")]
     mimics = {joint.get("name", ""): _mimic(joint, path) for joint in root.findall("joint[mimic]")}
+    return Urdf(path, text, root, tuple(x for x in inertials if x is not None), mimics, tuple(remarks))
+
+
+def build_model(urdf: Urdf, *, mimic: bool = False) -> pin.Model:
+    """Pinocchio's model of a file, every joint on its own unless ``mimic`` leaves those that mimic to Pinocchio.
+
+    Raises:
+        RobotError: Pinocchio cannot read it, or reads less than there is.
+    """
+    text = urdf.text if urdf.root is None else _written(urdf, _dynamics(urdf.root))
+    options = {"mimic": True} if mimic else {}
     with _captured_stderr() as complaints:
         try:
-            # From what was checked, not from the file: the two XML parsers do not agree on everything.
-            model = pin.buildModelFromXML(ET.tostring(root, encoding="unicode"))
+            model = _on_a_stack(urdf, lambda: pin.buildModelFromXML(text, **options))
         except (ValueError, RuntimeError, IndexError) as error:
             detail = "; ".join(complaints()) or str(error)
-            raise RobotError(f"{path} is not a URDF that Pinocchio can read: {detail}") from None
+            fault = f": {urdf.fault}" if urdf.fault else f" that Pinocchio can read: {detail}"
+            raise RobotError(f"{urdf.path} is not a URDF{fault}") from None
         for line in complaints():
-            logger.warning("%s: %s", path, line)
-    described = sum(float(mass.get("value", "0")) for mass in root.findall("link/inertial[1]/mass[1]"))
+            logger.warning("%s: %s", urdf.path, line)
+    described = sum(inertial.mass for inertial in urdf.inertials)
     read = sum(body.mass for body in model.inertias)
-    if not math.isclose(described, read, rel_tol=1e-9):
-        raise RobotError(f"{path} describes links of {described:.6g} kg in all, of which Pinocchio reads {read:.6g} kg")
-    return model, mimics
+    if urdf.root is not None and not math.isclose(described, read, rel_tol=1e-9):
+        raise RobotError(
+            f"{urdf.path} describes links of {described:.6g} kg in all, of which Pinocchio reads {read:.6g} kg"
+        )
+    return model
 
 
-def read_root(path: Path) -> ET.Element:
-    """The <robot> element of a URDF file, expanded and within the limits on its size.
+def build_shapes(
+    urdf: Urdf, model: pin.Model, package_dirs: Sequence[str], loader: pin.coal.MeshLoader, link: str | None = None
+) -> pin.GeometryModel:
+    """The visual geometry in a file, as Pinocchio reads it.
+
+    Args:
+        urdf: The file.
+        model: From :func:`build_model`.
+        package_dirs: Where ``package://`` paths are looked up.
+        loader: Reads meshes, and may keep them.
+        link: The only one wanted, if there is one; only in well-formed XML.
 
     Raises:
-        FileError: The file cannot be read.
-        RobotError: It is too large, or not the XML of a URDF.
+        RobotError: A mesh is missing or cannot be read; the message names it.
     """
+    text, textures = urdf.text, dict[str, str]()
+    if urdf.root is not None:
+        looks, textures = _looks(urdf.root, link)
+        text = _written(urdf, looks)
+
+    def read() -> pin.GeometryModel:
+        return pin.buildGeomFromUrdfString(model, text, pin.GeometryType.VISUAL, None, list(package_dirs), loader)
+
+    with _captured_stderr() as complaints:
+        try:
+            shapes = _on_a_stack(urdf, read)
+        except (ValueError, RuntimeError, IndexError) as error:
+            whose = "" if link is None else f" of link {link!r}"
+            raise RobotError(f"the meshes{whose} in {urdf.path} cannot be read: {error}") from None
+        for line in complaints():
+            logger.warning("%s: %s", urdf.path, line)
+    for shape in shapes.geometryObjects:
+        if shape.name in textures:
+            shape.meshTexturePath = _texture(textures[shape.name], urdf.path, package_dirs)
+    return shapes
+
+
+def _decoded(path: Path) -> tuple[str, list[str]]:
+    """A file's text in the encoding that it declares, and what is to be said of it."""
     try:
-        with path.open("rb") as stream:
-            content = stream.read(MAX_BYTES + 1)
+        content = path.read_bytes()
     except OSError as error:
         raise FileError(f"cannot read {path}: {error.strerror}") from None
-    if len(content) > MAX_BYTES:
-        raise RobotError(f"{path} is larger than {MAX_BYTES / 1e6:g} MB, the largest URDF that is read")
-    text = content.decode("utf-8", errors="replace")
-    if "<!ENTITY" in text:
-        raise RobotError(f"{path} declares XML entities, which can expand without bound: write out what they stand for")
+    declared = _DECLARED.match(content)
+    encoding = next((name for mark, name in _BYTE_ORDER_MARKS if content.startswith(mark)), "")
+    remarks = []
+    if not encoding:
+        encoding = declared[1].decode() if declared else "utf-8"
+        try:
+            name = codecs.lookup(encoding).name
+        except LookupError:
+            remarks.append(f"its encoding {encoding!r} is unknown; it is read as utf-8")
+            encoding = "utf-8"
+        else:
+            # Whose declaration can be read byte by byte is not in an encoding of two or four bytes.
+            encoding = "utf-8" if name.startswith(("utf-16", "utf-32")) else encoding
     try:
-        root = ET.fromstring(text)
-    except ET.ParseError as error:
-        start = text[:200].lstrip("\ufeff \t\r\n").lower()
-        if start.startswith(("<!doctype html", "<html")):
-            raise RobotError(f"{path} is a web page, not a URDF") from None
-        raise RobotError(f"{path} is not a URDF: it is not well-formed XML: {error}") from None
-    level, depth = [root], 0
-    while level:
-        depth, level = depth + 1, [child for element in level for child in element]
-        if depth > _NESTED:
-            raise RobotError(f"{path} is not a URDF: its elements are nested more than {_NESTED} deep")
+        text = content.decode(encoding)
+    except (UnicodeError, LookupError) as error:
+        remarks.append(f"it is not {encoding} as it should be ({error}); what cannot be read is replaced by \ufffd")
+        text = content.decode("utf-8", errors="replace")
+    return text.lstrip("\ufeff \t\r\n"), remarks
+
+
+def _parsed(text: str) -> ET.Element:
+    """The root element of an XML text, prefixes kept as they are written.
+
+    Raises:
+        ExpatError: The text is not well-formed.
+    """
+    # Comments go, as "--" may not stand in them in XML but often does; their lines stay, for messages.
+    text = _COMMENT.sub(lambda found: found[1] or "\n" * found[0].count("\n"), text)
+    builder, parser = ET.TreeBuilder(), expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
+    parser.CharacterDataHandler = builder.data
+    parser.Parse(text, True)
+    return builder.close()
+
+
+def _require_robot(root: ET.Element, path: Path) -> None:
+    if root.tag.lower() == "html":
+        raise RobotError(f"{path} is a web page, not a URDF")
     if root.tag != "robot":
         raise RobotError(f"{path} is not a URDF: its root element is <{root.tag}>, not <robot>")
-    if any("wiki/xacro}" in element.tag for element in root):
-        raise RobotError(f"{path} is a xacro file: expand it first, with xacro {path.name} > {path.stem}.urdf")
+    if leftover := _xacro(root):
+        name = path.name.removesuffix(".xacro").removesuffix(".urdf")
+        raise RobotError(
+            f"{path} is a xacro file: expand it first, with xacro {path.name} > {name}.expanded.urdf; it has {leftover}"
+        )
     if not root.get("name"):
         raise RobotError(f"{path}: its <robot> has no name, which a URDF must have")
     if root.find("link") is None:
         raise RobotError(f"{path} describes no link")
-    return root
 
 
-def _check_tree(root: ET.Element, path: Path) -> None:
-    links, joints = len(root.findall("link")), root.findall("joint")
-    moving = sum(joint.get("type") != "fixed" for joint in joints)
-    for number, what, most in ((max(links, len(joints)), "links", MAX_LINKS), (moving, "moving joints", MAX_JOINTS)):
-        if number > most:
-            raise RobotError(f"{path} has {number} {what}; varpin takes robots of at most {most}")
+def _xacro(root: ET.Element) -> str:
+    """The first thing that xacro would have replaced, if there is one."""
+    prefixes = {"xacro"} | {key.removeprefix("xmlns:") for key, value in root.items() if "wiki/xacro" in value}
+    for element in root.iter():
+        prefix, colon, _ = element.tag.partition(":")
+        if colon and prefix in prefixes:
+            return f"<{element.tag}>"
+    for part in root:
+        for element in part.iter() if part.tag in ("link", "joint") else ():
+            for key, value in element.items():
+                if "${" in value or value.startswith("$("):
+                    return f"<{element.tag} {key}={value!r}>"
+    return ""
+
+
+def _require_tree(root: ET.Element, path: Path) -> None:
     above: dict[str, tuple[str, str]] = {}
-    for joint in joints:
+    for joint in root.findall("joint"):
         parent, child = joint.find("parent"), joint.find("child")
         if parent is None or child is None:
             continue
@@ -133,46 +285,53 @@ def _check_tree(root: ET.Element, path: Path) -> None:
                 "varpin takes trees, no closed loops"
             )
         above[link] = parent.get("link", ""), name
-    depths: dict[str, int] = {}
+    rooted: set[str] = set()
     for start in above:
         link, way = start, dict[str, None]()
-        while link in above and link not in depths:
+        while link in above and link not in rooted:
             if link in way:
                 loop = list(way)[list(way).index(link) :]
                 raise RobotError(f"{path}: links {', '.join(map(repr, loop))} form a loop that hangs on no root")
             way[link] = None
             link = above[link][0]
-        depth = depths.get(link, 0)
-        for link in reversed(way):
-            depth += 1
-            depths[link] = depth
-        if depth > MAX_DEPTH:
-            raise RobotError(f"{path}: link {start!r} is {depth} joints from its root; {MAX_DEPTH} are the most")
+        rooted.update(way)
 
 
-def _check_inertial(link: ET.Element, path: Path) -> None:
+def _inertial(link: ET.Element, path: Path, remarks: list[str]) -> Inertial | None:
+    """Mass and inertia of a link, or None if it has none; what is left out is added to ``remarks``.
+
+    Raises:
+        RobotError: A number is none, or the mass is negative.
+    """
     inertial = link.find("inertial")
     if inertial is None:
-        return
-    where = f"{path}: link {link.get('name')!r}"
+        return None
+    name = link.get("name", "")
+    where = f"{path}: link {name!r}"
     mass, moments, origin = inertial.find("mass"), inertial.find("inertia"), inertial.find("origin")
-    if mass is None or moments is None:
-        raise RobotError(f"{where}: its <inertial> has no <{'mass' if mass is None else 'inertia'}>")
-    if _number(mass.get("value"), f"{where}: its mass") < 0.0:
+    if mass is None or mass.get("value") is None:
+        remarks.append(f"link {name!r}: its <inertial> has no <mass>: it is massless, as Pinocchio reads it")
+        return None
+    value = _number(mass.get("value"), f"{where}: its mass")
+    if value < 0.0:
         raise RobotError(f"{where} has mass {mass.get('value')} < 0 [kg]")
-    # Numbers are put back without white space that Pinocchio would stumble over.
-    mass.set("value", mass.get("value", "").strip())
-    for entry in _MOMENTS:
-        _number(moments.get(entry), f"{where}: its inertia {entry}")
-        moments.set(entry, moments.get(entry, "").strip())
-    for entry in ("xyz", "rpy") if origin is not None else ():
-        assert origin is not None
-        words = origin.get(entry, "0 0 0").split()
+    given = {} if moments is None else {key: moments.get(key) for key in _MOMENTS if moments.get(key) is not None}
+    numbers = {key: _number(word, f"{where}: its inertia {key}") for key, word in given.items()}
+    if len(numbers) < len(_MOMENTS):
+        absent = "no <inertia>" if moments is None else f"no {', '.join(x for x in _MOMENTS if x not in given)}"
+        remarks.append(f"link {name!r}: its <inertial> has {absent}: it is a point mass, as Pinocchio reads it")
+        numbers = dict.fromkeys(_MOMENTS, 0.0)
+    place = np.zeros((2, 3))
+    for row, entry in zip(place, ("xyz", "rpy"), strict=True):
+        words = ("0 0 0" if origin is None else origin.get(entry, "0 0 0")).split()
         if len(words) != 3:  # Pinocchio would drop the whole <inertial> in silence
             raise RobotError(f"{where}: the {entry} of its <inertial> must be three numbers, got {' '.join(words)!r}")
-        for word in words:
-            _number(word, f"{where}: the {entry} of its <inertial>")
-        origin.set(entry, " ".join(words))
+        row[:] = [_number(word, f"{where}: the {entry} of its <inertial>") for word in words]
+    xx, xy, xz, yy, yz, zz = (numbers[key] for key in _MOMENTS)
+    turn = pin.rpy.rpyToMatrix(*place[1])
+    own = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    with np.errstate(over="ignore", invalid="ignore"):
+        return Inertial(name, value, place[0], turn @ own @ turn.T)
 
 
 def _mimic(joint: ET.Element, path: Path) -> Mimic:
@@ -196,12 +355,110 @@ def _number(word: str | None, what: str) -> float:
     return number
 
 
+def _dynamics(root: ET.Element) -> ET.Element:
+    """What Pinocchio makes a model of: links with their inertias, and joints."""
+    small = ET.Element("robot", {"name": root.get("name", "")})
+    for link in root.findall("link"):
+        part = ET.SubElement(small, "link", _named(link))
+        part.extend(_tidy(inertial) for inertial in link.findall("inertial")[:1] if _weighs(inertial))
+    small.extend(root.findall("joint"))
+    return small
+
+
+def _looks(root: ET.Element, only: str | None) -> tuple[ET.Element, dict[str, str]]:
+    """What Pinocchio makes shapes of: links with their visuals, of all or of one, and joints; and shapes' textures.
+
+    Pinocchio knows no textures, and takes a material without a colour for black. Such a material is left out, as is
+    black beside a texture, where a converter had no colour: the mesh then keeps the colours of its file.
+    """
+    small = ET.Element("robot", {"name": root.get("name", "")})
+    shared = {material.get("name"): material for material in root.findall("material")}
+    small.extend(material for material in shared.values() if _has_color(material))
+    textures = {}
+    for link in root.findall("link"):
+        part = ET.SubElement(small, "link", _named(link))
+        for k, visual in enumerate(link.findall("visual") if only in (None, link.get("name")) else ()):
+            own = visual.find("material")
+            material = own if own is None or len(own) else shared.get(own.get("name"), own)
+            texture = None if material is None else material.find("texture")
+            if texture is not None and texture.get("filename"):
+                # Pinocchio's name of the shape.
+                textures[f"{link.get('name')}_{k}"] = texture.get("filename", "")
+            plain = ET.SubElement(part, "visual", visual.attrib)
+            plain.extend(
+                child for child in visual if child is not own or (material is not None and _has_color(material))
+            )
+    small.extend(root.findall("joint"))
+    return small, textures
+
+
+def _has_color(material: ET.Element) -> bool:
+    color = material.find("color")
+    if color is None:
+        return False
+    return material.find("texture") is None or any(word.strip("0.") for word in color.get("rgba", "").split()[:3])
+
+
+def _texture(name: str, urdf: Path, package_dirs: Sequence[str]) -> str:
+    """The file of a texture; empty, with a warning in the log, if it is not there."""
+    scheme, separator, rest = name.partition("://")
+    places = [Path(folder, rest) for folder in package_dirs] if scheme == "package" else [urdf.parent / name]
+    places = [Path(rest)] if separator and scheme == "file" else places
+    for place in places:
+        if place.is_file():
+            return str(place)
+    logger.warning("%s: texture %r is not there", urdf, name)
+    return ""
+
+
+def _named(link: ET.Element) -> dict[str, str]:
+    return {key: value for key, value in link.items() if key == "name"}
+
+
+def _weighs(inertial: ET.Element) -> bool:
+    mass = inertial.find("mass")
+    return mass is not None and mass.get("value") is not None
+
+
+def _tidy(inertial: ET.Element) -> ET.Element:
+    """An ``<inertial>`` that was looked at, whole and without white space that Pinocchio would stumble over."""
+    tidy = ET.Element("inertial")
+    mass, moments, origin = inertial.find("mass"), inertial.find("inertia"), inertial.find("origin")
+    if origin is not None:
+        ET.SubElement(tidy, "origin", {key: " ".join(origin.get(key, "0 0 0").split()) for key in ("xyz", "rpy")})
+    ET.SubElement(tidy, "mass", {"value": "" if mass is None else mass.get("value", "").strip()})
+    words = {key: "" if moments is None else moments.get(key, "").strip() for key in _MOMENTS}
+    ET.SubElement(tidy, "inertia", words if all(words.values()) else dict.fromkeys(_MOMENTS, "0"))
+    return tidy
+
+
+def _written(urdf: Urdf, root: ET.Element) -> str:
+    try:
+        return ET.tostring(root, encoding="unicode")
+    except RecursionError:
+        raise RobotError(f"{urdf.path} is not a URDF: its elements are nested too deep") from None
+
+
+def _on_a_stack(urdf: Urdf, read: Callable[[], T]) -> T:
+    """What ``read`` returns, run on a stack that Pinocchio's parser gets to the end of the tree on."""
+    links = urdf.text.count("<link")
+    if links <= _DEEP:
+        return read()
+    # The size is that of threads that start from now on, whose stacks may well be larger.
+    before = threading.stack_size(max(links * _STACK_OF_LINK // 4096 * 4096, 16 * 2**20))
+    try:
+        with ThreadPoolExecutor(1) as thread:
+            return thread.submit(read).result()
+    finally:
+        threading.stack_size(before)
+
+
 @contextlib.contextmanager
 def _captured_stderr() -> Iterator[Callable[[], list[str]]]:
     """Catch what Pinocchio's C++ parser writes to the process's stderr; yields a function that returns its messages."""
-    sys.stderr.flush()
-    saved = os.dup(2)
-    with tempfile.TemporaryFile() as sink:
+    with _STDERR, tempfile.TemporaryFile() as sink:
+        sys.stderr.flush()
+        saved = os.dup(2)
         os.dup2(sink.fileno(), 2)
 
         def messages() -> list[str]:

@@ -1,0 +1,270 @@
+"""Any URDF that Pinocchio reads loads, as Pinocchio reads it; what is left out of it is told."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import threading
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from mechanisms import INERTIAL, arm, joint, link, mimic, write_urdf
+
+import varpin as vp
+from varpin.robot import example_robot_data, geometry, readable_geometry
+from varpin.robot.urdf import build_model, read_urdf
+
+ROBOTS = example_robot_data.locate(example_robot_data.FIXED_BASE["ur5"]).parents[2]
+PUBLISHED = sorted(str(path.relative_to(ROBOTS)) for path in ROBOTS.rglob("*.urdf"))
+BALL = '<visual><geometry><sphere radius="0.1"/></geometry></visual>'
+HEAVY = '<inertial><origin xyz="0.1 0 0.2"/><mass value="5"/></inertial>'
+THIN = '<inertial><mass value="2"/><inertia ixx="{}" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>'
+
+
+@pytest.fixture
+def two(tmp_path):
+    """The text of a robot of two joints, the second of which mimics the first, and a fixed link."""
+    parts = [link(name, extra=BALL) for name in ("l1", "l2", "tool")]
+    joints = [joint("j1", "base", "l1"), joint("j2", "l1", "l2", inside=mimic("j1", 2, 0.1))]
+    return write_urdf(tmp_path, *parts, *joints, joint("j3", "l2", "tool", "fixed")).read_text()
+
+
+def written(folder, text, encoding="utf-8"):
+    path = folder / "odd.urdf"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode(encoding))
+    return path
+
+
+def assert_same(model, expected):
+    """Two models have the same joints, placements, inertias and limits."""
+    assert list(model.names) == list(expected.names)
+    assert list(model.parents) == list(expected.parents)
+    for one, other in zip(model.jointPlacements, expected.jointPlacements, strict=True):
+        np.testing.assert_array_equal(one.homogeneous, other.homogeneous)
+    for one, other in zip(model.inertias, expected.inertias, strict=True):
+        np.testing.assert_array_equal(one.toDynamicParameters(), other.toDynamicParameters())
+    for one, other in zip(model.joints, expected.joints, strict=True):
+        assert one.shortname() == other.shortname()
+    for name in ("lowerPositionLimit", "upperPositionLimit", "effortLimit", "velocityLimit", "damping"):
+        np.testing.assert_array_equal(getattr(model, name), getattr(expected, name))
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_published_robots_are_as_pinocchio_reads_them(name):
+    try:
+        expected = pin.buildModelFromUrdf(str(ROBOTS / name))
+    except ValueError:
+        with pytest.raises(vp.RobotError):
+            build_model(read_urdf(ROBOTS / name))
+        return
+    urdf = read_urdf(ROBOTS / name)
+    assert_same(build_model(urdf), expected)
+    frames = {frame.name: frame for frame in expected.frames if frame.type == pin.FrameType.BODY}
+    # Links that hang on one another for good, taken together, are the bodies.
+    bodies = np.zeros((expected.njoints, 6, 6))
+    for part in urdf.inertials:
+        lever, place = part.mass * pin.skew(part.center), frames[part.link].placement
+        body = np.block([[part.mass * np.eye(3), -lever], [lever, part.inertia - lever @ pin.skew(part.center)]])
+        bodies[frames[part.link].parentJoint] += place.toDualActionMatrix() @ body @ place.toActionMatrixInverse()
+    for joint_index, body in enumerate(bodies):
+        read = expected.inertias[joint_index].matrix()
+        np.testing.assert_allclose(body, read, rtol=0, atol=1e-12 * max(np.abs(read).max(), 1e-9))
+
+
+# What is done to the text, and what the log has to say of it.
+ODD = {
+    "as it is": (lambda text: text, ""),
+    "drake without a namespace": (
+        lambda text: text.replace("<limit ", '<limit drake:acceleration="3" ').replace(
+            "</robot>", '<drake:joint name="x"/><drake:loop_constraint a="b"/></robot>'
+        ),
+        "",
+    ),
+    "a default namespace": (lambda text: text.replace("<robot ", '<robot xmlns="http://drake.mit.edu" '), ""),
+    "an expanded xacro": (lambda text: text.replace("<robot ", '<robot xmlns:xacro="http://ros.org/wiki/xacro" '), ""),
+    "comments with dashes": (lambda text: text.replace("<joint", "<!-- one -- two --- -->\n<!---->\n<joint"), ""),
+    "a comment around a joint": (lambda text: text.replace("</robot>", "<!--<joint name='k'/>--></robot>"), ""),
+    "unknown elements": (lambda text: text.replace("</link>", "<sensor><camera/></sensor><mass/></link>"), ""),
+    "other programs' elements": (
+        lambda text: text.replace(
+            "</robot>",
+            '<gazebo reference="l1"><mu1>0.2</mu1><plugin name="p" filename="q"/></gazebo>'
+            '<transmission name="t"><joint name="j1"/><actuator name="m"><mechanicalReduction>x</mechanicalReduction>'
+            '</actuator></transmission><ros2_control name="r" type="system"><joint name="j1"/></ros2_control></robot>',
+        ),
+        "",
+    ),
+    "a byte order mark": (lambda text: "\ufeff" + text, ""),
+    "utf-16": (lambda text: text.encode("utf-16"), ""),
+    "dos lines": (lambda text: text.replace("\n", "\r\n"), ""),
+    "mac lines": (lambda text: text.replace("\n", "\r"), ""),
+    "blank lines first": (lambda text: "\n \n" + text, ""),
+    "no declaration": (lambda text: text.partition("\n")[2], ""),
+    "entities": (
+        lambda text: '<!DOCTYPE robot [<!ENTITY m "1.3">]>\n' + text.partition("\n")[2].replace('"1.3"', '"&m;"'),
+        "",
+    ),
+    "an encoding that it is not in": (lambda text: text.replace("?>", ' encoding="utf-16"?>', 1), ""),
+    "an unknown encoding": (lambda text: text.replace("?>", ' encoding="klingon"?>', 1), "'klingon' is unknown"),
+    "no inertia": (lambda text: text.replace(INERTIAL, HEAVY, 1), "link 'l1': its <inertial> has no <inertia>"),
+    "no ixy": (lambda text: text.replace('ixy="0.001" ', "", 1), "link 'l1': its <inertial> has no ixy"),
+    "no mass": (
+        lambda text: text.replace('<mass value="1.3"/>', "", 1),
+        "link 'l1': its <inertial> has no <mass>: it is massless",
+    ),
+    "an empty inertial": (lambda text: text.replace(INERTIAL, "<inertial/>", 1), "link 'l1': its <inertial> has no"),
+    "an ampersand": (lambda text: text.replace("</robot>", "<a>b & c</a></robot>"), "not well-formed XML"),
+    "something behind it": (lambda text: text + "<more/>", "junk after document element"),
+}
+
+
+class TestOdd:
+    @pytest.mark.parametrize("kind", ODD)
+    def test_files_load_as_pinocchio_reads_them(self, tmp_path, two, caplog, kind):
+        change, words = ODD[kind]
+        assert kind == "as it is" or change(two) != two
+        path = written(tmp_path, change(two))
+        with caplog.at_level(logging.WARNING):
+            robot = vp.load_robot(path)
+        assert words in caplog.text
+        assert bool(words) == bool(caplog.records)
+        if kind not in ("entities", "utf-16"):  # of which Pinocchio's parser reads nothing
+            assert_same(robot.free_model, pin.buildModelFromUrdf(str(path)))
+        assert robot.joint_names == ("j1",)
+        (tie,) = robot.ties
+        assert (tie.ratio, tie.offset) == (2.0, 0.1)
+        found, missing = readable_geometry(robot)
+        assert (found.ngeoms, missing) == (3, {})
+        report = vp.inspect_robot(path)
+        assert len(report.joints) == 2
+        assert not words or any(words in said for said in (*report.warnings, caplog.text))
+
+    @pytest.mark.parametrize("encoding", ["iso-8859-1", "latin-1", "cp1252", "UTF-8"])
+    def test_names_in_the_encoding_that_is_declared(self, tmp_path, two, caplog, encoding):
+        text = two.replace("?>", f" encoding='{encoding}' ?>", 1).replace('"j1"', '"épaule"')
+        robot = vp.load_robot(written(tmp_path, text, encoding))
+        assert robot.joint_names == ("épaule",)
+        assert not caplog.records
+
+    def test_masses_behind_a_faulty_inertial_are_drawn(self, tmp_path, two):
+        # Pinocchio drops the visuals of a link with the rest of its inertial.
+        robot = vp.load_robot(written(tmp_path, two.replace(INERTIAL, HEAVY, 1)))
+        assert geometry(robot).ngeoms == 3
+        assert robot.model.inertias[1].mass == 5.0
+        np.testing.assert_array_equal(robot.model.inertias[1].lever, [0.1, 0.0, 0.2])
+
+    def test_mimics_of_a_file_that_only_pinocchio_reads(self, tmp_path, two):
+        sound = vp.load_robot(written(tmp_path, two))
+        odd = vp.load_robot(written(tmp_path, two + "<more/>"))
+        assert odd.ties == sound.ties
+        assert vp.load_robot(written(tmp_path, two + "<more/>"), mimic="free").dof == 2
+
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            (lambda text: "", "is empty"),
+            (lambda text: " \r\n", "is empty"),
+            (lambda text: "hello", "not well-formed XML: syntax error"),
+            (lambda text: text[:-10], "not well-formed XML"),
+            (lambda text: text.replace("</robot>", "<xacro:macro name='a'/></robot>"), "is a xacro file: expand it"),
+            (
+                lambda text: text.replace("<robot ", '<robot xmlns:x="http://ros.org/wiki/xacro" ').replace(
+                    "</link>", "<x:insert/></link>"
+                ),
+                "is a xacro file: expand it first, .* it has <x:insert>",
+            ),
+            (lambda text: text.replace('"1.3"', '"${m}"', 1), r"is a xacro file: .* <mass value='\$\{m\}'>"),
+            (lambda text: text.replace('"l1"', '"$(arg l)"'), r"is a xacro file: .* <link name='\$\(arg l\)'>"),
+            (lambda text: text.replace("robot", "sdf"), "its root element is <sdf>"),
+            (lambda text: '<robot name="a"/>', "describes no link"),
+            (lambda text: "<!DOCTYPE html><html><body></html>", "is a web page"),
+        ],
+    )
+    def test_files_that_are_none(self, tmp_path, two, change, words):
+        assert change(two) != two
+        with pytest.raises(vp.RobotError, match=words) as info:
+            vp.load_robot(written(tmp_path, change(two)))
+        assert "odd.urdf" in str(info.value)
+
+    def test_folder(self, tmp_path, two):
+        written(tmp_path, two)
+        with pytest.raises(vp.RobotError, match=r"is a folder, not a URDF file; it holds made_up.urdf, odd.urdf"):
+            vp.load_robot(tmp_path)
+
+
+class TestInertia:
+    @pytest.mark.parametrize(
+        ("ixx", "words"),
+        [
+            (-0.05, "link 'l1' has a non-physical inertia: it is not positive definite .*-0.05, 0.1, 0.1 kg m"),
+            (0.5, "link 'l1' has a non-physical inertia: .* 0.1, 0.1, 0.5 kg m.2 violate the triangle .* 0.5 > 0.1"),
+        ],
+    )
+    def test_that_no_body_has_is_told_at_load_and_in_the_report(self, tmp_path, caplog, ixx, words):
+        path = arm(tmp_path, THIN.format(ixx))
+        robot = vp.load_robot(path)
+        (record,) = caplog.records
+        assert pytest.approx(robot.model.inertias[1].inertia[0, 0]) == ixx
+        caplog.clear()
+        vp.load_robot(pin.buildModelFromUrdf(str(path)))
+        for text in (record.getMessage(), "".join(vp.inspect_robot(path).warnings), caplog.text):
+            assert re.search(words, text)
+
+    def test_hidden_on_a_fixed_joint_is_told(self, tmp_path, caplog):
+        # The body that the two links make has no fault.
+        path = write_urdf(
+            tmp_path,
+            link("l1", INERTIAL.replace('"0.02" iyy="0.03" izz="0.025"', '"2" iyy="2" izz="2"')),
+            link("tool", THIN.format(0.5)),
+            joint("j1", "base", "l1"),
+            joint("j2", "l1", "tool", "fixed"),
+        )
+        vp.load_robot(path)
+        assert "link 'tool' has a non-physical inertia" in caplog.text
+
+    @pytest.mark.parametrize("ixx", [0.2, 0.0, 0.1])
+    def test_that_a_body_has_is_not(self, tmp_path, caplog, ixx):
+        vp.load_robot(arm(tmp_path, THIN.format(ixx)))
+        assert not caplog.records
+
+
+class TestMany:
+    @pytest.mark.parametrize("joints", [300, pytest.param(1000, marks=pytest.mark.slow)])
+    def test_joints_load_and_step(self, joints):
+        robot = vp.planar_chain(joints, length=1.0 / joints, mass=1.0 / joints)
+        assert robot.dof == joints
+        # Stretched out along x, the tip is 1 m away; of a quarter circle, a chord away.
+        assert robot.frame_positions(np.zeros((1, joints)))[0] == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)
+        bent = np.full((1, joints), 0.5 * np.pi / joints)
+        assert np.linalg.norm(robot.frame_positions(bent)) == pytest.approx(2**1.5 / np.pi, rel=1e-5)
+        scene = vp.Scene(robot)
+        motion = vp.simulate(scene, np.zeros(joints), np.zeros(joints), dt=1e-5, steps=1)
+        assert np.isfinite(motion.q).all()
+        assert abs(motion.energy[-1] - motion.energy[0]) < 1e-9
+
+    def test_joints_of_a_file(self, tmp_path):
+        parts = [link(f"l{k}") + joint(f"j{k}", f"l{k - 1}" if k else "base", f"l{k}") for k in range(300)]
+        path = write_urdf(tmp_path, *parts)
+        robot = vp.load_robot(path)
+        assert robot.dof == 300
+        assert_same(robot.free_model, pin.buildModelFromUrdf(str(path)))
+
+    def test_links_without_number(self, tmp_path):
+        parts = [f'<link name="l{k}"/>' for k in range(12_000)]
+        fixed = [
+            f'<joint name="f{k}" type="fixed"><parent link="base"/><child link="l{k}"/></joint>' for k in range(12_000)
+        ]
+        path = write_urdf(tmp_path, *parts, *fixed, link("end"), joint("j1", "base", "end"))
+        assert vp.load_robot(path).dof == 1
+
+    def test_threads_that_load_at_once_keep_stderr(self, tmp_path, capfd):
+        path = arm(tmp_path)
+        workers = [threading.Thread(target=lambda: [vp.load_robot(path) for _ in range(10)]) for _ in range(4)]
+        for worker in workers:
+            worker.start()
+        for worker in workers:
+            worker.join()
+        os.write(2, b"still here")
+        assert "still here" in capfd.readouterr().err
