@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import broadcast_array
+from varpin.checks import JointValues, joint_array
 from varpin.errors import InputError, RobotError, SingularMassMatrix
 from varpin.integrators import Midpoint, largest_step
 from varpin.lagrangian import lagrangian_jet
@@ -164,8 +164,8 @@ def inspect_robot(
     package_dirs: Sequence[str | os.PathLike[str]] | None = None,
     lock: Mapping[str, ArrayLike] | None = None,
     mimic: Literal["tied", "free"] = "tied",
-    q: ArrayLike | None = None,
-    v: ArrayLike | None = None,
+    q: JointValues | None = None,
+    v: JointValues | None = None,
     gravity: ArrayLike | bool = True,
 ) -> RobotReport:
     """Look into a robot description, sound or faulty.
@@ -173,8 +173,8 @@ def inspect_robot(
     Main args:
         source: What :func:`varpin.load_robot` takes, or a robot it made.
         lock: Joints to hold still, as for :func:`varpin.load_robot`.
-        q: Configuration to look at, one number or (n,) [rad or m]; 0 if left out.
-        v: Velocity there, one number or (n,) [rad/s or m/s]; 0 if left out.
+        q: Configuration to look at, one number, (n,) or by joint name [rad or m]; 0 if left out.
+        v: Velocity there, the same [rad/s or m/s]; 0 if left out.
 
     Other Args:
         package_dirs: As for :func:`varpin.load_robot`.
@@ -193,8 +193,8 @@ def inspect_robot(
     else:
         robot = build_robot(source, package_dirs=package_dirs, lock=lock, mimic=mimic)
     scene = Scene(robot, gravity=gravity)
-    configuration = broadcast_array("q", 0.0 if q is None else q, robot.dof)
-    velocity = broadcast_array("v", 0.0 if v is None else v, robot.dof)
+    configuration = joint_array("q", 0.0 if q is None else q, robot.joint_names, uniform=True)
+    velocity = joint_array("v", 0.0 if v is None else v, robot.joint_names, uniform=True)
     with np.errstate(all="ignore"):
         jet = lagrangian_jet(scene, configuration, velocity, backend="pinocchio")
     if not all(np.isfinite(array).all() for array in (jet.Lvv, jet.Lqq)):
