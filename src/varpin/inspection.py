@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import JointValues, joint_array
 from varpin.errors import InputError, RobotError, SingularMassMatrix
+from varpin.inspection_tables import parts_of
 from varpin.integrators import Midpoint, largest_step
 from varpin.lagrangian import lagrangian_jet
 from varpin.markup import facts, folded, table
@@ -21,9 +22,11 @@ from varpin.robot import Robot, build_robot, check_inertia, read_root
 from varpin.robot.mimic import joint_index
 from varpin.robot.tree import is_unbounded, joint_axis
 from varpin.scene import Scene
+from varpin.tables import plain
 
 Floats = NDArray[np.float64]
 Kind = Literal["revolute", "prismatic", "continuous", "mimic"]
+FrameKind = Literal["link", "joint", "fixed joint", "frame"]
 
 # The largest step is no limit beyond this [s].
 _ANY_STEP = 100.0
@@ -89,14 +92,32 @@ class LinkReport:
     moments: Floats
 
 
+@dataclass(frozen=True)
+class FrameReport:
+    """A frame, whose name costs, traces and payloads take.
+
+    Attributes:
+        name: Its name.
+        kind: A link's, a joint's, a fixed joint's, or one by itself.
+        parent: The link or frame that it is attached to, or empty for the world.
+        joint: The joint that moves it, or empty if it is fixed to the base.
+    """
+
+    name: str
+    kind: FrameKind
+    parent: str
+    joint: str
+
+
 @dataclass(frozen=True, eq=False)
 class RobotReport:
-    """A robot as its description has it, and what looks wrong.
+    """A robot as its description has it, and what looks wrong; ``print`` shows all of it in tables.
 
     Attributes:
         robot: The robot, possibly one that :func:`varpin.load_robot` refuses.
         joints: Every joint that moves, mimic joints included, in Pinocchio's order.
         links: Every link with mass or inertia.
+        frames: Every frame by whose name varpin finds it, in Pinocchio's order.
         locked: Joints held still, and where [rad or m].
         total_mass: Of everything that moves [kg].
         q: The configuration looked at (n,) [rad or m].
@@ -113,6 +134,7 @@ class RobotReport:
     robot: Robot = field(repr=False)
     joints: tuple[JointReport, ...]
     links: tuple[LinkReport, ...]
+    frames: tuple[FrameReport, ...]
     locked: Mapping[str, float | tuple[float, ...]]
     total_mass: float
     q: Floats
@@ -128,6 +150,9 @@ class RobotReport:
             f"RobotReport({self.robot.name}: {len(self.joints)} joints, {len(self.links)} links, "
             f"{len(self.warnings)} warnings)"
         )
+
+    def __str__(self) -> str:
+        return plain(parts_of(self))
 
     @property
     def step_in_words(self) -> str:
@@ -155,6 +180,13 @@ class RobotReport:
             rows,
             table(("joint", "kind", "lower [rad or m]", "upper", "velocity [1/s]", "effort [N m or N]"), joints),
             folded("links", table(("link", "moved by", "mass [kg]", "principal moments [kg m^2]"), links)),
+            folded(
+                "frames",
+                table(
+                    ("frame", "what it is", "on", "moved by"),
+                    [(x.name, x.kind, x.parent or "the world", x.joint or "the base") for x in self.frames],
+                ),
+            ),
         )
 
 
@@ -218,6 +250,7 @@ def inspect_robot(
         robot=robot,
         joints=joints,
         links=links,
+        frames=_frames(robot),
         locked=robot.locked,
         total_mass=float(robot.tree.mass.sum()),
         q=configuration,
@@ -307,6 +340,27 @@ def _links(robot: Robot) -> tuple[LinkReport, ...]:
             )
         )
     return tuple(reports)
+
+
+_KINDS: dict[pin.FrameType, FrameKind] = {
+    pin.FrameType.BODY: "link",
+    pin.FrameType.JOINT: "joint",
+    pin.FrameType.FIXED_JOINT: "fixed joint",
+}
+
+
+def _frames(robot: Robot) -> tuple[FrameReport, ...]:
+    model, reports = robot.free_model, {}
+    for index, frame in enumerate(model.frames):
+        # The first is the world itself; of frames of one name varpin finds the first.
+        if index == 0 or frame.name in reports:
+            continue
+        kind: FrameKind = _KINDS.get(frame.type, "frame")
+        joint = model.names[frame.parentJoint] if frame.parentJoint else ""
+        on = model.frames[frame.parentFrame].name if frame.parentFrame else ""
+        # A frame that was added by hand may name no parent but the world, and yet move with a joint.
+        reports[frame.name] = FrameReport(frame.name, kind, on or ("" if kind == "joint" else joint), joint)
+    return tuple(reports.values())
 
 
 def _attributes(element: ET.Element, tag: str) -> dict[str, str]:

@@ -18,16 +18,16 @@ from rich.table import Table
 
 from varpin.checks import count, positive
 from varpin.cli.arguments import add_motion, add_robot, motion_of, names_scene, scene_file
-from varpin.cli.console import WIDTH, add_row, complain, facts, file_size, progress_bar, say
+from varpin.cli.console import complain, file_size, progress_bar, say
 from varpin.cli.exits import INTERRUPTED, MISTAKE, STEP_FAILED
 from varpin.cli.outputs import Output, add_outputs, outputs_of, write_all
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint
 from varpin.lagrangian import lagrangian_jet
 from varpin.replay import frame_names
-from varpin.robot import Robot
 from varpin.scene import Scene
 from varpin.simulation import Interrupted, StepFailure, simulate
+from varpin.tables import WIDTH, add_row, facts
 from varpin.tradeoff.setting import Setting
 from varpin.trajectory import Trajectory
 
@@ -122,7 +122,7 @@ def _run(
         status = status or MISTAKE
     if not request.quiet:
         tables = Console() if sys.stdout.isatty() else Console(width=WIDTH)
-        tables.print(_summary(robot, trajectory, steps, wall_time, driven, written))
+        tables.print(_summary(trajectory, steps, wall_time, driven, written))
     if status == INTERRUPTED:
         say(errors, complaint)
     elif complaint:
@@ -144,9 +144,7 @@ def _steps(request: argparse.Namespace) -> int:
     return steps
 
 
-def _summary(
-    robot: Robot, trajectory: Trajectory, asked: int, wall_time: float, driven: bool, files: Iterable[Path]
-) -> Table:
+def _summary(trajectory: Trajectory, asked: int, wall_time: float, driven: bool, files: Iterable[Path]) -> Table:
     """What a run was, took and made."""
     table = facts(f"{trajectory.robot}: {trajectory.integrator}")
     statistics, steps = trajectory.statistics, trajectory.steps
@@ -177,11 +175,6 @@ def _summary(
         share = f"{part:.2g} of" if part < 1.0 else f"{part:.3g} times"
         of_kinetic = f", {share} the largest kinetic energy" if part > 0.0 else ""
         add_row(table, "energy error", f"{drift:.3g} J at most{of_kinetic}")
-    lower, upper = robot.position_limits
-    outside = np.any((trajectory.q < lower) | (trajectory.q > upper), axis=0)
-    if outside.any():
-        joints = ", ".join(name for name, out in zip(robot.joint_names, outside, strict=True) if out)
-        add_row(table, "beyond their limits", f"{joints} (limits are not modelled)")
     names = "q at the end [rad or m]", "v at the end [rad/s or m/s]"
     for name, values in zip(names, (trajectory.q[-1], trajectory.v[-1]), strict=True):
         add_row(table, name, "  ".join(f"{value:.6g}" for value in values))

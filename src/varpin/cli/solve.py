@@ -16,11 +16,12 @@ from rich.table import Table
 
 from varpin.checks import writable
 from varpin.cli.arguments import scene_file
-from varpin.cli.console import WIDTH, add_row, facts, file_size, say
+from varpin.cli.console import file_size, say
 from varpin.cli.exits import INTERRUPTED, MISTAKE, STEP_FAILED
 from varpin.cli.outputs import add_outputs, outputs_of, write_all
 from varpin.scenefile import SceneFile
 from varpin.sddp import Solution, Status
+from varpin.tables import WIDTH, add_row, facts
 
 
 def add_solve(parser: argparse.ArgumentParser) -> None:

@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     from varpin.extremes import Cell
 
 from varpin.cli.arguments import add_motion, add_robot, motion_of
-from varpin.cli.console import WIDTH, add_row, progress_bar, say, table_of
+from varpin.cli.console import progress_bar, say
 from varpin.cli.exits import FAULTY, INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import folder_at
+from varpin.tables import WIDTH, add_row, table_of
 
 
 def add_tradeoff(parser: argparse.ArgumentParser) -> None:
