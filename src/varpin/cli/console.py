@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterator
 from types import TracebackType
+from typing import NoReturn
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from varpin.cli.exits import MISTAKE
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose complaints are one line, which no list of options stands before."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong, and where help is; exit with status 2."""
+        self.exit(MISTAKE, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
 
 def file_size(size: int) -> str:

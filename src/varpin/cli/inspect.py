@@ -9,7 +9,7 @@ import sys
 from rich.console import Console
 from rich.text import Text
 
-from varpin.cli.arguments import add_gravity, add_robot, add_vector, names_scene, one_or_all, scene_file
+from varpin.cli.arguments import add_gravity, add_robot, add_vector, names_scene, scene_file, values_of
 from varpin.cli.console import say
 from varpin.inspection import inspect_robot
 from varpin.inspection_tables import parts_of
@@ -59,7 +59,7 @@ def _inspect(request: argparse.Namespace, _errors: Console) -> int:
     if names_scene(request.robot):
         return _inspect_scene(request)
     arguments = {"package_dirs": request.package_dir, "lock": dict(request.lock), "gravity": request.gravity}
-    report = inspect_robot(request.robot, q=one_or_all(request.q), v=one_or_all(request.v), **arguments)
+    report = inspect_robot(request.robot, q=values_of("q", request.q), v=values_of("v", request.v), **arguments)
     console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
     for part in parts_of(report):
         console.print(part, soft_wrap=isinstance(part, Text))

@@ -1,0 +1,71 @@
+"""Integrators by name, and as text: what a trajectory says made it can be made again."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from dataclasses import fields
+from types import MappingProxyType
+from typing import Any
+
+from varpin.errors import InputError
+from varpin.integrators.base import Integrator
+from varpin.integrators.explicit import ExplicitEuler, RungeKutta4, SemiImplicitEuler
+from varpin.integrators.gauss import Gauss
+from varpin.integrators.midpoint import Midpoint
+from varpin.integrators.reference import Reference
+
+_OWN: tuple[type[Integrator], ...] = (Midpoint, Gauss, ExplicitEuler, SemiImplicitEuler, RungeKutta4, Reference)
+# By the names of their classes. A new integrator enters here.
+BY_NAME: Mapping[str, type[Integrator]] = MappingProxyType({kind.__name__: kind for kind in _OWN})
+
+
+def options_of(kind: type[Integrator]) -> tuple[str, ...]:
+    """The names of an integrator's options, in order."""
+    return tuple(item.name for item in fields(kind))  # type: ignore[arg-type]
+
+
+def integrator_of(text: str) -> Integrator:
+    """The integrator that a text names, with its options: ``str`` and ``repr`` of one give such a text.
+
+        integrator_of("RungeKutta4")
+        integrator_of("Gauss(3)")
+        integrator_of("Midpoint(alpha=0.5, kick=split)")
+
+    Raises:
+        InputError: The text is no such call, or names an integrator or an option that varpin does not have; a value is
+            out of its range.
+    """
+    form = "a name, or a name with options such as Gauss(stages=3)"
+    try:
+        node = ast.parse(text.strip(), mode="eval").body
+        match node:
+            case ast.Name(id=name):
+                values, named = [], {}
+            case ast.Call(func=ast.Name(id=name), args=args, keywords=keywords):
+                values = [_value(argument) for argument in args]
+                named = {str(keyword.arg): _value(keyword.value) for keyword in keywords}
+            case _:
+                raise InputError(f"an integrator is written as {form}, got {text!r}")
+    except (SyntaxError, RecursionError, MemoryError):
+        raise InputError(f"an integrator is written as {form}, got {text!r}") from None
+    if name not in BY_NAME:
+        raise InputError(f"varpin has no integrator {name!r}; it has {', '.join(BY_NAME)}")
+    kind = BY_NAME[name]
+    known = options_of(kind)
+    odd = [option for option in named if option not in known[len(values) :]]
+    if len(values) > len(known) or odd:
+        which = f"option {odd[0]!r}" if odd and odd[0] not in known else "room for all of these options"
+        has = f"its options are {', '.join(known)}" if known else "it has none"
+        raise InputError(f"{name} has no {which}; {has}: {text!r}")
+    return kind(*values, **named)
+
+
+def _value(node: ast.expr) -> Any:
+    """A number, None, or a word with or without quotes."""
+    if isinstance(node, ast.Name):
+        return node.id
+    try:
+        return ast.literal_eval(node)
+    except ValueError:
+        raise InputError(f"options of an integrator are numbers and words, got {ast.unparse(node)!r}") from None
