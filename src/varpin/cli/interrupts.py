@@ -29,13 +29,15 @@ class Interrupts:
 
     Attributes:
         wanted: Whether to finish what is being written, and to leave out the rest.
+        ended: Whether to write nothing more.
     """
 
     def __init__(self, console: Console) -> None:
-        self.wanted = False
+        self.wanted = self.ended = False
         self._console = console
         self._keeping = self._writing = False
         self._heard = self._handled = 0
+        self._raised = False
         self._undo = contextlib.ExitStack()
 
     def __enter__(self) -> Interrupts:
@@ -90,8 +92,12 @@ class Interrupts:
                 say(self._console, answer)
 
     def _handle(self, _number: int, _frame: FrameType | None) -> None:
-        self._handled += 1
-        if self._keeping and (self._handled == 2 or (self._handled == 1 and self._writing)):
-            self.wanted = True
-            return
+        # Several within one call of a kernel come as one.
+        self._handled = max(self._handled + 1, self._heard)
+        if self._keeping:
+            self.ended = self._handled > 2
+            self.wanted = self.ended or self._handled == 2 or self._writing
+            if not self.ended and (self._raised or self._writing):
+                return
+            self._raised = True
         raise KeyboardInterrupt

@@ -144,7 +144,7 @@ def write_all(
     written: list[Path] = []
     status = 0
     for path, write in files.items():
-        if interrupts.wanted and (written or status):
+        if interrupts.ended or (interrupts.wanted and (written or status)):
             complain(errors, f"{path} was not written: interrupted")
             continue
         try:
