@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 
 import varpin as vp
+from varpin.replay.annotations import torque_shares
 
 UR5 = vp.load_robot("ur5")
 NAMES = UR5.joint_names
@@ -115,3 +116,63 @@ def test_gravity_as_a_number_is_answered_with_the_vector_meant(value):
 def test_gravity_of_zero_is_answered_with_false():
     with pytest.raises(vp.InputError, match="did you mean gravity=False"):
         vp.Scene(UR5, gravity=0.0)
+
+
+def test_noise_costs_and_barriers_take_names():
+    named = vp.Scene(UR5, noise=vp.AdditiveNoise({"elbow_joint": 0.2}) + vp.StateNoise({"wrist_1_joint": 0.3}, POSE))
+    rows = vp.Scene(UR5, noise=vp.AdditiveNoise([0, 0, 0.2, 0, 0, 0]) + vp.StateNoise([0, 0, 0, 0.3, 0, 0], ROW))
+    options = {"dt": 2e-3, "steps": 10, "rng": 5}
+    moved = vp.simulate(named, ROW, np.zeros(6), **options)
+    assert same(moved, vp.simulate(rows, ROW, np.zeros(6), **options))
+    assert np.ptp(moved.q[:, 2]) > 0.0
+
+    weight = {"elbow_joint": 3.0, "wrist_1_joint": 1.0}
+    row = np.array([0, 0, 3.0, 1.0, 0, 0])
+
+    def value(cost):
+        problem = vp.OptimalControlProblem(vp.Scene(UR5), cost + vp.ControlCost(1.0), ROW, 0.5 * ROW, dt=0.01, steps=5)
+        return problem.cost_of(problem.simulate(np.ones(6)))
+
+    for by_name, by_row in (
+        (vp.TrackingCost(POSE, weight), vp.TrackingCost(ROW, row)),
+        (vp.VelocityCost(weight, {"wrist_3_joint": 0.1}), vp.VelocityCost(row, [0, 0, 0, 0, 0, 0.1])),
+        (vp.JointLimitBarrier(UR5, weight, {"elbow_joint": 2.5}), vp.JointLimitBarrier(UR5, row, [0, 0, 2.5, 0, 0, 0])),
+    ):
+        assert value(by_name) == value(by_row)
+    assert repr(vp.TrackingCost(0.0, weight)) == f"TrackingCost(weight={weight})"
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda value: vp.Scene(UR5, noise=vp.AdditiveNoise(value)),
+        lambda value: vp.Scene(UR5, noise=[vp.StateNoise(1.0, value)]),
+        lambda value: vp.OptimalControlProblem(
+            vp.Scene(UR5), vp.TrackingCost(value) + vp.ControlCost(), ROW, ROW, dt=1e-2, steps=1
+        ),
+        lambda value: vp.OptimalControlProblem(
+            vp.Scene(UR5), vp.VelocityCost(value) + vp.ControlCost(), ROW, ROW, dt=1e-2, steps=1
+        ),
+        lambda value: vp.JointLimitBarrier(UR5, value),
+        lambda value: vp.JointLimitBarrier(UR5, 1.0, value),
+    ],
+)
+def test_unknown_names_in_noise_and_costs(make):
+    with pytest.raises(vp.UnknownJoint, match="the robot has no joint 'elbow'; did you mean 'elbow_joint'"):
+        make({"elbow": 1.0})
+
+
+def test_weights_by_name_are_not_negative_and_not_of_controls():
+    cost = vp.VelocityCost({"elbow_joint": -1.0}) + vp.ControlCost()
+    with pytest.raises(vp.InputError, match="VelocityCost weight must be positive semidefinite"):
+        vp.OptimalControlProblem(vp.Scene(UR5), cost, ROW, ROW, dt=1e-2, steps=1)
+    with pytest.raises(vp.InputError, match="ControlCost weight must be an array of real numbers"):
+        vp.ControlCost({"elbow_joint": 1.0})
+
+
+def test_a_torque_limit_by_name_leaves_the_others_their_own():
+    torques = np.full((3, 6), 7.0)
+    shares = torque_shares(UR5, torques, torques, {"elbow_joint": 14.0})
+    own = torque_shares(UR5, torques, torques, None)
+    assert shares[:, 2].tolist() == [0.5] * 3
+    np.testing.assert_array_equal(np.delete(shares, 2, axis=1), np.delete(own, 2, axis=1))

@@ -32,7 +32,7 @@ def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
     return require_finite(name, array)
 
 
-def broadcast_array(name: str, value: ArrayLike, size: int) -> Floats:
+def broadcast_array(name: str, value: object, size: int) -> Floats:
     """``value``, one number or (size,), as a new float array (size,).
 
     Raises:
@@ -92,7 +92,7 @@ def checked_limits(name: str, limits: tuple[ArrayLike, ArrayLike] | None, size: 
     return both
 
 
-def as_floats(name: str, value: ArrayLike) -> Floats:
+def as_floats(name: str, value: object) -> Floats:
     """``value`` as a new float array, or an InputError that names it."""
     try:
         array = np.asarray(value)

@@ -94,7 +94,7 @@ class Scene:
             "rest": joint_array("rest", rest, robot.joint_names, uniform=True),
         }
         values["actuation"] = _actuation(robot, actuation)
-        values["noise"] = bind(noise, values["actuation"])
+        values["noise"] = bind(noise, values["actuation"], robot.joint_names)
         values["announced"] = set()
         for name, value in values.items():
             if isinstance(value, np.ndarray):
