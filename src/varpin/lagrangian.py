@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from varpin.checks import JointValues, fraction, joint_array, positive
 from varpin.errors import InputError
-from varpin.kernels._compile import announced_compilation
-from varpin.kernels.jet import lagrangian_sweep
-from varpin.kernels.tree import new_sweep
 from varpin.scene import Scene, require_scene
+from varpin.textbook import rigid_body_Lqq
 
 Floats = NDArray[np.float64]
 
@@ -68,10 +66,7 @@ def lagrangian_jet(
 
 
 def _compiled(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
-    w = new_sweep(scene.robot.tree.parent.size, scene.robot.dof)
-    with announced_compilation("lagrangian_jet"):
-        kinetic, potential = lagrangian_sweep(scene.mechanism, q, v, w)
-    return LagrangianJet(kinetic - potential, w.Lq, w.Lv, w.Lqq, w.A, w.M)
+    return LagrangianJet(*scene.core.jet(q, v))
 
 
 def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
@@ -97,42 +92,9 @@ def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
     deflection = q - scene.rest
     Lvv = G.T @ M @ G
     Lq = G.T @ (C.T @ full_v - gravity) - scene.stiffness * deflection
-    Lqq = G.T @ _curvature(model, data, full_q, full_v, scene.gravity) @ G - np.diag(scene.stiffness)
+    Lqq = G.T @ rigid_body_Lqq(model, full_q, full_v) @ G - np.diag(scene.stiffness)
     potential = pin.computePotentialEnergy(model, data, full_q) + 0.5 * scene.stiffness @ deflection**2
     return LagrangianJet(float(0.5 * v @ Lvv @ v - potential), Lq, Lvv @ v, Lqq, G.T @ A @ G, Lvv)
-
-
-def _curvature(model: pin.Model, data: pin.Data, q: Floats, v: Floats, gravity: Floats) -> Floats:
-    """L_qq (nv, nv) of gravity and motion from Pinocchio's world-frame Jacobian and its rate.
-
-    Pinocchio's Python bindings have no second derivatives of RNEA; see :mod:`varpin.kernels.jet` for the formula
-    L_qq[i, j] = W_i . B_j - F_j . (S_i x g), i an ancestor of j or j itself.
-    """
-    pin.computeJointJacobiansTimeVariation(model, data, q, v)
-    # With one joint the bindings drop an axis.
-    S, W = data.J.reshape(6, model.nv), data.dJ.reshape(6, model.nv)
-    inertia = [np.zeros((6, 6)) for _ in range(model.njoints)]
-    momentum = [np.zeros(6) for _ in range(model.njoints)]
-    for joint in range(1, model.njoints):
-        inertia[joint] = data.oMi[joint].act(model.inertias[joint]).matrix()
-        velocity = data.oMi[joint].act(pin.getVelocity(model, data, joint)).vector
-        momentum[joint] = inertia[joint] @ velocity
-    for joint in range(model.njoints - 1, 0, -1):
-        inertia[model.parents[joint]] += inertia[joint]
-        momentum[model.parents[joint]] += momentum[joint]
-    field = pin.Motion(gravity, np.zeros(3))
-    curvature = np.zeros((model.nv, model.nv))
-    for below in range(1, model.njoints):
-        j = model.joints[below].idx_v
-        F = inertia[below] @ S[:, j]
-        B = inertia[below] @ W[:, j] + pin.Motion(S[:, j]).cross(pin.Force(momentum[below])).vector
-        above = below
-        while above > 0:
-            i = model.joints[above].idx_v
-            curvature[i, j] = W[:, i] @ B - F @ pin.Motion(S[:, i]).cross(field).vector
-            curvature[j, i] = curvature[i, j]
-            above = model.parents[above]
-    return curvature
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import as_floats, finite_array
 from varpin.errors import InputError, LinearizationError
 from varpin.integrators import Integrator, Midpoint
-from varpin.integrators.base import diffusion_and_drift, open_loop, read_only
+from varpin.integrators.base import diffusion_and_drift, open_loop
 from varpin.kernels._compile import announced_compilation
-from varpin.kernels.jet import jets
 from varpin.kernels.jet_tangent import momentum_curvatures, new_tangent
 from varpin.kernels.tree import new_sweep
 from varpin.markup import facts, table
@@ -236,10 +235,7 @@ def _kick_columns(scene: Scene, trajectory: Trajectory, integrator: Integrator, 
 
 def node_jets(scene: Scene, q: Floats, v: Floats) -> tuple[Floats, Floats]:
     """M and L_vq at many (q, v): each (N, n, n)."""
-    N, n = q.shape
-    M, A = np.empty((N, n, n)), np.empty((N, n, n))
-    jets(scene.mechanism, read_only(q), read_only(v), new_sweep(scene.robot.tree.parent.size, n), M, A)
-    return M, A
+    return scene.core.jets(np.ascontiguousarray(q), np.ascontiguousarray(v))
 
 
 def velocity_at_nodes(scene: Scene, q: Floats, v: Floats) -> Floats:

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import JointValues, as_floats, finite_array, joint_array
+from varpin.core import Mechanism as Core
 from varpin.errors import InputError, RobotError
-from varpin.kernels._compile import announced_compilation
-from varpin.kernels.jet import lagrangian_sweep
-from varpin.kernels.tree import Diffusion, Mechanism, new_sweep
+from varpin.kernels.tree import Diffusion, Mechanism
 from varpin.markup import facts, listed
 from varpin.noise import BoundNoise, Noise, bind
 from varpin.robot import Robot, require_sound
@@ -22,6 +21,11 @@ from varpin.robot import Robot, require_sound
 Floats = NDArray[np.float64]
 
 EARTH = (0.0, 0.0, -9.81)
+# Fields of the tree that the core takes.
+_TREE = (
+    "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio", "offset",
+    "origin", "armature", "group",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -136,6 +140,13 @@ class Scene:
         return self.noise.processes
 
     @cached_property
+    def core(self) -> Core:
+        """The tree, gravity and springs as the compiled core takes them."""
+        tree = self.robot.tree
+        own = {name: getattr(tree, name) for name in _TREE}
+        return Core.make(**own, groups=tree.groups, gravity=self.gravity, stiffness=self.stiffness, rest=self.rest)
+
+    @cached_property
     def mechanism(self) -> Mechanism:
         """The scene as flat arrays for the kernels; without fields that only Python can evaluate."""
         n, m = self.actuation.shape
@@ -163,10 +174,8 @@ class Scene:
             UnknownJoint: ``q`` names a joint that is no coordinate of the robot.
         """
         at = joint_array("q", q, self.robot.joint_names)
-        w = new_sweep(self.robot.tree.parent.size, self.robot.dof)
-        with announced_compilation("holding_torque"):
-            lagrangian_sweep(self.mechanism, at, np.zeros_like(at), w)
-        return np.asarray(-w.Lq, dtype=np.float64)
+        _, Lq, *_ = self.core.jet(at, np.zeros_like(at))
+        return np.asarray(-Lq, dtype=np.float64)
 
     def holding_controls(self, q: JointValues) -> Floats:
         """The controls (m,) that hold the robot at rest at ``q``; of several that do, the smallest.

@@ -1,0 +1,50 @@
+// The robot as a tree of bodies, each on one joint about or along the z axis of its own frame, and what a scene adds.
+#pragma once
+
+#include <cstddef>
+#include <vector>
+
+#include "varpin/spatial.hpp"
+
+namespace varpin {
+
+// Body and joint. The joint stands at ratio * q[coordinate] + offset; mimic joints have ratios other than 1.
+struct Body {
+    int parent = -1;  // -1 at a root; parents come first
+    bool prismatic = false;
+    Mat3<double> rotation{};     // of the joint's frame in its parent's, at joint position 0
+    Vec3<double> translation{};  // [m]
+    double mass = 0.0;           // [kg]
+    Vec3<double> center{};       // in the body's frame [m]
+    Sym3<double> inertia{};      // about the centre, in the body's axes [kg m^2]
+    int coordinate = 0;
+    double ratio = 1.0;
+    double offset = 0.0;  // [rad or m]
+    bool origin = false;  // no joint above turns: moments of what it carries are taken about its own joint
+};
+
+// Coordinates [begin, end) outside of which a block of M, L_vq and L_qq vanishes.
+struct Block {
+    int begin = 0;
+    int end = 0;
+};
+
+struct Tree {
+    std::vector<Body> bodies;
+    std::vector<double> armature;  // (n) [kg m^2 or kg]
+    std::vector<int> group;        // (n) mechanically independent group of a coordinate
+    int groups = 0;
+    std::vector<Block> blocks;
+
+    std::size_t dof() const { return armature.size(); }
+};
+
+// A tree in its surroundings.
+struct Mechanism {
+    Tree tree;
+    Vec3<double> gravity{};         // [m/s^2]
+    std::vector<double> stiffness;  // (n) of joint springs [N m/rad or N/m]
+    std::vector<double> rest;       // (n) where they are slack [rad or m]
+};
+
+}  // namespace varpin

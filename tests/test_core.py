@@ -1,0 +1,88 @@
+"""The compiled core at its border: what it computes against the kernels it replaces, and what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin.core import Mechanism
+from varpin.kernels.jet import lagrangian_sweep
+from varpin.kernels.tree import new_sweep
+
+rng = np.random.default_rng(3)
+ROBOTS = ("finger", "ur5", "panda", "chain")
+
+
+@pytest.fixture(scope="module", params=ROBOTS)
+def scene(request):
+    robot = vp.planar_chain(12) if request.param == "chain" else vp.load_robot(request.param)
+    return vp.Scene(robot, gravity=(1.0, -2.0, -9.0), stiffness=0.3, rest=0.1)
+
+
+def test_the_jet_is_that_of_the_kernel(scene):
+    n = scene.robot.dof
+    for scale in (0.0, 1.0, 1e3):
+        q, v = rng.normal(size=n), scale * rng.normal(size=n)
+        w = new_sweep(scene.robot.tree.parent.size, n)
+        kinetic, potential = lagrangian_sweep(scene.mechanism, q, v, w)
+        L, *rest = scene.core.jet(q, v)
+        assert abs(L - (kinetic - potential)) <= 1e-14 * (kinetic + np.abs(w.V_scale).sum())
+        for ours, theirs in zip(rest, (w.Lq, w.Lv, w.Lqq, w.A, w.M), strict=True):
+            assert np.abs(ours - theirs).max() <= 1e-14 * np.abs(theirs).max()
+
+
+def test_many_jets_are_those_of_each_row(scene):
+    q, v = rng.normal(size=(2, 5, scene.robot.dof))
+    M, A = scene.core.jets(q, v)
+    for k in range(5):
+        *_, own_A, own_M = scene.core.jet(q[k], v[k])
+        assert np.array_equal(M[k], own_M)
+        assert np.array_equal(A[k], own_A)
+
+
+def test_the_jet_along_a_direction_is_its_difference(scene):
+    q, v, alpha, beta = rng.normal(size=(4, scene.robot.dof))
+    # Central differences of eighth order.
+    step, weights = 0.02, {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+    expected = np.zeros((3, len(q), len(q)))
+    for k, c in weights.items():
+        for sign in (1.0, -1.0):
+            s = sign * k * step
+            _, _, _, Lqq, A, M = scene.core.jet(q + s * alpha, v + s * beta)
+            expected += sign * c / step * np.stack([M, A, Lqq])
+    for ours, theirs in zip(scene.core.jet_along(q, v, alpha, beta), expected, strict=True):
+        assert np.abs(ours - theirs).max() <= 1e-9 * np.abs(theirs).max()
+
+
+def test_arrays_of_a_wrong_shape_are_refused(scene):
+    n = scene.robot.dof
+    q = np.zeros(n)
+    with pytest.raises(ValueError, match=f"v has size {n + 1} along axis 0, not {n}"):
+        scene.core.jet(q, np.zeros(n + 1))
+    with pytest.raises(ValueError, match="v has size 2 along axis 0, not 3"):
+        scene.core.jets(np.zeros((3, n)), np.zeros((2, n)))
+    with pytest.raises(TypeError):
+        scene.core.jet(q, np.zeros((n, n)))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "match"),
+    [
+        ("parent", [-1, 1], "parents come before"),
+        ("coordinate", [0, 2], "coordinate is out of range"),
+        ("group", [0, 3], "group is out of range"),
+        ("mass", [1.0], "mass has size 1"),
+    ],
+)
+def test_what_is_no_tree_is_refused(field, value, match):
+    tree = vp.planar_chain(2).tree
+    names = (
+        "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio",
+        "offset", "origin", "armature", "group",
+    )  # fmt: skip
+    own = {name: getattr(tree, name) for name in names}
+    own[field] = np.array(value, dtype=own[field].dtype)
+    nothing = np.zeros(2)
+    with pytest.raises(ValueError, match=match):
+        Mechanism.make(**own, groups=tree.groups, gravity=np.zeros(3), stiffness=nothing, rest=nothing)

@@ -1,0 +1,164 @@
+"""The textbook against the rest of the library, which shares no code with it, and against differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import varpin as vp
+from varpin import textbook
+
+rng = np.random.default_rng(20)
+
+
+def pair(robot, *, noise=None, fields=textbook.no_noise, gravity=(0.0, 0.0, -9.81), **surroundings):
+    """The same arm as a scene and as a system of the textbook."""
+    model = robot.model.copy()
+    model.gravity = pin.Motion(np.array(gravity), np.zeros(3))
+    scene = vp.Scene(robot, gravity=gravity, noise=noise, **surroundings)
+    return scene, textbook.system(model, fields=fields, **surroundings)
+
+
+@pytest.fixture(scope="module", params=["finger", "ur5", "chain"])
+def arm(request):
+    robot = vp.planar_chain(3) if request.param == "chain" else vp.load_robot(request.param)
+    n = robot.dof
+    return pair(robot, damping=np.linspace(0.0, 0.02, n), stiffness=np.linspace(0.3, 0.0, n), rest=0.2)
+
+
+def test_the_jet_is_that_of_the_textbook(arm):
+    scene, system = arm
+    q, v = rng.normal(size=(2, scene.robot.dof))
+    ours, theirs = vp.lagrangian_jet(scene, q, v), textbook.lagrangian(system, q, v)
+    for name in textbook.Lagrangian._fields:
+        expected = getattr(theirs, name)
+        assert np.abs(getattr(ours, name) - expected).max() <= 1e-12 * np.abs(expected).max(), name
+
+
+@pytest.mark.parametrize("alpha", [0.5, 0.2])
+def test_slots_are_derivatives_of_the_discrete_lagrangian(arm, alpha):
+    scene, system = arm
+    n, h = scene.robot.dof, 0.01
+    q0 = rng.normal(size=n)
+    q1 = q0 + h * rng.normal(size=n)
+    slots = textbook.discrete_lagrangian(system, q0, q1, h, alpha)
+    ours = vp.discrete_lagrangian(scene, q0, q1, h, alpha=alpha)
+    for name in textbook.Slots._fields:
+        expected = getattr(slots, name)
+        assert np.abs(getattr(ours, name) - expected).max() <= 1e-11 * np.abs(expected).max(), name
+    e = 1e-5
+
+    def difference(f):
+        return np.array([(f(+e * d) - f(-e * d)) / (2 * e) for d in np.eye(n)])
+
+    D1 = difference(lambda d: textbook.discrete_lagrangian(system, q0 + d, q1, h, alpha).Ld)
+    D2D1 = difference(lambda d: textbook.discrete_lagrangian(system, q0, q1 + d, h, alpha).D1).T
+    assert np.abs(D1 - slots.D1).max() <= 1e-6 * np.abs(slots.D1).max()
+    assert np.abs(D2D1 - slots.D2D1).max() <= 1e-6 * np.abs(slots.D2D1).max()
+
+
+@pytest.mark.parametrize("alpha", [0.5, 0.2])
+def test_motions_and_linearizations_are_those_of_the_textbook(arm, alpha):
+    scene, system = arm
+    # The finger's inertias are a millionth of the others': 0.1 ms are to it what 2 ms are to them.
+    n, N, h = scene.robot.dof, 20, 1e-4 if scene.robot.name == "finger" else 2e-3
+    q0, v0 = 0.3 * rng.normal(size=(2, n))
+    scale = np.abs(vp.lagrangian_jet(scene, q0, v0).Lq).max()
+    u = 0.1 * scale * rng.normal(size=(N, n))
+    ours = vp.simulate(scene, q0, v0, dt=h, steps=N, controls=u, integrator=vp.Midpoint(alpha), check=False)
+    assert ours.statistics.split_steps == 0
+    theirs = textbook.rollout(system, q0, v0, u, h, a=alpha)
+    assert np.abs(ours.q - theirs.q).max() <= 1e-11 * np.abs(theirs.q).max()
+    assert np.abs(ours.p - theirs.p).max() <= 1e-10 * np.abs(theirs.p).max()
+    lin = vp.linearize(scene, ours, integrator=vp.Midpoint(alpha))
+    for k in (0, N - 1):
+        own = textbook.linearize_step(system, theirs.q[k], theirs.q[k + 1], u[k], h, alpha)
+        for name in ("A", "B", "K"):
+            expected = getattr(own, name)
+            # Blocks of x = (q, p) have units of their own.
+            for part in (slice(0, n), slice(n, 2 * n)):
+                gap = np.abs(getattr(lin, name)[k][part] - expected[part]).max()
+                assert gap <= 1e-8 * np.abs(expected[part]).max(), (name, k)
+
+
+def test_a_step_of_the_textbook_is_symplectic():
+    _, system = pair(vp.planar_chain(3))
+    motion = textbook.rollout(system, np.array([0.3, -0.4, 0.5]), np.ones(3), np.zeros((5, 3)), 0.01)
+    J = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.eye(3), np.zeros((3, 3))]])
+    A = textbook.linearize_step(system, motion.q[3], motion.q[4], np.zeros(3), 0.01).A
+    assert np.abs(A.T @ J @ A - J).max() <= 1e-12 * np.abs(A).max() ** 2
+
+
+@pytest.mark.parametrize(
+    ("noise", "fields"),
+    [
+        (vp.AdditiveNoise(1e-2), textbook.white_noise(1e-2)),
+        (vp.ControlNoise(3e-2), textbook.control_noise(3e-2)),
+        (vp.StateNoise(5e-2), textbook.state_noise(5e-2, np.array([0.4, 0.1, -0.2]))),
+    ],
+    ids=["white", "control", "state"],
+)
+def test_noise_acts_as_in_the_textbook(noise, fields):
+    scene, system = pair(vp.planar_chain(3), noise=noise, fields=fields)
+    q0, h, N = np.array([0.4, 0.1, -0.2]), 5e-3, 20
+    u, dw = rng.normal(size=(N, 3)), np.sqrt(h) * rng.normal(size=(N, 3))
+    ours = vp.simulate(scene, q0, np.zeros(3), dt=h, steps=N, controls=u, increments=dw, check=False)
+    theirs = textbook.rollout(system, q0, np.zeros(3), u, h, dw=dw)
+    assert np.abs(ours.q - theirs.q).max() <= 1e-11
+    # What noise adds to a step, (1.7), against differences of the step itself.
+    own = textbook.linearize_step(system, *textbook.rollout(system, q0, np.zeros(3), u[:1], h).q, u[0], h)
+    for i in range(3):
+        e = 1e-2 * np.eye(3)[i]
+        ends = [np.concatenate(textbook.step(system, q0, np.zeros(3), u[0], h, dw=s * e)) for s in (1.0, -1.0)]
+        assert np.abs((ends[0] - ends[1]) / 2e-2 - own.K @ own.F[:, i]).max() <= 1e-7 * np.abs(own.K).max()
+
+
+@pytest.mark.parametrize("case", ["white", "control"])
+def test_a_plan_is_that_of_the_textbook(case):
+    noise, fields = {
+        "white": (vp.AdditiveNoise(1e-2), textbook.white_noise(1e-2)),
+        "control": (vp.ControlNoise(2e-2), textbook.control_noise(2e-2)),
+    }[case]
+    scene, system = pair(vp.planar_chain(2), noise=noise, fields=fields, gravity=(0.0, 0.0, 0.0))
+
+    def reference(t):
+        return np.array([1.0 + 0.25 * np.sin(4 * np.pi * t), 0.1 * np.sin(2 * np.pi * t)])
+
+    h, N, q0 = 0.02, 40, np.array([0.8, 0.1])
+    plan = textbook.solve(system, textbook.TrackingCost(reference), q0, np.zeros(2), np.zeros((N, 2)), h)
+    cost = vp.TrackingCost(reference, 10.0) + vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost(reference))
+    problem = vp.OptimalControlProblem(
+        scene, cost, q0, np.zeros(2), dt=h, steps=N, integrator=vp.Midpoint(), sampling="start"
+    )
+    ours = vp.solve(problem, np.zeros(2), tolerance=1e-9)
+    assert ours.status.converged
+    assert ours.cost == pytest.approx(plan.cost, rel=1e-6)
+    assert ours.noise_cost == pytest.approx(plan.noise_cost, rel=1e-4)
+    assert np.abs(ours.controls - plan.motion.u).max() <= 1e-3 * np.abs(plan.motion.u).max()
+    assert np.abs(ours.gains - plan.policy.feedback).max() <= 1e-3 * np.abs(plan.policy.feedback).max()
+
+
+def test_a_backward_pass_without_noise_is_riccatis():
+    # Of a linear arm, a slider on a spring, it is exact: one step of length 1 is the optimum.
+    model = pin.Model()
+    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slider")
+    model.appendBodyToJoint(joint, pin.Inertia(2.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+    system = textbook.system(model, damping=0.3, stiffness=5.0)
+    cost = textbook.TrackingCost(lambda t: np.array([1.0]))
+    h, N = 0.05, 30
+    plan = textbook.solve(system, cost, np.zeros(1), np.zeros(1), np.zeros((N, 1)), h)
+    assert plan.iterations == 1
+    lin = textbook.linearize_step(system, np.zeros(1), np.zeros(1), np.zeros(1), h)
+    P, Q, R = np.diag([2.0, 0.0]), h * np.diag([20.0, 0.0]), np.array([[0.2 * h]])
+    for k in range(N - 1, -1, -1):
+        G = -np.linalg.solve(R + lin.B.T @ P @ lin.B, lin.B.T @ P @ lin.A)
+        assert plan.policy.feedback[k] == pytest.approx(G, rel=1e-9)
+        P = Q + lin.A.T @ P @ lin.A + lin.A.T @ P @ lin.B @ G
+
+
+def test_models_of_joints_with_two_variables_are_refused():
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelRUBZ(), pin.SE3.Identity(), "continuous")
+    with pytest.raises(vp.InputError, match="one variable"):
+        textbook.system(model)
