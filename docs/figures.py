@@ -57,8 +57,7 @@ def reach(folder: Path) -> bytes:
     stiffness = np.array([400.0, 400.0, 200.0, 40.0, 20.0, 4.0])  # [N m/rad]
 
     def control(_: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        gravity = vp.lagrangian_jet(scene, q, np.zeros(6)).Lq
-        return -gravity - stiffness * (q - goal) - 0.2 * stiffness * v
+        return scene.holding_torque(q) - stiffness * (q - goal) - 0.2 * stiffness * v
 
     motion = vp.simulate(scene, begin, np.zeros(6), dt=2e-3, steps=1000, controls=control)
     hand = robot.frame_positions([begin, goal])
@@ -100,7 +99,7 @@ def controller(folder: Path) -> Image.Image:
     def target(t: float) -> list[float]:
         return [0.45 + 0.1 * np.sin(2.0 * t), 0.15 + 0.15 * np.cos(1.3 * t), 0.4 + 0.1 * np.sin(1.7 * t)]
 
-    hold = -vp.lagrangian_jet(scene, begin, np.zeros(6)).Lq
+    hold = scene.holding_torque(begin)
     cost = vp.FramePositionCost(robot, "tool0", target, 1e3) + vp.VelocityCost(0.05) + vp.ControlCost(1e-4, hold)
     problem = vp.OptimalControlProblem(scene, cost, begin, np.zeros(6), dt=1e-2, steps=50)
     run = vp.Mpc(problem, iterations=1).run(duration=3.0)

@@ -22,7 +22,7 @@ def target(t):
 def controller(integrator):
     """Half a second ahead, in fifty steps."""
     scene = vp.Scene(robot, damping=0.05)
-    hold = -vp.lagrangian_jet(scene, begin, np.zeros(robot.dof)).Lq
+    hold = scene.holding_torque(begin)
     cost = vp.FramePositionCost(robot, "tool0", target, 1e3) + vp.VelocityCost(0.05) + vp.ControlCost(1e-4, hold)
     cost += vp.Terminal(vp.FramePositionCost(robot, "tool0", target, 1e2) + vp.VelocityCost(0.5))
     problem = vp.OptimalControlProblem(

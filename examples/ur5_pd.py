@@ -17,9 +17,8 @@ damping = np.array([80.0, 80.0, 30.0, 4.0, 2.0, 0.2])  # [N m s/rad]
 
 
 def control(_: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Torques [N m]: the static part of L_q is gravity's torque."""
-    gravity = vp.lagrangian_jet(scene, q, np.zeros(robot.dof)).Lq
-    return -gravity - stiffness * (q - goal) - damping * v
+    """Torques [N m]: what carries the arm, and springs and dampers towards the goal."""
+    return scene.holding_torque(q) - stiffness * (q - goal) - damping * v
 
 
 motion = vp.simulate(scene, np.zeros(6), np.zeros(6), dt=2e-3, steps=1500, controls=control)

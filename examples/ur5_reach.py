@@ -15,7 +15,7 @@ begin = np.array([0.0, -1.5, 0.8, -0.5, 0.0, 0.0])  # [rad]
 goal = np.array([1.0, -1.0, 1.5, -1.2, 0.8, 0.5])
 rest = np.zeros(robot.dof)
 
-hold = -vp.lagrangian_jet(scene, goal, rest).Lq  # torques that carry the arm at the goal [N m]
+hold = scene.holding_torque(goal)  # torques that carry the arm at the goal [N m]
 cost = vp.ControlCost(1e-3, reference=hold) + vp.VelocityCost(1e-2)
 cost += vp.Terminal(vp.TrackingCost(goal, 1e4) + vp.VelocityCost(1e2))
 

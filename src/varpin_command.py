@@ -9,7 +9,9 @@ import sys
 
 def main() -> int:
     """Run the command line of the process and return the exit status."""
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     from varpin.cli import main as run  # noqa: PLC0415 - this is what takes long
 
     signal.signal(signal.SIGINT, before)

@@ -41,6 +41,7 @@ anything = st.one_of(
     st.booleans(),
     st.lists(numbers | st.lists(numbers, max_size=3), max_size=3),
     st.sampled_from([[0.1, 0.2], np.array([0.1, 0.2])[::-1], np.asfortranarray(np.ones((5, 2))), {}, {"a": 1}, b"ab"]),
+    st.dictionaries(st.sampled_from(["joint1", "joint2", "a", 1]), numbers | st.text(max_size=2), max_size=2),
     st.just(object()),
 )
 SETTINGS = settings(max_examples=150, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))

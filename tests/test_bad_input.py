@@ -347,7 +347,7 @@ NOT_NUMBERS = [
     ([[1], [1, 2]], "must be an array of real numbers: "),
     ([10**400, 0], "must be an array of real numbers: "),
     ([None, 0], "must be an array of real numbers, got"),
-    ({"joint1": 1}, "must be an array of real numbers, got"),
+    ({1, 2}, "must be an array of real numbers, got"),
 ]
 
 
@@ -378,7 +378,8 @@ class TestScene:
             ([0, 0, np.nan], "gravity[2] is nan; it must be finite"),
             ([-np.inf, 0, 0], "gravity[0] is -inf; it must be finite"),
             ([0, 0], "gravity must have shape (3,), got (2,)"),
-            (-9.81, "gravity must have shape (3,), got ()"),
+            (-9.81, "gravity is a vector in world axes, z up [m/s^2], got the number -9.81; did you mean"),
+            ({"z": -9.81}, "gravity must be an array of real numbers, got"),
             *((value, f"gravity {words}") for value, words in NOT_NUMBERS),
         ],
     )
@@ -535,6 +536,7 @@ class TestSimulation:
             (0.0, "got ()"),
             (np.array([[0, 0]] * 4 + [[0, np.nan]]), "controls[4, 1] is nan; it must be finite"),
             ([0, np.inf], "controls[1] is inf; it must be finite"),
+            ({"joint1": 1}, "controls must be an array of real numbers, got"),
             *((value, f"controls {words}") for value, words in NOT_NUMBERS),
         ],
     )

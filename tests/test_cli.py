@@ -3,6 +3,7 @@
 import io
 import logging
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -55,7 +56,7 @@ def usage_error(arguments, capsys):
     with pytest.raises(SystemExit) as stop:
         main(arguments)
     assert stop.value.code == 2
-    return capsys.readouterr().err.splitlines()[-1]
+    return error_of(capsys)
 
 
 def test_plain_run_prints_a_summary_and_writes_nothing(arm, tmp_path, capsys):
@@ -199,7 +200,7 @@ def test_energy_of_a_damped_motion_is_what_it_lost(arm, tmp_path, capsys):
         (["--q0", "1", "2", "3"], "--q0 takes one number for all joints or 2, for shoulder, elbow; got 3"),
         (["--damping", "1", "2", "3"], "--damping takes one number for all joints or 2, for shoulder, elbow; got 3"),
         (["--damping", "-1"], "damping[0] is -1.0; it must be >= 0"),
-        (["--q0", "nan"], "q0[0] is nan; it must be finite"),
+        (["--q0", "nan"], "q0 is nan; it must be finite"),
         (["--v0", "0", "-inf"], "v0[1] is -inf; it must be finite"),
         (["--dt", "0"], "--dt must be positive and finite [s], got 0.0"),
         (["--dt", "-1e-3"], "--dt must be positive and finite [s], got -0.001"),
@@ -209,6 +210,18 @@ def test_energy_of_a_damped_motion_is_what_it_lost(arm, tmp_path, capsys):
         (["--steps", "0"], "--steps must be at least 1, got 0"),
         (["--steps", "-3"], "--steps must be at least 1, got -3"),
         (["--alpha", "1.5"], "alpha must be in [0, 1], got 1.5"),
+        (["--integrator", "gaus"], "there is no integrator 'gaus'; did you mean Gauss? integrators: Midpoint, Gauss, "),
+        (["--integrator", "gauss", "--stages", "9"], "stages must be at most 6, got 9"),
+        (["--integrator", "Gauss(steps=2)"], "Gauss has no option 'steps'; its options are stages, "),
+        (["--integrator", "RungeKutta4", "--stages", "2"], "--stages is an option of Gauss, not of RungeKutta4"),
+        (["--stages", "2"], "--stages is an option of Gauss, not of Midpoint"),
+        (["--q0", "elbo=1"], "q0: the robot has no joint 'elbo'; did you mean 'elbow'?"),
+        (["--q0", "elbow=nan"], "q0['elbow'] is nan; it must be finite"),
+        (["--q0", "elbow=1", "2"], "--q0 takes either numbers or JOINT=VALUE, not both at once"),
+        (["--v0", "elbow=1", "elbow=2"], "--v0 names 'elbow' more than once"),
+        (["--save", "a.txt"], "--save must end in .npz, got 'a.txt'"),
+        (["--save", "a"], "--save must end in .npz, got 'a'"),
+        (["--html", "a.npz"], "--html must end in .html, .htm, got 'a.npz'"),
         (["--lock", "elbo=1"], "the robot has no joint 'elbo'; did you mean 'elbow'?"),
         (["--save", "/nowhere/a.npz"], "cannot write /nowhere/a.npz: there is no folder /nowhere"),
         (["--plot", "a.gif"], "--plot must end in .png, .pdf, .svg, got 'a.gif'"),
@@ -230,35 +243,179 @@ def test_unknown_robot_gets_close_matches(capsys, command):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "varpin: error: the following arguments are required: COMMAND"),
+        ([], "varpin: error: a command is missing; commands: simulate, "),
+        (["simulat", "finger"], "varpin: error: there is no command 'simulat'; did you mean 'simulate'? commands: "),
+        (["repla"], "did you mean 'replay'?"),
+        (["frobnicate"], "varpin: error: there is no command 'frobnicate'; commands: simulate, "),
+        (["--frobnicate"], "varpin: error: "),
         (["simulate"], "varpin simulate: error: the following arguments are required: ROBOT"),
-        (["simulate", "finger", "--q0", "a"], "argument --q0: invalid float value: 'a'"),
+        (["simulate", "finger", "--q0", "a"], "argument --q0: 'a' is neither a number nor of the form JOINT=VALUE"),
         (["simulate", "finger", "--lock", "elbow"], "'elbow' is not of the form JOINT=VALUE, for example elbow=0.5"),
         (["simulate", "finger", "--lock", "elbow=x"], "'elbow=x' is not of the form JOINT=VALUE"),
         (["simulate", "finger", "--steps", "1.5"], "argument --steps: invalid int value: '1.5'"),
         (["simulate", "finger", "--steps", "1", "--duration", "1"], "not allowed with argument --steps"),
         (["simulate", "finger", "--no-gravity", "--gravity", "0", "0", "-1"], "not allowed with argument"),
-        (["simulate", "finger", "--dur", "1"], "unrecognized arguments: --dur 1"),
+        (["simulate", "finger", "--dur", "1"], "unrecognized arguments: --dur; did you mean --duration for --dur?"),
         (
             ["simulate", "finger", "--stifness", "0.5", "-1e-3"],
-            "varpin simulate: error: unrecognized arguments: --stifness 0.5 -1e-3; did you mean --stiffness for "
-            "--stifness?",
+            "varpin simulate: error: unrecognized arguments: --stifness; did you mean --stiffness for --stifness?",
         ),
         (["inspect", "ur5", "--packagedir=x"], "did you mean --package-dir for --packagedir?"),
         (["robots", "ur5"], "varpin robots: error: unrecognized arguments: ur5"),
+        # What is misspelled comes before what is missing for it.
+        (["advise", "ur5", "--tolerence", "1e-3"], "did you mean --tolerance for --tolerence?"),
     ],
 )
-def test_usage_errors_are_argparses_and_status_2(capsys, arguments, message):
-    assert message in usage_error(arguments, capsys)
+def test_usage_errors_are_one_line_and_status_2(capsys, arguments, message):
+    line = usage_error(arguments, capsys)
+    assert message in line
+    assert re.search(r" \(see varpin( \w+)? --help\)$", line)
+
+
+def test_joints_are_set_by_name(arm, tmp_path):
+    path = tmp_path / "a.npz"
+    options = ["--q0", "elbow=-0.3", "--v0", "shoulder=1e-1", "--damping", "elbow=0.5", "--steps", "20"]
+    assert main(["simulate", arm, *options, "--save", str(path), "--quiet"]) == 0
+    scene = vp.Scene(load_robot(arm), damping=[0.0, 0.5])
+    expected = vp.simulate(scene, [0.0, -0.3], [0.1, 0.0], dt=1e-3, steps=20)
+    np.testing.assert_array_equal(vp.Trajectory.load(path).q, expected.q)
+
+
+@pytest.mark.parametrize(
+    ("words", "integrator"),
+    [
+        (["--integrator", "gauss"], vp.Gauss()),
+        (["--integrator", "Gauss", "--stages", "3"], vp.Gauss(3)),
+        (["--integrator", "Gauss(stages=3)"], vp.Gauss(3)),
+        (["--integrator", "gauss(2, kick=split)"], vp.Gauss(2, kick="split")),
+        (["--integrator", "runge_kutta_4"], vp.RungeKutta4()),
+        (["--integrator", "SemiImplicitEuler"], vp.SemiImplicitEuler()),
+        (["--integrator", "midpoint", "--alpha", "0.3"], vp.Midpoint(alpha=0.3)),
+        (["--alpha", "0.3"], vp.Midpoint(alpha=0.3)),
+        ([], vp.Midpoint()),
+    ],
+)
+def test_integrators_are_chosen_by_name(arm, tmp_path, words, integrator):
+    path = tmp_path / "a.npz"
+    options = ["--q0", "0.3", "--dt", "0.02", "--steps", "10", "--save", str(path), "--quiet"]
+    assert main(["simulate", arm, *options, *words]) == 0
+    motion = vp.Trajectory.load(path)
+    expected = vp.simulate(vp.Scene(load_robot(arm)), [0.3] * 2, [0.0] * 2, dt=0.02, steps=10, integrator=integrator)
+    assert motion.integrator == str(integrator)
+    np.testing.assert_array_equal(motion.q, expected.q)
+
+
+def test_what_advise_answers_can_be_pasted(arm, tmp_path, capsys):
+    options = ["--duration", "0.3", "--q0", "shoulder=0.3", "--v0", "-1e-1", "0", "--damping", "0.1"]
+    options += ["--torque", "elbow=-2.5", "--gravity", "1", "0", "-9", "--package-dir", str(tmp_path)]
+    assert main(["advise", arm, "--tolerance", "1e-6", *options]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("run it: ")]
+    program, *words = shlex.split(line.removeprefix("run it: "))
+    assert program == "varpin"
+    path = tmp_path / "a.npz"
+    assert main([*words, "--save", str(path), "--quiet"]) == 0
+    motion = vp.Trajectory.load(path)
+    assert motion.duration == pytest.approx(0.3, rel=1e-12)
+    scene = vp.Scene(load_robot(arm), gravity=[1, 0, -9], damping=0.1)
+    start = [0.3, 0.0], [-0.1, 0.0]
+    true = vp.simulate(scene, *start, dt=0.3, steps=1, controls=[0.0, -2.5], integrator=vp.Reference(rtol=1e-12))
+    assert np.abs(motion.q[-1] - true.q[-1]).max() < 1e-6
+
+
+def test_a_locked_joint_is_in_what_advise_answers(arm, capsys):
+    options = ["--duration", "0.2", "--lock", "elbow=-0.5", "--no-gravity", "--v0", "1"]
+    assert main(["advise", arm, "--tolerance", "1e-3", *options]) == 0
+    assert "--lock elbow=-0.5 --v0 1.0 --no-gravity" in capsys.readouterr().out
+
+
+@pytest.fixture
+def saved(arm, tmp_path):
+    motion = vp.simulate(vp.Scene(load_robot(arm)), [0.3, 0.1], [0.0, 0.0], dt=0.01, steps=20)
+    return str(motion.save(tmp_path / "motion.npz"))
+
+
+def test_a_saved_motion_is_replayed(arm, saved, tmp_path, capsys):
+    page = tmp_path / "page.html"
+    words = ["--trace", "lower", "--ghost", saved, "--speed", "0.5", "--frames", "upper"]
+    assert main(["replay", saved, "--robot", arm, "--html", str(page), *words]) == 0
+    assert capsys.readouterr().out == f"written: {page}\n"
+    paths = [command["path"] for command in commands(page) if command["type"] == "set_object"]
+    assert any("/traces/" in path and path.endswith("motion lower") for path in paths)
+    assert any("frames" in path and "upper" in path for path in paths), paths
+
+
+def test_a_motion_of_a_robot_with_a_name_needs_no_other(tmp_path):
+    scene = vp.Scene(vp.load_robot("finger"))
+    path = str(vp.simulate(scene, {"pip": 0.3}, {}, dt=0.01, steps=5).save(tmp_path / "a.npz"))
+    assert main(["replay", path, "--html", str(tmp_path / "a.html")]) == 0
+    assert (tmp_path / "a.html").stat().st_size > 10_000
+
+
+def test_a_saved_plan_is_replayed_with_its_task(scene, tmp_path):
+    assert main(["solve", scene, "--max-iterations", "1", "--save", "plan.npz", "--quiet"]) == exits.STEP_FAILED
+    assert main(["replay", "plan.npz", "--robot", scene, "--html", "plan.html"]) == 0
+    paths = [command["path"] for command in commands(tmp_path / "plan.html") if command["type"] == "set_object"]
+    assert any(path.startswith("/meshcat/ghost/") for path in paths)
+    assert main(["replay", "plan.npz", "--html", "bare.html"]) == 0
+
+
+def test_replay_opens_a_window_until_ctrl_c(saved, arm, monkeypatch, capsys):
+    class Viewer:
+        def url(self):
+            return "http://here"
+
+    def interrupt(_seconds):
+        raise KeyboardInterrupt
+
+    shown = []
+    monkeypatch.setattr("varpin.cli.replay.replay", lambda *words, **options: shown.append(options) or Viewer())
+    monkeypatch.setattr("varpin.cli.replay.time.sleep", interrupt)
+    assert main(["replay", saved, "--robot", arm, "--once"]) == 0
+    assert "http://here; Ctrl-C ends it" in capsys.readouterr().err
+    assert shown[0]["open"]
+    assert not shown[0]["loop"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["none.npz"], "there is no file none.npz"),
+        (["SAVED"], "is of robot 'arm', which is no name that varpin knows: give its URDF file, or its scene file, as"),
+        (["SAVED", "--robot", "ur5"], "with joints shoulder, elbow; 'ur5' has joints shoulder_pan_joint, "),
+        (["SAVED", "--robot", "ARM", "--trace", "nose"], "--trace: robot 'arm' has no frame 'nose'"),
+        (["SAVED", "--robot", "ARM", "--html", "a.txt"], "--html must end in .html, .htm, got 'a.txt'"),
+        (["SAVED", "--robot", "ARM", "--html", "a.html", "--open"], "ask for one or the other"),
+        (["SAVED", "--robot", "ARM", "--html", "a.html", "--ghost", "no.npz"], "there is no file no.npz"),
+        (["SAVED", "--robot", "ARM", "--speed", "0"], "--speed must be positive"),
+    ],
+)
+def test_mistakes_about_replays(words, message, saved, arm, capsys):
+    assert main(["replay", *({"SAVED": saved, "ARM": arm}.get(word, word) for word in words)]) == 2
+    assert message in error_of(capsys)
+
+
+def test_replay_says_which_joints_were_locked(tmp_path, capsys):
+    panda = vp.load_robot("panda", lock={"panda_finger_joint1": 0.02})
+    q = 0.5 * np.add(*panda.position_limits)
+    path = str(vp.simulate(vp.Scene(panda), q, np.zeros(7), dt=1e-3, steps=2).save(tmp_path / "a.npz"))
+    assert main(["replay", path, "--html", str(tmp_path / "a.html")]) == 2
+    assert "lock them as they were, --lock panda_finger_joint1=VALUE" in error_of(capsys)
+    words = ["--lock", "panda_finger_joint1=0.02", "--html", str(tmp_path / "a.html")]
+    assert main(["replay", path, *words]) == 0
 
 
 def test_outputs_are_checked_before_the_run(arm, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("varpin.cli.simulate.simulate", lambda *_, **__: pytest.fail("the run must not start"))
     kept = str(tmp_path / "kept.npz")
     for option, path in (("--html", "/nowhere/a.html"), ("--plot", "/nowhere/a.png"), ("--save", str(tmp_path))):
-        assert main(["simulate", arm, "--html", kept, option, path]) == 2
+        assert main(["simulate", arm, "--save", kept, option, path]) == 2
         assert f"cannot write {path}" in error_of(capsys)
-    assert main(["simulate", arm, "--save", kept, "--html", kept]) == 2
+    film = str(tmp_path / "kept.gif")
+    assert main(["simulate", arm, "--video", film, "--save", film]) == 2
+    assert "--save must end in .npz" in error_of(capsys)
+    (tmp_path / "same.html").symlink_to(tmp_path / "same.png")
+    words = ["--plot", str(tmp_path / "same.png"), "--html", str(tmp_path / "same.html")]
+    assert main(["simulate", arm, *words]) == 2
     assert "two outputs cannot be one file" in error_of(capsys)
 
 

@@ -245,3 +245,48 @@ def test_malformed_centre_of_mass_is_refused_by_name(tmp_path, entry, value):
         vp.RobotError, match=f"'link1': the {entry} of its <inertial> must be three numbers, got '{value}'"
     ):
         inspect_robot(write_arm(tmp_path, link))
+
+
+def test_a_report_prints_its_tables_and_warnings():
+    report = inspect_robot("panda", lock={"panda_joint7": 0.5})
+    text = str(report)
+    for joint in report.joints:
+        assert joint.name in text
+    for link in report.links:
+        assert f"│ {link.name} " in text
+    assert f"{report.total_mass:.5g} kg" in text
+    for warning in report.warnings:
+        assert f"warning: {warning}\n" in text + "\n"
+    assert "\x1b" not in text
+    assert repr(report).startswith("RobotReport(panda: ")
+    assert "nothing looks wrong" in str(inspect_robot("finger"))
+
+
+def test_frames_are_listed_with_what_carries_them():
+    """Each by a name that varpin finds; the chain of parents ends at the world, and passes the joint that moves it."""
+    robot = vp.load_robot("ur5")
+    report = inspect_robot(robot)
+    model = robot.free_model
+    assert [frame.name for frame in report.frames] == [frame.name for frame in list(model.frames)[1:]]
+    frames = {frame.name: frame for frame in report.frames}
+    q = np.zeros((1, 6))
+    for frame in report.frames:
+        assert robot.frame_positions(q, frame.name).shape == (1, 3)
+        at, passed = frame, set()
+        while at is not None:
+            passed.add(at.name)
+            at = frames.get(at.parent)
+        assert not frame.joint or frame.joint in passed
+        moving = [joint for joint in robot.joint_names if joint in passed]
+        assert frame.joint == (moving[-1] if moving else "")
+    assert frames["tool0"].kind == "link"
+    assert frames["tool0"].parent == "wrist_3_link-tool0_fixed_joint"
+    assert frames["elbow_joint"] == vp.FrameReport("elbow_joint", "joint", "upper_arm_link", "elbow_joint")
+    for name in frames:
+        assert f"│ {name} " in str(report)
+
+
+def test_frames_added_by_hand_are_on_their_joint():
+    first, second, tip = inspect_robot(vp.planar_chain(2)).frames
+    assert (first.parent, second.parent) == ("", "joint1")
+    assert tip == vp.FrameReport("tip", "frame", "joint2", "joint2")

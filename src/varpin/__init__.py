@@ -45,6 +45,7 @@ from varpin.errors import UnknownFrame as UnknownFrame
 from varpin.errors import UnknownJoint as UnknownJoint
 from varpin.errors import UnsupportedJoint as UnsupportedJoint
 from varpin.errors import VarpinError as VarpinError
+from varpin.inspection import FrameReport as FrameReport
 from varpin.inspection import JointReport as JointReport
 from varpin.inspection import LinkReport as LinkReport
 from varpin.inspection import RobotReport as RobotReport

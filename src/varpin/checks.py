@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 import os
 import reprlib
+from collections.abc import Mapping, Sequence
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.errors import FileError, InputError
+from varpin.errors import FileError, InputError, UnknownJoint
 
 Floats = NDArray[np.float64]
+# One number for each joint, in order or by the joint's name.
+JointValues: TypeAlias = ArrayLike | Mapping[str, float]
 
 
 def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
@@ -29,7 +32,7 @@ def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
     return require_finite(name, array)
 
 
-def broadcast_array(name: str, value: ArrayLike, size: int) -> Floats:
+def broadcast_array(name: str, value: object, size: int) -> Floats:
     """``value``, one number or (size,), as a new float array (size,).
 
     Raises:
@@ -39,6 +42,29 @@ def broadcast_array(name: str, value: ArrayLike, size: int) -> Floats:
     if array.shape not in ((), (size,)):
         raise InputError(f"{name} must be one number or have shape ({size},), got {array.shape}")
     return np.array(np.broadcast_to(require_finite(name, array), (size,)))
+
+
+def joint_array(name: str, value: JointValues, joints: Sequence[str], *, uniform: bool = False) -> Floats:
+    """``value`` as a new float array (n,) with a number for each of the n ``joints``.
+
+    Args:
+        name: What it is, for the error.
+        value: (n,), or numbers by the joints' names; joints that are not named get 0.
+        joints: The names, in order.
+        uniform: Whether one number may stand for every joint.
+
+    Raises:
+        UnknownJoint: A name that is no joint's.
+        InputError: As for :func:`finite_array`.
+    """
+    if not isinstance(value, Mapping):
+        return broadcast_array(name, value, len(joints)) if uniform else finite_array(name, value, (len(joints),))
+    array = np.zeros(len(joints))
+    for joint, number in value.items():
+        if joint not in joints:
+            raise UnknownJoint(str(joint), joints, name)
+        array[joints.index(joint)] = finite(f"{name}[{joint!r}]", number)
+    return array
 
 
 def checked_limits(name: str, limits: tuple[ArrayLike, ArrayLike] | None, size: int) -> Floats:
@@ -66,7 +92,7 @@ def checked_limits(name: str, limits: tuple[ArrayLike, ArrayLike] | None, size: 
     return both
 
 
-def as_floats(name: str, value: ArrayLike) -> Floats:
+def as_floats(name: str, value: object) -> Floats:
     """``value`` as a new float array, or an InputError that names it."""
     try:
         array = np.asarray(value)
@@ -113,6 +139,14 @@ def real(name: str, value: Any) -> float:
         return float(value)
     except OverflowError:
         raise InputError(f"{name} is beyond the range of floating-point numbers") from None
+
+
+def finite(name: str, value: Any) -> float:
+    """``value`` as a finite float, or an InputError that names it."""
+    number = real(name, value)
+    if not math.isfinite(number):
+        raise InputError(f"{name} is {number}; it must be finite")
+    return number
 
 
 def fraction(name: str, value: float) -> float:

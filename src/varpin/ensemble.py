@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, count, finite_array, positive, require_finite
+from varpin.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, rows
@@ -133,8 +133,8 @@ class EnsembleInterrupted(KeyboardInterrupt):
 
 def simulate_ensemble(
     scene: Scene,
-    q0: ArrayLike,
-    v0: ArrayLike,
+    q0: JointValues,
+    v0: JointValues,
     *,
     dt: float,
     steps: int,
@@ -153,8 +153,8 @@ def simulate_ensemble(
 
     Main args:
         scene: The scene, with noise that kernels can evaluate (not a ``CustomNoise``).
-        q0: Initial configuration, (n,) for all paths or (P, n) [rad or m].
-        v0: Initial velocity, (n,) or (P, n) [rad/s or m/s].
+        q0: Initial configuration, (n,) or by joint name for all paths, or (P, n) [rad or m].
+        v0: Initial velocity, the same [rad/s or m/s].
         dt: Time step [s].
         steps: N.
         paths: P.
@@ -176,7 +176,7 @@ def simulate_ensemble(
     n = require_scene(scene).robot.dof
     dt, steps, paths = positive("dt", dt, "s"), count("steps", steps), count("paths", paths, least=1)
     _require_memory(scene, steps, paths, store=store)
-    start = [_per_path(name, value, paths, n) for name, value in (("q0", q0), ("v0", v0))]
+    start = [_per_path(name, value, paths, scene.robot.joint_names) for name, value in (("q0", q0), ("v0", v0))]
     if scene.noise.diffusion is None:
         raise InputError("an ensemble needs noise that kernels evaluate; a CustomNoise is simulated path by path")
     levels = require_finite("quantiles", as_floats("quantiles", quantiles))
@@ -231,8 +231,9 @@ def _require_memory(scene: Scene, steps: int, paths: int, *, store: bool) -> Non
             ) from None
 
 
-def _per_path(name: str, value: ArrayLike, paths: int, n: int) -> Floats:
-    array = as_floats(name, value)
+def _per_path(name: str, value: JointValues, paths: int, joints: Sequence[str]) -> Floats:
+    n = len(joints)
+    array = joint_array(name, value, joints) if isinstance(value, Mapping) else as_floats(name, value)
     if array.shape == (n,):
         array = np.repeat(array[None], paths, axis=0)
     return finite_array(name, array, (paths, n))

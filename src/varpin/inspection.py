@@ -11,8 +11,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import broadcast_array
+from varpin.checks import JointValues, joint_array
 from varpin.errors import InputError, RobotError, SingularMassMatrix
+from varpin.inspection_tables import parts_of
 from varpin.integrators import Midpoint, largest_step
 from varpin.lagrangian import lagrangian_jet
 from varpin.markup import facts, folded, table
@@ -22,9 +23,11 @@ from varpin.robot.mimic import joint_index
 from varpin.robot.tree import is_unbounded, joint_axis
 from varpin.robot.urdf import Urdf, read_urdf
 from varpin.scene import Scene
+from varpin.tables import plain
 
 Floats = NDArray[np.float64]
 Kind = Literal["revolute", "prismatic", "continuous", "mimic"]
+FrameKind = Literal["link", "joint", "fixed joint", "frame"]
 
 # The largest step is no limit beyond this [s].
 _ANY_STEP = 100.0
@@ -88,14 +91,32 @@ class LinkReport:
     moments: Floats
 
 
+@dataclass(frozen=True)
+class FrameReport:
+    """A frame, whose name costs, traces and payloads take.
+
+    Attributes:
+        name: Its name.
+        kind: A link's, a joint's, a fixed joint's, or one by itself.
+        parent: The link or frame that it is attached to, or empty for the world.
+        joint: The joint that moves it, or empty if it is fixed to the base.
+    """
+
+    name: str
+    kind: FrameKind
+    parent: str
+    joint: str
+
+
 @dataclass(frozen=True, eq=False)
 class RobotReport:
-    """A robot as its description has it, and what looks wrong.
+    """A robot as its description has it, and what looks wrong; ``print`` shows all of it in tables.
 
     Attributes:
         robot: The robot, possibly one that :func:`varpin.load_robot` refuses.
         joints: Every joint that moves, mimic joints included, in Pinocchio's order.
         links: Every link with mass or inertia.
+        frames: Every frame by whose name varpin finds it, in Pinocchio's order.
         locked: Joints held still, and where [rad or m].
         total_mass: Of everything that moves [kg].
         q: The configuration looked at (n,) [rad or m].
@@ -112,6 +133,7 @@ class RobotReport:
     robot: Robot = field(repr=False)
     joints: tuple[JointReport, ...]
     links: tuple[LinkReport, ...]
+    frames: tuple[FrameReport, ...]
     locked: Mapping[str, float | tuple[float, ...]]
     total_mass: float
     q: Floats
@@ -127,6 +149,9 @@ class RobotReport:
             f"RobotReport({self.robot.name}: {len(self.joints)} joints, {len(self.links)} links, "
             f"{len(self.warnings)} warnings)"
         )
+
+    def __str__(self) -> str:
+        return plain(parts_of(self))
 
     @property
     def step_in_words(self) -> str:
@@ -154,6 +179,13 @@ class RobotReport:
             rows,
             table(("joint", "kind", "lower [rad or m]", "upper", "velocity [1/s]", "effort [N m or N]"), joints),
             folded("links", table(("link", "moved by", "mass [kg]", "principal moments [kg m^2]"), links)),
+            folded(
+                "frames",
+                table(
+                    ("frame", "what it is", "on", "moved by"),
+                    [(x.name, x.kind, x.parent or "the world", x.joint or "the base") for x in self.frames],
+                ),
+            ),
         )
 
 
@@ -163,8 +195,8 @@ def inspect_robot(
     package_dirs: Sequence[str | os.PathLike[str]] | None = None,
     lock: Mapping[str, ArrayLike] | None = None,
     mimic: Literal["tied", "free"] = "tied",
-    q: ArrayLike | None = None,
-    v: ArrayLike | None = None,
+    q: JointValues | None = None,
+    v: JointValues | None = None,
     gravity: ArrayLike | bool = True,
 ) -> RobotReport:
     """Look into a robot description, sound or faulty.
@@ -172,8 +204,8 @@ def inspect_robot(
     Main args:
         source: What :func:`varpin.load_robot` takes, or a robot it made.
         lock: Joints to hold still, as for :func:`varpin.load_robot`.
-        q: Configuration to look at, one number or (n,) [rad or m]; 0 if left out.
-        v: Velocity there, one number or (n,) [rad/s or m/s]; 0 if left out.
+        q: Configuration to look at, one number, (n,) or by joint name [rad or m]; 0 if left out.
+        v: Velocity there, the same [rad/s or m/s]; 0 if left out.
 
     Other Args:
         package_dirs: As for :func:`varpin.load_robot`.
@@ -192,8 +224,8 @@ def inspect_robot(
     else:
         robot = build_robot(source, package_dirs=package_dirs, lock=lock, mimic=mimic)
     scene = Scene(robot, gravity=gravity)
-    configuration = broadcast_array("q", 0.0 if q is None else q, robot.dof)
-    velocity = broadcast_array("v", 0.0 if v is None else v, robot.dof)
+    configuration = joint_array("q", 0.0 if q is None else q, robot.joint_names, uniform=True)
+    velocity = joint_array("v", 0.0 if v is None else v, robot.joint_names, uniform=True)
     with np.errstate(all="ignore"):
         jet = lagrangian_jet(scene, configuration, velocity, backend="pinocchio")
     if not all(np.isfinite(array).all() for array in (jet.Lvv, jet.Lqq)):
@@ -219,6 +251,7 @@ def inspect_robot(
         robot=robot,
         joints=joints,
         links=links,
+        frames=_frames(robot),
         locked=robot.locked,
         total_mass=float(robot.tree.mass.sum()),
         q=configuration,
@@ -299,6 +332,27 @@ def _links(robot: Robot, urdf: Urdf | None) -> tuple[LinkReport, ...]:
         for link in urdf.inertials
         if link.link in joints
     )
+
+
+_KINDS: dict[pin.FrameType, FrameKind] = {
+    pin.FrameType.BODY: "link",
+    pin.FrameType.JOINT: "joint",
+    pin.FrameType.FIXED_JOINT: "fixed joint",
+}
+
+
+def _frames(robot: Robot) -> tuple[FrameReport, ...]:
+    model, reports = robot.free_model, {}
+    for index, frame in enumerate(model.frames):
+        # The first is the world itself; of frames of one name varpin finds the first.
+        if index == 0 or frame.name in reports:
+            continue
+        kind: FrameKind = _KINDS.get(frame.type, "frame")
+        joint = model.names[frame.parentJoint] if frame.parentJoint else ""
+        on = model.frames[frame.parentFrame].name if frame.parentFrame else ""
+        # A frame that was added by hand may name no parent but the world, and yet move with a joint.
+        reports[frame.name] = FrameReport(frame.name, kind, on or ("" if kind == "joint" else joint), joint)
+    return tuple(reports.values())
 
 
 def _body(robot: Robot, joint: int) -> LinkReport:

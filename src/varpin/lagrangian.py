@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from varpin.checks import finite_array, fraction, positive
+from varpin.checks import JointValues, fraction, joint_array, positive
 from varpin.errors import InputError
 from varpin.scene import Scene, require_scene
 from varpin.textbook import rigid_body_Lqq
@@ -42,22 +42,22 @@ class LagrangianJet:
 
 
 def lagrangian_jet(
-    scene: Scene, q: ArrayLike, v: ArrayLike, *, backend: Literal["compiled", "pinocchio"] = "compiled"
+    scene: Scene, q: JointValues, v: JointValues, *, backend: Literal["compiled", "pinocchio"] = "compiled"
 ) -> LagrangianJet:
     """L and all its derivatives up to second order; gravity, springs and armature of the scene included.
 
     Args:
         scene: The scene.
-        q: Configuration (n,) [rad or m].
-        v: Velocity (n,) [rad/s or m/s].
+        q: Configuration, (n,) or by joint name [rad or m].
+        v: Velocity, (n,) or by joint name [rad/s or m/s].
         backend: ``"compiled"`` takes one sweep over the tree (see ``docs/mathematics.md``); ``"pinocchio"`` puts
             the same together from Pinocchio's algorithms, slowly, as a reference.
 
     Raises:
         InputError: Wrong shapes, values that are not finite, or an unknown backend.
     """
-    n = require_scene(scene).robot.dof
-    q, v = finite_array("q", q, (n,)), finite_array("v", v, (n,))
+    joints = require_scene(scene).robot.joint_names
+    q, v = joint_array("q", q, joints), joint_array("v", v, joints)
     if backend == "compiled":
         return _compiled(scene, q, v)
     if backend == "pinocchio":
@@ -124,7 +124,7 @@ class DiscreteLagrangian:
 
 
 def discrete_lagrangian(
-    scene: Scene, q0: ArrayLike, q1: ArrayLike, dt: float, *, alpha: float = 0.5
+    scene: Scene, q0: JointValues, q1: JointValues, dt: float, *, alpha: float = 0.5
 ) -> DiscreteLagrangian:
     """L_d(q0, q1) = dt L((1 - alpha) q0 + alpha q1, (q1 - q0) / dt) and its slot derivatives.
 
@@ -133,16 +133,16 @@ def discrete_lagrangian(
 
     Args:
         scene: The scene.
-        q0: Configuration (n,) at the start [rad or m].
-        q1: Configuration (n,) at the end [rad or m].
+        q0: Configuration at the start, (n,) or by joint name [rad or m].
+        q1: Configuration at the end, (n,) or by joint name [rad or m].
         dt: Time step [s].
         alpha: Where between q0 and q1 the Lagrangian is taken, in [0, 1]; 1/2 is of second order.
 
     Raises:
         InputError: Wrong shapes, values that are not finite, dt <= 0, alpha outside [0, 1].
     """
-    n = require_scene(scene).robot.dof
-    q0, q1 = finite_array("q0", q0, (n,)), finite_array("q1", q1, (n,))
+    joints = require_scene(scene).robot.joint_names
+    q0, q1 = joint_array("q0", q0, joints), joint_array("q1", q1, joints)
     h, a = positive("dt", dt, "s"), fraction("alpha", alpha)
     jet = lagrangian_jet(scene, (1.0 - a) * q0 + a * q1, (q1 - q0) / h)
     b = 1.0 - a

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import finite_array, positive
+from varpin.checks import JointValues, finite_array, joint_array, positive
 from varpin.integrators import Integrator, Midpoint
 from varpin.lagrangian import lagrangian_jet
 from varpin.linearization import linearize
@@ -46,8 +46,8 @@ class LinearizationCheck:
 
 def check_linearization(
     scene: Scene,
-    q: ArrayLike,
-    v: ArrayLike,
+    q: JointValues,
+    v: JointValues,
     u: ArrayLike | None = None,
     *,
     dt: float,
@@ -58,8 +58,8 @@ def check_linearization(
 
     Main args:
         scene: The scene.
-        q: Configuration (n,) [rad or m].
-        v: Velocity (n,) [rad/s or m/s].
+        q: Configuration, (n,) or by joint name [rad or m].
+        v: Velocity, (n,) or by joint name [rad/s or m/s].
         u: Controls (m,); zero if left out.
         dt: Time step [s].
 
@@ -72,7 +72,7 @@ def check_linearization(
         StepFailure: A step of the differences cannot be taken; a smaller ``step`` or ``dt`` may help.
     """
     n, m, k = require_scene(scene).robot.dof, scene.controls, scene.processes
-    q, v = finite_array("q", q, (n,)), finite_array("v", v, (n,))
+    q, v = joint_array("q", q, scene.robot.joint_names), joint_array("v", v, scene.robot.joint_names)
     u = np.zeros(m) if u is None else finite_array("u", u, (m,))
     dt, step = positive("dt", dt, "s"), positive("step", step, "1")
     method = Midpoint() if integrator is None else integrator

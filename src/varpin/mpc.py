@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import count, positive, real
+from varpin.checks import JointValues, count, positive, real
 from varpin.errors import InputError
 from varpin.integrators import Integrator, RungeKutta4
 from varpin.integrators.base import Failure
@@ -178,8 +178,8 @@ class Mpc:
     def plan(
         self,
         t: float,
-        q: ArrayLike,
-        v: ArrayLike,
+        q: JointValues,
+        v: JointValues,
         previous: Solution | None = None,
         decisions: int = 1,
         before: ArrayLike | None = None,
@@ -188,8 +188,8 @@ class Mpc:
 
         Args:
             t: Now.
-            q: [rad or m].
-            v: [rad/s or m/s].
+            q: (n,) or by joint name [rad or m].
+            v: (n,) or by joint name [rad/s or m/s].
             previous: The plan to start from; None in the first tick.
             decisions: How many decisions ago it was made.
             before: The control applied last (m,), where changes of controls cost something. Left out, what ``previous``

@@ -10,13 +10,22 @@ field depends on the velocity (:class:`CustomNoise` alone can) the strong order 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, broadcast_array, count, finite_array, require_finite
+from varpin.checks import (
+    JointValues,
+    as_floats,
+    broadcast_array,
+    count,
+    finite_array,
+    joint_array,
+    require_finite,
+)
 from varpin.errors import InputError
 from varpin.kernels.tree import Diffusion
 
@@ -46,6 +55,14 @@ class Fields:
 
 class Noise(ABC):
     """A diffusion model. Whoever adds one provides ``bind``, which fits it to a robot."""
+
+    def named(self, joints: Sequence[str]) -> Noise:  # noqa: ARG002
+        """The model with numbers in the order of ``joints`` where it has them by the joints' names.
+
+        Raises:
+            UnknownJoint: A name that is no joint's.
+        """
+        return self
 
     @abstractmethod
     def bind(self, actuation: Floats) -> BoundNoise:
@@ -197,11 +214,15 @@ class AdditiveNoise(Noise):
     """Forces of constant strength: F constant.
 
     Attributes:
-        intensity: One number C for F_i = C e_i; (n,) for F_i = C_i e_i; or the matrix F (n, k) itself
-            [N m s^0.5 or N s^0.5].
+        intensity: One number C for F_i = C e_i; (n,), or by joint name, for F_i = C_i e_i; or the matrix F (n, k)
+            itself [N m s^0.5 or N s^0.5].
     """
 
-    intensity: ArrayLike
+    intensity: JointValues
+
+    def named(self, joints: Sequence[str]) -> Noise:
+        """See :meth:`Noise.named`."""
+        return _named(self, joints, "intensity")
 
     def bind(self, actuation: Floats) -> CompiledFields:
         """See :meth:`Noise.bind`."""
@@ -242,12 +263,16 @@ class StateNoise(Noise):
     """Forces that grow with the distance from a posture: F_i = C_i e_i (q_i - center_i)^2.
 
     Attributes:
-        intensity: One number or (n,) [N m s^0.5 / rad^2 or N s^0.5 / m^2].
-        center: One number or (n,) [rad or m]; the configuration at which the motion starts if None.
+        intensity: One number, (n,) or by joint name [N m s^0.5 / rad^2 or N s^0.5 / m^2].
+        center: One number, (n,) or by joint name [rad or m]; the configuration at which the motion starts if None.
     """
 
-    intensity: ArrayLike
-    center: ArrayLike | None = None
+    intensity: JointValues
+    center: JointValues | None = None
+
+    def named(self, joints: Sequence[str]) -> Noise:
+        """See :meth:`Noise.named`."""
+        return _named(self, joints, "intensity", "center")
 
     def bind(self, actuation: Floats) -> CompiledFields:
         """See :meth:`Noise.bind`."""
@@ -391,9 +416,27 @@ class NoiseSum(Noise):
 
     terms: tuple[Noise, ...]
 
+    def named(self, joints: Sequence[str]) -> Noise:
+        """See :meth:`Noise.named`."""
+        return NoiseSum(tuple(term.named(joints) for term in self.terms))
+
     def bind(self, actuation: Floats) -> BoundNoise:
         """See :meth:`Noise.bind`."""
         return CompositeFields(tuple(term.bind(actuation) for term in self.terms))
+
+
+_Model = TypeVar("_Model", "AdditiveNoise", "StateNoise")
+
+
+def _named(noise: _Model, joints: Sequence[str], *names: str) -> _Model:
+    """A model with arrays where it has numbers by joint name."""
+    given = {name: getattr(noise, name) for name in names}
+    by_name = {
+        name: joint_array(f"{type(noise).__name__} {name}", value, joints)
+        for name, value in given.items()
+        if isinstance(value, Mapping)
+    }
+    return replace(noise, **by_name) if by_name else noise
 
 
 def _terms(noise: Noise) -> tuple[Noise, ...]:
@@ -417,10 +460,11 @@ def _sound(model: Noise, bound: BoundNoise, n: int, m: int) -> BoundNoise:
     return bound
 
 
-def bind(noise: Noise | Sequence[Noise] | None, actuation: Floats) -> BoundNoise:
-    """None, a model or several, on a robot with this actuation matrix (n, m).
+def bind(noise: Noise | Sequence[Noise] | None, actuation: Floats, joints: Sequence[str] | None = None) -> BoundNoise:
+    """None, a model or several, on a robot with this actuation matrix (n, m) and joints of these names.
 
     Raises:
+        UnknownJoint: A model names a joint that is none of them.
         InputError: Something else than a noise model, or parameters that do not fit.
     """
     if noise is None or (isinstance(noise, Sequence) and not noise):
@@ -431,5 +475,6 @@ def bind(noise: Noise | Sequence[Noise] | None, actuation: Floats) -> BoundNoise
     for model in models:
         if not isinstance(model, Noise):
             raise InputError(f"noise must be a varpin noise model or several of them, got {type(model).__name__}")
-        bound.append(_sound(model, model.bind(actuation), *actuation.shape))
+        known = model if joints is None else model.named(joints)
+        bound.append(_sound(known, known.bind(actuation), *actuation.shape))
     return bound[0] if len(bound) == 1 else CompositeFields(tuple(bound))

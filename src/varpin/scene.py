@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, broadcast_array, finite_array
+from varpin.checks import JointValues, as_floats, finite_array, joint_array
 from varpin.core import Mechanism as Core
 from varpin.errors import InputError, RobotError
 from varpin.kernels.tree import Diffusion, Mechanism
@@ -57,9 +57,9 @@ class Scene:
         robot: Robot,
         *,
         gravity: ArrayLike | bool = True,
-        damping: ArrayLike = 0.0,
-        stiffness: ArrayLike = 0.0,
-        rest: ArrayLike = 0.0,
+        damping: JointValues = 0.0,
+        stiffness: JointValues = 0.0,
+        rest: JointValues = 0.0,
         actuation: ArrayLike | Sequence[str] | None = None,
         noise: Noise | Sequence[Noise] | None = None,
     ) -> None:
@@ -68,17 +68,19 @@ class Scene:
         Main args:
             robot: From :func:`varpin.load_robot`.
             gravity: ``True`` for (0, 0, -9.81), ``False`` for none, or any vector (3,) [m/s^2].
-            damping: One number or (n,), >= 0 [N m s/rad or N s/m].
-            stiffness: One number or (n,), >= 0 [N m/rad or N/m].
+            damping: One number, (n,), or numbers by joint name, ``{"elbow": 0.1}``, >= 0 [N m s/rad or N s/m]. Joints
+                that are not named have none.
+            stiffness: The same, >= 0 [N m/rad or N/m].
 
         Other Args:
-            rest: One number or (n,) [rad or m].
+            rest: The same [rad or m]; 0 for joints that are not named.
             actuation: A matrix (n, m); or the names of the m actuated joints; every joint if left out.
             noise: A noise model, several of them, or their sum; see :mod:`varpin.noise`.
 
         Raises:
             InputError: A wrong shape, a value that is not finite, negative damping or stiffness.
-            UnknownJoint: ``actuation`` names a joint that is no coordinate of the robot.
+            UnknownJoint: ``actuation``, ``damping``, ``stiffness`` or ``rest`` names a joint that is no coordinate of
+                the robot.
         """
         if not isinstance(robot, Robot):
             raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
@@ -86,17 +88,17 @@ class Scene:
         n = robot.dof
         if robot.tree.armature.size != n:
             raise RobotError(f"the robot's tree is damaged: it has {robot.tree.armature.size} coordinates, not {n}")
-        if isinstance(gravity, bool | np.bool_):
-            gravity = EARTH if gravity else (0.0, 0.0, 0.0)
         values: dict[str, Any] = {
             "robot": robot,
-            "gravity": finite_array("gravity", gravity, (3,)),
-            "damping": _not_negative("damping", broadcast_array("damping", damping, n)),
-            "stiffness": _not_negative("stiffness", broadcast_array("stiffness", stiffness, n)),
-            "rest": broadcast_array("rest", rest, n),
+            "gravity": _gravity(gravity),
+            "damping": _not_negative("damping", joint_array("damping", damping, robot.joint_names, uniform=True)),
+            "stiffness": _not_negative(
+                "stiffness", joint_array("stiffness", stiffness, robot.joint_names, uniform=True)
+            ),
+            "rest": joint_array("rest", rest, robot.joint_names, uniform=True),
         }
         values["actuation"] = _actuation(robot, actuation)
-        values["noise"] = bind(noise, values["actuation"])
+        values["noise"] = bind(noise, values["actuation"], robot.joint_names)
         values["announced"] = set()
         for name, value in values.items():
             if isinstance(value, np.ndarray):
@@ -159,12 +161,65 @@ class Scene:
             diffusion=self.noise.diffusion or nothing,
         )
 
+    def holding_torque(self, q: JointValues) -> Floats:
+        """The generalized forces (n,) that hold the robot at rest at ``q``, against gravity and springs [N m or N].
+
+        The gradient of the potential energy, -L_q(q, 0).
+
+        Args:
+            q: Configuration, (n,) or by joint name [rad or m].
+
+        Raises:
+            InputError: A wrong shape, or a value that is not finite.
+            UnknownJoint: ``q`` names a joint that is no coordinate of the robot.
+        """
+        at = joint_array("q", q, self.robot.joint_names)
+        _, Lq, *_ = self.core.jet(at, np.zeros_like(at))
+        return np.asarray(-Lq, dtype=np.float64)
+
+    def holding_controls(self, q: JointValues) -> Floats:
+        """The controls (m,) that hold the robot at rest at ``q``; of several that do, the smallest.
+
+        Args:
+            q: Configuration, (n,) or by joint name [rad or m].
+
+        Raises:
+            InputError: No controls hold it there; or as :meth:`holding_torque`.
+            UnknownJoint: As :meth:`holding_torque`.
+        """
+        torque = self.holding_torque(q)
+        controls = np.linalg.lstsq(self.actuation, torque, rcond=None)[0]
+        left = torque - self.actuation @ controls
+        # Where nothing pulls, rounding leaves a trace of the weights' own moments, those at a metre say.
+        weight = float(self.robot.tree.mass.sum() * np.linalg.norm(self.gravity))
+        if (np.abs(left) > 1e-9 * (np.abs(torque).max() + weight)).any():
+            c = int(np.argmax(np.abs(left)))
+            raise InputError(
+                f"no controls hold the robot at this q: joint {self.robot.joint_names[c]!r} is left with {left[c]:.4g} "
+                "N m or N that no actuator takes"
+            )
+        return np.asarray(controls, dtype=np.float64)
+
 
 def require_scene(scene: object) -> Scene:
     """``scene`` itself, or an InputError that says what it is instead."""
     if not isinstance(scene, Scene):
         raise InputError(f"scene must be a varpin.Scene, got {type(scene).__name__}")
     return scene
+
+
+def _gravity(gravity: ArrayLike | bool) -> Floats:
+    """Gravity (3,) from what a user gives."""
+    if isinstance(gravity, bool | np.bool_):
+        return np.array(EARTH if gravity else (0.0, 0.0, 0.0))
+    given = as_floats("gravity", gravity)
+    if given.ndim == 0 and np.isfinite(given):
+        meant = f"({', '.join(f'{g:g}' for g in (0.0, 0.0, -abs(float(given))))})" if given else "False"
+        raise InputError(
+            f"gravity is a vector in world axes, z up [m/s^2], got the number {float(given):g}; did you mean "
+            f"gravity={meant}?"
+        )
+    return finite_array("gravity", given, (3,))
 
 
 def _not_negative(name: str, values: Floats) -> Floats:

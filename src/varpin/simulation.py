@@ -10,7 +10,16 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, count, finite_array, is_one_of, positive, require_finite
+from varpin.checks import (
+    JointValues,
+    as_floats,
+    count,
+    finite_array,
+    is_one_of,
+    joint_array,
+    positive,
+    require_finite,
+)
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, open_loop, rows, steps_of
@@ -206,8 +215,8 @@ def rollout(
 
 def simulate(
     scene: Scene,
-    q0: ArrayLike,
-    v0: ArrayLike,
+    q0: JointValues,
+    v0: JointValues,
     *,
     dt: float,
     steps: int,
@@ -223,8 +232,8 @@ def simulate(
 
     Main args:
         scene: The scene.
-        q0: Initial configuration (n,) [rad or m].
-        v0: Initial velocity (n,) [rad/s or m/s].
+        q0: Initial configuration, (n,) or by joint name, 0 for those not named [rad or m].
+        v0: Initial velocity, the same [rad/s or m/s].
         dt: Time step [s].
         steps: N, their number.
         controls: None for none; an array (N, m), one row a step; one row (m,) for all steps; a
@@ -247,14 +256,16 @@ def simulate(
 
     Raises:
         InputError: Wrong shapes, values that are not finite, dt <= 0, steps < 0.
+        UnknownJoint: ``q0`` or ``v0`` names a joint that is no coordinate of the robot.
         ControlError: The control function returned something unusable; holds the trajectory so far.
         NoiseError: A function of a CustomNoise did; holds the trajectory so far.
         StepFailure: A step has no trustworthy solution; holds the trajectory so far.
         SingularMassMatrix: M(q0) is not positive definite.
         Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt.
     """
-    n = require_scene(scene).robot.dof
-    q0, v0 = finite_array("q0", q0, (n,)), finite_array("v0", v0, (n,))
+    joints = require_scene(scene).robot.joint_names
+    n = len(joints)
+    q0, v0 = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
     dt, steps = positive("dt", dt, "s"), count("steps", steps)
     if not is_one_of(sampling, ("midpoint", "start")):
         raise InputError(f"sampling must be 'midpoint' or 'start', got {sampling!r}")

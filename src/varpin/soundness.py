@@ -34,6 +34,12 @@ _LOOKED_AT = 4
 _STILL = 1e-9
 
 
+# The kind of finding that says nothing against the motion as a solution of its equations.
+JOINT_LIMITS = "joint limits"
+# Beyond its limit by more than this a joint is spoken of [rad or m]; and so many of them with numbers.
+_OUTSIDE, _NAMED = 1e-6, 6
+
+
 @dataclass(frozen=True)
 class Finding:
     """One thing to be said about a motion.
@@ -95,7 +101,32 @@ def evident(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
                 f"{split} of {steps} steps were taken in up to {most} parts: dt = {dt:g} s is coarse here",
             )
         )
-    return tuple(found)
+    return (*found, *_beyond_limits(scene, trajectory))
+
+
+def _beyond_limits(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Says which joints leave their limits, which no motion is stopped by; the motion itself may be right."""
+    lower, upper = scene.robot.position_limits
+    # Limits that leave no room are a fault of the description, which inspect_robot tells of.
+    sound = lower < upper
+    with np.errstate(invalid="ignore"):
+        excess = np.where(sound, np.maximum(lower - trajectory.q, trajectory.q - upper), -np.inf)
+    most = excess.max(axis=0)
+    joints = [int(c) for c in np.argsort(-most, kind="stable") if most[c] > _OUTSIDE]
+    if not joints:
+        return ()
+    tree = scene.robot.tree
+    slides = np.isin(np.arange(len(most)), tree.coordinate[tree.prismatic > 0])
+    parts = []
+    for c in joints[:_NAMED]:
+        first, peak = int(np.argmax(excess[:, c] > _OUTSIDE)), int(np.argmax(excess[:, c]))
+        since = "from the start" if first == 0 else f"from t = {trajectory.t[first]:.4g} s"
+        unit, t = "m" if slides[c] else "rad", trajectory.t[peak]
+        name, side = scene.robot.joint_names[c], "above" if trajectory.q[peak, c] > upper[c] else "below"
+        limit = upper[c] if side == "above" else lower[c]
+        parts.append(f"{name!r} {since}, at most {most[c]:.3g} {unit} {side} {limit:.4g} at t = {t:.4g} s")
+    more = f"; and {len(joints) - _NAMED} more" if len(joints) > _NAMED else ""
+    return (Finding(JOINT_LIMITS, f"joints leave their limits, which nothing stops: {'; '.join(parts)}{more}"),)
 
 
 def _ringing(scene: Scene, q0: Floats, dt: float) -> tuple[Finding, ...]:

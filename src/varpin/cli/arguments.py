@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import difflib
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from varpin.checks import JointValues, joint_array
 from varpin.errors import InputError
+from varpin.integrators import BY_NAME, Integrator, integrator_of, options_of
 from varpin.robot import Robot, load_robot
 from varpin.scene import Scene
 from varpin.scenefile import SceneFile, load_scene, scenes
@@ -25,6 +31,11 @@ def add_robot(parser: argparse.ArgumentParser, *, optional: bool = False, scenes
         + ("; scenes made up for it if left out" if optional else "")
         + ("; or a scene file (TOML), or name of a scene of varpin" if scenes else ""),
     )
+    add_robot_options(parser)
+
+
+def add_robot_options(parser: argparse.ArgumentParser) -> None:
+    """How the robot is loaded: which joints are locked, and where its meshes are."""
     parser.add_argument(
         "--lock",
         type=_lock,
@@ -56,8 +67,79 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
 
 
 def add_vector(group: argparse._ActionsContainer, name: str, text: str) -> None:
-    """An option of one number for all joints or one for each."""
-    group.add_argument(f"--{name}", type=float, nargs="+", metavar="X", help=text)
+    """An option of one number for all joints, one for each, or some by name."""
+    group.add_argument(f"--{name}", type=_number, nargs="+", metavar="X", help=text)
+
+
+def add_integrator(parser: argparse.ArgumentParser) -> None:
+    """Which integrator to take."""
+    group = parser.add_argument_group("integrator")
+    group.add_argument(
+        "--integrator",
+        metavar="NAME",
+        help=f"{', '.join(BY_NAME)}; with options as Python writes them, 'Gauss(stages=3)'; default: Midpoint",
+    )
+    group.add_argument("--stages", type=int, metavar="N", help="of Gauss: 1 to 6, of order twice as many; default: 2")
+    group.add_argument(
+        "--alpha", type=float, metavar="A", help="of Midpoint, in [0, 1]: of second order at 0.5, the default"
+    )
+
+
+def integrator_asked_for(request: argparse.Namespace) -> Integrator:
+    """The integrator of the options that :func:`add_integrator` adds.
+
+    Raises:
+        InputError: An unknown name, or an option that it does not have.
+    """
+    text = (request.integrator or "Midpoint").strip()
+    name, bracket, rest = text.partition("(")
+    # runge_kutta_4, RUNGEKUTTA4 and semi-implicit-euler are as good as the names of the classes.
+    plain = {_letters(own): own for own in BY_NAME}
+    if _letters(name) not in plain:
+        matches = difflib.get_close_matches(_letters(name), plain, n=1)
+        hint = f"did you mean {plain[matches[0]]}? " if matches else ""
+        raise InputError(f"there is no integrator {name!r}; {hint}integrators: {', '.join(BY_NAME)}")
+    integrator = integrator_of(plain[_letters(name)] + bracket + rest)
+    for option in ("stages", "alpha"):
+        value = getattr(request, option)
+        if value is None:
+            continue
+        if option not in options_of(type(integrator)):
+            owner = next(own for own, kind in BY_NAME.items() if option in options_of(kind))
+            raise InputError(f"--{option} is an option of {owner}, not of {type(integrator).__name__}")
+        integrator = replace(integrator, **{option: value})  # type: ignore[type-var]
+    return integrator
+
+
+def _letters(name: str) -> str:
+    return re.sub(r"[\s_-]", "", name).lower()
+
+
+def simulate_words(request: argparse.Namespace, integrator: Integrator, dt: float, steps: int) -> str:
+    """The command line that simulates the motion of ``request`` with an integrator and step."""
+    words = ["varpin", "simulate", request.robot, "--integrator", str(integrator), "--dt", repr(dt)]
+    words += ["--steps", str(steps)]
+    if request.lock:
+        words += ["--lock", *(f"{name}={_text(at)}" for name, at in request.lock)]
+    for folder in request.package_dir or ():
+        words += ["--package-dir", folder]
+    for option in ("q0", "v0", "damping", "stiffness", "rest", "torque"):
+        if (given := getattr(request, option)) is not None:
+            words += [f"--{option}", *(_text(item) for item in given)]
+    if request.gravity is False:
+        words.append("--no-gravity")
+    elif request.gravity is not True:
+        words += ["--gravity", *(_text(g) for g in request.gravity)]
+    return shlex.join(words)
+
+
+def _text(value: object) -> str:
+    """A number, numbers or a joint's number as the command line takes them."""
+    if isinstance(value, tuple):
+        return f"{value[0]}={_text(value[1])}"
+    if isinstance(value, list):
+        return ",".join(map(_text, value))
+    return repr(value)
 
 
 def add_gravity(group: argparse._ActionsContainer) -> None:
@@ -85,16 +167,48 @@ def _lock(word: str) -> tuple[str, ArrayLike]:
     return name, numbers[0] if len(numbers) == 1 else numbers
 
 
-def _vector(option: str, numbers: Sequence[float] | None, robot: Robot) -> ArrayLike:
-    """The numbers of an option: none for 0, one for all joints, or (n,)."""
-    if numbers is None:
-        return 0.0
-    if len(numbers) not in (1, robot.dof):
+def _number(word: str) -> float | tuple[str, float]:
+    """A number, or a joint and its number."""
+    name, equals, value = word.strip().rpartition("=")
+    try:
+        number = float(value)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{word.strip()!r} is neither a number nor of the form JOINT=VALUE, for example elbow=0.5"
+        ) from None
+    return (name, number) if equals else number
+
+
+def values_of(option: str, given: Sequence[float | tuple[str, float]] | None) -> JointValues | None:
+    """What an option of :func:`add_vector` says: None if it was not given, one number, several, or some by name.
+
+    Raises:
+        InputError: Names and numbers are mixed, or a name is there twice.
+    """
+    if given is None:
+        return None
+    named = [item for item in given if isinstance(item, tuple)]
+    if not named:
+        numbers = [item for item in given if not isinstance(item, tuple)]
+        return numbers[0] if len(numbers) == 1 else numbers
+    if len(named) < len(given):
+        raise InputError(f"--{option} takes either numbers or JOINT=VALUE, not both at once")
+    names = [name for name, _ in named]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"--{option} names {', '.join(map(repr, twice))} more than once")
+    return dict(named)
+
+
+def _vector(option: str, given: Sequence[float | tuple[str, float]] | None, robot: Robot) -> NDArray[np.float64]:
+    """The numbers (n,) of an option; zeros if it was not given."""
+    values = values_of(option, given)
+    numbers = np.size(0.0 if values is None or isinstance(values, Mapping) else values)
+    if numbers not in (1, robot.dof):
         raise InputError(
             f"--{option} takes one number for all joints or {robot.dof}, for {', '.join(robot.joint_names)}; "
-            f"got {len(numbers)}"
+            f"got {numbers}"
         )
-    return numbers[0] if len(numbers) == 1 else list(numbers)
+    return joint_array(option, 0.0 if values is None else values, robot.joint_names, uniform=True)
 
 
 def motion_of(request: argparse.Namespace) -> tuple[Scene, ArrayLike, ArrayLike, NDArray[np.float64] | None]:
@@ -107,9 +221,7 @@ def motion_of(request: argparse.Namespace) -> tuple[Scene, ArrayLike, ArrayLike,
         stiffness=_vector("stiffness", request.stiffness, robot),
         rest=_vector("rest", request.rest, robot),
     )
-    q0, v0, torque = (
-        np.broadcast_to(_vector(name, getattr(request, name), robot), (robot.dof,)) for name in ("q0", "v0", "torque")
-    )
+    q0, v0, torque = (_vector(name, getattr(request, name), robot) for name in ("q0", "v0", "torque"))
     return scene, q0, v0, torque if torque.any() else None
 
 
@@ -131,8 +243,3 @@ def scene_file(request: argparse.Namespace, word: str, *given: str) -> SceneFile
         if hasattr(request, name) and getattr(request, name) is None:
             setattr(request, name, getattr(outputs, name))
     return scene
-
-
-def one_or_all(numbers: Sequence[float] | None) -> ArrayLike | None:
-    """One number by itself, several as they are."""
-    return numbers[0] if numbers is not None and len(numbers) == 1 else numbers

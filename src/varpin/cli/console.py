@@ -1,42 +1,27 @@
-"""What the command says: tables, progress, the log and complaints."""
+"""What the command says: progress, the log and complaints."""
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from types import TracebackType
+from typing import NoReturn
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
-from rich.table import Table
-from rich.text import Text
 
-# Width of tables in a pipe or a file, which have none of their own.
-WIDTH = 140
+from varpin.cli.exits import MISTAKE
 
 
-def table_of(title: str, columns: Sequence[str]) -> Table:
-    """A table with a title and columns."""
-    table = Table(title=Text(title), title_justify="left")
-    for column in columns:
-        table.add_column(Text(column), overflow="fold")
-    return table
+class Parser(argparse.ArgumentParser):
+    """A parser whose complaints are one line, which no list of options stands before."""
 
-
-def facts(title: str) -> Table:
-    """A table of two columns, names and values."""
-    table = Table(title=Text(title), title_justify="left", show_header=False)
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    return table
-
-
-def add_row(table: Table, *cells: str, style: str = "") -> None:
-    """Add a row of plain words to a table."""
-    # As Text: rich takes what stands in brackets for markup, and units stand in brackets.
-    table.add_row(*(Text(cell) for cell in cells), style=style)
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong, and where help is; exit with status 2."""
+        self.exit(MISTAKE, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
 
 def file_size(size: int) -> str:

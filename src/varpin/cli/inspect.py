@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import argparse
 import logging
-import math
 import sys
 
 from rich.console import Console
-from rich.table import Table
+from rich.text import Text
 
-from varpin.cli.arguments import add_gravity, add_robot, add_vector, names_scene, one_or_all, scene_file
-from varpin.cli.console import WIDTH, add_row, facts, say, table_of
-from varpin.inspection import JointReport, RobotReport, inspect_robot
+from varpin.cli.arguments import add_gravity, add_robot, add_vector, names_scene, scene_file, values_of
+from varpin.cli.console import say
+from varpin.inspection import inspect_robot
+from varpin.inspection_tables import parts_of
 from varpin.robot import build_robot, robot_names
+from varpin.tables import WIDTH, add_row, facts, table_of
 
 
 def add_inspect(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin inspect``."""
     parser.description = (
-        "Print a robot's joints, links and masses, how well its mass matrix is conditioned, the largest step the "
-        "midpoint integrator's branch guard accepts, and whatever looks wrong. Takes robots that simulate refuses."
+        "Print a robot's joints, links, masses and frames, how well its mass matrix is conditioned, the largest step "
+        "that the midpoint integrator's branch guard accepts, and whatever looks wrong. Takes robots that "
+        "simulate refuses."
     )
     # What loading warns of is among the report's own warnings.
     parser.set_defaults(run=_inspect, log_level=logging.ERROR)
@@ -57,76 +59,11 @@ def _inspect(request: argparse.Namespace, _errors: Console) -> int:
     if names_scene(request.robot):
         return _inspect_scene(request)
     arguments = {"package_dirs": request.package_dir, "lock": dict(request.lock), "gravity": request.gravity}
-    report = inspect_robot(request.robot, q=one_or_all(request.q), v=one_or_all(request.v), **arguments)
+    report = inspect_robot(request.robot, q=values_of("q", request.q), v=values_of("v", request.v), **arguments)
     console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
-    console.print(_joint_table(report))
-    console.print(_link_table(report))
-    console.print(_report_table(report))
-    for warning in report.warnings:
-        say(console, warning, prefix="warning", style="yellow")
-    if not report.warnings:
-        say(console, "nothing looks wrong", prefix="")
+    for part in parts_of(report):
+        console.print(part, soft_wrap=isinstance(part, Text))
     return 0
-
-
-def _joint_table(report: RobotReport) -> Table:
-    columns = "#", "joint", "kind", "axis", "position", "velocity", "effort"
-    table = table_of(f"{report.robot.name}: joints", columns)
-    number = iter(range(len(report.joints)))
-    for joint in report.joints:
-        slides = joint.unit == "m"
-        kind = joint.kind if joint.kind != "mimic" else f"mimic: {joint.follows}"
-        add_row(
-            table,
-            "" if joint.kind == "mimic" else str(next(number)),
-            joint.name,
-            kind,
-            _axis(joint),
-            "free" if joint.kind == "continuous" else f"{joint.lower:g} .. {joint.upper:g} {joint.unit}",
-            _bound(joint.velocity, "m/s" if slides else "rad/s"),
-            _bound(joint.effort, "N" if slides else "N m"),
-        )
-    for name, at in report.locked.items():
-        add_row(table, "", name, f"locked at {at}", "", "", "", "", style="dim")
-    return table
-
-
-def _axis(joint: JointReport) -> str:
-    for letter, component in zip("xyz", joint.axis, strict=True):
-        if abs(abs(component) - 1.0) < 1e-9:
-            return f"{'+' if component > 0.0 else '-'}{letter}"
-    return "(" + ", ".join(f"{component:.3g}" for component in joint.axis) + ")"
-
-
-def _bound(value: float, unit: str) -> str:
-    return "none" if math.isinf(value) else f"{value:g} {unit}"
-
-
-def _link_table(report: RobotReport) -> Table:
-    columns = "link", "moved by", "mass [kg]", "centre of mass [m]", "principal moments [kg m^2]"
-    table = table_of(f"{report.robot.name}: links", columns)
-    for link in report.links:
-        add_row(
-            table,
-            link.name,
-            link.joint or "the base",
-            f"{link.mass:.4g}",
-            "  ".join(f"{x:.3g}" for x in link.center),
-            "  ".join(f"{x:.3g}" for x in link.moments),
-            style="" if link.joint else "dim",
-        )
-    return table
-
-
-def _report_table(report: RobotReport) -> Table:
-    table = facts(f"{report.robot.name}: as a whole")
-    add_row(table, "degrees of freedom", str(report.robot.dof))
-    add_row(table, "mass of what moves", f"{report.total_mass:.5g} kg")
-    add_row(table, "at q [rad or m]", "  ".join(f"{x:g}" for x in report.q))
-    add_row(table, "condition of M(q)", f"{report.condition:.3g}; {report.scaled_condition:.3g} with a unit diagonal")
-    remark = f"(branch margin {report.branch_margin:g}; says nothing of accuracy)"
-    add_row(table, "largest step accepted", f"{report.step_in_words} {remark}")
-    return table
 
 
 def add_robots(parser: argparse.ArgumentParser) -> None:

@@ -12,6 +12,8 @@ from rich.console import Console
 
 from varpin.checks import positive, writable
 from varpin.cli.console import complain
+from varpin.cli.exits import INTERRUPTED, MISTAKE
+from varpin.cli.interrupts import Interrupts
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.replay import check_film, replay
 from varpin.robot import Robot
@@ -24,6 +26,12 @@ def add_outputs(parser: argparse.ArgumentParser, what: str) -> None:
     outputs = parser.add_argument_group("outputs")
     outputs.add_argument("--save", type=Path, metavar="NPZ", help=f"write the {what}, for {what.title()}.load")
     outputs.add_argument("--plot", type=Path, metavar="PNG", help="draw an overview, as png, pdf or svg")
+    add_shown(outputs)
+    outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
+
+
+def add_shown(outputs: argparse._ActionsContainer) -> None:
+    """Options for the files that show a motion."""
     outputs.add_argument("--html", type=Path, metavar="HTML", help="write a replay that any browser opens")
     outputs.add_argument(
         "--video", type=Path, metavar="MP4", help="film the replay, as mp4 or gif; needs varpin[video]"
@@ -35,7 +43,6 @@ def add_outputs(parser: argparse.ArgumentParser, what: str) -> None:
         metavar="X",
         help="of the replay; 0.1 is ten times slower; default: the scene file's, or true speed",
     )
-    outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
 
 
 @dataclass(frozen=True)
@@ -66,12 +73,24 @@ def outputs_of(request: argparse.Namespace, marks: Marks | None = None) -> list[
         outputs.append(_record(writable(request.save)))
     if request.plot is not None:
         outputs.append(_figure(writable(request.plot)))
+    return _apart([*outputs, *replays_of(request, marks)])
+
+
+def replays_of(request: argparse.Namespace, marks: Marks | None = None) -> list[Output]:
+    """The page and the film asked for; errors as for :func:`outputs_of`."""
+    outputs = []
     for path, film in ((request.html, False), (request.video, True)):
         if path is not None:
             if film:
                 check_film(path)
+            else:
+                _require_ending("--html", path, (".html", ".htm"))
             speed = positive("--speed", 1.0 if request.speed is None else request.speed, "1")
             outputs.append(_replay(writable(path), speed, request.trace, film, marks))
+    return _apart(outputs)
+
+
+def _apart(outputs: list[Output]) -> list[Output]:
     paths = [output.path.resolve() for output in outputs]
     for path in paths:
         if paths.count(path) > 1:
@@ -79,7 +98,14 @@ def outputs_of(request: argparse.Namespace, marks: Marks | None = None) -> list[
     return outputs
 
 
+def _require_ending(option: str, path: Path, endings: Sequence[str]) -> None:
+    if path.suffix.lower() not in endings:
+        raise InputError(f"{option} must end in {', '.join(endings)}, got {path.name!r}")
+
+
 def _record(path: Path) -> Output:
+    _require_ending("--save", path, (".npz",))
+
     def write(_robot: Robot, trajectory: Trajectory) -> None:
         trajectory.save(path)
 
@@ -87,8 +113,7 @@ def _record(path: Path) -> Output:
 
 
 def _figure(path: Path) -> Output:
-    if path.suffix.lower() not in FIGURES:
-        raise InputError(f"--plot must end in {', '.join(FIGURES)}, got {path.name!r}")
+    _require_ending("--plot", path, FIGURES)
     from varpin.plots import plot_trajectory  # noqa: PLC0415 - matplotlib is slow to import
 
     def write(robot: Robot, trajectory: Trajectory) -> None:
@@ -109,17 +134,28 @@ def _replay(path: Path, speed: float, frames: Sequence[str], film: bool, marks: 
     return Output(path, write)
 
 
-def write_all(errors: Console, files: Mapping[Path, Callable[[], object]]) -> list[Path]:
-    """Write files, complain of those that cannot be, and return the others."""
-    written = []
+def write_all(
+    errors: Console, files: Mapping[Path, Callable[[], object]], interrupts: Interrupts
+) -> tuple[list[Path], int]:
+    """Write files, and complain of those that cannot be; the others, and the exit status.
+
+    A Ctrl-C in the meantime lets the file at hand be finished, and leaves out the rest.
+    """
+    written: list[Path] = []
+    status = 0
     for path, write in files.items():
+        if interrupts.ended or (interrupts.wanted and (written or status)):
+            complain(errors, f"{path} was not written: interrupted")
+            continue
         try:
-            write()
+            with interrupts.written():
+                write()
         except (VarpinError, OSError) as error:
             complain(errors, f"{path} was not written: {error}")
+            status = MISTAKE
         else:
             written.append(path)
-    return written
+    return written, INTERRUPTED if interrupts.wanted else status
 
 
 def folder_at(path: Path) -> Path:

@@ -17,17 +17,25 @@ from rich.console import Console
 from rich.table import Table
 
 from varpin.checks import count, positive
-from varpin.cli.arguments import add_motion, add_robot, motion_of, names_scene, scene_file
-from varpin.cli.console import WIDTH, add_row, complain, facts, file_size, progress_bar, say
-from varpin.cli.exits import INTERRUPTED, MISTAKE, STEP_FAILED
+from varpin.cli.arguments import (
+    add_integrator,
+    add_motion,
+    add_robot,
+    integrator_asked_for,
+    motion_of,
+    names_scene,
+    scene_file,
+)
+from varpin.cli.console import complain, file_size, progress_bar, say
+from varpin.cli.exits import INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import Output, add_outputs, outputs_of, write_all
 from varpin.errors import InputError
-from varpin.integrators import Integrator, Midpoint
+from varpin.integrators import Integrator
 from varpin.lagrangian import lagrangian_jet
 from varpin.replay import frame_names
-from varpin.robot import Robot
 from varpin.scene import Scene
 from varpin.simulation import Interrupted, StepFailure, simulate
+from varpin.tables import WIDTH, add_row, facts
 from varpin.tradeoff.setting import Setting
 from varpin.trajectory import Trajectory
 
@@ -35,7 +43,7 @@ from varpin.trajectory import Trajectory
 MOST_STEPS = 10**9
 # Options that a scene file leaves no room for.
 _OF_MOTIONS = (
-    *("lock", "package_dir", "dt", "duration", "steps", "alpha"),
+    *("lock", "package_dir", "dt", "duration", "steps", "integrator", "alpha", "stages"),
     *("q0", "v0", "gravity", "damping", "stiffness", "rest", "torque"),
 )
 
@@ -43,9 +51,9 @@ _OF_MOTIONS = (
 def add_simulate(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin simulate``."""
     parser.description = (
-        "Integrate a robot in time with the midpoint variational integrator; or a scene file, which says all of it "
-        "itself. Of numbers that belong to joints, one alone is taken for all of them. Ctrl-C and a failed step keep "
-        "what was computed before."
+        "Integrate a robot in time with a variational integrator; or a scene file, which says all of it itself. Of "
+        "numbers that belong to joints, one alone is taken for all of them, and JOINT=VALUE for those that it names. "
+        "Ctrl-C and a failed step keep what was computed before."
     )
     parser.set_defaults(run=_simulate, log_level=logging.WARNING)
     add_robot(parser, scenes=True)
@@ -55,12 +63,7 @@ def add_simulate(parser: argparse.ArgumentParser) -> None:
         "--duration", type=float, metavar="S", help="time to simulate [s], rounded to whole steps; default: 2"
     )
     length.add_argument("--steps", type=int, metavar="N", help="the number of steps instead")
-    parser.add_argument(
-        "--alpha",
-        type=float,
-        default=0.5,
-        help="of the midpoint rule, in [0, 1]; second order at 0.5, first elsewhere; default: %(default)g",
-    )
+    add_integrator(parser)
     add_motion(parser)
     add_outputs(parser, "trajectory")
 
@@ -69,13 +72,13 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
     if names_scene(request.robot):
         file = scene_file(request, request.robot, "simulate", *_OF_MOTIONS)
         driven = bool(file.scene.damping.any() or file.controls() is not None or file.spec.seed is not None)
-        _warm_up(file.scene, file.q0, file.v0, None, file.spec.integrator)
         outputs = outputs_of(request, file.marks)
+        _warm_up(file.scene, file.q0, file.v0, None, file.spec.integrator)
         return _run(request, errors, file.scene, driven, file.spec.steps, lambda p: file.simulate(progress=p), outputs)
     outputs = outputs_of(request)
     steps = _steps(request)
+    integrator = integrator_asked_for(request)
     scene, q0, v0, torque = motion_of(request)
-    integrator = Midpoint(alpha=request.alpha)
     _warm_up(scene, q0, v0, torque, integrator)
 
     def run(progress: Callable[[int, int], None]) -> Trajectory:
@@ -106,25 +109,25 @@ def _run(
     robot = scene.robot
     frame_names("--trace", [robot], request.trace)
     status, complaint, begin = 0, "", time.perf_counter()
-    try:
-        with progress_bar(errors, steps, quiet=request.quiet) as progress:
-            trajectory = run(progress)
-    except Interrupted as interruption:
-        trajectory, status = interruption.trajectory, INTERRUPTED
-        complaint = f"interrupted after {trajectory.steps} of {steps} steps, which are kept"
-    except StepFailure as failure:
-        trajectory, status = failure.trajectory, STEP_FAILED
-        complaint = str(failure).replace("is in error.trajectory", "is kept")
-    wall_time = time.perf_counter() - begin
-
-    written = write_all(errors, {output.path: partial(output.write, robot, trajectory) for output in outputs})
-    if len(written) < len(outputs):
-        status = status or MISTAKE
+    with request.interrupts.keeping():
+        try:
+            with progress_bar(errors, steps, quiet=request.quiet) as progress:
+                trajectory = run(progress)
+        except Interrupted as interruption:
+            trajectory, status = interruption.trajectory, INTERRUPTED
+            complaint = f"interrupted after {trajectory.steps} of {steps} steps, which are kept"
+        except StepFailure as failure:
+            trajectory, status = failure.trajectory, STEP_FAILED
+            complaint = str(failure).replace("is in error.trajectory", "is kept")
+        wall_time = time.perf_counter() - begin
+        writers = {output.path: partial(output.write, robot, trajectory) for output in outputs}
+        written, trouble = write_all(errors, writers, request.interrupts)
+    status = status or trouble
     if not request.quiet:
         tables = Console() if sys.stdout.isatty() else Console(width=WIDTH)
-        tables.print(_summary(robot, trajectory, steps, wall_time, driven, written))
+        tables.print(_summary(trajectory, steps, wall_time, driven, written))
     if status == INTERRUPTED:
-        say(errors, complaint)
+        say(errors, complaint or "interrupted")
     elif complaint:
         complain(errors, complaint)
     return status
@@ -144,9 +147,7 @@ def _steps(request: argparse.Namespace) -> int:
     return steps
 
 
-def _summary(
-    robot: Robot, trajectory: Trajectory, asked: int, wall_time: float, driven: bool, files: Iterable[Path]
-) -> Table:
+def _summary(trajectory: Trajectory, asked: int, wall_time: float, driven: bool, files: Iterable[Path]) -> Table:
     """What a run was, took and made."""
     table = facts(f"{trajectory.robot}: {trajectory.integrator}")
     statistics, steps = trajectory.statistics, trajectory.steps
@@ -177,11 +178,6 @@ def _summary(
         share = f"{part:.2g} of" if part < 1.0 else f"{part:.3g} times"
         of_kinetic = f", {share} the largest kinetic energy" if part > 0.0 else ""
         add_row(table, "energy error", f"{drift:.3g} J at most{of_kinetic}")
-    lower, upper = robot.position_limits
-    outside = np.any((trajectory.q < lower) | (trajectory.q > upper), axis=0)
-    if outside.any():
-        joints = ", ".join(name for name, out in zip(robot.joint_names, outside, strict=True) if out)
-        add_row(table, "beyond their limits", f"{joints} (limits are not modelled)")
     names = "q at the end [rad or m]", "v at the end [rad/s or m/s]"
     for name, values in zip(names, (trajectory.q[-1], trajectory.v[-1]), strict=True):
         add_row(table, name, "  ".join(f"{value:.6g}" for value in values))

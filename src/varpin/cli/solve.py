@@ -16,11 +16,12 @@ from rich.table import Table
 
 from varpin.checks import writable
 from varpin.cli.arguments import scene_file
-from varpin.cli.console import WIDTH, add_row, facts, file_size, say
-from varpin.cli.exits import INTERRUPTED, MISTAKE, STEP_FAILED
+from varpin.cli.console import file_size, say
+from varpin.cli.exits import INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import add_outputs, outputs_of, write_all
 from varpin.scenefile import SceneFile
 from varpin.sddp import Solution, Status
+from varpin.tables import WIDTH, add_row, facts
 
 
 def add_solve(parser: argparse.ArgumentParser) -> None:
@@ -41,22 +42,22 @@ def _solve(request: argparse.Namespace, errors: Console) -> int:
     outputs = outputs_of(request, file.marks)
     options = {} if request.max_iterations is None else {"max_iterations": request.max_iterations}
     resume = None if request.resume is None else file.load_solution(request.resume)
-    begin = time.perf_counter()
-    solution = file.solve(resume=resume, **options)
-    wall_time = time.perf_counter() - begin
-    status = 0 if solution.status.converged else STEP_FAILED
-    if solution.status is Status.INTERRUPTED:
-        status = INTERRUPTED
-    saved = None if request.save is None else writable(request.save)
-    writers: dict[Path, Callable[[], object]] = {
-        output.path: partial(solution.save, output.path)
-        if output.path == saved
-        else partial(output.write, file.robot, solution.trajectory)
-        for output in outputs
-    }
-    written = write_all(errors, writers)
-    if len(written) < len(outputs):
-        status = status or MISTAKE
+    with request.interrupts.keeping():
+        begin = time.perf_counter()
+        solution = file.solve(resume=resume, **options)
+        wall_time = time.perf_counter() - begin
+        status = 0 if solution.status.converged else STEP_FAILED
+        if solution.status is Status.INTERRUPTED:
+            status = INTERRUPTED
+        saved = None if request.save is None else writable(request.save)
+        writers: dict[Path, Callable[[], object]] = {
+            output.path: partial(solution.save, output.path)
+            if output.path == saved
+            else partial(output.write, file.robot, solution.trajectory)
+            for output in outputs
+        }
+        written, trouble = write_all(errors, writers, request.interrupts)
+    status = status or trouble
     if not request.quiet:
         console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
         for line in solution.table().splitlines()[:-1]:

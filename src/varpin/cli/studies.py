@@ -17,10 +17,11 @@ from varpin.tradeoff import advise, work_precision
 if TYPE_CHECKING:
     from varpin.extremes import Cell
 
-from varpin.cli.arguments import add_motion, add_robot, motion_of
-from varpin.cli.console import WIDTH, add_row, progress_bar, say, table_of
+from varpin.cli.arguments import add_motion, add_robot, motion_of, simulate_words
+from varpin.cli.console import progress_bar, say
 from varpin.cli.exits import FAULTY, INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import folder_at
+from varpin.tables import WIDTH, add_row, table_of
 
 
 def add_tradeoff(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +54,7 @@ def _tradeoff(request: argparse.Namespace, errors: Console) -> int:
 
     folder = None if request.out is None else folder_at(request.out)
     scene, q0, v0, torque = motion_of(request)
-    with progress_bar(errors, 1, quiet=request.quiet, unit="runs") as progress:
+    with request.interrupts.keeping(), progress_bar(errors, 1, quiet=request.quiet, unit="runs") as progress:
         record = work_precision(
             scene,
             q0,
@@ -115,6 +116,7 @@ def _advise(request: argparse.Namespace, _errors: Console) -> int:
     console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
     for line in advice.reason.splitlines():
         say(console, line, prefix="")
+    say(console, simulate_words(request, advice.integrator, advice.dt, advice.steps), prefix="run it")
     table = table_of("The best of each method", ADVICE_COLUMNS)
     for choice in (advice.best, *advice.alternatives):
         add_row(table, *advice_cells(choice))
@@ -181,7 +183,7 @@ def _extremes(request: argparse.Namespace, errors: Console) -> int:
     if request.robot is not None:
         robot = load_robot(request.robot, package_dirs=request.package_dir, lock=dict(request.lock))
     folder = None if request.out is None else folder_at(request.out)
-    with progress_bar(errors, 1, quiet=request.quiet, unit="cells") as progress:
+    with request.interrupts.keeping(), progress_bar(errors, 1, quiet=request.quiet, unit="cells") as progress:
         record = run(
             robot,
             deep=request.deep,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import broadcast_array, checked_limits
+from varpin.checks import JointValues, checked_limits, joint_array
 from varpin.costs.base import Cost, Points, Scaled, Terminal
 from varpin.costs.residual import Residual, TaskCost
 from varpin.errors import InputError
@@ -41,16 +42,16 @@ class _Barrier(TaskCost):
     def __init__(
         self,
         robot: Robot,
-        weight: ArrayLike = 1.0,
-        margin: ArrayLike = 0.0,
+        weight: JointValues = 1.0,
+        margin: JointValues = 0.0,
         limits: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
         """Describe the cost.
 
         Args:
             robot: The robot.
-            weight: One number, (n,), or a matrix (n, n), positive semidefinite.
-            margin: One number or (n,) >= 0, as limits; of it, at most half the way from limit to limit.
+            weight: One number, (n,), by joint name, or a matrix (n, n), positive semidefinite.
+            margin: One number, (n,) or by joint name, >= 0, as limits; of it, at most half the way from limit to limit.
             limits: (lower, upper), each one number or (n,), infinite where there is none; the robot's if left out
                 [rad or m; of velocities rad/s or m/s].
 
@@ -58,12 +59,14 @@ class _Barrier(TaskCost):
             InputError: There is no limit, or an argument has a wrong shape or value.
         """
         self.size = robot.dof if isinstance(robot, Robot) else 0
-        super().__init__(robot, weight)
         name = type(self).__name__
+        if isinstance(weight, Mapping) and isinstance(robot, Robot):
+            weight = joint_array(f"{name} weight", weight, robot.joint_names)
+        super().__init__(robot, weight)
         self.limits = checked_limits(f"{name} limits", self._own(robot) if limits is None else limits, self.size)
         if not np.isfinite(self.limits).any():
             raise InputError(f"{name}: robot {robot.name!r} has no such limits; give limits=(lower, upper)")
-        self.margin = broadcast_array(f"{name} margin", margin, self.size)
+        self.margin = joint_array(f"{name} margin", margin, robot.joint_names, uniform=True)
         if (self.margin < 0.0).any():
             raise InputError(f"{name} margin must be >= 0, got {self.margin.min():g}")
         self.margin = np.minimum(self.margin, 0.5 * (self.limits[1] - self.limits[0]))

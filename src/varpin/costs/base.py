@@ -47,6 +47,7 @@ class Points:
         dof: n.
         controls: m.
         t0: When the horizon begins [s].
+        joints: Names of the coordinates, if costs are to find theirs by name.
     """
 
     t: Floats
@@ -55,6 +56,7 @@ class Points:
     dof: int
     controls: int
     t0: float = 0.0
+    joints: tuple[str, ...] = ()
 
     @property
     def elapsed(self) -> Floats:
@@ -272,7 +274,7 @@ class Terminal(Cost):
         return self.cost.bind(points)
 
 
-def checked_weight(name: str, weight: ArrayLike) -> Floats:
+def checked_weight(name: str, weight: object) -> Floats:
     """A weight as given: one number, a vector or a symmetric matrix.
 
     Raises:

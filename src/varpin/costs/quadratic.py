@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats
+from varpin.checks import JointValues, as_floats, joint_array
 from varpin.costs.base import BoundCost, Cost, Expansion, Points, Reference, checked_weight, sample, weight_matrix
 
 Floats = NDArray[np.float64]
@@ -16,16 +18,22 @@ Floats = NDArray[np.float64]
 class _Quadratic(Cost):
     """weight . (y - y_r)^2 for one block y of z."""
 
-    weight: Floats
-    reference: Reference
+    weight: Floats | Mapping[str, float]
+    reference: Reference | Mapping[str, float]
     block: str
 
-    def __init__(self, reference: Reference, weight: ArrayLike) -> None:
-        self.weight = checked_weight(type(self).__name__, weight)
-        self.reference = reference if callable(reference) else as_floats(f"{type(self).__name__} reference", reference)
+    def __init__(self, reference: Reference | Mapping[str, float], weight: JointValues) -> None:
+        self.weight = weight if self._by_name(weight) else checked_weight(type(self).__name__, weight)
+        given = callable(reference) or self._by_name(reference)
+        self.reference = reference if given else as_floats(f"{type(self).__name__} reference", reference)
+
+    def _by_name(self, values: object) -> TypeGuard[Mapping[str, float]]:
+        """Whether values are by the names of joints, which controls do not have."""
+        return isinstance(values, Mapping) and self.block != "u"
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}(weight={self.weight.tolist()})"
+        weight = dict(self.weight) if isinstance(self.weight, Mapping) else self.weight.tolist()
+        return f"{type(self).__name__}(weight={weight})"
 
     @property
     def nonnegative(self) -> bool:
@@ -36,11 +44,15 @@ class _Quadratic(Cost):
         """See :meth:`Cost.bind`."""
         size = points.controls if self.block == "u" else points.dof
         begin = {"q": 0, "v": points.dof, "u": 2 * points.dof}[self.block]
-        name = type(self).__name__
-        W = weight_matrix(name, self.weight, size)
+        name, weight, values = type(self).__name__, self.weight, self.reference
+        if isinstance(weight, Mapping):
+            weight = checked_weight(name, joint_array(f"{name} weight", weight, points.joints))
+        if isinstance(values, Mapping):
+            values = joint_array(f"{name} reference", values, points.joints)
+        W = weight_matrix(name, weight, size)
         hessian = np.zeros((1, points.size, points.size))
         hessian[0, begin : begin + size, begin : begin + size] = 2.0 * W
-        reference = sample(name, self.reference, points, size, held=self.block == "u")
+        reference = sample(name, values, points, size, held=self.block == "u")
         return _BoundQuadratic(self.block, begin, reference, W, hessian)
 
 
@@ -69,13 +81,15 @@ class TrackingCost(_Quadratic):
 
     block = "q"
 
-    def __init__(self, reference: Reference, weight: ArrayLike = 1.0) -> None:
+    def __init__(self, reference: Reference | Mapping[str, float], weight: JointValues = 1.0) -> None:
         """Describe the cost.
 
         Args:
-            reference: q_r: a function of the time [s] that returns (n,), a constant (n,), or an array (N + 1, n) of
-                its values at the problem's nodes, between which it is linear [rad or m].
-            weight: One number, (n,), or a matrix (n, n), positive semidefinite.
+            reference: q_r: a function of the time [s] that returns (n,), a constant (n,), by joint name too, with 0 for
+                joints that are not named, or an array (N + 1, n) of its values at the problem's nodes, between which it
+                is linear [rad or m].
+            weight: One number, (n,), by joint name, with 0 for joints that are not named, or a matrix (n, n), positive
+                semidefinite.
 
         Raises:
             InputError: A weight that is not finite, indefinite, or neither number, vector nor square matrix.
@@ -88,7 +102,7 @@ class VelocityCost(_Quadratic):
 
     block = "v"
 
-    def __init__(self, weight: ArrayLike = 1.0, reference: Reference = 0.0) -> None:
+    def __init__(self, weight: JointValues = 1.0, reference: Reference | Mapping[str, float] = 0.0) -> None:
         """Describe the cost; see :class:`TrackingCost`."""
         super().__init__(reference, weight)
 

@@ -12,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from varpin.checks import as_floats, broadcast_array, require_finite
+from varpin.checks import JointValues, as_floats, joint_array, require_finite
 from varpin.errors import InputError
 from varpin.mpc import MpcRun
 from varpin.replay.script import Outlook, Target, Trace
@@ -212,7 +212,7 @@ def target(name: str, track: tuple[Floats, Floats, Floats | None], times: Floats
 
 
 def torque_shares(
-    robot: Robot, motion: Trajectory | ArrayLike, torques: bool | ArrayLike, limit: ArrayLike | None
+    robot: Robot, motion: Trajectory | ArrayLike, torques: bool | ArrayLike, limit: JointValues | None
 ) -> Floats | None:
     """How much of its limit each joint's torque takes in each step (N, n), in [0, 1]; None if it is not to be shown.
 
@@ -248,7 +248,10 @@ def torque_shares(
     own = robot.effort_limit
     bound = np.where(np.isfinite(own) & (own > 0.0), own, largest)
     if limit is not None:
-        bound = broadcast_array("torque_limit", limit, robot.dof)
+        given = joint_array("torque_limit", limit, robot.joint_names, uniform=True)
+        # Of joints that are not named the limit stays their own.
+        named = [not isinstance(limit, Mapping) or name in limit for name in robot.joint_names]
+        bound = np.where(named, given, bound)
         if not (bound > 0.0).all():
             raise InputError(f"torque_limit must be positive [N m or N], got {limit}")
     return np.minimum(size / np.where(bound > 0.0, bound, 1.0), 1.0)

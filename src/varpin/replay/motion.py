@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, count, finite_array, positive, require_finite, writable
+from varpin.checks import JointValues, as_floats, count, finite_array, positive, require_finite, writable
 from varpin.errors import InputError
 from varpin.mpc import MpcRun
 from varpin.replay.annotations import (
@@ -56,7 +56,7 @@ def replay(
     targets: Mapping[str, object] | None = None,
     frames: bool | str | Sequence[str] = False,
     torques: bool | ArrayLike | Sequence[bool | ArrayLike] = False,
-    torque_limit: ArrayLike | None = None,
+    torque_limit: JointValues | None = None,
     offset: ArrayLike | None = None,
     speed: float = 1.0,
     loop: bool = True,
@@ -94,8 +94,8 @@ def replay(
         torques: Colour each link by the torque of the joint that moves it, grey for none, red at its limit: ``True``
             for the controls of the trajectory, one a joint; or the torques (N, n) themselves [N m or N], of N steps
             spread evenly over the motion's time. Of several robots, that for all of them, or a list with one for each.
-        torque_limit: One number or (n,) [N m or N]; the robot's effort limits if left out. A joint without one is red
-            at its own largest torque.
+        torque_limit: One number, (n,) or by joint name [N m or N]; the robot's effort limits if left out. A joint
+            without one is red at its own largest torque.
         offset: From each of several robots to the next (3,) [m]; far enough to see them all if left out.
         speed: Playback speed; 1 is true speed, 0.1 ten times slower.
         loop: Start again at the end; otherwise stop there.
@@ -218,7 +218,7 @@ def _ahead(ahead: float | None, run: MpcRun | None) -> float:
 
 
 def _shares(
-    pairs: Sequence[tuple[Robot, Trajectory | ArrayLike]], torques: Sequence[Any], limit: ArrayLike | None
+    pairs: Sequence[tuple[Robot, Trajectory | ArrayLike]], torques: Sequence[Any], limit: JointValues | None
 ) -> list[Floats | None]:
     """:func:`torque_shares` of each robot; the limit is of those that are coloured."""
     hidden = [isinstance(own, bool | np.bool_) and not own for own in torques]

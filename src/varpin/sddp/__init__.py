@@ -9,4 +9,5 @@ from varpin.sddp.problem import OptimalControlProblem as OptimalControlProblem
 from varpin.sddp.search import solve as solve
 from varpin.sddp.solution import Solution as Solution
 from varpin.sddp.solution import Violations as Violations
+from varpin.sddp.solution_file import solution_trajectory as solution_trajectory
 from varpin.sddp.verification import Verification as Verification

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import checked_limits, count, finite_array, is_one_of, positive, real
+from varpin.checks import JointValues, checked_limits, count, is_one_of, joint_array, positive, real
 from varpin.costs import (
     BoundSum,
     ControlRate,
@@ -60,8 +60,8 @@ class OptimalControlProblem:
     Attributes:
         scene: The scene, its noise included.
         cost: Running and terminal costs.
-        q0: Initial configuration (n,) [rad or m].
-        v0: Initial velocity (n,) [rad/s or m/s].
+        q0: Initial configuration (n,) [rad or m]; it may be given by joint name.
+        v0: Initial velocity (n,) [rad/s or m/s]; the same.
         dt: Time step [s].
         steps: N.
         integrator: Any of varpin's; ``Midpoint()`` if left out.
@@ -95,8 +95,8 @@ class OptimalControlProblem:
         self,
         scene: Scene,
         cost: Cost,
-        q0: ArrayLike,
-        v0: ArrayLike,
+        q0: JointValues,
+        v0: JointValues,
         *,
         dt: float,
         steps: int,
@@ -130,12 +130,13 @@ class OptimalControlProblem:
         places, rule = _rule(sampling, dt)
         times = ((np.arange(steps, dtype=np.float64)[:, None] + places) * dt).reshape(-1)
         t0 = real("t0", t0)
-        running, terminal = bind_cost(cost, t0 + times, Points(t0 + times, dt * steps, steps, n, m, t0))
+        points = Points(t0 + times, dt * steps, steps, n, m, t0, scene.robot.joint_names)
+        running, terminal = bind_cost(cost, t0 + times, points)
         values = {
             "scene": scene,
             "cost": cost,
-            "q0": finite_array("q0", q0, (n,)),
-            "v0": finite_array("v0", v0, (n,)),
+            "q0": joint_array("q0", q0, scene.robot.joint_names),
+            "v0": joint_array("v0", v0, scene.robot.joint_names),
             "dt": dt,
             "steps": steps,
             "integrator": Midpoint() if integrator is None else integrator,
@@ -187,8 +188,8 @@ class OptimalControlProblem:
     def at(
         self,
         *,
-        q0: ArrayLike | None = None,
-        v0: ArrayLike | None = None,
+        q0: JointValues | None = None,
+        v0: JointValues | None = None,
         dt: float | None = None,
         steps: int | None = None,
         integrator: Integrator | None = None,

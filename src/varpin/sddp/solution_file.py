@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from varpin.checks import path_like
 from varpin.errors import FileError
+from varpin.robot import Robot
 from varpin.sddp.history import Iteration, SearchState, Status
 from varpin.sddp.problem import OptimalControlProblem
-from varpin.trajectory import MEMBERS, Trajectory, atomic_file, read_members
+from varpin.trajectory import MEMBERS, Trajectory, atomic_file, read_members, require_layout
 
 Floats = NDArray[np.float64]
 
@@ -69,6 +70,17 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     reader = _Reader(source, members, problem)
     reader.check_problem()
     return reader.fields()
+
+
+def solution_trajectory(path: str | os.PathLike[str], robot: Robot | None = None) -> Trajectory:
+    """The motion alone of a solution in a file, for which its problem is not needed.
+
+    Raises:
+        FileError: As :meth:`Trajectory.load`.
+    """
+    source = path_like("path", path)
+    members = read_members(source, _FORMAT, MEMBERS, check=lambda headers: require_layout(source, headers))
+    return Trajectory.of_members(source, members, robot)
 
 
 def _most_bytes(problem: OptimalControlProblem) -> int:

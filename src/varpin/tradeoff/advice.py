@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import positive
+from varpin.checks import JointValues, positive
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Reference, largest_step
 from varpin.lagrangian import lagrangian_jet
@@ -327,8 +327,8 @@ class _Method:
 
 def advise(
     scene: Scene,
-    q0: ArrayLike,
-    v0: ArrayLike,
+    q0: JointValues,
+    v0: JointValues,
     *,
     duration: float,
     controls: ArrayLike | None = None,
@@ -345,8 +345,8 @@ def advise(
 
     Main args:
         scene: Without noise.
-        q0: Initial configuration (n,) [rad or m].
-        v0: Initial velocity (n,) [rad/s or m/s].
+        q0: Initial configuration, (n,) or by joint name [rad or m].
+        v0: Initial velocity, (n,) or by joint name [rad/s or m/s].
         duration: The horizon [s].
         tolerance: Accuracy to meet [rad or m].
         budget: Wall time to keep to [s], instead.

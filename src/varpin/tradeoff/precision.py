@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import count, positive, writable
+from varpin.checks import JointValues, count, positive, writable
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.integrators import Integrator, Reference
 from varpin.scene import Scene
@@ -167,8 +167,8 @@ class WorkPrecision(Record):
 
 def work_precision(
     scene: Scene,
-    q0: ArrayLike,
-    v0: ArrayLike,
+    q0: JointValues,
+    v0: JointValues,
     *,
     duration: float,
     controls: ArrayLike | None = None,
@@ -186,8 +186,8 @@ def work_precision(
 
     Main args:
         scene: Without noise.
-        q0: Initial configuration (n,) [rad or m].
-        v0: Initial velocity (n,) [rad/s or m/s].
+        q0: Initial configuration, (n,) or by joint name [rad or m].
+        v0: Initial velocity, (n,) or by joint name [rad/s or m/s].
         duration: Of the motion [s].
         controls: None for none, one row (m,), or rows (R, m) that are held over duration / R each.
         integrators: varpin's own fixed-step ones if left out.

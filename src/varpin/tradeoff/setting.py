@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, finite_array, positive, require_finite
+from varpin.checks import JointValues, as_floats, joint_array, positive, require_finite
 from varpin.errors import InputError
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
 from varpin.integrators.base import Segment, open_loop
@@ -87,13 +87,13 @@ class Setting:
     duration: float
 
     @classmethod
-    def of(cls, scene: Scene, q0: ArrayLike, v0: ArrayLike, controls: ArrayLike | None, duration: float) -> Setting:
+    def of(cls, scene: Scene, q0: JointValues, v0: JointValues, controls: ArrayLike | None, duration: float) -> Setting:
         """Checked.
 
         Raises:
             InputError: Wrong shapes or values, a scene with noise, controls that are a function.
         """
-        n, m = require_scene(scene).robot.dof, scene.controls
+        joints, m = require_scene(scene).robot.joint_names, scene.controls
         if scene.processes:
             raise InputError("errors of single motions are compared here: leave the noise out of the scene")
         if controls is None:
@@ -106,8 +106,8 @@ class Setting:
                 raise InputError(f"controls must have shape (R, {m}) or ({m},), got {np.shape(controls)}")
         return cls(
             scene,
-            finite_array("q0", q0, (n,)),
-            finite_array("v0", v0, (n,)),
+            joint_array("q0", q0, joints),
+            joint_array("v0", v0, joints),
             rows,
             positive("duration", duration, "s"),
         )

@@ -1,0 +1,129 @@
+"""``varpin replay``: show a motion that was saved."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+import time
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from varpin.archive import read_npz
+from varpin.checks import path_like, positive
+from varpin.cli.arguments import add_robot_options, names_scene
+from varpin.cli.console import say
+from varpin.cli.outputs import Output, add_shown, replays_of, write_all
+from varpin.errors import FileError, InputError, RobotNotFound
+from varpin.replay import frame_names, replay
+from varpin.robot import Robot, load_robot
+from varpin.scenefile import SceneFile, load_scene
+from varpin.sddp import solution_trajectory
+from varpin.tables import WIDTH
+from varpin.trajectory import Trajectory
+
+
+def add_replay(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``varpin replay``."""
+    parser.description = (
+        "Show a motion that simulate or solve has saved: in a window of the web browser, until Ctrl-C; or as a page "
+        "or a film."
+    )
+    parser.set_defaults(run=_replay, log_level=logging.WARNING)
+    parser.add_argument("motion", type=Path, metavar="NPZ", help="a trajectory or a solution, as --save writes it")
+    parser.add_argument(
+        "--robot",
+        metavar="ROBOT",
+        help="path of a URDF file, or name of a robot; or a scene file (TOML), or name of a scene, whose task is shown "
+        "too; default: the robot by whose name the motion goes",
+    )
+    add_robot_options(parser)
+    outputs = parser.add_argument_group("outputs")
+    outputs.add_argument("--open", action="store_true", help="open a window; what is done if no file is asked for")
+    add_shown(outputs)
+    outputs.add_argument("--ghost", type=Path, metavar="NPZ", help="a second motion of the robot, drawn translucent")
+    outputs.add_argument("--frames", nargs="+", default=[], metavar="FRAME", help="draw frames as triads")
+    outputs.add_argument("--torques", action="store_true", help="colour links by the torques of their joints")
+    outputs.add_argument("--once", action="store_true", help="stop at the end, instead of starting again")
+
+
+def _replay(request: argparse.Namespace, errors: Console) -> int:
+    asked = request.html is not None or request.video is not None
+    if asked and request.open:
+        raise InputError("--open shows a window, and --html and --video write files: ask for one or the other")
+    first = _motion(request.motion)
+    robot, scene = _robot(request, first)
+    motion = _motion(request.motion, robot)
+    options: dict[str, Any] = {} if scene is None else dict(scene.marks(motion.duration))
+    if request.ghost is not None:
+        options["ghost"] = _motion(request.ghost, robot)
+    if request.trace:
+        options["trace"] = request.trace
+    options |= {"frames": request.frames, "torques": request.torques, "loop": not request.once}
+    for name in ("trace", "frames"):
+        frame_names(f"--{name}", [robot], options.get(name, ()))
+    if not asked:
+        return _window(request, errors, robot, motion, options)
+
+    def marks(_duration: float) -> Mapping[str, Any]:
+        return options
+
+    outputs: list[Output] = replays_of(request, marks)
+    writers = {output.path: partial(output.write, robot, motion) for output in outputs}
+    with request.interrupts.keeping():
+        written, status = write_all(errors, writers, request.interrupts)
+    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
+    for path in written:
+        say(console, str(path), prefix="written")
+    return status
+
+
+def _window(
+    request: argparse.Namespace, errors: Console, robot: Robot, motion: Trajectory, options: Mapping[str, Any]
+) -> int:
+    """Show the motion in a live window, until Ctrl-C."""
+    speed = positive("--speed", 1.0 if request.speed is None else request.speed, "1")
+    viewer = replay(robot, motion, open=True, speed=speed, **options)
+    say(errors, f"{motion!r} at {viewer.url()}; Ctrl-C ends it")  # type: ignore[union-attr]
+    try:
+        while True:
+            time.sleep(3600.0)
+    except KeyboardInterrupt:
+        return 0
+
+
+def _motion(path: Path, robot: Robot | None = None) -> Trajectory:
+    """The trajectory in a file of a trajectory or of a solution."""
+    source = path_like("NPZ", path)
+    kind = str(read_npz(source, {"format"}, "varpin trajectory or solution", wanted={"format"})["format"])
+    return solution_trajectory(source, robot) if kind.startswith("varpin.solution/") else Trajectory.load(source, robot)
+
+
+def _robot(request: argparse.Namespace, motion: Trajectory) -> tuple[Robot, SceneFile | None]:
+    """The robot that the motion is of, and the scene, if the robot is that of one."""
+    if request.robot is not None and names_scene(request.robot):
+        if request.lock or request.package_dir:
+            raise InputError("--lock and --package-dir have no place beside a scene file, which has its own")
+        scene = load_scene(request.robot)
+        return scene.robot, scene
+    name = request.robot or motion.robot
+    try:
+        robot = load_robot(name, package_dirs=request.package_dir, lock=dict(request.lock))
+    except RobotNotFound as error:
+        if request.robot is not None:
+            raise
+        raise InputError(
+            f"{request.motion} is of robot {motion.robot!r}, which is no name that varpin knows: give its URDF file, "
+            "or its scene file, as --robot"
+        ) from error
+    missing = [joint for joint in robot.joint_names if joint not in motion.joint_names]
+    if missing and set(motion.joint_names) < set(robot.joint_names):
+        raise FileError(
+            f"{request.motion} holds no motion of {', '.join(missing)}: lock them as they were, "
+            f"--lock {' '.join(f'{joint}=VALUE' for joint in missing)}, or give the scene file as --robot"
+        )
+    return robot, None

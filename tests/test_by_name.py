@@ -1,0 +1,178 @@
+"""Joint values by name, holding torques and gravity: what a scene and those who take a state accept."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import varpin as vp
+from varpin.replay.annotations import torque_shares
+
+UR5 = vp.load_robot("ur5")
+NAMES = UR5.joint_names
+POSE = {"elbow_joint": 1.1, "shoulder_lift_joint": -0.7}
+ROW = np.array([0.0, -0.7, 1.1, 0.0, 0.0, 0.0])
+
+
+def same(a: vp.Trajectory, b: vp.Trajectory) -> bool:
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("q", "v", "p", "energy"))
+
+
+def test_a_scene_takes_values_by_joint_name():
+    named = vp.Scene(UR5, damping={"elbow_joint": 1}, stiffness={"wrist_1_joint": 20.0}, rest={"wrist_1_joint": 0.4})
+    assert named.damping.tolist() == [0, 0, 1, 0, 0, 0]
+    assert named.stiffness.tolist() == [0, 0, 0, 20, 0, 0]
+    assert named.rest.tolist() == [0, 0, 0, 0.4, 0, 0]
+    assert not vp.Scene(UR5, damping={}).damping.any()
+
+
+def test_motions_start_where_names_say():
+    scene = vp.Scene(UR5, damping=0.1)
+    options = {"dt": 2e-3, "steps": 20}
+    rows = vp.simulate(scene, ROW, 0.1 * ROW, **options)
+    spin = {name: 0.1 * value for name, value in POSE.items()}
+    assert same(vp.simulate(scene, POSE, spin, **options), rows)
+    ensemble = vp.simulate_ensemble(scene, POSE, spin, paths=2, rng=0, workers=1, **options)
+    np.testing.assert_allclose(ensemble.q[1], rows.q, atol=1e-12)
+
+
+def test_problems_jets_and_reports_take_names_too():
+    scene = vp.Scene(UR5)
+    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0), POSE, {"wrist_3_joint": 2.0}, dt=0.01, steps=5)
+    assert problem.q0.tolist() == ROW.tolist()
+    assert problem.v0.tolist() == [0, 0, 0, 0, 0, 2]
+    assert problem.at(q0={"elbow_joint": 0.5}).q0.tolist() == [0, 0, 0.5, 0, 0, 0]
+    for backend in ("compiled", "pinocchio"):
+        by_row = vp.lagrangian_jet(scene, ROW, np.zeros(6), backend=backend)
+        assert np.array_equal(vp.lagrangian_jet(scene, POSE, {}, backend=backend).Lq, by_row.Lq)
+    assert vp.inspect_robot(UR5, q=POSE, v={"elbow_joint": 1.0}).q.tolist() == ROW.tolist()
+    step = vp.discrete_lagrangian(scene, POSE, POSE, 0.01)
+    assert step.Ld == vp.discrete_lagrangian(scene, ROW, ROW, 0.01).Ld
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda value: vp.Scene(UR5, damping=value),
+        lambda value: vp.Scene(UR5, stiffness=value),
+        lambda value: vp.Scene(UR5, rest=value),
+        lambda value: vp.simulate(vp.Scene(UR5), value, np.zeros(6), dt=1e-3, steps=1),
+        lambda value: vp.simulate_ensemble(vp.Scene(UR5), np.zeros(6), value, dt=1e-3, steps=1, paths=1, rng=0),
+        lambda value: vp.OptimalControlProblem(vp.Scene(UR5), vp.ControlCost(), value, ROW, dt=1e-3, steps=1),
+        lambda value: vp.lagrangian_jet(vp.Scene(UR5), value, np.zeros(6)),
+        lambda value: vp.Scene(UR5).holding_torque(value),
+        lambda value: vp.inspect_robot(UR5, q=value),
+        lambda value: vp.advise(vp.Scene(UR5), value, np.zeros(6), duration=1.0, tolerance=1e-3),
+    ],
+)
+def test_names_and_numbers_that_are_none_are_named(call):
+    with pytest.raises(vp.UnknownJoint, match="the robot has no joint 'elbow'; did you mean 'elbow_joint'") as caught:
+        call({"elbow": 1.0})
+    assert caught.value.matches[0] == "elbow_joint"
+    assert caught.value.joints == NAMES
+    for value, words in ((np.nan, r"\['elbow_joint'\] is nan; it must be finite"), ("a", "must be a number, got 'a'")):
+        with pytest.raises(vp.InputError, match=words):
+            call({"elbow_joint": value})
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda", "finger"])
+def test_holding_torque_is_pinocchios_gravity_and_the_springs(name):
+    robot = vp.load_robot(name)
+    rng = np.random.default_rng(3)
+    q, stiffness, rest = rng.uniform(-1, 1, (3, robot.dof))
+    scene = vp.Scene(robot, gravity=(1.0, -2.0, -7.0), stiffness=np.abs(stiffness), rest=rest)
+    model = robot.free_model.copy()
+    model.gravity = pin.Motion(np.array([1.0, -2.0, -7.0]), np.zeros(3))
+    pull = pin.computeGeneralizedGravity(model, model.createData(), robot.free_positions(q))
+    expected = robot.free_velocities(np.eye(robot.dof)) @ pull + np.abs(stiffness) * (q - rest)
+    np.testing.assert_allclose(scene.holding_torque(q), expected, atol=1e-10)
+    np.testing.assert_allclose(scene.holding_controls(q), expected, atol=1e-10)
+
+
+def test_an_arm_stays_under_its_holding_torque_and_controls():
+    gear = np.diag([100.0, 50.0, 60.0, 20.0, 20.0, 10.0])
+    scene = vp.Scene(UR5, actuation=gear, stiffness={"elbow_joint": 3.0})
+    controls = scene.holding_controls(POSE)
+    np.testing.assert_allclose(gear @ controls, scene.holding_torque(POSE), atol=1e-12)
+    held = vp.simulate(scene, POSE, {}, dt=1e-3, steps=50, controls=controls)
+    np.testing.assert_allclose(held.q, np.tile(ROW, (51, 1)), atol=1e-9)
+
+
+def test_controls_that_cannot_hold_are_refused():
+    scene = vp.Scene(vp.planar_chain(2), actuation=["joint2"])
+    with pytest.raises(vp.InputError, match="no controls hold the robot at this q: joint 'joint1' is left with"):
+        scene.holding_controls([1.0, 0.3])
+    # Upright nothing pulls but rounding.
+    np.testing.assert_allclose(scene.holding_controls([0.5 * np.pi, 0.0]), 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("value", [-9.81, 9.81, np.float64(-9.81), np.array(9.81)])
+def test_gravity_as_a_number_is_answered_with_the_vector_meant(value):
+    with pytest.raises(vp.InputError, match=r"did you mean gravity=\(0, 0, -9.81\)\?"):
+        vp.Scene(UR5, gravity=value)
+
+
+def test_gravity_of_zero_is_answered_with_false():
+    with pytest.raises(vp.InputError, match="did you mean gravity=False"):
+        vp.Scene(UR5, gravity=0.0)
+
+
+def test_noise_costs_and_barriers_take_names():
+    named = vp.Scene(UR5, noise=vp.AdditiveNoise({"elbow_joint": 0.2}) + vp.StateNoise({"wrist_1_joint": 0.3}, POSE))
+    rows = vp.Scene(UR5, noise=vp.AdditiveNoise([0, 0, 0.2, 0, 0, 0]) + vp.StateNoise([0, 0, 0, 0.3, 0, 0], ROW))
+    options = {"dt": 2e-3, "steps": 10, "rng": 5}
+    moved = vp.simulate(named, ROW, np.zeros(6), **options)
+    assert same(moved, vp.simulate(rows, ROW, np.zeros(6), **options))
+    assert np.ptp(moved.q[:, 2]) > 0.0
+
+    weight = {"elbow_joint": 3.0, "wrist_1_joint": 1.0}
+    row = np.array([0, 0, 3.0, 1.0, 0, 0])
+
+    def value(cost):
+        problem = vp.OptimalControlProblem(vp.Scene(UR5), cost + vp.ControlCost(1.0), ROW, 0.5 * ROW, dt=0.01, steps=5)
+        return problem.cost_of(problem.simulate(np.ones(6)))
+
+    for by_name, by_row in (
+        (vp.TrackingCost(POSE, weight), vp.TrackingCost(ROW, row)),
+        (vp.VelocityCost(weight, {"wrist_3_joint": 0.1}), vp.VelocityCost(row, [0, 0, 0, 0, 0, 0.1])),
+        (vp.JointLimitBarrier(UR5, weight, {"elbow_joint": 2.5}), vp.JointLimitBarrier(UR5, row, [0, 0, 2.5, 0, 0, 0])),
+    ):
+        assert value(by_name) == value(by_row)
+    assert repr(vp.TrackingCost(0.0, weight)) == f"TrackingCost(weight={weight})"
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda value: vp.Scene(UR5, noise=vp.AdditiveNoise(value)),
+        lambda value: vp.Scene(UR5, noise=[vp.StateNoise(1.0, value)]),
+        lambda value: vp.OptimalControlProblem(
+            vp.Scene(UR5), vp.TrackingCost(value) + vp.ControlCost(), ROW, ROW, dt=1e-2, steps=1
+        ),
+        lambda value: vp.OptimalControlProblem(
+            vp.Scene(UR5), vp.VelocityCost(value) + vp.ControlCost(), ROW, ROW, dt=1e-2, steps=1
+        ),
+        lambda value: vp.JointLimitBarrier(UR5, value),
+        lambda value: vp.JointLimitBarrier(UR5, 1.0, value),
+    ],
+)
+def test_unknown_names_in_noise_and_costs(make):
+    with pytest.raises(vp.UnknownJoint, match="the robot has no joint 'elbow'; did you mean 'elbow_joint'"):
+        make({"elbow": 1.0})
+
+
+def test_weights_by_name_are_not_negative_and_not_of_controls():
+    cost = vp.VelocityCost({"elbow_joint": -1.0}) + vp.ControlCost()
+    with pytest.raises(vp.InputError, match="VelocityCost weight must be positive semidefinite"):
+        vp.OptimalControlProblem(vp.Scene(UR5), cost, ROW, ROW, dt=1e-2, steps=1)
+    with pytest.raises(vp.InputError, match="ControlCost weight must be an array of real numbers"):
+        vp.ControlCost({"elbow_joint": 1.0})
+
+
+def test_a_torque_limit_by_name_leaves_the_others_their_own():
+    torques = np.full((3, 6), 7.0)
+    shares = torque_shares(UR5, torques, torques, {"elbow_joint": 14.0})
+    own = torque_shares(UR5, torques, torques, None)
+    assert shares[:, 2].tolist() == [0.5] * 3
+    np.testing.assert_array_equal(np.delete(shares, 2, axis=1), np.delete(own, 2, axis=1))
