@@ -15,6 +15,7 @@ from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, open_loop, rows, steps_of
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
+from varpin.loop_stability import unstable_loop
 from varpin.policy import LinearPolicy, OpenLoop, takes
 from varpin.scene import Scene, require_scene
 from varpin.soundness import Finding, announce, evident, examined, with_warnings
@@ -274,6 +275,7 @@ def simulate(
         commands = open_loop(np.zeros((0, scene.controls)))
     else:
         commands = commands_of(scene, integrator, controls, steps, dt)
+    hold = period if law is not None else controls.hold if isinstance(controls, LinearPolicy) else None
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
     with announced_compilation(f"simulate with {type(integrator).__name__}"):
         state, (start,) = integrator.start(scene, q0[None], v0[None])
@@ -310,19 +312,22 @@ def simulate(
                 if progress is not None and (done // chunk < record.steps // chunk or record.steps == steps):
                     progress(record.steps, steps)
         except KeyboardInterrupt:
-            raise Interrupted(_told(scene, integrator, record.trajectory(), check=check)[0]) from None
-        trajectory, found = _told(scene, integrator, record.trajectory(), check=check)
+            raise Interrupted(_told(scene, integrator, record.trajectory(), hold, check=check)[0]) from None
+        trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
     announce(logger, scene, dt, found)
     return trajectory
 
 
 def _told(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, *, check: bool
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None, *, check: bool
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
-    """A whole motion with what is to be said of it."""
-    if check:
-        return examined(scene, integrator, trajectory)
-    found = evident(scene, trajectory)
+    """A whole motion with what is to be said of it; ``hold`` is the period of its feedback in steps, None for none."""
+    if not check:
+        found = evident(scene, trajectory)
+        return with_warnings(trajectory, found), found
+    trajectory, found = examined(scene, integrator, trajectory)
+    if hold is not None:
+        found = (*unstable_loop(scene, trajectory, hold), *found)
     return with_warnings(trajectory, found), found
 
 
