@@ -3,8 +3,9 @@
 Two looks. What theory says: where the record determines the law, u = K (q, v) + c, with a share of gravity's torque if
 need be, the loop is linearized at the equilibrium next to the motion. With the plant's exact step under a held control,
 x' = A x + B u (Franklin, Powell and Workman 1998, section 4.3), it is stable if the spectral radius of A + B K is below
-1. And what the record shows of any other law: the controls grow steadily, by orders of magnitude, and do work. What a
-law would do in continuous time is not held against its period: a pendulum that falls, falls.
+one. And what the record shows of any other law: the controls grow steadily and do work, by orders of magnitude, or
+less if what the law last did and the plant make an unstable loop. What a law would do in continuous time is not held
+against its period: a pendulum that falls, falls.
 """
 
 from __future__ import annotations
@@ -30,16 +31,41 @@ KIND = "unstable loop"
 _GREW, _GROWS = 1e2, 2.0
 # Nodes that a law is sought from: so many with the largest changes, and as many spread over the motion.
 _NODES = 48
-# Error of a fit, in units of the largest control, up to which the law is what was fitted: rounding, and no more.
-_EXACT = 1e-8
-# Directions in which the state moves by less than this share of the largest are not known.
-_EXCITED = 1e-7
+# Error of a fit up to which a law is what was fitted, in units of rounding, and in units of how badly squares of the
+# state are fitted: along a smooth motion that stays on a curve, anything can be.
+_EXACT, _TELLING = (32.0, 1e5), 1e-6
+# Directions in which the state moves by less than this share of the largest are not known: from the whole of a record,
+# and from its last changes.
+_EXCITED, _CHANGED = 1e-9, 1e-3
+# Growth of the controls' changes over the second half of a motion that wants an explanation; what the fit to the last
+# changes may leave of them.
+_WANTS, _LEFT = 1.5, 0.1
+# Angle over a period [rad] from which on deviations alternate with the periods.
+_TURNS = np.pi / 6.0
 # Beyond this nothing can be squared.
 _HUGE = 1e120
 # Newton's iterations from one start, and halvings of one of its steps.
 _ITERATIONS, _HALVINGS = 30, 6
 # Growth over the whole motion that is worth a word, of a spectral radius that rounding cannot explain.
 _WORTH, _ABOVE_ONE = 1.01, 1e-6
+
+
+@dataclass(frozen=True)
+class Span:
+    """Directions in which a state moved.
+
+    Attributes:
+        directions: Orthonormal after division by ``unit`` (2n, r).
+        unit: Of each entry of (q, v) (2n,).
+    """
+
+    directions: Floats
+    unit: Floats
+
+    def values(self, matrix: Floats) -> NDArray[np.complex128]:
+        """Eigenvalues of a matrix (2n, 2n) within these directions."""
+        inside = self.directions.T @ (matrix * self.unit / self.unit[:, None]) @ self.directions
+        return np.asarray(np.linalg.eigvals(inside), dtype=np.complex128)
 
 
 @dataclass(frozen=True)
@@ -51,8 +77,7 @@ class Law:
         Kv: (m, n).
         S: Share of gravity's and the springs' forces (m, n).
         c: (m,).
-        seen: Directions of (q, v) in which the state moved, orthonormal after division by ``unit`` (2n, r).
-        unit: Of each entry of (q, v) (2n,).
+        span: What of (q, v) it was seen for.
         near: The configuration where the motion was slowest to change (n,).
     """
 
@@ -60,44 +85,42 @@ class Law:
     Kv: Floats
     S: Floats
     c: Floats
-    seen: Floats
-    unit: Floats
+    span: Span
     near: Floats
 
 
 @dataclass(frozen=True)
 class Loop:
-    """A linearized plant with a law, at an equilibrium.
+    """A linearized plant with a law.
 
     Attributes:
         A: Rate of (q, v) by (q, v) (2n, 2n) [1/s].
         B: By u (2n, m).
         K: The law (m, 2n).
-        law: Where it comes from.
-        q: The equilibrium (n,).
+        span: What of (q, v) the law is known for.
+        q: Where it was linearized (n,).
     """
 
     A: Floats
     B: Floats
     K: Floats
-    law: Law
+    span: Span
     q: Floats
 
     def growth(self, period: float) -> float:
         """By what a period [s] multiplies deviations: the spectral radius of the loop with a zero-order hold."""
+        return float(np.abs(self.multiplier(period)))
+
+    def multiplier(self, period: float) -> complex:
+        """The eigenvalue of the loop with a zero-order hold that is farthest from zero."""
         size, m = self.B.shape
         held = expm(period * np.block([[self.A, self.B], [np.zeros((m, size + m))]]))
-        return float(np.abs(self._values(held[:size, :size] + held[:size, size:] @ self.K)).max())
+        values = self.span.values(held[:size, :size] + held[:size, size:] @ self.K)
+        return complex(values[np.argmax(np.abs(values))])
 
     def rate(self) -> float:
         """The fastest rate of growth if the law acted at every instant [1/s]; negative if the loop is stable then."""
-        return float(self._values(self.A + self.B @ self.K).real.max())
-
-    def _values(self, matrix: Floats) -> NDArray[np.complex128]:
-        """Eigenvalues within what was seen of the state."""
-        seen, unit = self.law.seen, self.law.unit
-        inside = seen.T @ (matrix * unit / unit[:, None]) @ seen
-        return np.asarray(np.linalg.eigvals(inside), dtype=np.complex128)
+        return float(self.span.values(self.A + self.B @ self.K).real.max())
 
 
 def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[Finding, ...]:
@@ -113,27 +136,29 @@ def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[
             found = _by_theory(scene, x, u, period)
         except (np.linalg.LinAlgError, LinearizationError):
             found = ()
-        return found or _by_the_record(scene, trajectory, u, at, period)
+        if found or not _does_work(scene, trajectory.part(int(at[round(0.75 * (len(at) - 1))]), trajectory.steps)):
+            return found
+        try:
+            return _by_the_record(u, period) or _by_last_changes(scene, x, u, period)
+        except (np.linalg.LinAlgError, LinearizationError):
+            return ()
 
 
-def _by_the_record(
-    scene: Scene, trajectory: Trajectory, u: Floats, at: NDArray[np.int64], period: float
-) -> tuple[Finding, ...]:
-    """Controls that grow steadily while they do work: no plant and no friction makes them."""
+def _does_work(scene: Scene, trajectory: Trajectory) -> bool:
+    """Whether the controls bring energy into a motion, rather than take it out."""
+    ways, force = np.diff(trajectory.q, axis=0), trajectory.u @ scene.actuation.T
+    return bool(((force / np.abs(force).max()) * (ways / np.abs(ways).max())).sum() > 0.0)
+
+
+def _by_the_record(u: Floats, period: float) -> tuple[Finding, ...]:
+    """Controls that have grown by orders of magnitude, and still do."""
     largest = np.maximum.accumulate(np.abs(u), axis=0)
     last = len(u) - 1
     quarter, half, three = (largest[round(share * last)] for share in (0.25, 0.5, 0.75))
-    grew = largest[last] / np.where(quarter > 0.0, quarter, np.inf)
     steadily = (largest[last] >= _GROWS * three) & (three >= _GROWS * half)
-    grew = np.where(steadily, grew, 0.0)
+    grew = np.where(steadily & (quarter > 0.0), largest[last] / quarter, 0.0)
     worst = int(np.argmax(grew))
     if not grew[worst] >= _GREW:
-        return ()
-    begin = at[round(0.75 * last)]
-    ways = np.diff(trajectory.q[begin:], axis=0)
-    force = trajectory.u[begin:] @ scene.actuation.T
-    size = np.abs(force).max(), np.abs(ways).max()
-    if not ((force / size[0]) * (ways / size[1])).sum() > 0.0:
         return ()
     return (
         Finding(
@@ -141,6 +166,50 @@ def _by_the_record(
             f"the control loop is unstable at its period of {period:g} s: control {worst} grows from "
             f"{quarter[worst]:.3g} in the first quarter of the motion to {largest[last, worst]:.3g} in the end; "
             "take a shorter period or lower gains",
+        ),
+    )
+
+
+def _by_last_changes(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Finding, ...]:
+    """Controls whose changes grow, where the plant and what the law last answered to changes say that they will."""
+    n, last = scene.robot.dof, len(u) - 1
+    changes = np.abs(np.diff(u, axis=0))
+    peaks = np.array([part.max(axis=0) for part in np.array_split(changes[last // 2 :], 4)])
+    growing = (np.diff(peaks, axis=0) > 0.0).all(axis=0) & (peaks[-1] >= _WANTS * peaks[0])
+    window = 3 * n + 8
+    if last < 2 * window or not growing.any() or not np.isfinite(x).all():
+        return ()
+    dx, du = np.diff(x[-window:], axis=0), np.diff(u[-window:], axis=0)
+    unit = np.sqrt(np.mean(dx**2, axis=0))
+    unit = np.where(unit > 0.0, unit, np.inf)
+    mean = dx.mean(axis=0), du.mean(axis=0)
+    left, sizes, right = np.linalg.svd((dx - mean[0]) / unit, full_matrices=False)
+    known = sizes > _CHANGED * sizes[0]
+    part = left[:, known].T @ (du - mean[1])
+    if known.sum() > window - 8 or np.linalg.norm(du - mean[1] - left[:, known] @ part) > _LEFT * np.linalg.norm(du):
+        return ()
+    K = ((right[known].T / sizes[known]) @ part).T / unit
+    q, v, force = x[-1:, :n], x[-1:, n:], u[-1:] @ scene.actuation.T
+    _, aq, av, af = (value[0] for value in accelerations(scene, q, v, force))
+    span = Span(right[known].T, np.where(np.isfinite(unit), unit, 1.0))
+    loop = _loop(scene, aq, av, af, K, span, q[0])
+    multiplier = loop.multiplier(period)
+    growth = float(np.abs(multiplier))
+    if known.all():
+        own = np.log(growth) <= 2.0 * max(loop.rate(), 0.0) * period
+    else:
+        # In continuous time the directions that were seen do not keep to themselves. What turns round within some
+        # periods comes of them; goals that move do not.
+        own = np.abs(np.angle(multiplier)) < _TURNS
+    if own or not 0.5 * last * np.log(growth) > np.log(_WANTS):
+        return ()
+    worst = int(np.argmax(np.where(growing, peaks[-1], 0.0)))
+    return (
+        Finding(
+            KIND,
+            f"the control loop is unstable at its period of {period:g} s: changes of control {worst} grow from "
+            f"{peaks[0, worst]:.3g} to {peaks[-1, worst]:.3g} over the second half of the motion, and each period "
+            f"multiplies deviations by {growth:.4g} in the end; take a shorter period or lower gains",
         ),
     )
 
@@ -195,11 +264,11 @@ def fitted_law(scene: Scene, x: Floats, u: Floats) -> Law | None:
     K, c = gains
     S = K[:, 2 * n :] if K.shape[1] > 2 * n else np.zeros((len(K), n))
     moving = np.flatnonzero(unit > 0.0)
-    centered = _centered(x[:, moving], weight) / unit[moving]
-    _, sizes, rows = np.linalg.svd(centered, full_matrices=False)
-    seen = np.zeros((2 * n, int((sizes > _EXCITED * sizes[0]).sum())))
-    seen[moving] = rows[: seen.shape[1]].T
-    return Law(Kq=K[:, :n], Kv=K[:, n : 2 * n], S=S, c=c, seen=seen, unit=np.where(unit > 0.0, unit, 1.0), near=near)
+    _, sizes, rows = np.linalg.svd(_centered(x[:, moving], weight) / unit[moving], full_matrices=False)
+    directions = np.zeros((2 * n, int((sizes > _EXCITED * sizes[0]).sum())))
+    directions[moving] = rows[: directions.shape[1]].T
+    span = Span(directions, np.where(unit > 0.0, unit, 1.0))
+    return Law(Kq=K[:, :n], Kv=K[:, n : 2 * n], S=S, c=c, span=span, near=near)
 
 
 def _pull(scene: Scene, q: Floats) -> Floats:
@@ -228,19 +297,28 @@ def _affine(x: Floats, u: Floats, weight: Floats) -> tuple[Floats, Floats] | Non
     moving = np.flatnonzero(unit > 0.0)
     if not len(moving):
         return None
-    left, sizes, right = np.linalg.svd(_centered(x[:, moving], weight) / unit[moving], full_matrices=False)
+    state = _centered(x[:, moving], weight) / unit[moving]
+    left, sizes, right = np.linalg.svd(state, full_matrices=False)
     known = sizes > _EXCITED * sizes[0]
+    left = left[:, known]
     if len(x) < known.sum() + 4:
         return None
-    scaled = (right[known].T / sizes[known]) @ (left[:, known].T @ _centered(u, weight))
+    target = _centered(u, weight)
+    scaled = (right[known].T / sizes[known]) @ (left.T @ target)
     # What rounding leaves where a law has no gain would take the double eigenvalue of a free joint apart.
     scaled[np.abs(scaled) < 1e-10 * np.abs(scaled).max(axis=0)] = 0.0
     K = np.zeros((u.shape[1], x.shape[1]))
     K[:, moving] = (scaled / unit[moving, None]).T
     rest = u - x @ K.T
     c = weight**2 @ rest / (weight @ weight)
-    off = np.abs((rest - c) * weight[:, None]).max(axis=0)
-    return (K, c) if (off <= _EXACT * np.abs(u * weight[:, None]).max()).all() else None
+    off = np.abs((rest - c) * weight[:, None]).max()
+    terms = ((np.abs(x) @ np.abs(K.T) + np.abs(c)) * weight[:, None]).max()
+    squares = _centered((state / weight[:, None]) ** 2, weight)
+    missed = np.abs(squares - left @ (left.T @ squares)).max(axis=0) / np.abs(squares).max(axis=0)
+    # Rounding, which directions that are little excited enlarge.
+    rounding = np.finfo(np.float64).eps * min(_EXACT[0] * sizes[0] / sizes[known][-1], _EXACT[1]) * terms
+    allowed = min(rounding, _TELLING * np.median(missed) * np.abs(target).max())
+    return (K, c) if off <= allowed else None
 
 
 def loop_at_rest(scene: Scene, law: Law) -> Loop | None:
@@ -278,8 +356,15 @@ def _linearized(scene: Scene, law: Law, q: Floats) -> tuple[Loop, Floats, float]
         u, Kq = u + law.S @ jet.Lq, Kq + law.S @ jet.Lqq
     force = scene.actuation @ u
     a, aq, av, af = (value[0] for value in accelerations(scene, q[None], np.zeros((1, n)), force[None]))
+    pushed = np.abs(af @ scene.actuation)
+    terms = pushed @ (np.abs(law.Kq) @ np.abs(q) + np.abs(law.c)) + np.abs(a - af @ force)
+    loop = _loop(scene, aq, av, af, np.concatenate([Kq, law.Kv], axis=1), law.span, q)
+    return loop, a, float(terms.max())
+
+
+def _loop(scene: Scene, aq: Floats, av: Floats, af: Floats, K: Floats, span: Span, q: Floats) -> Loop:
+    """The loop, from the derivatives of the acceleration in q, v and force, each (n, n)."""
+    n = len(q)
     pushed = af @ scene.actuation
-    terms = np.abs(pushed) @ (np.abs(law.Kq) @ np.abs(q) + np.abs(law.c)) + np.abs(a - af @ force)
     A = np.block([[np.zeros((n, n)), np.eye(n)], [aq, av]])
-    B = np.concatenate([np.zeros_like(pushed), pushed])
-    return Loop(A, B, np.concatenate([Kq, law.Kv], axis=1), law, q), a, float(terms.max())
+    return Loop(A, np.concatenate([np.zeros_like(pushed), pushed]), K, span, q)
