@@ -3,9 +3,9 @@
 Two looks. What theory says: where the record determines the law, u = K (q, v) + c, with a share of gravity's torque if
 need be, the loop is linearized at the equilibrium next to the motion. With the plant's exact step under a held control,
 x' = A x + B u (Franklin, Powell and Workman 1998, section 4.3), it is stable if the spectral radius of A + B K is below
-one. And what the record shows of any other law: the controls grow steadily and do work, by orders of magnitude, or
-less if what the law last did and the plant make an unstable loop. What a law would do in continuous time is not held
-against its period: a pendulum that falls, falls.
+one. And what the record shows of any other law: the controls do work and grow steadily, by orders of magnitude, or by
+less if they turn round from period to period. What a law would do in continuous time is not held against its period: a
+pendulum that falls, falls.
 """
 
 from __future__ import annotations
@@ -37,10 +37,9 @@ _EXACT, _TELLING = (32.0, 1e5), 1e-6
 # Directions in which the state moves by less than this share of the largest are not known: from the whole of a record,
 # and from its last changes.
 _EXCITED, _CHANGED = 1e-9, 1e-3
-# Growth of the controls' changes over the second half of a motion that wants an explanation; what the fit to the last
-# changes may leave of them.
-_WANTS, _LEFT = 1.5, 0.1
-# Angle over a period [rad] from which on deviations alternate with the periods.
+# Growth of the controls' changes over the second half of a motion that is spoken of if they turn round.
+_WANTS = 1.5
+# Angle over a period [rad] from which on they do: goals that move, and plants, take many periods for a turn.
 _TURNS = np.pi / 6.0
 # Beyond this nothing can be squared.
 _HUGE = 1e120
@@ -109,14 +108,9 @@ class Loop:
 
     def growth(self, period: float) -> float:
         """By what a period [s] multiplies deviations: the spectral radius of the loop with a zero-order hold."""
-        return float(np.abs(self.multiplier(period)))
-
-    def multiplier(self, period: float) -> complex:
-        """The eigenvalue of the loop with a zero-order hold that is farthest from zero."""
         size, m = self.B.shape
         held = expm(period * np.block([[self.A, self.B], [np.zeros((m, size + m))]]))
-        values = self.span.values(held[:size, :size] + held[:size, size:] @ self.K)
-        return complex(values[np.argmax(np.abs(values))])
+        return float(np.abs(self.span.values(held[:size, :size] + held[:size, size:] @ self.K)).max())
 
     def rate(self) -> float:
         """The fastest rate of growth if the law acted at every instant [1/s]; negative if the loop is stable then."""
@@ -139,7 +133,7 @@ def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[
         if found or not _does_work(scene, trajectory.part(int(at[round(0.75 * (len(at) - 1))]), trajectory.steps)):
             return found
         try:
-            return _by_the_record(u, period) or _by_last_changes(scene, x, u, period)
+            return _by_the_record(u, period) or _by_last_changes(x, u, period)
         except (np.linalg.LinAlgError, LinearizationError):
             return ()
 
@@ -170,38 +164,25 @@ def _by_the_record(u: Floats, period: float) -> tuple[Finding, ...]:
     )
 
 
-def _by_last_changes(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Finding, ...]:
-    """Controls whose changes grow, where the plant and what the law last answered to changes say that they will."""
-    n, last = scene.robot.dof, len(u) - 1
+def _by_last_changes(x: Floats, u: Floats, period: float) -> tuple[Finding, ...]:
+    """Controls whose changes grow, in a motion that turns round within some periods."""
+    n, last = x.shape[1] // 2, len(u) - 1
     changes = np.abs(np.diff(u, axis=0))
     peaks = np.array([part.max(axis=0) for part in np.array_split(changes[last // 2 :], 4)])
     growing = (np.diff(peaks, axis=0) > 0.0).all(axis=0) & (peaks[-1] >= _WANTS * peaks[0])
     window = 3 * n + 8
-    if last < 2 * window or not growing.any() or not np.isfinite(x).all():
+    if last < 2 * window or not growing.any():
         return ()
-    dx, du = np.diff(x[-window:], axis=0), np.diff(u[-window:], axis=0)
-    unit = np.sqrt(np.mean(dx**2, axis=0))
-    unit = np.where(unit > 0.0, unit, np.inf)
-    mean = dx.mean(axis=0), du.mean(axis=0)
-    left, sizes, right = np.linalg.svd((dx - mean[0]) / unit, full_matrices=False)
-    known = sizes > _CHANGED * sizes[0]
-    part = left[:, known].T @ (du - mean[1])
-    if known.sum() > window - 8 or np.linalg.norm(du - mean[1] - left[:, known] @ part) > _LEFT * np.linalg.norm(du):
-        return ()
-    K = ((right[known].T / sizes[known]) @ part).T / unit
-    q, v, force = x[-1:, :n], x[-1:, n:], u[-1:] @ scene.actuation.T
-    _, aq, av, af = (value[0] for value in accelerations(scene, q, v, force))
-    span = Span(right[known].T, np.where(np.isfinite(unit), unit, 1.0))
-    loop = _loop(scene, aq, av, af, K, span, q[0])
-    multiplier = loop.multiplier(period)
-    growth = float(np.abs(multiplier))
-    if known.all():
-        own = np.log(growth) <= 2.0 * max(loop.rate(), 0.0) * period
-    else:
-        # In continuous time the directions that were seen do not keep to themselves. What turns round within some
-        # periods comes of them; goals that move do not.
-        own = np.abs(np.angle(multiplier)) < _TURNS
-    if own or not 0.5 * last * np.log(growth) > np.log(_WANTS):
+    # The last changes of the state as a linear map of those before (dynamic mode decomposition, Schmid 2010).
+    dx = np.diff(x[-window:], axis=0)
+    dx -= dx.mean(axis=0)
+    size = np.sqrt(np.mean(dx**2, axis=0))
+    left, sizes, _ = np.linalg.svd(dx[:, size > 0.0] / size[size > 0.0], full_matrices=False)
+    modes = (left * sizes)[:, sizes > _CHANGED * sizes[0]]
+    step = np.linalg.lstsq(modes[:-1], modes[1:], rcond=None)[0]
+    values = np.linalg.eigvals(step)
+    growth = float(np.abs(values[np.abs(np.angle(values)) >= _TURNS]).max(initial=0.0))
+    if not 0.5 * last * np.log(growth) > np.log(_WANTS):
         return ()
     worst = int(np.argmax(np.where(growing, peaks[-1], 0.0)))
     return (
@@ -356,15 +337,8 @@ def _linearized(scene: Scene, law: Law, q: Floats) -> tuple[Loop, Floats, float]
         u, Kq = u + law.S @ jet.Lq, Kq + law.S @ jet.Lqq
     force = scene.actuation @ u
     a, aq, av, af = (value[0] for value in accelerations(scene, q[None], np.zeros((1, n)), force[None]))
-    pushed = np.abs(af @ scene.actuation)
-    terms = pushed @ (np.abs(law.Kq) @ np.abs(q) + np.abs(law.c)) + np.abs(a - af @ force)
-    loop = _loop(scene, aq, av, af, np.concatenate([Kq, law.Kv], axis=1), law.span, q)
-    return loop, a, float(terms.max())
-
-
-def _loop(scene: Scene, aq: Floats, av: Floats, af: Floats, K: Floats, span: Span, q: Floats) -> Loop:
-    """The loop, from the derivatives of the acceleration in q, v and force, each (n, n)."""
-    n = len(q)
     pushed = af @ scene.actuation
+    terms = np.abs(pushed) @ (np.abs(law.Kq) @ np.abs(q) + np.abs(law.c)) + np.abs(a - af @ force)
     A = np.block([[np.zeros((n, n)), np.eye(n)], [aq, av]])
-    return Loop(A, np.concatenate([np.zeros_like(pushed), pushed]), K, span, q)
+    B = np.concatenate([np.zeros_like(pushed), pushed])
+    return Loop(A, B, np.concatenate([Kq, law.Kv], axis=1), law.span, q), a, float(terms.max())
