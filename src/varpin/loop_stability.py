@@ -30,7 +30,7 @@ KIND = "unstable loop"
 # spoken of. A steady growth by 1e3 is one by 1e3 ** (3/4) from the end of the first quarter.
 _GREW, _GROWS = 1e2, 2.0
 # Nodes that a law is sought from: so many with the largest changes, and as many spread over the motion.
-_NODES = 48
+_NODES = 32
 # Error of a fit up to which a law is what was fitted, in units of rounding, and in units of how badly squares of the
 # state are fitted: along a smooth motion that stays on a curve, anything can be.
 _EXACT, _TELLING = (32.0, 1e5), 1e-6
@@ -167,11 +167,13 @@ def _by_the_record(u: Floats, period: float) -> tuple[Finding, ...]:
 def _by_last_changes(x: Floats, u: Floats, period: float) -> tuple[Finding, ...]:
     """Controls whose changes grow, in a motion that turns round within some periods."""
     n, last = x.shape[1] // 2, len(u) - 1
+    window = 3 * n + 8
+    if last < 2 * window:
+        return ()
     changes = np.abs(np.diff(u, axis=0))
     peaks = np.array([part.max(axis=0) for part in np.array_split(changes[last // 2 :], 4)])
     growing = (np.diff(peaks, axis=0) > 0.0).all(axis=0) & (peaks[-1] >= _WANTS * peaks[0])
-    window = 3 * n + 8
-    if last < 2 * window or not growing.any():
+    if not growing.any():
         return ()
     # The last changes of the state as a linear map of those before (dynamic mode decomposition, Schmid 2010).
     dx = np.diff(x[-window:], axis=0)
@@ -307,24 +309,23 @@ def loop_at_rest(scene: Scene, law: Law) -> Loop | None:
 
     The goal is where the law asks for no control. None if no equilibrium is found.
     """
+    n = scene.robot.dof
     goal = law.near - np.linalg.lstsq(law.Kq, law.Kq @ law.near + law.c, rcond=None)[0]
     for start in (law.near, goal):
-        q = start
+        loop, a, terms = _linearized(scene, law, start)
         for _ in range(_ITERATIONS):
-            loop, a, terms = _linearized(scene, law, q)
-            n = len(q)
             step = np.linalg.lstsq(loop.A[n:, :n] + loop.B[n:] @ loop.K[:, :n], -a, rcond=None)[0]
-            if np.abs(step).max() <= 1e-9 * max(1.0, np.abs(q).max()):
+            if np.abs(step).max() <= 1e-9 * max(1.0, np.abs(loop.q).max()):
                 # A matrix without an inverse may leave a force that no step takes away.
                 if np.abs(a).max() > 1e-6 * terms:
                     break
                 return loop
+            before, q = np.abs(a).max(), loop.q
             # Damped while the acceleration does not fall.
-            for _ in range(_HALVINGS):
-                if np.abs(_linearized(scene, law, q + step)[1]).max() < np.abs(a).max():
+            for halved in range(_HALVINGS):
+                loop, a, terms = _linearized(scene, law, q + 0.5**halved * step)
+                if np.abs(a).max() < before:
                     break
-                step = 0.5 * step
-            q = q + step
     return None
 
 

@@ -94,7 +94,7 @@ class StepFailure(VarpinError, RuntimeError):
         q: Configuration at the start of the step (n,) [rad or m].
         v: Velocity there (n,).
         p: Momentum there (n,).
-        trajectory: What was computed before.
+        trajectory: What was computed before, with a warning if its control loop is unstable.
     """
 
     def __init__(self, step: int, time: float, failure: Failure, trajectory: Trajectory) -> None:
@@ -104,10 +104,11 @@ class StepFailure(VarpinError, RuntimeError):
         self.reason = failure.reason
         self.q, self.v, self.p = trajectory.q[-1], trajectory.v[-1], trajectory.p[-1]
         self.trajectory = trajectory
+        advice = trajectory.warnings[0] if trajectory.warnings else "a smaller dt may go further"
         super().__init__(
             f"step {step} (t = {time:.6g} s) cannot be trusted: {failure.reason}; last residual {failure.residual:.3g} "
             f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}. What came before is in error.trajectory; "
-            "a smaller dt may go further"
+            f"{advice}"
         )
 
 
@@ -308,6 +309,8 @@ def simulate(
                 record.add(segment)
                 if segment.failure is not None:
                     node = record.trajectory()
+                    if hold is not None and check:
+                        node = with_warnings(node, unstable_loop(scene, node, hold))
                     raise StepFailure(node.steps, node.t[-1], segment.failure, node)
                 if progress is not None and (done // chunk < record.steps // chunk or record.steps == steps):
                     progress(record.steps, steps)
