@@ -108,9 +108,25 @@ class Loop:
 
     def growth(self, period: float) -> float:
         """By what a period [s] multiplies deviations: the spectral radius of the loop with a zero-order hold."""
+        return float(np.abs(self.multiplier(period)))
+
+    def multiplier(self, period: float) -> complex:
+        """The eigenvalue of the loop with a zero-order hold that is farthest from zero."""
         size, m = self.B.shape
         held = expm(period * np.block([[self.A, self.B], [np.zeros((m, size + m))]]))
-        return float(np.abs(self.span.values(held[:size, :size] + held[:size, size:] @ self.K)).max())
+        values = self.span.values(held[:size, :size] + held[:size, size:] @ self.K)
+        return complex(values[np.argmax(np.abs(values))])
+
+    def owes(self, period: float) -> bool:
+        """Whether its growth is the period's doing, and not that of the law in continuous time as well.
+
+        Directions that the state keeps to from period to period it need not keep to in between: where not all are
+        known, what turns round within some periods is the period's.
+        """
+        multiplier = self.multiplier(period)
+        if self.span.directions.shape[1] < len(self.span.unit) and np.abs(np.angle(multiplier)) >= _TURNS:
+            return True
+        return bool(np.log(np.abs(multiplier)) > 1.5 * max(self.rate(), 0.0) * period)
 
     def rate(self) -> float:
         """The fastest rate of growth if the law acted at every instant [1/s]; negative if the loop is stable then."""
@@ -206,9 +222,7 @@ def _by_theory(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Findi
     if loop is None:
         return ()
     growth = loop.growth(period)
-    # Growth that the law would show in continuous time as well is not its period's fault.
-    own = np.exp(1.5 * max(loop.rate(), 0.0) * period)
-    if not (growth > own * (1.0 + _ABOVE_ONE) and len(u) * np.log(growth) > np.log(_WORTH)):
+    if not (growth > 1.0 + _ABOVE_ONE and len(u) * np.log(growth) > np.log(_WORTH) and loop.owes(period)):
         return ()
     stable = next((period / 2**k for k in range(1, 8) if loop.growth(period / 2**k) < 1.0), None)
     advice = "take lower gains" if stable is None else f"with a period of {stable:g} s or lower gains it is stable"
@@ -339,7 +353,8 @@ def _linearized(scene: Scene, law: Law, q: Floats) -> tuple[Loop, Floats, float]
     force = scene.actuation @ u
     a, aq, av, af = (value[0] for value in accelerations(scene, q[None], np.zeros((1, n)), force[None]))
     pushed = af @ scene.actuation
-    terms = np.abs(pushed) @ (np.abs(law.Kq) @ np.abs(q) + np.abs(law.c)) + np.abs(a - af @ force)
+    sizes = np.abs(law.Kq) @ (np.abs(q) + law.span.unit[:n]) + np.abs(law.c)
+    terms = np.abs(pushed) @ sizes + np.abs(a - af @ force)
     A = np.block([[np.zeros((n, n)), np.eye(n)], [aq, av]])
     B = np.concatenate([np.zeros_like(pushed), pushed])
     return Loop(A, B, np.concatenate([Kq, law.Kv], axis=1), law.span, q), a, float(terms.max())
