@@ -82,8 +82,13 @@ def run(scene, q, v, law, **options):
 @pytest.mark.parametrize("gravity", [False, True])
 @pytest.mark.parametrize(
     ("kp", "kd", "dt", "stable"),
-    [(1e4, 100, 4e-3, True), (1e4, 200, 5e-3, False), (100, 110, 1e-2, False), (1e4, 300, 5e-3, False)]
-    + [(2500, 100, 1e-2, False)],
+    [
+        (1e4, 100, 4e-3, True),
+        (1e4, 200, 5e-3, False),
+        (100, 110, 1e-2, False),
+        (1e4, 300, 5e-3, False),
+        (2500, 100, 1e-2, False),
+    ],
 )
 @pytest.mark.parametrize("integrator", [*INTEGRATORS, vp.ExplicitEuler()], ids=str)
 def test_stiff_laws(kp, kd, dt, stable, gravity, integrator):
@@ -97,7 +102,7 @@ def test_stiff_laws(kp, kd, dt, stable, gravity, integrator):
             assert motion.warnings == ()
         exact = plant.digital(law, zero, zero, dt, 100)
         # A rod in the plane: gravity changes little over a step, and the torque does not change at all.
-        limit = {1: 0.2, 2: 1e-4, 4: 1e-9}[integrator.order]
+        limit = {1: 0.3, 2: 1e-5, 4: 1e-6}[integrator.order]
         assert np.abs(motion.q[:101, 0] - exact[:, 0]).max() < limit
 
 
@@ -141,21 +146,22 @@ def test_random_loops():
 @pytest.mark.parametrize("name", ["ur5", "panda"])
 @pytest.mark.parametrize("share", [0.8, 2.6])
 def test_stiff_laws_on_arms(name, share):
-    """Velocity gains at a share of what one joint with the least inertia of the arm takes: below 2 is stable."""
-    scene = vp.Scene(vp.load_robot(name), damping=0.05)
+    """Gains in proportion to inertias, such that the fastest direction loses a share of its speed a period."""
+    lock = {"panda_finger_joint1": 0.02} if name == "panda" else None
+    scene = vp.Scene(vp.load_robot(name, lock=lock), damping=0.05)
     n, plant, dt = scene.robot.dof, Plant(scene), 2e-3
     goal = np.linspace(0.3, -0.4, n) - (1.5 if name == "panda" else 0.0) * (np.arange(n) == 3)
-    inverse = np.linalg.inv(vp.lagrangian_jet(scene, goal, np.zeros(n)).Lvv)
-    kd = share / dt / np.abs(np.linalg.eigvalsh(inverse)).max()
-    kp = 5.0 * kd
+    M = vp.lagrangian_jet(scene, goal, np.zeros(n)).Lvv
+    kd = np.diag(M) * share / dt / np.linalg.eigvals(np.linalg.solve(M, np.diag(np.diag(M)))).real.max()
+    kp = 50.0 * kd
     law = spring_and_damper(kp, kd, goal)
-    K = np.hstack([-kp * np.eye(n), -kd * np.eye(n)])
+    K = np.hstack([-np.diag(kp), -np.diag(kd)])
     radius = plant.spectral_radius(law, K, dt, goal)
     assert (radius < 1.0) == (share < 2.0)
     q0 = goal + 0.02
     motion, told = run(scene, q0, np.zeros(n), law, dt=dt, steps=150, integrator=vp.Gauss(2))
     assert told == (share > 2.0)
-    if motion is not None:
+    if share < 2.0:
         exact = plant.digital(law, q0, np.zeros(n), dt, 15)
         np.testing.assert_allclose(motion.q[:16], exact[:, :n], rtol=0, atol=1e-6)
 
@@ -269,7 +275,7 @@ def cases_with_alarm():
         "integral": (rod, [0], integral(300.0, 500.0, 70.0, 1e-2), {}),
         "gravity compensated": (
             two, [1, 0.9],
-            lambda t, q, v: -vp.lagrangian_jet(two, q, np.zeros(2)).Lq - 100 * (q - 1) - 15 * v, {},
+            lambda t, q, v: -vp.lagrangian_jet(two, q, np.zeros(2)).Lq - 100 * (q - 1) - 40 * v, {},
         ),
         "inverse dynamics": (two, [1, 0.9], inverse_dynamics, {}),
         "one joint of two": (one, [0, 0], lambda t, q, v: -100 * (q[:1] - 1) - 200 * v[:1], {}),
@@ -292,14 +298,11 @@ def test_no_motion_ends_silently_above_a_thousand_times_its_start():
     free = vp.Scene(vp.planar_chain(1), gravity=False)
     for kp, kd in ((10.0, 69.0), (1e3, 0.0), (1e4, 10.0), (3e3, 20.0)):
         for shape in (lambda x: x, lambda x: x * (1.0 + 0.1 * np.sin(x)), lambda x: x + 0.1 * np.cos(x)):
-            motion, told = run(
-                free,
-                [0.0],
-                [0.0],
-                lambda t, q, v, k=(kp, kd), s=shape: s(-k[0] * (q - 1) - k[1] * v),
-                dt=1e-2,
-                steps=400,
-            )
+
+            def law(t, q, v, kp=kp, kd=kd, shape=shape):
+                return shape(-kp * (q - 1) - kd * v)
+
+            motion, told = run(free, [0.0], [0.0], law, dt=1e-2, steps=400)
             if motion is not None and np.abs(motion.u[-20:]).max() > 1e3 * np.abs(motion.u[0]).max():
                 assert told
                 continue

@@ -47,6 +47,8 @@ _HUGE = 1e120
 _ITERATIONS, _HALVINGS = 30, 6
 # Growth over the whole motion that is worth a word, of a spectral radius that rounding cannot explain.
 _WORTH, _ABOVE_ONE = 1.01, 1e-6
+# Growth over a period that is spoken of where no equilibrium is found.
+_FAST = 1.05
 
 
 @dataclass(frozen=True)
@@ -106,12 +108,8 @@ class Loop:
     span: Span
     q: Floats
 
-    def growth(self, period: float) -> float:
-        """By what a period [s] multiplies deviations: the spectral radius of the loop with a zero-order hold."""
-        return float(np.abs(self.multiplier(period)))
-
     def multiplier(self, period: float) -> complex:
-        """The eigenvalue of the loop with a zero-order hold that is farthest from zero."""
+        """By what a period [s] multiplies deviations: of the loop with a zero-order hold the largest eigenvalue."""
         size, m = self.B.shape
         held = expm(period * np.block([[self.A, self.B], [np.zeros((m, size + m))]]))
         values = self.span.values(held[:size, :size] + held[:size, size:] @ self.K)
@@ -219,18 +217,24 @@ def _by_theory(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Findi
     if law is None:
         return ()
     loop = loop_at_rest(scene, law)
+    rests = loop is not None
     if loop is None:
-        return ()
-    growth = loop.growth(period)
+        loop = _linearized(scene, law, law.near)[0]
+    multiplier = loop.multiplier(period)
+    growth = float(np.abs(multiplier))
     if not (growth > 1.0 + _ABOVE_ONE and len(u) * np.log(growth) > np.log(_WORTH) and loop.owes(period)):
         return ()
-    stable = next((period / 2**k for k in range(1, 8) if loop.growth(period / 2**k) < 1.0), None)
+    # Away from an equilibrium only what a slow motion cannot be taken for.
+    if not rests and (np.abs(np.angle(multiplier)) < _TURNS or growth < _FAST):
+        return ()
+    place = "its equilibrium q" if rests else "q"
+    stable = next((period / 2**k for k in range(1, 8) if np.abs(loop.multiplier(period / 2**k)) < 1.0), None)
     advice = "take lower gains" if stable is None else f"with a period of {stable:g} s or lower gains it is stable"
     return (
         Finding(
             KIND,
             f"the control loop is unstable at its period of {period:g} s: each multiplies deviations by {growth:.4g} "
-            f"(linearized at rest near q = [{', '.join(f'{value:.4g}' for value in loop.q)}]); {advice}",
+            f"(linearized at {place} = [{', '.join(f'{value:.4g}' for value in loop.q)}]); {advice}",
         ),
     )
 
