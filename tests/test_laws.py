@@ -130,15 +130,15 @@ def test_random_loops():
             assert np.abs(exact[:, n:]).max() > 1e2, what
             continue
         assert not told, what
-        exact = plant.digital(law, zero, zero, dt, 12)
-        fine, _ = run(scene, zero, zero, law, dt=dt / 4, steps=48, period=4, integrator=vp.Gauss(3))
-        # Where links fold and whirl round, ten periods enlarge the smallest error by orders of magnitude.
-        calm = np.abs(exact[:, n:]).max() * dt < 0.2
-        if calm:
-            held += 1
-            np.testing.assert_allclose(fine.q[::4], exact[:, :n], rtol=0, atol=1e-7, err_msg=what)
-            own = np.abs(motion.q[:13] - exact[:, :n]).max()
-            assert own < {2: 0.02, 4: 0.002}[integrator.order], what
+        # Where links fold and whirl round, some periods enlarge the smallest error by orders of magnitude.
+        if np.abs(motion.v[:9]).max() * dt > 0.2:
+            continue
+        held += 1
+        exact = plant.digital(law, zero, zero, dt, 8)
+        fine, _ = run(scene, zero, zero, law, dt=dt / 4, steps=32, period=4, integrator=vp.Gauss(3))
+        np.testing.assert_allclose(fine.q[::4], exact[:, :n], rtol=0, atol=1e-7, err_msg=what)
+        own = np.abs(motion.q[:9] - exact[:, :n]).max()
+        assert own < {2: 0.02, 4: 0.002}[integrator.order], what
     assert held > 60
     assert alarmed > 40
 
