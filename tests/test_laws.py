@@ -354,3 +354,20 @@ def test_short_motions_and_still_ones():
     for steps in range(6):
         motion = vp.simulate(scene, [0], [0], dt=1e-3, steps=steps, controls=spring_and_damper(10.0, 1.0))
         assert unstable_loop(scene, motion) == ()
+
+
+def test_noise_that_python_evaluates_keeps_the_period():
+    """Such noise is simulated step by step; the law still decides once a period."""
+    times = []
+
+    def law(t, q, v):
+        times.append(t)
+        return -10.0 * q - v
+
+    motions = []
+    for noise in (vp.CustomNoise(lambda q, v, u: np.eye(2) * 0.1, 2), vp.AdditiveNoise(0.1)):
+        times.clear()
+        scene = vp.Scene(vp.planar_chain(2), noise=noise)
+        motions.append(vp.simulate(scene, [0.3, 0], [0, 0], dt=1e-2, steps=17, controls=law, period=5, rng=3))
+        np.testing.assert_allclose(times, [0.0, 0.05, 0.1, 0.15])
+    np.testing.assert_allclose(motions[0].u, motions[1].u, atol=1e-12)
