@@ -1,4 +1,4 @@
-"""A UR5 under gravity brought to a posture by a PD law with gravity compensation."""
+"""A UR5 under gravity brought to a posture by a digital PD controller with gravity compensation."""
 
 from pathlib import Path
 
@@ -17,11 +17,11 @@ damping = np.array([80.0, 80.0, 30.0, 4.0, 2.0, 0.2])  # [N m s/rad]
 
 
 def control(_: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Torques [N m]: what carries the arm, and springs and dampers towards the goal."""
+    """Torques [N m], held over the controller's period: what carries the arm, springs and dampers towards the goal."""
     return scene.holding_torque(q) - stiffness * (q - goal) - damping * v
 
 
-motion = vp.simulate(scene, np.zeros(6), np.zeros(6), dt=2e-3, steps=1500, controls=control)
+motion = vp.simulate(scene, np.zeros(6), np.zeros(6), dt=2e-3, steps=1500, controls=control, period=1)
 print(motion)
 print("distance to the goal [rad]:", np.abs(motion.q[-1] - goal).max())
 print(vp.replay(robot, motion, html=out / "ur5_pd.html"))

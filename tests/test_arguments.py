@@ -90,7 +90,7 @@ def test_noise(kind, value):
 
 @SETTINGS
 @given(
-    name=st.sampled_from(["q0", "v0", "dt", "controls", "increments", "rng", "integrator", "sampling"]),
+    name=st.sampled_from(["q0", "v0", "dt", "controls", "increments", "rng", "integrator", "period"]),
     value=anything,
     integrator=st.sampled_from([vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4(), vp.SemiImplicitEuler()]),
 )

@@ -544,7 +544,7 @@ class TestSimulation:
         with refused(vp.InputError, words):
             self.run(scene, controls=value)
 
-    @pytest.mark.parametrize("sampling", ["midpoint", "start"])
+    @pytest.mark.parametrize("kind", ["law", "open loop"])
     @pytest.mark.parametrize(
         ("value", "words"),
         [
@@ -555,17 +555,19 @@ class TestSimulation:
             (ZeroDivisionError("no torque"), "raised ZeroDivisionError('no torque')"),
         ],
     )
-    def test_control_functions(self, scene, sampling, value, words):
-        def law(t, q, v):
+    def test_control_functions(self, scene, kind, value, words):
+        def swing(t):
             if t < 0.03:
                 return [0.1, 0.2]
             if isinstance(value, Exception):
                 raise value
             return value
 
-        time = 0.035 if sampling == "midpoint" else 0.03
+        controls, time = (lambda t, q, v: swing(t)), 0.03
+        if kind == "open loop":
+            controls, time, words = vp.OpenLoop(swing), 0.035, words.replace("controls(t, q, v)", "OpenLoop: f(t)")
         with refused(vp.ControlError, f"step 3 (t = {time:g} s)", words, "error.trajectory") as info:
-            self.run(scene, controls=law, sampling=sampling)
+            self.run(scene, controls=controls)
         error = info.value
         assert (error.step, error.time, error.trajectory.steps) == (3, pytest.approx(time), 3)
         whole = self.run(scene, steps=3, controls=[0.1, 0.2])
@@ -575,31 +577,61 @@ class TestSimulation:
             assert error.__cause__ is value
 
     def test_a_control_function_of_wrong_arguments(self, scene):
-        with refused(vp.ControlError, "step 0", "raised TypeError(", "3 were given"):
+        with refused(vp.InputError, "a control law takes (t, q, v)", "varpin.OpenLoop(f)"):
             self.run(scene, controls=lambda t: [0.0, 0.0])
+        with refused(vp.InputError, "must be a function of (t, q, v)"):
+            self.run(scene, controls=lambda t, q: [0.0, 0.0])
+
+    @pytest.mark.parametrize(
+        ("function", "words"),
+        [
+            (lambda t, q, v: [0.0, 0.0], "a law of (t, q, v) is given as it is, controls=law"),
+            (lambda: [0.0, 0.0], "OpenLoop takes a function of one argument, the time t"),
+            ([0.0, 0.0], "OpenLoop takes a function of the time t, got [0.0, 0.0]"),
+        ],
+    )
+    def test_open_loops_of_something_else(self, function, words):
+        with refused(vp.InputError, words):
+            vp.OpenLoop(function)
+
+    @pytest.mark.parametrize(("period", "words"), [(0, "at least 1, got 0"), (1.5, "an integer, got 1.5")])
+    def test_period(self, scene, period, words):
+        with refused(vp.InputError, f"period must be {words}"):
+            self.run(scene, controls=lambda t, q, v: [0.0, 0.0], period=period)
+
+    @pytest.mark.parametrize("controls", [None, [0.1, 0.2], vp.OpenLoop(lambda t: [0.1, 0.2])])
+    def test_a_period_is_of_a_law(self, scene, controls):
+        with refused(vp.InputError, "period = 2 is of a control law"):
+            self.run(scene, controls=controls, period=2)
+
+    def test_an_ensemble_takes_no_law(self, scene):
+        noisy = vp.Scene(scene.robot, noise=vp.AdditiveNoise(0.1))
+        with refused(vp.InputError, "only simulate takes a control law"):
+            vp.simulate_ensemble(
+                noisy, [0, 0], [0, 0], dt=0.01, steps=2, paths=2, rng=0, controls=lambda t, q, v: [0.0, 0.0]
+            )
+        with refused(vp.ControlError, "step 1 (t = 0.015 s)", "OpenLoop: f(t) must have shape (2,)") as info:
+            broken = vp.OpenLoop(lambda t: [0.0, 0.0] if t < 0.01 else [0.0])
+            vp.simulate_ensemble(noisy, [0, 0], [0, 0], dt=0.01, steps=2, paths=2, rng=0, controls=broken)
+        assert info.value.trajectory is None
 
     def test_a_control_function_cannot_reach_into_the_state(self, scene):
         def law(t, q, v):
             q[:], v[:] = 99.0, 99.0
             return [0.0, 0.0]
 
-        for sampling in ("midpoint", "start"):
-            meddled = self.run(scene, controls=law, sampling=sampling)
-            assert np.array_equal(meddled.q, self.run(scene, controls=lambda t, q, v: [0.0, 0.0]).q)
+        meddled = self.run(scene, controls=law)
+        assert np.array_equal(meddled.q, self.run(scene, controls=lambda t, q, v: [0.0, 0.0]).q)
 
     def test_keyboard_interrupt_in_a_control_function_is_no_control_error(self, scene):
         def law(t, q, v):
-            if t > 0.02:
+            if t > 0.015:
                 raise KeyboardInterrupt
             return [0.0, 0.0]
 
         with pytest.raises(vp.Interrupted) as info:
             self.run(scene, controls=law)
         assert info.value.trajectory.steps == 2
-
-    def test_sampling(self, scene):
-        with refused(vp.InputError, "sampling must be 'midpoint' or 'start', got 'end'"):
-            self.run(scene, sampling="end")
 
     @pytest.mark.parametrize("value", ["rk4", vp.Midpoint, 3])
     def test_integrator(self, scene, value):

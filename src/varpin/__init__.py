@@ -79,6 +79,7 @@ from varpin.noise import Noise as Noise
 from varpin.noise import NoiseFieldError as NoiseFieldError
 from varpin.noise import StateNoise as StateNoise
 from varpin.policy import LinearPolicy as LinearPolicy
+from varpin.policy import OpenLoop as OpenLoop
 from varpin.replay import replay as replay
 from varpin.robot import Payload as Payload
 from varpin.robot import Robot as Robot

@@ -18,7 +18,7 @@ from varpin.integrators.base import Failure, rows
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
 from varpin.markup import facts, table
-from varpin.policy import LinearPolicy
+from varpin.policy import LinearPolicy, OpenLoop
 from varpin.scene import Scene, require_scene
 from varpin.simulation import commands_of
 from varpin.wiener import generator
@@ -140,7 +140,7 @@ def simulate_ensemble(
     steps: int,
     paths: int,
     rng: np.random.Generator | int,
-    controls: ArrayLike | LinearPolicy | None = None,
+    controls: ArrayLike | LinearPolicy | OpenLoop | None = None,
     integrator: Integrator | None = None,
     store: bool = True,
     quantiles: Sequence[float] = (0.05, 0.5, 0.95),
@@ -159,7 +159,8 @@ def simulate_ensemble(
         steps: N.
         paths: P.
         rng: Seed or generator.
-        controls: None, (N, m), (m,), or a :class:`LinearPolicy` that each path evaluates at its own state.
+        controls: None, (N, m), (m,), :class:`OpenLoop`, or a :class:`LinearPolicy` that each path evaluates at its own
+            state.
 
     Other Args:
         integrator: ``Midpoint()`` if left out.
@@ -186,7 +187,7 @@ def simulate_ensemble(
     integrator = Midpoint() if integrator is None else integrator
     if not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
-    commands = commands_of(scene, integrator, controls, steps)
+    commands = commands_of(scene, integrator, controls, steps, dt)
     run = _Run(scene, integrator, dt, start, rng, commands)
     block = min(steps, _BLOCK // (paths * (2 * n + 1)))
     block = max(1, block // commands.hold) * commands.hold

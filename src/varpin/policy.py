@@ -1,7 +1,10 @@
-"""Feedback policies that kernels can evaluate."""
+"""Controls that are neither rows nor a law: a torque of time alone, and feedback that kernels can evaluate."""
 
 from __future__ import annotations
 
+import inspect
+import reprlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,6 +16,43 @@ from varpin.errors import InputError
 from varpin.kernels.tree import Commands
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class OpenLoop:
+    """Controls that are a function of time alone.
+
+    The function is evaluated once a step, in the middle of it, and held over the step: the motion is right to second
+    order, whatever the integrator. What depends on the state is a control law, a function of (t, q, v).
+
+    Attributes:
+        f: Of the time [s]; returns the controls (m,).
+
+    Raises:
+        InputError: It is no function, or not one of one argument.
+    """
+
+    f: Callable[[float], ArrayLike]
+
+    def __post_init__(self) -> None:
+        if not callable(self.f):
+            raise InputError(f"OpenLoop takes a function of the time t, got {reprlib.repr(self.f)}")
+        if not takes(self.f, 1):
+            hint = "; a law of (t, q, v) is given as it is, controls=law" if takes(self.f, 3) else ""
+            raise InputError(f"OpenLoop takes a function of one argument, the time t{hint}")
+
+
+def takes(function: Callable[..., object], arguments: int) -> bool:
+    """Whether a function can be called with so many arguments; true where it does not tell."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return True
+    try:
+        signature.bind(*range(arguments))
+    except TypeError:
+        return False
+    return True
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -5,27 +5,18 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import fields
-from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import (
-    JointValues,
-    as_floats,
-    count,
-    finite_array,
-    is_one_of,
-    joint_array,
-    positive,
-    require_finite,
-)
+from varpin.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, open_loop, rows, steps_of
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
-from varpin.policy import LinearPolicy
+from varpin.loop_stability import unstable_loop
+from varpin.policy import LinearPolicy, OpenLoop, takes
 from varpin.scene import Scene, require_scene
 from varpin.soundness import Finding, announce, evident, examined, with_warnings
 from varpin.trajectory import StepStatistics, Trajectory
@@ -61,23 +52,24 @@ class _StepError(VarpinError, ValueError):
     Attributes:
         step: Index of the step.
         time: When it was called [s].
-        trajectory: What was computed before.
+        trajectory: What was computed before; None where the function is called before the motion begins.
     """
 
-    def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory) -> None:
+    def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory | None) -> None:
         self.step = step
         self.time = time
         self.trajectory = trajectory
-        super().__init__(f"step {step} (t = {time:.6g} s): {problem}; what came before is in error.trajectory")
+        before = "" if trajectory is None else "; what came before is in error.trajectory"
+        super().__init__(f"step {step} (t = {time:.6g} s): {problem}{before}")
 
 
 class ControlError(_StepError):
-    """A control function raised, or returned something that is no control.
+    """A control law or the function of an OpenLoop raised, or returned something that is no control.
 
     Attributes:
         step: Index of the step it was called for.
         time: The time it was called with [s].
-        trajectory: What was computed before.
+        trajectory: What was computed before; None from an ensemble, whose controls are evaluated before it begins.
     """
 
 
@@ -102,7 +94,7 @@ class StepFailure(VarpinError, RuntimeError):
         q: Configuration at the start of the step (n,) [rad or m].
         v: Velocity there (n,).
         p: Momentum there (n,).
-        trajectory: What was computed before.
+        trajectory: What was computed before, with a warning if its control loop is unstable.
     """
 
     def __init__(self, step: int, time: float, failure: Failure, trajectory: Trajectory) -> None:
@@ -112,10 +104,11 @@ class StepFailure(VarpinError, RuntimeError):
         self.reason = failure.reason
         self.q, self.v, self.p = trajectory.q[-1], trajectory.v[-1], trajectory.p[-1]
         self.trajectory = trajectory
+        advice = trajectory.warnings[0] if trajectory.warnings else "a smaller dt may go further"
         super().__init__(
             f"step {step} (t = {time:.6g} s) cannot be trusted: {failure.reason}; last residual {failure.residual:.3g} "
             f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}. What came before is in error.trajectory; "
-            "a smaller dt may go further"
+            f"{advice}"
         )
 
 
@@ -220,11 +213,11 @@ def simulate(
     *,
     dt: float,
     steps: int,
-    controls: ArrayLike | ControlLaw | LinearPolicy | None = None,
+    controls: ArrayLike | ControlLaw | LinearPolicy | OpenLoop | None = None,
+    period: int = 1,
     integrator: Integrator | None = None,
     rng: np.random.Generator | int | None = None,
     increments: ArrayLike | None = None,
-    sampling: Literal["midpoint", "start"] = "midpoint",
     check: bool = True,
     progress: Progress | None = None,
 ) -> Trajectory:
@@ -237,25 +230,26 @@ def simulate(
         dt: Time step [s].
         steps: N, their number.
         controls: None for none; an array (N, m), one row a step; one row (m,) for all steps; a
-            :class:`varpin.LinearPolicy`; or a function of (t [s], q (n,), v (n,)) that returns (m,).
-            Controls are constant over each step.
+            :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that returns (m,); or
+            :class:`varpin.OpenLoop`, a function of time alone. Controls are constant over each step. A law is a digital
+            controller: it is called once where each of its periods begins, with the time and the state of that node,
+            and what it returns is held over the period.
+        period: Of a control law, in steps.
         integrator: :class:`Midpoint` with alpha = 1/2 if left out.
 
     Other Args:
         rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero.
         increments: The increments themselves, (N, k) [s^0.5], to replay or refine a path; see :mod:`varpin.wiener`.
-        sampling: Where a control function is evaluated, once a step. ``"midpoint"``: at the step's midpoint, at the
-            state expected there, which keeps second order. ``"start"``: at the node where the step begins, as a
-            digital controller with a zero-order hold would, at the price of first order.
-        check: Look at the finished motion, whether the balance of its energy closes and its steps resolve it, for
-            ``Trajectory.warnings`` and the log. It takes half a millisecond to one.
+        check: Look at the finished motion, whether the balance of its energy closes, its steps resolve it and its
+            control loop is stable, for ``Trajectory.warnings`` and the log. It takes a millisecond or two.
         progress: Called now and then with (steps done, steps in all).
 
     Returns:
         The trajectory, frozen.
 
     Raises:
-        InputError: Wrong shapes, values that are not finite, dt <= 0, steps < 0.
+        InputError: Wrong shapes, values that are not finite, dt <= 0, steps < 0, a law of other arguments than
+            (t, q, v), a period without a law.
         UnknownJoint: ``q0`` or ``v0`` names a joint that is no coordinate of the robot.
         ControlError: The control function returned something unusable; holds the trajectory so far.
         NoiseError: A function of a CustomNoise did; holds the trajectory so far.
@@ -267,27 +261,41 @@ def simulate(
     n = len(joints)
     q0, v0 = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
     dt, steps = positive("dt", dt, "s"), count("steps", steps)
-    if not is_one_of(sampling, ("midpoint", "start")):
-        raise InputError(f"sampling must be 'midpoint' or 'start', got {sampling!r}")
+    period = count("period", period, least=1)
     integrator = Midpoint() if integrator is None else integrator
     if not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
     law = controls if callable(controls) else None
+    if law is not None:
+        _require_law(law)
+    elif period != 1:
+        raise InputError(
+            f"period = {period} is of a control law, a function of (t, q, v); rows are given one a step, "
+            "and a LinearPolicy has a hold of its own"
+        )
     _require_memory(scene, steps)
-    given = (None, 0) if callable(controls) else (controls, steps)
-    commands = commands_of(scene, integrator, *given)
+    if callable(controls) or isinstance(controls, OpenLoop):
+        commands = open_loop(np.zeros((0, scene.controls)))
+    else:
+        commands = commands_of(scene, integrator, controls, steps, dt)
+    hold = period if law is not None else controls.hold if isinstance(controls, LinearPolicy) else None
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
     with announced_compilation(f"simulate with {type(integrator).__name__}"):
         state, (start,) = integrator.start(scene, q0[None], v0[None])
         record = _Record(scene, integrator, dt, steps, dw, start)
         # A sweep takes as long as the robot has joints, an elimination as their cube.
         chunk = max(1, _CHUNK // (n + n**3 // 100))
-        # One step at a time where Python functions are called, so that what came before one that fails is recorded.
-        stepwise = law is not None or scene.noise.diffusion is None
+        # One step at a time where noise calls Python functions, so that what came before one that fails is recorded.
+        stepwise = scene.noise.diffusion is None
         try:
             while record.steps < steps:
+                done = record.steps
                 if law is not None:
-                    block = open_loop(_sample(law, sampling, integrator, state, record))
+                    held = min(1 if stepwise else period, steps - done)
+                    u = record.u[done - 1 : done] if done % period else _decision(law, record)
+                    block = open_loop(u)._replace(hold=held)
+                elif isinstance(controls, OpenLoop):
+                    block = open_loop(_sampled(controls, record, 1 if stepwise else min(chunk, steps - done)))
                 elif stepwise:
                     block = _next(commands, record)
                 else:
@@ -303,23 +311,28 @@ def simulate(
                 record.add(segment)
                 if segment.failure is not None:
                     node = record.trajectory()
+                    if hold is not None and check:
+                        node = with_warnings(node, unstable_loop(scene, node, hold))
                     raise StepFailure(node.steps, node.t[-1], segment.failure, node)
-                if progress is not None and (not stepwise or record.steps % chunk == 0 or record.steps == steps):
+                if progress is not None and (done // chunk < record.steps // chunk or record.steps == steps):
                     progress(record.steps, steps)
         except KeyboardInterrupt:
-            raise Interrupted(_told(scene, integrator, record.trajectory(), check=check)[0]) from None
-        trajectory, found = _told(scene, integrator, record.trajectory(), check=check)
+            raise Interrupted(_told(scene, integrator, record.trajectory(), hold, check=check)[0]) from None
+        trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
     announce(logger, scene, dt, found)
     return trajectory
 
 
 def _told(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, *, check: bool
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None, *, check: bool
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
-    """A whole motion with what is to be said of it."""
-    if check:
-        return examined(scene, integrator, trajectory)
-    found = evident(scene, trajectory)
+    """A whole motion with what is to be said of it; ``hold`` is the period of its feedback in steps, None for none."""
+    if not check:
+        found = evident(scene, trajectory)
+        return with_warnings(trajectory, found), found
+    trajectory, found = examined(scene, integrator, trajectory)
+    if hold is not None:
+        found = (*unstable_loop(scene, trajectory, hold), *found)
     return with_warnings(trajectory, found), found
 
 
@@ -333,11 +346,25 @@ def _require_memory(scene: Scene, steps: int) -> None:
 
 
 def commands_of(
-    scene: Scene, integrator: Integrator, controls: ArrayLike | LinearPolicy | None, steps: int
+    scene: Scene, integrator: Integrator, controls: ArrayLike | LinearPolicy | OpenLoop | None, steps: int, dt: float
 ) -> Commands:
-    """Controls of ``steps`` steps as kernels take them: None, (steps, m), (m,) or a policy."""
+    """Controls of ``steps`` steps of ``dt`` [s] as kernels take them: None, (steps, m), (m,), a function or a policy.
+
+    Raises:
+        InputError: The array is neither (steps, m) nor (m,), or not finite; the policy is for something else; a law.
+        ControlError: The function of an OpenLoop failed; it holds no trajectory.
+    """
     if isinstance(controls, LinearPolicy):
         return controls.commands(steps, scene.controls, scene.robot.dof, integrator.variational)
+    if isinstance(controls, OpenLoop):
+        u = np.empty((steps, scene.controls))
+        for k in range(steps):
+            u[k] = _row_at(controls, scene, dt, k)
+        return open_loop(u)
+    if callable(controls):
+        raise InputError(
+            "controls must be rows, a varpin.LinearPolicy or a varpin.OpenLoop here; only simulate takes a control law"
+        )
     return open_loop(control_rows(scene, controls, steps))
 
 
@@ -366,18 +393,59 @@ def _next(commands: Commands, record: _Record) -> Commands:
     return rows(commands, decision, decision + 1, before)._replace(hold=1)
 
 
-def _sample(law: ControlLaw, sampling: str, integrator: Integrator, state: Any, record: _Record) -> Floats:
-    """The control of the next step, (1, m), from a control function."""
-    k, dt = record.steps, record.dt
-    if sampling == "start":
-        time, q, v = k * dt, record.nodes["q"][k].copy(), record.nodes["v"][k].copy()
-    else:
-        time, (q, v) = (k + 0.5) * dt, integrator.predict(state, dt)
+def _require_law(law: ControlLaw) -> None:
+    """Refuse a function that cannot be called with (t, q, v)."""
+    if takes(law, 3):
+        return
+    if takes(law, 1):
+        raise InputError(
+            "controls is a function of one argument; a control law takes (t, q, v), and controls that are a function "
+            "of time alone are given as varpin.OpenLoop(f)"
+        )
+    raise InputError("controls must be a function of (t, q, v): it cannot be called with three arguments")
+
+
+def _decision(law: ControlLaw, record: _Record) -> Floats:
+    """The control (1, m) of the period that begins at the last node."""
+    k = record.steps
+    time = k * record.dt
+    state = record.nodes["q"][k].copy(), record.nodes["v"][k].copy()
+    return _called("controls(t, q, v)", lambda: law(time, *state), record.scene, k, time, record)[None]
+
+
+def _sampled(controls: OpenLoop, record: _Record, steps: int) -> Floats:
+    """Controls (steps, m) of the next steps, or of those before the first for which the function fails."""
+    u = np.empty((steps, record.scene.controls))
+    for k in range(steps):
+        try:
+            u[k] = _row_at(controls, record.scene, record.dt, record.steps + k, record)
+        except ControlError:
+            if k == 0:
+                raise
+            return u[:k].copy()
+    return u
+
+
+def _row_at(controls: OpenLoop, scene: Scene, dt: float, step: int, record: _Record | None = None) -> Floats:
+    """The control (m,) of one step, from its middle."""
+    time = (step + 0.5) * dt
+    return _called("OpenLoop: f(t)", lambda: controls.f(time), scene, step, time, record)
+
+
+def _called(
+    name: str, call: Callable[[], ArrayLike], scene: Scene, step: int, time: float, record: _Record | None
+) -> Floats:
+    """What a function of the user's returns as a control (m,).
+
+    Raises:
+        ControlError: It raised, or returned something else.
+    """
     try:
-        value = law(time, q, v)
+        value = call()
     except Exception as error:
-        raise ControlError(k, time, f"controls(t, q, v) raised {error!r}", record.trajectory()) from error
+        before = None if record is None else record.trajectory()
+        raise ControlError(step, time, f"{name} raised {error!r}", before) from error
     try:
-        return finite_array("controls(t, q, v)", value, (record.scene.controls,))[None]
+        return finite_array(name, value, (scene.controls,))
     except InputError as error:
-        raise ControlError(k, time, str(error), record.trajectory()) from None
+        raise ControlError(step, time, str(error), None if record is None else record.trajectory()) from None

@@ -64,9 +64,8 @@ class Integrator(ABC):
        copies it;
     2. ``rollout_compiled`` and ``step_in_python``, which move a state on: many steps of many paths in a kernel, and one
        step of one path with noise that only Python can evaluate;
-    3. ``predict``, the state to expect half a step ahead, to second order, at which feedback is evaluated;
-    4. ``linearize``, the derivatives of its steps;
-    5. ``variational``, which says whether it maps (q, p) or (q, v), and ``order``.
+    3. ``linearize``, the derivatives of its steps;
+    4. ``variational``, which says whether it maps (q, p) or (q, v), and ``order``.
     """
 
     variational: bool
@@ -169,10 +168,6 @@ class Integrator(ABC):
             LinearizationError: A step has no solution at dw = 0.
         """
         raise InputError(f"{self} has no second-order linearization; varpin.Midpoint(...) has")
-
-    @abstractmethod
-    def predict(self, state: Any, dt: float) -> tuple[Floats, Floats]:
-        """Q (n,) and v (n,) expected in the middle of the next step."""
 
 
 def _text(value: object) -> str:

@@ -110,11 +110,6 @@ class _Explicit(Integrator):
         )
         return segments_of(nodes, REASONS)
 
-    def predict(self, state: ExplicitRun, dt: float) -> tuple[Floats, Floats]:
-        """See :meth:`Integrator.predict`; the velocity goes on as over the last step."""
-        now = state.state
-        return now.q[0] + 0.5 * dt * now.v[0], now.v[0] + 0.5 * now.lead[0]
-
 
 def mass(scene: Scene, q: Floats) -> Floats:
     """M(q) (n, n)."""

@@ -35,10 +35,11 @@ class Gauss(Variational):
     Solves L_v(Q_i, V_i) = p0 + dt sum_j a_ij (L_q + F)(Q_j, V_j) with Q_i = q0 + dt sum_j a_ij V_j for the stage
     velocities V_i. Of order 2 s, symmetric, and symplectic where nothing is forced; one stage is ``Midpoint()``.
 
-    Dampers and springs of the scene act at every stage and keep the order. Controls are constant over a step: the
-    motion under the held controls is of order 2 s, but a control that is to change with time or state within the step
-    is right to second order only, whatever s, when it is sampled in the step's middle, and to first order when at its
-    start (a :class:`varpin.LinearPolicy` is). So put viscous friction into the scene, not into a control function.
+    Dampers and springs of the scene act at every stage and keep the order. Controls are constant over a step, and so
+    the motion under a digital controller (a control law, a :class:`varpin.LinearPolicy`) is of order 2 s. Of a control
+    that changes within the step the motion is right to second order only, whatever s, when it is sampled in the step's
+    middle (:class:`varpin.OpenLoop`), and to first order when at its start. So put viscous friction into the scene,
+    not into a control law.
 
     Steps are accepted or taken in parts as :class:`Midpoint` does.
 
@@ -160,12 +161,3 @@ class Gauss(Variational):
             (1.0 - c) * (1.0 - 3.0 * c) * v[:-1, None] + c * (3.0 * c - 2.0) * v[1:, None] + 6.0 * c * (1.0 - c) * mean
         )
         return guess
-
-    def predict(self, state: VariationalRun, dt: float) -> tuple[Floats, Floats]:
-        """See :meth:`Integrator.predict`; the velocity goes on as from the last step's mean to its end."""
-        now = state.state
-        velocity = now.v[0].copy()
-        if now.counters[0, 0] > 0:
-            stages = int(self.stages)
-            velocity += now.past[0, stages] - tableau(stages).b @ now.past[0, :stages]
-        return now.q[0] + 0.5 * dt * now.v[0], velocity

@@ -194,11 +194,3 @@ class Midpoint(Variational):
             H += start.T @ self._curvatures(scene, length, at_q, at_p, at_v, force[None], z[None])[0] @ start
             z = z @ link[: 2 * n, : 2 * n]
         return H
-
-    def predict(self, state: VariationalRun, dt: float) -> tuple[Floats, Floats]:
-        """See :meth:`Integrator.predict`; the velocity goes on from the last midpoint through the node."""
-        now = state.state
-        velocity = now.v[0].copy()
-        if now.counters[0, 0] > 0:
-            velocity += now.v[0] - now.past[0, 0]
-        return now.q[0] + 0.5 * dt * now.v[0], velocity

@@ -37,13 +37,11 @@ class ReferenceRun:
         x: (q, v) of each path (P, 2n).
         dynamics: Work arrays.
         tried: The last length of a step inside [s], 0 for none: the next begins with it.
-        last: Change of v over the last step (P, n).
     """
 
     x: Floats
     dynamics: Dynamics
     tried: float
-    last: Floats
 
 
 class _RunsAway(ArithmeticError):
@@ -90,7 +88,6 @@ class Reference(Integrator):
             x=np.hstack([q0, v0]),
             dynamics=new_dynamics(scene.robot.tree.parent.size, n),
             tried=0.0,
-            last=np.zeros((paths, n)),
         )
         nodes = new_nodes(paths, 1, n, scene.controls)
         states = kernels.new_explicit_state(q0, v0, scene.mechanism.diffusion.center)
@@ -100,7 +97,7 @@ class Reference(Integrator):
 
     def fork(self, state: ReferenceRun) -> ReferenceRun:
         """See :meth:`Integrator.fork`."""
-        return replace(state, x=state.x.copy(), last=state.last.copy())
+        return replace(state, x=state.x.copy())
 
     def step_in_python(
         self,
@@ -141,8 +138,6 @@ class Reference(Integrator):
                 x, nodes.tally[i, s, 2] = self._step(scene, state, i, force, dt)
             except _RunsAway:
                 return Failure(TOO_STEEP, 0.0)
-            n = scene.robot.dof
-            state.last[i] = x[n:] - state.x[i, n:]
             state.x[i] = x
             if kernels.enter_node(scene.mechanism, x, state.dynamics, nodes, i, s) != kernels.SOLVED:
                 return Failure(TOO_STEEP, 0.0)
@@ -212,12 +207,6 @@ class Reference(Integrator):
         blocks[n:, :n], blocks[n:, n : 2 * n], blocks[n:, 2 * n :] = unit * fast, unit, unit * light
         end, _, _ = _integrate(rate, y, dt, self.rtol, np.append(atol, blocks.ravel()), 0.0)
         return end[2 * n :].reshape(2 * n, 3 * n)
-
-    def predict(self, state: ReferenceRun, dt: float) -> tuple[Floats, Floats]:
-        """See :meth:`Integrator.predict`; the velocity goes on as over the last step."""
-        n = state.last.shape[1]
-        q, v = state.x[0, :n], state.x[0, n:]
-        return q + 0.5 * dt * v, v + 0.5 * state.last[0]
 
 
 def _integrate(rate: Rate, x: Floats, dt: float, rtol: float, atol: Floats, tried: float) -> tuple[Floats, int, float]:

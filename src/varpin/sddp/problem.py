@@ -24,7 +24,7 @@ from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint
 from varpin.lagrangian import lagrangian_jet
 from varpin.markup import facts, listed
-from varpin.policy import LinearPolicy
+from varpin.policy import LinearPolicy, OpenLoop
 from varpin.scene import Scene, require_scene
 from varpin.simulation import simulate
 from varpin.trajectory import Trajectory, require_motion
@@ -317,9 +317,9 @@ class OptimalControlProblem:
         return float(self.costs(trajectory.q, trajectory.v, trajectory.u))
 
     def simulate(
-        self, controls: ArrayLike | LinearPolicy, *, rng: np.random.Generator | int | None = None
+        self, controls: ArrayLike | LinearPolicy | OpenLoop, *, rng: np.random.Generator | int | None = None
     ) -> Trajectory:
-        """The motion from (q0, v0) under some controls (N, m) or a policy, with the scene's noise if there is an rng.
+        """The motion from (q0, v0) under controls (N, m), a policy or an OpenLoop; with noise if rng is given.
 
         Raises:
             StepFailure: The motion cannot go on.

@@ -1,0 +1,373 @@
+"""Control laws are digital controllers; a loop that is unstable at its period is told of, and no other."""
+
+import logging
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.optimize import fsolve
+
+import varpin as vp
+from varpin.loop_stability import unstable_loop
+
+INTEGRATORS = (vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4())
+
+
+class Plant:
+    """A robot by Pinocchio's algorithms alone."""
+
+    def __init__(self, scene):
+        self.robot, self.damping = scene.robot, scene.damping
+        self.model = scene.robot.model.copy()
+        self.model.gravity = pin.Motion(scene.gravity, np.zeros(3))
+        self.data = self.model.createData()
+
+    def acceleration(self, q, v, u):
+        place = self.robot.configuration(q)
+        return pin.aba(self.model, self.data, place, v, u - self.damping * v).copy()
+
+    def digital(self, law, q, v, dt, periods):
+        """(periods + 1, 2n): DOP853 under a law that is evaluated every dt and held."""
+        n, nodes = len(q), [np.concatenate([q, v])]
+        for k in range(periods):
+            x = nodes[-1]
+            u = law(k * dt, x[:n], x[n:])
+
+            def rate(_, x, u=u):
+                return np.concatenate([x[n:], self.acceleration(x[:n], x[n:], u)])
+
+            nodes.append(solve_ivp(rate, (0.0, dt), x, method="DOP853", rtol=1e-11, atol=1e-11).y[:, -1])
+        return np.array(nodes)
+
+    def spectral_radius(self, law, K, dt, guess):
+        """Of the loop about its equilibrium next to a guess, by differences and scipy's expm."""
+        n, still, h = len(guess), np.zeros(len(guess)), 1e-5
+        q = fsolve(lambda q: self.acceleration(q, still, law(0.0, q, still)), guess)
+        u, unit = law(0.0, q, still), np.eye(n)
+
+        def slope(f):
+            return np.array([(f(h * e) - f(-h * e)) / (2.0 * h) for e in unit]).T
+
+        zero = np.zeros((n, n))
+        rates = np.block(
+            [
+                [zero, unit, zero],
+                [
+                    slope(lambda e: self.acceleration(q + e, still, u)),
+                    slope(lambda e: self.acceleration(q, e, u)),
+                    slope(lambda e: self.acceleration(q, still, u + e)),
+                ],
+                [np.zeros((n, 3 * n))],
+            ]
+        )
+        step = expm(dt * rates)[: 2 * n]
+        return np.abs(np.linalg.eigvals(step[:, : 2 * n] + step[:, 2 * n :] @ K)).max()
+
+
+def spring_and_damper(kp, kd, goal=1.0):
+    return lambda t, q, v: -kp * (q - goal) - kd * v
+
+
+def run(scene, q, v, law, **options):
+    """The motion and whether its loop was called unstable; (None, True) if it cannot go on."""
+    try:
+        motion = vp.simulate(scene, q, v, controls=law, **options)
+    except (vp.StepFailure, vp.ControlError):
+        return None, True
+    return motion, any("unstable" in sentence for sentence in motion.warnings)
+
+
+@pytest.mark.parametrize("gravity", [False, True])
+@pytest.mark.parametrize(
+    ("kp", "kd", "dt", "stable"),
+    [
+        (1e4, 100, 4e-3, True),
+        (1e4, 200, 5e-3, False),
+        (100, 110, 1e-2, False),
+        (1e4, 300, 5e-3, False),
+        (2500, 100, 1e-2, False),
+    ],
+)
+@pytest.mark.parametrize("integrator", [*INTEGRATORS, vp.ExplicitEuler()], ids=str)
+def test_stiff_laws(kp, kd, dt, stable, gravity, integrator):
+    scene, law = vp.Scene(vp.planar_chain(1), gravity=gravity), spring_and_damper(kp, kd)
+    plant, zero = Plant(scene), np.zeros(1)
+    assert (plant.spectral_radius(law, np.array([[-kp, -kd]]), dt, np.ones(1)) < 1.0) == stable
+    motion, told = run(scene, zero, zero, law, dt=dt, steps=200, integrator=integrator)
+    assert told == (not stable)
+    if stable:
+        if integrator.order > 1:
+            assert motion.warnings == ()
+        exact = plant.digital(law, zero, zero, dt, 100)
+        # A rod in the plane: gravity changes little over a step, and the torque does not change at all.
+        limit = {1: 0.3, 2: 1e-5, 4: 1e-6}[integrator.order]
+        assert np.abs(motion.q[:101, 0] - exact[:, 0]).max() < limit
+
+
+def test_random_loops():
+    """The motion is that of the digital controller; what is said of its loop agrees with its eigenvalues."""
+    rng = np.random.default_rng(14)
+    held = alarmed = 0
+    for trial in range(200):
+        n = int(rng.integers(1, 4))
+        kp, kd, dt = 10 ** rng.uniform(1, 4), 10 ** rng.uniform(0, 2.5), 10 ** rng.uniform(-3, -1.7)
+        scene, law = vp.Scene(vp.planar_chain(n), gravity=bool(rng.integers(2))), spring_and_damper(kp, kd)
+        plant, zero = Plant(scene), np.zeros(n)
+        K = np.hstack([-kp * np.eye(n), -kd * np.eye(n)])
+        radius = plant.spectral_radius(law, K, dt, np.ones(n))
+        integrator = INTEGRATORS[trial % 3]
+        what = f"{n} links, kp = {kp:.6g}, kd = {kd:.6g}, dt = {dt:.6g} s, radius {radius:.6g}, {integrator}"
+        motion, told = run(scene, zero, zero, law, dt=dt, steps=200, integrator=integrator)
+        if radius >= 1.0:
+            alarmed += 1
+            assert told, what
+            continue
+        if motion is None:
+            # Stable next to its goal, but not from where it starts: so is the exact loop.
+            exact = plant.digital(law, zero, zero, dt, 10)
+            assert np.abs(exact[:, n:]).max() > 1e2, what
+            continue
+        assert not told, what
+        # Where links fold and whirl round, some periods enlarge the smallest error by orders of magnitude.
+        if np.abs(motion.v[:9]).max() * dt > 0.2:
+            continue
+        held += 1
+        exact = plant.digital(law, zero, zero, dt, 8)
+        fine, _ = run(scene, zero, zero, law, dt=dt / 4, steps=32, period=4, integrator=vp.Gauss(3))
+        np.testing.assert_allclose(fine.q[::4], exact[:, :n], rtol=0, atol=1e-7, err_msg=what)
+        own = np.abs(motion.q[:9] - exact[:, :n]).max()
+        assert own < {2: 0.02, 4: 0.002}[integrator.order], what
+    assert held > 60
+    assert alarmed > 40
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda"])
+@pytest.mark.parametrize("share", [0.8, 2.6])
+def test_stiff_laws_on_arms(name, share):
+    """Gains in proportion to inertias, such that the fastest direction loses a share of its speed a period."""
+    lock = {"panda_finger_joint1": 0.02} if name == "panda" else None
+    scene = vp.Scene(vp.load_robot(name, lock=lock), damping=0.05)
+    n, plant, dt = scene.robot.dof, Plant(scene), 2e-3
+    goal = np.linspace(0.3, -0.4, n) - (1.5 if name == "panda" else 0.0) * (np.arange(n) == 3)
+    M = vp.lagrangian_jet(scene, goal, np.zeros(n)).Lvv
+    kd = np.diag(M) * share / dt / np.linalg.eigvals(np.linalg.solve(M, np.diag(np.diag(M)))).real.max()
+    kp = 50.0 * kd
+    law = spring_and_damper(kp, kd, goal)
+    K = np.hstack([-np.diag(kp), -np.diag(kd)])
+    radius = plant.spectral_radius(law, K, dt, goal)
+    assert (radius < 1.0) == (share < 2.0)
+    q0 = goal + 0.02
+    motion, told = run(scene, q0, np.zeros(n), law, dt=dt, steps=150, integrator=vp.Gauss(2))
+    assert told == (share > 2.0)
+    if share < 2.0:
+        exact = plant.digital(law, q0, np.zeros(n), dt, 15)
+        np.testing.assert_allclose(motion.q[:16], exact[:, :n], rtol=0, atol=1e-6)
+
+
+def test_a_law_is_not_called_for_a_look():
+    """A law may have a memory: one call a period, in the order of time, whatever is looked at."""
+    scene, times = vp.Scene(vp.planar_chain(2)), []
+
+    def law(t, q, v):
+        times.append(t)
+        return -50.0 * (q - 1.0) - 10.0 * v
+
+    for check in (True, False):
+        times.clear()
+        vp.simulate(scene, [0, 0], [0, 0], dt=2e-3, steps=60, controls=law, period=3, check=check)
+        np.testing.assert_allclose(times, 6e-3 * np.arange(20), atol=1e-12)
+
+
+def slow_law(radius):
+    """A damper on a rod whose loop multiplies deviations of v by -radius a period of 4 ms."""
+    rod = vp.Scene(vp.planar_chain(1), gravity=False)
+    inertia = vp.lagrangian_jet(rod, [0.0], [0.0]).Lvv[0, 0]
+    return rod, (1.0 + radius) * inertia / 4e-3
+
+
+@pytest.mark.parametrize("radius", [0.995, 1.005])
+def test_a_loop_that_is_slowly_unstable(radius):
+    rod, kd = slow_law(radius)
+    motion, told = run(rod, [0.3], [0.2], lambda t, q, v: -kd * v, dt=4e-3, steps=60)
+    assert told == (radius > 1.0)
+    if told:
+        assert f"multiplies deviations by {radius:.4g}" in motion.warnings[0]
+    # Its goal moves, and no equilibrium is there to look at: the motion tells.
+    _, told = run(rod, [0.3], [0.2], lambda t, q, v: -kd * (v - 3.0), dt=4e-3, steps=400)
+    assert told == (radius > 1.0)
+
+
+def test_slow_turns_of_a_complex_pair():
+    """A sampled spring without a damper gains amplitude: |z|^2 = 1 + kp T^2 / (2 M)."""
+    rod, _ = slow_law(1.0)
+    inertia, dt = 1.0 / 3.0, 4e-3
+    for kp in (30.0, 300.0):
+        motion, told = run(rod, [0.3], [0.0], spring_and_damper(kp, 0.0, 0.0), dt=dt, steps=600)
+        assert told
+        assert f"multiplies deviations by {np.sqrt(1.0 + 0.5 * kp * dt**2 / inertia):.4g}" in motion.warnings[0]
+
+
+def cases_without_alarm():
+    rod, free = vp.Scene(vp.planar_chain(1)), vp.Scene(vp.planar_chain(1), gravity=False)
+    two, up = vp.Scene(vp.planar_chain(2)), np.pi / 2 - 1e-6
+    noisy = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(0.1))
+    passive = vp.Scene(vp.planar_chain(2), actuation=[[1.0], [0.0]])
+
+    def pump(t, q, v):
+        return -0.3 * v * (v**2 / 6.0 + 0.5 * 9.81 * (np.sin(q) - 1.0))
+
+    return {
+        "falls from upright, weak damping": (rod, [up], lambda t, q, v: -0.1 * v, {}),
+        "falls from upright, weak springs": (rod, [up], lambda t, q, v: -(q - np.pi / 2) - 0.1 * v, {}),
+        "falls without torque": (two, [0, 0], lambda t, q, v: 0.0 * v, {}),
+        "constant torque": (free, [0], lambda t, q, v: np.ones(1), {}),
+        "goal that swings": (two, [0, 0], lambda t, q, v: -300 * (q - np.sin(3 * t)) - 30 * v, {}),
+        "goal that jumps late": (free, [0], lambda t, q, v: -100 * (q - (t > 1.0)) - 10 * v, {}),
+        "goal that runs away": (free, [0], lambda t, q, v: -100 * (q - t**3) - 10 * (v - 3 * t**2), {}),
+        "saturates": (rod, [0], lambda t, q, v: np.clip(-1e3 * (q - 1) - 50 * v, -20, 20), {}),
+        "gravity compensated": (
+            two, [0, 0],
+            lambda t, q, v: -vp.lagrangian_jet(two, q, np.zeros(2)).Lq - 100 * (q - 1) - 5 * v, {},
+        ),
+        "starts at its goal and sags": (rod, [1], spring_and_damper(1e4, 100.0), {}),
+        "rests at its goal": (free, [1], spring_and_damper(1e4, 300.0), {}),
+        "velocity goal": (free, [0], lambda t, q, v: -30 * (v - 5), {}),
+        "drag": (free, [0], lambda t, q, v: -100 * (q - 1) - 20 * v * np.abs(v), {}),
+        "one joint of two": (passive, [0, 0], lambda t, q, v: -100 * (q[:1] - 1) - 20 * v[:1], {}),
+        "pumped up": (rod, [0.01 - np.pi / 2], pump, {}),
+        "noise": (noisy, [0, 0], spring_and_damper(300.0, 10.0), {"rng": 0}),
+        "seldom": (rod, [0], spring_and_damper(100.0, 20.0), {"period": 4}),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("case", cases_without_alarm())
+def test_no_alarm(case):
+    scene, q0, law, options = cases_without_alarm()[case]
+    motion, told = run(scene, q0, np.zeros(len(q0)), law, dt=2e-3, steps=700, **options)
+    assert motion is not None
+    assert not told
+
+
+def integral(kp, ki, kd, dt):
+    """A law with a memory."""
+    total = 0.0
+
+    def law(t, q, v):
+        nonlocal total
+        total = total + dt * (q - 1.0)
+        return -kp * (q - 1.0) - ki * total - kd * v
+
+    return law
+
+
+def cases_with_alarm():
+    rod, free, two = (vp.Scene(vp.planar_chain(n), gravity=g) for n, g in ((1, True), (1, False), (2, True)))
+    one = vp.Scene(vp.planar_chain(2), actuation=[[1.0], [0.0]])
+    noisy = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(0.1))
+    plant = Plant(two)
+
+    def inverse_dynamics(t, q, v):
+        return pin.rnea(plant.model, plant.data, q, v, -100.0 * (q - 1.0) - 203.0 * v)
+
+    return {
+        "integral": (rod, [0], integral(300.0, 500.0, 70.0, 1e-2), {}),
+        "gravity compensated": (
+            two, [1, 0.9],
+            lambda t, q, v: -vp.lagrangian_jet(two, q, np.zeros(2)).Lq - 100 * (q - 1) - 40 * v, {},
+        ),
+        "inverse dynamics": (two, [1, 0.9], inverse_dynamics, {}),
+        "one joint of two": (one, [0, 0], lambda t, q, v: -100 * (q[:1] - 1) - 200 * v[:1], {}),
+        "noise": (noisy, [0, 0], spring_and_damper(300.0, 60.0), {"rng": 0}),
+        "negative damper": (free, [0.1], lambda t, q, v: -10 * q + 5 * v, {}),
+        "seldom": (rod, [0], spring_and_damper(100.0, 40.0), {"period": 2}),
+        "near its goal": (free, [1 + 1e-6], spring_and_damper(1e3, 80.0), {}),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("case", cases_with_alarm())
+def test_alarm(case):
+    scene, q0, law, options = cases_with_alarm()[case]
+    _, told = run(scene, q0, np.zeros(len(q0)), law, dt=1e-2, steps=200, **options)
+    assert told
+
+
+def test_no_motion_ends_silently_above_a_thousand_times_its_start():
+    """Whatever the law: torques that grow on and on."""
+    free = vp.Scene(vp.planar_chain(1), gravity=False)
+    for kp, kd in ((10.0, 69.0), (1e3, 0.0), (1e4, 10.0), (3e3, 20.0)):
+        for shape in (lambda x: x, lambda x: x * (1.0 + 0.1 * np.sin(x)), lambda x: x + 0.1 * np.cos(x)):
+
+            def law(t, q, v, kp=kp, kd=kd, shape=shape):
+                return shape(-kp * (q - 1) - kd * v)
+
+            motion, told = run(free, [0.0], [0.0], law, dt=1e-2, steps=400)
+            if motion is not None and np.abs(motion.u[-20:]).max() > 1e3 * np.abs(motion.u[0]).max():
+                assert told
+                continue
+            assert told or np.abs(motion.u).max() < 1e4 * np.abs(motion.u[0]).max()
+
+
+def test_policies_are_looked_at():
+    """Gains of a plan that act for its horizon are no alarm; constant gains beyond their period are."""
+    scene, steps = vp.Scene(vp.planar_chain(2)), 100
+    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost([0.5, 0.3], 1e4) + vp.VelocityCost(1e2))
+    problem = vp.OptimalControlProblem(
+        scene, cost, [0, 0], [0, 0], dt=1e-2, steps=steps, integrator=vp.Gauss(2), sampling="gauss"
+    )
+    policy = vp.solve(problem).policy
+    options = {"dt": 1e-2, "steps": steps, "integrator": vp.Gauss(2)}
+    for q0 in ([0, 0], [0.05, -0.03]):
+        assert not any("unstable" in w for w in vp.simulate(scene, q0, [0, 0], controls=policy, **options).warnings)
+    free = vp.Scene(vp.planar_chain(1), gravity=False)
+    for kd, unstable in ((50.0, False), (80.0, True)):
+        own = vp.LinearPolicy(
+            np.zeros((steps, 1)), np.tile([[-1e3, -kd]], (steps, 1, 1)), np.tile([1.0, 0.0], (steps, 1)), on="velocity"
+        )
+        motion, told = run(free, [0], [0], own, dt=1e-2, steps=steps, integrator=vp.RungeKutta4())
+        assert told == unstable, (motion and motion.warnings, kd)
+
+
+def test_the_sentence_says_what_to_do(caplog):
+    scene = vp.Scene(vp.planar_chain(1), gravity=False)
+    with caplog.at_level(logging.WARNING, "varpin"):
+        motion, _ = run(scene, [0], [0], spring_and_damper(1e4, 200.0), dt=5e-3, steps=50)
+        run(scene, [0], [0], spring_and_damper(1e4, 200.0), dt=5e-3, steps=50)
+    (sentence,) = motion.warnings
+    assert "unstable at its period of 0.005 s: each multiplies deviations by 2.136" in sentence
+    assert "with a period of 0.0025 s or lower gains it is stable" in sentence
+    assert [record.getMessage() for record in caplog.records] == [sentence]
+    assert not run(scene, [0], [0], spring_and_damper(1e4, 200.0), dt=2.5e-3, steps=50)[1]
+    assert run(scene, [0], [0], spring_and_damper(1e4, 200.0), dt=5e-3, steps=50, check=False)[0].warnings == ()
+
+
+def test_a_step_that_fails_says_why():
+    scene = vp.Scene(vp.planar_chain(1), gravity=False)
+    with pytest.raises(vp.StepFailure, match="unstable at its period") as caught:
+        vp.simulate(scene, [0], [0], dt=5e-3, steps=2000, controls=spring_and_damper(1e4, 300.0))
+    assert "unstable" in caught.value.trajectory.warnings[0]
+
+
+def test_short_motions_and_still_ones():
+    scene = vp.Scene(vp.planar_chain(1))
+    for steps in range(6):
+        motion = vp.simulate(scene, [0], [0], dt=1e-3, steps=steps, controls=spring_and_damper(10.0, 1.0))
+        assert unstable_loop(scene, motion) == ()
+
+
+def test_noise_that_python_evaluates_keeps_the_period():
+    """Such noise is simulated step by step; the law still decides once a period."""
+    times = []
+
+    def law(t, q, v):
+        times.append(t)
+        return -10.0 * q - v
+
+    motions = []
+    for noise in (vp.CustomNoise(lambda q, v, u: np.eye(2) * 0.1, 2), vp.AdditiveNoise(0.1)):
+        times.clear()
+        scene = vp.Scene(vp.planar_chain(2), noise=noise)
+        motions.append(vp.simulate(scene, [0.3, 0], [0, 0], dt=1e-2, steps=17, controls=law, period=5, rng=3))
+        np.testing.assert_allclose(times, [0.0, 0.05, 0.1, 0.15])
+    np.testing.assert_allclose(motions[0].u, motions[1].u, atol=1e-12)
