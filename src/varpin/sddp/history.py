@@ -83,11 +83,12 @@ class SearchState:
     Attributes:
         trajectory: The motion then.
         cost: Of it, without noise.
-        first: Cost of the first motion.
+        above: By how much it costs more than the best one, without noise.
+        first: How much of the cost of the first motion was at stake.
         best: The motion of the least expected cost so far, if one was rated yet.
-        best_merit: Its expected cost.
         best_cost: Its cost without noise.
-        merits: The least expected cost after each iteration.
+        best_noise: What noise added to it, where that depends on the motion.
+        gains: By how much each iteration lowered the least expected cost.
         regularization: Relative to the diagonal of Quu.
         growth: Of the regularization.
         history: Of the iterations before.
@@ -95,11 +96,12 @@ class SearchState:
 
     trajectory: Trajectory
     cost: float
+    above: float
     first: float
     best: Trajectory | None
-    best_merit: float
     best_cost: float
-    merits: tuple[float, ...]
+    best_noise: float
+    gains: tuple[float, ...]
     regularization: float
     growth: float
     history: tuple[Iteration, ...]
