@@ -63,14 +63,18 @@ class Plan:
         return np.where(held, 0.0, self.gradient)
 
 
-def noise_shares(problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan) -> Floats:
+def noise_shares(
+    problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan, processes: NDArray[np.bool_] | None = None
+) -> Floats:
     """What noise adds in each step (N,) to the cost of a motion, if it acts and costs as it did along the plan's own.
 
-    Empty where there is no noise.
+    ``processes`` (k,) says which ones count, all if left out. Empty where there is no noise.
     """
     if problem.scene.processes == 0:
         return np.zeros(0)
     g = impulses(problem, trajectory, plan.jumps)
+    if processes is not None:
+        g = g[:, :, processes]
     added: Floats = 0.5 * np.einsum("Nai,Nai->N", g, plan.spread @ g)
     return added
 

@@ -87,10 +87,12 @@ class SearchState:
         first: How much of the cost of the first motion was at stake.
         best: The motion of the least expected cost so far, if one was rated yet.
         best_cost: Its cost without noise.
-        best_noise: What noise added to it, where that depends on the motion.
+        best_noise: What noise adds to it; that of constant strength changes no plan, and is left out.
         gains: By how much each iteration lowered the least expected cost.
         regularization: Relative to the diagonal of Quu.
         growth: Of the regularization.
+        bounded: Whether the line search gives up trials whose steps are cut into many parts.
+        cut: Whether it has given up one.
         history: Of the iterations before.
     """
 
@@ -104,6 +106,8 @@ class SearchState:
     gains: tuple[float, ...]
     regularization: float
     growth: float
+    bounded: bool
+    cut: bool
     history: tuple[Iteration, ...]
 
     def __repr__(self) -> str:

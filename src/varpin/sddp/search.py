@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Callable
@@ -52,8 +53,8 @@ _NOTHING = 1e-9
 # Trials of a line search: 0.25^10 is 1e-6.
 _TRIALS = 10
 # A trial is given up where a step wants more halvings than this, or than the motion so far, and where it has taken more
-# parts in all than so many times those of the motion so far. What was given up is tried again with more of both only
-# where nothing else has helped, and in the end without a bound, so that no problem becomes unsolvable.
+# parts in all than so many times those of the motion so far. What was given up is tried again with more of both where
+# nothing else has led far, and without a bound where nothing has helped; a search that stalls goes on without bounds.
 _HALVINGS, _MORE_HALVINGS = 2, 3
 _PARTS = 3
 _CUT, _DEAR = "its steps are cut into many parts", "it costs too much already"
@@ -211,10 +212,12 @@ def _held(u: Floats, problem: OptimalControlProblem) -> Commands:
     return open_loop(u)._replace(hold=problem.hold, limits=problem.control_limits.copy())
 
 
-def _is_additive(problem: OptimalControlProblem) -> bool:
-    """Whether all noise is of constant strength: nothing that controls do changes what it adds to the cost."""
+def _steered(problem: OptimalControlProblem) -> NDArray[np.bool_]:
+    """Which processes (k,) the plans take into account: those of constant strength change nothing in them."""
     fields = problem.scene.noise.diffusion
-    return fields is not None and not (fields.control.any() or fields.quadratic.any())
+    if fields is None or not problem.integrator.variational:
+        return np.ones(problem.scene.processes, dtype=np.bool_)
+    return np.array(fields.control.any(axis=(0, 2)) | fields.quadratic.any(axis=0), dtype=np.bool_)
 
 
 def _onto_limits(u: Floats, limits: Floats) -> Floats:
@@ -297,9 +300,11 @@ class _Search:
         self.best: Trajectory | None = None
         self.best_cost = self.best_noise = np.inf
         self.above = 0.0  # what the trajectory costs more than the best one, without noise
+        self.bounded = True  # whether trials are given up for their parts
+        self.cut = False  # whether one was
         self.gains: list[float] = []  # by how much each iteration lowered the least expected cost
         self.reason = ""
-        self.fixed_noise = problem.integrator.variational and _is_additive(problem)
+        self.steered = _steered(problem)
 
     def begin(self, commands: Commands) -> None:
         trajectory, failure = self.motions.under(commands)
@@ -318,6 +323,7 @@ class _Search:
         self.gains, self.history = list(state.gains), list(state.history)
         self.best, self.best_cost, self.best_noise = state.best, state.best_cost, state.best_noise
         self.regularization, self.growth = state.regularization, state.growth
+        self.bounded, self.cut = state.bounded, state.cut
 
     def _state(self) -> SearchState:
         return SearchState(
@@ -331,6 +337,8 @@ class _Search:
             gains=tuple(self.gains),
             regularization=self.regularization,
             growth=self.growth,
+            bounded=self.bounded,
+            cut=self.cut,
             history=tuple(self.history),
         )
 
@@ -359,6 +367,8 @@ class _Search:
                 self.reason = self._numbers(tolerance)
                 return Status.CONVERGED
             ended, why = self._ended(self.plan, tolerance, last, deadline)
+            if ended is Status.STALLED and self._lift():
+                continue
             if ended is not None:
                 self._note(report, started, passes)
                 self.reason = why + self._numbers(tolerance, afresh=True)
@@ -374,7 +384,7 @@ class _Search:
                 return Status.CONVERGED
             if step.length >= _LONG:
                 self._relax()
-            elif step.length <= _SHORT and not self._stiffen():
+            elif step.length <= _SHORT and not self._stiffen() and not self._lift():
                 self.reason = "no step lowers the cost, whatever the regularization; "
                 self.reason += self._numbers(tolerance, afresh=True)
                 return Status.STALLED
@@ -389,8 +399,12 @@ class _Search:
             self.gains.append(0.0)
 
     def _noise(self, plan: Plan) -> float:
-        """What noise adds to the cost, so far as controls can change it."""
-        return 0.0 if self.fixed_noise else plan.noise
+        """What the noise that plans take into account adds to the cost."""
+        if self.steered.all():
+            return plan.noise
+        if not self.steered.any():
+            return 0.0
+        return float(noise_shares(self.problem, self.trajectory, plan, self.steered).sum())
 
     def _stake(self, plan: Plan) -> Stake:
         return at_stake(self.problem, self.trajectory, plan.model)
@@ -404,8 +418,7 @@ class _Search:
         if self.problem.cost.nonnegative and plan.promise > tolerance * self.cost + least:
             # Of squares no more is at stake than they cost.
             return False
-        quiet = self.fixed_noise or self.problem.scene.processes == 0
-        if quiet and self._stake(plan).free <= least:
+        if not self.steered.any() and self._stake(plan).free <= least:
             # No motion at all costs less. Without costs on the controls the model may have no minimum even there.
             self.plan = self._least_regularized()[0] or plan
             return True
@@ -442,10 +455,11 @@ class _Search:
         """What the status rests on; ``afresh`` with as little regularization as the model needs."""
         needed = ""
         if afresh and self.regularization > 0.0:
-            plan, least = self._least_regularized()
-            if plan is not None:
-                self.plan = plan
-                needed = f" under a regularization of {least:.0e}" if least > 0.0 else ""
+            with contextlib.suppress(*_LOST):
+                plan, least = self._least_regularized()
+                if plan is not None:
+                    self.plan = plan
+                    needed = f" under a regularization of {least:.0e}, without which it has no minimum" if least else ""
         share = np.nan if self.plan is None else self._share(self.plan, tolerance)
         return f"{self._promised()}{needed}; the tolerance of {tolerance:g} times the cost at stake is {share:.1e}"
 
@@ -479,6 +493,16 @@ class _Search:
         self.growth = max(_GROWTH, self.growth * _GROWTH)
         self.regularization = max(_LEAST, self.regularization * self.growth)
         return self.regularization <= _MOST
+
+    def _lift(self) -> bool:
+        """Go on without bounds on what trials may take, if there were any and one was given up."""
+        if not (self.bounded and self.cut):
+            return False
+        logger.info("no progress with trials of few parts: from here on they may take as many as they need")
+        self.bounded, self.regularization, self.growth = False, 0.0, 1.0
+        # One line search without bounds, before what was gained lately is looked at again.
+        self.gains = self.gains[1 - _PATIENCE :]
+        return True
 
     def _plan(self, *, exact: bool | None = None) -> int:
         """A backward pass, with as much regularization as it takes; returns how many it took.
@@ -524,6 +548,7 @@ class _Search:
                     break
                 if trial.cut:
                     cut.append(step)
+                    self.cut = True
                 elif trial.shares is not None:
                     tried = trial.shares
             left = [step for step in cut if step > length]
@@ -542,7 +567,7 @@ class _Search:
         """What trials may take, one after another while nothing else helps."""
         integrator = self.problem.integrator
         bounds = [_Bounds(integrator, np.inf)]
-        if isinstance(integrator, Variational) and is_dataclass(integrator):
+        if self.bounded and isinstance(integrator, Variational) and is_dataclass(integrator):
             # As many parts as a step of the motion so far has take fewer halvings of halves.
             halvings = max(_HALVINGS, int(self.trajectory.statistics.substeps.max()) - 1)
             for factor in (_PARTS**2, _PARTS):
@@ -562,7 +587,8 @@ class _Search:
 
         def futile(done: list[Segment]) -> str | None:
             taken = sum(int(part.statistics.substeps.sum()) for part in done)
-            if taken > bounds.parts * parts[sum(len(part.u) for part in done) - 1]:
+            # Explicit methods count no parts.
+            if taken > bounds.parts * max(1, parts[sum(len(part.u) for part in done) - 1]):
                 return _CUT
             return _DEAR if bounded and spent(problem, done, here) > most else None
 

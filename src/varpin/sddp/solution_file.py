@@ -25,6 +25,7 @@ _NUMBERS = ("cost", "noise_cost")
 _PROBLEM = ("q0", "v0", "t0", "steps", "hold", "sampling", "control_limits")
 _SURROUNDINGS = ("gravity", "damping", "stiffness", "rest", "actuation")
 _SEARCH = ("cost", "above", "first", "best_cost", "best_noise", "regularization", "growth")
+_FLAGS = ("bounded", "cut")
 _COLUMNS = tuple(item.name for item in fields(Iteration))
 
 
@@ -55,7 +56,7 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
     if search is not None:
         members["search.history"] = len(search.history)
         members["search.gains"] = np.array(search.gains)
-        members |= {f"search.{name}": getattr(search, name) for name in _SEARCH}
+        members |= {f"search.{name}": getattr(search, name) for name in (*_SEARCH, *_FLAGS)}
     with atomic_file(path) as stream:
         np.savez_compressed(stream, **members, format=_FORMAT)
     return Path(path)
@@ -187,6 +188,8 @@ class _Reader:
                 gains=tuple(self.array("search.gains", (-1,)).tolist()),
                 history=history[: self.count("search.history", len(history))],
                 **numbers,
+                bounded=bool(self.count("search.bounded", 1)),
+                cut=bool(self.count("search.cut", 1)),
             )
         return {
             "problem": problem,
