@@ -231,9 +231,15 @@ def test_warm_starts_have_little_left_to_do(noise, grid):
         again = vp.solve(problem, start)
         assert again.status is vp.Status.CONVERGED
         assert again.iterations <= 1
-    # As far as rounding goes: no tolerance is too small for a search to end.
-    best = vp.solve(problem, sol, tolerance=1e-15)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_a_search_ends_where_rounding_begins(grid):
+    """No tolerance is too small."""
+    problem = reach(**GRIDS[grid])
+    best = vp.solve(problem, tolerance=1e-18)
     assert best.status is vp.Status.CONVERGED
+    assert best.gradient == pytest.approx(0.0, abs=1e-6)
     assert vp.solve(problem, best).iterations == 0
 
 
