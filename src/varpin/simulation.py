@@ -195,8 +195,8 @@ class Motions:
         Args:
             commands: For all of its steps.
             integrator: To make it with: the one of these motions with other options, and itself if left out.
-            futile: Asked after a quarter and a half of a motion, about the parts that there are; where it answers with
-                a reason, the motion ends.
+            futile: Asked after a third of a motion, about the parts that there are; where it answers with a reason, the
+                motion ends.
         """
         integrator = self.integrator if integrator is None else integrator
         nothing = np.zeros((0, 0, self.scene.processes))
@@ -204,7 +204,7 @@ class Motions:
         decisions, begin = len(commands.u), 0
         parts: list[Segment] = []
         failure: Failure | None = None
-        ends = {decisions} if futile is None else {decisions // 4, decisions // 2, decisions} - {0}
+        ends = {decisions} if futile is None else {decisions // 3, decisions} - {0}
         for end in sorted(ends):
             block = commands if end - begin == decisions else rows(commands, begin, end, _last_control(parts))
             parts += integrator.rollout(self.scene, state, block, nothing, self.dt)

@@ -230,10 +230,18 @@ def _onto_limits(u: Floats, limits: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _Bounds:
-    """What a trial of the line search may take: halvings of a step, and parts by those of the motion so far."""
+    """What a trial of the line search may take.
+
+    Attributes:
+        integrator: With the halvings that a step may take.
+        parts: Of all steps, by those of the motion so far.
+        watched: Whether even a trial of the whole step is looked at on its way. Most searches take it, and looking
+            takes time.
+    """
 
     integrator: Integrator
     parts: float
+    watched: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -566,14 +574,19 @@ class _Search:
     def _bounds(self) -> list[_Bounds]:
         """What trials may take, one after another while nothing else helps."""
         integrator = self.problem.integrator
-        bounds = [_Bounds(integrator, np.inf)]
-        if self.bounded and isinstance(integrator, Variational) and is_dataclass(integrator):
-            # As many parts as a step of the motion so far has take fewer halvings of halves.
-            halvings = max(_HALVINGS, int(self.trajectory.statistics.substeps.max()) - 1)
-            for factor in (_PARTS**2, _PARTS):
-                more = halvings + (_MORE_HALVINGS if factor > _PARTS else 0)
-                bounds.insert(0, _Bounds(replace(integrator, max_halvings=min(more, integrator.max_halvings)), factor))
-        return bounds
+        if not (self.bounded and isinstance(integrator, Variational) and is_dataclass(integrator)):
+            return [_Bounds(integrator, np.inf, watched=False)]
+        # As many parts as a step of the motion so far has take fewer halvings of halves.
+        few = max(_HALVINGS, int(self.trajectory.statistics.substeps.max()) - 1)
+        first, second = (
+            replace(integrator, max_halvings=min(halvings, integrator.max_halvings))
+            for halvings in (few, few + _MORE_HALVINGS)
+        )
+        return [
+            _Bounds(first, _PARTS, watched=few > _HALVINGS),
+            _Bounds(second, _PARTS**2, watched=True),
+            _Bounds(integrator, np.inf, watched=True),
+        ]
 
     def _try(self, step: float, added: Floats, bounds: _Bounds) -> _Trial:
         """A motion so far along the plan, given up where it is cut to pieces or too dear already."""
@@ -594,8 +607,7 @@ class _Search:
 
         commands = self._along(step, plan)
         try:
-            # Most searches take the whole step: only where it was too long are trials looked at on their way.
-            asked = futile if step < 1.0 else None
+            asked = futile if bounds.watched or step < 1.0 else None
             moved, failure = self.motions.under(commands, integrator=bounds.integrator, futile=asked)
             if failure is not None:
                 # Whatever makes a step of few halvings fail, more may mend.
