@@ -56,7 +56,8 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
     if search is not None:
         members["search.history"] = len(search.history)
         members["search.gains"] = np.array(search.gains)
-        members |= {f"search.{name}": getattr(search, name) for name in (*_SEARCH, *_FLAGS)}
+        members |= {f"search.{name}": getattr(search, name) for name in _SEARCH}
+        members |= {f"search.{name}": int(getattr(search, name)) for name in _FLAGS}
     with atomic_file(path) as stream:
         np.savez_compressed(stream, **members, format=_FORMAT)
     return Path(path)
