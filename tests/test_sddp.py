@@ -13,7 +13,7 @@ from mechanisms import random_inertia
 from scipy.interpolate import CubicHermiteSpline
 
 import varpin as vp
-from varpin.sddp.backward import backward, noise_cost
+from varpin.sddp.backward import backward, noise_shares
 
 WEIGHTS = {1: 2 / 3, 2: -1 / 12}
 SAMPLINGS = ["midpoint", "gauss", "start"]
@@ -547,9 +547,9 @@ def test_gradient_of_the_noise_on_an_arm(integrator, sampling):
 
     def merit(u):
         motion = run(problem, u)
-        return problem.cost_of(motion) + noise_cost(problem, motion, plan)
+        return problem.cost_of(motion) + noise_shares(problem, motion, plan).sum()
 
-    assert noise_cost(problem, run(problem, controls), plan) == pytest.approx(plan.noise, rel=1e-12)
+    assert noise_shares(problem, run(problem, controls), plan).sum() == pytest.approx(plan.noise, rel=1e-12)
     assert plan.noise > 0.1 * moved_cost(problem, controls)
     numeric = differences(merit, controls, 3e-3 * np.abs(controls).max())
     np.testing.assert_allclose(plan.gradient, numeric, rtol=0, atol=1e-8 * np.abs(numeric).max())

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Segment
-from varpin.integrators.base import Failure, open_loop, rows, steps_of
+from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
 from varpin.loop_stability import unstable_loop
@@ -25,6 +25,7 @@ from varpin.wiener import wiener_increments
 Floats = NDArray[np.float64]
 ControlLaw = Callable[[float, Floats, Floats], ArrayLike]
 Progress = Callable[[int, int], None]
+Futile = Callable[[list[Segment]], str | None]
 
 logger = logging.getLogger(__name__)
 
@@ -188,15 +189,42 @@ class Motions:
         self.scene, self.integrator, self.dt = scene, integrator, dt
         self._state, (self._first,) = integrator.start(scene, q0[None], v0[None])
 
-    def under(self, commands: Commands) -> tuple[Trajectory, Failure | None]:
-        """The motion, and why it stopped early, if it did; nothing is checked."""
-        first, nothing = self._first, np.zeros((0, 0, self.scene.processes))
-        state = self.integrator.fork(self._state)
-        (steps,) = self.integrator.rollout(self.scene, state, commands, nothing, self.dt)
-        nodes = {name: np.concatenate([getattr(first, name), getattr(steps, name)]) for name in _NODES}
+    def under(
+        self, commands: Commands, *, integrator: Integrator | None = None, futile: Futile | None = None
+    ) -> tuple[Trajectory, Failure | None]:
+        """The motion, and why it stopped early, if it did; nothing is checked.
+
+        Args:
+            commands: For all of its steps.
+            integrator: To make it with: the one of these motions with other options, and itself if left out.
+            futile: Asked after a third of a motion, about the parts that there are; where it answers with a reason, the
+                motion ends.
+        """
+        integrator = self.integrator if integrator is None else integrator
+        nothing = np.zeros((0, 0, self.scene.processes))
+        state = integrator.fork(self._state)
+        decisions, begin = len(commands.u), 0
+        parts: list[Segment] = []
+        failure: Failure | None = None
+        ends = {decisions} if futile is None else {decisions // 3, decisions} - {0}
+        for end in sorted(ends):
+            block = commands if end - begin == decisions else rows(commands, begin, end, _last_control(parts))
+            parts += integrator.rollout(self.scene, state, block, nothing, self.dt)
+            failure, begin = parts[-1].failure, end
+            if failure is None and futile is not None and end < decisions:
+                reason = futile(parts)
+                failure = None if reason is None else Failure(reason, 0.0)
+            if failure is not None:
+                break
+        steps = join(parts) if len(parts) > 1 else parts[0]
+        nodes = {name: np.concatenate([getattr(self._first, name), getattr(steps, name)]) for name in _NODES}
         dw = np.zeros((len(steps.u), self.scene.processes))
         made = _trajectory(self.scene, self.integrator, self.dt, nodes, steps.u, dw, steps.statistics)
-        return made, steps.failure
+        return made, failure
+
+
+def _last_control(parts: list[Segment]) -> Floats | None:
+    return parts[-1].u[None, -1] if parts else None
 
 
 def rollout(

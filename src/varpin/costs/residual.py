@@ -74,6 +74,11 @@ class TaskCost(Cost):
     def _subject(self) -> str:
         return ""
 
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`varpin.costs.Cost.nonnegative`."""
+        return True
+
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`varpin.costs.Cost.bind`."""
         name = type(self).__name__

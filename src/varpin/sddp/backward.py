@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.costs import CostError
+from varpin.costs import CostError, Expansion
 from varpin.errors import LinearizationError
 from varpin.kernels import backward as kernels
 from varpin.linearization import (
@@ -17,6 +17,7 @@ from varpin.linearization import (
     velocity_at_nodes,
     velocity_curvature,
 )
+from varpin.sddp.descent import Model
 from varpin.sddp.problem import OptimalControlProblem
 from varpin.sddp.square_root import RootPass, Squares, squares_of
 from varpin.trajectory import Trajectory
@@ -45,6 +46,7 @@ class Plan:
     spread: Floats  # (N, 2n, 2n)
     limited: bool
     loss: float  # about the part of Quu, or of its root, that rounding may have changed
+    model: Model  # of the cost along the motion
 
     @property
     def promise(self) -> float:
@@ -61,12 +63,20 @@ class Plan:
         return np.where(held, 0.0, self.gradient)
 
 
-def noise_cost(problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan) -> float:
-    """What noise adds to the cost of a motion, if it acts and is penalized as it was along the plan's own."""
+def noise_shares(
+    problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan, processes: NDArray[np.bool_] | None = None
+) -> Floats:
+    """What noise adds in each step (N,) to the cost of a motion, if it acts and costs as it did along the plan's own.
+
+    ``processes`` (k,) says which ones count, all if left out. Empty where there is no noise.
+    """
     if problem.scene.processes == 0:
-        return 0.0
+        return np.zeros(0)
     g = impulses(problem, trajectory, plan.jumps)
-    return 0.5 * float(np.einsum("Nai,Nai->", g, plan.spread @ g))
+    if processes is not None:
+        g = g[:, :, processes]
+    added: Floats = 0.5 * np.einsum("Nai,Nai->N", g, plan.spread @ g)
+    return added
 
 
 def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floats) -> Floats:
@@ -244,6 +254,7 @@ def _one_pass(
         spread,
         problem.limited,
         float(value.loss[0]),
+        Model(running, Expansion(*terminal[:2])),
     )
     return plan, costate
 

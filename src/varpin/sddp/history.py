@@ -83,25 +83,31 @@ class SearchState:
     Attributes:
         trajectory: The motion then.
         cost: Of it, without noise.
-        first: Cost of the first motion.
+        above: By how much it costs more than the best one, without noise.
+        first: How much of the cost of the first motion was at stake.
         best: The motion of the least expected cost so far, if one was rated yet.
-        best_merit: Its expected cost.
         best_cost: Its cost without noise.
-        merits: The least expected cost after each iteration.
+        best_noise: What noise adds to it; that of constant strength changes no plan, and is left out.
+        gains: By how much each iteration lowered the least expected cost.
         regularization: Relative to the diagonal of Quu.
         growth: Of the regularization.
+        bounded: Whether the line search gives up trials whose steps are cut into many parts.
+        cut: Whether it has given up one.
         history: Of the iterations before.
     """
 
     trajectory: Trajectory
     cost: float
+    above: float
     first: float
     best: Trajectory | None
-    best_merit: float
     best_cost: float
-    merits: tuple[float, ...]
+    best_noise: float
+    gains: tuple[float, ...]
     regularization: float
     growth: float
+    bounded: bool
+    cut: bool
     history: tuple[Iteration, ...]
 
     def __repr__(self) -> str:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, is_dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,12 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import as_floats, count, finite_array, fraction, is_one_of, positive, real
 from varpin.costs import CostError
 from varpin.errors import InputError, LinearizationError
+from varpin.integrators import Integrator, Segment
 from varpin.integrators.base import open_loop
+from varpin.integrators.variational import Variational
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
 from varpin.noise import NoiseFieldError
 from varpin.policy import LinearPolicy
-from varpin.sddp.backward import Plan, backward, noise_cost
+from varpin.sddp.backward import Plan, backward, noise_shares
+from varpin.sddp.descent import Stake, at_stake, rounding, shares, spent
 from varpin.sddp.history import Iteration, SearchState, Status
 from varpin.sddp.problem import OptimalControlProblem
 from varpin.sddp.solution import Solution
@@ -43,10 +48,16 @@ _LITTLE = 1e-4
 _LOSSY = 1e-8
 # Iterations without a decrease worth the name before a search gives up: the cost jumps where guards cut steps.
 _PATIENCE = 15
-# Part of a motion's own cost that the tolerance on the expected cost may hide with nothing said.
-_HIDDEN = 1e-3
+# Where the optimum costs nothing, there is nothing to be relative to but this part of what was at stake at first.
+_NOTHING = 1e-9
 # Trials of a line search: 0.25^10 is 1e-6.
 _TRIALS = 10
+# A trial is given up where a step wants more halvings than this, or than the motion so far, and where it has taken more
+# parts in all than so many times those of the motion so far. What was given up is tried again with more of both where
+# nothing else has led far, and without a bound where nothing has helped; a search that stalls goes on without bounds.
+_HALVINGS, _MORE_HALVINGS = 2, 3
+_PARTS = 3
+_CUT, _DEAR = "its steps are cut into many parts", "it costs too much already"
 
 
 def solve(
@@ -90,7 +101,10 @@ def solve(
         controls: To start from: None to hold the robot at q0; an array (R, m) or (m,), R the number of
             decisions; a :class:`LinearPolicy`; or a :class:`Solution`, whose policy then runs on this problem. What
             leaves the problem's limits is brought within them.
-        tolerance: Stop when the decrease that the quadratic model promises is below this part of the cost.
+        tolerance: Stop when the decrease that the quadratic model promises is below this part of the cost at stake:
+            what the cost would lose by its own quadratic models along the motion if each state and control were free,
+            and no more than it changes by over what moves. Of squared distances that is about their value; of
+            constants, whatever their size, and of what noise adds it is nothing.
         max_iterations: At most.
 
     Other Args:
@@ -154,15 +168,7 @@ def solve(
             status = search.run(tolerance, max_iterations, deadline, report)
         except KeyboardInterrupt:
             status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
-    solution = search.solution(status)
-    if status.converged and tolerance * solution.noise_cost > _HIDDEN * abs(solution.cost):
-        logger.warning(
-            "noise adds %.3g to a cost of %.3g: the tolerance is on their sum, and hides what the controls do to the "
-            "motion's own cost; a smaller tolerance searches on",
-            solution.noise_cost,
-            solution.cost,
-        )
-    return solution
+    return search.solution(status)
 
 
 def _first_commands(problem: OptimalControlProblem, controls: ArrayLike | LinearPolicy | Solution | None) -> Commands:
@@ -206,12 +212,72 @@ def _held(u: Floats, problem: OptimalControlProblem) -> Commands:
     return open_loop(u)._replace(hold=problem.hold, limits=problem.control_limits.copy())
 
 
+def _steered(problem: OptimalControlProblem) -> NDArray[np.bool_]:
+    """Which processes (k,) the plans take into account: those of constant strength change nothing in them."""
+    fields = problem.scene.noise.diffusion
+    if fields is None or not problem.integrator.variational:
+        return np.ones(problem.scene.processes, dtype=np.bool_)
+    return np.array(fields.control.any(axis=(0, 2)) | fields.quadratic.any(axis=0), dtype=np.bool_)
+
+
 def _onto_limits(u: Floats, limits: Floats) -> Floats:
     """Controls (R, m) that rounding keeps from a limit brought to it, so that they are known to be there."""
     room = 8.0 * np.finfo(float).eps * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
     for limit in limits:
         u = np.where(np.abs(u - limit) <= room, limit, u)
     return u
+
+
+@dataclass(frozen=True)
+class _Bounds:
+    """What a trial of the line search may take.
+
+    Attributes:
+        integrator: With the halvings that a step may take.
+        parts: Of all steps, by those of the motion so far.
+        watched: Whether even a trial of the whole step is looked at on its way. Most searches take it, and looking
+            takes time.
+    """
+
+    integrator: Integrator
+    parts: float
+    watched: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A motion that the line search tried.
+
+    Attributes:
+        motion: None where it was given up, or has no cost.
+        shares: Of its cost.
+        cost: By how much it is dearer without noise.
+        expected: By how much it is dearer with noise.
+        cut: Whether it was given up for being cut into many parts.
+    """
+
+    motion: Trajectory | None = None
+    shares: Floats | None = None
+    cost: float = np.inf
+    expected: float = np.inf
+    cut: bool = False
+
+
+@dataclass(frozen=True)
+class _Step:
+    """What a line search did.
+
+    Attributes:
+        length: Of the step taken; 0 if none was.
+        trials: How many it took.
+        decrease: Of the expected cost.
+        hidden: What rounding may do to a difference of costs; 0 where no trial has a cost.
+    """
+
+    length: float
+    trials: int
+    decrease: float
+    hidden: float
 
 
 class _Search:
@@ -235,12 +301,18 @@ class _Search:
         self.planned: tuple[Trajectory, float, bool] | None = None  # what it is a plan for, and how it was made
         self.motions = Motions(problem.scene, problem.integrator, problem.q0, problem.v0, problem.dt)
         self.trajectory: Trajectory
-        self.cost = self.first = np.inf
-        self.reached = np.inf  # the expected cost of the last step taken, by the plan it was taken with
+        self.shares: Floats  # of the cost of the trajectory
+        self.cost = np.inf
+        self.first = 0.0  # what was at stake on the first motion
         self.state: SearchState | None = None  # at the start of the last iteration, from where it can go on
-        self.merits: list[float] = []  # the best so far, after each iteration
-        self.best: tuple[float, float, Trajectory | None] = (np.inf, np.inf, None)
+        self.best: Trajectory | None = None
+        self.best_cost = self.best_noise = np.inf
+        self.above = 0.0  # what the trajectory costs more than the best one, without noise
+        self.bounded = True  # whether trials are given up for their parts
+        self.cut = False  # whether one was
+        self.gains: list[float] = []  # by how much each iteration lowered the least expected cost
         self.reason = ""
+        self.steered = _steered(problem)
 
     def begin(self, commands: Commands) -> None:
         trajectory, failure = self.motions.under(commands)
@@ -250,27 +322,31 @@ class _Search:
         self.cost = self.problem.cost_of(trajectory)
         if not np.isfinite(self.cost):
             raise CostError(repr(self.problem.cost), f"the cost of the first motion is {self.cost}")
-        self.first = self.cost
+        self.shares = shares(self.problem, trajectory)
 
     def resume(self, state: SearchState) -> None:
         """Stand where ``state`` was taken."""
-        self.trajectory, self.cost, self.first = state.trajectory, state.cost, state.first
-        self.merits, self.history = list(state.merits), list(state.history)
-        self.best = state.best_merit, state.best_cost, state.best
+        self.trajectory, self.cost, self.above, self.first = state.trajectory, state.cost, state.above, state.first
+        self.shares = shares(self.problem, state.trajectory)
+        self.gains, self.history = list(state.gains), list(state.history)
+        self.best, self.best_cost, self.best_noise = state.best, state.best_cost, state.best_noise
         self.regularization, self.growth = state.regularization, state.growth
+        self.bounded, self.cut = state.bounded, state.cut
 
     def _state(self) -> SearchState:
-        merit, cost, best = self.best
         return SearchState(
             trajectory=self.trajectory,
             cost=self.cost,
+            above=self.above,
             first=self.first,
-            best=best,
-            best_merit=merit,
-            best_cost=cost,
-            merits=tuple(self.merits),
+            best=self.best,
+            best_cost=self.best_cost,
+            best_noise=self.best_noise,
+            gains=tuple(self.gains),
             regularization=self.regularization,
             growth=self.growth,
+            bounded=self.bounded,
+            cut=self.cut,
             history=tuple(self.history),
         )
 
@@ -290,51 +366,112 @@ class _Search:
             if self.plan is None:
                 self.reason = f"the regularization has reached {self.regularization:.1e} of the diagonal of Quu"
                 return Status.INDEFINITE
-            merit = self.cost + self.plan.noise
-            if merit < self.best[0]:
-                self.best = merit, self.cost, self.trajectory
-            self.merits.append(self.best[0])
-            # Where the optimum costs nothing, there is nothing to be relative to but where it began.
-            scale = abs(merit) + 1e-9 * abs(self.first)
-            # Without costs on the controls the model may need regularization to have a minimum even there.
-            nothing = self.problem.cost.nonnegative and merit <= tolerance * scale
-            converged = nothing or self.plan.promise <= tolerance * scale
-            if converged and self.regularization > 0.0:
-                # Regularization makes promises smaller; it must not pass for an optimum.
-                plan, least = self._least_regularized()
-                if plan is not None and (nothing or (least <= _LITTLE and plan.promise <= tolerance * scale)):
-                    self.plan = plan
-                else:
-                    converged = False
-            promised = f"the model promises a decrease of {self.plan.promise:.1e}"
-            share = f"the tolerance of {tolerance:g} times the cost is {tolerance * scale:.1e}"
-            if converged or len(self.history) >= last:
+            self._compare_with_best(self.plan)
+            if not self.history:
+                stake = self._stake(self.plan)
+                self.first = stake.free if np.isfinite(stake.free) else stake.moved
+            if self._is_there(self.plan, tolerance):
                 self._note(report, started, passes)
-                self.reason = f"{promised}; {share}"
-                return Status.CONVERGED if converged else Status.MAX_ITERATIONS
-            if len(self.merits) > _PATIENCE and self.merits[-1 - _PATIENCE] - self.merits[-1] <= tolerance * scale:
+                self.reason = self._numbers(tolerance)
+                return Status.CONVERGED
+            ended, why = self._ended(self.plan, tolerance, last, deadline)
+            if ended is Status.STALLED and self._lift():
+                continue
+            if ended is not None:
                 self._note(report, started, passes)
-                self.reason = f"{_PATIENCE} iterations brought less than the tolerance; {promised}; {share}"
-                return Status.STALLED
-            if time.perf_counter() > deadline:
-                self._note(report, started, passes)
-                self.reason = f"{promised}; {share}"
-                return Status.OUT_OF_TIME
-            step, trials = self._line_search(merit)
-            if step == 0.0 and self.exact:
+                self.reason = why + self._numbers(tolerance, afresh=True)
+                return ended
+            step = self._line_search()
+            if step.length == 0.0 and self.exact:
                 passes += self._plan(exact=False)
-                more = self._line_search(merit)
-                step, trials = more[0], trials + more[1]
-            self._note(report, started, passes, trials, step, merit - self.reached if step > 0.0 else 0.0)
-            if step >= _LONG:
+                more = self._line_search()
+                step = replace(more, trials=step.trials + more.trials, hidden=max(step.hidden, more.hidden))
+            self._note(report, started, passes, step)
+            if step.length == 0.0 and self._keeps_no_promise_above(step.hidden):
+                self.reason = f"{self._promised()}, and rounding hides {step.hidden:.1e} of the cost"
+                return Status.CONVERGED
+            if step.length >= _LONG:
                 self._relax()
-            elif step <= _SHORT and not self._stiffen():
-                self.reason = f"no step lowers the cost, whatever the regularization; {promised}; {share}"
+            elif step.length <= _SHORT and not self._stiffen() and not self._lift():
+                self.reason = "no step lowers the cost, whatever the regularization; "
+                self.reason += self._numbers(tolerance, afresh=True)
                 return Status.STALLED
 
-    def _note(
-        self, report: Callback, started: float, passes: int, trials: int = 0, step: float = 0.0, decrease: float = 0.0
-    ) -> None:
+    def _compare_with_best(self, plan: Plan) -> None:
+        noise = self._noise(plan)
+        gain = self.best_noise - self.above - noise
+        if self.best is None or gain > 0.0:
+            self.gains.append(0.0 if self.best is None else gain)
+            self.best, self.best_cost, self.best_noise, self.above = self.trajectory, self.cost, noise, 0.0
+        else:
+            self.gains.append(0.0)
+
+    def _noise(self, plan: Plan) -> float:
+        """What the noise that plans take into account adds to the cost."""
+        if self.steered.all():
+            return plan.noise
+        if not self.steered.any():
+            return 0.0
+        return float(noise_shares(self.problem, self.trajectory, plan, self.steered).sum())
+
+    def _stake(self, plan: Plan) -> Stake:
+        return at_stake(self.problem, self.trajectory, plan.model)
+
+    def _share(self, plan: Plan, tolerance: float) -> float:
+        """The tolerance on the promised decrease."""
+        return tolerance * (self._stake(plan).moved + _NOTHING * self.first)
+
+    def _is_there(self, plan: Plan, tolerance: float) -> bool:
+        least = tolerance * _NOTHING * self.first
+        if self.problem.cost.nonnegative and plan.promise > tolerance * self.cost + least:
+            # Of squares no more is at stake than they cost.
+            return False
+        if not self.steered.any() and self._stake(plan).free <= least:
+            # No motion at all costs less. Without costs on the controls the model may have no minimum even there.
+            self.plan = self._least_regularized()[0] or plan
+            return True
+        return self._keeps_no_promise_above(self._share(plan, tolerance))
+
+    def _ended(self, plan: Plan, tolerance: float, last: int, deadline: float) -> tuple[Status | None, str]:
+        """How a search ends that has not converged, if it does, and the reason."""
+        if len(self.history) >= last:
+            return Status.MAX_ITERATIONS, ""
+        if len(self.gains) > _PATIENCE:
+            recent = sum(self.gains[-_PATIENCE:])
+            if recent <= self._share(plan, tolerance):
+                return Status.STALLED, f"{_PATIENCE} iterations have lowered the expected cost by {recent:.1e}; "
+        return (Status.OUT_OF_TIME if time.perf_counter() > deadline else None), ""
+
+    def _keeps_no_promise_above(self, bound: float) -> bool:
+        """Whether the model promises no more than ``bound``; the plan is then one that can be trusted with that.
+
+        Regularization makes promises smaller; it must not pass for an optimum.
+        """
+        if self.plan is None or not self.plan.promise <= bound:
+            return False
+        if self.regularization > 0.0:
+            plan, least = self._least_regularized()
+            if plan is None or least > _LITTLE or not plan.promise <= bound:
+                return False
+            self.plan = plan
+        return True
+
+    def _promised(self) -> str:
+        return f"the model promises a decrease of {np.nan if self.plan is None else self.plan.promise:.1e}"
+
+    def _numbers(self, tolerance: float, *, afresh: bool = False) -> str:
+        """What the status rests on; ``afresh`` with as little regularization as the model needs."""
+        needed = ""
+        if afresh and self.regularization > 0.0:
+            with contextlib.suppress(*_LOST):
+                plan, least = self._least_regularized()
+                if plan is not None:
+                    self.plan = plan
+                    needed = f" under a regularization of {least:.0e}, without which it has no minimum" if least else ""
+        share = np.nan if self.plan is None else self._share(self.plan, tolerance)
+        return f"{self._promised()}{needed}; the tolerance of {tolerance:g} times the cost at stake is {share:.1e}"
+
+    def _note(self, report: Callback, started: float, passes: int, step: _Step | None = None) -> None:
         if self.plan is None:
             return
         item = Iteration(
@@ -342,12 +479,12 @@ class _Search:
             cost=self.cost,
             noise_cost=self.plan.noise,
             promised_decrease=self.plan.promise,
-            decrease=decrease,
-            step=step,
+            decrease=0.0 if step is None else step.decrease,
+            step=0.0 if step is None else step.length,
             regularization=self.regularization,
             gradient=float(np.abs(self.plan.free_gradient(self.problem, self.trajectory)).max()),
             backward_passes=passes,
-            rollouts=trials,
+            rollouts=0 if step is None else step.trials,
             seconds=time.perf_counter() - started,
         )
         self.history.append(item)
@@ -364,6 +501,16 @@ class _Search:
         self.growth = max(_GROWTH, self.growth * _GROWTH)
         self.regularization = max(_LEAST, self.regularization * self.growth)
         return self.regularization <= _MOST
+
+    def _lift(self) -> bool:
+        """Go on without bounds on what trials may take, if there were any and one was given up."""
+        if not (self.bounded and self.cut):
+            return False
+        logger.info("no progress with trials of few parts: from here on they may take as many as they need")
+        self.bounded, self.regularization, self.growth = False, 0.0, 1.0
+        # One line search without bounds, before what was gained lately is looked at again.
+        self.gains = self.gains[1 - _PATIENCE :]
+        return True
 
     def _plan(self, *, exact: bool | None = None) -> int:
         """A backward pass, with as much regularization as it takes; returns how many it took.
@@ -392,50 +539,104 @@ class _Search:
                     return plan, float(regularization)
         return None, np.inf
 
-    def _line_search(self, merit: float) -> tuple[float, int]:
-        """Move to the first motion along the plan whose expected cost is low enough: its step, or 0, and trials."""
+    def _line_search(self) -> _Step:
+        """Move to the first motion along the plan whose expected cost is low enough."""
         if self.plan is None:
-            return 0.0, 0
-        problem, plan, step = self.problem, self.plan, 1.0
-        for trial in range(_TRIALS):
-            moved = self._move(step)
-            if moved is not None:
-                try:
-                    cost = problem.cost_of(moved)
-                    added = noise_cost(problem, moved, plan)
-                except _LOST as error:
-                    logger.info("trial of length %g: %s", step, error)
-                    cost = added = np.inf
-                if cost + added <= merit + self.armijo * step * plan.slope:
-                    self.trajectory, self.cost = moved, cost
-                    self.reached = cost + added
-                    return step, trial + 1
-            step *= self.backtracking
-        return 0.0, _TRIALS
+            return _Step(0.0, 0, 0.0, 0.0)
+        added = noise_shares(self.problem, self.trajectory, self.plan)
+        taken, length, tried, trials = _Trial(), 0.0, None, 0
+        left = list(self.backtracking ** np.arange(_TRIALS))
+        for bounds in self._bounds():
+            cut = []
+            for step in left:
+                trials += 1
+                trial = self._try(float(step), added, bounds)
+                if trial.expected <= self.armijo * step * self.plan.slope:
+                    taken, length = trial, float(step)
+                    break
+                if trial.cut:
+                    cut.append(step)
+                    self.cut = True
+                elif trial.shares is not None:
+                    tried = trial.shares
+            left = [step for step in cut if step > length]
+            if not left or length > (_SHORT if bounds.parts == _PARTS else 0.0):
+                break
+        hidden = 0.0
+        if taken.motion is not None and taken.shares is not None:
+            self.trajectory, self.shares = taken.motion, taken.shares
+            self.cost = self.problem.cost_of(taken.motion)
+            self.above += taken.cost
+        elif tried is not None:
+            hidden = rounding(self.problem, self.trajectory, self.shares, tried, self.plan.model)
+        return _Step(length, trials, -taken.expected if length > 0.0 else 0.0, hidden)
 
-    def _move(self, step: float) -> Trajectory | None:
-        if self.plan is None:
-            return None
+    def _bounds(self) -> list[_Bounds]:
+        """What trials may take, one after another while nothing else helps."""
+        integrator = self.problem.integrator
+        if not (self.bounded and isinstance(integrator, Variational) and is_dataclass(integrator)):
+            return [_Bounds(integrator, np.inf, watched=False)]
+        # As many parts as a step of the motion so far has take fewer halvings of halves.
+        few = max(_HALVINGS, int(self.trajectory.statistics.substeps.max()) - 1)
+        first, second = (
+            replace(integrator, max_halvings=min(halvings, integrator.max_halvings))
+            for halvings in (few, few + _MORE_HALVINGS)
+        )
+        return [
+            _Bounds(first, _PARTS, watched=few > _HALVINGS),
+            _Bounds(second, _PARTS**2, watched=True),
+            _Bounds(integrator, np.inf, watched=True),
+        ]
+
+    def _try(self, step: float, added: Floats, bounds: _Bounds) -> _Trial:
+        """A motion so far along the plan, given up where it is cut to pieces or too dear already."""
+        problem, plan, here = self.problem, self.plan, self.trajectory
+        if plan is None:
+            return _Trial()
+        parts = np.cumsum(here.statistics.substeps)
+        # What is to come of the cost, and what noise adds to it, is known not to be below zero.
+        bounded = problem.cost.nonnegative and not (self.exact and problem.scene.processes)
+        most = float(self.shares.sum() + added.sum()) + self.armijo * step * plan.slope if bounded else np.inf
+
+        def futile(done: list[Segment]) -> str | None:
+            taken = sum(int(part.statistics.substeps.sum()) for part in done)
+            # Explicit methods count no parts.
+            if taken > bounds.parts * max(1, parts[sum(len(part.u) for part in done) - 1]):
+                return _CUT
+            return _DEAR if bounded and spent(problem, done, here) > most else None
+
+        commands = self._along(step, plan)
+        try:
+            asked = futile if bounds.watched or step < 1.0 else None
+            moved, failure = self.motions.under(commands, integrator=bounds.integrator, futile=asked)
+            if failure is not None:
+                # Whatever makes a step of few halvings fail, more may mend.
+                few = bounds.integrator != problem.integrator
+                return _Trial(cut=failure.reason == _CUT or (few and failure.reason != _DEAR))
+            there, noise = shares(problem, moved), noise_shares(problem, moved, plan)
+        except _LOST as error:
+            logger.info("trial of length %g: %s", step, error)
+            return _Trial()
+        if not np.isfinite(there).all():
+            return _Trial()
+        cost = float((there - self.shares).sum())
+        return _Trial(moved, there, cost, cost + float((noise - added).sum()))
+
+    def _along(self, step: float, plan: Plan) -> Commands:
+        """The commands of a trial."""
         problem, here = self.problem, self.trajectory
-        u = here.u[:: problem.hold] + step * self.plan.feedforward
+        u = here.u[:: problem.hold] + step * plan.feedforward
         if problem.limited:
             u = _onto_limits(u, problem.control_limits)
         if self.forward == "open":
-            commands = _held(u, problem)
-        else:
-            gains, reference = self.plan.feedback, states(problem, here)[: -1 : problem.hold]
-            if self.plan.previous is not None:
-                before = here.u[: -problem.hold : problem.hold]
-                gains = np.concatenate([gains, self.plan.previous], axis=2)
-                # The first change is from a control that is given.
-                reference = np.hstack([reference, np.vstack([here.u[:1], before])])
-            commands = _held(u, problem)._replace(gains=gains, reference=reference)
-        try:
-            moved, failure = self.motions.under(commands)
-        except NoiseFieldError as error:
-            logger.info("trial of length %g: %s", step, error)
-            return None
-        return moved if failure is None else None
+            return _held(u, problem)
+        gains, reference = plan.feedback, states(problem, here)[: -1 : problem.hold]
+        if plan.previous is not None:
+            before = here.u[: -problem.hold : problem.hold]
+            gains = np.concatenate([gains, plan.previous], axis=2)
+            # The first change is from a control that is given.
+            reference = np.hstack([reference, np.vstack([here.u[:1], before])])
+        return _held(u, problem)._replace(gains=gains, reference=reference)
 
     def _last_plan(self) -> Plan | None:
         if self.plan is not None and self.planned == (self.trajectory, 0.0, self.second_order):
@@ -451,9 +652,9 @@ class _Search:
             # With noise the fixed point of the search is not the minimum of the expected cost, and the last motion not
             # always the best; nor does the last plan belong to it, or hold without its regularization.
             plan = self._last_plan()
-            merit, cost, best = self.best
-            if best is not None and best is not self.trajectory and not (plan and self.cost + plan.noise <= merit):
-                self.trajectory, self.cost = best, cost
+            above = np.inf if plan is None else self.above + self._noise(plan) - self.best_noise
+            if self.best is not None and self.best is not self.trajectory and not above <= 0.0:
+                self.trajectory, self.cost = self.best, self.best_cost
                 plan = self._last_plan()
         reason = self.reason
         if plan is not None and plan.loss > _LOSSY:

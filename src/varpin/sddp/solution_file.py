@@ -25,7 +25,8 @@ _PLAN = ("gains", "feedforward", "gradient")
 _NUMBERS = ("cost", "noise_cost")
 _PROBLEM = ("q0", "v0", "t0", "steps", "hold", "sampling", "control_limits")
 _SURROUNDINGS = ("gravity", "damping", "stiffness", "rest", "actuation")
-_SEARCH = ("cost", "first", "best_merit", "best_cost", "regularization", "growth")
+_SEARCH = ("cost", "above", "first", "best_cost", "best_noise", "regularization", "growth")
+_FLAGS = ("bounded", "cut")
 _COLUMNS = tuple(item.name for item in fields(Iteration))
 
 
@@ -55,8 +56,9 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
     members |= _surroundings(problem)
     if search is not None:
         members["search.history"] = len(search.history)
-        members["search.merits"] = np.array(search.merits)
+        members["search.gains"] = np.array(search.gains)
         members |= {f"search.{name}": getattr(search, name) for name in _SEARCH}
+        members |= {f"search.{name}": int(getattr(search, name)) for name in _FLAGS}
     with atomic_file(path) as stream:
         np.savez_compressed(stream, **members, format=_FORMAT)
     return Path(path)
@@ -196,9 +198,11 @@ class _Reader:
             search = SearchState(
                 trajectory=motions[names["search."]],
                 best=motions.get(names["best."]),
-                merits=tuple(self.array("search.merits", (-1,)).tolist()),
+                gains=tuple(self.array("search.gains", (-1,)).tolist()),
                 history=history[: self.count("search.history", len(history))],
                 **numbers,
+                bounded=bool(self.count("search.bounded", 1)),
+                cut=bool(self.count("search.cut", 1)),
             )
         return {
             "problem": problem,

@@ -1,0 +1,378 @@
+"""The search for a plan: what its trials may take, when it ends; constants, scales and steady noise change nothing."""
+
+import re
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import varpin as vp
+from varpin.integrators.base import open_loop
+from varpin.sddp import search
+from varpin.sddp.backward import backward
+from varpin.sddp.descent import at_stake, shares, spent
+from varpin.simulation import Motions
+
+GOAL = [0.8, -0.5]
+
+
+def reach(*extra, factor=1.0, noise=None, **options):
+    """Two links to a posture in a second."""
+    scene = vp.Scene(vp.planar_chain(2), damping=0.1, noise=noise)
+    end = vp.Terminal(vp.TrackingCost(GOAL, 1e3) + vp.VelocityCost(10.0))
+    cost = factor * (vp.ControlCost(1e-2) + vp.VelocityCost(0.1) + end)
+    for term in extra:
+        cost = cost + term
+    return vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], **{"dt": 0.02, "steps": 50, **options})
+
+
+def swing(steps):
+    """A swing on a grid so coarse that steps are taken in parts: up to 7 with 20 steps."""
+    end = vp.TrackingCost([-np.pi / 2, 0.0], 100.0) + vp.VelocityCost(5.0)
+    cost = vp.ControlCost(0.1) + vp.VelocityCost(0.01) + vp.Terminal(end)
+    scene = vp.Scene(vp.planar_chain(2))
+    return vp.OptimalControlProblem(scene, cost, [np.pi / 2, 0.0], [0, 0], dt=2.0 / steps, steps=steps)
+
+
+def tool_reach(name="xarm7", steps=50):
+    """A redundant arm brings its tool to a place, with little on the controls: early trials run wild."""
+    robot = vp.load_robot(name)
+    lower, upper = robot.position_limits
+    rng = np.random.default_rng(0)
+    begin = np.clip(0.5 * (lower + upper), -1.5, 1.5) + rng.uniform(-0.3, 0.3, robot.dof)
+    model = robot.model
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, begin + rng.uniform(-0.5, 0.5, robot.dof))
+    frame = model.frames[model.nframes - 1].name
+    place = data.oMf[model.nframes - 1].translation.copy()
+    end = vp.FramePositionCost(robot, frame, place, 1e4) + vp.VelocityCost(10.0)
+    cost = vp.ControlCost(1e-3) + vp.Terminal(end)
+    rest = np.zeros(robot.dof)
+    return vp.OptimalControlProblem(vp.Scene(robot), cost, begin, rest, dt=1.0 / steps, steps=steps)
+
+
+def constant(value):
+    return vp.CustomCost(lambda t, q, v, u: np.full(len(t), value), name="constant")
+
+
+def numbers(reason):
+    """The promised decrease and the tolerance on it."""
+    promise = re.search(r"promises a decrease of (\S+?)[;, ]", reason)
+    share = re.search(r"at stake is (\S+)$", reason)
+    return float(promise[1]), float(share[1])
+
+
+def assert_same_search(one, other, rtol=0.0):
+    assert one.status is other.status
+    assert [item.step for item in one.history] == [item.step for item in other.history]
+    assert [item.rollouts for item in one.history] == [item.rollouts for item in other.history]
+    np.testing.assert_allclose(other.controls, one.controls, rtol=rtol, atol=rtol * np.abs(one.controls).max())
+
+
+GRIDS = {
+    "midpoint": {},
+    "gauss": {"integrator": vp.Gauss(stages=2), "sampling": "gauss"},
+    "rk4": {"integrator": vp.RungeKutta4(), "sampling": "gauss"},
+}
+
+
+# Constants, scales and noise
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+@pytest.mark.parametrize("extra", [constant(1e6), constant(-1e9), vp.Terminal(constant(1e6))], ids=repr)
+def test_a_constant_changes_nothing(extra, grid):
+    plain, other = vp.solve(reach(**GRIDS[grid])), vp.solve(reach(extra, **GRIDS[grid]))
+    assert plain.status is vp.Status.CONVERGED
+    assert_same_search(plain, other)
+    assert numbers(plain.reason) == numbers(other.reason)
+
+
+@pytest.mark.parametrize("value", [1e6, -1e6])
+def test_a_constant_inside_a_cost_of_ones_own_changes_nothing(value):
+    hessian = np.diag([2.0, 2.0, 0.0, 0.0, 0.2, 0.2])[None]
+
+    def problem(offset):
+        def function(t, q, v, u):
+            return offset + ((q - GOAL) ** 2).sum(axis=1) + 0.1 * (u**2).sum(axis=1)
+
+        def derivatives(t, q, v, u):
+            return np.hstack([2.0 * (q - GOAL), 0.0 * v, 0.2 * u]), hessian
+
+        scene = vp.Scene(vp.planar_chain(2), damping=0.1)
+        return vp.OptimalControlProblem(scene, vp.CustomCost(function, derivatives), [0, 0], [0, 0], dt=0.02, steps=50)
+
+    plain = vp.solve(problem(0.0))
+    assert plain.status is vp.Status.CONVERGED
+    assert_same_search(plain, vp.solve(problem(value)), rtol=1e-9)
+    # The same as costs that varpin knows.
+    known = vp.TrackingCost(GOAL) + vp.ControlCost(0.1)
+    scene = vp.Scene(vp.planar_chain(2), damping=0.1)
+    known = vp.solve(vp.OptimalControlProblem(scene, known, [0, 0], [0, 0], dt=0.02, steps=50))
+    assert_same_search(known, plain, rtol=1e-9)
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+@pytest.mark.parametrize("most", [4, 100], ids=["cut short", "converged"])
+def test_scaling_a_cost_changes_nothing(factor, most):
+    plain = vp.solve(reach(), max_iterations=most)
+    other = vp.solve(reach(factor=factor), max_iterations=most)
+    assert_same_search(plain, other, rtol=1e-9)
+    assert other.cost == pytest.approx(factor * plain.cost, rel=1e-9)
+
+
+def test_constants_and_scales_change_nothing_where_a_search_stalls():
+    plain = vp.solve(swing(40))
+    assert plain.status is vp.Status.STALLED
+    problem = swing(40)
+    scale = 2.0**-20
+    cost = scale * problem.cost + constant(1e6)
+    other = vp.OptimalControlProblem(problem.scene, cost, problem.q0, problem.v0, dt=problem.dt, steps=problem.steps)
+    assert_same_search(plain, vp.solve(other))
+
+
+@pytest.mark.parametrize("strength", [1.0, 1e3])
+@pytest.mark.parametrize("grid", ["midpoint", "gauss"])
+def test_additive_noise_changes_no_plan(strength, grid):
+    """However much it adds to the cost: 1e7 times that of the motion."""
+    quiet = vp.solve(reach(**GRIDS[grid]))
+    noisy = vp.solve(reach(noise=vp.AdditiveNoise(strength), **GRIDS[grid]))
+    assert noisy.noise_cost > strength**2 * quiet.cost
+    assert_same_search(quiet, noisy, rtol=1e-9)
+
+
+def test_additive_noise_changes_no_plan_that_is_not_finished():
+    for most in (1, 3, 6):
+        quiet = vp.solve(swing(40), max_iterations=most)
+        problem = swing(40)
+        scene = vp.Scene(problem.scene.robot, noise=vp.AdditiveNoise(100.0))
+        noisy = vp.OptimalControlProblem(scene, problem.cost, problem.q0, problem.v0, dt=problem.dt, steps=40)
+        assert_same_search(quiet, vp.solve(noisy, max_iterations=most), rtol=1e-9)
+
+
+def test_additive_noise_hides_nothing_of_noise_that_controls_steer():
+    one = vp.solve(reach(noise=vp.ControlNoise(0.1)))
+    both = vp.solve(reach(noise=vp.ControlNoise(0.1) + vp.AdditiveNoise(300.0)))
+    assert one.status is vp.Status.CONVERGED
+    assert both.noise_cost > 1e5 * one.noise_cost
+    assert_same_search(one, both, rtol=1e-8)
+
+
+# What is at stake
+
+
+def test_what_is_at_stake_of_squares_is_their_value():
+    problem = reach(vp.ControlRateCost(0.1))
+    motion = vp.solve(problem, max_iterations=2).trajectory
+    model = backward(problem, motion, 0.0).model
+    stake = at_stake(problem, motion, model)
+    assert stake.free == pytest.approx(problem.cost_of(motion), rel=1e-12)
+    assert 0.0 < stake.moved <= stake.free
+    more = reach(vp.ControlRateCost(0.1), constant(7.0), vp.Terminal(constant(-3.0)))
+    model = backward(more, motion, 0.0).model
+    assert at_stake(more, motion, model).free == pytest.approx(stake.free, rel=1e-12)
+
+
+def test_a_target_out_of_reach_does_not_loosen_the_tolerance():
+    """1000 m away: 1e6 of the cost is there to stay."""
+    robot = vp.load_robot("ur5")
+    cost = vp.ControlCost(1e-3) + vp.VelocityCost(0.1)
+    cost += vp.Terminal(vp.FramePositionCost(robot, "tool0", [0.0, 1000.0, 0.5], 1.0) + vp.VelocityCost(10.0))
+    begin = [0.0, -1.5, 0.8, -0.5, 0.0, 0.0]
+    problem = vp.OptimalControlProblem(vp.Scene(robot, damping=1.0), cost, begin, np.zeros(6), dt=0.02, steps=50)
+    sol = vp.solve(problem, max_iterations=3)
+    assert sol.cost > 0.9e6
+    assert numbers(sol.reason)[1] < 1e-2 * 1e-7 * sol.cost
+
+
+def test_shares_add_up_to_the_cost():
+    problem = reach(constant(2.0), vp.ControlRateCost(0.3), vp.Terminal(constant(-3.0)), hold=5, sampling="gauss")
+    motion = vp.solve(problem, max_iterations=1).trajectory
+    assert shares(problem, motion).sum() == pytest.approx(problem.cost_of(motion), rel=1e-13)
+
+
+# How it ends
+
+
+def test_a_stalled_search_gives_numbers_that_agree():
+    for steps in (20, 40):
+        sol = vp.solve(swing(steps))
+        assert sol.status is vp.Status.STALLED
+        promise, share = numbers(sol.reason)
+        assert promise > share
+        # The promise is that of the motion that is returned, not of some regularization.
+        assert promise == pytest.approx(backward(sol.problem, sol.trajectory, 0.0).promise, rel=0.06)
+    gained = re.match(r"15 iterations have lowered the expected cost by (\S+);", sol.reason)
+    assert float(gained[1]) <= share
+    costs = [item.cost for item in sol.history]
+    assert costs[-17] - costs[-1] == pytest.approx(float(gained[1]), abs=1e-10)
+
+
+def test_wrong_derivatives_stall_and_say_so():
+    def derivatives(t, q, v, u):
+        return np.hstack([-2.0 * (q - 1.0), 0.0 * v, 0.2 * u]), np.diag([2.0, 2.0, 0.0, 0.0, 0.2, 0.2])[None]
+
+    wrong = vp.CustomCost(lambda t, q, v, u: ((q - 1.0) ** 2).sum(axis=1) + 0.1 * (u**2).sum(axis=1), derivatives)
+    scene = vp.Scene(vp.planar_chain(2), damping=0.1)
+    sol = vp.solve(vp.OptimalControlProblem(scene, wrong, [0, 0], [0, 0], dt=0.02, steps=50))
+    assert sol.status is vp.Status.STALLED
+    assert "no step lowers the cost" in sol.reason
+    promise, share = numbers(sol.reason)
+    assert promise > share
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+@pytest.mark.parametrize("noise", [None, vp.AdditiveNoise(0.1), vp.ControlNoise(0.05)], ids=["quiet", "add", "control"])
+def test_warm_starts_have_little_left_to_do(noise, grid):
+    problem = reach(noise=noise, **GRIDS[grid])
+    sol = vp.solve(problem)
+    assert sol.status is vp.Status.CONVERGED
+    for start in (sol, sol.policy, sol.controls):
+        again = vp.solve(problem, start)
+        assert again.status is vp.Status.CONVERGED
+        assert again.iterations <= 1
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_a_search_ends_where_rounding_begins(grid):
+    """No tolerance is too small."""
+    problem = reach(**GRIDS[grid])
+    best = vp.solve(problem, tolerance=1e-18)
+    assert best.status is vp.Status.CONVERGED
+    assert best.gradient == pytest.approx(0.0, abs=1e-6)
+    assert vp.solve(problem, best).iterations == 0
+
+
+@pytest.mark.parametrize("at", [[0.0, 0.0], [0.3, -1.2]])
+def test_a_search_that_begins_at_the_optimum_ends_there(at):
+    """At rest at the goal, where gravity does nothing."""
+    scene = vp.Scene(vp.planar_chain(2), gravity=False)
+    cost = vp.TrackingCost(at, 10.0) + vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost(at, 10.0))
+    sol = vp.solve(vp.OptimalControlProblem(scene, cost, at, [0, 0], dt=0.02, steps=50))
+    assert sol.status is vp.Status.CONVERGED
+    assert sol.iterations == 0
+    assert sol.cost == 0.0
+
+
+# What trials may take
+
+
+def work(monkeypatch, problem, **options):
+    """A solution, and the parts that all of its motions took."""
+    parts = []
+    own = type(problem.integrator).rollout_compiled
+
+    def counted(self, *args):
+        segments = own(self, *args)
+        parts.extend(int(segment.statistics.substeps.sum()) for segment in segments)
+        return segments
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(problem.integrator), "rollout_compiled", counted)
+        return vp.solve(problem, **options), sum(parts)
+
+
+def test_trials_that_are_cut_to_pieces_are_given_up(monkeypatch):
+    problem = tool_reach()
+    sol, parts = work(monkeypatch, problem, max_iterations=12)
+    with monkeypatch.context() as patch:
+        patch.setattr(search, "_HALVINGS", problem.integrator.max_halvings)
+        patch.setattr(search, "_PARTS", np.inf)
+        unbounded, all_parts = work(monkeypatch, problem, max_iterations=12)
+    assert parts < 0.4 * all_parts
+    assert sol.cost <= 1.01 * unbounded.cost
+
+
+@pytest.mark.parametrize("steps", [20, 40])
+def test_what_was_given_up_is_tried_again_where_nothing_else_helps(steps, monkeypatch):
+    """With no halvings to begin with, motions that need them are found all the same."""
+    free = vp.solve(swing(steps))
+    monkeypatch.setattr(search, "_HALVINGS", 0)
+    monkeypatch.setattr(search, "_MORE_HALVINGS", 0)
+    bounded = vp.solve(swing(steps))
+    assert bounded.trajectory.statistics.substeps.max() > 1
+    assert bounded.cost <= 1.05 * free.cost
+    assert not bounded.search.bounded
+
+
+def test_bounded_searches_go_on_as_if_not_interrupted():
+    """The bounds are those of the motion so far, which is all that a search holds."""
+    problem = tool_reach()
+    whole = vp.solve(problem, max_iterations=8)
+    parts = vp.solve(problem, max_iterations=3)
+    assert any(item.rollouts > 4 for item in whole.history)
+    parts = vp.solve(problem, resume=parts, max_iterations=5)
+    for name in ("gains", "feedforward", "controls"):
+        assert getattr(parts, name).tobytes() == getattr(whole, name).tobytes()
+    assert [item.rollouts for item in parts.history] == [item.rollouts for item in whole.history]
+
+
+@pytest.mark.parametrize("hold", [1, 5])
+@pytest.mark.parametrize("grid", GRIDS)
+def test_motions_that_are_looked_at_on_their_way_are_the_same(grid, hold):
+    problem = reach(vp.ControlRateCost(0.1), hold=hold, **GRIDS[grid])
+    policy = vp.solve(problem, max_iterations=2).policy
+    commands = policy.commands(problem.steps, 2, 2, problem.integrator.variational)
+    motions = Motions(problem.scene, problem.integrator, problem.q0 + 0.1, problem.v0, problem.dt)
+    seen = []
+    whole, failure = motions.under(commands)
+    looked, same = motions.under(commands, futile=lambda parts: seen.append(len(parts)))
+    assert failure is same is None
+    assert seen == [1]
+    for name in ("q", "v", "p", "u", "energy"):
+        assert getattr(whole, name).tobytes() == getattr(looked, name).tobytes()
+    np.testing.assert_array_equal(whole.statistics.substeps, looked.statistics.substeps)
+
+
+def test_motions_that_are_futile_end():
+    problem = reach()
+    motions = Motions(problem.scene, problem.integrator, problem.q0, problem.v0, problem.dt)
+    motion, failure = motions.under(open_loop(np.zeros((50, 2))), futile=lambda parts: "enough")
+    assert failure.reason == "enough"
+    assert motion.steps == 16
+
+
+def test_trials_that_cost_too_much_already_are_given_up(monkeypatch):
+    """Those of a motion that runs off are no longer than a third of it, and the plan is the same."""
+    lengths = []
+    own = search._Search._try
+
+    def watched(self, step, added, bounds):
+        before = self.motions.under
+
+        def under(commands, **options):
+            motion, failure = before(commands, **options)
+            lengths.append((motion.steps, None if failure is None else failure.reason))
+            return motion, failure
+
+        with monkeypatch.context() as patch:
+            patch.setattr(self.motions, "under", under)
+            return own(self, step, added, bounds)
+
+    robot = vp.planar_chain(2)
+    cost = vp.TrackingCost(GOAL, 100.0) + vp.ControlCost(1e-6)
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot), cost, [2.5, 2.0], [0, 0], dt=0.02, steps=50, integrator=vp.RungeKutta4(), sampling="gauss"
+    )
+    monkeypatch.setattr(search._Search, "_try", watched)
+    sol = vp.solve(problem, forward="open", max_iterations=30)
+    dear = [steps for steps, reason in lengths if reason == search._DEAR]
+    assert dear
+    assert max(dear) <= 16
+    monkeypatch.setattr(search, "spent", lambda *given: 0.0)
+    lengths.clear()
+    assert_same_search(vp.solve(problem, forward="open", max_iterations=30), sol)
+    assert not [reason for _, reason in lengths if reason == search._DEAR]
+
+
+def test_what_is_spent_of_a_running_cost():
+    problem = reach(sampling="gauss")
+    motions = Motions(problem.scene, problem.integrator, problem.q0, problem.v0, problem.dt)
+    found = []
+    whole, _ = motions.under(open_loop(np.ones((50, 2))), futile=lambda parts: found.append((len(parts), list(parts))))
+    other, _ = motions.under(open_loop(np.zeros((50, 2))))
+    for (_, parts), steps in zip(found, (16,), strict=True):
+        short = problem.at(steps=steps)
+        own = short.costs(whole.q[: steps + 1], whole.v[: steps + 1], whole.u[:steps])
+        end = short.terminal.value(whole.q[steps : steps + 1], whole.v[steps : steps + 1], np.zeros((1, 2)))[0]
+        assert spent(problem, parts, other) == pytest.approx(own - end, rel=1e-12)
