@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, count, finite_array, positive, require_finite
 from varpin.errors import InputError, VarpinError
+from varpin.frozen import Frozen
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, rows
 from varpin.kernels._compile import announced_compilation
@@ -36,7 +37,7 @@ _PATH = 200
 
 
 @dataclass(frozen=True, eq=False)
-class EnsembleStatistics:
+class EnsembleStatistics(Frozen):
     """Moments and quantiles over the paths at each of N + 1 nodes. x is (q, p), or (q, v): see the integrator.
 
     Attributes:
@@ -78,7 +79,7 @@ class PathFailure:
 
 
 @dataclass(frozen=True, eq=False)
-class Ensemble:
+class Ensemble(Frozen):
     """P paths over N steps.
 
     Attributes:

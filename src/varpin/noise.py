@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, broadcast_array, count, finite_array, require_finite
 from varpin.errors import InputError
+from varpin.frozen import Frozen
 from varpin.kernels.tree import Diffusion
 
 Floats = NDArray[np.float64]
@@ -58,7 +59,7 @@ class Noise(ABC):
         return NoiseSum((*_terms(self), *_terms(other)))
 
 
-class BoundNoise(ABC):
+class BoundNoise(Frozen, ABC):
     """A noise model on a robot."""
 
     @property

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, broadcast_array, finite_array
 from varpin.errors import InputError, RobotError
+from varpin.frozen import Frozen
 from varpin.kernels.tree import Diffusion, Mechanism
 from varpin.markup import facts, listed
 from varpin.noise import BoundNoise, Noise, bind
@@ -23,7 +24,7 @@ EARTH = (0.0, 0.0, -9.81)
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class Scene:
+class Scene(Frozen):
     """A robot in its surroundings.
 
     Attributes:

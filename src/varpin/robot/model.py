@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, is_one_of, require_finite
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint
+from varpin.frozen import Frozen
 from varpin.kernels.tree import Tree
 from varpin.markup import facts, listed, table
 from varpin.robot import example_robot_data
@@ -32,7 +33,7 @@ _FEW = 128
 
 
 @dataclass(frozen=True, eq=False)
-class Robot:
+class Robot(Frozen):
     """An arm in generalized coordinates. Made by :func:`load_robot`.
 
     The n coordinates are the positions of the joints that are neither locked, fixed nor mimicking, in

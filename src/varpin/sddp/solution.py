@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import count, is_one_of, positive
 from varpin.costs import barriers_of
 from varpin.errors import InputError
+from varpin.frozen import Frozen
 from varpin.kernels._compile import announced_compilation
 from varpin.linearization import velocity_at_nodes
 from varpin.markup import facts, folded, listed, table
@@ -55,7 +56,7 @@ class Violations:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class Solution(Frozen):
     """The best motion a solver found, with the policy around it.
 
     ``print(plan.table())`` shows a row for each iteration, then how the search ended and why:
