@@ -180,19 +180,22 @@ def _trajectory(
 
 
 class Motions:
-    """Motions without noise from one state under commands of any kind; they share their work arrays."""
+    """Motions from one state under commands of any kind; they share their work arrays."""
 
     def __init__(self, scene: Scene, integrator: Integrator, q0: Floats, v0: Floats, dt: float) -> None:
         self.scene, self.integrator, self.dt = scene, integrator, dt
         self._state, (self._first,) = integrator.start(scene, q0[None], v0[None])
 
-    def under(self, commands: Commands) -> tuple[Trajectory, Failure | None]:
-        """The motion, and why it stopped early, if it did; nothing is checked."""
-        first, nothing = self._first, np.zeros((0, 0, self.scene.processes))
+    def under(self, commands: Commands, increments: Floats | None = None) -> tuple[Trajectory, Failure | None]:
+        """The motion, and why it stopped early, if it did; nothing is checked.
+
+        Without the increments of its Wiener processes (N, k) there is no noise.
+        """
+        first, drawn = self._first, np.zeros((0, 0, self.scene.processes)) if increments is None else increments[None]
         state = self.integrator.fork(self._state)
-        (steps,) = self.integrator.rollout(self.scene, state, commands, nothing, self.dt)
+        (steps,) = self.integrator.rollout(self.scene, state, commands, drawn, self.dt)
         nodes = {name: np.concatenate([getattr(first, name), getattr(steps, name)]) for name in _NODES}
-        dw = np.zeros((len(steps.u), self.scene.processes))
+        dw = np.zeros((len(steps.u), self.scene.processes)) if increments is None else increments[: len(steps.u)]
         made = _trajectory(self.scene, self.integrator, self.dt, nodes, steps.u, dw, steps.statistics)
         return made, steps.failure
 
