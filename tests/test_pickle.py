@@ -1,4 +1,4 @@
-"""What leaves the process comes back as it was: the same bytes from simulations and solves, the same kinds of arrays."""
+"""What leaves the process comes back as it was: simulations and solves of the same bytes, arrays of the same kind."""
 
 import copy
 import dataclasses

@@ -8,7 +8,7 @@ import itertools
 import logging
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -41,8 +41,8 @@ logger = logging.getLogger(__name__)
 # Paths that one kernel call takes, and numbers that a block of nodes holds.
 _GROUP = 32
 _BLOCK = 1_000_000
-# A chunk of paths is what a worker does at a time. Its size depends on the ensemble alone, and so does every sum: so many
-# chunks, but each with this much to do at least and at most [steps of paths]; fewest paths come before most to do.
+# A chunk of paths is what a worker does at a time. Its size depends on the ensemble alone, and so does every sum: so
+# many chunks, but each with this much to do at least and at most [steps of paths], and never fewer or more paths.
 _CHUNKS, _LEAST, _MOST, _FEWEST_PATHS, _MOST_PATHS = 64, 4_000, 200_000, 16, 1024
 # Numbers up to which quantiles are exact without stored paths, numbers in the bins that they are read from beyond, and
 # how far those reach on either side of the first chunk's values, in units of their range.
@@ -256,7 +256,7 @@ def simulate_ensemble(
     return dataclasses.replace(sums.ensemble(), warnings=tuple(finding.sentence for finding in found))
 
 
-def _parts(pool: Executor, sums: _Sums, q0: Floats, v0: Floats) -> Iterator[Part]:
+def _parts(pool: Executor, sums: _Sums, q0: Floats, v0: Floats) -> Generator[Part, None, None]:
     """What comes of the chunks; the first by itself where the bins of the others depend on it."""
     tasks = sums.tasks(q0, v0)
     if sums.estimated:

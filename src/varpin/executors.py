@@ -7,7 +7,7 @@ import logging
 import os
 import pickle
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from typing import Generic, TypeVar
 
@@ -40,12 +40,17 @@ def executing(executor: Executor | None, workers: int | None) -> Iterator[Execut
         return
     if workers is not None:
         raise InputError("give workers, a number of threads, or executor, which has workers of its own; not both")
+    yield require_executor(executor)
+
+
+def require_executor(executor: object) -> Executor:
+    """``executor`` itself, or an InputError that says what it is instead."""
     if not isinstance(executor, Executor):
         raise InputError(
             "executor must be a concurrent.futures.Executor, for example a ProcessPoolExecutor or Dask's "
             f"client.get_executor(), got {type(executor).__name__}"
         )
-    yield executor
+    return executor
 
 
 def in_process(executor: Executor) -> bool:
@@ -76,7 +81,9 @@ class _Guarded(Generic[Task, Result]):
             return _Raised(error)
 
 
-def in_order(executor: Executor, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
+def in_order(
+    executor: Executor, function: Callable[[Task], Result], tasks: Iterable[Task]
+) -> Generator[Result, None, None]:
     """``function`` of each task, in their order.
 
     A task whose worker is lost is done again, in a pool that has broken by a new one like it. Few tasks are ahead of

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
@@ -296,12 +297,15 @@ class Solution(Frozen):
         *,
         feedback: bool = True,
         workers: int | None = None,
+        executor: Executor | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> MonteCarlo:
         """Expected cost of the policy under the scene's noise, with the problem's own integrator and step.
 
-        Path i draws its noise from the i-th child of ``rng``, for any number of workers. Noise that only Python can
-        evaluate (:class:`varpin.CustomNoise`) is simulated path by path, which is slow.
+        Path i draws its noise from the i-th child of ``rng``: the same bytes for any number of workers, threads,
+        processes or machines of one kind. Only costs come back from them. Noise that only Python can evaluate
+        (:class:`varpin.CustomNoise`) is simulated path by path, which is slow, and without ``executor`` one after
+        another.
 
         Main args:
             paths: How many.
@@ -310,15 +314,25 @@ class Solution(Frozen):
 
         Other Args:
             workers: Threads; as many as there are cores if left out.
+            executor: Any ``concurrent.futures.Executor`` instead of threads; see :func:`varpin.simulate_ensemble`.
             progress: Called now and then with (paths done, paths in all).
 
         Raises:
             InputError: Wrong arguments.
-            VarpinError: Every path failed.
+            VarpinError: Every path failed, or workers get lost again and again.
             MonteCarloInterrupted: Ctrl-C; holds the result of the paths done. It is a KeyboardInterrupt.
         """
         policy = self.policy if feedback else self.policy.without_feedback()
-        return monte_carlo(self.problem, policy, self.expected_cost, paths, rng, workers=workers, progress=progress)
+        return monte_carlo(
+            self.problem,
+            policy,
+            self.expected_cost,
+            paths,
+            rng,
+            workers=workers,
+            executor=executor,
+            progress=progress,
+        )
 
 
 def _beyond(y: Floats, limits: Sequence[tuple[Floats, Floats] | Floats]) -> Floats:
