@@ -26,6 +26,7 @@ def python_blocks(page):
         ("replay.md", 2, ["marks.html", "pair.html", "controller.html"]),
         ("notebooks.md", 2, []),
         ("control-loop.md", 1, ["loop.html"]),
+        ("many-machines.md", 4, []),
     ],
 )
 def test_a_page_runs_from_top_to_bottom(page, least, made, tmp_path):

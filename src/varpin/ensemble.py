@@ -50,8 +50,8 @@ _EXACT, _BINS, _REACH = 2**25, 2**25, 0.75
 _FEWEST_BINS, _MOST_BINS = 64, 1000
 # Numbers that a part of the nodes may have whose quantiles are taken at a time.
 _SPAN = 100_000
-# Paths that are looked at once more, at most, and of how many it is one.
-_LOOKS, _LOOKED_AT = 4, 50
+# Paths that are looked at once more, at most, and of how many each is one.
+_LOOKS, _LOOKED_AT = 4, 5
 
 
 @dataclass(frozen=True, eq=False)
