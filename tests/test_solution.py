@@ -223,10 +223,10 @@ def test_monte_carlo_interrupted_holds_the_paths_done():
             raise KeyboardInterrupt
 
     with pytest.raises(vp.MonteCarloInterrupted, match=r"after \d+ paths; they are in") as caught:
-        sol.monte_carlo(200, 5, workers=1, progress=stop)
+        sol.monte_carlo(600, 5, workers=1, progress=stop)
     assert len(seen) == 1
     done = seen[0][0]
-    assert done < 200
+    assert done < 600
     assert dataclasses.replace(sol.monte_carlo(done, 5, workers=2), warnings=()) == caught.value.result
     own = vp.CustomNoise(lambda q, v, u: 0.1 * np.eye(2), 2)
 

@@ -634,8 +634,7 @@ class _Sums:
         there = own.count > 0
         degrees = np.maximum(own.count - 1, 1)
         quantiles, errors = self._quantiles()
-        stored: dict[str, Floats | None] = dict.fromkeys(("q", "v", "p", "u", "energy"))
-        stored |= {name: array[: self.done] for name, array in self.stored.items()}
+        stored = {name: array[: self.done] for name, array in self.stored.items()}
         return Ensemble(
             t=np.arange(self.shared.steps + 1, dtype=np.float64) * self.shared.dt,
             statistics=EnsembleStatistics(
@@ -648,8 +647,12 @@ class _Sums:
                 energy_deviation=np.where(there, np.sqrt(own.energy / degrees), np.nan),
                 count=own.count,
             ),
+            q=stored.get("q"),
+            v=stored.get("v"),
+            p=stored.get("p"),
+            u=stored.get("u"),
+            energy=stored.get("energy"),
             failures=tuple(self.failures),
-            **stored,
         )
 
     def _quantiles(self) -> tuple[Floats, Floats]:
@@ -700,7 +703,7 @@ class _Histogram:
         self.counts = np.zeros((*spread.shape, bins + 2), dtype=np.int64)
         self.bounds = np.stack([np.full(spread.shape, np.inf), np.full(spread.shape, -np.inf)])
         counts, bounds = np.zeros(self.counts.shape, dtype=np.uint16), np.empty(self.bounds.shape)
-        counted(values, *self.grid[0], bins, counts, bounds)
+        counted(values, self.grid[0][0], self.grid[0][1], bins, counts, bounds)
         self.add(counts, bounds)
 
     def add(self, counts: NDArray[np.uint16], bounds: Floats) -> None:

@@ -145,9 +145,15 @@ def in_order(
             own.shutdown(wait=False, cancel_futures=True)
 
 
-def _ahead(executor: Executor) -> int:
+def _workers(executor: Executor) -> int | None:
+    """How many it has, if it says."""
     workers = getattr(executor, "_max_workers", None) or getattr(executor, "num_workers", None)
-    return _AHEAD * workers if isinstance(workers, int) else _AHEAD_OF_ANY
+    return workers if isinstance(workers, int) else None
+
+
+def _ahead(executor: Executor) -> int:
+    workers = _workers(executor)
+    return _AHEAD_OF_ANY if workers is None else _AHEAD * workers
 
 
 def _renewed(executor: Executor, error: BrokenExecutor) -> Executor:
@@ -159,7 +165,7 @@ def _renewed(executor: Executor, error: BrokenExecutor) -> Executor:
     if not isinstance(executor, ProcessPoolExecutor):
         raise VarpinError(f"the executor has broken, and only a ProcessPoolExecutor is made anew: {error}") from error
     return ProcessPoolExecutor(
-        executor._max_workers,
+        _workers(executor),
         executor._mp_context,
         initializer=executor._initializer,
         initargs=executor._initargs,
