@@ -27,6 +27,7 @@ def python_blocks(page):
         ("notebooks.md", 2, []),
         ("control-loop.md", 1, ["loop.html"]),
         ("textbook.md", 2, []),
+        ("many-machines.md", 4, []),
     ],
 )
 def test_a_page_runs_from_top_to_bottom(page, least, made, tmp_path):

@@ -39,12 +39,12 @@ def numbers_a_step(scene, paths):
 
 @pytest.mark.parametrize("kick", ["left", "split"])
 def test_same_bytes_for_any_number_of_workers_and_blocks(kick, monkeypatch):
-    integrator = vp.Midpoint(kick=kick)
-    one, two, seven = (run(paths=100, workers=w, integrator=integrator) for w in (1, 2, 7))
-    blocks_of(monkeypatch, 9 * numbers_a_step(make_scene(), 100))
-    calls = []
-    in_blocks = run(paths=100, workers=2, integrator=integrator, progress=lambda *done: calls.append(done))
-    assert calls == [(9, 50), (18, 50), (27, 50), (36, 50), (45, 50), (50, 50)]
+    integrator, calls = vp.Midpoint(kick=kick), []
+    one, two = (run(paths=200, workers=w, integrator=integrator) for w in (1, 2))
+    seven = run(paths=200, workers=7, integrator=integrator, progress=lambda *done: calls.append(done))
+    assert calls == [(96, 200), (192, 200), (200, 200)]
+    blocks_of(monkeypatch, 9 * numbers_a_step(make_scene(), 96))
+    in_blocks = run(paths=200, workers=2, integrator=integrator)
     for other in (two, seven, in_blocks):
         for name in ARRAYS:
             assert getattr(other, name).tobytes() == getattr(one, name).tobytes()
@@ -248,6 +248,7 @@ def test_failing_paths_are_left_out_from_where_they_fail(monkeypatch, caplog):
     options = FRAGILE | {"paths": 40, "q0": starts(40), "v0": np.zeros(3)}
     with caplog.at_level(logging.WARNING, "varpin.ensemble"):
         end = run(fragile_scene(), **options)
+    assert any("of 40 paths failed" in warning for warning in end.warnings)
     failed = {failure.path: failure for failure in end.failures}
     steps = {path: failure.step for path, failure in failed.items()}
     assert len(set(steps.values())) >= 3
@@ -285,37 +286,92 @@ def test_all_paths_failing_is_an_error(monkeypatch, block):
     failing = slice(0, 18, 3)
     options = FRAGILE | {"paths": 6, "q0": starts(40)[failing], "v0": np.zeros(3)}
     blocks_of(monkeypatch, block * numbers_a_step(fragile_scene(), 6))
-    calls = []
     with pytest.raises(vp.VarpinError, match=r"^6 of 6 paths failed, the first at step \d+: ") as caught:
-        run(fragile_scene(), progress=lambda *done: calls.append(done), **options)
+        run(fragile_scene(), **options)
     assert type(caught.value) is vp.VarpinError
-    # It ends with the last path.
-    assert calls[-1][0] < 60 or block == 60
 
 
-def test_interruption_keeps_what_is_done(monkeypatch):
-    blocks_of(monkeypatch, 8 * numbers_a_step(make_scene(), 40))
-
+def test_interruption_keeps_what_is_done():
     def interrupt(done, total):
-        if done == 24:
+        if done == 192:
             raise KeyboardInterrupt
 
-    with pytest.raises(vp.EnsembleInterrupted, match="interrupted after 24 steps of all paths") as caught:
-        run(progress=interrupt)
+    with pytest.raises(vp.EnsembleInterrupted, match="interrupted after 192 paths") as caught:
+        run(paths=300, progress=interrupt)
     assert isinstance(caught.value, KeyboardInterrupt)
-    part, whole = caught.value.ensemble, run()
-    assert part.t.tobytes() == whole.t[:25].tobytes()
+    part, whole = caught.value.ensemble, run(paths=300)
+    assert part.t.tobytes() == whole.t.tobytes()
     for name in ARRAYS:
-        done = 24 if name == "u" else 25
-        assert getattr(part, name).shape == getattr(whole, name)[:, :done].shape
-        assert getattr(part, name).tobytes() == getattr(whole, name)[:, :done].tobytes()
-    np.testing.assert_array_equal(part.statistics.mean, whole.statistics.mean[:25])
-    assert part.statistics.quantiles.shape == (3, 25, 4)
-    assert part.statistics.count.tolist() == [40] * 25
+        assert getattr(part, name).tobytes() == getattr(whole, name)[:192].tobytes()
+    check_statistics(part)
+    assert part.statistics.count.tolist() == [192] * 51
     with pytest.raises(vp.EnsembleInterrupted) as caught:
-        run(progress=interrupt, store=False)
+        run(paths=300, progress=interrupt, store=False)
     assert caught.value.ensemble.q is None
-    np.testing.assert_array_equal(caught.value.ensemble.statistics.mean, part.statistics.mean)
+    same_statistics(caught.value.ensemble, part)
+
+
+def test_interruption_before_anything_is_done(monkeypatch):
+    def stop(*given):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(varpin.ensemble, "simulate_paths", stop)
+    with pytest.raises(vp.EnsembleInterrupted, match=r"interrupted after 0 paths$") as caught:
+        run()
+    assert caught.value.ensemble is None
+
+
+def test_quantiles_of_very_many_paths_are_off_by_no_more_than_they_say(monkeypatch):
+    exact = run(paths=3000, steps=20, quantiles=[0.0, 0.01, 0.5, 0.9, 1.0]).statistics
+    monkeypatch.setattr(varpin.ensemble, "_EXACT", 1000)
+    rough = run(paths=3000, steps=20, quantiles=[0.0, 0.01, 0.5, 0.9, 1.0], store=False, workers=3).statistics
+    assert not exact.quantile_errors.any()
+    off = np.abs(rough.quantiles - exact.quantiles)
+    deviation = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
+    assert (off <= rough.quantile_errors + 1e-15).all()
+    assert not off[[0, -1]].any()
+    # By far less than paths scatter, but for what these few say of a tail.
+    assert (off[1:4, 1:] < 0.02 * deviation[1:]).all()
+    assert (rough.quantile_errors[2, 1:] < 0.02 * deviation[1:]).all()
+    np.testing.assert_array_equal(rough.quantiles[:, 0], exact.quantiles[:, 0])
+    # The same for any workers, and whatever of the values lies outside the first paths' bins.
+    again = run(paths=3000, steps=20, quantiles=[0.0, 0.01, 0.5, 0.9, 1.0], store=False, workers=1).statistics
+    np.testing.assert_array_equal(again.quantiles, rough.quantiles)
+    q0 = np.zeros((3000, 2))
+    q0[2000:] = np.linspace(1.0, 3.0, 1000)[:, None]
+    monkeypatch.setattr(varpin.ensemble, "_EXACT", 2**25)
+    exact = run(paths=3000, steps=5, q0=q0, store=False).statistics
+    monkeypatch.setattr(varpin.ensemble, "_EXACT", 1000)
+    rough = run(paths=3000, steps=5, q0=q0, store=False).statistics
+    assert (np.abs(rough.quantiles - exact.quantiles) <= rough.quantile_errors + 1e-15).all()
+
+
+def test_a_coarse_step_is_told_of(caplog):
+    scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(1e-2))
+    coarse = {"dt": 0.05, "steps": 40, "controls": None, "integrator": vp.ExplicitEuler(), "store": False}
+    with caplog.at_level(logging.WARNING, "varpin.ensemble"):
+        end = run(scene, **coarse)
+        again = run(scene, **coarse)
+    assert any("the energy is off by" in warning for warning in end.warnings)
+    assert any("dt = 0.05 s is coarse for ExplicitEuler" in warning for warning in end.warnings)
+    assert all(warning.startswith("path ") for warning in end.warnings)
+    assert again.warnings == end.warnings
+    # Once in the log, and in every form of the result.
+    assert [record.getMessage() for record in caplog.records] == list(end.warnings)
+    assert repr(end).endswith(f", {len(end.warnings)} warnings)")
+    for warning in end.warnings:
+        assert f"warning: {warning}" in str(end)
+        assert "is coarse for ExplicitEuler" in end._repr_html_()
+    assert run(vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(1e-2)), dt=1e-3).warnings == ()
+
+
+def test_the_paths_that_stand_out_are_looked_at():
+    """One of 200 starts so fast that its steps are taken in parts."""
+    v0 = np.zeros((200, 2))
+    v0[137] = 60.0
+    scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(1e-3))
+    end = run(scene, paths=200, v0=v0, dt=0.01, steps=20, store=False)
+    assert any(warning.startswith("path 137: ") for warning in end.warnings)
 
 
 CUSTOM = vp.CustomNoise(lambda q, v, u: np.eye(2), 2)

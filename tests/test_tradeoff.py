@@ -222,9 +222,9 @@ def test_members_that_fail_do_not_stop_the_others():
 def count_runs(monkeypatch):
     measured, original = [], precision._measure
 
-    def counting(setting, exact, member, steps, repeats):
-        measured.append((str(member), steps))
-        return original(setting, exact, member, steps, repeats)
+    def counting(cell):
+        measured.append((str(cell.member), cell.steps))
+        return original(cell)
 
     monkeypatch.setattr(precision, "_measure", counting)
     return measured

@@ -1,11 +1,16 @@
-"""Many noisy paths at once, on all cores, and their statistics."""
+"""Many noisy paths at once, on all cores or many machines, and their statistics."""
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import itertools
 import logging
+import math
 import os
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
 from varpin.errors import InputError, VarpinError
+from varpin.executors import executing, in_order, in_process
+from varpin.frozen import Frozen
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, rows
 from varpin.kernels._compile import announced_compilation
@@ -20,23 +27,35 @@ from varpin.kernels.tree import Commands
 from varpin.markup import facts, table
 from varpin.policy import LinearPolicy, OpenLoop
 from varpin.scene import Scene, require_scene
-from varpin.simulation import commands_of
-from varpin.wiener import generator
+from varpin.simulation import Motions, commands_of
+from varpin.soundness import Finding, announce, examined
+from varpin.wiener import Children, children
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+# By what they are extreme in, how much of it, and which path.
+Extremes = dict[str, tuple[float, int]]
 
 logger = logging.getLogger(__name__)
 
-# Paths that one kernel call takes, and how many numbers a block of nodes and a part of it to be reduced may hold.
+# Paths that one kernel call takes, and numbers that a block of nodes holds.
 _GROUP = 32
-_BLOCK = 4_000_000
+_BLOCK = 1_000_000
+# A chunk of paths is what a worker does at a time. Its size depends on the ensemble alone, and so does every sum: so
+# many chunks, but each with this much to do at least and at most [steps of paths], and never fewer or more paths.
+_CHUNKS, _LEAST, _MOST, _FEWEST_PATHS, _MOST_PATHS = 64, 4_000, 200_000, 16, 1024
+# Numbers up to which quantiles are exact without stored paths, numbers in the bins that they are read from beyond, and
+# how far those reach on either side of the first chunk's values, in units of their range.
+_EXACT, _BINS, _REACH = 2**25, 2**25, 0.75
+_FEWEST_BINS, _MOST_BINS = 64, 1000
+# Numbers that a part of the nodes may have whose quantiles are taken at a time.
 _SPAN = 100_000
-# What a path's generator takes, in numbers.
-_PATH = 200
+# Paths that are looked at once more, at most, and of how many each is one.
+_LOOKS, _LOOKED_AT = 4, 5
 
 
 @dataclass(frozen=True, eq=False)
-class EnsembleStatistics:
+class EnsembleStatistics(Frozen):
     """Moments and quantiles over the paths at each of N + 1 nodes. x is (q, p), or (q, v): see the integrator.
 
     Attributes:
@@ -44,6 +63,7 @@ class EnsembleStatistics:
         covariance: (N + 1, 2n, 2n), with P - 1 in the denominator.
         levels: Of the quantiles (L,).
         quantiles: (L, N + 1, 2n).
+        quantile_errors: What each is off by at most, (L, N + 1, 2n); zero where they are exact.
         energy_mean: (N + 1,) [J].
         energy_deviation: Standard deviation (N + 1,) [J].
         count: Paths that are counted at each node (N + 1,): those that have not failed before.
@@ -53,6 +73,7 @@ class EnsembleStatistics:
     covariance: Floats
     levels: Floats
     quantiles: Floats
+    quantile_errors: Floats
     energy_mean: Floats
     energy_deviation: Floats
     count: NDArray[np.int64]
@@ -78,7 +99,7 @@ class PathFailure:
 
 
 @dataclass(frozen=True, eq=False)
-class Ensemble:
+class Ensemble(Frozen):
     """P paths over N steps.
 
     Attributes:
@@ -90,6 +111,9 @@ class Ensemble:
         u: Controls applied (P, N, m).
         energy: (P, N + 1) [J].
         failures: Paths that stopped early; they are left out of the statistics from there on.
+        warnings: What varpin says of the paths, a sentence each: dt too coarse, energy off, paths that stopped early.
+            A few paths are looked at, as :func:`varpin.simulate` looks at its motion: the first, the one with the most
+            split steps, the one with the most energy and the fastest.
     """
 
     t: Floats
@@ -100,9 +124,13 @@ class Ensemble:
     u: Floats | None
     energy: Floats | None
     failures: tuple[PathFailure, ...]
+    warnings: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        return f"Ensemble({self._size()})"
+        return f"Ensemble({self._size()}{said(self.warnings)})"
+
+    def __str__(self) -> str:
+        return "\n".join([f"Ensemble({self._size()})", *(f"warning: {warning}" for warning in self.warnings)])
 
     def _repr_html_(self) -> str:
         own, half = self.statistics, self.statistics.mean.shape[1] // 2
@@ -110,7 +138,8 @@ class Ensemble:
         rows = [(j, float(own.mean[-1, j]), float(deviation[j])) for j in range(half)]
         head = ("coordinate", "mean of q in the end [rad or m]", "standard deviation")
         energy = f"{own.energy_mean[-1]:.4g} +- {own.energy_deviation[-1]:.2g} in the end"
-        return facts("Ensemble", [("of", self._size()), ("energy [J]", energy)], table(head, rows))
+        warned = [("warning", warning) for warning in self.warnings]
+        return facts("Ensemble", [("of", self._size()), ("energy [J]", energy), *warned], table(head, rows))
 
     def _size(self) -> str:
         counted = int(self.statistics.count[0])
@@ -119,16 +148,22 @@ class Ensemble:
         return f"{counted} paths{kept} over {len(self.t) - 1} steps, {self.t[-1] - self.t[0]:g} s{lost}"
 
 
+def said(warnings: Sequence[str]) -> str:
+    """How many warnings there are, for one line; nothing if there are none."""
+    return f", {len(warnings)} warning{'s' * (len(warnings) > 1)}" if warnings else ""
+
+
 class EnsembleInterrupted(KeyboardInterrupt):
     """Ctrl-C during an ensemble.
 
     Attributes:
-        ensemble: All paths up to the last node that all of them had reached.
+        ensemble: The first paths, up to where they were done; None if none were.
     """
 
-    def __init__(self, ensemble: Ensemble) -> None:
+    def __init__(self, ensemble: Ensemble | None) -> None:
         self.ensemble = ensemble
-        super().__init__(f"interrupted after {len(ensemble.t) - 1} steps of all paths; they are in .ensemble")
+        done = 0 if ensemble is None else int(ensemble.statistics.count[0])
+        super().__init__(f"interrupted after {done} paths" + ("; they are in .ensemble" if done else ""))
 
 
 def simulate_ensemble(
@@ -145,11 +180,13 @@ def simulate_ensemble(
     store: bool = True,
     quantiles: Sequence[float] = (0.05, 0.5, 0.95),
     workers: int | None = None,
+    executor: Executor | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Ensemble:
     """Simulate many paths of a noisy scene.
 
-    Path i draws its noise from the i-th child of ``rng``: the same bytes for any number of workers or of paths.
+    Path i draws its noise from the i-th child of ``rng``, and moments are merged in the order of the paths: the same
+    bytes for any number of workers, threads, processes or machines of one kind.
 
     Main args:
         scene: The scene, with noise that kernels can evaluate (not a ``CustomNoise``).
@@ -165,16 +202,22 @@ def simulate_ensemble(
     Other Args:
         integrator: ``Midpoint()`` if left out.
         store: Keep every path. Without, only the statistics are kept, and memory does not grow with P N.
-        quantiles: Levels in [0, 1].
+        quantiles: Levels in [0, 1]; none, and no more than moments come back from the workers. They are exact if paths
+            are stored, or if P (N + 1) 2n is no more than 33 million. Beyond, they are read from histograms of up to
+            1000 bins over 2.5 times the range of the first paths (up to 1024), linear within a bin; then
+            ``statistics.quantile_errors`` says what they are off by at most, a bin. Levels 0 and 1 stay exact.
         workers: Threads; as many as there are cores if left out.
-        progress: Called now and then with (steps done by all paths, N).
+        executor: Any ``concurrent.futures.Executor`` instead of threads: a ``ProcessPoolExecutor``, Dask's
+            ``client.get_executor()``, an ``mpi4py.futures.MPIPoolExecutor``. It stays open. The work of a worker that
+            is lost is done again.
+        progress: Called now and then with (paths done, P).
 
     Raises:
         InputError: Wrong shapes, values that are not finite, or a scene whose noise kernels cannot evaluate.
-        VarpinError: Every path failed.
-        EnsembleInterrupted: Ctrl-C; holds what was done. It is a KeyboardInterrupt.
+        VarpinError: Every path failed, or workers get lost again and again.
+        EnsembleInterrupted: Ctrl-C; holds the paths that were done. It is a KeyboardInterrupt.
     """
-    n = require_scene(scene).robot.dof
+    require_scene(scene)
     dt, steps, paths = positive("dt", dt, "s"), count("steps", steps), count("paths", paths, least=1)
     _require_memory(scene, steps, paths, store=store)
     start = [_per_path(name, value, paths, scene.robot.joint_names) for name, value in (("q0", q0), ("v0", v0))]
@@ -183,46 +226,53 @@ def simulate_ensemble(
     levels = require_finite("quantiles", as_floats("quantiles", quantiles))
     if levels.ndim != 1 or ((levels < 0.0) | (levels > 1.0)).any():
         raise InputError(f"quantiles must be levels in [0, 1], got {quantiles}")
-    workers = count("workers", (os.cpu_count() or 1) if workers is None else workers, least=1)
     integrator = Midpoint() if integrator is None else integrator
     if not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
     commands = commands_of(scene, integrator, controls, steps, dt)
-    run = _Run(scene, integrator, dt, start, rng, commands)
-    block = min(steps, _BLOCK // (paths * (2 * n + 1)))
-    block = max(1, block // commands.hold) * commands.hold
-    collector = _Collector(steps, block, levels, run, store)
-    feature = f"simulate_ensemble with {type(integrator).__name__}"
-    with announced_compilation(feature), ThreadPoolExecutor(workers) as pool:
+    with (
+        executing(executor, workers) as pool,
+        announced_compilation(f"simulate_ensemble with {type(integrator).__name__}"),
+    ):
+        shared = Shared(without_geometry(scene), integrator, commands, dt, steps, children(rng, paths))
+        sums = _Sums(shared, paths, levels, store=store)
+        if not in_process(pool):
+            warm_up(shared, start[0][0], start[1][0])
         try:
-            run.begin(collector, pool)
-            for begin in range(0, steps, block):
-                end = min(steps, begin + block)
-                run.advance(begin, end, collector, pool)
-                if progress is not None:
-                    progress(end, steps)
-                if not run.alive.any():
-                    break
+            with closing(_parts(pool, sums, start[0], start[1])) as parts:
+                for part in parts:
+                    sums.add(part)
+                    if progress is not None:
+                        progress(sums.done, paths)
+            found = looked_at(pool, shared, start[0], start[1], sums.extremes)
         except KeyboardInterrupt:
-            raise EnsembleInterrupted(collector.ensemble()) from None
-    ensemble = collector.ensemble()
-    if ensemble.failures:
-        first = min(ensemble.failures, key=lambda failure: failure.step)
-        text = f"{len(ensemble.failures)} of {paths} paths failed, the first at step {first.step}: {first.reason}"
-        if len(ensemble.failures) == paths:
+            raise EnsembleInterrupted(sums.ensemble() if sums.done else None) from None
+    if lost := sums.failures:
+        first = min(lost, key=lambda failure: failure.step)
+        text = f"{len(lost)} of {paths} paths failed, the first at step {first.step}: {first.reason}"
+        if len(lost) == paths:
             raise VarpinError(text)
-        logger.warning("%s; they are left out of the statistics from there on", text)
-    return ensemble
+        found = (Finding("failed paths", f"{text}; they are left out of the statistics from there on"), *found)
+    announce(logger, scene, dt, found)
+    return dataclasses.replace(sums.ensemble(), warnings=tuple(finding.sentence for finding in found))
+
+
+def _parts(pool: Executor, sums: _Sums, q0: Floats, v0: Floats) -> Generator[Part, None, None]:
+    """What comes of the chunks; the first by itself where the bins of the others depend on it."""
+    tasks = sums.tasks(q0, v0)
+    if sums.estimated:
+        yield from in_order(pool, simulate_paths, itertools.islice(tasks, 1))
+    yield from in_order(pool, simulate_paths, tasks)
 
 
 def _require_memory(scene: Scene, steps: int, paths: int, *, store: bool) -> None:
     """Refuse a record that cannot be held, before anything runs."""
     n, m = scene.robot.dof, scene.controls
     stored = paths if store else 0
-    row = 2 * n * (2 * n + 5) + m + stored * (3 * n + m + 1)
+    row = 2 * n * (4 * n + 5) + m + stored * (3 * n + m + 1)
     for shape, what in (
         ((steps + 1, row), f"steps = {steps} with {stored} stored paths"),
-        ((paths, _PATH + 16 * n), f"paths = {paths}"),
+        ((paths, 2 * n), f"paths = {paths}"),
     ):
         try:
             np.empty(shape)
@@ -236,144 +286,499 @@ def _per_path(name: str, value: JointValues, paths: int, joints: Sequence[str]) 
     n = len(joints)
     array = joint_array(name, value, joints) if isinstance(value, Mapping) else as_floats(name, value)
     if array.shape == (n,):
-        array = np.repeat(array[None], paths, axis=0)
+        return np.broadcast_to(finite_array(name, array, (n,)), (paths, n))
     return finite_array(name, array, (paths, n))
 
 
-class _Run:
-    """The groups of paths, each with its integrator state, generators and failures."""
+def without_geometry(scene: Scene) -> Scene:
+    """The scene without shapes that came with its robot: no simulation needs them, and meshes are large to send."""
+    if scene.robot.visuals is None:
+        return scene
+    bare = copy.copy(scene)
+    vars(bare)["robot"] = dataclasses.replace(scene.robot, visuals=None)
+    return bare
 
-    def __init__(
-        self,
-        scene: Scene,
-        integrator: Integrator,
-        dt: float,
-        start: list[Floats],
-        rng: np.random.Generator | int,
-        commands: Commands,
-    ) -> None:
-        self.scene, self.integrator, self.dt, self.commands = scene, integrator, dt, commands
-        self.paths = len(start[0])
-        self.generators = generator(rng).spawn(self.paths)
-        self.alive = np.ones(self.paths, dtype=bool)
-        self.failures: list[PathFailure] = []
+
+def chunks(steps: int, paths: int) -> Iterator[tuple[int, int]]:
+    """The first path of each chunk, and one past its last; the same for any workers."""
+    steps = max(1, steps)
+    size = max(math.ceil(paths / _CHUNKS), _LEAST // steps)
+    size = max(_FEWEST_PATHS, min(size, _MOST // steps, _MOST_PATHS))
+    if size > _GROUP:
+        size = math.ceil(size / _GROUP) * _GROUP
+    for first in range(0, paths, size):
+        yield first, min(first + size, paths)
+
+
+@dataclass(frozen=True, eq=False)
+class Shared(Frozen):
+    """What all paths of an ensemble share.
+
+    Attributes:
+        scene: The scene.
+        integrator: The integrator.
+        commands: Of all steps.
+        dt: Time step [s].
+        steps: N.
+        seeds: A child for each path.
+    """
+
+    scene: Scene
+    integrator: Integrator
+    commands: Commands
+    dt: float
+    steps: int
+    seeds: Children
+
+
+@dataclass(frozen=True, eq=False)
+class Task(Frozen):
+    """A chunk of paths to simulate, and what of them is wanted.
+
+    Attributes:
+        shared: What they share with others.
+        first: The first of them.
+        q0: (C, n) [rad or m].
+        v0: (C, n).
+        store: The paths themselves.
+        moments: Their moments.
+        values: Their states, node by node.
+        grid: The bins in which to count their states, as least value and width (2, N + 1, 2n) and how many; or None.
+    """
+
+    shared: Shared
+    first: int
+    q0: Floats
+    v0: Floats
+    store: bool = False
+    moments: bool = True
+    values: bool = False
+    grid: tuple[Floats, int] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Moments(Frozen):
+    """Sums over some paths at each of N + 1 nodes.
+
+    Attributes:
+        count: Paths (N + 1,).
+        mean: Of x and of the energy (N + 1, 2n + 1).
+        squares: Products of deviations from it, added up, of x (N + 1, 2n, 2n).
+        energy: The same of the energy (N + 1,).
+    """
+
+    count: Integers
+    mean: Floats
+    squares: Floats
+    energy: Floats
+
+    def merged(self, other: Moments) -> Moments:
+        """Those of both (Chan, Golub and LeVeque 1979)."""
+        total = self.count + other.count
+        share = other.count / np.maximum(total, 1)
+        apart = other.mean - self.mean
+        weight, x = self.count * share, apart[:, :-1]
+        return Moments(
+            total,
+            self.mean + apart * share[:, None],
+            self.squares + other.squares + (weight[:, None] * x)[:, :, None] * x[:, None, :],
+            self.energy + other.energy + weight * apart[:, -1] ** 2,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Part(Frozen):
+    """What came of a chunk.
+
+    Attributes:
+        first: Its first path.
+        paths: C.
+        failures: Paths that stopped early.
+        extremes: Those of its paths that are worth a look: what for, how much of it, and which path.
+        nodes: By path, how many nodes each has (C,).
+        moments: If wanted.
+        stored: The paths by name, (C, ...), if wanted.
+        values: x by node (N + 1, 2n, C), NaN after a failure, if wanted.
+        counts: Paths in each bin (N + 1, 2n, B + 2), below and above the bins too, if wanted.
+        bounds: Least and greatest x (2, N + 1, 2n), if counts are.
+    """
+
+    first: int
+    paths: int
+    failures: tuple[PathFailure, ...]
+    extremes: Extremes
+    nodes: Integers
+    moments: Moments | None
+    stored: dict[str, Floats]
+    values: Floats | None
+    counts: NDArray[np.uint16] | None
+    bounds: Floats | None
+
+
+def simulate_paths(task: Task) -> Part:
+    """A chunk of paths, in one thread; path by path the bytes are those of any other chunk."""
+    return _Chunk(task).part()
+
+
+class _Chunk:
+    """Paths in groups, each with its integrator state and generators, which go through blocks of nodes together."""
+
+    def __init__(self, task: Task) -> None:
+        self.task, own = task, task.shared
+        self.shared, self.paths = own, len(task.q0)
+        n, m, N = own.scene.robot.dof, own.scene.controls, own.steps
         self.groups = [slice(a, min(a + _GROUP, self.paths)) for a in range(0, self.paths, _GROUP)]
+        self.generators = own.seeds.generators(task.first, task.first + self.paths)
         # The control before, of each path; before the first there is none, if the policy does not say.
-        self.before = [np.repeat(commands.before, group.stop - group.start, axis=0) for group in self.groups]
-        self.states = []
-        self.first: list[list[Segment]] = []
+        self.before = [np.repeat(own.commands.before, group.stop - group.start, axis=0) for group in self.groups]
+        self.alive = np.ones(self.paths, dtype=bool)
+        self.nodes = np.zeros(self.paths, dtype=np.int64)
+        self.split = np.zeros(self.paths, dtype=np.int64)
+        self.most_energy, self.fastest = np.full((2, self.paths), -np.inf)
+        self.failures: list[PathFailure] = []
+        block = max(1, _BLOCK // (self.paths * (2 * n + 1)) // own.commands.hold) * own.commands.hold
+        self.length = min(N, block)
+        # Nodes of a block, paths last: statistics run over them.
+        self.block = np.empty((max(1, self.length), 2 * n + 1, self.paths))
+        self.moments = None
+        if task.moments:
+            self.moments = Moments(
+                np.zeros(N + 1, np.int64),
+                np.zeros((N + 1, 2 * n + 1)),
+                np.zeros((N + 1, 2 * n, 2 * n)),
+                np.zeros(N + 1),
+            )
+        self.values = np.empty((N + 1, 2 * n, self.paths)) if task.values else None
+        self.counts: NDArray[np.uint16] | None = None
+        self.bounds: Floats | None = None
+        if task.grid is not None:
+            self.counts = np.zeros((N + 1, 2 * n, task.grid[1] + 2), dtype=np.uint16)
+            self.bounds = np.empty((2, N + 1, 2 * n))
+        self.stored: dict[str, Floats] = {}
+        if task.store:
+            self.stored = {name: np.full((self.paths, N + 1, n), np.nan) for name in ("q", "v", "p")}
+            self.stored |= {"energy": np.full((self.paths, N + 1), np.nan), "u": np.full((self.paths, N, m), np.nan)}
+
+    def part(self) -> Part:
+        """All steps."""
+        task, own = self.task, self.shared
+        states = []
         for group in self.groups:
-            state, first = integrator.start(scene, start[0][group], start[1][group])
-            self.states.append(state)
-            self.first.append(first)
+            state, first = own.integrator.start(own.scene, task.q0[group], task.v0[group])
+            states.append(state)
+            self._put(0, group, first, [1] * len(first))
+        self._reduce(0, np.ones(self.paths, dtype=np.int64))
+        for begin in range(0, own.steps, max(1, self.length)):
+            end = min(own.steps, begin + self.length)
+            done = np.concatenate(
+                [self._advance(number, states[number], begin, end) for number in range(len(self.groups))]
+            )
+            self._reduce(begin + 1, done)
+        extremes = {
+            name: (float(values.max()), task.first + int(np.argmax(values)))
+            for name, values in (("split", self.split), ("energy", self.most_energy), ("speed", self.fastest))
+        }
+        return Part(
+            first=task.first,
+            paths=self.paths,
+            failures=tuple(self.failures),
+            extremes=extremes,
+            nodes=self.nodes,
+            moments=self.moments,
+            stored=self.stored,
+            values=self.values,
+            counts=self.counts,
+            bounds=self.bounds,
+        )
 
-    def begin(self, collector: _Collector, pool: ThreadPoolExecutor) -> None:
-        """The first node of every path."""
-        for number, segments in enumerate(self.first):
-            collector.put(0, number, segments, [1] * len(segments))
-        collector.reduce(0, 1, np.ones(self.paths, dtype=np.int64), pool)
+    def _advance(self, number: int, state: object, begin: int, end: int) -> Integers:
+        """Steps begin .. end of a group: how many each path did; one that has failed does none."""
+        own, group = self.shared, self.groups[number]
+        hold = own.commands.hold
+        decisions = rows(own.commands, begin // hold, end // hold, self.before[number])
+        increments = np.empty((group.stop - group.start, end - begin, own.scene.processes))
+        for drawn, child in zip(increments, self.generators[group], strict=True):
+            child.standard_normal(out=drawn)
+        increments *= np.sqrt(own.dt)
+        segments = own.integrator.rollout(own.scene, state, decisions, increments, own.dt)
+        alive = self.alive[group]
+        done = [len(segment.q) * int(still) for segment, still in zip(segments, alive, strict=True)]
+        self._put(begin + 1, group, segments, done)
+        lost = np.full(own.scene.controls, np.nan)
+        self.before[number] = np.array([segment.u[-1] if len(segment.u) else lost for segment in segments])
+        for i, (k, segment) in enumerate(zip(done, segments, strict=True)):
+            if not alive[i]:
+                continue
+            self.split[group.start + i] += int(segment.statistics.substeps.sum()) - k
+            if segment.failure is not None:
+                self._fail(group.start + i, begin + k, segment.failure)
+        return np.array(done, dtype=np.int64)
 
-    def advance(self, begin: int, end: int, collector: _Collector, pool: ThreadPoolExecutor) -> None:
-        """Steps begin .. end of every path; a path that has failed does none."""
+    def _fail(self, path: int, step: int, failure: Failure) -> None:
+        self.alive[path] = False
+        self.failures.append(PathFailure(self.task.first + path, step, failure.reason))
 
-        def work(number: int) -> list[tuple[int, Failure | None]]:
-            group, hold = self.groups[number], self.commands.hold
-            decisions = rows(self.commands, begin // hold, end // hold, self.before[number])
-            increments = np.empty((group.stop - group.start, end - begin, self.scene.processes))
-            for drawn, child in zip(increments, self.generators[group], strict=True):
-                child.standard_normal(out=drawn)
-            increments *= np.sqrt(self.dt)
-            segments = self.integrator.rollout(self.scene, self.states[number], decisions, increments, self.dt)
-            done = [len(segment.q) * int(alive) for segment, alive in zip(segments, self.alive[group], strict=True)]
-            collector.put(begin + 1, number, segments, done)
-            lost = np.full(self.scene.controls, np.nan)
-            self.before[number] = np.array([segment.u[-1] if len(segment.u) else lost for segment in segments])
-            return [(k, segment.failure) for k, segment in zip(done, segments, strict=True)]
-
-        outcomes = [outcome for part in pool.map(work, range(len(self.groups))) for outcome in part]
-        collector.reduce(begin + 1, end + 1, np.array([done for done, _ in outcomes]), pool)
-        for path in np.flatnonzero(self.alive):
-            done, failure = outcomes[path]
-            if failure is not None:
-                self.alive[path] = False
-                self.failures.append(PathFailure(int(path), begin + done, failure.reason))
-
-
-class _Collector:
-    """Puts blocks of nodes into statistics and, if asked, into arrays of all paths."""
-
-    def __init__(self, steps: int, block: int, levels: Floats, run: _Run, store: bool) -> None:
-        self.run, self.levels = run, levels
-        n, m, P = run.scene.robot.dof, run.scene.controls, run.paths
-        self.done = 0
-        self.mean = np.full((steps + 1, 2 * n), np.nan)
-        self.covariance = np.full((steps + 1, 2 * n, 2 * n), np.nan)
-        self.quantiles = np.full((len(levels), steps + 1, 2 * n), np.nan)
-        self.energy = np.full((2, steps + 1), np.nan)
-        self.count = np.zeros(steps + 1, dtype=np.int64)
-        # A block of nodes of each group of paths, paths last: statistics run over them.
-        self.blocks = [np.empty((block, 2 * n + 1, group.stop - group.start)) for group in run.groups]
-        shapes = {"q": n, "v": n, "p": n}
-        self.stored = {name: np.full((P, steps + 1, size), np.nan) for name, size in shapes.items()} if store else {}
-        if store:
-            self.stored |= {"energy": np.full((P, steps + 1), np.nan), "u": np.full((P, steps, m), np.nan)}
-
-    def put(self, first: int, number: int, segments: list[Segment], done: list[int]) -> None:
-        """Nodes of a group from node ``first`` on, ``done[i]`` of its i-th path; threads may put other groups."""
-        n = self.run.scene.robot.dof
-        momentum = self.run.integrator.variational
-        for i, (segment, k) in enumerate(zip(segments, done, strict=True)):
-            x = self.blocks[number][:k, :, i]
-            x[:, :n], x[:, n:-1] = segment.q[:k], (segment.p if momentum else segment.v)[:k]
-            x[:, -1] = segment.energy[:k]
+    def _put(self, first: int, group: slice, segments: list[Segment], done: list[int]) -> None:
+        """Nodes of a group from node ``first`` on, ``done[i]`` of its i-th path."""
+        n, momentum = self.shared.scene.robot.dof, self.shared.integrator.variational
+        self.nodes[group] += done
+        for i, (segment, k) in enumerate(zip(segments, done, strict=True), group.start):
+            x = self.block[:, :, i]
+            x[:k, :n], x[:k, n:-1] = segment.q[:k], (segment.p if momentum else segment.v)[:k]
+            x[:k, -1] = segment.energy[:k]
+            if k < len(x):
+                x[k:] = np.nan
             for name, array in self.stored.items():
                 # The control that leads to a node stands one row before it, and none leads to the first.
                 row = first - 1 if name == "u" else first
                 if row >= 0:
-                    array[self.run.groups[number].start + i, row : row + k] = getattr(segment, name)[:k]
+                    array[i, row : row + k] = getattr(segment, name)[:k]
 
-    def reduce(self, first: int, last: int, done: NDArray[np.int64], pool: ThreadPoolExecutor) -> None:
-        """Statistics of nodes first .. last, which have been put; path i has the first ``done[i]`` of them."""
-        size = max(1, _SPAN // (self.run.paths * self.mean.shape[1]))
-        spans = []
+    def _reduce(self, first: int, done: Integers) -> None:
+        """Take in the block, which begins at node ``first`` and has ``done[i]`` nodes of path i."""
+        last, n2 = int(done.max()), self.block.shape[1] - 1
+        length = min(self.shared.steps + 1 - first, len(self.block))
+        block = self.block[:last]
+        np.fmax(self.most_energy, np.fmax.reduce(block[:, -1], axis=0, initial=-np.inf), out=self.most_energy)
+        speed = np.fmax.reduce(np.abs(block[:, n2 // 2 : -1]), axis=(0, 1), initial=-np.inf)
+        np.fmax(self.fastest, speed, out=self.fastest)
+        if self.values is not None:
+            self.values[first : first + length] = self.block[:length, :-1]
+        if self.counts is not None and self.bounds is not None and self.task.grid is not None:
+            (least, width), bins = self.task.grid
+            nodes = slice(first, first + length)
+            counted(
+                self.block[:length, :-1], least[nodes], width[nodes], bins, self.counts[nodes], self.bounds[:, nodes]
+            )
+        if self.moments is None:
+            return
         begin = 0
         # Between two nodes at which paths fail, the same paths are counted.
-        for end in np.unique(done[done > 0]):
-            spans += [(a, min(a + size, end), done >= end) for a in range(begin, end, size)]
+        for end in np.unique(done[done > 0]).tolist():
+            inside = done >= end
+            span = block[begin:end] if inside.all() else np.compress(inside, block[begin:end], axis=2)
+            nodes = slice(first + begin, first + end)
+            own, mean = self.moments, span.mean(axis=2)
+            deviation = span - mean[:, :, None]
+            own.mean[nodes], own.count[nodes] = mean, span.shape[2]
+            own.squares[nodes] = np.einsum("jaP,jbP->jab", deviation[:, :-1], deviation[:, :-1])
+            own.energy[nodes] = np.einsum("jP,jP->j", deviation[:, -1], deviation[:, -1])
             begin = end
-        list(pool.map(lambda span: self._reduce(first, *span), spans))
-        self.done = last - 1
 
-    def _reduce(self, first: int, begin: int, end: int, counted: NDArray[np.bool_]) -> None:
-        """Statistics of nodes begin .. end of the blocks, which start at node ``first``, over the paths counted."""
-        nodes = slice(first + begin, first + end)
-        block = np.concatenate([part[begin:end] for part in self.blocks], axis=2)
-        if not counted.all():
-            block = np.compress(counted, block, axis=2)
-        x, energy, paths = block[:, :-1], block[:, -1], block.shape[2]
-        self.mean[nodes] = x.mean(axis=2)
-        deviation = x - self.mean[nodes, :, None]
-        self.covariance[nodes] = np.einsum("jaP,jbP->jab", deviation, deviation) / max(1, paths - 1)
-        self.quantiles[:, nodes] = np.quantile(x, self.levels, axis=2)
-        self.energy[0, nodes] = energy.mean(axis=1)
-        self.energy[1, nodes] = energy.std(axis=1, ddof=paths > 1)
-        self.count[nodes] = paths
+
+def counted(x: Floats, least: Floats, width: Floats, bins: int, counts: NDArray[np.uint16], bounds: Floats) -> None:
+    """Count x (k, 2n, C) in bins from ``least`` on, ``width`` wide each (k, 2n), and find its bounds (2, k, 2n)."""
+    place = np.floor((x - least[:, :, None]) / width[:, :, None])
+    there = ~np.isnan(place)
+    index = np.clip(np.where(there, place, 0.0), -1, bins).astype(np.int64) + 1
+    index += (bins + 2) * np.arange(width.size).reshape(*width.shape, 1)
+    counts.reshape(-1)[:] = np.bincount(index[there], minlength=counts.size)
+    bounds[0], bounds[1] = np.fmin.reduce(x, axis=2, initial=np.inf), np.fmax.reduce(x, axis=2, initial=-np.inf)
+
+
+class _Sums:
+    """What comes of chunks, taken in in the order of the paths."""
+
+    def __init__(self, shared: Shared, paths: int, levels: Floats, *, store: bool) -> None:
+        self.shared, self.paths, self.levels, self.store = shared, paths, levels, store
+        n, m, N = shared.scene.robot.dof, shared.scene.controls, shared.steps
+        self.done = 0
+        self.moments: Moments | None = None
+        self.failures: list[PathFailure] = []
+        self.extremes: Extremes = {}
+        self.nodes = np.zeros(paths, dtype=np.int64)
+        self.stored: dict[str, Floats] = {}
+        if store:
+            self.stored = {name: np.empty((paths, N + 1, n)) for name in ("q", "v", "p")}
+            self.stored |= {"energy": np.empty((paths, N + 1)), "u": np.empty((paths, N, m))}
+        exact = paths * (N + 1) * 2 * n <= _EXACT
+        self.values = np.empty((N + 1, 2 * n, paths)) if len(levels) and exact and not store else None
+        self.histogram: _Histogram | None = None
+        self.estimated = bool(len(levels)) and not exact and not store
+
+    def tasks(self, q0: Floats, v0: Floats) -> Iterator[Task]:
+        """The chunks; where quantiles are estimated, the second is asked for once the first has been taken in."""
+        for first, last in chunks(self.shared.steps, self.paths):
+            yield Task(
+                self.shared,
+                first,
+                q0[first:last].copy(),
+                v0[first:last].copy(),
+                store=self.store,
+                values=self.values is not None or (self.estimated and self.histogram is None),
+                grid=None if self.histogram is None else self.histogram.grid,
+            )
+
+    def add(self, part: Part) -> None:
+        """The next chunk."""
+        here = slice(part.first, part.first + part.paths)
+        assert part.first == self.done
+        assert part.moments is not None
+        self.moments = part.moments if self.moments is None else self.moments.merged(part.moments)
+        self.failures += part.failures
+        self.extremes = greater(self.extremes, part.extremes)
+        self.nodes[here] = part.nodes
+        for name, array in part.stored.items():
+            self.stored[name][here] = array
+        if self.estimated:
+            if self.histogram is None and part.values is not None:
+                self.histogram = _Histogram(part.values)
+            elif self.histogram is not None and part.counts is not None and part.bounds is not None:
+                self.histogram.add(part.counts, part.bounds)
+        elif self.values is not None and part.values is not None:
+            self.values[:, :, here] = part.values
+        self.done = here.stop
 
     def ensemble(self) -> Ensemble:
-        nodes = slice(0, self.done + 1)
-        stored = {name: self.stored[name][:, nodes] if self.stored else None for name in ("q", "v", "p", "energy")}
+        """Of the paths that were taken in."""
+        own, n2 = self.moments, 2 * self.shared.scene.robot.dof
+        assert own is not None
+        there = own.count > 0
+        degrees = np.maximum(own.count - 1, 1)
+        quantiles, errors = self._quantiles()
+        stored = {name: array[: self.done] for name, array in self.stored.items()}
         return Ensemble(
-            t=np.arange(self.done + 1, dtype=np.float64) * self.run.dt,
+            t=np.arange(self.shared.steps + 1, dtype=np.float64) * self.shared.dt,
             statistics=EnsembleStatistics(
-                mean=self.mean[nodes],
-                covariance=self.covariance[nodes],
+                mean=np.where(there[:, None], own.mean[:, :n2], np.nan),
+                covariance=np.where(there[:, None, None], own.squares / degrees[:, None, None], np.nan),
                 levels=self.levels,
-                quantiles=self.quantiles[:, nodes],
-                energy_mean=self.energy[0, nodes],
-                energy_deviation=self.energy[1, nodes],
-                count=self.count[nodes],
+                quantiles=quantiles,
+                quantile_errors=errors,
+                energy_mean=np.where(there, own.mean[:, n2], np.nan),
+                energy_deviation=np.where(there, np.sqrt(own.energy / degrees), np.nan),
+                count=own.count,
             ),
-            u=self.stored["u"][:, : self.done] if self.stored else None,
-            failures=tuple(self.run.failures),
-            **stored,
+            q=stored.get("q"),
+            v=stored.get("v"),
+            p=stored.get("p"),
+            u=stored.get("u"),
+            energy=stored.get("energy"),
+            failures=tuple(self.failures),
         )
+
+    def _quantiles(self) -> tuple[Floats, Floats]:
+        shape = (len(self.levels), self.shared.steps + 1, 2 * self.shared.scene.robot.dof)
+        if self.histogram is not None:
+            return self.histogram.quantiles(self.levels)
+        found = np.full(shape, np.nan)
+        if not len(self.levels):
+            return found, np.zeros(shape)
+        size, nodes = max(1, _SPAN // (self.done * shape[2])), self.nodes[: self.done]
+        spans, begin = [], 0
+        # Between two nodes at which paths fail, the same paths are counted.
+        for end in np.unique(nodes).tolist():
+            spans += [(a, min(a + size, end), nodes >= end) for a in range(begin, end, size)]
+            begin = end
+
+        def take(span: tuple[int, int, NDArray[np.bool_]]) -> None:
+            first, last, inside = span
+            x = self._states(first, last)
+            found[:, first:last] = np.quantile(x if inside.all() else x[:, :, inside], self.levels, axis=2)
+
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            list(pool.map(take, spans))
+        return found, np.zeros(shape)
+
+    def _states(self, first: int, last: int) -> Floats:
+        """X at some nodes (k, 2n, P)."""
+        if self.values is not None:
+            return self.values[first:last, :, : self.done]
+        second = self.stored["p" if self.shared.integrator.variational else "v"]
+        parts = [array[: self.done, first:last].transpose(1, 2, 0) for array in (self.stored["q"], second)]
+        return np.concatenate(parts, axis=1)
+
+
+class _Histogram:
+    """Counts of x in bins around the values of the first paths (N + 1, 2n, C)."""
+
+    def __init__(self, values: Floats) -> None:
+        least = np.fmin.reduce(values, axis=2, initial=np.inf)
+        most = np.fmax.reduce(values, axis=2, initial=-np.inf)
+        # Where all of them have failed, bins are those of the node before.
+        there = np.isfinite(least).all(axis=1)
+        node = np.maximum.accumulate(np.where(there, np.arange(len(there)), 0))
+        least, most = least[node], most[node]
+        spread = np.maximum(most - least, 1e-9 * np.maximum(np.abs(least), np.abs(most)) + 1e-300)
+        bins = int(np.clip(_BINS // spread.size, _FEWEST_BINS, _MOST_BINS))
+        self.grid = np.stack([least - _REACH * spread, (1.0 + 2.0 * _REACH) * spread / bins]), bins
+        self.counts = np.zeros((*spread.shape, bins + 2), dtype=np.int64)
+        self.bounds = np.stack([np.full(spread.shape, np.inf), np.full(spread.shape, -np.inf)])
+        counts, bounds = np.zeros(self.counts.shape, dtype=np.uint16), np.empty(self.bounds.shape)
+        counted(values, self.grid[0][0], self.grid[0][1], bins, counts, bounds)
+        self.add(counts, bounds)
+
+    def add(self, counts: NDArray[np.uint16], bounds: Floats) -> None:
+        """Those of other paths."""
+        self.counts += counts
+        np.minimum(self.bounds[0], bounds[0], out=self.bounds[0])
+        np.maximum(self.bounds[1], bounds[1], out=self.bounds[1])
+
+    def quantiles(self, levels: Floats) -> tuple[Floats, Floats]:
+        """Quantiles, and what they are off by at most, each (L, N + 1, 2n)."""
+        found, errors = np.full((2, len(levels), *self.counts.shape[:2]), np.nan)
+        for j in range(len(self.counts)):
+            below = np.cumsum(self.counts[j], axis=1)
+            for i, level in enumerate(levels):
+                rank = level * (below[:, -1] - 1)
+                lower, upper = (
+                    self._ranked(j, below, np.asarray(r(rank), dtype=np.int64)) for r in (np.floor, np.ceil)
+                )
+                found[i, j] = lower[0] + (rank - np.floor(rank)) * (upper[0] - lower[0])
+                errors[i, j] = np.maximum(lower[1], upper[1])
+        return np.where(self.counts.any(axis=2), found, np.nan), np.where(self.counts.any(axis=2), errors, np.nan)
+
+    def _ranked(self, node: int, below: Integers, rank: Integers) -> tuple[Floats, Floats]:
+        """The value (2n,) of so many less than it, and what it is off by at most; ``below`` are cumulated counts."""
+        (least, width), bins = self.grid[0][:, node], self.grid[1]
+        first, last = self.bounds[:, node]
+        place = np.argmax(below > rank[:, None], axis=1)
+        rows = np.arange(len(rank))
+        inside = np.maximum(self.counts[node][rows, place], 1)
+        share = (rank + 0.5 - (below[rows, place] - inside)) / inside
+        begin = np.where(place == 0, first, least + (place - 1) * width)
+        end = np.where(place == bins + 1, last, least + place * width)
+        # The extremes are known themselves.
+        begin, end = np.maximum(begin, first), np.minimum(end, last)
+        begin = np.where(rank >= below[:, -1] - 1, last, begin)
+        end = np.where(rank <= 0, first, np.maximum(begin, end))
+        begin = np.minimum(begin, end)
+        return begin + share * (end - begin), end - begin
+
+
+def greater(one: Extremes, other: Extremes) -> Extremes:
+    """Of each extreme the greater, of equal ones that of ``one``."""
+    return {name: max(one.get(name, found), found, key=lambda x: x[0]) for name, found in other.items()}
+
+
+def warm_up(shared: Shared, q0: Floats, v0: Floats) -> None:
+    """Compile here what many workers would else compile at the same time, each for itself."""
+    if shared.steps:
+        few = rows(shared.commands, 0, 1)
+        motions = Motions(shared.scene, shared.integrator, q0, v0, shared.dt)
+        motions.under(few, increments=np.zeros((few.hold, shared.scene.processes)))
+
+
+def looked_at(pool: Executor, shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> tuple[Finding, ...]:
+    """What is to be said of a few paths, each kind of finding once, of the first path that shows it."""
+    if not shared.steps:
+        return ()
+    split = [path for amount, path in (extremes["split"],) if amount > 0]
+    paths = [0, *split, extremes["energy"][1], extremes["speed"][1]]
+    few = list(dict.fromkeys(paths))[: min(_LOOKS, max(1, len(q0) // _LOOKED_AT))]
+    tasks = [Task(shared, path, q0[path : path + 1].copy(), v0[path : path + 1].copy()) for path in few]
+    found: dict[str, Finding] = {}
+    with closing(in_order(pool, _look, tasks)) as looks:
+        for path, findings in zip(few, looks, strict=True):
+            for finding in findings:
+                found.setdefault(finding.kind, Finding(finding.kind, f"path {path}: {finding.sentence}"))
+    return tuple(found.values())
+
+
+def _look(task: Task) -> tuple[Finding, ...]:
+    """What is to be said of one path."""
+    own = task.shared
+    (generator,) = own.seeds.generators(task.first, task.first + 1)
+    drawn = generator.standard_normal((own.steps, own.scene.processes)) * np.sqrt(own.dt)
+    motions = Motions(own.scene, own.integrator, task.q0[0], task.v0[0], own.dt)
+    return examined(own.scene, own.integrator, motions.under(own.commands, increments=drawn)[0])[1]

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import JointValues, count, positive, real
 from varpin.errors import InputError
+from varpin.frozen import Frozen
 from varpin.integrators import Integrator, RungeKutta4
 from varpin.integrators.base import Failure
 from varpin.markup import facts
@@ -45,7 +46,7 @@ class Plant:
 
 
 @dataclass(frozen=True, eq=False)
-class MpcRun:
+class MpcRun(Frozen):
     """What a controller did with a plant.
 
     Attributes:

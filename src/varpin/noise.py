@@ -27,6 +27,7 @@ from varpin.checks import (
     require_finite,
 )
 from varpin.errors import InputError
+from varpin.frozen import Frozen
 from varpin.kernels.tree import Diffusion
 
 Floats = NDArray[np.float64]
@@ -78,7 +79,7 @@ class Noise(ABC):
         return NoiseSum((*_terms(self), *_terms(other)))
 
 
-class BoundNoise(ABC):
+class BoundNoise(Frozen, ABC):
     """A noise model on a robot."""
 
     @property

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, checked_limits, count, finite_array, is_one_of
 from varpin.errors import InputError
+from varpin.frozen import Frozen
 from varpin.kernels.tree import Commands
 
 Floats = NDArray[np.float64]
@@ -56,7 +57,7 @@ def takes(function: Callable[..., object], arguments: int) -> bool:
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class LinearPolicy:
+class LinearPolicy(Frozen):
     """u = u_k + gains_k (x - x_k) within limits, evaluated at the start of each of N intervals and held over it.
 
     x is (q, p) for variational integrators and (q, v) for the others. Where changes of the control cost something

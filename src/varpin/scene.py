@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import JointValues, as_floats, finite_array, joint_array
 from varpin.core import Mechanism as Core
 from varpin.errors import InputError, RobotError
+from varpin.frozen import Frozen
 from varpin.kernels.tree import Diffusion, Mechanism
 from varpin.markup import facts, listed
 from varpin.noise import BoundNoise, Noise, bind
@@ -29,7 +30,7 @@ _TREE = (
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class Scene:
+class Scene(Frozen):
     """A robot in its surroundings.
 
     Attributes:

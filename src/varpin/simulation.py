@@ -183,25 +183,31 @@ def _trajectory(
 
 
 class Motions:
-    """Motions without noise from one state under commands of any kind; they share their work arrays."""
+    """Motions from one state under commands of any kind; they share their work arrays."""
 
     def __init__(self, scene: Scene, integrator: Integrator, q0: Floats, v0: Floats, dt: float) -> None:
         self.scene, self.integrator, self.dt = scene, integrator, dt
         self._state, (self._first,) = integrator.start(scene, q0[None], v0[None])
 
     def under(
-        self, commands: Commands, *, integrator: Integrator | None = None, futile: Futile | None = None
+        self,
+        commands: Commands,
+        *,
+        increments: Floats | None = None,
+        integrator: Integrator | None = None,
+        futile: Futile | None = None,
     ) -> tuple[Trajectory, Failure | None]:
         """The motion, and why it stopped early, if it did; nothing is checked.
 
         Args:
             commands: For all of its steps.
+            increments: Of its Wiener processes (N, k) [s^0.5]; left out, there is no noise.
             integrator: To make it with: the one of these motions with other options, and itself if left out.
             futile: Asked after a third of a motion, about the parts that there are; where it answers with a reason, the
                 motion ends.
         """
         integrator = self.integrator if integrator is None else integrator
-        nothing = np.zeros((0, 0, self.scene.processes))
+        drawn = np.zeros((0, 0, self.scene.processes)) if increments is None else increments[None]
         state = integrator.fork(self._state)
         decisions, begin = len(commands.u), 0
         parts: list[Segment] = []
@@ -209,7 +215,8 @@ class Motions:
         ends = {decisions} if futile is None else {decisions // 3, decisions} - {0}
         for end in sorted(ends):
             block = commands if end - begin == decisions else rows(commands, begin, end, _last_control(parts))
-            parts += integrator.rollout(self.scene, state, block, nothing, self.dt)
+            now = drawn[:, begin * commands.hold : end * commands.hold]
+            parts += integrator.rollout(self.scene, state, block, now, self.dt)
             failure, begin = parts[-1].failure, end
             if failure is None and futile is not None and end < decisions:
                 reason = futile(parts)
@@ -218,7 +225,7 @@ class Motions:
                 break
         steps = join(parts) if len(parts) > 1 else parts[0]
         nodes = {name: np.concatenate([getattr(self._first, name), getattr(steps, name)]) for name in _NODES}
-        dw = np.zeros((len(steps.u), self.scene.processes))
+        dw = np.zeros((len(steps.u), self.scene.processes)) if increments is None else increments[: len(steps.u)]
         made = _trajectory(self.scene, self.integrator, self.dt, nodes, steps.u, dw, steps.statistics)
         return made, failure
 

@@ -18,6 +18,7 @@ from varpin._version import __version__
 from varpin.archive import Check, Header, read_npz
 from varpin.checks import path_like, writable
 from varpin.errors import FileError, InputError
+from varpin.frozen import Frozen
 from varpin.markup import facts, table
 from varpin.robot import Robot
 from varpin.scene import Scene
@@ -34,7 +35,7 @@ _COUNTS = {f"statistics.{name}" for name in ("newton_iterations", "jets", "sweep
 
 
 @dataclass(frozen=True, eq=False)
-class StepStatistics:
+class StepStatistics(Frozen):
     """What each of N steps took, and how sound its solution is. Zeros where an integrator has no such thing.
 
     Attributes:
@@ -73,7 +74,7 @@ class StepStatistics:
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(Frozen):
     """A motion over N steps and N + 1 nodes.
 
     Attributes:

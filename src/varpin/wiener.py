@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +13,9 @@ from varpin.checks import as_floats, count, finite_array, positive, require_fini
 from varpin.errors import InputError
 
 Floats = NDArray[np.float64]
+
+# Seeds that are made at a time.
+_AT_ONCE = 10_000
 
 
 def wiener_increments(
@@ -55,6 +60,55 @@ def generator(rng: np.random.Generator | int | None) -> np.random.Generator:
         return np.random.default_rng(rng)
     except (TypeError, ValueError) as error:
         raise InputError(f"rng must be a numpy Generator or a seed, an integer >= 0, got {rng!r}: {error}") from None
+
+
+@dataclass(frozen=True)
+class Children:
+    """The children of a generator, each made where it is needed: bytes that travel, instead of a million generators.
+
+    Attributes:
+        kind: Of their bit generators.
+        entropy: Of the parent's seed.
+        spawn_key: Of the parent's seed.
+        pool_size: Of the parent's seed.
+        before: How many children the parent had.
+    """
+
+    kind: type[np.random.BitGenerator]
+    entropy: int | Sequence[int] | None
+    spawn_key: tuple[int, ...]
+    pool_size: int
+    before: int
+
+    def generators(self, first: int, last: int) -> list[np.random.Generator]:
+        """The children first .. last, as ``Generator.spawn`` makes them."""
+        return [
+            np.random.Generator(
+                self.kind(
+                    np.random.SeedSequence(
+                        self.entropy, spawn_key=(*self.spawn_key, self.before + i), pool_size=self.pool_size
+                    )
+                )
+            )
+            for i in range(first, last)
+        ]
+
+
+def children(rng: np.random.Generator | int, number: int) -> Children:
+    """So many children of ``rng``; a generator has had them then.
+
+    Raises:
+        InputError: Neither a generator nor a seed, or a generator that cannot have children.
+    """
+    parent = generator(rng).bit_generator
+    seed = parent.seed_seq
+    if not isinstance(seed, np.random.SeedSequence):
+        raise InputError(f"rng must be seeded by a numpy SeedSequence, to have a child for each path; got {seed!r}")
+    own = Children(type(parent), seed.entropy, tuple(seed.spawn_key), seed.pool_size, seed.n_children_spawned)
+    if isinstance(rng, np.random.Generator):
+        for first in range(0, number, _AT_ONCE):
+            seed.spawn(min(_AT_ONCE, number - first))
+    return own
 
 
 def coarsen(increments: ArrayLike, factor: int = 2) -> Floats:

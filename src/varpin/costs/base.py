@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, finite_array, require_finite
 from varpin.errors import InputError, VarpinError
+from varpin.frozen import Frozen
 from varpin.markup import facts
 
 Floats = NDArray[np.float64]
@@ -37,7 +38,7 @@ class CostError(VarpinError, ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Points:
+class Points(Frozen):
     """Where costs are to be evaluated: N points in time on a horizon.
 
     Attributes:
@@ -82,7 +83,7 @@ class Expansion:
     hessian: Floats
 
 
-class BoundCost(ABC):
+class BoundCost(Frozen, ABC):
     """A cost at given points."""
 
     @abstractmethod
@@ -94,7 +95,7 @@ class BoundCost(ABC):
         """Its expansion at q (N, n), v (N, n) and u (N, m)."""
 
 
-class Cost(ABC):
+class Cost(Frozen, ABC):
     """A cost. Whoever adds one provides ``bind``; ``CustomCost`` is the shorter way."""
 
     @abstractmethod

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import as_floats, finite_array, require_finite
 from varpin.costs.base import BoundCost, Cost, CostSum, Points, Scaled, checked_weight, weight_matrix
 from varpin.errors import InputError
+from varpin.frozen import Frozen
 
 Floats = NDArray[np.float64]
 
@@ -69,7 +70,7 @@ class ControlRateCost(Cost):
 
 
 @dataclass(frozen=True, eq=False)
-class ControlRate:
+class ControlRate(Frozen):
     """What changes of the controls cost in all.
 
     Attributes:

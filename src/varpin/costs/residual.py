@@ -14,12 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.costs.base import BoundCost, Cost, Expansion, Points, checked_weight, weight_matrix
 from varpin.errors import InputError
+from varpin.frozen import Frozen
 from varpin.robot import Robot
 
 Floats = NDArray[np.float64]
 
 
-class Residual:
+class Residual(Frozen):
     """A residual at given points; ``columns`` are those entries of z = (q, v, u) it depends on."""
 
     columns: slice

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.errors import InputError
+from varpin.frozen import Frozen
 from varpin.kernels.kinematics import Bodies, place, place_frame, rotation_logarithms
 from varpin.kernels.tree import Tree
 from varpin.robot.model import Robot
@@ -17,7 +18,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Links:
+class Links(Frozen):
     """Some bodies of a robot's tree with all their ancestors.
 
     Attributes:
@@ -109,7 +110,7 @@ class FrameMotion:
 
 
 @dataclass(frozen=True, eq=False)
-class FrameKinematics:
+class FrameKinematics(Frozen):
     """A frame of a robot. Made by :func:`frame_kinematics`.
 
     Attributes:
@@ -160,7 +161,7 @@ def frame_kinematics(robot: Robot, frame: str) -> FrameKinematics:
 
 
 @dataclass(frozen=True, eq=False)
-class CenterOfMass:
+class CenterOfMass(Frozen):
     """The centre of mass of the links that joints move. Made by :func:`center_of_mass`.
 
     Attributes:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, is_one_of, require_finite
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint
+from varpin.frozen import Frozen
 from varpin.kernels.tree import Tree
 from varpin.markup import facts, listed, table
 from varpin.robot.inertia import faults
@@ -38,7 +39,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class Robot:
+class Robot(Frozen):
     """An arm in generalized coordinates. Made by :func:`load_robot`.
 
     The n coordinates are the positions of the joints that are neither locked, fixed nor mimicking, in

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TextIO
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from varpin.archive import read_npz
@@ -45,13 +46,64 @@ class Timeline:
 
     def columns(self, keep: Sequence[int]) -> Timeline:
         """Some of the components."""
-        index = np.array(keep, dtype=np.int64)
-        return Timeline(lambda t: self.at(t)[:, index], self.constant)
+        return Timeline(_Columns(self.at, np.array(keep, dtype=np.int64)), self.constant)
 
 
 def constant(values: Floats) -> Timeline:
     """The same values at all times."""
-    return Timeline(lambda t: np.tile(values, (len(t), 1)), True)
+    return Timeline(_Constant(values), True)
+
+
+# Functions of time, as classes: those that are made in place cannot be pickled.
+
+
+@dataclass(frozen=True, eq=False)
+class _Constant:
+    values: Floats
+
+    def __call__(self, t: Floats) -> Floats:
+        return np.tile(self.values, (len(t), 1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    of: Callable[[Floats], Floats]
+    index: NDArray[np.int64]
+
+    def __call__(self, t: Floats) -> Floats:
+        return self.of(t)[:, self.index]
+
+
+@dataclass(frozen=True, eq=False)
+class _Sines:
+    offset: Floats
+    sines: tuple[Sine, ...]
+    place: tuple[int, ...]
+
+    def __call__(self, t: Floats) -> Floats:
+        total = np.tile(self.offset, (len(t), 1))
+        for column, sine in zip(self.place, self.sines, strict=True):
+            total[:, column] += sine.amplitude * np.sin(2.0 * math.pi * sine.frequency * t + sine.phase)
+        return total
+
+
+@dataclass(frozen=True, eq=False)
+class _Smooth:
+    curve: PchipInterpolator
+    first: float
+    last: float
+
+    def __call__(self, t: Floats) -> Floats:
+        return np.asarray(self.curve(np.clip(t, self.first, self.last)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    times: Floats
+    rows: Floats
+
+    def __call__(self, t: Floats) -> Floats:
+        return np.column_stack([np.interp(t, self.times, column) for column in self.rows.T])
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,15 +170,8 @@ class Reference:
                     f"{self.name}.sines[{index}].of",
                     f"there is no {what} {sine.of!r}; {suggestion(sine.of, names, what + 's')}",
                 )
-        place = [names.index(sine.of) for sine in self.sines]
-
-        def at(t: Floats) -> Floats:
-            total = np.tile(offset, (len(t), 1))
-            for column, sine in zip(place, self.sines, strict=True):
-                total[:, column] += sine.amplitude * np.sin(2.0 * math.pi * sine.frequency * t + sine.phase)
-            return total
-
-        return Timeline(at, constant=False)
+        place = tuple(names.index(sine.of) for sine in self.sines)
+        return Timeline(_Sines(offset, self.sines, place), constant=False)
 
     def _of_file(self, path: Path, names: Sequence[str], duration: float, what: str) -> Timeline:
         def wrong(problem: str) -> Exception:
@@ -150,9 +195,8 @@ class Reference:
 def _between(times: Floats, rows: Floats, *, smooth: bool) -> Timeline:
     """Rows over time, the first and the last held before and after."""
     if smooth:
-        curve = PchipInterpolator(times, rows)
-        return Timeline(lambda t: np.asarray(curve(np.clip(t, times[0], times[-1]))), constant=False)
-    return Timeline(lambda t: np.column_stack([np.interp(t, times, column) for column in rows.T]), constant=False)
+        return Timeline(_Smooth(PchipInterpolator(times, rows), times[0], times[-1]), constant=False)
+    return Timeline(_Linear(times, rows), constant=False)
 
 
 def _csv(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:

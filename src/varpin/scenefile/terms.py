@@ -62,7 +62,17 @@ class Given:
         """The same for roll, pitch and yaw, as rotation matrices."""
         assert self.target is not None
         angles = self.target
-        return _matrix(angles(0.0)) if angles.constant else lambda t: _matrix(angles(t))
+        return _matrix(angles(0.0)) if angles.constant else _Turning(angles)
+
+
+@dataclass(frozen=True, eq=False)
+class _Turning:
+    """Rotation matrices over time, in a form that can be pickled."""
+
+    angles: Timeline
+
+    def __call__(self, time: float) -> Floats:
+        return _matrix(self.angles(time))
 
 
 def _matrix(angles: Floats) -> Floats:

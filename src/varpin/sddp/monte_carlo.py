@@ -2,27 +2,44 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import copy
+import logging
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import closing
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from varpin.checks import count
-from varpin.ensemble import simulate_ensemble
-from varpin.errors import InputError, VarpinError
+from varpin.costs import CostSum
+from varpin.ensemble import (
+    Extremes,
+    Shared,
+    Task,
+    chunks,
+    greater,
+    looked_at,
+    said,
+    simulate_paths,
+    warm_up,
+    without_geometry,
+)
+from varpin.errors import VarpinError
+from varpin.executors import executing, in_order, in_process
+from varpin.frozen import Frozen
 from varpin.markup import facts
 from varpin.policy import LinearPolicy
 from varpin.sddp.problem import OptimalControlProblem
 from varpin.sddp.verification import excess, percent
-from varpin.simulation import NoiseError, StepFailure
-from varpin.wiener import generator
+from varpin.simulation import NoiseError, StepFailure, commands_of
+from varpin.soundness import Finding, announce, examined
+from varpin.wiener import Children, children
 
 Floats = NDArray[np.float64]
 
-# Paths that are kept at a time to add up their costs; few, so that Ctrl-C loses little.
-_PATHS, _PATHS_PER_WORKER = 256, 32
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -35,6 +52,7 @@ class MonteCarlo:
         predicted: By the solver's model.
         paths: How many were counted.
         failures: Paths that could not be finished; they are not counted.
+        warnings: What varpin says of the paths, a sentence each, as of those of an :class:`Ensemble`.
     """
 
     cost: float
@@ -42,15 +60,21 @@ class MonteCarlo:
     predicted: float
     paths: int
     failures: int
+    warnings: tuple[str, ...] = field(default=(), repr=False)
+
+    def __repr__(self) -> str:
+        gap = f"MonteCarlo(cost {self.cost:.6g} +- {self.standard_error:.1e}, predicted {self.predicted:.6g}"
+        lost = f", {self.failures} failed" if self.failures else ""
+        return f"{gap}, {self.paths} paths{lost}{said(self.warnings)})"
 
     def _repr_html_(self) -> str:
-        rows = [
+        rows: list[tuple[str, object]] = [
             ("simulated", f"{self.cost:.6e} +- {self.standard_error:.1e}"),
             ("predicted", f"{self.predicted:.6e}"),
             ("paths", self.paths),
             ("ran away", self.failures),
         ]
-        return facts("Expected cost", rows)
+        return facts("Expected cost", rows + [("warning", warning) for warning in self.warnings])
 
     def __str__(self) -> str:
         gap = self.cost - self.predicted
@@ -64,6 +88,7 @@ class MonteCarlo:
                 f"{'difference':16}{gap:+14.6e} ({percent(excess(self.cost, self.predicted))}{apart})",
                 "read it so: within three standard errors (+-) the two agree; beyond, noise is too strong for the "
                 "model",
+                *(f"warning: {warning}" for warning in self.warnings),
             ]
         )
 
@@ -81,6 +106,32 @@ class MonteCarloInterrupted(KeyboardInterrupt):
         super().__init__(f"interrupted after {done} paths" + ("; they are in .result" if done else ""))
 
 
+@dataclass(frozen=True, eq=False)
+class _Costs(Frozen):
+    """What came of a chunk: costs of its paths (C,), NaN where one failed, and which of them are worth a look."""
+
+    values: Floats
+    extremes: Extremes
+
+
+@dataclass(frozen=True, eq=False)
+class _Chunk(Frozen):
+    """Paths of a problem; ``task`` for those that kernels can take."""
+
+    problem: OptimalControlProblem
+    task: Task
+
+
+@dataclass(frozen=True, eq=False)
+class _Alone(Frozen):
+    """A path of a problem with noise that only Python can evaluate."""
+
+    problem: OptimalControlProblem
+    policy: LinearPolicy
+    seeds: Children
+    path: int
+
+
 def monte_carlo(
     problem: OptimalControlProblem,
     policy: LinearPolicy,
@@ -89,65 +140,91 @@ def monte_carlo(
     rng: np.random.Generator | int,
     *,
     workers: int | None,
+    executor: Executor | None,
     progress: Callable[[int, int], None] | None,
 ) -> MonteCarlo:
     """As :meth:`Solution.monte_carlo` says, of any policy."""
-    draws, paths = generator(rng), count("paths", paths, least=2)
-    workers = count("workers", (os.cpu_count() or 1) if workers is None else workers, least=1)
-    compiled = problem.scene.noise.diffusion is not None
-    most = min(_PATHS, _PATHS_PER_WORKER * workers) if compiled else 1
+    paths = count("paths", paths, least=2)
     costs: list[Floats] = []
-    try:
-        for first in range(0, paths, most):
-            batch = min(most, paths - first)
-            costs.append(
-                _together(problem, batch, draws, policy, workers) if compiled else _alone(problem, draws, policy)
-            )
-            if progress is not None:
-                progress(first + batch, paths)
-    except KeyboardInterrupt:
-        raise MonteCarloInterrupted(_mean(costs, predicted)) from None
+    found: tuple[Finding, ...] = ()
+    extremes: Extremes = {}
+    done, sent = 0, _sent(problem)
+    with executing(executor, workers) as pool:
+        seeds = children(rng, paths)
+        compiled = problem.scene.noise.diffusion is not None
+        q0, v0 = (np.broadcast_to(x, (paths, x.size)) for x in (sent.q0, sent.v0))
+        shared: Shared | None = None
+        if compiled:
+            commands = commands_of(sent.scene, sent.integrator, policy, sent.steps, sent.dt)
+            shared = Shared(sent.scene, sent.integrator, commands, sent.dt, sent.steps, seeds)
+            if not in_process(pool):
+                warm_up(shared, sent.q0, sent.v0)
+        try:
+            parts: Generator[_Costs, None, None]
+            if shared is not None:
+                parts = in_order(pool, _together, _tasks(sent, shared, q0, v0))
+            elif executor is not None:
+                parts = in_order(pool, _alone, (_Alone(sent, policy, seeds, path) for path in range(paths)))
+            else:
+                # Functions of the user's need not be made for several threads.
+                parts = (_alone(_Alone(sent, policy, seeds, path)) for path in range(paths))
+            with closing(parts):
+                for part in parts:
+                    costs.append(part.values)
+                    extremes = greater(extremes, part.extremes)
+                    done += len(part.values)
+                    if progress is not None:
+                        progress(done, paths)
+            if shared is not None:
+                found = looked_at(pool, shared, q0, v0, extremes)
+            elif np.isfinite(costs[0]).all():
+                found = _look_alone(_Alone(sent, policy, seeds, 0))
+        except KeyboardInterrupt:
+            raise MonteCarloInterrupted(_mean(costs, predicted)) from None
     result = _mean(costs, predicted)
     if result is None:
         raise VarpinError(f"fewer than two of {paths} paths got to the end; a smaller dt may help")
-    return result
+    if result.failures:
+        text = f"{result.failures} of {paths} paths could not be finished, and are not counted; a smaller dt may help"
+        found = (Finding("failed paths", text), *found)
+    announce(logger, problem.scene, problem.dt, found)
+    return replace(result, warnings=tuple(finding.sentence for finding in found))
 
 
-def _together(
-    problem: OptimalControlProblem, paths: int, draws: np.random.Generator, policy: LinearPolicy, workers: int
-) -> Floats:
-    """Costs of some paths (P,), NaN where one failed."""
+def _sent(problem: OptimalControlProblem) -> OptimalControlProblem:
+    """The problem without what no path needs: shapes of the robot, and references that are sampled already."""
+    sent = copy.copy(problem)
+    vars(sent).update(scene=without_geometry(problem.scene), cost=CostSum(()))
+    return sent
+
+
+def _tasks(problem: OptimalControlProblem, shared: Shared, q0: Floats, v0: Floats) -> Iterator[_Chunk]:
+    for first, last in chunks(shared.steps, len(q0)):
+        own = Task(shared, first, q0[first:last].copy(), v0[first:last].copy(), store=True, moments=False)
+        yield _Chunk(problem, own)
+
+
+def _together(chunk: _Chunk) -> _Costs:
+    part = simulate_paths(chunk.task)
+    own = part.stored
+    return _Costs(chunk.problem.costs(own["q"], own["v"], own["u"]), part.extremes)
+
+
+def _alone(given: _Alone) -> _Costs:
+    (child,) = given.seeds.generators(given.path, given.path + 1)
     try:
-        ensemble = simulate_ensemble(
-            problem.scene,
-            problem.q0,
-            problem.v0,
-            dt=problem.dt,
-            steps=problem.steps,
-            paths=paths,
-            rng=draws,
-            controls=policy,
-            integrator=problem.integrator,
-            quantiles=(),
-            workers=workers,
-        )
-    except InputError:
-        raise
-    except VarpinError:  # every path failed
-        return np.full(paths, np.nan)
-    if ensemble.q is None or ensemble.v is None or ensemble.u is None:
-        return np.full(paths, np.nan)
-    return problem.costs(ensemble.q, ensemble.v, ensemble.u)
-
-
-def _alone(problem: OptimalControlProblem, draws: np.random.Generator, policy: LinearPolicy) -> Floats:
-    """The cost of a path (1,), NaN where it failed."""
-    (child,) = draws.spawn(1)
-    try:
-        motion = problem.simulate(policy, rng=child)
+        motion = given.problem.simulate(given.policy, rng=child)
     except (StepFailure, NoiseError):
-        return np.full(1, np.nan)
-    return np.array([problem.cost_of(motion)])
+        return _Costs(np.full(1, np.nan), {})
+    return _Costs(np.array([given.problem.cost_of(motion)]), {})
+
+
+def _look_alone(given: _Alone) -> tuple[Finding, ...]:
+    """What is to be said of the first path."""
+    (child,) = given.seeds.generators(given.path, given.path + 1)
+    motion = given.problem.simulate(given.policy, rng=child)
+    found = examined(given.problem.scene, given.problem.integrator, motion)[1]
+    return tuple(Finding(finding.kind, f"path {given.path}: {finding.sentence}") for finding in found)
 
 
 def _mean(costs: Sequence[Floats], predicted: float) -> MonteCarlo | None:

@@ -21,6 +21,7 @@ from varpin.costs import (
     with_control_before,
 )
 from varpin.errors import InputError
+from varpin.frozen import Frozen
 from varpin.integrators import Integrator, Midpoint
 from varpin.lagrangian import lagrangian_jet
 from varpin.markup import facts, listed
@@ -34,7 +35,7 @@ Sampling = Literal["midpoint", "gauss", "start"]
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class OptimalControlProblem:
+class OptimalControlProblem(Frozen):
     """Minimize the expected cost of a motion from (q0, v0) over the controls, each held over ``hold`` steps.
 
     Running costs are integrals in time, sampled once a step, and references are functions of time: the problem means

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import count, is_one_of, positive
 from varpin.costs import barriers_of
 from varpin.errors import InputError
+from varpin.frozen import Frozen
 from varpin.kernels._compile import announced_compilation
 from varpin.linearization import velocity_at_nodes
 from varpin.markup import facts, folded, listed, table
@@ -55,7 +57,7 @@ class Violations:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class Solution(Frozen):
     """The best motion a solver found, with the policy around it.
 
     ``print(plan.table())`` shows a row for each iteration, then how the search ended and why:
@@ -295,12 +297,15 @@ class Solution:
         *,
         feedback: bool = True,
         workers: int | None = None,
+        executor: Executor | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> MonteCarlo:
         """Expected cost of the policy under the scene's noise, with the problem's own integrator and step.
 
-        Path i draws its noise from the i-th child of ``rng``, for any number of workers. Noise that only Python can
-        evaluate (:class:`varpin.CustomNoise`) is simulated path by path, which is slow.
+        Path i draws its noise from the i-th child of ``rng``: the same bytes for any number of workers, threads,
+        processes or machines of one kind. Only costs come back from them. Noise that only Python can evaluate
+        (:class:`varpin.CustomNoise`) is simulated path by path, which is slow, and without ``executor`` one after
+        another.
 
         Main args:
             paths: How many.
@@ -309,15 +314,25 @@ class Solution:
 
         Other Args:
             workers: Threads; as many as there are cores if left out.
+            executor: Any ``concurrent.futures.Executor`` instead of threads; see :func:`varpin.simulate_ensemble`.
             progress: Called now and then with (paths done, paths in all).
 
         Raises:
             InputError: Wrong arguments.
-            VarpinError: Every path failed.
+            VarpinError: Every path failed, or workers get lost again and again.
             MonteCarloInterrupted: Ctrl-C; holds the result of the paths done. It is a KeyboardInterrupt.
         """
         policy = self.policy if feedback else self.policy.without_feedback()
-        return monte_carlo(self.problem, policy, self.expected_cost, paths, rng, workers=workers, progress=progress)
+        return monte_carlo(
+            self.problem,
+            policy,
+            self.expected_cost,
+            paths,
+            rng,
+            workers=workers,
+            executor=executor,
+            progress=progress,
+        )
 
 
 def _beyond(y: Floats, limits: Sequence[tuple[Floats, Floats] | Floats]) -> Floats:

@@ -6,6 +6,7 @@ import logging
 import math
 import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import JointValues, count, positive, writable
 from varpin.errors import FileError, InputError, VarpinError
+from varpin.executors import in_order, require_executor
 from varpin.integrators import Integrator, Reference
 from varpin.scene import Scene
 from varpin.tradeoff.records import Record, pareto_front
@@ -178,10 +180,11 @@ def work_precision(
     repeats: int = 3,
     progress: Progress | None = None,
     save: str | os.PathLike[str] | None = None,
+    executor: Executor | None = None,
 ) -> WorkPrecision:
     """Measure errors and wall times of integrators over steps, on one motion.
 
-    Everything runs on one thread and is compiled before it is timed. A run that fails is in the record with its
+    A run has one thread to itself, and is compiled before it is timed. A run that fails is in the record with its
     reason, and the others go on; Ctrl-C ends the measurement, and what is done is returned.
 
     Main args:
@@ -199,6 +202,9 @@ def work_precision(
         progress: Called with (runs done, runs in all).
         save: Keep the record in this npz, run by run; runs that it holds already are kept, and not run again,
             whatever other steps and integrators are asked for.
+        executor: Any ``concurrent.futures.Executor`` that takes the runs, one at a time each; they follow each other
+            here if left out. Errors are the same; wall times are those of its workers, and to be trusted where each
+            has a core, and all have the same kind.
 
     Raises:
         InputError: Wrong arguments.
@@ -207,6 +213,7 @@ def work_precision(
     """
     setting = Setting.of(scene, q0, v0, controls, duration)
     members, repeats = integrators_of(integrators), count("repeats", repeats, least=1)
+    executor = None if executor is None else require_executor(executor)
     reference = Reference(rtol=1e-13) if reference is None else reference
     if not isinstance(reference, Reference):
         raise InputError(f"reference must be a varpin.Reference, got {reference!r}")
@@ -228,19 +235,23 @@ def work_precision(
     def now() -> WorkPrecision:
         return replace(base, runs=(*kept, *finished), missing=len(plan) - len(finished))
 
+    missing = [(member, steps) for member, steps in plan if (repr(member), steps) not in done]
+    if missing and exact is None:
+        exact = _Exact(setting, reference, samples)
+    cells = [] if exact is None else [_Cell(setting, exact, member, steps, repeats) for member, steps in missing]
+    fresh = (_measure(cell) for cell in cells) if executor is None else in_order(executor, _measure, cells)
     try:
         for member, steps in plan:
             run = done.get((repr(member), steps))
-            if run is None:
-                exact = _Exact(setting, reference, samples) if exact is None else exact
-                run = _measure(setting, exact, member, steps, repeats)
-            finished.append(run)
+            finished.append(next(fresh) if run is None else run)
             if path is not None:
                 now().save(path)
             if progress is not None:
                 progress(len(finished), len(plan))
     except KeyboardInterrupt:
         logger.warning("interrupted after %d of %d runs, which are kept", len(finished), len(plan))
+    finally:
+        fresh.close()
     return now()
 
 
@@ -315,13 +326,25 @@ def _samples(grids: Sequence[int], rows: int) -> int:
     return rows * max(k for k in range(1, min(shared, most) + 1) if shared % k == 0)
 
 
-def _measure(setting: Setting, exact: _Exact, member: Integrator, steps: int, repeats: int) -> WorkPrecisionRun:
+@dataclass(frozen=True, eq=False)
+class _Cell:
+    """A run to be measured."""
+
+    setting: Setting
+    exact: _Exact
+    member: Integrator
+    steps: int
+    repeats: int
+
+
+def _measure(cell: _Cell) -> WorkPrecisionRun:
+    setting, exact, member, steps = cell.setting, cell.exact, cell.member, cell.steps
     # Whatever goes wrong with one run, the others are worth having.
     samples = _samples([steps, len(exact.q) - 1], len(setting.controls))
     shared = slice(None, None, (len(exact.q) - 1) // samples)
     try:
         setting.warm_up(member)
-        outcome = setting.run(member, steps, samples=samples, repeats=repeats)
+        outcome = setting.run(member, steps, samples=samples, repeats=cell.repeats)
     except Exception as reason:
         lost = np.full_like(exact.q[shared], np.nan)
         outcome = Outcome(lost, lost, np.nan, np.nan, 0, 0, 0, 0, f"{type(reason).__name__}: {reason}")

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import JointValues, as_floats, joint_array, positive, require_finite
 from varpin.errors import InputError
+from varpin.frozen import Frozen
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
 from varpin.integrators.base import Segment, open_loop
 from varpin.kernels._compile import announced_compilation
@@ -69,7 +70,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, eq=False)
-class Setting:
+class Setting(Frozen):
     """A motion to integrate.
 
     Attributes:

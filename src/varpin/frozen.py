@@ -1,0 +1,54 @@
+"""Frozen objects that leave the process and come back as they were."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+
+class Frozen:
+    """Base of frozen dataclasses that are pickled and deep-copied.
+
+    Kernels are compiled for each kind of array that they meet, and pickle forgets of which kind arrays were: read-only
+    ones come back writable, and writable ones read-only where their bytes travelled beside the pickle. So attributes,
+    and what tuples among them hold, keep their kind here. Views of mappings, which pickle refuses, travel as mappings;
+    cached properties stay behind and are made again on use.
+    """
+
+    def __getstate__(self) -> dict[str, Any]:
+        cached = {
+            name
+            for kind in type(self).__mro__
+            for name, value in vars(kind).items()
+            if isinstance(value, cached_property)
+        }
+        own = {name: value for name, value in vars(self).items() if name not in cached}
+        views = {name: dict(value) for name, value in own.items() if isinstance(value, MappingProxyType)}
+        return {"values": own | views, "views": tuple(views), "writable": {name: _writable(own[name]) for name in own}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        values = {name: _restored(value, state["writable"][name]) for name, value in state["values"].items()}
+        # Past the dataclass, which refuses assignments.
+        vars(self).update(values | {name: MappingProxyType(values[name]) for name in state["views"]})
+
+
+def _writable(value: Any) -> Any:
+    """Of an array whether it can be written to; of a tuple the same of its items."""
+    if isinstance(value, np.ndarray):
+        return bool(value.flags.writeable)
+    return tuple(map(_writable, value)) if isinstance(value, tuple) else None
+
+
+def _restored(value: Any, writable: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        # Bytes of others may be read-only, or begin at an odd place.
+        array = value if value.flags.owndata and value.flags.aligned else value.copy(order="K")
+        array.setflags(write=writable)
+        return array
+    if isinstance(value, tuple):
+        items = [_restored(*pair) for pair in zip(value, writable, strict=True)]
+        return type(value)(*items) if hasattr(value, "_fields") else tuple(items)
+    return value

@@ -1,0 +1,344 @@
+"""Work on other processes and machines: the bytes of threads, little on the way, and what gets lost again."""
+
+import logging
+import multiprocessing
+import os
+import pickle
+import signal
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_ensemble import ARRAYS, make_scene, run, same_statistics
+
+import varpin as vp
+import varpin.ensemble
+from varpin.executors import executing, in_order
+
+
+@pytest.fixture(scope="module", params=["fork", "spawn"])
+def pool(request):
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context(request.param)) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def spawned():
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as opened:
+        yield opened
+
+
+class Shipping(Executor):
+    """Takes tasks and gives results as bytes, in this process, and counts them."""
+
+    def __init__(self):
+        self.sent, self.returned, self.most = 0, 0, 0
+
+    def submit(self, fn, /, *args, **kwargs):
+        task = pickle.dumps((fn, args, kwargs))
+        fn, args, kwargs = pickle.loads(task)
+        answer = pickle.dumps(fn(*args, **kwargs))
+        self.sent, self.returned, self.most = self.sent + 1, self.returned + len(answer), max(self.most, len(task))
+        done = Future()
+        done.set_result(pickle.loads(answer))
+        return done
+
+
+def same_ensembles(one, other):
+    same_statistics(one, other)
+    assert one.failures == other.failures
+    assert one.warnings == other.warnings
+    for name in ARRAYS:
+        a, b = getattr(one, name), getattr(other, name)
+        assert (a is None) == (b is None)
+        assert a is None or a.tobytes() == b.tobytes()
+
+
+@pytest.mark.parametrize("store", [True, False])
+def test_processes_give_the_bytes_of_threads(pool, store):
+    calls = []
+    threads = run(paths=300, store=store, workers=3)
+    same_ensembles(run(paths=300, store=store, executor=pool, progress=lambda *done: calls.append(done)), threads)
+    assert calls[-1] == (300, 300)
+    assert len(calls) > 2
+    with ThreadPoolExecutor(2) as other:
+        same_ensembles(run(paths=300, store=store, executor=other), threads)
+
+
+def test_estimated_quantiles_are_those_of_threads(spawned, monkeypatch):
+    monkeypatch.setattr(varpin.ensemble, "_EXACT", 1000)
+    threads = run(paths=300, store=False, workers=3)
+    assert threads.statistics.quantile_errors.any()
+    same_ensembles(run(paths=300, store=False, executor=spawned), threads)
+
+
+def test_generators_go_on_as_with_threads(spawned):
+    one, other = np.random.default_rng(3), np.random.default_rng(3)
+    run(rng=one)
+    run(rng=other, executor=spawned)
+    assert one.spawn(1)[0].random() == other.spawn(1)[0].random() == np.random.default_rng(3).spawn(41)[40].random()
+
+
+def test_policies_and_integrators_on_velocities(spawned):
+    policy = vp.LinearPolicy(np.zeros((10, 2)), -np.ones((10, 2, 4)), np.zeros((10, 4)), hold=5, limits=(-1.0, 1.0))
+    options = {"controls": policy, "integrator": vp.RungeKutta4(), "paths": 100}
+    same_ensembles(run(executor=spawned, **options), run(**options))
+
+
+def test_nothing_comes_back_that_was_not_asked_for():
+    shipping = Shipping()
+    paths, steps = 2000, 50
+    end = run(paths=paths, steps=steps, store=False, quantiles=(), executor=shipping)
+    same_ensembles(end, run(paths=paths, steps=steps, store=False, quantiles=()))
+    numbers = (steps + 1) * (1 + 5 + 16 + 1)
+    assert shipping.sent >= 10
+    assert shipping.returned < shipping.sent * (8 * numbers + 5000) + 8 * paths
+    assert shipping.most < 50_000
+    whole = Shipping()
+    run(paths=paths, steps=steps, executor=whole)
+    assert whole.returned > 8 * paths * steps * 9
+
+
+def test_meshes_stay_at_home():
+    import coal  # noqa: PLC0415
+    import pinocchio as pin  # noqa: PLC0415
+
+    visuals = pin.GeometryModel()
+    mesh = coal.BVHModelOBBRSS()
+    mesh.beginModel(20_000, 60_000)
+    mesh.addVertices(np.random.default_rng(0).normal(size=(60_000, 3)))
+    mesh.endModel()
+    visuals.addGeometryObject(pin.GeometryObject("mesh", 1, pin.SE3.Identity(), mesh))
+    robot = vp.load_robot(pin.RobotWrapper(vp.planar_chain(2).model.copy(), visual_model=visuals))
+    scene = vp.Scene(robot, noise=vp.AdditiveNoise(0.1))
+    shipping = Shipping()
+    run(scene, executor=shipping)
+    assert shipping.most < 50_000
+    assert scene.robot.visuals is not None
+
+
+def plan_of(scene, **options):
+    cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost([0.5, 0.2], 10.0))
+    return vp.solve(vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=0.02, steps=20), **options)
+
+
+def test_monte_carlo_on_processes(spawned):
+    plan = plan_of(make_scene(), max_iterations=3)
+    calls = []
+    found = plan.monte_carlo(300, 1, executor=spawned, progress=lambda *done: calls.append(done))
+    assert found == plan.monte_carlo(300, 1, workers=2) == plan.monte_carlo(300, 1, workers=1)
+    assert calls[-1] == (300, 300)
+    shipping = Shipping()
+    assert plan.monte_carlo(300, 1, executor=shipping) == found
+    assert shipping.returned < 300 * 8 + 3000 * shipping.sent
+
+
+def field(q, v, u):
+    return 0.1 * np.eye(2)
+
+
+def test_monte_carlo_with_noise_of_ones_own_on_processes(spawned):
+    plan = plan_of(vp.Scene(vp.planar_chain(2), noise=vp.CustomNoise(field, 2)), max_iterations=2)
+    assert plan.monte_carlo(4, 1, executor=spawned) == plan.monte_carlo(4, 1)
+    here = plan_of(vp.Scene(vp.planar_chain(2), noise=vp.CustomNoise(lambda q, v, u: 0.1 * np.eye(2), 2)))
+    with pytest.raises(vp.InputError, match=r"cannot be sent to them: .*; functions must be importable there"):
+        here.monte_carlo(4, 1, executor=spawned)
+
+
+def test_references_in_place_are_sampled_before_they_are_sent(spawned):
+    cost = vp.TrackingCost(lambda t: [0.1 * t, 0.0]) + vp.ControlCost(1e-2)
+    problem = vp.OptimalControlProblem(make_scene(), cost, [0.0, 0.0], [0.0, 0.0], dt=0.02, steps=10)
+    plan = vp.solve(problem, max_iterations=2)
+    assert plan.monte_carlo(50, 1, executor=spawned) == plan.monte_carlo(50, 1)
+
+
+def test_monte_carlo_tells_of_what_its_paths_do(caplog):
+    scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(0.1))
+    cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost([0.5, 0.2], 10.0))
+    problem = vp.OptimalControlProblem(
+        scene, cost, [1.5, 0.0], [0.0, 0.0], dt=0.1, steps=20, integrator=vp.ExplicitEuler()
+    )
+    plan = vp.solve(problem, max_iterations=2)
+    with caplog.at_level(logging.WARNING, "varpin.sddp.monte_carlo"):
+        found = plan.monte_carlo(60, 0)
+    assert any("coarse" in warning for warning in found.warnings)
+    for warning in found.warnings:
+        assert f"warning: {warning}" in str(found)
+    assert f"{len(found.warnings)} warning" in repr(found)
+    assert "coarse" in found._repr_html_()
+
+
+def test_work_and_precision_on_processes(spawned, tmp_path):
+    scene = vp.Scene(vp.planar_chain(2))
+    options = {
+        "duration": 0.2,
+        "integrators": [vp.Midpoint(), vp.RungeKutta4()],
+        "dts": [0.02, 0.01],
+        "repeats": 1,
+    }
+    calls = []
+    here = vp.work_precision(scene, [0.5, 0.2], [0.0, 0.0], **options)
+    there = vp.work_precision(
+        scene, [0.5, 0.2], [0.0, 0.0], executor=spawned, progress=lambda *done: calls.append(done),
+        save=tmp_path / "record.npz", **options,
+    )  # fmt: skip
+    assert calls == [(k, 4) for k in range(1, 5)]
+    assert [(run.integrator, run.dt, run.error) for run in there.runs] == [
+        (run.integrator, run.dt, run.error) for run in here.runs
+    ]
+    assert vp.WorkPrecision.load(tmp_path / "record.npz").runs == there.runs
+    with pytest.raises(vp.InputError, match=r"executor must be a concurrent.futures.Executor"):
+        vp.work_precision(scene, [0.5, 0.2], [0.0, 0.0], executor=3, **options)
+
+
+def once_deadly(task):
+    """Ends its process the first time that it is called with 3."""
+    number, marker = task
+    if number == 3 and not Path(marker).exists():
+        Path(marker).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number**2
+
+
+def test_a_lost_worker_is_made_up_for(tmp_path, caplog):
+    tasks = [(number, str(tmp_path / "marker")) for number in range(12)]
+    with ProcessPoolExecutor(2) as pool, caplog.at_level(logging.WARNING, "varpin.executors"):
+        assert list(in_order(pool, once_deadly, tasks)) == [number**2 for number in range(12)]
+    assert "a worker was lost" in caplog.text
+
+
+def killing(task):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_work_that_kills_every_worker_is_given_up(caplog):
+    with (
+        ProcessPoolExecutor(1) as pool,
+        pytest.raises(vp.VarpinError, match="workers get lost again and again") as caught,
+    ):
+        list(in_order(pool, killing, range(3)))
+    assert isinstance(caught.value.__cause__, BrokenProcessPool)
+
+
+def test_an_ensemble_outlives_a_worker():
+    """A worker is killed while the ensemble runs; the bytes are those of threads."""
+    with ProcessPoolExecutor(2) as pool:
+        killed = []
+
+        def kill(done, paths):
+            if not killed:
+                killed.append(next(iter(pool._processes)))
+                os.kill(killed[0], signal.SIGKILL)
+
+        end = run(paths=2000, store=False, executor=pool, progress=kill)
+    assert killed
+    same_ensembles(end, run(paths=2000, store=False))
+
+
+def failing(task):
+    if task == 2:
+        raise vp.UnknownJoint("elbow", ("knee",), "a robot")
+    return task
+
+
+def test_what_work_raises_comes_back(spawned):
+    results = in_order(spawned, failing, range(5))
+    assert [next(results), next(results)] == [0, 1]
+    with pytest.raises(vp.VarpinError, match="elbow"):
+        next(results)
+    # The pool is as good as before.
+    assert list(in_order(spawned, abs, [-1, 2])) == [1, 2]
+
+
+def test_executors_of_others_that_break_are_told_of():
+    class Broken(Executor):
+        def submit(self, fn, /, *args, **kwargs):
+            raise BrokenExecutor("the cluster is gone")
+
+    with pytest.raises(vp.VarpinError, match=r"the executor has broken, .*: the cluster is gone"):
+        run(executor=Broken())
+
+
+def test_few_tasks_are_ahead():
+    asked = []
+
+    def tasks():
+        for number in range(1000):
+            asked.append(number)
+            yield number
+
+    with ThreadPoolExecutor(2) as pool:
+        results = in_order(pool, abs, tasks())
+        assert next(results) == 0
+        assert len(asked) <= 9
+        results.close()
+    assert len(asked) <= 9
+
+
+def test_interruption_on_processes_keeps_what_is_done(spawned):
+    def interrupt(done, paths):
+        if done > 200:
+            raise KeyboardInterrupt
+
+    with pytest.raises(vp.EnsembleInterrupted) as caught:
+        run(paths=500, executor=spawned, progress=interrupt)
+    part = caught.value.ensemble
+    done = len(part.q)
+    assert 200 < done < 500
+    assert part.q.tobytes() == run(paths=500).q[:done].tobytes()
+    assert run(executor=spawned).statistics.count[0] == 40
+
+
+def test_workers_or_executor(spawned):
+    with pytest.raises(vp.InputError, match="not both"):
+        run(workers=2, executor=spawned)
+    with pytest.raises(vp.InputError, match=r"executor must be a concurrent.futures.Executor, .*, got int"):
+        run(executor=4)
+    with executing(None, 2) as own:
+        assert isinstance(own, ThreadPoolExecutor)
+
+
+@pytest.mark.slow
+def test_a_dask_cluster_gives_the_bytes_of_threads():
+    """Two processes of a local cluster, of which one is killed on the way."""
+    distributed = pytest.importorskip("distributed")
+    plan = plan_of(make_scene(), max_iterations=3)
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        executor = client.get_executor()
+        same_ensembles(run(paths=300, executor=executor), run(paths=300))
+        assert plan.monte_carlo(100, 1, executor=executor) == plan.monte_carlo(100, 1)
+        killed = []
+
+        def kill(done, paths):
+            if not killed:
+                killed.append(next(iter(client.run(os.getpid).values())))
+                os.kill(killed[0], signal.SIGKILL)
+
+        end = run(paths=3000, store=False, executor=executor, progress=kill)
+    assert killed
+    same_ensembles(end, run(paths=3000, store=False))
+
+
+@pytest.mark.slow
+def test_many_paths_need_no_more_memory_than_few():
+    """The peak of this process while 40 000 paths of 100 steps come back from a pool, over that of 4000."""
+    import tracemalloc  # noqa: PLC0415
+
+    def peak(paths):
+        tracemalloc.start()
+        with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+            end = run(vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(0.1)), paths=paths, steps=100,
+                      store=False, quantiles=(), executor=pool)  # fmt: skip
+        size = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert end.statistics.count[-1] == paths
+        return size
+
+    few, many = peak(4000), peak(40_000)
+    # A number or two for each path; paths themselves would take 100 times as much.
+    assert many < few + 40_000 * 64
