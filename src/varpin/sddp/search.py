@@ -19,6 +19,7 @@ from varpin.kernels.tree import Commands
 from varpin.noise import NoiseFieldError
 from varpin.policy import LinearPolicy
 from varpin.sddp.backward import Plan, backward, noise_cost
+from varpin.sddp.examination import looked_at
 from varpin.sddp.history import Iteration, SearchState, Status
 from varpin.sddp.problem import OptimalControlProblem
 from varpin.sddp.solution import Solution
@@ -64,6 +65,7 @@ def solve(
     callback: Callback | None = None,
     resume: Solution | None = None,
     progress: Progress | None = None,
+    check: bool = True,
 ) -> Solution:
     """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
 
@@ -109,9 +111,12 @@ def solve(
         resume: A solution of this very problem, as solve returned it or as read from a file: the search goes on where
             it stopped, for at most ``max_iterations`` more, as if it had not been interrupted. Give the other options
             as before; ``regularization`` goes on by itself.
+        check: Look at the finished plan, whether it costs in finer steps what it promises and its velocities do not
+            alternate, for ``Solution.warnings`` and the log. It takes as long as some motions of the search.
 
     Returns:
-        The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers.
+        The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers, and
+        ``warnings`` what keeps a robot from following it.
 
     Raises:
         InputError: Controls of a wrong shape, or options out of their range.
@@ -162,7 +167,7 @@ def solve(
             solution.noise_cost,
             solution.cost,
         )
-    return solution
+    return looked_at(solution) if check else solution
 
 
 def _first_commands(problem: OptimalControlProblem, controls: ArrayLike | LinearPolicy | Solution | None) -> Commands:
