@@ -22,7 +22,7 @@ from varpin.scenefile.terms import TERMS, Term
 # A motion of seven joints over so many steps takes gigabytes.
 MOST_STEPS = 10**7
 # Of Gauss in scene files, and of problems that name no integrator.
-DEFAULT_STAGES = 3
+DEFAULT_STAGES = 4
 # Steps times terms of a cost: references are evaluated for each.
 MOST_EVALUATIONS = 10**6
 # Of a file: bytes, dots outside numbers, tables within tables, characters of a word, tables or words of a list.
