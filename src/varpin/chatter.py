@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-# Changes of velocity that count, in units of the joint's largest velocity.
-_COUNTS = 1e-3
+# Second differences of the velocity that count, in units of the joint's largest: four times what alternates.
+_COUNTS = 2e-3
 # In units of the largest velocity of all joints: what couplings and rounding leave of joints that stand still.
 _IDLE = 1e-6
 # Changes of sign in a row that are spoken of. An oscillation that the steps resolve has none in a row. What the jump at
@@ -21,11 +21,11 @@ RUN = 8
 
 @dataclass(frozen=True)
 class Alternation:
-    """The longest stretch over which a joint's velocity goes up in one step and down in the next.
+    """The longest stretch over which a joint's velocity is above its trend at one node and below it at the next.
 
     Attributes:
         joint: Its coordinate.
-        changes: Changes of sign of the velocity's differences, one after another.
+        changes: Changes of sign of the velocity's second differences, one after another.
         first: The node where they begin.
     """
 
@@ -43,12 +43,14 @@ def alternation(v: Floats, u: Floats | None = None) -> Alternation | None:
             Left out, everything does.
     """
     fastest = np.abs(v).max(axis=0)
-    change = np.diff(v, axis=0)
-    counts = (np.abs(change) > _COUNTS * fastest) & (np.abs(change) > _IDLE * fastest.max())
-    turns = (change[1:] * change[:-1] < 0.0) & counts[1:] & counts[:-1]
-    if u is not None and len(u) > 1:
-        jump = np.diff(u, axis=0, prepend=u[:1])
-        # A change that follows one of the other sign, or none: rounding is no reason.
+    if len(v) < RUN + 3:
+        return None
+    bend = np.diff(v, n=2, axis=0)
+    counts = (np.abs(bend) > _COUNTS * fastest) & (np.abs(bend) > _IDLE * fastest.max())
+    turns = (bend[1:] * bend[:-1] < 0.0) & counts[1:] & counts[:-1]
+    if u is not None:
+        # The bend at a node is driven by the jump of the controls there.
+        jump = np.diff(u, axis=0)
         driven = (jump[1:] * jump[:-1] < 0.0) & (np.abs(jump[1:]) > _COUNTS * np.abs(u).max(axis=0))
         turns &= ~driven.any(axis=1, keepdims=True)
     # How many turns in a row end at each node.

@@ -74,8 +74,8 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
 def replayed(solution: Solution) -> Replay:
     """Play a plan again, without noise and under the same held controls, in steps of a quarter of its own.
 
-    The integrator is the plan's: what it has wrong at dt it has much less wrong at a quarter of that. Costs are
-    integrated by Simpson's rule. :meth:`Solution.verify` tells the same to many digits, for more time.
+    The integrator is the plan's: what it has wrong at dt it has less wrong at a quarter of that, by its order. Costs
+    are integrated by Simpson's rule. :meth:`Solution.verify` tells the same to many digits, for more time.
 
     Raises:
         VarpinError: A cost or a noise field of one's own fails off the plan.
@@ -90,7 +90,9 @@ def replayed(solution: Solution) -> Replay:
     # Where the optimum costs nothing, there is nothing to be relative to but where the search began.
     base = abs(solution.cost) + (1e-9 * first if np.isfinite(first) else 0.0)
     costs = [accurate_cost(problem, commands, PARTS, integrator=problem.integrator)[0] for commands in (alone, fed)]
-    lost = [0.0 if cost == solution.cost else (cost - solution.cost) / (base or 1.0) for cost in costs]
+    # What the quarters still have wrong themselves.
+    whole = 1.0 - float(PARTS) ** -problem.integrator.order
+    lost = [0.0 if cost == solution.cost else (cost - solution.cost) / (whole * (base or 1.0)) for cost in costs]
     return Replay(*lost)
 
 
