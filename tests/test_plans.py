@@ -138,8 +138,6 @@ def test_a_plan_that_costs_nothing_is_no_plan_that_loses_all():
 
 
 def test_a_cost_that_fails_off_the_plan_is_told():
-    first = {}
-
     def picky(t, q, v, u):
         if len(t) > 40:
             raise ValueError("too many")
@@ -149,7 +147,16 @@ def test_a_cost_that_fails_off_the_plan_is_told():
     problem = vp.OptimalControlProblem(vp.Scene(vp.planar_chain(1)), cost, [0.1], [0.0], dt=0.01, steps=20)
     plan = vp.solve(problem, max_iterations=2)
     assert any("cannot be played again" in sentence and "too many" in sentence for sentence in plan.warnings)
-    assert not first
+
+
+def test_ctrl_c_ends_the_look_and_not_the_plan(monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("varpin.sddp.examination.replayed", stop)
+    plan = vp.solve(reach(vp.planar_chain(2), 3, steps=10, dt=0.05))
+    assert plan.status.converged
+    assert "interrupted before the plan was played again" in plan.warnings[0]
 
 
 def test_warnings_go_through_files(tmp_path, load):

@@ -47,8 +47,14 @@ class Replay:
 
 
 def looked_at(solution: Solution) -> Solution:
-    """The solution with its warnings, which the log has once for a scene and a time step."""
-    found = findings(solution)
+    """The solution with its warnings, which the log has once for a scene and a time step.
+
+    Ctrl-C ends the look and not the plan.
+    """
+    try:
+        found = findings(solution)
+    except KeyboardInterrupt:
+        found = (Finding("interrupted", "interrupted before the plan was played again: what it is worth is not known"),)
     problem = solution.problem
     announce(logger, problem.scene, problem.dt, found)
     return replace(solution, warnings=tuple(finding.sentence for finding in found))
