@@ -34,7 +34,7 @@ sampled = plan.monte_carlo(1000, rng=0)
 print(f"cost under noise: predicted {sampled.predicted:.3g}, found {sampled.cost:.3g} +- {sampled.standard_error:.1g}")
 
 unaware = vp.solve(vp.OptimalControlProblem(quiet, cost, **start))
-paths = vp.simulate_ensemble(noisy, **start, controls=unaware.policy, paths=1000, rng=0)
+paths = vp.simulate_ensemble(noisy, **start, controls=unaware.policy, paths=1000, rng=0, integrator=problem.integrator)
 print(f"the plan that knows of no noise, under the same noise: {problem.costs(paths.q, paths.v, paths.u).mean():.3g}")
 
 motion = plan.trajectory

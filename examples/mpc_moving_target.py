@@ -33,7 +33,7 @@ def controller(integrator):
 
 plant = vp.Plant(vp.Scene(heavier, damping=0.05, noise=vp.AdditiveNoise(0.02)))
 runs = {}
-for name, integrator in (("midpoint", vp.Midpoint()), ("explicit Euler", vp.ExplicitEuler())):
+for name, integrator in (("variational", vp.Gauss(4)), ("explicit Euler", vp.ExplicitEuler())):
     runs[name] = run = controller(integrator).run(plant, duration=4.0, rng=1)
     tip = robot.frame_positions(run.motion.q, "tool0")
     error = np.linalg.norm(tip - [target(t) for t in run.motion.t], axis=1)
@@ -44,6 +44,6 @@ for name, integrator in (("midpoint", vp.Midpoint()), ("explicit Euler", vp.Expl
 # The arm, where its plan means to be in half a second as a ghost, and the way there as beads.
 goal = {"target": [target(t) for t in np.linspace(0.0, 4.0, 200)]}
 marks = {"trace": "tool0", "growing": True, "targets": goal}
-print(vp.replay(robot, runs["midpoint"], html=out / "mpc_moving_target.html", **marks))
+print(vp.replay(robot, runs["variational"], html=out / "mpc_moving_target.html", **marks))
 both = [(robot, run) for run in runs.values()]
 print(vp.replay(both, html=out / "mpc_integrators.html", ahead=0.1, **marks))

@@ -20,7 +20,7 @@ cost = vp.ControlCost(1e-3, reference=hold) + vp.VelocityCost(1e-2)
 cost += vp.Terminal(vp.TrackingCost(goal, 1e4) + vp.VelocityCost(1e2))
 
 plans = {}
-for name, integrator in (("midpoint", vp.Midpoint()), ("explicit Euler", vp.ExplicitEuler())):
+for name, integrator in (("variational", vp.Gauss(4)), ("explicit Euler", vp.ExplicitEuler())):
     problem = vp.OptimalControlProblem(scene, cost, begin, rest, dt=1e-2, steps=100, integrator=integrator)
     plans[name] = plan = vp.solve(problem)
     truth = plan.verify(tolerance=1e-8)
@@ -29,7 +29,7 @@ for name, integrator in (("midpoint", vp.Midpoint()), ("explicit Euler", vp.Expl
     print(f"    true cost {truth.open_loop_cost:.4g} open loop, {truth.closed_loop_cost:.4g} with feedback")
     print(f"    ends {truth.open_loop_gap:.1e} rad from the plan open loop, {truth.closed_loop_gap:.1e} with feedback")
 
-motion = plans["midpoint"].trajectory
+motion = plans["variational"].trajectory
 hand = robot.frame_positions([goal])[0]  # where the tool is to be [m]
 marks = {"targets": {"goal": hand}, "trace": True, "frames": True, "torques": True}
 print(vp.replay(robot, motion, ghost=[goal], html=out / "ur5_reach.html", speed=0.5, **marks))

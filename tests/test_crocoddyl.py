@@ -30,6 +30,7 @@ def problem(name, N, **options):
     cost = cost + vp.Terminal(vp.VelocityCost(weights["Wv"]))
     scene = vp.Scene(vp.load_robot(stored["robot"], lock=stored["lock"] or None), gravity=stored["gravity"])
     rest = np.zeros(scene.robot.dof)
+    options = {"integrator": vp.Midpoint(), "sampling": "midpoint", **options}
     return vp.OptimalControlProblem(scene, cost, stored["q0"], rest, dt=stored["tf"] / N, steps=N, **options)
 
 

@@ -284,8 +284,10 @@ def test_a_tolerance_that_hides_the_motion_is_spoken_of():
 
 def test_the_cost_by_hand_has_the_weights():
     task = Task(vp.Scene(rod_chain([1.0], [1.0])), np.zeros(1), np.array([2.0]), tracking=3.0, effort=5.0, final=7.0)
-    # One step of 1/2 from 0 to 1 under u = 4: off by 3/2 in the middle and by 1 at the end.
-    assert task.cost(np.array([[0.0], [1.0]]), np.array([[4.0]]), 0.5) == 0.5 * (3 * 1.5**2 + 5 * 16) + 7
+    motion = vp.simulate(task.scene, [0.0], [2.0], dt=0.5, steps=1, controls=[4.0])
+    motion = dataclasses.replace(motion, q=np.array([[0.0], [1.0]]), v=np.array([[2.0], [2.0]]))
+    # One step of 1/2 from 0 to 1 at a constant velocity under u = 4: off by 2 at first and by 1 at the end.
+    assert task.cost(motion) == pytest.approx(0.5 * (3 * 7 / 3 + 5 * 16) + 7, rel=1e-14)
 
 
 # --- the record ----------------------------------------------------------------------------------------------------

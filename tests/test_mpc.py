@@ -78,7 +78,7 @@ def test_a_plan_that_acts_on_is_looked_at_later():
 
 
 def test_references_are_those_of_the_plants_time():
-    problem = tracking()
+    problem = tracking(sampling="midpoint")
     moved = problem.at(t0=0.5)
     assert moved.t0 == 0.5
     assert problem.at(t0=0.5).at(steps=10).t0 == 0.5

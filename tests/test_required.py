@@ -125,7 +125,7 @@ def test_saving_is_measured(tmp_path):
         ('type = "explicit_euler"', vp.ExplicitEuler()),
         ('type = "semi_implicit_euler"', vp.SemiImplicitEuler()),
         ('type = "runge_kutta_4"', vp.RungeKutta4()),
-        ('alpha = 0.3\nkick = "split"', vp.Midpoint(alpha=0.3, kick="split")),
+        ('type = "midpoint"\nalpha = 0.3\nkick = "split"', vp.Midpoint(alpha=0.3, kick="split")),
     ],
 )
 def test_integrators(text, integrator, tmp_path):

@@ -660,7 +660,12 @@ def test_no_other_key_is_taken(key, data, tmp_path_factory):
     free = ("damping", "lock", "gear", "v", "offset", "weight")
     tables = [place for place in leaves(whole) if isinstance(at(whole, place), dict) and place[-1] not in free]
     place = data.draw(st.sampled_from([(), *tables]))
-    known = {name for _, keys in keys_of(tomllib.loads(documented()[0])) for name in keys} | {"steps", "stages", "kick"}
+    known = {name for _, keys in keys_of(tomllib.loads(documented()[0])) for name in keys} | {
+        "steps",
+        "alpha",
+        "stages",
+        "kick",
+    }
     assume(key not in known)
     at(whole, place)[key] = 1
     path = tmp_path_factory.mktemp("scene") / "scene.toml"

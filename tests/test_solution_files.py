@@ -33,7 +33,7 @@ def same(a, b):
 CASES = {
     "plain": ({}, {}),
     "noise": ({"noise": vp.StateNoise(0.3, center=0.0)}, {}),
-    "second order": ({}, {"second_order": True}),
+    "second order": ({"integrator": vp.Midpoint()}, {"second_order": True}),
     "open": ({"integrator": vp.ExplicitEuler(), "dt": 0.01}, {"forward": "open", "regularization": 1.0}),
 }
 

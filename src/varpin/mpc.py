@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -9,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from varpin.chatter import alternation
 from varpin.checks import JointValues, count, positive, real
 from varpin.errors import InputError
 from varpin.frozen import Frozen
@@ -18,9 +20,12 @@ from varpin.markup import facts
 from varpin.scene import Scene, require_scene
 from varpin.sddp import OptimalControlProblem, Solution, solve
 from varpin.simulation import Interrupted, StepFailure, simulate
+from varpin.soundness import Finding, announce, examined
 from varpin.trajectory import Trajectory, chained
 
 Floats = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,8 @@ class MpcRun(Frozen):
         late: Ticks whose plan came after its budget (K,); the plan of the tick before acted on.
         period: Of the ticks [s].
         budget: For planning in a tick [s]; infinite for any.
+        warnings: What looks wrong with the plant's motion, as in :attr:`Trajectory.warnings`, with its velocities from
+            tick to tick, and with the first plan.
     """
 
     motion: Trajectory
@@ -66,6 +73,7 @@ class MpcRun(Frozen):
     late: NDArray[np.bool_]
     period: float
     budget: float
+    warnings: tuple[str, ...] = ()
 
     def planned(self, ahead: float | None = None) -> Floats:
         """Where the plans mean to be some time later: configurations (K + 1, n) [rad or m].
@@ -96,7 +104,7 @@ class MpcRun(Frozen):
         return int(self.late.sum())
 
     def __repr__(self) -> str:
-        return f"MpcRun({self})"
+        return f"MpcRun({str(self).splitlines()[0]})"
 
     @property
     def _planning(self) -> str:
@@ -119,12 +127,14 @@ class MpcRun(Frozen):
             ("planning took", self._planning),
             ("late", self._within),
             ("plant", self.motion),
+            *(("warning", sentence) for sentence in self.warnings),
         ]
         return facts(f"Run of a controller of {self.motion.robot}", rows)
 
     def __str__(self) -> str:
         ticks = f"{len(self.plans)} ticks of {1e3 * self.period:.3g} ms"
-        return f"{ticks}: planning took {self._planning}; {self._within}"
+        told = f"{ticks}: planning took {self._planning}; {self._within}"
+        return "\n".join([told, *(f"warning: {sentence}" for sentence in self.warnings)])
 
 
 @dataclass(frozen=True)
@@ -208,7 +218,15 @@ class Mpc:
         if previous is None:
             return solve(problem, tolerance=self.tolerance, max_iterations=self.first_iterations)
         start = previous.shifted(min(decisions, problem.decisions - 1), before)
-        return solve(problem, start, tolerance=self.tolerance, max_iterations=self.iterations, time_limit=self.budget)
+        # A tick has no time for a second look at its plan; the run takes one at what came of them all.
+        return solve(
+            problem,
+            start,
+            tolerance=self.tolerance,
+            max_iterations=self.iterations,
+            time_limit=self.budget,
+            check=False,
+        )
 
     def run(
         self,
@@ -273,7 +291,32 @@ class Mpc:
             if not parts:
                 raise
             raise Interrupted(chained(parts)) from None
-        return MpcRun(chained(parts), tuple(plans), seconds, iterations, late, self.period, self.budget)
+        motion, found = examined(plant.scene, plant.integrator, chained(parts))
+        found = (*found, *_alternating(motion, plant.substeps))
+        announce(logger, plant.scene, dt, found)
+        return MpcRun(
+            motion,
+            tuple(plans),
+            seconds,
+            iterations,
+            late,
+            self.period,
+            self.budget,
+            warnings=(*plans[0].warnings, *(finding.sentence for finding in found)),
+        )
+
+
+def _alternating(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:
+    """Says if a plant's velocities alternate from tick to tick: the controller is too fast for its period."""
+    found = None if motion.dw.any() else alternation(motion.v[::substeps])
+    if found is None:
+        return ()
+    sentence = (
+        f"under the controller the velocity of {motion.joint_names[found.joint]} alternates from tick to tick, "
+        f"{found.changes} times in a row from t = {motion.t[substeps * found.first]:.4g} s on: the feedback is too "
+        "fast for the period; a smaller dt, or a greater weight on the controls or on their changes, calms it"
+    )
+    return (Finding("alternating ticks", sentence),)
 
 
 def _decision(plan: Solution, age: int, q: Floats, v: Floats, before: Floats | None = None) -> Floats:

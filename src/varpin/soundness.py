@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.chatter import alternation
 from varpin.errors import SingularMassMatrix
 from varpin.integrators import Integrator, Reference
 from varpin.integrators.base import open_loop
@@ -72,8 +73,21 @@ def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tu
     if not integrator.variational:
         own = replace(trajectory.statistics, energy_defect=energy_defects(scene, trajectory))
         trajectory = replace(trajectory, statistics=own)
-    found = (*evident(scene, trajectory), *_looked_for(scene, integrator, trajectory))
+    found = (*evident(scene, trajectory), *_looked_for(scene, integrator, trajectory), *alternating(scene, trajectory))
     return with_warnings(trajectory, found), found
+
+
+def alternating(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Says if velocities alternate from step to step with neither controls nor noise that make them."""
+    found = None if trajectory.dw.any() else alternation(trajectory.v, trajectory.u)
+    if found is None:
+        return ()
+    sentence = (
+        f"the velocity of {scene.robot.joint_names[found.joint]} alternates from step to step, {found.changes} times "
+        f"in a row from t = {trajectory.t[found.first]:.4g} s on: dt = {trajectory.dt:g} s is too long for what is "
+        "stiff, damped or fed back here"
+    )
+    return (Finding("alternating velocities", sentence),)
 
 
 def with_warnings(trajectory: Trajectory, found: Iterable[Finding]) -> Trajectory:
@@ -92,7 +106,7 @@ def announce(logger: logging.Logger, scene: Scene, dt: float, found: Iterable[Fi
 
 def evident(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
     """What the record tells without taking steps again: dampers faster than the step, steps taken in parts."""
-    found = list(_ringing(scene, trajectory.q[0], trajectory.dt))
+    found = list(_ringing(scene, trajectory.q, trajectory.dt))
     if split := trajectory.statistics.split_steps:
         most, steps, dt = trajectory.statistics.substeps.max(), trajectory.steps, trajectory.dt
         found.append(
@@ -129,12 +143,14 @@ def _beyond_limits(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
     return (Finding(JOINT_LIMITS, f"joints leave their limits, which nothing stops: {'; '.join(parts)}{more}"),)
 
 
-def _ringing(scene: Scene, q0: Floats, dt: float) -> tuple[Finding, ...]:
+def _ringing(scene: Scene, q: Floats, dt: float) -> tuple[Finding, ...]:
     """Says if dampers are too fast for the step: the midpoint rule keeps stable, but turns velocities round."""
     if not scene.damping.any():
         return ()
-    rate = np.linalg.solve(lagrangian_jet(scene, q0, np.zeros_like(q0)).Lvv, np.diag(scene.damping))
-    fastest = float(np.abs(np.linalg.eigvals(rate)).max()) if np.isfinite(rate).all() else np.inf
+    # Rates change along the motion as the inertia does.
+    fastest = max(
+        _damping_rate(scene, q[k]) for k in np.unique(np.linspace(0, len(q) - 1, _LOOKED_AT).astype(np.int64))
+    )
     if 0.5 * dt * fastest <= 1.0:
         return ()
     return (
@@ -144,6 +160,12 @@ def _ringing(scene: Scene, q0: Floats, dt: float) -> tuple[Finding, ...]:
             f"dt below {2.0 / fastest:.3g} s resolves it",
         ),
     )
+
+
+def _damping_rate(scene: Scene, q: Floats) -> float:
+    """The fastest rate at which dampers stop a motion at a configuration [1/s]."""
+    rate = np.linalg.solve(lagrangian_jet(scene, q, np.zeros_like(q)).Lvv, np.diag(scene.damping))
+    return float(np.abs(np.linalg.eigvals(rate)).max()) if np.isfinite(rate).all() else np.inf
 
 
 def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicHermiteSpline
 
 from varpin.costs import ControlCost, Cost, Terminal, TrackingCost
 from varpin.errors import VarpinError
@@ -21,12 +22,13 @@ from varpin.robot import Robot
 from varpin.robot.chain import rod_chain
 from varpin.scene import Scene
 from varpin.sddp import OptimalControlProblem, Solution, solve
+from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
 # Part of a plan's cost that single controls may still take off it, and relative error of the cost itself.
 LEFT_LEVEL, COST_LEVEL = 1e-2, 1e-6
-_PLANNERS = (Midpoint(), Gauss(stages=2), ExplicitEuler())
+_PLANNERS = (Midpoint(), Gauss(stages=4), ExplicitEuler())
 # Part of a cost up to which noise does not move its optimum to speak of.
 _QUIET = 1e-4
 # Controls that are varied one by one.
@@ -63,11 +65,15 @@ class Task:
         v0 = np.zeros(len(self.q0))
         return OptimalControlProblem(self.scene, cost, self.q0, v0, dt=dt, steps=steps, integrator=integrator)
 
-    def cost(self, q: Floats, u: Floats, dt: float) -> float:
-        """The cost of a motion, summed by hand at the midpoints of its steps."""
+    def cost(self, motion: Trajectory) -> float:
+        """The cost of a motion, summed by hand at two Gauss points of each step, on the cubic through its nodes."""
+        t, q, u, dt = motion.t, motion.q, motion.u, motion.dt
         rows = np.broadcast_to(np.atleast_2d(self.reference), q.shape)
-        off = 0.5 * (q[1:] + q[:-1]) - 0.5 * (rows[1:] + rows[:-1])
-        running = dt * (self.tracking * (off**2).sum() + self.effort * (u**2).sum())
+        path, tracking = CubicHermiteSpline(t, q, motion.v), 0.0
+        for place in (0.5 - math.sqrt(3.0) / 6.0, 0.5 + math.sqrt(3.0) / 6.0):
+            off = path(t[:-1] + place * dt) - ((1.0 - place) * rows[:-1] + place * rows[1:])
+            tracking += 0.5 * (off**2).sum()
+        running = dt * (self.tracking * tracking + self.effort * (u**2).sum())
         return float(running + self.final * ((q[-1] - rows[-1]) ** 2).sum())
 
 
@@ -147,7 +153,7 @@ def _heard() -> Iterator[list[str]]:
 def cost_error(task: Task, solution: Solution) -> float:
     """Distance of a solution's cost from that of its motion, summed by hand, in units of the cost."""
     motion = solution.trajectory
-    cost = task.cost(motion.q, motion.u, motion.dt)
+    cost = task.cost(motion)
     return abs(cost - solution.cost) / max(abs(cost), np.finfo(np.float64).tiny) if cost != solution.cost else 0.0
 
 
@@ -178,8 +184,7 @@ def _gain(task: Task, solution: Solution, change: float) -> float:
         controls = u.copy()
         if cell is not None:
             controls[tuple(cell)] += by
-        motion = problem.simulate(controls)
-        return task.cost(motion.q, controls, problem.dt)
+        return task.cost(problem.simulate(controls))
 
     here, gain = cost(), 0.0
     for cell in chosen:

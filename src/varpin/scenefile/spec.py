@@ -21,6 +21,8 @@ from varpin.scenefile.terms import TERMS, Term
 
 # A motion of seven joints over so many steps takes gigabytes.
 MOST_STEPS = 10**7
+# Of Gauss in scene files, and of problems that name no integrator.
+DEFAULT_STAGES = 4
 # Steps times terms of a cost: references are evaluated for each.
 MOST_EVALUATIONS = 10**6
 # Of a file: bytes, dots outside numbers, tables within tables, characters of a word, tables or words of a list.
@@ -407,7 +409,7 @@ def _horizon(table: Table) -> dict[str, Any]:
         "dt": dt,
         "steps": steps,
         "hold": hold,
-        "sampling": table.choice("sampling", ("midpoint", "gauss", "start"), "midpoint"),
+        "sampling": table.choice("sampling", ("gauss", "midpoint", "start"), "gauss"),
     }
 
 
@@ -423,14 +425,14 @@ _INTEGRATORS: dict[str, tuple[Callable[..., Integrator], tuple[str, ...]]] = {
 
 
 def _integrator(table: Table) -> Integrator:
-    kind = table.choice("type", _INTEGRATORS, "midpoint")
+    kind = table.choice("type", _INTEGRATORS, "gauss")
     make, names = _INTEGRATORS[kind]
     table.allow("type", *names)
     given: dict[str, Any] = {}
     if "alpha" in table:
         given["alpha"] = table.number("alpha", least=0.0, most=1.0)
-    if "stages" in table:
-        given["stages"] = table.whole("stages", least=1)
+    if kind == "gauss":
+        given["stages"] = table.whole("stages", DEFAULT_STAGES, least=1)
     if "kick" in table:
         given["kick"] = table.choice("kick", ("left", "split"))
     try:

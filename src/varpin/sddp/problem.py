@@ -22,7 +22,7 @@ from varpin.costs import (
 )
 from varpin.errors import InputError
 from varpin.frozen import Frozen
-from varpin.integrators import Integrator, Midpoint
+from varpin.integrators import Gauss, Integrator
 from varpin.lagrangian import lagrangian_jet
 from varpin.markup import facts, listed
 from varpin.policy import LinearPolicy, OpenLoop
@@ -65,10 +65,12 @@ class OptimalControlProblem(Frozen):
         v0: Initial velocity (n,) [rad/s or m/s]; the same.
         dt: Time step [s].
         steps: N.
-        integrator: Any of varpin's; ``Midpoint()`` if left out.
-        sampling: ``"midpoint"``: running costs at ((q + q')/2, (q' - q)/dt, u) of each step, of second order.
-            ``"gauss"``: at its two Gauss points, the motion between the nodes taken for a cubic: of fourth order, for
-            integrators that are. ``"start"``: at the node where it begins, a left sum as in the paper, of first order.
+        integrator: Any of varpin's; ``Gauss(stages=4)`` if left out.
+        sampling: Where running costs are taken in each step. ``"gauss"``, if left out: at its two Gauss points, the
+            motion between the nodes taken for a cubic, of fourth order. ``"midpoint"``: at
+            ((q + q')/2, (q' - q)/dt, u), of second order; it does not see velocities that alternate from node to node,
+            and the optimal ones often do. ``"start"``: at the node where it begins, a left sum as in the paper, of
+            first order.
         hold: Steps that share one control: a digital controller's period over the integrator's step.
         t0: When the horizon begins [s]; references that are functions of time see it.
         control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none.
@@ -102,7 +104,7 @@ class OptimalControlProblem(Frozen):
         dt: float,
         steps: int,
         integrator: Integrator | None = None,
-        sampling: Sampling = "midpoint",
+        sampling: Sampling = "gauss",
         hold: int = 1,
         t0: float = 0.0,
         control_limits: tuple[ArrayLike, ArrayLike] | None = None,
@@ -125,7 +127,7 @@ class OptimalControlProblem(Frozen):
         if not is_one_of(sampling, ("midpoint", "gauss", "start")):
             raise InputError(f"sampling must be 'midpoint', 'gauss' or 'start', got {sampling!r}")
         if integrator is not None and not isinstance(integrator, Integrator):
-            raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
+            raise InputError(f"integrator must be one of varpin's, for example varpin.Gauss(4), got {integrator!r}")
         if m == 0:
             raise InputError("the scene has no controls, so there is nothing to optimize")
         places, rule = _rule(sampling, dt)
@@ -140,7 +142,7 @@ class OptimalControlProblem(Frozen):
             "v0": joint_array("v0", v0, scene.robot.joint_names),
             "dt": dt,
             "steps": steps,
-            "integrator": Midpoint() if integrator is None else integrator,
+            "integrator": default_integrator() if integrator is None else integrator,
             "sampling": sampling,
             "hold": hold,
             "t0": t0,
@@ -345,6 +347,16 @@ class OptimalControlProblem(Frozen):
     def expand_terminal(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""
         return self.terminal.expand(trajectory.q[-1:], trajectory.v[-1:], np.zeros((1, self.scene.controls)))
+
+
+def default_integrator() -> Integrator:
+    """What plans are made with where nothing is said.
+
+    Two stages are of the cost's order. Light joints of an arm with friction need more: their velocities settle within a
+    fraction of a step. Four stages follow that where friction is up to ten times as fast as the step, for a third more
+    time than two.
+    """
+    return Gauss(stages=4)
 
 
 def _rule(sampling: str, dt: float) -> tuple[Floats, Floats]:

@@ -24,6 +24,7 @@ from varpin.noise import NoiseFieldError
 from varpin.policy import LinearPolicy
 from varpin.sddp.backward import Plan, backward, noise_shares
 from varpin.sddp.descent import Stake, at_stake, rounding, shares, spent
+from varpin.sddp.examination import looked_at
 from varpin.sddp.history import Iteration, SearchState, Status
 from varpin.sddp.problem import OptimalControlProblem
 from varpin.sddp.solution import Solution
@@ -75,6 +76,7 @@ def solve(
     callback: Callback | None = None,
     resume: Solution | None = None,
     progress: Progress | None = None,
+    check: bool = True,
 ) -> Solution:
     """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
 
@@ -123,9 +125,12 @@ def solve(
         resume: A solution of this very problem, as solve returned it or as read from a file: the search goes on where
             it stopped, for at most ``max_iterations`` more, as if it had not been interrupted. Give the other options
             as before; ``regularization`` goes on by itself.
+        check: Look at the finished plan, whether it costs in finer steps what it promises and its velocities do not
+            alternate, for ``Solution.warnings`` and the log. It takes as long as some motions of the search.
 
     Returns:
-        The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers.
+        The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers, and
+        ``warnings`` what keeps a robot from following it.
 
     Raises:
         InputError: Controls of a wrong shape, or options out of their range.
@@ -168,7 +173,8 @@ def solve(
             status = search.run(tolerance, max_iterations, deadline, report)
         except KeyboardInterrupt:
             status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
-    return search.solution(status)
+    solution = search.solution(status)
+    return looked_at(solution) if check else solution
 
 
 def _first_commands(problem: OptimalControlProblem, controls: ArrayLike | LinearPolicy | Solution | None) -> Commands:

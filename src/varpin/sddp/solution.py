@@ -92,6 +92,8 @@ class Solution(Frozen):
         reason: With which numbers.
         history: One entry for each iteration.
         search: From where :func:`varpin.solve` can go on, with ``resume``.
+        warnings: What looks wrong with the plan, in sentences that say what to change: it costs more than planned when
+            its steps are taken in quarters, its velocities alternate, its energy balance does not close.
     """
 
     problem: OptimalControlProblem
@@ -106,6 +108,7 @@ class Solution(Frozen):
     history: tuple[Iteration, ...]
     search: SearchState | None = None
     previous_gains: Floats | None = None
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for array in (self.gains, self.feedforward, self.gradient, self.previous_gains):
@@ -145,7 +148,11 @@ class Solution(Frozen):
 
     def __repr__(self) -> str:
         noise = f" + {self.noise_cost:.4g} by noise" if self.noise_cost else ""
-        return f"Solution(cost {self.cost:.6g}{noise}, {self.iterations} iterations, {self.status.value})"
+        warned = f", {len(self.warnings)} warnings" if self.warnings else ""
+        return f"Solution(cost {self.cost:.6g}{noise}, {self.iterations} iterations, {self.status.value}{warned})"
+
+    def __str__(self) -> str:
+        return "\n".join([repr(self), *(f"warning: {sentence}" for sentence in self.warnings)])
 
     def _repr_html_(self) -> str:
         problem, beyond, motion = self.problem, self.violations, self.trajectory
@@ -165,7 +172,7 @@ class Solution(Frozen):
                 rows.append((f"{what} beyond limits [{unit}]", listed(over)))
         if beyond.control.any():
             rows.append(("controls beyond limits", f"{beyond.control.max():.3g} at most"))
-        rows += [("warning", warning) for warning in motion.warnings]
+        rows += [("warning", warning) for warning in self.warnings]
         most = np.abs(motion.u).max(axis=0, initial=0.0)
         rows.append(("largest controls", listed(f"{value:.4g}" for value in most)))
         columns = ("", "cost", "noise cost", "promise", "decrease", "gradient", "regularization", "step", "rollouts")
@@ -178,7 +185,8 @@ class Solution(Frozen):
 
     def table(self) -> str:
         """The iterations, one row each, and how and why they ended; :class:`Solution` explains the columns."""
-        return "\n".join([Iteration.HEADER, *map(str, self.history), self.status.value, f"({self.reason})"])
+        warned = (f"warning: {sentence}" for sentence in self.warnings)
+        return "\n".join([Iteration.HEADER, *map(str, self.history), *warned, self.status.value, f"({self.reason})"])
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the solution as a compressed npz file without pickle; returns its path.

@@ -40,6 +40,7 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
     members: dict[str, Any] = {
         "status": solution["status"].name,
         "reason": solution["reason"],
+        "plan.warnings": np.array(solution["warnings"], dtype=np.str_),
         "history": _rows(solution["history"]),
     }
     # Motions are often one and the same: each is written once.
@@ -67,7 +68,7 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
 def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[str, Any]:
     """The fields of the :class:`Solution` in a file; errors as :meth:`Solution.load` says."""
     source = path_like("path", path)
-    expected = {*MEMBERS, *_PLAN, *_NUMBERS, *_PROBLEM, "status", "reason", "history"}
+    expected = {*MEMBERS, *_PLAN, *_NUMBERS, *_PROBLEM, "status", "reason", "history", "plan.warnings"}
     members = read_members(source, _FORMAT, expected, others=True, most=_most_bytes(problem))
     reader = _Reader(source, members, problem)
     reader.check_problem()
@@ -216,5 +217,6 @@ class _Reader:
             "reason": str(members["reason"]),
             "history": history,
             "search": search,
+            "warnings": tuple(str(sentence) for sentence in members["plan.warnings"].reshape(-1)),
             "previous_gains": None if problem.rate is None else self.array("previous_gains", (R, m, m)),
         }

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.costs import BoundSum
-from varpin.integrators import RungeKutta4
+from varpin.integrators import Integrator, RungeKutta4
 from varpin.integrators.base import open_loop
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
@@ -162,13 +162,20 @@ def _fine_costs(problem: OptimalControlProblem, substeps: int) -> tuple[BoundSum
 
 
 def accurate_cost(
-    problem: OptimalControlProblem, commands: Commands, substeps: int, costs: tuple[BoundSum, BoundSum] | None = None
+    problem: OptimalControlProblem,
+    commands: Commands,
+    substeps: int,
+    costs: tuple[BoundSum, BoundSum] | None = None,
+    integrator: Integrator | None = None,
 ) -> tuple[float, Floats]:
-    """True cost under given commands, and the end configuration; NaN where the motion runs away."""
+    """True cost under given commands, and the end configuration; NaN where the motion runs away.
+
+    In ``substeps`` steps, an even number, of the integrator, :class:`RungeKutta4` if left out, for each of the plan's.
+    """
     scene, h = problem.scene, problem.dt / substeps
     n, m = scene.robot.dof, scene.controls
     with announced_compilation("accurate integration"):
-        motion, failure = rollout(scene, RungeKutta4(), problem.q0, problem.v0, commands, h)
+        motion, failure = rollout(scene, integrator or RungeKutta4(), problem.q0, problem.v0, commands, h)
     if failure is not None:
         return np.nan, np.full(n, np.nan)
     running, terminal = _fine_costs(problem, substeps) if costs is None else costs

@@ -225,7 +225,7 @@ def _fingerprint(problem: OptimalControlProblem, options: dict[str, Any]) -> str
 
 def _solved(problem: OptimalControlProblem, options: dict[str, Any]) -> tuple[Solution, float]:
     begin = time.perf_counter()
-    solution = solve(problem, **options)
+    solution = solve(problem, **{"check": False, **options})
     seconds = time.perf_counter() - begin
     # The solver returns its best motion at Ctrl-C; here that run does not count.
     if solution.status.name == "INTERRUPTED":
@@ -240,7 +240,7 @@ def _measured(problem: OptimalControlProblem, repeats: int, options: dict[str, A
     # Whatever goes wrong with one run, the others are worth having.
     try:
         # One iteration compiles all that the solver needs; held controls need kernels of their own.
-        solve(problem, **{**options, "max_iterations": 1, "callback": None})
+        solve(problem, **{"check": False, **options, "max_iterations": 1, "callback": None})
         solution, seconds, spread = fastest(lambda: _solved(problem, options), repeats)
         truth = solution.verify()
         planned, opened, closed = truth.planned_cost, truth.open_loop_cost, truth.closed_loop_cost

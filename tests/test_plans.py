@@ -1,0 +1,252 @@
+"""Plans that a robot can follow: what the defaults promise holds on the continuous robot, or the plan says so."""
+
+import logging
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin.chatter import RUN, alternation
+from varpin.sddp.examination import findings, replayed
+from varpin.soundness import examined
+
+ARMS = {
+    "ur5": {},
+    "ur10": {},
+    "xarm7": {},
+    "panda": {"panda_finger_joint1": 0.02},
+    "z1": {},
+}
+
+
+def arm(load, name):
+    return vp.load_robot(name, lock=ARMS[name]) if ARMS[name] else load(name)
+
+
+def reach(robot, seed, *, damping=0.1, dt=0.01, steps=100, running="velocity", **options):
+    """From one posture to another a radian or so away, rest to rest."""
+    rng = np.random.default_rng(seed)
+    lower, upper = (
+        np.clip(np.nan_to_num(limit, posinf=np.pi, neginf=-np.pi), -np.pi, np.pi) for limit in robot.position_limits
+    )
+    begin = 0.5 * (lower + upper) + 0.25 * (upper - lower) * rng.uniform(-1.0, 1.0, robot.dof)
+    goal = np.clip(begin + rng.uniform(-0.8, 0.8, robot.dof), lower, upper)
+    scene = vp.Scene(robot, damping=damping)
+    rest = np.zeros(robot.dof)
+    cost = vp.ControlCost(1e-3, -vp.lagrangian_jet(scene, begin, rest).Lq)
+    cost += vp.Terminal(vp.TrackingCost(goal, 1e3) + vp.VelocityCost(10.0))
+    cost += vp.VelocityCost(1.0) if running == "velocity" else vp.TrackingCost(goal, 10.0)
+    return vp.OptimalControlProblem(scene, cost, begin, rest, dt=dt, steps=steps, **options)
+
+
+def changes(motion, smallest=1e-3):
+    """Changes of sign of the velocity's differences, of those that a thousandth of the joint's speed shows (n,)."""
+    d = np.diff(motion.v, axis=0)
+    seen = np.abs(d) > smallest * np.abs(motion.v).max(axis=0)
+    return ((d[1:] * d[:-1] < 0.0) & seen[1:] & seen[:-1]).sum(axis=0)
+
+
+def test_defaults():
+    problem = reach(vp.planar_chain(2), 0, steps=2)
+    assert problem.integrator == vp.Gauss(stages=4)
+    assert problem.sampling == "gauss"
+    # The rule stays where only the integrator is named.
+    assert reach(vp.planar_chain(2), 0, steps=2, integrator=vp.Midpoint()).sampling == "gauss"
+
+
+def test_second_order_asks_for_the_midpoint_rule():
+    with pytest.raises(vp.InputError, match=r"no second-order linearization; varpin.Midpoint\(...\) has"):
+        vp.solve(reach(vp.planar_chain(2), 0, steps=5), second_order=True)
+
+
+def test_a_reach_of_a_heavy_arm_under_defaults(load):
+    """Its wrist is light, and cheap controls make it jump: by the midpoint rule it alternated in 99 of 99 steps."""
+    plan = vp.solve(reach(load("ur10"), 1001))
+    truth = plan.verify(tolerance=1e-6)
+    assert plan.warnings == ()
+    assert abs(truth.open_loop_loss) < 1e-3
+    assert changes(plan.trajectory).max() <= 12
+
+
+def test_the_midpoint_rule_tells_that_it_chatters(load, caplog):
+    problem = reach(load("ur10"), 1001, integrator=vp.Midpoint(), sampling="midpoint")
+    with caplog.at_level(logging.WARNING):
+        plans = [vp.solve(problem) for _ in range(2)]
+    assert changes(plans[0].trajectory).max() > 90
+    assert "alternates from step to step" in plans[0].warnings[0]
+    assert "sampling='gauss'" in plans[0].warnings[0]
+    assert plans[0].warnings == plans[1].warnings
+    assert sum("alternates" in record.message for record in caplog.records) == 1
+    for text in (str(plans[0]), plans[0].table(), plans[0]._repr_html_()):
+        assert "alternates from step to step" in text
+    assert vp.solve(problem, check=False).warnings == ()
+
+
+def test_dampers_faster_than_the_step(load):
+    """A wrist that stops at 735/s, in steps of 10 ms: two stages lose a tenth, and say what to do; four do not."""
+    problem = reach(load("xarm7"), 1002)
+    plan = vp.solve(problem.at(integrator=vp.Gauss(2)))
+    truth = plan.verify(tolerance=1e-6)
+    assert truth.closed_loop_loss > 1e-2
+    assert any("damping is faster than the step" in sentence for sentence in plan.warnings)
+    assert "problem.at(dt=0.0025, hold=4)" in vp.solve(problem.at(integrator=vp.Gauss(2))).warnings[0]
+    finer = vp.solve(problem.at(integrator=vp.Gauss(2), dt=0.0025, hold=4))
+    assert finer.warnings == ()
+    assert abs(finer.verify(tolerance=1e-6).closed_loop_loss) < 1e-3
+    usual = vp.solve(problem)
+    assert usual.warnings == ()
+    assert abs(usual.verify(tolerance=1e-6).closed_loop_loss) < 1e-3
+
+
+def test_fast_dampers_are_looked_for_along_the_motion():
+    """An arm that folds: its inertia, and with it the rate of a damper, depends on where it is."""
+    scene = vp.Scene(vp.planar_chain(2), damping=[20.0, 0.0], gravity=False)
+    rates = [
+        np.abs(np.linalg.eigvals(np.linalg.solve(vp.lagrangian_jet(scene, [0.0, q], [0, 0]).Lvv, np.diag([20.0, 0]))))
+        for q in (0.0, 0.5 * np.pi)
+    ]
+    slow, fast = sorted(float(rate.max()) for rate in rates)
+    dt = 2.0 / np.sqrt(slow * fast)
+    begin = 0.0 if rates[0].max() == slow else 0.5 * np.pi
+    q = np.linspace([0.0, begin], [0.0, 0.5 * np.pi - begin], 20)
+    motion = vp.simulate(scene, q[0], [0, 0], dt=dt, steps=19)
+    kinds = {
+        finding.kind for finding in examined(scene, vp.Midpoint(), motion.__class__(**{**vars(motion), "q": q}))[1]
+    }
+    assert "fast damping" in kinds
+
+
+@pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.Gauss(4), vp.RungeKutta4(), vp.SemiImplicitEuler()], ids=str)
+def test_the_replay_is_what_verification_finds(integrator):
+    """Also of an integrator of first order, in sign and size."""
+    plan = vp.solve(reach(vp.planar_chain(2), 3, steps=50, dt=0.02, integrator=integrator))
+    truth, found = plan.verify(tolerance=1e-8), replayed(plan)
+    if integrator.order > 1:
+        for a, b in ((found.alone, truth.open_loop_loss), (found.feedback, truth.closed_loop_loss)):
+            assert abs(a - b) <= 1e-5 + 0.3 * abs(b)
+    # What falls multiplies what an integrator of first order has wrong at a quarter of the step.
+    assert 0.5 <= (1e-4 + abs(found.feedback)) / (1e-4 + abs(truth.closed_loop_loss)) <= 2.0
+    assert bool(plan.warnings) == (not -1e-2 <= found.feedback <= 1e-3)
+
+
+def test_a_plan_that_costs_nothing_is_no_plan_that_loses_all():
+    robot = vp.planar_chain(2)
+    scene = vp.Scene(robot, gravity=False)
+    goal = vp.Terminal(vp.TrackingCost([0.3, 0.1])) + vp.ControlCost(1e-12)
+    plan = vp.solve(vp.OptimalControlProblem(scene, goal, [0.3, 0.1], [0, 0], dt=0.01, steps=20), [0.1, 0.1])
+    assert plan.warnings == ()
+
+
+def test_a_cost_that_fails_off_the_plan_is_told():
+    def picky(t, q, v, u):
+        if len(t) > 40:
+            raise ValueError("too many")
+        return (q**2).sum(axis=1)
+
+    cost = vp.CustomCost(picky) + vp.ControlCost(0.1)
+    problem = vp.OptimalControlProblem(vp.Scene(vp.planar_chain(1)), cost, [0.1], [0.0], dt=0.01, steps=20)
+    plan = vp.solve(problem, max_iterations=2)
+    assert any("cannot be played again" in sentence and "too many" in sentence for sentence in plan.warnings)
+
+
+def test_ctrl_c_ends_the_look_and_not_the_plan(monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("varpin.sddp.examination.replayed", stop)
+    plan = vp.solve(reach(vp.planar_chain(2), 3, steps=10, dt=0.05))
+    assert plan.status.converged
+    assert "interrupted before the plan was played again" in plan.warnings[0]
+
+
+def test_warnings_go_through_files(tmp_path, load):
+    problem = reach(vp.planar_chain(2), 3, steps=20, dt=0.05, integrator=vp.ExplicitEuler())
+    plan = vp.solve(problem)
+    assert plan.warnings
+    again = vp.Solution.load(plan.save(tmp_path / "plan.npz"), problem)
+    assert again.warnings == plan.warnings
+    assert tuple(finding.sentence for finding in findings(again)) == plan.warnings
+
+
+def test_alternation():
+    t = np.arange(101.0)
+    smooth, sign = np.sin(0.05 * t), (-1.0) ** t
+    assert alternation(np.stack([smooth, smooth + 0.01 * sign], axis=1)).joint == 1
+    assert alternation((smooth + 0.01 * sign)[:, None]).changes == 98
+    # Below what counts, short, resolved, or what held controls leave of a jump.
+    assert alternation((smooth + 1e-4 * sign)[:, None]) is None
+    assert alternation((smooth + 0.01 * sign * (t < RUN))[:, None]) is None
+    assert alternation(np.sin(2.0 * np.pi * t / 6.0)[:, None]) is None
+    assert alternation((1.0 - (2.0 - np.sqrt(3.0)) ** t * sign)[:, None]) is None
+    # A joint at rest beside one that moves.
+    assert alternation(np.stack([smooth, 1e-9 * sign], axis=1)) is None
+    # Where a control alternates, velocities may; where it is constant they may not.
+    v, u = (smooth + 0.01 * sign)[:, None], sign[:100, None]
+    assert alternation(v, u) is None
+    assert alternation(v, 0.0 * u).changes == 98
+    assert alternation(np.zeros((1, 2))) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_random_torques_and_noise_are_no_chatter(seed):
+    rng = np.random.default_rng(seed)
+    scene = vp.Scene(vp.planar_chain(2), gravity=False, noise=vp.AdditiveNoise(0.1))
+    options = {"dt": 1e-3, "steps": 2000, "controls": rng.normal(size=(2000, 2))}
+    for noise in (None, seed):
+        motion = vp.simulate(scene, [0.1, 0.2], [0, 0], rng=noise, **options)
+        assert not any("alternates" in sentence for sentence in motion.warnings)
+
+
+def light_cart(mass):
+    """A slider of a given mass [kg]."""
+    import pinocchio as pin  # noqa: PLC0415
+
+    model = pin.Model()
+    model.appendBodyToJoint(
+        model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "cart"),
+        pin.Inertia(mass, np.zeros(3), 0.01 * np.eye(3)),
+        pin.SE3.Identity(),
+    )
+    return vp.Scene(vp.load_robot(model), gravity=False)
+
+
+def test_a_controller_too_fast_for_its_period_is_told():
+    """Planned for 1 kg, the loop turns the velocity of 0.52 kg round in every tick."""
+    cost = vp.TrackingCost([0.0], 1.0) + vp.VelocityCost(10.0) + vp.ControlCost(1e-6)
+    problem = vp.OptimalControlProblem(light_cart(1.0), cost, [1.0], [0.3], dt=0.05, steps=20)
+    mpc = vp.Mpc(problem)
+    good, bad = mpc.run(duration=1.0), mpc.run(vp.Plant(light_cart(0.52)), duration=1.0)
+    assert good.warnings == ()
+    assert any("alternates from tick to tick" in sentence for sentence in bad.warnings)
+    assert "alternates from tick to tick" in str(bad)
+    assert "alternates from tick to tick" in bad._repr_html_()
+
+
+def held(plan):
+    """Whether a plan is what must hold: no chatter, and what the robot pays is what was planned."""
+    truth = plan.verify(tolerance=1e-6, max_substeps=256)
+    calm = 100 * changes(plan.trajectory).max() / plan.problem.steps <= 12
+    return calm and (truth.open_loop_loss < 1e-3 or truth.closed_loop_loss < 1e-3)
+
+
+@pytest.mark.slow
+def test_random_reaches_of_five_arms_hold_or_say_so(load):
+    warned = 0
+    for seed in range(20):
+        name = list(ARMS)[seed % len(ARMS)]
+        running = "velocity" if seed % 2 else "tracking"
+        plan = vp.solve(reach(arm(load, name), seed, running=running))
+        assert plan.status.converged
+        warned += bool(plan.warnings)
+        assert plan.warnings or held(plan), (seed, name)
+    assert warned <= 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(vp.scenefile.spec.scenes()))
+def test_bundled_scenes_hold(name):
+    file = vp.load_scene(name)
+    plan = file.solve()
+    assert plan.status.converged
+    assert plan.warnings == ()
+    assert held(plan)
