@@ -146,7 +146,7 @@ def in_words(trial: Trial, motion: Callable[[peers.Case, float], peers.Motion | 
     exact = truth(trial)
     known = exact.nodes < len(q)
     with np.errstate(over="ignore", invalid="ignore"):
-        error = np.abs(q[exact.nodes[known]] - exact.q[known]).max(initial=0.0) / exact.way
+        error = (np.abs(q[exact.nodes[known]] - exact.q[known]) / exact.way).max(initial=0.0)
         at = np.unique(np.linspace(0, len(q) - 1, 200).astype(int))
         jets = [lagrangian_jet(setup.scene, q[k], v[k]) for k in at]
         kinetic = np.array([0.5 * v[k] @ jet.Lv for k, jet in zip(at, jets, strict=True)])

@@ -28,7 +28,7 @@ from varpin.robot import Robot
 from varpin.simulation import Interrupted, simulate
 from varpin.trajectory import Trajectory, atomic_file
 
-FORMAT = "varpin.extremes/1"
+FORMAT = "varpin.extremes/2"
 
 INTEGRATORS: tuple[Integrator, ...] = (
     *(Midpoint(alpha=alpha) for alpha in (0.0, 0.5, 1.0)),
@@ -46,7 +46,7 @@ _SAVED_EVERY = 2.0
 Progress = Callable[[int, int, str], None]
 # What no coarse step excuses: a record that contradicts itself, and derivatives without their structure.
 _STRUCTURE = ("record", "symplecticity")
-_MEASURES = ("error", "energy", "momentum", "reversal", "symplecticity", "record")
+_MEASURES = ("error", "velocity", "energy", "momentum", "reversal", "symplecticity", "record")
 
 
 class _OutOfTime(KeyboardInterrupt):
@@ -82,6 +82,10 @@ class Record:
     def wrong(self) -> tuple[Cell, ...]:
         """The cells that are wrong with nothing said."""
         return tuple(cell for cell in self.cells if cell.kind is Kind.WRONG)
+
+    def needless(self) -> tuple[Cell, ...]:
+        """The cells that varpin warns of although every check passes: false alarms."""
+        return tuple(cell for cell in self.cells if cell.needless)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the record as JSON; returns its path. What is not a finite number stands there as null.

@@ -91,7 +91,7 @@ class Plan:
 def attempt(plan: Plan, integrator: Integrator, patience: float = math.inf) -> dict[str, Any]:
     """Solve it, within about this time [s], and judge the solution: what a cell holds."""
     outcome: dict[str, Any] = dict.fromkeys(
-        ("error", "energy", "momentum", "reversal", "symplecticity", "record"), math.nan
+        ("error", "velocity", "energy", "momentum", "reversal", "symplecticity", "record"), math.nan
     ) | {"said": (), "found": (), "done": 0}
     try:
         task = plan.build()
