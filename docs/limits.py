@@ -77,17 +77,20 @@ def main() -> None:
 
 
 def measured(cells: Sequence[Cell]) -> Iterator[str]:
-    """A row for each family: how many cells of each kind, and the worst of those that varpin says nothing of."""
-    yield "| extreme | cells | accurate | degraded | refused | stopped | silent wrong | worst unsaid error | of |"
-    yield "|---|---|---|---|---|---|---|---|---|"
+    """A row for each family: cells of each kind, needless warnings, and the worst of what varpin says nothing of."""
+    yield (
+        "| extreme | cells | accurate | degraded | refused | stopped | silent wrong | warned needlessly "
+        "| worst unsaid error | of |"
+    )
+    yield "|---" * 10 + "|"
     for family in families(cells):
         members = [cell for cell in cells if cell.family == family]
-        counts = [sum(cell.kind is kind for cell in members) for kind in Kind]
+        counts = [*(sum(cell.kind is kind for cell in members) for kind in Kind), sum(c.needless for c in members)]
         quiet = [cell for cell in members if cell.kind is Kind.ACCURATE and not math.isnan(cell.error)]
         worst = max(quiet, key=lambda cell: cell.error, default=None)
         text = "| |" if worst is None else f"{worst.error:.1e} | {worst.trial}, {worst.integrator} |"
         yield f"| {family} | {len(members)} | " + " | ".join(map(str, counts)) + f" | {text}"
-    total = [sum(cell.kind is kind for cell in cells) for kind in Kind]
+    total = [*(sum(cell.kind is kind for cell in cells) for kind in Kind), sum(cell.needless for cell in cells)]
     yield f"| all | {len(cells)} | {' | '.join(map(str, total))} | | |"
 
 
@@ -146,7 +149,7 @@ def in_words(trial: Trial, motion: Callable[[peers.Case, float], peers.Motion | 
     exact = truth(trial)
     known = exact.nodes < len(q)
     with np.errstate(over="ignore", invalid="ignore"):
-        error = (np.abs(q[exact.nodes[known]] - exact.q[known]) / exact.way).max(initial=0.0)
+        error = np.abs(q[exact.nodes[known]] - exact.q[known]).max(initial=0.0) / exact.way
         at = np.unique(np.linspace(0, len(q) - 1, 200).astype(int))
         jets = [lagrangian_jet(setup.scene, q[k], v[k]) for k in at]
         kinetic = np.array([0.5 * v[k] @ jet.Lv for k, jet in zip(at, jets, strict=True)])

@@ -29,7 +29,7 @@ Integers = NDArray[np.int64]
 ENERGY_BUDGET = 0.1
 # Error of a joint's position that is spoken of, in units of its way over a period; and of its velocity, in units of its
 # largest one: velocities have peaks, which a small shift in time moves by much.
-COARSE, COARSE_VELOCITY = 0.045, 0.3
+COARSE, COARSE_VELOCITY = 0.05, 0.2
 # Steps taken again at the start, and at each other place looked at.
 _FIRST, _WINDOW = 384, 64
 # Later on, errors in units of what is spoken of at the start: by then a motion has gone further than from there.
@@ -39,7 +39,7 @@ _VIOLENT, _SPREAD = 4, 3
 # Nodes on either side of a place within which a joint's period is looked for.
 _HORIZON = 1024
 # A small disturbance that grows by this is the motion's own doing: from there on no single motion can be told.
-_PREDICTABLE, _DISTURBANCE = 10.0, 1e-7
+_PREDICTABLE, _DISTURBANCE = 30.0, 1e-7
 # What a joint does that moves this much less than others of its kind, and with this much less speed than would have
 # their energy, is measured in these parts of theirs.
 _LITTLE, _LIGHT = 1e-2, 1e-2
@@ -144,7 +144,8 @@ def _fast_damping(scene: Scene, trajectory: Trajectory) -> float:
 
 def _ringing(rate: float, dt: float) -> str:
     return (
-        f"damping is faster than the step (dt * {rate:.3g}/s > 2): velocities that it should stop will ring; "
+        f"damping is faster than the step (dt * {rate:.3g}/s = {dt * rate:.3g} > 2): velocities that it should stop "
+        "will ring; "
         f"dt below {2.0 / rate:.3g} s resolves it"
     )
 
@@ -315,9 +316,12 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     worst = None
     places = _places(trajectory.v)
     inertia = np.array([np.diag(M) for M in _masses(scene, trajectory.q[places])]).max(axis=0)
+    # Half a step is as little as a whole one to dampers that are far faster.
+    fast = trajectory.dt * _fast_damping(scene, trajectory)
+    finer = int(2 ** np.clip(np.ceil(np.log2(max(1.0, fast))), 0, 3))
     for place in places:
         try:
-            found = _error_at(scene, integrator, trajectory, int(place), inertia)
+            found = _error_at(scene, integrator, trajectory, int(place), inertia, finer)
         except SingularMassMatrix:
             continue
         if found is not None and (worst is None or not found.worst <= worst.worst):
@@ -348,7 +352,7 @@ def _places(v: Floats) -> Integers:
 
 
 def _error_at(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, place: int, inertia: Floats
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, place: int, inertia: Floats, finer: int
 ) -> MotionError | None:
     """The error at one place; None where steps cannot be taken again."""
     ahead = slice(place, place + _HORIZON + 1)
@@ -356,7 +360,7 @@ def _error_at(
     variation = np.abs(np.diff(trajectory.v[ahead], axis=0)).cumsum(axis=0)
     # A period is two thirds of it.
     judged = np.where(whole, (2 * span + 2) // 3, span)
-    count, parts = _affordable(trajectory, place, int(judged.max()))
+    count, parts = _affordable(trajectory, place, int(judged.max()), finer)
     if not parts:
         return None
     again = _taken_again(scene, integrator, trajectory, place, count, parts)
@@ -365,17 +369,19 @@ def _error_at(
     recorded = trajectory.q[place : place + count + 1], trajectory.v[place : place + count + 1]
     if scene.noise.diffusion is None and trajectory.dw.any():
         # Kicks that only Python knows are left out of both.
-        plain = _taken_again(scene, integrator, trajectory, place, count, parts // 2)
+        plain = _taken_again(scene, integrator, trajectory, place, count, parts // (2 * finer))
         if plain is None:
             return None
         recorded = plain
-    units = _units(scene, trajectory, place, span, whole, inertia)
     # The part of the error that is left with the smaller steps.
     taken = np.maximum(trajectory.statistics.substeps[place : place + count], 1)
     left = float(parts) ** -integrator.order / np.mean(1.0 / taken.astype(float) ** integrator.order)
 
     def error(until: int) -> MotionError:
         here = np.minimum(judged, until)
+        # What cannot be told any more is no part of the way.
+        end = span if until == count else np.minimum(span, until)
+        units = _units(scene, trajectory, place, end, whole | (end < span), inertia)
         joints = np.arange(len(span))
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             off = [
@@ -419,15 +425,17 @@ def _periods(scene: Scene, q: Floats, v: Floats) -> tuple[Integers, NDArray[np.b
     return np.where(whole, over.argmax(axis=0) + 1, len(q) - 1), whole
 
 
-def _affordable(trajectory: Trajectory, place: int, span: int) -> tuple[int, int]:
-    """How many steps are taken again, each in how many parts: half of what they were taken in; (0, 0) for none.
+def _affordable(trajectory: Trajectory, place: int, span: int, finer: int) -> tuple[int, int]:
+    """How many steps are taken again, each in how many parts; (0, 0) for none.
+
+    These are half of what they were taken in, or that part of it again where dampers are faster.
 
     The work is at most that of some tens of steps, or an eighth of the motion's own.
     """
     length = _FIRST if place == 0 else _WINDOW
     substeps = np.maximum(trajectory.statistics.substeps, 1)
     most = max(4 * length, int(substeps.sum()) // 8)
-    parts = 2 * np.maximum.accumulate(substeps[place : place + min(length, span)])
+    parts = 2 * finer * np.maximum.accumulate(substeps[place : place + min(length, span)])
     affordable = parts * np.arange(1, len(parts) + 1) <= most
     if not affordable[0]:
         return 0, 0
@@ -466,11 +474,14 @@ def _units(
 
 def _predictable(scene: Scene, integrator: Integrator, trajectory: Trajectory, place: int, count: int) -> int:
     """Steps, one at least, until a small disturbance of q has grown out of hand."""
+    nodes = trajectory.q[place : place + count + 1]
     moved = _DISTURBANCE * max(1.0, float(np.abs(trajectory.q[place]).max()))
-    other = _taken_again(scene, integrator, trajectory, place, count, 1, moved)
+    # In v, by what the same part of the motion has.
+    way = max(float(np.ptp(nodes, axis=0).max()), moved)
+    faster = _DISTURBANCE * float(np.abs(trajectory.v[place : place + count + 1]).max()) / max(1.0, way)
+    other = _taken_again(scene, integrator, trajectory, place, count, 1, (moved, faster))
     if other is None:
         return 1
-    nodes = trajectory.q[place : place + count + 1]
     with np.errstate(over="ignore", invalid="ignore"):
         grown = ~(np.abs(other[0] - nodes).max(axis=1) <= _PREDICTABLE * moved)
     return max(1, int(grown.argmax())) if grown.any() else count
@@ -492,14 +503,20 @@ def _of_its_kind(scene: Scene, values: Floats) -> Floats:
 
 
 def _taken_again(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, place: int, count: int, parts: int, moved: float = 0.0
+    scene: Scene,
+    integrator: Integrator,
+    trajectory: Trajectory,
+    place: int,
+    count: int,
+    parts: int,
+    moved: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Floats, Floats] | None:
     """``count`` steps from a node on, q and v of their nodes (count + 1, n); each in parts, under the same forces.
 
-    NaN from where they fail; None if the first does. ``moved`` is added to q at first.
+    NaN from where they fail; None if the first does. ``moved`` is added to q and v at first.
     """
     steps = slice(place, place + count)
-    q, v = trajectory.q[place][None] + moved, trajectory.v[place][None].copy()
+    q, v = trajectory.q[place][None] + moved[0], trajectory.v[place][None] + moved[1]
     force = np.repeat(trajectory.u[steps] @ scene.actuation.T, parts, axis=0)[None]
     drawn = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
     if trajectory.dw.any() and scene.noise.diffusion is not None:

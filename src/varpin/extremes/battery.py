@@ -46,7 +46,7 @@ _SAVED_EVERY = 2.0
 Progress = Callable[[int, int, str], None]
 # What no coarse step excuses: a record that contradicts itself, and derivatives without their structure.
 _STRUCTURE = ("record", "symplecticity")
-_MEASURES = ("error", "velocity", "energy", "momentum", "reversal", "symplecticity", "record")
+_MEASURES = ("error", "joint", "velocity", "energy", "momentum", "reversal", "symplecticity", "record")
 
 
 class _OutOfTime(KeyboardInterrupt):

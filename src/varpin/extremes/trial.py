@@ -88,8 +88,9 @@ class Cell:
         trial: Its name.
         integrator: As text.
         kind: One of the five.
-        error: Largest distance in q from the exact motion over its window, each joint in units of its own way; of a
-            plan, the part of its cost that single controls would take off.
+        error: Largest distance in q from the exact motion over its window, in units of how far that goes; of a plan,
+            the part of its cost that single controls would take off.
+        joint: The same distance, each joint in units of its own way.
         velocity: The same of v, in units of each joint's largest velocity.
         energy: Largest error of the energy balance, in units of the energy there is to turn over.
         momentum: Largest change of the momentum that is to be conserved, in units of the largest one.
@@ -109,6 +110,7 @@ class Cell:
     integrator: str
     kind: Kind
     error: float
+    joint: float
     velocity: float
     energy: float
     momentum: float
