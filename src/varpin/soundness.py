@@ -43,7 +43,7 @@ _PREDICTABLE, _DISTURBANCE = 30.0, 1e-7
 # What a joint does that moves this much less than others of its kind, and with this much less speed than would have
 # their energy, is measured in these parts of theirs.
 _LITTLE, _LIGHT = 1e-2, 1e-2
-# Part of a joint's motion as a whole below which what it does at one place is rest.
+# Part of a joint's motion so far below which what it does at one place is rest.
 _REST = 1e-3
 # Part of a speed that counts as changed if nothing changes it: a wheel that turns evenly turns over next to nothing.
 _EVEN = 1e-3
@@ -462,8 +462,9 @@ def _units(
         nodes = slice(begin[i], place + span[i] + 1)
         way[i], speed[i] = np.ptp(trajectory.q[nodes, i]), np.abs(trajectory.v[nodes, i]).max()
         change[i] = _changed(trajectory.v[nodes, i : i + 1])[0]
-    way = np.maximum(way, _REST * np.ptp(trajectory.q, axis=0))
-    speed = np.maximum(speed, _REST * np.abs(trajectory.v).max(axis=0))
+        so_far = slice(0, place + span[i] + 1)
+        way[i] = max(way[i], _REST * np.ptp(trajectory.q[so_far, i]))
+        speed[i] = max(speed[i], _REST * np.abs(trajectory.v[so_far, i]).max())
     root = np.sqrt(inertia)
     light = _LIGHT * (root * change).max() / root
     least = np.minimum(_LITTLE * _of_its_kind(scene, speed), light)
