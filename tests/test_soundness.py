@@ -201,12 +201,12 @@ def test_even_turning_turns_over_nothing():
 
 @pytest.mark.parametrize("name", ["ur5", "panda"])
 def test_a_fast_joint_of_any_robot_hides_nothing(load, name):
-    """The last joint of an arm at 500 rad/s: the others are judged as without it."""
+    """A joint near the end of an arm at 50 rad/s: the others are judged as without it."""
     robot = load(name)
     scene, n = vp.Scene(robot), robot.dof
     q0, v0 = np.full(n, 0.3), np.zeros(n)
     calm = vp.simulate(scene, q0, v0, dt=0.02, steps=40, integrator=vp.ExplicitEuler())
-    v0[5 if name == "ur5" else 6] = 500.0
+    v0[5 if name == "ur5" else 6] = 50.0
     fast = vp.simulate(scene, q0, v0, dt=0.02, steps=40, integrator=vp.ExplicitEuler(), check=False)
     error = motion_error(scene, vp.ExplicitEuler(), fast)
     assert any("coarse" in sentence for sentence in calm.warnings)
@@ -248,10 +248,10 @@ def test_the_work_of_the_controls_is_turned_over():
 
 def test_a_short_blow_in_a_long_quiet_motion_is_found():
     """Five steps of the thousand are far too coarse: nothing of it shows at the start or at even distances."""
-    scene = vp.Scene(vp.planar_chain(2), gravity=False)
+    scene = vp.Scene(vp.planar_chain(2), gravity=False, damping=2.0)
     for at in (537, 611, 903):
         controls = np.zeros((1200, 2))
-        controls[at : at + 4] = np.array([[400.0, -400.0], [-400.0, 400.0], [400.0, -400.0], [-400.0, 400.0]])
+        controls[at : at + 4] = np.array([[150.0, -150.0], [-150.0, 150.0], [150.0, -150.0], [-150.0, 150.0]])
         motion = vp.simulate(
             scene, [0.0, 0.7], [1e-3, 0.0], dt=0.02, steps=1200, controls=controls, integrator=vp.SemiImplicitEuler()
         )
