@@ -239,7 +239,7 @@ def simulate(
             state expected there, which keeps second order. ``"start"``: at the node where the step begins, as a
             digital controller with a zero-order hold would, at the price of first order.
         check: Look at the finished motion, whether the balance of its energy closes and its steps resolve it, for
-            ``Trajectory.warnings`` and the log. It takes half a millisecond to one.
+            ``Trajectory.warnings`` and the log. It takes as long as some hundreds of steps.
         progress: Called now and then with (steps done, steps in all).
 
     Returns:

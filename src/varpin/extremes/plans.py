@@ -20,7 +20,7 @@ from varpin.noise import AdditiveNoise, ControlNoise, Noise
 from varpin.robot import Robot
 from varpin.robot.chain import rod_chain
 from varpin.scene import Scene
-from varpin.sddp import OptimalControlProblem, Solution, solve
+from varpin.sddp import OptimalControlProblem, Solution, Status, solve
 
 Floats = NDArray[np.float64]
 
@@ -119,7 +119,9 @@ def attempt(plan: Plan, integrator: Integrator, patience: float = math.inf) -> d
         wrong = wrong or solution.status.converged
         found.append(f"single controls take {left:.2g} off the cost (wrong from {LEFT_LEVEL:g})")
     said = (*(() if solution.status.converged else (solution.status.value,)), *warnings)
-    kind = Kind.WRONG if wrong else Kind.DEGRADED if said else Kind.ACCURATE
+    # Plans have a number of iterations here; one that it cuts short is no better and no worse than that.
+    cut = solution.status is Status.MAX_ITERATIONS
+    kind = Kind.WRONG if wrong else Kind.STOPPED if cut else Kind.DEGRADED if said else Kind.ACCURATE
     return outcome | {
         "kind": kind,
         "error": left,
