@@ -260,7 +260,8 @@ def _turned_over(scene: Scene, trajectory: Trajectory) -> Floats:
 def _changed(v: Floats) -> Floats:
     """By how much each joint's velocity changes over some nodes (n,), at most the largest; of v (K, n)."""
     fastest = np.abs(v).max(axis=0)
-    return np.clip(np.ptp(v, axis=0), _EVEN * fastest, fastest)
+    changed: Floats = np.clip(np.ptp(v, axis=0), _EVEN * fastest, fastest)
+    return changed
 
 
 def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
@@ -390,7 +391,8 @@ def _error_at(
             ]
             # Errors grow in the course of a period as the motion goes on.
             so_far = variation[here - 1, joints]
-            growth = np.where(so_far > 0.0, variation[judged - 1, joints] / so_far, judged / here)
+            growth = np.where(so_far > 0.0, variation[judged - 1, joints] / so_far, np.inf)
+            growth = np.minimum(growth, judged / here)
             growth = np.where(until == count, np.maximum(growth, 1.0), 1.0)
             rounding = 1e3 * np.finfo(np.float64).eps * (1.0 + np.abs(trajectory.q[place]).max())
             position = np.where(off[0] <= rounding, 0.0, off[0] * growth / units[0])
@@ -421,8 +423,9 @@ def _periods(scene: Scene, q: Floats, v: Floats) -> tuple[Integers, NDArray[np.b
     fastest = np.maximum.accumulate(np.abs(v), axis=0)[1:]
     round_once = ~_slides(scene) & (wide >= 2.0 * np.pi)
     over = ((gone >= 3.0 * wide) | round_once) & (varied >= 4.0 * fastest) & (wide > 0.0)
-    whole = over.any(axis=0)
-    return np.where(whole, over.argmax(axis=0) + 1, len(q) - 1), whole
+    whole = np.asarray(over.any(axis=0))
+    span: Integers = np.where(whole, over.argmax(axis=0) + 1, len(q) - 1)
+    return span, whole
 
 
 def _affordable(trajectory: Trajectory, place: int, span: int, finer: int) -> tuple[int, int]:
