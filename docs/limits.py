@@ -77,17 +77,20 @@ def main() -> None:
 
 
 def measured(cells: Sequence[Cell]) -> Iterator[str]:
-    """A row for each family: how many cells of each kind, and the worst of those that varpin says nothing of."""
-    yield "| extreme | cells | accurate | degraded | refused | stopped | silent wrong | worst unsaid error | of |"
-    yield "|---|---|---|---|---|---|---|---|---|"
+    """A row for each family: cells of each kind, needless warnings, and the worst of what varpin says nothing of."""
+    yield (
+        "| extreme | cells | accurate | degraded | refused | stopped | silent wrong | warned needlessly "
+        "| worst unsaid error | of |"
+    )
+    yield "|---" * 10 + "|"
     for family in families(cells):
         members = [cell for cell in cells if cell.family == family]
-        counts = [sum(cell.kind is kind for cell in members) for kind in Kind]
+        counts = [*(sum(cell.kind is kind for cell in members) for kind in Kind), sum(c.needless for c in members)]
         quiet = [cell for cell in members if cell.kind is Kind.ACCURATE and not math.isnan(cell.error)]
         worst = max(quiet, key=lambda cell: cell.error, default=None)
         text = "| |" if worst is None else f"{worst.error:.1e} | {worst.trial}, {worst.integrator} |"
         yield f"| {family} | {len(members)} | " + " | ".join(map(str, counts)) + f" | {text}"
-    total = [sum(cell.kind is kind for cell in cells) for kind in Kind]
+    total = [*(sum(cell.kind is kind for cell in cells) for kind in Kind), sum(cell.needless for cell in cells)]
     yield f"| all | {len(cells)} | {' | '.join(map(str, total))} | | |"
 
 

@@ -79,14 +79,22 @@ def violent(robot, forced, rng):
 
 
 def check(name, forced, cases, seed):
-    """Counts of steps taken whole, of those cut or refused, and of those where Newton alone jumps."""
+    """Counts of steps taken whole, of those cut or refused, of those where Newton alone jumps, and of gentle ones.
+
+    Gentle are those in which the branch is followed easily; the last count is of those among them not taken whole.
+    """
     robot = vp.load_robot(name) if name == "finger" else vp.planar_chain(int(name[-1]))
     rng = np.random.default_rng(seed)
-    whole = cut = jumps = 0
+    whole = cut = jumps = gentle = refused = 0
     for case in range(cases):
         scene, q, v, h, force, dw, kick = violent(robot, forced, rng)
         increments = dw[None] if forced else None
-        impulse = vp.lagrangian_jet(scene, q, v, backend="pinocchio").Lv + kick
+        jet = vp.lagrangian_jet(scene, q, v, backend="pinocchio")
+        impulse = jet.Lv + kick
+        # Where the step changes little of the momentum, nothing is in the way of taking it whole.
+        _, slope, _ = equation(scene, q, impulse, force, h, np.linalg.solve(jet.Lvv, impulse))
+        easy = np.abs(np.linalg.solve(jet.Lvv, -slope) - np.eye(len(q))).max() < 0.05
+        gentle += easy
         right = connected_root(scene, q, impulse, force, h)
         alone = newton_alone(scene, q, impulse, force, h, v)
         jumps += alone is not None and (right is None or np.abs(alone - right).max() > 1e-3 * np.abs(right).max())
@@ -94,16 +102,17 @@ def check(name, forced, cases, seed):
             motion = vp.simulate(scene, q, v, dt=h, steps=1, controls=force, increments=increments)
         except vp.StepFailure:
             cut += 1
+            refused += easy
             continue
         if motion.statistics.substeps[0] > 1:
             cut += 1
-            assert any("parts" in sentence for sentence in motion.warnings), case
+            refused += easy
             continue
         whole += 1
         assert right is not None, (case, "the branch ends before dt")
         taken = (motion.q[1] - q) / h
         assert np.abs(taken - right).max() <= 1e-8 * np.abs(right).max(), case
-    return whole, cut, jumps
+    return whole, cut, jumps, gentle, refused
 
 
 NAMES = ["chain2", "chain3", "finger"]
@@ -112,7 +121,9 @@ NAMES = ["chain2", "chain3", "finger"]
 @pytest.mark.parametrize("forced", [False, True], ids=["free", "forced"])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_whole_step_is_on_the_branch_that_starts_at_nothing(name, forced):
-    whole, cut, jumps = check(name, forced, 40, seed=5)
+    whole, cut, jumps, gentle, refused = check(name, forced, 40, seed=5)
+    # A solver that refuses what is easy proves nothing by what it takes.
+    assert refused <= 0.3 * gentle
     assert whole >= 5
     assert cut >= 5
     # The cases are violent enough for Newton alone to end on other branches.
@@ -123,7 +134,8 @@ def test_a_whole_step_is_on_the_branch_that_starts_at_nothing(name, forced):
 @pytest.mark.parametrize("forced", [False, True], ids=["free", "forced"])
 @pytest.mark.parametrize("name", NAMES)
 def test_many_whole_steps_are_on_the_branch_that_starts_at_nothing(name, forced):
-    whole, cut, jumps = check(name, forced, 200, seed=6)
+    whole, cut, jumps, gentle, refused = check(name, forced, 200, seed=6)
+    assert refused <= 0.3 * gentle
     assert whole >= 40
     assert cut >= 40
     assert jumps >= 5

@@ -44,6 +44,12 @@ dt { padding: 0 0.5rem; } dd { margin: 0; }
 """
 
 
+def false_alarms(record: Record) -> str:
+    """How many warnings were needless, in words."""
+    warned = record.counts()[Kind.DEGRADED]
+    return f"Of {warned} cells that varpin warns of, {len(record.needless())} fail no check: false alarms."
+
+
 def entry(cell: Cell) -> str:
     """A cell in a few signs: its letter and its error, or how far it came."""
     if cell.kind is Kind.STOPPED:
@@ -102,6 +108,7 @@ def _page(record: Record) -> str:
 in units of how far that motion goes; E stands before the error of the energy balance over the whole run, in units of
 the energy there is to turn over, where no exact motion is known. Point at a cell for all of its measures.{missing}</p>
 <dl>{legend}</dl>
+<p>{false_alarms(record)}</p>
 <table><thead><tr><th>scene</th>{head}</tr></thead><tbody>{"".join(_rows(columns, rows))}</tbody></table>
 </body></html>
 """
@@ -124,9 +131,10 @@ def _box(cell: Cell) -> str:
 
 def details(cell: Cell) -> str:
     """All there is to say of a cell."""
-    names = ("error", "energy", "momentum", "reversal", "symplecticity", "record")
+    names = ("error", "joint", "velocity", "energy", "momentum", "reversal", "symplecticity", "record")
     values = [f"{name} {getattr(cell, name):.2g}" for name in names if not math.isnan(getattr(cell, name))]
-    lines = [f"{cell.kind.value}; {cell.done} of {cell.steps} steps, {cell.seconds:.2g} s", ", ".join(values)]
+    kind = f"{cell.kind.value}, needlessly" if cell.needless else cell.kind.value
+    lines = [f"{kind}; {cell.done} of {cell.steps} steps, {cell.seconds:.2g} s", ", ".join(values)]
     return "\n".join(line for line in (*lines, *cell.found, *cell.said) if line)
 
 

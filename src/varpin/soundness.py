@@ -1,8 +1,8 @@
-"""What a finished motion says of itself: does its energy balance close, and do its steps resolve it?
+"""What a finished motion says of itself: does its energy balance close, and is it the motion of the robot?
 
-Both are asked of every integrator after the run, from its record and a few of its steps; what the guards of a step
-let pass, and integrators without guards, are told of here. Whoever makes a motion that a user sees calls
-:func:`examined`, and :func:`announce` for the log.
+Both are asked of every integrator after the run, from its record and by taking parts of it again in smaller steps; what
+the guards of a step let pass, and integrators without guards, are told of here. Whoever makes a motion that a user sees
+calls :func:`examined`, and :func:`announce` for the log.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from varpin.chatter import alternation
 from varpin.errors import SingularMassMatrix
-from varpin.integrators import Integrator, Reference
+from varpin.integrators import ExplicitEuler, Integrator, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.lagrangian import lagrangian_jet
@@ -24,19 +24,37 @@ from varpin.scene import Scene
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
-# Error of the energy balance that is spoken of, in units of the energy there was to turn over.
-ENERGY_BUDGET = 0.05
-# Error of a step that is spoken of, in units of what the step does. Over a period that makes some percent.
-COARSE = 0.005
-# Steps looked at: those that change the velocity most, and as many spread over the motion.
-_LOOKED_AT = 4
+# Error of the energy balance that is spoken of, in units of the energy that was turned over.
+ENERGY_BUDGET = 0.1
+# Error of a joint's position that is spoken of, in units of its way over a period; and of its velocity, in units of its
+# largest one: velocities have peaks, which a small shift in time moves by much.
+COARSE, COARSE_VELOCITY = 0.05, 0.2
+# Steps taken again at the start, and at each other place looked at.
+_FIRST, _WINDOW = 384, 64
+# Later on, errors in units of what is spoken of at the start: by then a motion has gone further than from there.
+_LATER = 0.5
+# Other places looked at: where velocities change most, and as many spread over the motion.
+_VIOLENT, _SPREAD = 4, 3
+# Nodes on either side of a place within which a joint's period is looked for.
+_HORIZON = 1024
+# A small disturbance that grows by this is the motion's own doing: from there on no single motion can be told.
+_PREDICTABLE, _DISTURBANCE = 30.0, 1e-7
+# What a joint does that moves this much less than others of its kind, and with this much less speed than would have
+# their energy, is measured in these parts of theirs.
+_LITTLE, _LIGHT = 1e-2, 1e-2
+# Part of a joint's motion so far below which what it does at one place is rest.
+_REST = 1e-3
+# Part of a speed that counts as changed if nothing changes it: a wheel that turns evenly turns over next to nothing.
+_EVEN = 1e-3
+# Nodes at which mass matrices, and energies of single groups, are looked at; and rates of dampers.
+_NODES, _INERTIAS = 16, 4
 # Velocities below this count as none [rad/s or m/s]: what rounding leaves of a robot in equilibrium.
 _STILL = 1e-9
 
-
-# The kind of finding that says nothing against the motion as a solution of its equations.
-JOINT_LIMITS = "joint limits"
+# The kind of finding that says nothing against the motion as a solution of its equations, and how its sentence begins.
+JOINT_LIMITS = "joints leave their limits"
 # Beyond its limit by more than this a joint is spoken of [rad or m]; and so many of them with numbers.
 _OUTSIDE, _NAMED = 1e-6, 6
 
@@ -55,17 +73,25 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class StepError:
-    """How far a step is from the same in two halves, at its worst over the steps looked at.
+class MotionError:
+    """How far a motion is from that of smaller steps, at its worst over the joints and the places looked at.
 
     Attributes:
-        step: Its index.
-        error: The distance, in units of what the step does: of its way in q, or of its change of v; joints that turn
-            and joints that slide each by themselves.
+        step: Where the place begins.
+        joint: Which coordinate.
+        position: Error of q there over a period, in units of the joint's way over it.
+        velocity: Error of v, in units of the joint's largest.
     """
 
     step: int
-    error: float
+    joint: int
+    position: float
+    velocity: float
+
+    @property
+    def worst(self) -> float:
+        """The larger error, in units of what is spoken of."""
+        return max(self.position / COARSE, self.velocity / COARSE_VELOCITY)
 
 
 def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Trajectory, tuple[Finding, ...]]:
@@ -73,7 +99,11 @@ def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tu
     if not integrator.variational:
         own = replace(trajectory.statistics, energy_defect=energy_defects(scene, trajectory))
         trajectory = replace(trajectory, statistics=own)
-    found = (*evident(scene, trajectory), *_looked_for(scene, integrator, trajectory), *alternating(scene, trajectory))
+    found = (
+        *_looked_for(scene, integrator, trajectory),
+        *alternating(scene, trajectory),
+        *_beyond_limits(scene, trajectory),
+    )
     return with_warnings(trajectory, found), found
 
 
@@ -105,16 +135,15 @@ def announce(logger: logging.Logger, scene: Scene, dt: float, found: Iterable[Fi
 
 
 def evident(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """What the record tells without taking steps again: dampers faster than the step, steps taken in parts."""
-    found = list(_ringing(scene, trajectory.q, trajectory.dt))
-    if split := trajectory.statistics.split_steps:
-        most, steps, dt = trajectory.statistics.substeps.max(), trajectory.steps, trajectory.dt
-        found.append(
-            Finding(
-                "split steps",
-                f"{split} of {steps} steps were taken in up to {most} parts: dt = {dt:g} s is coarse here",
-            )
-        )
+    """What may be wrong, from the record alone: dampers faster than the step, steps taken in parts, limits left.
+
+    For whoever does not take steps again; :func:`examined` says what is wrong.
+    """
+    found = []
+    if rate := _fast_damping(scene, trajectory):
+        found.append(Finding("fast damping", _ringing(rate, trajectory.dt)))
+    if split := _in_parts(trajectory):
+        found.append(Finding("split steps", f"{split}: dt = {trajectory.dt:g} s is coarse here"))
     return (*found, *_beyond_limits(scene, trajectory))
 
 
@@ -140,70 +169,149 @@ def _beyond_limits(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
         limit = upper[c] if side == "above" else lower[c]
         parts.append(f"{name!r} {since}, at most {most[c]:.3g} {unit} {side} {limit:.4g} at t = {t:.4g} s")
     more = f"; and {len(joints) - _NAMED} more" if len(joints) > _NAMED else ""
-    return (Finding(JOINT_LIMITS, f"joints leave their limits, which nothing stops: {'; '.join(parts)}{more}"),)
+    return (Finding(JOINT_LIMITS, f"{JOINT_LIMITS}, which nothing stops: {'; '.join(parts)}{more}"),)
 
 
-def _ringing(scene: Scene, q: Floats, dt: float) -> tuple[Finding, ...]:
-    """Says if dampers are too fast for the step: the midpoint rule keeps stable, but turns velocities round."""
+def _in_parts(trajectory: Trajectory) -> str:
+    """How many steps were taken in parts, in words; empty if none."""
+    split = trajectory.statistics.split_steps
+    if not split:
+        return ""
+    most = trajectory.statistics.substeps.max()
+    return f"{split} of {trajectory.steps} steps were taken in up to {most} parts"
+
+
+def _fast_damping(scene: Scene, trajectory: Trajectory) -> float:
+    """The fastest rate of the dampers [1/s] if a step cannot resolve it, else 0."""
     if not scene.damping.any():
-        return ()
+        return 0.0
     # Rates change along the motion as the inertia does.
-    fastest = max(
-        _damping_rate(scene, q[k]) for k in np.unique(np.linspace(0, len(q) - 1, _LOOKED_AT).astype(np.int64))
-    )
-    if 0.5 * dt * fastest <= 1.0:
-        return ()
+    at = np.unique(np.linspace(0, trajectory.steps, _INERTIAS).astype(np.int64))
+    rates = np.linalg.solve(_masses(scene, trajectory.q[at]), np.diag(scene.damping))
+    fastest = float(np.abs(np.linalg.eigvals(rates)).max()) if np.isfinite(rates).all() else np.inf
+    return fastest if trajectory.dt * fastest > 2.0 else 0.0
+
+
+def _ringing(rate: float, dt: float) -> str:
     return (
-        Finding(
-            "fast damping",
-            f"damping is faster than the step (dt * {fastest:.3g}/s > 2): velocities that it should stop will ring; "
-            f"dt below {2.0 / fastest:.3g} s resolves it",
-        ),
+        f"damping is faster than the step (dt * {rate:.3g}/s = {dt * rate:.3g} > 2): velocities that it should stop "
+        "will ring; "
+        f"dt below {2.0 / rate:.3g} s resolves it"
     )
 
 
-def _damping_rate(scene: Scene, q: Floats) -> float:
-    """The fastest rate at which dampers stop a motion at a configuration [1/s]."""
-    rate = np.linalg.solve(lagrangian_jet(scene, q, np.zeros_like(q)).Lvv, np.diag(scene.damping))
-    return float(np.abs(np.linalg.eigvals(rate)).max()) if np.isfinite(rate).all() else np.inf
+def _masses(scene: Scene, q: Floats) -> Floats:
+    """M at some configurations (K, n, n)."""
+    return np.array([lagrangian_jet(scene, row, np.zeros_like(row)).Lvv for row in q])
 
 
 def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
     """What the balance of the energy and steps taken again tell."""
     if not trajectory.steps:
         return ()
-    found = []
-    defect = np.abs(trajectory.statistics.energy_defect)
-    scale = energy_scale(scene, trajectory)
-    worst = int(np.argmax(defect))
-    rounding = 1e-12 * float(np.abs(trajectory.energy).max())
-    # Written such that what is not finite is spoken of.
-    if not defect[worst] <= ENERGY_BUDGET * scale + rounding:
-        share = f", {100 * defect[worst] / scale:.3g}% of what there was to turn over" if scale > 0.0 else ""
-        found.append(
-            Finding(
-                "energy",
-                f"the energy is off by {defect[worst]:.3g} J at t = {trajectory.t[worst + 1]:.4g} s{share}: "
-                f"dt = {trajectory.dt:g} s is too long for {integrator}",
-            )
+    found = [*_energy(scene, integrator, trajectory)]
+    error = motion_error(scene, integrator, trajectory)
+    if error is not None and not error.worst <= 1.0:
+        dt, start = trajectory.dt, trajectory.t[error.step]
+        off = (
+            f"smaller steps from t = {start:.4g} s on move joint {trajectory.joint_names[error.joint]!r} by "
+            f"{100 * error.position:.3g}% of its way over a period, and its velocity by {100 * error.velocity:.3g}%"
         )
-    step = step_error(scene, integrator, trajectory)
-    if step is not None and not step.error <= COARSE:
-        found.append(
-            Finding(
-                "coarse steps",
-                f"dt = {trajectory.dt:g} s is coarse for {integrator} here: halving it moves the step at "
-                f"t = {trajectory.t[step.step]:.4g} s by {100 * step.error:.3g}% of what the step does",
-            )
-        )
+        if rate := _fast_damping(scene, trajectory):
+            found.append(Finding("fast damping", f"{_ringing(rate, dt)}; {off}"))
+        else:
+            split = f" ({_in_parts(trajectory)})" if _in_parts(trajectory) else ""
+            found.append(Finding("coarse steps", f"dt = {dt:g} s is coarse for {integrator} here: {off}{split}"))
     return tuple(found)
 
 
+def _energy(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Says if the energy is off, of the whole robot or of a group of joints that moves by itself."""
+    worst: tuple[float, int, float, float] | None = None
+    for at, defect, scale in _balances(scene, integrator, trajectory):
+        # Dampers take what a coarse step leaves too much of: what is lost to them is no error of the motion.
+        off = np.maximum(defect, 0.0) if scene.damping.any() else np.abs(defect)
+        last = int(np.argmax(off))
+        rounding = 1e-12 * float(np.abs(trajectory.energy).max())
+        # Written such that what is not finite is spoken of.
+        if not off[last] <= ENERGY_BUDGET * scale + rounding:
+            share = float(off[last] / scale) if scale > 0.0 else np.inf
+            if worst is None or not share <= worst[0]:
+                worst = share, int(at[last]), float(off[last]), scale
+    if worst is None:
+        return ()
+    share, node, energy, scale = worst
+    part = f", {100 * share:.3g}% of what was turned over" if np.isfinite(share) else ""
+    return (
+        Finding(
+            "energy",
+            f"the energy is off by {energy:.3g} J at t = {trajectory.t[node]:.4g} s{part}: "
+            f"dt = {trajectory.dt:g} s is too long for {integrator}",
+        ),
+    )
+
+
+def _balances(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> list[tuple[Integers, Floats, float]]:
+    """Nodes, what the energy is off by there [J], and the energy turned over [J]: of all joints, and of each group.
+
+    Guards hold the balance of every group in each step of a variational integrator.
+    """
+    at = np.arange(1, trajectory.steps + 1)
+    turned = _turned_over(scene, trajectory)
+    work, _ = _works(scene, trajectory)
+    worked = np.abs(np.cumsum(work, axis=0)).max(axis=0, initial=0.0)
+    found = [(at, trajectory.statistics.energy_defect, energy_scale(scene, trajectory))]
+    tree = scene.robot.tree
+    if integrator.variational or tree.groups < 2 or scene.noise.diffusion is None:
+        return found
+    some = np.unique(np.linspace(1, trajectory.steps, _NODES).astype(np.int64))
+    for group in range(tree.groups):
+        own = tree.group == group
+        scale = float(turned[own].sum() + worked[own].sum())
+        found.append((some, _defects_of(scene, trajectory, own)[some], scale))
+    return found
+
+
+def _defects_of(scene: Scene, trajectory: Trajectory, own: NDArray[np.bool_]) -> Floats:
+    """What the energy of some joints is off by (N + 1,) [J]; they move by themselves. Zero but at some nodes."""
+    kicked, given = _kicks(scene, trajectory)
+    work, heat = _works(scene, trajectory, kicked)
+    gained = np.append(0.0, np.cumsum((work - heat + given)[:, own].sum(axis=1)))
+    kinetic = 0.5 * (trajectory.p * trajectory.v)[:, own].sum(axis=1)
+    off = np.zeros(trajectory.steps + 1)
+    still, rest = np.zeros(scene.robot.dof), trajectory.q[0]
+    first = lagrangian_jet(scene, rest, still).L
+    for node in np.unique(np.linspace(1, trajectory.steps, _NODES).astype(np.int64)):
+        potential = first - lagrangian_jet(scene, np.where(own, trajectory.q[node], rest), still).L
+        off[node] = kinetic[node] - kinetic[0] + potential - gained[node]
+    return off
+
+
 def energy_scale(scene: Scene, trajectory: Trajectory) -> float:
-    """The energy that a motion has to turn over [J]: its largest kinetic energy, and the work of the controls."""
+    """The energy that a motion turns over [J]: the kinetic energy that its joints gain or lose, and the controls' work.
+
+    What turns evenly all the time, however fast, turns nothing over.
+    """
     kinetic = 0.5 * np.einsum("ki,ki->k", trajectory.p, trajectory.v)
     work, _ = _works(scene, trajectory)
-    return float(kinetic.max() + np.abs(np.cumsum(work)).max(initial=0.0))
+    turned = min(float(kinetic.max()), float(_turned_over(scene, trajectory).sum()))
+    return turned + float(np.abs(np.cumsum(work.sum(axis=1))).max(initial=0.0))
+
+
+def _turned_over(scene: Scene, trajectory: Trajectory) -> Floats:
+    """Of each joint, the kinetic energy of the largest change of its velocity (n,) [J], for all it has to move."""
+    at = np.unique(np.linspace(0, trajectory.steps, _NODES).astype(np.int64))
+    inertia = np.array([np.diag(M) for M in _masses(scene, trajectory.q[at])]).max(axis=0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        turned: Floats = 0.5 * inertia * _changed(trajectory.v) ** 2
+    return turned
+
+
+def _changed(v: Floats) -> Floats:
+    """By how much each joint's velocity changes over some nodes (n,), at most the largest; of v (K, n)."""
+    fastest = np.abs(v).max(axis=0)
+    changed: Floats = np.clip(np.ptp(v, axis=0), _EVEN * fastest, fastest)
+    return changed
 
 
 def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
@@ -216,85 +324,270 @@ def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
         return np.zeros(trajectory.steps)
     kicked, given = _kicks(scene, trajectory)
     work, heat = _works(scene, trajectory, kicked)
-    gained: Floats = trajectory.energy[1:] - trajectory.energy[0] - np.cumsum(work - heat + given)
+    given_in_all = np.cumsum((work - heat + given).sum(axis=1))
+    gained: Floats = trajectory.energy[1:] - trajectory.energy[0] - given_in_all
     return np.nan_to_num(gained, nan=np.inf)
 
 
 def _works(scene: Scene, trajectory: Trajectory, kicked: Floats | float = 0.0) -> tuple[Floats, Floats]:
-    """Work of the controls, and what the dampers take, in each step (N,) [J], which a kick of v (N, n) begins."""
+    """Work of the controls, and the least that the dampers can take, at each joint in each step (N, n) [J].
+
+    A kick of v (N, n) begins each step. Dampers take least where the velocity is even, and q knows its mean.
+    """
     h, before, after = trajectory.dt, trajectory.v[:-1] + kicked, trajectory.v[1:]
     force = trajectory.u @ scene.actuation.T
     with np.errstate(over="ignore", invalid="ignore"):
-        work = 0.5 * h * np.einsum("ki,ki->k", force, before + after)
-        heat = h / 3.0 * ((before**2 + before * after + after**2) @ scene.damping)
+        work = 0.5 * h * force * (before + after)
+        even = (np.diff(trajectory.q, axis=0) / h) ** 2
+        heat = h * np.minimum((before**2 + before * after + after**2) / 3.0, even) * scene.damping
     return work, heat
 
 
 def _kicks(scene: Scene, trajectory: Trajectory) -> tuple[Floats | float, Floats | float]:
-    """What each step's kick does to v (N, n) and to the energy (N,) [J], if it comes all at once before the step."""
+    """What each step's kick does to v and to the energy [J], at each joint (N, n), if it comes all at once before."""
     if not trajectory.dw.any():
         return 0.0, 0.0
     q, v = trajectory.q[:-1], trajectory.v[:-1]
     fields = scene.noise.fields(q, v, trajectory.u, trajectory.q[0]).F
     impulse = np.einsum("kij,kj->ki", fields, trajectory.dw)
     change = np.einsum("kij,kj->ki", accelerations(scene, q, v, np.zeros_like(q))[3], impulse)
-    return change, np.einsum("ki,ki->k", impulse, v + 0.5 * change)
+    return change, impulse * (v + 0.5 * change)
 
 
-def step_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> StepError | None:
-    """The error of single steps, by taking some of them again, whole and in two halves and without noise.
+def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> MotionError | None:
+    """The error of a motion, by taking parts of it again from their first nodes, in steps of half the length.
 
-    It says nothing of how errors grow. None where nothing moves, and for an integrator that chooses its own steps.
+    The start, the places where velocities change most and some spread over the motion are looked at, over a period of
+    each joint or what can be had of it. Each joint is judged in units of its own motion. It says nothing of how errors
+    grow over many periods. None where nothing moves, and for an integrator that chooses its own steps.
     """
-    fastest = _of_its_kind(scene, np.abs(trajectory.v).max(axis=0))
-    if isinstance(integrator, Reference) or not fastest.max() > _STILL:
+    moved = np.abs(trajectory.v).max(initial=0.0)
+    if isinstance(integrator, Reference) or not trajectory.steps or not moved > _STILL:
         return None
-    change = np.abs(np.diff(trajectory.v, axis=0)).max(axis=1)
-    last = len(change) - 1
-    most = np.argpartition(change, max(0, last - _LOOKED_AT + 1))[-_LOOKED_AT:]
-    spread = np.linspace(0, last, _LOOKED_AT + 1)[1:].astype(np.int64)
-    at = np.unique(np.concatenate([[0], most, spread]))
-    q, v, h = trajectory.q[at], trajectory.v[at], trajectory.dt
-    force = trajectory.u[at] @ scene.actuation.T
-    try:
-        whole, halves = (_end(scene, integrator, q, v, force, h / parts, parts) for parts in (1, 2))
-    except SingularMassMatrix:
+    worst = None
+    places = _places(trajectory.v)
+    inertia = np.array([np.diag(M) for M in _masses(scene, trajectory.q[places])]).max(axis=0)
+    # Half a step is as little as a whole one to dampers that are far faster.
+    fast = trajectory.dt * _fast_damping(scene, trajectory)
+    finer = int(2 ** np.clip(np.ceil(np.log2(max(1.0, fast))), 0, 3))
+    for place in places:
+        try:
+            found = _error_at(scene, integrator, trajectory, int(place), inertia, finer)
+        except SingularMassMatrix:
+            continue
+        if found is not None and (worst is None or not found.worst <= worst.worst):
+            worst = found
+    return worst
+
+
+def _places(v: Floats) -> Integers:
+    """Where a motion is looked at: the first steps of its windows (K,); of v (N + 1, n)."""
+    steps = len(v) - 1
+    seen = np.zeros(steps, dtype=bool)
+    seen[:_FIRST] = True
+    found = [0]
+    change = np.abs(np.diff(v, axis=0))
+    most = change.max(axis=0)
+    # A joint's changes in units of its own largest.
+    change = ((change / np.where(most > 0.0, most, np.inf)) ** 2).sum(axis=1)
+    for _ in range(_VIOLENT):
+        if seen.all():
+            break
+        peak = int(np.argmax(np.where(seen, -1.0, change)))
+        found.append(min(max(0, peak - _WINDOW // 4), max(0, steps - _WINDOW)))
+        seen[found[-1] : found[-1] + _WINDOW] = True
+    for place in np.linspace(0, max(0, steps - _WINDOW), _SPREAD + 1)[1:].astype(np.int64):
+        if not seen[place : place + _WINDOW].all():
+            found.append(int(place))
+    return np.unique(found)
+
+
+def _error_at(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, place: int, inertia: Floats, finer: int
+) -> MotionError | None:
+    """The error at one place; None where steps cannot be taken again."""
+    ahead = slice(place, place + _HORIZON + 1)
+    span, whole = _periods(scene, trajectory.q[ahead], trajectory.v[ahead])
+    variation = np.abs(np.diff(trajectory.v[ahead], axis=0)).cumsum(axis=0)
+    # A period is two thirds of it.
+    judged = np.where(whole, (2 * span + 2) // 3, span)
+    count, parts = _affordable(trajectory, place, int(judged.max()), finer)
+    if not parts:
         return None
-    moves = np.where(fastest > _STILL, fastest, np.inf)
+    again = _taken_again(scene, integrator, trajectory, place, count, parts)
+    if again is None:
+        return None
+    recorded = trajectory.q[place : place + count + 1], trajectory.v[place : place + count + 1]
+    if scene.noise.diffusion is None and trajectory.dw.any():
+        # Kicks that only Python knows are left out of both.
+        plain = _taken_again(scene, integrator, trajectory, place, count, parts // (2 * finer))
+        if plain is None:
+            return None
+        recorded = plain
+    # The part of the error that is left with the smaller steps.
+    taken = np.maximum(trajectory.statistics.substeps[place : place + count], 1)
+    left = float(parts) ** -integrator.order / np.mean(1.0 / taken.astype(float) ** integrator.order)
+
+    def error(until: int) -> MotionError:
+        here = np.minimum(judged, until)
+        # What cannot be told any more is no part of the way.
+        end = span if until == count else np.minimum(span, until)
+        units = _units(scene, trajectory, place, end, whole | (end < span), inertia)
+        joints = np.arange(len(span))
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            off = [
+                np.maximum.accumulate(np.abs(a - b), axis=0)[here, joints] / (1.0 - left)
+                for a, b in zip(recorded, again, strict=True)
+            ]
+            # Errors grow in the course of a period as the motion goes on.
+            so_far = variation[here - 1, joints]
+            growth = np.where(so_far > 0.0, variation[judged - 1, joints] / so_far, np.inf)
+            growth = np.minimum(growth, judged / here)
+            growth = np.where(until == count, np.maximum(growth, 1.0), 1.0)
+            rounding = 1e3 * np.finfo(np.float64).eps * (1.0 + np.abs(trajectory.q[place]).max())
+            position = np.where(off[0] <= rounding, 0.0, off[0] * growth / units[0])
+            velocity = np.where(off[1] <= 1e-9 * units[1], 0.0, off[1] / units[1])
+        if place:
+            position, velocity = _LATER * position, _LATER * velocity
+        share = np.nan_to_num(np.maximum(position / COARSE, velocity / COARSE_VELOCITY), nan=np.inf)
+        joint = int(np.argmax(share))
+        return MotionError(place, joint, float(position[joint]), float(velocity[joint]))
+
+    found = error(count)
+    if not found.worst <= 1.0:
+        known = _predictable(scene, integrator, trajectory, place, count)
+        if known < count:
+            found = error(known)
+    return found
+
+
+def _periods(scene: Scene, q: Floats, v: Floats) -> tuple[Integers, NDArray[np.bool_]]:
+    """Over how many steps each joint goes to and fro, or right round (n,), for q and v (K + 1, n).
+
+    All of them where it does not, which the second value says. Where a joint turns back the way is as long as there and
+    back, and the velocity small; one and a half ways to and fro, with all that the velocity does, are no such place.
+    """
+    gone = np.abs(np.diff(q, axis=0)).cumsum(axis=0)
+    wide = (np.maximum.accumulate(q, axis=0) - np.minimum.accumulate(q, axis=0))[1:]
+    varied = np.abs(np.diff(v, axis=0)).cumsum(axis=0)
+    fastest = np.maximum.accumulate(np.abs(v), axis=0)[1:]
+    round_once = ~_slides(scene) & (wide >= 2.0 * np.pi)
+    over = ((gone >= 3.0 * wide) | round_once) & (varied >= 4.0 * fastest) & (wide > 0.0)
+    whole = np.asarray(over.any(axis=0))
+    span: Integers = np.where(whole, over.argmax(axis=0) + 1, len(q) - 1)
+    return span, whole
+
+
+def _affordable(trajectory: Trajectory, place: int, span: int, finer: int) -> tuple[int, int]:
+    """How many steps are taken again, each in how many parts; (0, 0) for none.
+
+    These are half of what they were taken in, or that part of it again where dampers are faster.
+
+    The work is at most that of some tens of steps, or an eighth of the motion's own.
+    """
+    length = _FIRST if place == 0 else _WINDOW
+    substeps = np.maximum(trajectory.statistics.substeps, 1)
+    most = max(4 * length, int(substeps.sum()) // 8)
+    parts = 2 * finer * np.maximum.accumulate(substeps[place : place + min(length, span)])
+    affordable = parts * np.arange(1, len(parts) + 1) <= most
+    if not affordable[0]:
+        return 0, 0
+    count = len(parts) if affordable.all() else int(affordable.argmin())
+    return count, int(parts[count - 1])
+
+
+def _units(
+    scene: Scene, trajectory: Trajectory, place: int, span: Integers, whole: NDArray[np.bool_], inertia: Floats
+) -> tuple[Floats, Floats]:
+    """In what each joint's errors of q and v are measured (n,): its way over a period, and its largest velocity.
+
+    A joint that hardly moves and has little energy is measured by the others.
+    """
+    n = len(span)
+    behind = slice(max(0, place - _HORIZON), place + 1)
+    before = np.zeros(n, dtype=np.int64)
+    if place:
+        before = _periods(scene, trajectory.q[behind][::-1], trajectory.v[behind][::-1])[0]
+    # Where the motion ends within a period, what came before completes it.
+    begin = place - np.where(whole, 0, before)
+    way, speed, change = np.empty(n), np.empty(n), np.empty(n)
+    for i in range(n):
+        nodes = slice(begin[i], place + span[i] + 1)
+        way[i], speed[i] = np.ptp(trajectory.q[nodes, i]), np.abs(trajectory.v[nodes, i]).max()
+        change[i] = _changed(trajectory.v[nodes, i : i + 1])[0]
+        so_far = slice(0, place + span[i] + 1)
+        way[i] = max(way[i], _REST * np.ptp(trajectory.q[so_far, i]))
+        speed[i] = max(speed[i], _REST * np.abs(trajectory.v[so_far, i]).max())
+    root = np.sqrt(inertia)
+    light = _LIGHT * (root * change).max() / root
+    least = np.minimum(_LITTLE * _of_its_kind(scene, speed), light)
+    least_way = np.minimum(_LITTLE * _of_its_kind(scene, way), light * span * trajectory.dt)
+    tiny = np.finfo(np.float64).tiny
+    return np.maximum(way, np.maximum(least_way, tiny)), np.maximum(speed, np.maximum(least, tiny))
+
+
+def _predictable(scene: Scene, integrator: Integrator, trajectory: Trajectory, place: int, count: int) -> int:
+    """Steps, one at least, until a small disturbance of q has grown out of hand."""
+    nodes = trajectory.q[place : place + count + 1]
+    moved = _DISTURBANCE * max(1.0, float(np.abs(trajectory.q[place]).max()))
+    # In v, by what the same part of the motion has.
+    way = max(float(np.ptp(nodes, axis=0).max()), moved)
+    faster = _DISTURBANCE * float(np.abs(trajectory.v[place : place + count + 1]).max()) / max(1.0, way)
+    other = _taken_again(scene, integrator, trajectory, place, count, 1, (moved, faster))
+    if other is None:
+        return 1
     with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(whole - halves)
-        turned = _of_its_kind(scene, np.nan_to_num(np.abs(halves[1] - v)).max(axis=0))
-        rounding = 1e3 * np.finfo(np.float64).eps * (1.0 + np.abs(q).max(axis=1)), 1e-12 * fastest
-        error = np.maximum(
-            np.where(off[0] <= rounding[0][:, None], 0.0, off[0] / (h * moves)),
-            np.where(off[1] <= rounding[1], 0.0, off[1] / np.maximum(turned, 1e-3 * moves)),
-        ).max(axis=1)
-    # A step that cannot be taken again, without the kick that came with it, says nothing.
-    if np.isnan(error).all():
-        return None
-    worst = int(np.nanargmax(error))
-    return StepError(int(at[worst]), float(error[worst]))
+        grown = ~(np.abs(other[0] - nodes).max(axis=1) <= _PREDICTABLE * moved)
+    return max(1, int(grown.argmax())) if grown.any() else count
+
+
+def _slides(scene: Scene) -> NDArray[np.bool_]:
+    """Which coordinates slide (n,)."""
+    tree = scene.robot.tree
+    slides = np.zeros(scene.robot.dof, dtype=bool)
+    slides[tree.coordinate[tree.prismatic > 0]] = True
+    return slides
 
 
 def _of_its_kind(scene: Scene, values: Floats) -> Floats:
     """For each coordinate (n,), the largest value of all that turn, or of all that slide: units do not compare."""
-    tree = scene.robot.tree
-    slides = np.zeros(len(values), dtype=bool)
-    slides[tree.coordinate[tree.prismatic > 0]] = True
+    slides = _slides(scene)
     largest: Floats = np.where(slides, values[slides].max(initial=0.0), values[~slides].max(initial=0.0))
     return largest
 
 
-def _end(scene: Scene, integrator: Integrator, q: Floats, v: Floats, force: Floats, dt: float, steps: int) -> Floats:
-    """Where ``steps`` steps under constant forces end, as (q, v) (2, P, n); NaN where they fail."""
-    paths, n = q.shape
+def _taken_again(
+    scene: Scene,
+    integrator: Integrator,
+    trajectory: Trajectory,
+    place: int,
+    count: int,
+    parts: int,
+    moved: tuple[float, float] = (0.0, 0.0),
+) -> tuple[Floats, Floats] | None:
+    """``count`` steps from a node on, q and v of their nodes (count + 1, n); each in parts, under the same forces.
+
+    NaN from where they fail; None if the first does. ``moved`` is added to q and v at first.
+    """
+    steps = slice(place, place + count)
+    q, v = trajectory.q[place][None] + moved[0], trajectory.v[place][None] + moved[1]
+    force = np.repeat(trajectory.u[steps] @ scene.actuation.T, parts, axis=0)[None]
+    drawn = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
+    if trajectory.dw.any() and scene.noise.diffusion is not None:
+        drawn = np.zeros((1, count * parts, trajectory.dw.shape[1]))
+        if isinstance(integrator, ExplicitEuler):
+            # Its kicks come after the step.
+            drawn[0, parts - 1 :: parts] = trajectory.dw[steps]
+        else:
+            drawn[0, ::parts] += integrator.left * trajectory.dw[steps]
+            drawn[0, parts - 1 :: parts] += (1.0 - integrator.left) * trajectory.dw[steps]
     state, _ = integrator.start(scene, q, v)
-    nothing = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
-    drift = np.repeat(force[:, None], steps, axis=1)
-    commands = open_loop(np.zeros((steps, scene.controls)))
-    segments = integrator.rollout_compiled(scene, state, commands, nothing, drift, dt)
-    end = np.full((2, paths, n), np.nan)
-    for i, segment in enumerate(segments):
-        if segment.failure is None:
-            end[:, i] = segment.q[-1], segment.v[-1]
-    return end
+    commands = open_loop(np.zeros((count * parts, scene.controls)))
+    (segment,) = integrator.rollout_compiled(scene, state, commands, drawn, force, trajectory.dt / parts)
+    done = len(segment.q) // parts
+    if not done:
+        return None
+    nodes = np.full((2, count + 1, q.shape[1]), np.nan)
+    for row, start, values in zip(nodes, (q, v), (segment.q, segment.v), strict=True):
+        row[0], row[1 : done + 1] = start[0], values[parts - 1 :: parts][:done]
+    return nodes[0], nodes[1]

@@ -205,6 +205,7 @@ def _extremes(request: argparse.Namespace, errors: Console) -> int:
         console.print(table)
         for kind, count in record.counts().items():
             say(console, f"{count} {kind.value}", prefix=report.LETTERS[kind])
+        say(console, report.false_alarms(record), prefix="needless")
         for path in files:
             say(console, str(path), prefix="written")
     for cell in record.wrong():

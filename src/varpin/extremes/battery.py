@@ -26,9 +26,10 @@ from varpin.extremes.trial import Cell, Kind, Setup, Trial
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
 from varpin.robot import Robot
 from varpin.simulation import Interrupted, simulate
+from varpin.soundness import JOINT_LIMITS
 from varpin.trajectory import Trajectory, atomic_file
 
-FORMAT = "varpin.extremes/1"
+FORMAT = "varpin.extremes/2"
 
 INTEGRATORS: tuple[Integrator, ...] = (
     *(Midpoint(alpha=alpha) for alpha in (0.0, 0.5, 1.0)),
@@ -46,7 +47,7 @@ _SAVED_EVERY = 2.0
 Progress = Callable[[int, int, str], None]
 # What no coarse step excuses: a record that contradicts itself, and derivatives without their structure.
 _STRUCTURE = ("record", "symplecticity")
-_MEASURES = ("error", "energy", "momentum", "reversal", "symplecticity", "record")
+_MEASURES = ("error", "joint", "velocity", "energy", "momentum", "reversal", "symplecticity", "record")
 
 
 class _OutOfTime(KeyboardInterrupt):
@@ -82,6 +83,10 @@ class Record:
     def wrong(self) -> tuple[Cell, ...]:
         """The cells that are wrong with nothing said."""
         return tuple(cell for cell in self.cells if cell.kind is Kind.WRONG)
+
+    def needless(self) -> tuple[Cell, ...]:
+        """The cells that varpin warns of although every check passes: false alarms."""
+        return tuple(cell for cell in self.cells if cell.needless)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the record as JSON; returns its path. What is not a finite number stands there as null.
@@ -298,17 +303,18 @@ class Bench:
             text = (f"unnamed error: {type(error).__name__}: {error}",)
             return nothing | {"kind": Kind.WRONG, "said": (), "found": text, "done": 0}
         wrong = findings(found, integrator, condition(self._setup))  # type: ignore[arg-type]
+        said = tuple(sentence for sentence in trajectory.warnings if not sentence.startswith(JOINT_LIMITS))
         if not finite(trajectory):
             kind, wrong = Kind.WRONG, ("the record is not finite", *wrong)
         elif any(sentence.startswith(_STRUCTURE) for sentence in wrong):
             kind = Kind.WRONG
         elif complaint is not None:
             kind = Kind.STOPPED
-        elif trajectory.warnings:
+        elif said:
             kind = Kind.DEGRADED
         else:
             kind = Kind.WRONG if wrong else Kind.ACCURATE
-        said = trajectory.warnings if complaint is None else (complaint, *trajectory.warnings)
+        said = said if complaint is None else (complaint, *said)
         return found | {"kind": kind, "said": said, "found": wrong, "done": trajectory.steps}
 
     def _simulate(self, trial: Trial, integrator: Integrator, patience: float) -> tuple[Trajectory, str | None]:

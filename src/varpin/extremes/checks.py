@@ -31,6 +31,8 @@ Floats = NDArray[np.float64]
 # ill-conditioned mass matrices.
 LEVELS = {
     "error": 0.05,
+    "joint": 0.1,
+    "velocity": 0.25,
     "energy": 0.1,
     "momentum": 0.1,
     "kept momentum": 1e-6,
@@ -44,7 +46,14 @@ _PREDICTABLE = 10.0
 _DISTURBANCE = 1e-7
 # Ways shorter than this count as it [rad or m].
 _SHORTEST = 1e-6
-_SAMPLES = 32
+# A joint that moves less than others of its kind, and with less of the speed that would have their energy, than these
+# parts is measured in these parts of theirs.
+_LITTLE, _LIGHT = 1e-2, 1e-2
+# Part of an even speed that counts as a change of it.
+_EVEN = 1e-3
+_SAMPLES, _DYING = 32, 4
+# Steps from rest of which half a step is much.
+_STARTING = 4
 # Rounding of a sum, in units of its largest term, with room for a hundred of them.
 _ROUNDING = 100.0 * np.finfo(np.float64).eps
 # The exact motion may take this long, of the processor's time, so that what else it does changes nothing [s].
@@ -61,11 +70,19 @@ class Exact:
         nodes: Their indices (K,).
         q: (K, n) [rad or m].
         way: How far it goes [rad or m].
+        v: (K, n) [rad/s or m/s], or None where it is not known.
+        ways: How far each joint goes (n,) [rad or m].
+        speeds: How fast each joint gets (n,) [rad/s or m/s].
+        cut: Whether it can be told over a part of the window only.
     """
 
     nodes: NDArray[np.int64]
     q: Floats
     way: float
+    v: Floats | None
+    ways: Floats
+    speeds: Floats
+    cut: bool = False
 
 
 def exact_motion(setup: Setup, dt: float, steps: int, window: float, *, late: bool = False) -> Exact:
@@ -84,38 +101,58 @@ def exact_motion(setup: Setup, dt: float, steps: int, window: float, *, late: bo
     stride = 1 if varying else max(1, steps // _SAMPLES)
     if varying:
         steps = min(steps, 2 * _SAMPLES)
-    nodes = np.arange(stride, steps + 1, stride)
+    # The first ones are where what is stiff dies out.
+    nodes = np.union1d(np.arange(1, min(steps, _DYING) + 1), np.arange(stride, steps + 1, stride))
     if setup.exact is not None:
         q = np.array([setup.exact(k * dt) for k in nodes])
-        return Exact(nodes, q, _way(q, setup.q0))
-    q = _reference(setup, dt, nodes, late) + setup.shift
-    return Exact(nodes[: len(q)], q, _way(q, setup.q0))
+        v = None if setup.rate is None else np.array([setup.rate(k * dt) for k in nodes])
+    else:
+        q, v = _reference(setup, dt, nodes, late)
+        q = q + setup.shift
+    cut = len(q) < len(nodes)
+    nodes = nodes[: len(q)]
+    way = max(float(np.abs(q - setup.q0).max()), _SHORTEST)
+    return Exact(nodes, q, way, v, *_units(setup, dt, nodes, q, v), cut)
 
 
-def _way(q: Floats, q0: Floats) -> float:
-    return max(float(np.abs(q - q0).max()), _SHORTEST)
+def _units(setup: Setup, dt: float, nodes: NDArray[np.int64], q: Floats, v: Floats | None) -> tuple[Floats, Floats]:
+    """Ways and speeds of :class:`Exact`: of each joint its own, or a small part of the others'."""
+    way = np.abs(q - setup.q0).max(axis=0)
+    known = np.vstack([setup.v0, np.diff(q, axis=0, prepend=setup.q0[None]) / dt if v is None else v])
+    speed, duration = np.abs(known).max(axis=0), float(nodes[-1]) * dt
+    tree = setup.scene.robot.tree
+    slides = np.isin(np.arange(q.shape[1]), tree.coordinate[tree.prismatic > 0])
+    inertia = np.sqrt(np.diag(lagrangian_jet(setup.scene, setup.q0, np.zeros_like(setup.q0), backend="pinocchio").Lvv))
+    # What turns evenly, however fast, has next to no part in what the others do.
+    change = np.clip(np.ptp(known, axis=0), _EVEN * speed, speed)
+    light = _LIGHT * (inertia * change).max() / inertia
+    for values, least in ((way, light * duration), (speed, light)):
+        for kind in (slides, ~slides):
+            others = _LITTLE * values[kind].max(initial=0.0)
+            values[kind] = np.maximum(values[kind], np.minimum(others, least[kind]))
+    return np.maximum(way, _SHORTEST), np.maximum(speed, _SHORTEST)
 
 
-def _reference(setup: Setup, dt: float, nodes: NDArray[np.int64], late: bool) -> Floats:
-    """Configurations of the twin at as many of the nodes as can be told, one at least (K, n)."""
+def _reference(setup: Setup, dt: float, nodes: NDArray[np.int64], late: bool) -> tuple[Floats, Floats]:
+    """Configurations and velocities of the twin at as many of the nodes as can be told, one at least, each (K, n)."""
     paths = [_reference_path(setup, dt, nodes, disturbance, late) for disturbance in (0.0, _DISTURBANCE)]
-    found: list[Floats] = []
+    found: list[tuple[Floats, Floats]] = []
     begin = time.process_time()
     try:
         for plain, moved in zip(*paths, strict=True):
             found.append(plain)
-            grown = np.abs(moved - plain).max() > _PREDICTABLE * _DISTURBANCE
+            grown = np.abs(moved[0] - plain[0]).max() > _PREDICTABLE * _DISTURBANCE
             if grown or time.process_time() - begin > _PATIENCE:
                 break
     except VarpinError:
         if not found:
             raise
-    return np.array(found)
+    return np.array([q for q, _ in found]), np.array([v for _, v in found])
 
 
 def _reference_path(
     setup: Setup, dt: float, nodes: NDArray[np.int64], disturbance: float, late: bool
-) -> Iterator[Floats]:
+) -> Iterator[tuple[Floats, Floats]]:
     scene = setup.scene if setup.twin is None else setup.twin
     quiet = Scene(
         scene.robot,
@@ -142,7 +179,7 @@ def _reference_path(
         if segment.failure is not None:
             raise VarpinError(f"no reference: {segment.failure.reason}")
         q, v, before = segment.q[0], segment.v[0] + (kick if late else 0.0), int(node)
-        yield q
+        yield q, v
 
 
 def _rows(setup: Setup) -> int:
@@ -154,8 +191,23 @@ def reference_error(exact: Exact, trajectory: Trajectory) -> float:
     known = exact.nodes <= trajectory.steps
     if not known.any():
         return math.nan
-    off = np.abs(trajectory.q[exact.nodes[known]] - exact.q[known]).max()
-    return float(off / exact.way)
+    return float(np.abs(trajectory.q[exact.nodes[known]] - exact.q[known]).max() / exact.way)
+
+
+def joint_error(exact: Exact, trajectory: Trajectory) -> float:
+    """The same, each joint in units of its own way: what is far or fast does not hide the others."""
+    known = exact.nodes <= trajectory.steps
+    if not known.any():
+        return math.nan
+    return float((np.abs(trajectory.q[exact.nodes[known]] - exact.q[known]) / exact.ways).max())
+
+
+def velocity_error(exact: Exact, trajectory: Trajectory) -> float:
+    """Largest distance in v from the exact motion, each joint in units of its own largest velocity."""
+    known = exact.nodes <= trajectory.steps
+    if exact.v is None or not known.any():
+        return math.nan
+    return float((np.abs(trajectory.v[exact.nodes[known]] - exact.v[known]) / exact.speeds).max())
 
 
 def unforced(scene: Scene, trajectory: Trajectory) -> bool:
@@ -306,10 +358,15 @@ def finite(trajectory: Trajectory) -> bool:
 def measures(setup: Setup, integrator: Integrator, trajectory: Trajectory, exact: Exact | None) -> dict[str, float]:
     """Every check of a motion by its name in :class:`Cell`."""
     scene = setup.scene
+    if exact is not None and exact.cut and integrator.order == 1 and exact.nodes[-1] < _STARTING and not setup.v0.any():
+        # What starts from rest is behind by half a step: much of what can be told of it, little of its motion.
+        exact = None
     with np.errstate(over="ignore", invalid="ignore"):
         A = linearized(scene, integrator, trajectory)
         return {
             "error": math.nan if exact is None else reference_error(exact, trajectory),
+            "joint": math.nan if exact is None else joint_error(exact, trajectory),
+            "velocity": math.nan if exact is None else velocity_error(exact, trajectory),
             "energy": energy_error(scene, trajectory),
             "momentum": momentum_error(scene, trajectory),
             "reversal": reversal_error(scene, integrator, trajectory),
@@ -327,8 +384,9 @@ def condition(setup: Setup) -> float:
 def findings(found: dict[str, float], integrator: Integrator, condition: float = 1.0) -> tuple[str, ...]:
     """Which measures are beyond their level, in words; ``condition`` is that of the mass matrix."""
     levels = {name: LEVELS[name] for name in found}
-    # Derivatives hold solutions of linear systems, and cannot be better than those.
-    levels["symplecticity"] = max(LEVELS["symplecticity"], 10.0 * np.finfo(np.float64).eps * condition)
+    # Derivatives, and steps themselves, hold solutions of linear systems, and cannot be better than those.
+    for name in ("symplecticity", "reversal"):
+        levels[name] = max(LEVELS[name], 10.0 * np.finfo(np.float64).eps * condition)
     if integrator.variational:
         levels["momentum"] = LEVELS["kept momentum"]
     return tuple(

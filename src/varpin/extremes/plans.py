@@ -21,7 +21,7 @@ from varpin.noise import AdditiveNoise, ControlNoise, Noise
 from varpin.robot import Robot
 from varpin.robot.chain import rod_chain
 from varpin.scene import Scene
-from varpin.sddp import OptimalControlProblem, Solution, solve
+from varpin.sddp import OptimalControlProblem, Solution, Status, solve
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -97,7 +97,7 @@ class Plan:
 def attempt(plan: Plan, integrator: Integrator, patience: float = math.inf) -> dict[str, Any]:
     """Solve it, within about this time [s], and judge the solution: what a cell holds."""
     outcome: dict[str, Any] = dict.fromkeys(
-        ("error", "energy", "momentum", "reversal", "symplecticity", "record"), math.nan
+        ("error", "joint", "velocity", "energy", "momentum", "reversal", "symplecticity", "record"), math.nan
     ) | {"said": (), "found": (), "done": 0}
     try:
         task = plan.build()
@@ -119,10 +119,15 @@ def attempt(plan: Plan, integrator: Integrator, patience: float = math.inf) -> d
         found.append(f"cost off by {record:.2g} of itself (wrong from {COST_LEVEL:g})")
     if not (np.isfinite(solution.gains).all() and np.isfinite(solution.feedforward).all()):
         found.append("the policy is not finite")
-    if solution.status.converged and not (math.isnan(left) or left <= LEFT_LEVEL):
+    # No word excuses a cost that is not the plan's own; one that is not the least, that it is not claimed to be.
+    wrong = bool(found)
+    if not (math.isnan(left) or left <= LEFT_LEVEL):
+        wrong = wrong or solution.status.converged
         found.append(f"single controls take {left:.2g} off the cost (wrong from {LEFT_LEVEL:g})")
     said = (*(() if solution.status.converged else (solution.status.value,)), *warnings)
-    kind = Kind.WRONG if found else Kind.DEGRADED if said else Kind.ACCURATE
+    # Plans have a number of iterations here; one that it cuts short is no better and no worse than that.
+    cut = solution.status is Status.MAX_ITERATIONS
+    kind = Kind.WRONG if wrong else Kind.STOPPED if cut else Kind.DEGRADED if said else Kind.ACCURATE
     return outcome | {
         "kind": kind,
         "error": left,

@@ -72,9 +72,15 @@ def _oscillator(stiffness: float, damping: float, q: float, v: float) -> Callabl
         b = (v - slow * q) / (fast - slow)
         return np.array([((q - b) * np.exp(slow * t) + b * np.exp(fast * t)).real])
 
+    def rate(t: float) -> Floats:
+        if abs(fast - slow) <= 1e-12 * abs(fast):
+            return np.array([((v + fast * (v - fast * q) * t) * np.exp(fast * t)).real])
+        b = (v - slow * q) / (fast - slow)
+        return np.array([(slow * (q - b) * np.exp(slow * t) + fast * b * np.exp(fast * t)).real])
+
     def build() -> Setup:
         scene = Scene(rod_chain([1.0], [1.0]), gravity=False, stiffness=stiffness, damping=damping)
-        return Setup(scene, np.array([q]), np.array([v]), exact=exact)
+        return Setup(scene, np.array([q]), np.array([v]), exact=exact, rate=rate)
 
     return build
 
@@ -89,6 +95,7 @@ def _pushed(torque: float) -> Callable[[], Setup]:
             np.zeros(1),
             controls=np.array([torque]),
             exact=lambda t: np.array([1.5 * torque * t * t]),
+            rate=lambda t: np.array([3.0 * torque * t]),
         )
 
     return build
@@ -115,6 +122,7 @@ def _spinning(rate: float) -> Callable[[], Setup]:
             np.zeros(3),
             np.array([rate, 0.0, 0.0]),
             exact=lambda t: np.array([rate * t, 0.0, 0.0]),
+            rate=lambda _: np.array([rate, 0.0, 0.0]),
         )
 
     return build

@@ -36,6 +36,7 @@ class Setup:
         controls: None, one row (m,), or a row for each step (N, m).
         increments: Of the Wiener processes (N, k) [s^0.5], or None.
         exact: The motion in closed form, q (n,) at a time [s], or None.
+        rate: Its velocity (n,) at a time [s], or None.
         twin: A scene with the same motion that is easier to compute, or None: at the origin, with angles reduced.
         shift: By how much q is ahead of the twin's (n,).
     """
@@ -46,6 +47,7 @@ class Setup:
     controls: Floats | None = None
     increments: Floats | None = None
     exact: Callable[[float], Floats] | None = None
+    rate: Callable[[float], Floats] | None = None
     twin: Scene | None = None
     shift: Floats | float = 0.0
 
@@ -87,7 +89,9 @@ class Cell:
         integrator: As text.
         kind: One of the five.
         error: Largest distance in q from the exact motion over its window, in units of how far that goes; of a plan,
-            the gradient of its cost that is left, in units of what the control cost alone makes.
+            the part of its cost that single controls would take off.
+        joint: The same distance, each joint in units of its own way.
+        velocity: The same of v, in units of each joint's largest velocity.
         energy: Largest error of the energy balance, in units of the energy there is to turn over.
         momentum: Largest change of the momentum that is to be conserved, in units of the largest one.
         reversal: Distance in q from where the reversed motion is to end, in units of the way.
@@ -106,6 +110,8 @@ class Cell:
     integrator: str
     kind: Kind
     error: float
+    joint: float
+    velocity: float
     energy: float
     momentum: float
     reversal: float
@@ -117,3 +123,13 @@ class Cell:
     steps: int
     seconds: float
     fingerprint: str
+
+    @property
+    def warned(self) -> bool:
+        """Whether varpin says that something is not as it should be with a motion that it returns."""
+        return self.kind is Kind.DEGRADED
+
+    @property
+    def needless(self) -> bool:
+        """Whether it says so although every check passes."""
+        return self.warned and not self.found
