@@ -22,7 +22,7 @@ from varpin.soundness import Finding
 from varpin.wiener import wiener_increments
 
 BY_NAME = {trial.name: trial for trial in (*extremes.TRIALS, *extremes.PLANS)}
-MEASURES = ("error", "energy", "momentum", "reversal", "symplecticity", "record")
+MEASURES = ("error", "joint", "velocity", "energy", "momentum", "reversal", "symplecticity", "record")
 
 
 def falling(integrator=None, *, dt=1e-2, steps=100, **scene):
@@ -331,7 +331,24 @@ def test_resumes_to_the_same_record(load, tmp_path):
 
 def test_a_record_survives_the_disk(tmp_path):
     cell = extremes.Cell(
-        "f", "t", "i", Kind.STOPPED, math.nan, math.inf, 1e-300, 0.1, math.nan, 0.0, ("a",), (), 1, 2, 0.5, "abc"
+        "f",
+        "t",
+        "i",
+        Kind.STOPPED,
+        math.nan,
+        0.2,
+        0.3,
+        math.inf,
+        1e-300,
+        0.1,
+        math.nan,
+        0.0,
+        ("a",),
+        (),
+        1,
+        2,
+        0.5,
+        "abc",
     )
     record = extremes.Record((cell,), "robot", deep=True, missing=3)
     loaded = extremes.Record.load(record.save(tmp_path / "record.json"))
@@ -431,3 +448,29 @@ def test_nothing_on_robots_and_trees_is_silent_wrong(benchmark, name):
     assert record.missing == 0
     assert [(cell.trial, cell.integrator, cell.found) for cell in record.wrong()] == []
     assert record.counts()[Kind.ACCURATE] > 0
+
+
+def test_needless_warnings_are_counted(monkeypatch):
+    setup, _ = falling()
+    assert run_one(setup, 1e-3).kind is Kind.ACCURATE
+    monkeypatch.setattr("varpin.soundness._looked_for", lambda *_: (Finding("test", "all is not well"),))
+    cell = run_one(setup, 1e-3)
+    assert cell.warned
+    assert cell.needless
+    record = extremes.Record((cell,), "robot", deep=False)
+    assert record.needless() == (cell,)
+
+
+def test_each_joint_is_checked_by_itself():
+    """A wheel that turns far does not hide a joint that is off by half of its own way; nor do velocities go unseen."""
+    scene = vp.Scene(rod_chain([1.0] * 2, [1.0] * 2), gravity=False)
+    setup = Setup(scene, np.zeros(2), np.array([1.0, -0.5]))
+    motion = vp.simulate(scene, setup.q0, setup.v0, dt=1e-2, steps=100)
+    exact = checks.exact_motion(setup, 1e-2, 100, 1.0)
+    far = dataclasses.replace(exact, way=3000.0)
+    off = tampered(motion, q=motion.q * [1.0, 1.5], v=motion.v * [1.0, -1.0])
+    assert checks.joint_error(exact, motion) < 1e-2
+    assert checks.velocity_error(exact, motion) < 1e-2
+    assert checks.reference_error(far, off) < checks.LEVELS["error"]
+    assert checks.joint_error(far, off) > checks.LEVELS["joint"]
+    assert checks.velocity_error(far, off) > checks.LEVELS["velocity"]
