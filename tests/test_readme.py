@@ -32,9 +32,10 @@ def test_python_block(number, tmp_path):
     if "verify" in blocks("python")[number]:
         begin = done.stdout.index("                          cost")
         for found, shown in zip(done.stdout[begin:].split(), blocks("text")[0].split(), strict=False):
-            assert found == shown or float(found) == pytest.approx(float(shown), rel=0.5)
-        costs = [float(found) for found in re.findall(r" (\d\.\d{6}e-06)", done.stdout[begin:])[:3]]
-        assert costs == pytest.approx([float(x) for x in re.findall(r" (\d\.\d{6}e-06)", blocks("text")[0])], rel=1e-3)
+            # What is down at rounding is another number on another machine.
+            assert found == shown or float(found) == pytest.approx(float(shown), rel=0.5, abs=1e-12)
+        costs = [float(found) for found in re.findall(r" (\d\.\d{6}e-07)", done.stdout[begin:])[:3]]
+        assert costs == pytest.approx([float(x) for x in re.findall(r" (\d\.\d{6}e-07)", blocks("text")[0])], rel=1e-3)
 
 
 def test_the_block_of_the_page_on_integrators(tmp_path):

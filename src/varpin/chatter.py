@@ -13,10 +13,11 @@ Floats = NDArray[np.float64]
 _COUNTS = 2e-3
 # In units of the largest velocity of all joints: what couplings and rounding leave of joints that stand still.
 _IDLE = 1e-6
-# Changes of sign in a row that are spoken of. An oscillation that the steps resolve has none in a row. What the jump at
-# an end of an optimal motion leaves falls to a quarter from step to step under held controls, and below what counts
-# after five.
+# Changes of sign in a row that are spoken of. An oscillation that the steps resolve has none in a row.
 RUN = 8
+# From a node to the next they change by less than this factor: what a jump at an end of an optimal motion leaves falls
+# to a quarter or two fifths from step to step under held controls, and is gone after a few.
+_EVEN = 2.0
 
 
 @dataclass(frozen=True)
@@ -47,17 +48,17 @@ def alternation(v: Floats, u: Floats | None = None) -> Alternation | None:
         return None
     bend = np.diff(v, n=2, axis=0)
     counts = (np.abs(bend) > _COUNTS * fastest) & (np.abs(bend) > _IDLE * fastest.max())
-    turns = (bend[1:] * bend[:-1] < 0.0) & counts[1:] & counts[:-1]
+    size = np.abs(bend)
+    even = (size[1:] < _EVEN * size[:-1]) & (size[:-1] < _EVEN * size[1:])
+    turns = (bend[1:] * bend[:-1] < 0.0) & counts[1:] & counts[:-1] & even
     if u is not None:
         # The bend at a node is driven by the jump of the controls there.
         jump = np.diff(u, axis=0)
         driven = (jump[1:] * jump[:-1] < 0.0) & (np.abs(jump[1:]) > _COUNTS * np.abs(u).max(axis=0))
         turns &= ~driven.any(axis=1, keepdims=True)
-    # How many turns in a row end at each node.
-    row, longest = np.zeros(v.shape[1], dtype=np.int64), Alternation(0, 0, 0)
-    for k, turn in enumerate(turns):
-        row = np.where(turn, row + 1, 0)
-        if row.max(initial=0) > longest.changes:
-            joint = int(row.argmax())
-            longest = Alternation(joint, int(row[joint]), k + 1 - int(row[joint]))
-    return longest if longest.changes >= RUN else None
+    # How many turns in a row end at each node: those since the last node without one.
+    nodes = np.arange(1, len(turns) + 1)[:, None]
+    rows = nodes - np.maximum.accumulate(np.where(turns, 0, nodes), axis=0)
+    last, joint = np.unravel_index(int(rows.argmax()), rows.shape)
+    longest = int(rows[last, joint])
+    return Alternation(int(joint), longest, int(last) + 1 - longest) if longest >= RUN else None

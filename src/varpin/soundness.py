@@ -202,7 +202,8 @@ def _ringing(rate: float, dt: float) -> str:
 
 def _masses(scene: Scene, q: Floats) -> Floats:
     """M at some configurations (K, n, n)."""
-    return np.array([lagrangian_jet(scene, row, np.zeros_like(row)).Lvv for row in q])
+    q = np.ascontiguousarray(q)
+    return scene.core.jets(q, np.zeros_like(q))[0]
 
 
 def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -257,13 +258,13 @@ def _balances(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> l
     Guards hold the balance of every group in each step of a variational integrator.
     """
     at = np.arange(1, trajectory.steps + 1)
-    turned = _turned_over(scene, trajectory)
-    work, _ = _works(scene, trajectory)
-    worked = np.abs(np.cumsum(work, axis=0)).max(axis=0, initial=0.0)
     found = [(at, trajectory.statistics.energy_defect, energy_scale(scene, trajectory))]
     tree = scene.robot.tree
     if integrator.variational or tree.groups < 2 or scene.noise.diffusion is None:
         return found
+    turned = _turned_over(scene, trajectory)
+    work, _ = _works(scene, trajectory)
+    worked = np.abs(np.cumsum(work, axis=0)).max(axis=0, initial=0.0)
     some = np.unique(np.linspace(1, trajectory.steps, _NODES).astype(np.int64))
     for group in range(tree.groups):
         own = tree.group == group
@@ -571,7 +572,6 @@ def _taken_again(
     """
     steps = slice(place, place + count)
     q, v = trajectory.q[place][None] + moved[0], trajectory.v[place][None] + moved[1]
-    force = np.repeat(trajectory.u[steps] @ scene.actuation.T, parts, axis=0)[None]
     drawn = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
     if trajectory.dw.any() and scene.noise.diffusion is not None:
         drawn = np.zeros((1, count * parts, trajectory.dw.shape[1]))
@@ -582,8 +582,10 @@ def _taken_again(
             drawn[0, ::parts] += integrator.left * trajectory.dw[steps]
             drawn[0, parts - 1 :: parts] += (1.0 - integrator.left) * trajectory.dw[steps]
     state, _ = integrator.start(scene, q, v)
-    commands = open_loop(np.zeros((count * parts, scene.controls)))
-    (segment,) = integrator.rollout_compiled(scene, state, commands, drawn, force, trajectory.dt / parts)
+    # Impulses of noise depend on the controls, too.
+    commands = open_loop(np.repeat(trajectory.u[steps], parts, axis=0))
+    no_drift = np.zeros((0, 0, scene.robot.dof))
+    (segment,) = integrator.rollout_compiled(scene, state, commands, drawn, no_drift, trajectory.dt / parts)
     done = len(segment.q) // parts
     if not done:
         return None
