@@ -338,9 +338,10 @@ def linearize_step(system: System, q0: Floats, q1: Floats, u: Floats, h: float, 
 
 @dataclass(frozen=True)
 class TrackingCost:
-    """The paper's cost: the integral of position |q - r(t)|^2 + effort |u|^2, and terminal |q - r(t_f)|^2 at the end.
+    """The paper's cost, with sums over joints and controls.
 
-    The integral is the sum over the left ends of the steps.
+    The integral of position (q - r(t))^2 + effort u^2, as the sum over the left ends of the steps, and
+    terminal (q - r(t_f))^2 at the end.
     """
 
     reference: Reference
