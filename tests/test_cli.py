@@ -167,14 +167,13 @@ def test_a_run_needs_nothing_compiled_that_warming_up_does_not():
     """Kernels are compiled, or loaded, once for each kind of arguments they meet."""
     code = """
 import numpy as np, varpin as vp
-from varpin.kernels import jet, midpoint
+from varpin.kernels import midpoint
 from varpin.tradeoff.setting import Setting
 
 scene, rest, torque = vp.Scene(vp.planar_chain(2), damping=0.1), np.zeros(2), np.ones(2)
-kernels = midpoint.rollout, midpoint.begin_paths, jet.lagrangian_sweep
+kernels = midpoint.rollout, midpoint.begin_paths
 signatures = lambda: [len(kernel.signatures) for kernel in kernels]
 Setting.of(scene, rest, rest, torque, 1e-3).warm_up(vp.Midpoint())
-vp.lagrangian_jet(scene, rest, rest)
 before = signatures()
 vp.simulate(scene, rest, rest, dt=1e-3, steps=3, controls=torque)
 vp.simulate(scene, rest, rest, dt=1e-3, steps=3)

@@ -141,10 +141,10 @@ def test_each_decision_is_the_minimum_in_its_box(load, second_order):
     limits = np.array([40.0, 60.0, 60.0, 3.0, 3.0, 1.0])
     begin = [0.2, -1.2, 0.9, 0.1, 0.3, 0.0]
     problem = vp.OptimalControlProblem(
-        scene, cost, begin, np.zeros(6), dt=1e-2, steps=2, control_limits=(-limits, limits)
+        scene, cost, begin, np.zeros(6), dt=1e-2, steps=2, control_limits=(-limits, limits), integrator=vp.Midpoint()
     )
     motion = vp.solve(problem, max_iterations=0).trajectory
-    free = vp.OptimalControlProblem(scene, cost, begin, np.zeros(6), dt=1e-2, steps=2)
+    free = vp.OptimalControlProblem(scene, cost, begin, np.zeros(6), dt=1e-2, steps=2, integrator=vp.Midpoint())
     within, without = (backward(p, motion, 0.0, second_order) for p in (problem, free))
     # The last decision's Q: its gradient is the cost's own, and its Hessian that of the cost in the last control.
     Qu = without.gradient[-1]
@@ -346,8 +346,9 @@ def reach(robot, goal, limits, **options):
     begin = [0.0, -1.5, 0.8, -0.5, 0.0, 0.0]
     scene = vp.Scene(robot, damping=0.1)
     problem = vp.OptimalControlProblem(
-        scene, cost, begin, np.zeros(6), dt=1e-2, steps=100, control_limits=(-limits, limits)
-    )
+        scene, cost, begin, np.zeros(6), dt=1e-2, steps=100, control_limits=(-limits, limits),
+        integrator=vp.Midpoint(), sampling="midpoint",
+    )  # fmt: skip
     return vp.solve(problem, backtracking=0.5, max_iterations=20, **options), R, p
 
 

@@ -89,7 +89,7 @@ def test_the_finding_has_a_kind_of_its_own_and_many_joints_are_counted():
     scene = vp.Scene(robot, gravity=False)
     q = np.full(6, 7.0)
     motion = vp.simulate(scene, q, np.zeros(6), dt=1e-3, steps=3, check=False)
-    (finding,) = evident(scene, motion)
+    (finding,) = evident(scene, vp.Midpoint(), motion)
     assert finding.kind == JOINT_LIMITS
     assert finding.sentence in motion.warnings
     assert finding.sentence.count(" rad above ") == 6

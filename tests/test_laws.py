@@ -371,3 +371,18 @@ def test_noise_that_python_evaluates_keeps_the_period():
         motions.append(vp.simulate(scene, [0.3, 0], [0, 0], dt=1e-2, steps=17, controls=law, period=5, rng=3))
         np.testing.assert_allclose(times, [0.0, 0.05, 0.1, 0.15])
     np.testing.assert_allclose(motions[0].u, motions[1].u, atol=1e-12)
+
+
+def test_an_ensemble_whose_loop_is_unstable_says_so():
+    """The gains that a motion is warned of, with noise: as many paths as one likes run away."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, noise=vp.AdditiveNoise(1e-3))
+    N = 100
+    gains = np.tile([[[-100.0, -110.0]]], (N, 1, 1))
+    policy = vp.LinearPolicy(np.zeros((N, 1)), gains, np.tile([1.0, 0.0], (N, 1)), on="velocity")
+    options = {"dt": 1e-2, "steps": N, "integrator": vp.RungeKutta4()}
+    ensemble = vp.simulate_ensemble(scene, [0.0], [0.0], paths=20, rng=0, controls=policy, **options)
+    assert np.abs(ensemble.q).max() > 1e3
+    assert any("control loop" in sentence for sentence in ensemble.warnings), ensemble.warnings
+    calm = vp.LinearPolicy(np.zeros((N, 1)), 0.2 * gains, policy.reference, on="velocity")
+    quiet = vp.simulate_ensemble(scene, [0.0], [0.0], paths=20, rng=0, controls=calm, **options)
+    assert not any("control loop" in sentence for sentence in quiet.warnings), quiet.warnings

@@ -26,12 +26,16 @@ def reach(*extra, factor=1.0, noise=None, **options):
     return vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], **{"dt": 0.02, "steps": 50, **options})
 
 
+# These grids are coarse for the midpoint rule.
+MIDPOINT = {"integrator": vp.Midpoint(), "sampling": "midpoint"}
+
+
 def swing(steps):
     """A swing on a grid so coarse that steps are taken in parts: up to 7 with 20 steps."""
     end = vp.TrackingCost([-np.pi / 2, 0.0], 100.0) + vp.VelocityCost(5.0)
     cost = vp.ControlCost(0.1) + vp.VelocityCost(0.01) + vp.Terminal(end)
     scene = vp.Scene(vp.planar_chain(2))
-    return vp.OptimalControlProblem(scene, cost, [np.pi / 2, 0.0], [0, 0], dt=2.0 / steps, steps=steps)
+    return vp.OptimalControlProblem(scene, cost, [np.pi / 2, 0.0], [0, 0], dt=2.0 / steps, steps=steps, **MIDPOINT)
 
 
 def tool_reach(name="xarm7", steps=50):
@@ -127,7 +131,9 @@ def test_constants_and_scales_change_nothing_where_a_search_stalls():
     problem = swing(40)
     scale = 2.0**-20
     cost = scale * problem.cost + constant(1e6)
-    other = vp.OptimalControlProblem(problem.scene, cost, problem.q0, problem.v0, dt=problem.dt, steps=problem.steps)
+    other = vp.OptimalControlProblem(
+        problem.scene, cost, problem.q0, problem.v0, dt=problem.dt, steps=problem.steps, **MIDPOINT
+    )
     assert_same_search(plain, vp.solve(other))
 
 
@@ -146,7 +152,9 @@ def test_additive_noise_changes_no_plan_that_is_not_finished():
         quiet = vp.solve(swing(40), max_iterations=most)
         problem = swing(40)
         scene = vp.Scene(problem.scene.robot, noise=vp.AdditiveNoise(100.0))
-        noisy = vp.OptimalControlProblem(scene, problem.cost, problem.q0, problem.v0, dt=problem.dt, steps=40)
+        noisy = vp.OptimalControlProblem(
+            scene, problem.cost, problem.q0, problem.v0, dt=problem.dt, steps=40, **MIDPOINT
+        )
         assert_same_search(quiet, vp.solve(noisy, max_iterations=most), rtol=1e-9)
 
 

@@ -24,11 +24,12 @@ from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, rows
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
+from varpin.loop_stability import examined_in_loop
 from varpin.markup import facts, table
 from varpin.policy import LinearPolicy, OpenLoop
 from varpin.scene import Scene, require_scene
 from varpin.simulation import Motions, commands_of
-from varpin.soundness import Finding, announce, examined
+from varpin.soundness import Finding, announce
 from varpin.wiener import Children, children
 
 Floats = NDArray[np.float64]
@@ -781,4 +782,6 @@ def _look(task: Task) -> tuple[Finding, ...]:
     (generator,) = own.seeds.generators(task.first, task.first + 1)
     drawn = generator.standard_normal((own.steps, own.scene.processes)) * np.sqrt(own.dt)
     motions = Motions(own.scene, own.integrator, task.q0[0], task.v0[0], own.dt)
-    return examined(own.scene, own.integrator, motions.under(own.commands, increments=drawn)[0])[1]
+    motion, _ = motions.under(own.commands, increments=drawn)
+    hold = own.commands.hold if len(own.commands.gains) else None
+    return examined_in_loop(own.scene, own.integrator, motion, hold)[1]

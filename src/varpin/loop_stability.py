@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from varpin.errors import LinearizationError
+from varpin.integrators import Integrator
 from varpin.integrators.explicit import accelerations
 from varpin.lagrangian import lagrangian_jet
 from varpin.scene import Scene
-from varpin.soundness import Finding
+from varpin.soundness import Finding, examined, with_warnings
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -129,6 +130,16 @@ class Loop:
     def rate(self) -> float:
         """The fastest rate of growth if the law acted at every instant [1/s]; negative if the loop is stable then."""
         return float(self.span.values(self.A + self.B @ self.K).real.max())
+
+
+def examined_in_loop(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None
+) -> tuple[Trajectory, tuple[Finding, ...]]:
+    """:func:`varpin.soundness.examined`, and the loop too; ``hold`` is its period in steps, None without feedback."""
+    trajectory, found = examined(scene, integrator, trajectory)
+    if hold is not None:
+        found = (*unstable_loop(scene, trajectory, hold), *found)
+    return with_warnings(trajectory, found), found
 
 
 def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[Finding, ...]:

@@ -14,13 +14,14 @@ from varpin.chatter import alternation
 from varpin.checks import JointValues, count, positive, real
 from varpin.errors import InputError
 from varpin.frozen import Frozen
-from varpin.integrators import Integrator, RungeKutta4
+from varpin.integrators import Gauss, Integrator
 from varpin.integrators.base import Failure
+from varpin.loop_stability import examined_in_loop
 from varpin.markup import facts
 from varpin.scene import Scene, require_scene
 from varpin.sddp import OptimalControlProblem, Solution, solve
 from varpin.simulation import Interrupted, StepFailure, simulate
-from varpin.soundness import Finding, announce, examined
+from varpin.soundness import Finding, announce
 from varpin.trajectory import Trajectory, chained
 
 Floats = NDArray[np.float64]
@@ -35,12 +36,12 @@ class Plant:
     Attributes:
         scene: Its scene, which need not be the one planned with: other masses, friction, noise. It takes the same
             controls.
-        integrator: Any of varpin's.
+        integrator: Any of varpin's; left out, one that no friction is too fast for, ``Gauss(stages=2)``.
         substeps: Steps to a decision of the controller.
     """
 
     scene: Scene
-    integrator: Integrator = field(default_factory=RungeKutta4)
+    integrator: Integrator = field(default_factory=lambda: Gauss(stages=2))
     substeps: int = 10
 
     def __post_init__(self) -> None:
@@ -291,7 +292,7 @@ class Mpc:
             if not parts:
                 raise
             raise Interrupted(chained(parts)) from None
-        motion, found = examined(plant.scene, plant.integrator, chained(parts))
+        motion, found = examined_in_loop(plant.scene, plant.integrator, chained(parts), plant.substeps)
         found = (*found, *_alternating(motion, plant.substeps))
         announce(logger, plant.scene, dt, found)
         return MpcRun(

@@ -15,10 +15,10 @@ from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
-from varpin.loop_stability import unstable_loop
+from varpin.loop_stability import examined_in_loop, unstable_loop
 from varpin.policy import LinearPolicy, OpenLoop, takes
 from varpin.scene import Scene, require_scene
-from varpin.soundness import Finding, announce, evident, examined, with_warnings
+from varpin.soundness import Finding, announce, evident, with_warnings
 from varpin.trajectory import StepStatistics, Trajectory
 from varpin.wiener import wiener_increments
 
@@ -352,8 +352,15 @@ def simulate(
                 if progress is not None and (done // chunk < record.steps // chunk or record.steps == steps):
                     progress(record.steps, steps)
         except KeyboardInterrupt:
-            raise Interrupted(_told(scene, integrator, record.trajectory(), hold, check=check)[0]) from None
-        trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
+            interrupted = True
+        else:
+            interrupted = False
+        try:
+            trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
+        except KeyboardInterrupt:
+            raise Interrupted(record.trajectory()) from None
+        if interrupted:
+            raise Interrupted(trajectory)
     announce(logger, scene, dt, found)
     return trajectory
 
@@ -362,12 +369,9 @@ def _told(
     scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None, *, check: bool
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
     """A whole motion with what is to be said of it; ``hold`` is the period of its feedback in steps, None for none."""
-    if not check:
-        found = evident(scene, trajectory)
-        return with_warnings(trajectory, found), found
-    trajectory, found = examined(scene, integrator, trajectory)
-    if hold is not None:
-        found = (*unstable_loop(scene, trajectory, hold), *found)
+    if check:
+        return examined_in_loop(scene, integrator, trajectory, hold)
+    found = evident(scene, integrator, trajectory)
     return with_warnings(trajectory, found), found
 
 

@@ -134,13 +134,15 @@ def announce(logger: logging.Logger, scene: Scene, dt: float, found: Iterable[Fi
             logger.warning(finding.sentence)
 
 
-def evident(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
+def evident(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
     """What may be wrong, from the record alone: dampers faster than the step, steps taken in parts, limits left.
 
     For whoever does not take steps again; :func:`examined` says what is wrong.
     """
     found = []
-    if rate := _fast_damping(scene, trajectory):
+    rate = _fast_damping(scene, trajectory)
+    # With more stages what dampers are faster than a step leaves is less.
+    if trajectory.dt * rate > 2.0 * getattr(integrator, "stages", 1):
         found.append(Finding("fast damping", _ringing(rate, trajectory.dt)))
     if split := _in_parts(trajectory):
         found.append(Finding("split steps", f"{split}: dt = {trajectory.dt:g} s is coarse here"))

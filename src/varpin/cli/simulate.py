@@ -31,7 +31,6 @@ from varpin.cli.exits import INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import Output, add_outputs, outputs_of, write_all
 from varpin.errors import InputError
 from varpin.integrators import Integrator
-from varpin.lagrangian import lagrangian_jet
 from varpin.replay import frame_names
 from varpin.scene import Scene
 from varpin.simulation import Interrupted, StepFailure, simulate
@@ -90,9 +89,8 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
 
 
 def _warm_up(scene: Scene, q0: ArrayLike, v0: ArrayLike, torque: ArrayLike | None, integrator: Integrator) -> None:
-    """Compile what a run needs, which is no part of its wall time; damping is looked at through the jet."""
+    """Compile what a run needs, which is no part of its wall time."""
     Setting.of(scene, q0, v0, torque, 1.0).warm_up(integrator)
-    lagrangian_jet(scene, q0, np.zeros(scene.robot.dof))
 
 
 def _run(

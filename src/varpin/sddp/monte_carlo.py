@@ -29,12 +29,13 @@ from varpin.ensemble import (
 from varpin.errors import VarpinError
 from varpin.executors import executing, in_order, in_process
 from varpin.frozen import Frozen
+from varpin.loop_stability import examined_in_loop
 from varpin.markup import facts
 from varpin.policy import LinearPolicy
 from varpin.sddp.problem import OptimalControlProblem
 from varpin.sddp.verification import excess, percent
 from varpin.simulation import NoiseError, StepFailure, commands_of
-from varpin.soundness import Finding, announce, examined
+from varpin.soundness import Finding, announce
 from varpin.wiener import Children, children
 
 Floats = NDArray[np.float64]
@@ -223,7 +224,7 @@ def _look_alone(given: _Alone) -> tuple[Finding, ...]:
     """What is to be said of the first path."""
     (child,) = given.seeds.generators(given.path, given.path + 1)
     motion = given.problem.simulate(given.policy, rng=child)
-    found = examined(given.problem.scene, given.problem.integrator, motion)[1]
+    _, found = examined_in_loop(given.problem.scene, given.problem.integrator, motion, given.policy.hold)
     return tuple(Finding(finding.kind, f"path {given.path}: {finding.sentence}") for finding in found)
 
 
