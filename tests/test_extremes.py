@@ -395,8 +395,8 @@ def test_the_command_fails_where_anything_is_silent_wrong(capsys, monkeypatch):
     assert capsys.readouterr().out.count("silent wrong: a lie, ") == len(INTEGRATORS)
 
 
-# Some motions near the levels of the checks pass unsaid, and so do energies of first-order methods under torques that flip
-# at each step, where work by velocities and by ways differ.
+# Some motions near the levels of the checks pass unsaid, and so do energies of first-order methods under torques that
+# flip at each step, where work by velocities and by ways differ.
 UNSAID = pytest.mark.xfail(reason="some motions that the checks find wrong are not told of yet", strict=False)
 
 
