@@ -51,7 +51,7 @@ def test_the_jet_along_a_direction_is_its_difference(scene):
             s = sign * k * step
             _, _, _, Lqq, A, M = scene.core.jet(q + s * alpha, v + s * beta)
             expected += sign * c / step * np.stack([M, A, Lqq])
-    for ours, theirs in zip(scene.core.jet_along(q, v, alpha, beta), expected, strict=True):
+    for ours, theirs in zip(scene.core.jets_along(q[None], v[None], alpha[None], beta[None]), expected, strict=True):
         assert np.abs(ours - theirs).max() <= 1e-9 * np.abs(theirs).max()
 
 
@@ -73,16 +73,22 @@ def test_arrays_of_a_wrong_shape_are_refused(scene):
         ("coordinate", [0, 2], "coordinate is out of range"),
         ("group", [0, 3], "group is out of range"),
         ("mass", [1.0], "mass has size 1"),
+        ("ends", [1], "last block ends"),
+        ("ends", [3], "ends of blocks"),
+        ("loads", [0], "carried has size 0 along axis 0, not 1"),
     ],
 )
 def test_what_is_no_tree_is_refused(field, value, match):
     tree = vp.planar_chain(2).tree
     names = (
         "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio",
-        "offset", "origin", "armature", "group",
+        "offset", "origin", "loads", "carried", "periodic", "armature", "group",
     )  # fmt: skip
     own = {name: getattr(tree, name) for name in names}
+    own["ends"] = np.array(tree.ends)
     own[field] = np.array(value, dtype=own[field].dtype)
-    nothing = np.zeros(2)
+    own |= {name: np.zeros(2) for name in ("damping", "stiffness", "rest")}
+    own |= {"actuation": np.eye(2), "constant": np.zeros((2, 0)), "control": np.zeros((2, 0, 2))}
+    own |= {"quadratic": np.zeros((2, 0)), "centers": np.zeros((2, 0))}
     with pytest.raises(ValueError, match=match):
-        Mechanism.make(**own, groups=tree.groups, gravity=np.zeros(3), stiffness=nothing, rest=nothing)
+        Mechanism.make(**own, groups=tree.groups, gravity=np.zeros(3))

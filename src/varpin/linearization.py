@@ -13,8 +13,6 @@ from varpin.errors import InputError, LinearizationError
 from varpin.integrators import Integrator, integrator_of
 from varpin.integrators.base import diffusion_and_drift, open_loop
 from varpin.kernels._compile import announced_compilation
-from varpin.kernels.jet_tangent import momentum_curvatures, new_tangent
-from varpin.kernels.tree import new_sweep
 from varpin.markup import facts, table
 from varpin.noise import Fields
 from varpin.scene import Scene, require_scene
@@ -257,18 +255,7 @@ def velocity_curvature(scene: Scene, q: Floats, v: Floats, c: Floats) -> Floats:
     N, n = q.shape
     first = velocity_at_nodes(scene, q, v)
     y = np.einsum("Nij,Nj->Ni", first[:, :, n:], c)
-    bodies = scene.robot.tree.parent.size
-    dA, dLqq = np.empty((N, n, n)), np.empty((N, n, n))
-    momentum_curvatures(
-        scene.mechanism,
-        np.ascontiguousarray(q),
-        np.ascontiguousarray(v),
-        -y,
-        new_sweep(bodies, n),
-        new_tangent(bodies, n),
-        dA,
-        dLqq,
-    )
+    _, dA, dLqq = scene.core.jets_along(np.ascontiguousarray(q), np.ascontiguousarray(v), np.zeros_like(y), -y)
     D = np.concatenate([np.broadcast_to(np.eye(n, 2 * n), (N, n, 2 * n)), first], axis=1)
     inner = np.block([[dLqq, np.swapaxes(dA, 1, 2)], [dA, np.zeros_like(dA)]])
     second: Floats = np.swapaxes(D, 1, 2) @ inner @ D

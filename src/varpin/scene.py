@@ -25,7 +25,7 @@ EARTH = (0.0, 0.0, -9.81)
 # Fields of the tree that the core takes.
 _TREE = (
     "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio", "offset",
-    "origin", "armature", "group",
+    "origin", "loads", "carried", "periodic", "armature", "group",
 )  # fmt: skip
 
 
@@ -142,10 +142,24 @@ class Scene(Frozen):
 
     @cached_property
     def core(self) -> Core:
-        """The tree, gravity and springs as the compiled core takes them."""
-        tree = self.robot.tree
-        own = {name: getattr(tree, name) for name in _TREE}
-        return Core.make(**own, groups=tree.groups, gravity=self.gravity, stiffness=self.stiffness, rest=self.rest)
+        """The scene as the compiled core takes it; without fields that only Python can evaluate."""
+        tree, (n, m) = self.robot.tree, self.actuation.shape
+        nothing = Diffusion(np.zeros((n, 0)), np.zeros((n, 0, m)), np.zeros((n, 0)), np.zeros((n, 0)))
+        fields = self.noise.diffusion or nothing
+        return Core.make(
+            **{name: getattr(tree, name) for name in _TREE},
+            groups=tree.groups,
+            ends=np.array(tree.ends, dtype=np.int64),
+            gravity=self.gravity,
+            damping=self.damping,
+            stiffness=self.stiffness,
+            rest=self.rest,
+            actuation=self.actuation,
+            constant=fields.constant,
+            control=fields.control,
+            quadratic=fields.quadratic,
+            centers=fields.center,
+        )
 
     @cached_property
     def mechanism(self) -> Mechanism:

@@ -7,7 +7,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 class Mechanism:
-    """A tree of bodies with gravity and springs; see src/core/include/varpin/tree.hpp for the fields."""
+    """A tree of bodies in its surroundings; see src/core/include/varpin/tree.hpp for the fields."""
 
     @staticmethod
     def make(
@@ -23,12 +23,22 @@ class Mechanism:
         ratio: Floats,
         offset: Floats,
         origin: Integers,
+        loads: Integers,
+        carried: Integers,
+        periodic: Integers,
         armature: Floats,
         group: Integers,
         groups: int,
+        ends: Integers,
         gravity: Floats,
+        damping: Floats,
         stiffness: Floats,
         rest: Floats,
+        actuation: Floats,
+        constant: Floats,
+        control: Floats,
+        quadratic: Floats,
+        centers: Floats,
     ) -> Mechanism:
         """Raises ValueError for arrays that do not fit each other or describe no tree."""
 
@@ -38,5 +48,5 @@ class Mechanism:
     def jets(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
         """M and L_vq (N, n, n) at each row of q and v (N, n)."""
 
-    def jet_along(self, q: Floats, v: Floats, alpha: Floats, beta: Floats) -> tuple[Floats, Floats, Floats]:
-        """Derivatives of M, L_vq and L_qq (n, n) at (q, v) along (alpha, beta)."""
+    def jets_along(self, q: Floats, v: Floats, alpha: Floats, beta: Floats) -> tuple[Floats, Floats, Floats]:
+        """Derivatives of M, L_vq and L_qq (N, n, n) at each row of q and v along that of alpha and beta (N, n)."""

@@ -13,6 +13,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <type_traits>
 #include <vector>
 
 #include "varpin/dual.hpp"
@@ -21,18 +22,19 @@
 
 namespace varpin {
 
+// Sums of norms, in which nothing cancels, of the terms that make up a body's velocity, momentum and first moment:
+// rounding errors are in proportion to them and not to the results.
+struct Magnitudes {
+    double velocity = 0.0, turning = 0.0;  // V: linear, angular
+    double momentum = 0.0, spin = 0.0;     // H: linear, angular
+    double moment = 0.0;                   // m c
+};
+
 // Work arrays of a sweep, and where it leaves its results; matrices are (n, n), row by row.
 template <class T>
 struct Jet {
-    explicit Jet(const Tree& tree)
-        : body(tree.bodies.size()),
-          dof(tree.dof()),
-          potential(static_cast<std::size_t>(tree.groups)),
-          Lq(dof),
-          Lv(dof),
-          M(dof * dof),
-          A(dof * dof),
-          Lqq(dof * dof) {}
+    // Only steps ask how much rounding there is in L_q, L_v and the potential.
+    static constexpr bool scaled = std::is_same_v<T, double>;
 
     struct BodyState {
         Mat3<T> rotation{};
@@ -42,13 +44,28 @@ struct Jet {
         Motion<T> axis_rate{};
         Inertia<T> inertia{};
         Force<T> momentum{};
+        Magnitudes magnitude{};
     };
 
+    explicit Jet(const Tree& tree)
+        : body(tree.bodies.size()),
+          dof(tree.dof()),
+          potential(tree.groups),
+          Lq(dof),
+          Lv(dof),
+          M(dof * dof),
+          A(dof * dof),
+          Lqq(dof * dof),
+          potential_scale(tree.groups),
+          Lq_scale(dof),
+          Lv_scale(dof) {}
+
     std::vector<BodyState> body;
-    std::size_t dof;
+    int dof;
     T kinetic{};               // [J]
     std::vector<T> potential;  // of each group [J]
     std::vector<T> Lq, Lv, M, A, Lqq;
+    std::vector<double> potential_scale, Lq_scale, Lv_scale;  // sums of the magnitudes that make them up
 
     T total_potential() const {
         T sum{};
@@ -59,9 +76,14 @@ struct Jet {
 
 namespace detail {
 
-// Orientation, position and axis of a body; returns its joint's position [rad or m].
 template <class T>
-T place(const Tree& tree, std::size_t j, const T* q, Jet<T>& w) {
+double norm1(const Vec3<T>& a) {
+    return std::abs(a.x) + std::abs(a.y) + std::abs(a.z);
+}
+
+// Orientation, position and axis of a body.
+template <class T>
+void place(const Tree& tree, int j, const T* q, Jet<T>& w) {
     using std::cos, std::sin;
     const Body& link = tree.bodies[j];
     auto& here = w.body[j];
@@ -72,10 +94,10 @@ T place(const Tree& tree, std::size_t j, const T* q, Jet<T>& w) {
         const Mat3<double>& E = link.rotation;
         R = {{E.x.x, E.x.y, E.x.z}, {E.y.x, E.y.y, E.y.z}, {E.z.x, E.z.y, E.z.z}};
     } else {
-        R = w.body[static_cast<std::size_t>(link.parent)].rotation * link.rotation;
+        R = w.body[link.parent].rotation * link.rotation;
     }
     if (!link.origin) {
-        const auto& up = w.body[static_cast<std::size_t>(link.parent)];
+        const auto& up = w.body[link.parent];
         p = up.position + up.rotation * link.translation;
     }
     if (link.prismatic) {
@@ -88,12 +110,11 @@ T place(const Tree& tree, std::size_t j, const T* q, Jet<T>& w) {
         here.rotation = {c * R.x + s * R.y, c * R.y - s * R.x, R.z};
     }
     here.position = p;
-    return angle;
 }
 
 // Velocity V of a body and the rate W of its axis.
 template <class T>
-void move(const Tree& tree, std::size_t j, const T* v, Jet<T>& w) {
+void move(const Tree& tree, int j, const T* v, Jet<T>& w) {
     const Body& link = tree.bodies[j];
     auto& here = w.body[j];
     const T rate = link.ratio * v[link.coordinate];
@@ -102,50 +123,88 @@ void move(const Tree& tree, std::size_t j, const T* v, Jet<T>& w) {
         here.axis_rate = {};
         return;
     }
-    const Motion<T>& up = w.body[static_cast<std::size_t>(link.parent)].velocity;
+    const Motion<T>& up = w.body[link.parent].velocity;
     here.axis_rate = cross(up, here.axis);  // V_j x S_j = V_parent x S_j, since S x S = 0
     here.velocity = up + rate * here.axis;
 }
 
+inline void measure(const Tree& tree, int j, const double* v, Jet<double>& w) {
+    const Body& link = tree.bodies[j];
+    auto& here = w.body[j];
+    const double rate = std::abs(link.ratio * v[link.coordinate]);
+    Magnitudes& own = here.magnitude;
+    own.velocity = norm1(here.axis.linear) * rate;
+    own.turning = norm1(here.axis.angular) * rate;
+    if (link.parent >= 0) {
+        own.velocity += w.body[link.parent].magnitude.velocity;
+        own.turning += w.body[link.parent].magnitude.turning;
+    }
+    own.moment = norm1(here.inertia.moment);
+    own.momentum = link.mass * own.velocity + own.turning * own.moment;
+    own.spin = (link.inertia.xx + link.inertia.yy + link.inertia.zz) * own.turning;
+    if (link.mass > 0.0) own.spin += own.moment / link.mass * own.momentum;
+}
+
 // Gravity's potential energy of what an origin carries: of its moments, and of all masses' shift.
 template <class T>
-void add_potential(const Mechanism& mechanism, std::size_t j, const T& angle, Jet<T>& w) {
+void add_potential(const Mechanism& mechanism, int j, const T* q, Jet<T>& w) {
     const Body& link = mechanism.tree.bodies[j];
     const auto& here = w.body[j];
     Vec3<T> shift{T(link.translation.x), T(link.translation.y), T(link.translation.z)};
-    if (link.parent >= 0) shift = w.body[static_cast<std::size_t>(link.parent)].rotation * link.translation;
-    if (link.prismatic) shift += angle * here.axis.linear;
-    const auto group = static_cast<std::size_t>(mechanism.tree.group[static_cast<std::size_t>(link.coordinate)]);
+    if (link.parent >= 0) shift = w.body[link.parent].rotation * link.translation;
+    if (link.prismatic) shift += (link.ratio * q[link.coordinate] + link.offset) * here.axis.linear;
+    const int group = mechanism.tree.group[link.coordinate];
     w.potential[group] -= dot(here.inertia.mass * shift + here.inertia.moment, mechanism.gravity);
+    if constexpr (Jet<T>::scaled) {
+        w.potential_scale[group] +=
+            norm1(mechanism.gravity) * (here.inertia.mass * norm1(shift) + norm1(here.inertia.moment));
+    }
 }
 
-// The share of what body j carries in L_q, L_v, M, A and L_qq.
+// The share of what body j carries in L_q and L_v.
 template <class T>
-void project(const Mechanism& mechanism, std::size_t j, Jet<T>& w) {
+void project_first(const Mechanism& mechanism, int j, Jet<T>& w) {
+    const Body& link = mechanism.tree.bodies[j];
+    const auto& here = w.body[j];
+    const Vec3<double>& g = mechanism.gravity;
+    const Force<T> weight{here.inertia.mass * g, cross(here.inertia.moment, g)};
+    const int c = link.coordinate;
+    w.Lv[c] += link.ratio * dot(here.axis, here.momentum);
+    w.Lq[c] += link.ratio * (dot(here.axis_rate, here.momentum) + dot(here.axis, weight));
+    if constexpr (Jet<T>::scaled) {
+        const Magnitudes& own = here.magnitude;
+        const Magnitudes up = link.parent >= 0 ? w.body[link.parent].magnitude : Magnitudes{};
+        const double shift = norm1(here.axis.linear), turn = norm1(here.axis.angular);
+        const double Lv_scale = shift * own.momentum + turn * own.spin;
+        double Lq_scale = (up.turning * shift + up.velocity * turn) * own.momentum + up.turning * turn * own.spin;
+        Lq_scale += norm1(g) * (here.inertia.mass * shift + turn * own.moment);
+        w.Lv_scale[c] += std::abs(link.ratio) * Lv_scale;
+        w.Lq_scale[c] += std::abs(link.ratio) * Lq_scale;
+    }
+}
+
+// The share of what body j carries in M, A and L_qq.
+template <class T>
+void project_second(const Mechanism& mechanism, int j, Jet<T>& w) {
     const Tree& tree = mechanism.tree;
     const Body& link = tree.bodies[j];
     const auto& here = w.body[j];
-    const std::size_t n = w.dof, cj = static_cast<std::size_t>(link.coordinate);
-    const Vec3<double>& g = mechanism.gravity;
-    const Force<T> weight{here.inertia.mass * g, cross(here.inertia.moment, g)};
-    w.Lv[cj] += link.ratio * dot(here.axis, here.momentum);
-    w.Lq[cj] += link.ratio * (dot(here.axis_rate, here.momentum) + dot(here.axis, weight));
-
+    const int n = w.dof, cj = link.coordinate;
     const Force<T> F = here.inertia * here.axis;
     const Force<T> B = here.inertia * here.axis_rate + cross(here.axis, here.momentum);
     // F . (S_i x g) = S_i(angular) . (g x F(linear))
-    const Vec3<T> turning = cross(g, F.linear);
-    for (int i = static_cast<int>(j); i >= 0; i = tree.bodies[static_cast<std::size_t>(i)].parent) {
-        const Body& above = tree.bodies[static_cast<std::size_t>(i)];
-        const auto& there = w.body[static_cast<std::size_t>(i)];
-        const std::size_t ci = static_cast<std::size_t>(above.coordinate);
+    const Vec3<T> turning = cross(mechanism.gravity, F.linear);
+    for (int i = j; i >= 0; i = tree.bodies[i].parent) {
+        const Body& above = tree.bodies[i];
+        const auto& there = w.body[i];
+        const int ci = above.coordinate;
         const double ratio = above.ratio * link.ratio;
         const T mass = ratio * dot(there.axis, F);
         const T curvature = ratio * (dot(there.axis_rate, B) - dot(there.axis.angular, turning));
         w.M[ci * n + cj] += mass;
         w.Lqq[ci * n + cj] += curvature;
         w.A[ci * n + cj] += ratio * dot(there.axis, B);
-        if (i != static_cast<int>(j)) {
+        if (i != j) {
             w.M[cj * n + ci] += mass;
             w.Lqq[cj * n + ci] += curvature;
             w.A[cj * n + ci] += ratio * dot(there.axis_rate, F);
@@ -153,18 +212,83 @@ void project(const Mechanism& mechanism, std::size_t j, Jet<T>& w) {
     }
 }
 
-// Springs and armature.
+// The share of what body j carries in M alone: the composite rigid body algorithm.
 template <class T>
-void add_joints(const Mechanism& mechanism, const T* q, const T* v, Jet<T>& w) {
-    const Tree& tree = mechanism.tree;
-    w.kinetic = T{};
-    for (std::size_t c = 0; c < w.dof; ++c) {
+void project_mass(const Tree& tree, int j, Jet<T>& w) {
+    const Body& link = tree.bodies[j];
+    const Force<T> F = w.body[j].inertia * w.body[j].axis;
+    const int n = w.dof, cj = link.coordinate;
+    for (int i = j; i >= 0; i = tree.bodies[i].parent) {
+        const Body& above = tree.bodies[i];
+        const T mass = above.ratio * link.ratio * dot(w.body[i].axis, F);
+        w.M[above.coordinate * n + cj] += mass;
+        if (i != j) w.M[cj * n + above.coordinate] += mass;
+    }
+}
+
+// Hand what body j carries on to its parent. Above an origin all slide: they see masses and linear momenta alone.
+template <class T>
+void pass_inertia(const Body& link, const Inertia<T>& own, Inertia<T>& up, bool second) {
+    up.mass += own.mass;
+    if (link.origin) return;
+    up.moment += own.moment;
+    if (second) up.second += own.second;
+}
+
+template <class T>
+void pass_momentum(const Body& link, int j, Jet<T>& w) {
+    auto& up = w.body[link.parent];
+    up.momentum += w.body[j].momentum;
+    if constexpr (Jet<T>::scaled) {
+        up.magnitude.momentum += w.body[j].magnitude.momentum;
+        up.magnitude.spin += w.body[j].magnitude.spin;
+        up.magnitude.moment += w.body[j].magnitude.moment;
+    }
+}
+
+template <class T>
+void clear_first(Jet<T>& w) {
+    for (auto* sum : {&w.potential, &w.Lq, &w.Lv}) std::fill(sum->begin(), sum->end(), T{});
+    for (auto* sum : {&w.potential_scale, &w.Lq_scale, &w.Lv_scale}) std::fill(sum->begin(), sum->end(), 0.0);
+}
+
+// Zero the blocks of a matrix; outside of them nothing is ever written.
+template <class T>
+void clear_blocks(const Tree& tree, std::vector<T>& matrix) {
+    const int n = tree.dof();
+    for (const Block& block : tree.blocks) {
+        for (int i = block.begin; i < block.end; ++i) {
+            std::fill(matrix.begin() + i * n + block.begin, matrix.begin() + i * n + block.end, T{});
+        }
+    }
+}
+
+// The springs' potential energy; where `sloped`, their forces too.
+template <class T>
+void add_springs(const Mechanism& mechanism, const T* q, Jet<T>& w, bool sloped) {
+    for (int c = 0; c < w.dof; ++c) {
         const T stretch = q[c] - T(mechanism.rest[c]);
-        w.Lq[c] -= mechanism.stiffness[c] * stretch;
-        w.Lqq[c * w.dof + c] -= T(mechanism.stiffness[c]);
-        w.potential[static_cast<std::size_t>(tree.group[c])] += 0.5 * mechanism.stiffness[c] * (stretch * stretch);
-        w.M[c * w.dof + c] += T(tree.armature[c]);
-        w.Lv[c] += tree.armature[c] * v[c];
+        const T force = -mechanism.stiffness[c] * stretch;
+        const T energy = -0.5 * force * stretch;
+        const int group = mechanism.tree.group[c];
+        w.potential[group] += energy;
+        if (sloped) w.Lq[c] += force;
+        if constexpr (Jet<T>::scaled) {
+            w.potential_scale[group] += energy;
+            if (sloped)
+                w.Lq_scale[c] += std::abs(mechanism.stiffness[c]) * (std::abs(q[c]) + std::abs(mechanism.rest[c]));
+        }
+    }
+}
+
+// Armature's momentum, and the kinetic energy.
+template <class T>
+void add_armature(const Tree& tree, const T* v, Jet<T>& w) {
+    w.kinetic = T{};
+    for (int c = 0; c < w.dof; ++c) {
+        const T momentum = tree.armature[c] * v[c];
+        w.Lv[c] += momentum;
+        if constexpr (Jet<T>::scaled) w.Lv_scale[c] += std::abs(momentum);
         w.kinetic += 0.5 * (v[c] * w.Lv[c]);
     }
 }
@@ -175,32 +299,86 @@ void add_joints(const Mechanism& mechanism, const T* q, const T* v, Jet<T>& w) {
 template <class T>
 void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T>& w) {
     const Tree& tree = mechanism.tree;
-    for (auto* sum : {&w.potential, &w.Lq, &w.Lv, &w.M, &w.A, &w.Lqq}) std::fill(sum->begin(), sum->end(), T{});
-    for (std::size_t j = 0; j < tree.bodies.size(); ++j) {
+    detail::clear_first(w);
+    for (auto* matrix : {&w.M, &w.A, &w.Lqq}) detail::clear_blocks(tree, *matrix);
+    for (int j = 0; j < tree.size(); ++j) {
         const Body& link = tree.bodies[j];
         auto& here = w.body[j];
         detail::place(tree, j, q, w);
         detail::move(tree, j, v, w);
         here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
         here.momentum = here.inertia * here.velocity;
+        if constexpr (Jet<T>::scaled) detail::measure(tree, j, v, w);
     }
-    for (std::size_t j = tree.bodies.size(); j-- > 0;) {
+    for (int j = tree.size() - 1; j >= 0; --j) {
         const Body& link = tree.bodies[j];
-        const auto& here = w.body[j];
-        detail::project(mechanism, j, w);
+        detail::project_first(mechanism, j, w);
+        detail::project_second(mechanism, j, w);
         if (link.parent >= 0) {
-            auto& up = w.body[static_cast<std::size_t>(link.parent)];
-            up.momentum += here.momentum;
-            up.inertia.mass += here.inertia.mass;
-            // Above an origin all slide: they see masses and linear momenta alone.
-            if (!link.origin) {
-                up.inertia.moment += here.inertia.moment;
-                up.inertia.second += here.inertia.second;
-            }
+            detail::pass_momentum(link, j, w);
+            detail::pass_inertia(link, w.body[j].inertia, w.body[link.parent].inertia, true);
         }
-        if (link.origin) detail::add_potential(mechanism, j, link.ratio * q[link.coordinate] + link.offset, w);
+        if (link.origin) detail::add_potential(mechanism, j, q, w);
     }
-    detail::add_joints(mechanism, q, v, w);
+    detail::add_springs(mechanism, q, w, true);
+    for (int c = 0; c < w.dof; ++c) {
+        w.M[c * w.dof + c] += T(tree.armature[c]);
+        w.Lqq[c * w.dof + c] -= T(mechanism.stiffness[c]);
+    }
+    detail::add_armature(tree, v, w);
+}
+
+// L_q, L_v and the energies at (q, v) alone. Moments of inertia stay in their bodies' axes.
+inline void first_order(const Mechanism& mechanism, const double* q, const double* v, Jet<double>& w) {
+    const Tree& tree = mechanism.tree;
+    detail::clear_first(w);
+    for (int j = 0; j < tree.size(); ++j) {
+        const Body& link = tree.bodies[j];
+        auto& here = w.body[j];
+        detail::place(tree, j, q, w);
+        detail::move(tree, j, v, w);
+        const Vec3<double> center = here.position + here.rotation * link.center;
+        here.inertia.mass = link.mass;
+        here.inertia.moment = link.mass * center;
+        const Vec3<double>& spin = here.velocity.angular;
+        const Vec3<double> momentum = link.mass * (here.velocity.linear + cross(spin, center));
+        here.momentum = {momentum,
+                         here.rotation * (link.inertia * (transposed(here.rotation) * spin)) + cross(center, momentum)};
+        detail::measure(tree, j, v, w);
+    }
+    for (int j = tree.size() - 1; j >= 0; --j) {
+        const Body& link = tree.bodies[j];
+        detail::project_first(mechanism, j, w);
+        if (link.parent >= 0) {
+            detail::pass_momentum(link, j, w);
+            detail::pass_inertia(link, w.body[j].inertia, w.body[link.parent].inertia, false);
+        }
+        if (link.origin) detail::add_potential(mechanism, j, q, w);
+    }
+    detail::add_springs(mechanism, q, w, true);
+    detail::add_armature(tree, v, w);
+}
+
+// M and the potential energy at q alone.
+inline void mass_matrix(const Mechanism& mechanism, const double* q, Jet<double>& w) {
+    const Tree& tree = mechanism.tree;
+    std::fill(w.potential.begin(), w.potential.end(), 0.0);
+    std::fill(w.potential_scale.begin(), w.potential_scale.end(), 0.0);
+    detail::clear_blocks(tree, w.M);
+    for (int j = 0; j < tree.size(); ++j) {
+        const Body& link = tree.bodies[j];
+        auto& here = w.body[j];
+        detail::place(tree, j, q, w);
+        here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
+    }
+    for (int j = tree.size() - 1; j >= 0; --j) {
+        const Body& link = tree.bodies[j];
+        detail::project_mass(tree, j, w);
+        if (link.parent >= 0) detail::pass_inertia(link, w.body[j].inertia, w.body[link.parent].inertia, true);
+        if (link.origin) detail::add_potential(mechanism, j, q, w);
+    }
+    detail::add_springs(mechanism, q, w, false);
+    for (int c = 0; c < w.dof; ++c) w.M[c * w.dof + c] += tree.armature[c];
 }
 
 }  // namespace varpin

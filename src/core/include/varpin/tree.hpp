@@ -29,22 +29,47 @@ struct Block {
     int end = 0;
 };
 
+// A part that is light beside what carries it, with an energy balance of its own (guards.hpp).
+struct LightPart {
+    int body = 0;               // with which it begins
+    std::vector<char> carried;  // (n) whether a coordinate belongs to it
+};
+
 struct Tree {
     std::vector<Body> bodies;
     std::vector<double> armature;  // (n) [kg m^2 or kg]
+    std::vector<char> periodic;    // (n) the Lagrangian without springs is the same after a whole turn
     std::vector<int> group;        // (n) mechanically independent group of a coordinate
     int groups = 0;
-    std::vector<Block> blocks;
+    std::vector<Block> blocks;  // in order; together they hold all coordinates
+    std::vector<LightPart> light_parts;
 
-    std::size_t dof() const { return armature.size(); }
+    int dof() const { return static_cast<int>(armature.size()); }
+    int size() const { return static_cast<int>(bodies.size()); }
+};
+
+// Diffusion fields F_i of k Wiener processes, entry by entry
+// F = constant + control u + quadratic (q - center)^2; a center of NaN stands for the q at which a rollout starts.
+struct Diffusion {
+    int processes = 0;
+    std::vector<double> constant;   // (n, k) generalized force per square root of time
+    std::vector<double> control;    // (n, k, m)
+    std::vector<double> quadratic;  // (n, k)
+    std::vector<double> center;     // (n, k) [rad or m]
 };
 
 // A tree in its surroundings.
 struct Mechanism {
     Tree tree;
     Vec3<double> gravity{};         // [m/s^2]
+    std::vector<double> damping;    // (n) [N m s/rad or N s/m]
     std::vector<double> stiffness;  // (n) of joint springs [N m/rad or N/m]
     std::vector<double> rest;       // (n) where they are slack [rad or m]
+    int controls = 0;               // m
+    std::vector<double> actuation;  // (n, m) generalized force per control
+    Diffusion diffusion;
+
+    int dof() const { return tree.dof(); }
 };
 
 }  // namespace varpin

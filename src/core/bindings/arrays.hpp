@@ -1,0 +1,65 @@
+// Arrays at the border to Python: their kinds, and the one place where their shapes are checked.
+#pragma once
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include <algorithm>
+#include <cstdint>
+#include <initializer_list>
+#include <stdexcept>
+#include <string>
+
+namespace varpin::border {
+
+namespace nb = nanobind;
+
+template <int dimensions>
+using In = nb::ndarray<const double, nb::ndim<dimensions>, nb::c_contig, nb::device::cpu>;
+template <int dimensions>
+using InOut = nb::ndarray<double, nb::ndim<dimensions>, nb::c_contig, nb::device::cpu>;
+template <int dimensions>
+using Integers = nb::ndarray<const std::int64_t, nb::ndim<dimensions>, nb::c_contig, nb::device::cpu>;
+template <int dimensions>
+using IntegersInOut = nb::ndarray<std::int64_t, nb::ndim<dimensions>, nb::c_contig, nb::device::cpu>;
+using Out = nb::ndarray<nb::numpy, double>;
+
+// std::invalid_argument becomes ValueError.
+template <class Array>
+void require(const Array& array, const char* name, std::initializer_list<std::size_t> shape) {
+    std::size_t axis = 0;
+    for (std::size_t size : shape) {
+        if (array.shape(axis) != size) {
+            throw std::invalid_argument(std::string(name) + " has size " + std::to_string(array.shape(axis)) +
+                                        " along axis " + std::to_string(axis) + ", not " + std::to_string(size));
+        }
+        ++axis;
+    }
+}
+
+// Of an array that may be left out: empty along its first axis, or of this shape.
+template <class Array>
+bool given(const Array& array, const char* name, std::initializer_list<std::size_t> shape) {
+    if (array.shape(0) == 0 && *shape.begin() != 0) return false;
+    require(array, name, shape);
+    return true;
+}
+
+// A NumPy array to be filled in.
+inline Out array_for(double*& values, std::initializer_list<std::size_t> shape) {
+    std::size_t size = 1;
+    for (std::size_t length : shape) size *= length;
+    values = new double[size]();
+    nb::capsule owner(values, [](void* held) noexcept { delete[] static_cast<double*>(held); });
+    return Out(values, shape, owner);
+}
+
+// A NumPy array that owns a copy of some numbers.
+inline Out array_of(const double* values, std::initializer_list<std::size_t> shape) {
+    double* copy = nullptr;
+    Out out = array_for(copy, shape);
+    std::copy(values, values + out.size(), copy);
+    return out;
+}
+
+}  // namespace varpin::border

@@ -1,0 +1,176 @@
+// The mechanism and its Lagrangian jet.
+#include <nanobind/stl/tuple.h>
+
+#include <tuple>
+#include <utility>
+
+#include "arrays.hpp"
+#include "registrations.hpp"
+#include "varpin/jet.hpp"
+
+namespace varpin::border {
+
+namespace {
+
+using namespace nanobind::literals;
+
+template <class Array>
+std::vector<double> copied(const Array& array) {
+    return {array.data(), array.data() + array.size()};
+}
+
+Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation, In<2> translation, In<1> mass,
+                       In<2> center, In<2> inertia, Integers<1> coordinate, In<1> ratio, In<1> offset,
+                       Integers<1> origin, Integers<1> loads, Integers<2> carried, Integers<1> periodic, In<1> armature,
+                       Integers<1> group, int groups, Integers<1> ends, In<1> gravity, In<1> damping, In<1> stiffness,
+                       In<1> rest, In<2> actuation, In<2> constant, In<3> control, In<2> quadratic, In<2> centers) {
+    const std::size_t bodies = parent.shape(0), n = armature.shape(0), m = actuation.shape(1);
+    const std::size_t processes = constant.shape(1);
+    for (const auto& [array, name] :
+         {std::pair{&prismatic, "prismatic"}, {&coordinate, "coordinate"}, {&origin, "origin"}})
+        require(*array, name, {bodies});
+    for (const auto& [array, name] : {std::pair{&mass, "mass"}, {&ratio, "ratio"}, {&offset, "offset"}})
+        require(*array, name, {bodies});
+    require(rotation, "rotation", {bodies, 3, 3});
+    require(translation, "translation", {bodies, 3});
+    require(center, "center", {bodies, 3});
+    require(inertia, "inertia", {bodies, 6});
+    require(carried, "carried", {loads.shape(0), n});
+    for (const auto& [array, name] : {std::pair{&group, "group"}, {&periodic, "periodic"}}) require(*array, name, {n});
+    require(gravity, "gravity", {3});
+    for (const auto& [array, name] : {std::pair{&damping, "damping"}, {&stiffness, "stiffness"}, {&rest, "rest"}})
+        require(*array, name, {n});
+    require(actuation, "actuation", {n, m});
+    require(constant, "constant", {n, processes});
+    require(control, "control", {n, processes, m});
+    require(quadratic, "quadratic", {n, processes});
+    require(centers, "centers", {n, processes});
+    Mechanism out;
+    for (std::size_t j = 0; j < bodies; ++j) {
+        if (parent(j) < -1 || parent(j) >= static_cast<std::int64_t>(j))
+            throw std::invalid_argument("parents come before their children");
+        if (coordinate(j) < 0 || coordinate(j) >= static_cast<std::int64_t>(n))
+            throw std::invalid_argument("a body's coordinate is out of range");
+        if (origin(j) == 0 && parent(j) < 0) throw std::invalid_argument("a root is an origin");
+        Body link;
+        link.parent = static_cast<int>(parent(j));
+        link.prismatic = prismatic(j) != 0;
+        link.rotation = {{rotation(j, 0, 0), rotation(j, 1, 0), rotation(j, 2, 0)},
+                         {rotation(j, 0, 1), rotation(j, 1, 1), rotation(j, 2, 1)},
+                         {rotation(j, 0, 2), rotation(j, 1, 2), rotation(j, 2, 2)}};
+        link.translation = {translation(j, 0), translation(j, 1), translation(j, 2)};
+        link.mass = mass(j);
+        link.center = {center(j, 0), center(j, 1), center(j, 2)};
+        link.inertia = {inertia(j, 0), inertia(j, 1), inertia(j, 2), inertia(j, 3), inertia(j, 4), inertia(j, 5)};
+        link.coordinate = static_cast<int>(coordinate(j));
+        link.ratio = ratio(j);
+        link.offset = offset(j);
+        link.origin = origin(j) != 0;
+        out.tree.bodies.push_back(link);
+    }
+    for (std::size_t c = 0; c < n; ++c) {
+        if (group(c) < 0 || group(c) >= groups) throw std::invalid_argument("a coordinate's group is out of range");
+        out.tree.group.push_back(static_cast<int>(group(c)));
+        out.tree.periodic.push_back(periodic(c) != 0);
+    }
+    out.tree.groups = groups;
+    int begin = 0;
+    for (std::size_t b = 0; b < ends.shape(0); ++b) {
+        if (ends(b) <= begin || ends(b) > static_cast<std::int64_t>(n))
+            throw std::invalid_argument("the ends of blocks rise up to the number of coordinates");
+        out.tree.blocks.push_back({begin, static_cast<int>(ends(b))});
+        begin = static_cast<int>(ends(b));
+    }
+    if (begin != static_cast<int>(n)) throw std::invalid_argument("the last block ends with the last coordinate");
+    for (std::size_t r = 0; r < loads.shape(0); ++r) {
+        if (loads(r) < 0 || loads(r) >= static_cast<std::int64_t>(bodies) || parent(loads(r)) < 0)
+            throw std::invalid_argument("a light part begins with a body that another carries");
+        LightPart part;
+        part.body = static_cast<int>(loads(r));
+        for (std::size_t c = 0; c < n; ++c) part.carried.push_back(carried(r, c) != 0);
+        out.tree.light_parts.push_back(part);
+    }
+    out.tree.armature = copied(armature);
+    out.gravity = {gravity(0), gravity(1), gravity(2)};
+    out.damping = copied(damping);
+    out.stiffness = copied(stiffness);
+    out.rest = copied(rest);
+    out.controls = static_cast<int>(m);
+    out.actuation = copied(actuation);
+    out.diffusion = {static_cast<int>(processes), copied(constant), copied(control), copied(quadratic),
+                     copied(centers)};
+    return out;
+}
+
+// L, L_q, L_v, L_qq, L_vq, L_vv.
+std::tuple<double, Out, Out, Out, Out, Out> jet(const Mechanism& mechanism, In<1> q, In<1> v) {
+    const auto n = static_cast<std::size_t>(mechanism.dof());
+    require(q, "q", {n});
+    require(v, "v", {n});
+    Jet<double> w(mechanism.tree);
+    lagrangian_jet(mechanism, q.data(), v.data(), w);
+    return {w.kinetic - w.total_potential(), array_of(w.Lq.data(), {n}),   array_of(w.Lv.data(), {n}),
+            array_of(w.Lqq.data(), {n, n}),  array_of(w.A.data(), {n, n}), array_of(w.M.data(), {n, n})};
+}
+
+// M and L_vq at each row of q and v (N, n).
+std::tuple<Out, Out> jets(const Mechanism& mechanism, In<2> q, In<2> v) {
+    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
+    require(q, "q", {rows, n});
+    require(v, "v", {rows, n});
+    double *M = nullptr, *A = nullptr;
+    Out Ms = array_for(M, {rows, n, n}), As = array_for(A, {rows, n, n});
+    {
+        nb::gil_scoped_release release;
+        Jet<double> w(mechanism.tree);
+        for (std::size_t s = 0; s < rows; ++s) {
+            lagrangian_jet(mechanism, q.data() + s * n, v.data() + s * n, w);
+            std::copy(w.M.begin(), w.M.end(), M + s * n * n);
+            std::copy(w.A.begin(), w.A.end(), A + s * n * n);
+        }
+    }
+    return {Ms, As};
+}
+
+// Derivatives of M, L_vq and L_qq along (alpha, beta) at each row of q, v, alpha and beta (N, n).
+std::tuple<Out, Out, Out> jets_along(const Mechanism& mechanism, In<2> q, In<2> v, In<2> alpha, In<2> beta) {
+    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
+    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}, {&alpha, "alpha"}, {&beta, "beta"}})
+        require(*array, name, {rows, n});
+    double* slopes[3] = {};
+    const Out M = array_for(slopes[0], {rows, n, n}), A = array_for(slopes[1], {rows, n, n}),
+              Lqq = array_for(slopes[2], {rows, n, n});
+    {
+        nb::gil_scoped_release release;
+        Jet<Dual> w(mechanism.tree);
+        std::vector<Dual> at_q(n), at_v(n);
+        const std::vector<Dual>* of[3] = {&w.M, &w.A, &w.Lqq};
+        for (std::size_t s = 0; s < rows; ++s) {
+            for (std::size_t c = 0; c < n; ++c) {
+                at_q[c] = {q(s, c), alpha(s, c)};
+                at_v[c] = {v(s, c), beta(s, c)};
+            }
+            lagrangian_jet(mechanism, at_q.data(), at_v.data(), w);
+            for (int i = 0; i < 3; ++i) {
+                std::transform(of[i]->begin(), of[i]->end(), slopes[i] + s * n * n,
+                               [](const Dual& x) { return x.slope; });
+            }
+        }
+    }
+    return {M, A, Lqq};
+}
+
+}  // namespace
+
+void register_mechanism(nb::module_& m) {
+    nb::class_<Mechanism>(m, "Mechanism")
+        .def_static("make", &mechanism_of, nb::kw_only(), "parent"_a, "prismatic"_a, "rotation"_a, "translation"_a,
+                    "mass"_a, "center"_a, "inertia"_a, "coordinate"_a, "ratio"_a, "offset"_a, "origin"_a, "loads"_a,
+                    "carried"_a, "periodic"_a, "armature"_a, "group"_a, "groups"_a, "ends"_a, "gravity"_a, "damping"_a,
+                    "stiffness"_a, "rest"_a, "actuation"_a, "constant"_a, "control"_a, "quadratic"_a, "centers"_a)
+        .def("jet", &jet, "q"_a, "v"_a)
+        .def("jets", &jets, "q"_a, "v"_a)
+        .def("jets_along", &jets_along, "q"_a, "v"_a, "alpha"_a, "beta"_a);
+}
+
+}  // namespace varpin::border

@@ -1,0 +1,12 @@
+#pragma once
+
+#include <nanobind/nanobind.h>
+
+namespace varpin::border {
+
+void register_mechanism(nanobind::module_& m);
+void register_kinematics(nanobind::module_& m);
+void register_backward(nanobind::module_& m);
+void register_rollouts(nanobind::module_& m);
+
+}  // namespace varpin::border

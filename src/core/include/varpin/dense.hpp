@@ -1,0 +1,204 @@
+// Small dense factorizations, written out: at the size of an arm a call of LAPACK costs more than its work.
+// Matrices are square with rows of length n; a function works on the rows and columns [begin, end) of one block.
+// Inner loops run along rows.
+#pragma once
+
+#include <cmath>
+#include <limits>
+#include <utility>
+
+#include "varpin/tree.hpp"
+
+namespace varpin {
+
+// LU in place without pivoting; false at a pivot that is not positive. For a matrix whose symmetric part is positive
+// definite every pivot is positive and none grows without bound.
+inline bool factor_lu(double* a, int n, Block block) {
+    for (int k = block.begin; k < block.end; ++k) {
+        const double* top = a + k * n;
+        if (!(top[k] > 0.0)) return false;
+        const double inverse = 1.0 / top[k];
+        for (int i = k + 1; i < block.end; ++i) {
+            double* row = a + i * n;
+            const double factor = row[k] * inverse;
+            row[k] = factor;
+            for (int j = k + 1; j < block.end; ++j) row[j] -= factor * top[j];
+        }
+    }
+    return true;
+}
+
+// The x with L U x = b; x may be b.
+inline void solve_lu(const double* lu, int n, Block block, const double* b, double* x) {
+    for (int i = block.begin; i < block.end; ++i) {
+        double total = b[i];
+        for (int j = block.begin; j < i; ++j) total -= lu[i * n + j] * x[j];
+        x[i] = total;
+    }
+    for (int i = block.end - 1; i >= block.begin; --i) {
+        double total = x[i];
+        for (int j = i + 1; j < block.end; ++j) total -= lu[i * n + j] * x[j];
+        x[i] = total / lu[i * n + i];
+    }
+}
+
+// The X with L U X = B, B and X (size of the block, columns) row by row and in one place, all columns at once.
+// Row i of the block stands at x + (i - begin) * stride.
+inline void solve_lu_rows(const double* lu, int n, Block block, double* x, int columns, int stride) {
+    for (int i = block.begin; i < block.end; ++i) {
+        double* __restrict row = x + (i - block.begin) * stride;
+        for (int j = block.begin; j < i; ++j) {
+            const double factor = lu[i * n + j];
+            const double* __restrict other = x + (j - block.begin) * stride;
+            for (int c = 0; c < columns; ++c) row[c] -= factor * other[c];
+        }
+    }
+    for (int i = block.end - 1; i >= block.begin; --i) {
+        double* __restrict row = x + (i - block.begin) * stride;
+        for (int j = i + 1; j < block.end; ++j) {
+            const double factor = lu[i * n + j];
+            const double* __restrict other = x + (j - block.begin) * stride;
+            for (int c = 0; c < columns; ++c) row[c] -= factor * other[c];
+        }
+        const double inverse = 1.0 / lu[i * n + i];
+        for (int c = 0; c < columns; ++c) row[c] *= inverse;
+    }
+}
+
+// LU with rows exchanged; `order` (n) receives which row stands where. Returns the sign of the determinant, 0 where it
+// is not finite.
+inline int factor_lu_pivoting(double* a, int n, int* order) {
+    int sign = 1;
+    for (int i = 0; i < n; ++i) order[i] = i;
+    for (int k = 0; k < n; ++k) {
+        int best = k;
+        for (int i = k + 1; i < n; ++i) {
+            if (std::abs(a[i * n + k]) > std::abs(a[best * n + k])) best = i;
+        }
+        if (best != k) {
+            sign = -sign;
+            std::swap(order[k], order[best]);
+            for (int j = 0; j < n; ++j) std::swap(a[k * n + j], a[best * n + j]);
+        }
+        const double* __restrict top = a + k * n;
+        const double pivot = top[k];
+        if (!(std::abs(pivot) > 0.0) || !(std::abs(pivot) < std::numeric_limits<double>::infinity())) return 0;
+        if (pivot < 0.0) sign = -sign;
+        const double inverse = 1.0 / pivot;
+        for (int i = k + 1; i < n; ++i) {
+            double* __restrict row = a + i * n;
+            const double factor = row[k] * inverse;
+            row[k] = factor;
+            for (int j = k + 1; j < n; ++j) row[j] -= factor * top[j];
+        }
+    }
+    return sign;
+}
+
+// The x with a x = b for the a that factor_lu_pivoting has factored.
+inline void solve_lu_pivoting(const double* lu, int n, const int* order, const double* b, double* x) {
+    for (int i = 0; i < n; ++i) {
+        double total = b[order[i]];
+        for (int j = 0; j < i; ++j) total -= lu[i * n + j] * x[j];
+        x[i] = total;
+    }
+    for (int i = n - 1; i >= 0; --i) {
+        double total = x[i];
+        for (int j = i + 1; j < n; ++j) total -= lu[i * n + j] * x[j];
+        x[i] = total / lu[i * n + i];
+    }
+}
+
+// L D L' of a symmetric matrix in place: pivots on the diagonal, unit L below it. Reads the lower triangle; false at a
+// pivot that is not positive.
+inline bool factor_ldl(double* a, int n, Block block) {
+    for (int k = block.begin; k < block.end; ++k) {
+        const double pivot = a[k * n + k];
+        if (!(pivot > 0.0)) return false;
+        const double inverse = 1.0 / pivot;
+        for (int i = k + 1; i < block.end; ++i) {
+            const double factor = a[i * n + k] * inverse;
+            for (int j = k + 1; j <= i; ++j) a[i * n + j] -= factor * a[j * n + k];
+        }
+        for (int i = k + 1; i < block.end; ++i) a[i * n + k] *= inverse;
+    }
+    return true;
+}
+
+// The smallest ratio of a pivot of the symmetric a to the same pivot of b; 0 if one is not positive. Reads and
+// overwrites the lower triangles; both are factored at once, as neither fills a processor's pipeline.
+inline double least_pivot_ratio(double* a, double* b, int n, Block block) {
+    double least = std::numeric_limits<double>::infinity();
+    for (int k = block.begin; k < block.end; ++k) {
+        const double pivot_a = a[k * n + k], pivot_b = b[k * n + k];
+        if (!(pivot_a > 0.0 && pivot_b > 0.0)) return 0.0;
+        least = std::min(least, pivot_a / pivot_b);
+        const double inverse_a = 1.0 / pivot_a, inverse_b = 1.0 / pivot_b;
+        for (int i = k + 1; i < block.end; ++i) {
+            const double factor_a = a[i * n + k] * inverse_a, factor_b = b[i * n + k] * inverse_b;
+            for (int j = k + 1; j <= i; ++j) {
+                a[i * n + j] -= factor_a * a[j * n + k];
+                b[i * n + j] -= factor_b * b[j * n + k];
+            }
+        }
+    }
+    return least;
+}
+
+// The x with L x = b, and the x with L' x = b in place of b.
+inline void solve_lower(const double* ldl, int n, Block block, const double* b, double* x) {
+    for (int i = block.begin; i < block.end; ++i) {
+        double total = b[i];
+        for (int j = block.begin; j < i; ++j) total -= ldl[i * n + j] * x[j];
+        x[i] = total;
+    }
+}
+inline void solve_upper(const double* ldl, int n, Block block, double* x) {
+    for (int i = block.end - 1; i >= block.begin; --i) {
+        double total = x[i];
+        for (int j = i + 1; j < block.end; ++j) total -= ldl[j * n + i] * x[j];
+        x[i] = total;
+    }
+}
+
+// The x with L D L' x = b; x may be b.
+inline void solve_ldl(const double* ldl, int n, Block block, const double* b, double* x) {
+    solve_lower(ldl, n, block, b, x);
+    for (int i = block.begin; i < block.end; ++i) x[i] /= ldl[i * n + i];
+    solve_upper(ldl, n, block, x);
+}
+
+// The X with L D L' X = B (n, columns), in place, whole rows at a time.
+inline void solve_ldl_rows(const double* ldl, int n, double* b, int columns) {
+    for (int i = 0; i < n; ++i) {
+        double* __restrict row = b + i * columns;
+        for (int j = 0; j < i; ++j) {
+            const double factor = ldl[i * n + j];
+            const double* __restrict other = b + j * columns;
+            for (int c = 0; c < columns; ++c) row[c] -= factor * other[c];
+        }
+    }
+    for (int i = n - 1; i >= 0; --i) {
+        double* __restrict row = b + i * columns;
+        const double inverse = 1.0 / ldl[i * n + i];
+        for (int c = 0; c < columns; ++c) row[c] *= inverse;
+        for (int j = i + 1; j < n; ++j) {
+            const double factor = ldl[j * n + i];
+            const double* __restrict other = b + j * columns;
+            for (int c = 0; c < columns; ++c) row[c] -= factor * other[c];
+        }
+    }
+}
+
+// x' a x over one block.
+inline double quadratic_form(const double* a, int n, Block block, const double* x) {
+    double total = 0.0;
+    for (int i = block.begin; i < block.end; ++i) {
+        double row = 0.0;
+        for (int j = block.begin; j < block.end; ++j) row += a[i * n + j] * x[j];
+        total += x[i] * row;
+    }
+    return total;
+}
+
+}  // namespace varpin
