@@ -3,6 +3,7 @@
 // Inner loops run along rows.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 #include <utility>
@@ -107,6 +108,19 @@ inline void solve_lu_pivoting(const double* lu, int n, const int* order, const d
         for (int j = i + 1; j < n; ++j) total -= lu[i * n + j] * x[j];
         x[i] = total / lu[i * n + i];
     }
+}
+
+// The x with a' x = b from the factors of a; `order` is null where rows were not exchanged. Overwrites b.
+inline void solve_lu_transposed(const double* lu, int n, const int* order, double* b, double* x) {
+    // a = P' L U, so U' y = b, L' z = y, x = P' z.
+    for (int i = 0; i < n; ++i) {
+        b[i] /= lu[i * n + i];
+        for (int j = i + 1; j < n; ++j) b[j] -= lu[i * n + j] * b[i];
+    }
+    for (int i = n - 1; i >= 0; --i) {
+        for (int j = 0; j < i; ++j) b[j] -= lu[i * n + j] * b[i];
+    }
+    for (int i = 0; i < n; ++i) x[order ? order[i] : i] = b[i];
 }
 
 // L D L' of a symmetric matrix in place: pivots on the diagonal, unit L below it. Reads the lower triangle; false at a

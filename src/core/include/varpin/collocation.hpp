@@ -1,0 +1,410 @@
+// The equation of a collocation step, its Newton iteration and its derivatives. docs/mathematics.md, "Higher order" and
+// "Structured linearization". The unknowns are the stage velocities V_i (tableau.hpp); with F = f - D V
+//
+//     r_i(V) = p0 + h sum_j (abar_ij L_q + f_ij F)(Q_j, V_j) - L_v(Q_i, V_i) = 0
+//     N_im = -dr_i/dV_m = delta_im M_i + h (a_im A_i - abar_im A_m' + f_im D) - h^2 sum_j abar_ij a_jm L_qq,j
+//
+// N falls apart into one matrix for each block of the tree. On the branch of solutions that is connected to h -> 0 its
+// determinant is positive.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <vector>
+
+#include "varpin/compensated.hpp"
+#include "varpin/dense.hpp"
+#include "varpin/jet.hpp"
+#include "varpin/nodes.hpp"
+#include "varpin/tableau.hpp"
+
+namespace varpin {
+
+inline constexpr double infinity = std::numeric_limits<double>::infinity();
+inline constexpr double rounding_unit = std::numeric_limits<double>::epsilon();
+// Below it squares and products with the rounding unit underflow: what dies out ends at rest.
+inline constexpr double nothing = 1e-290;
+
+// What a step took.
+struct Effort {
+    std::int64_t newton_iterations = 0;
+    std::int64_t jets = 0;
+    std::int64_t sweeps = 0;  // of first order
+    std::int64_t substeps = 0;
+    double residual = 0.0;  // the worst, in rounding units of the terms that cancel in it
+    double branch_margin = infinity;
+};
+
+// Where a step begins.
+struct Start {
+    const Place* place = nullptr;    // (n)
+    const Compensated* p = nullptr;  // (n)
+    const double* force = nullptr;   // (n) constant over the step: the controls', and the drift of the noise
+};
+
+class Collocation {
+   public:
+    Collocation(const Mechanism& mechanism, const Tableau& tableau)
+        : mechanism(mechanism),
+          tableau(tableau),
+          n(mechanism.dof()),
+          stages(tableau.stages),
+          stage(stages, Jet<double>(mechanism.tree)),
+          V(stages * n),
+          Q(stages * n),
+          slope(stages * n),
+          residual(stages * n),
+          delta(stages * n) {
+        int size = 0, largest = 0;
+        for (const Block& block : mechanism.tree.blocks) {
+            const int own = stages * (block.end - block.begin);
+            size += own * own;
+            largest = std::max(largest, own);
+        }
+        lu.resize(size);
+        order.resize(stages * n);
+        change.resize(stages * largest);
+        local.resize(2 * largest);
+    }
+
+    const Mechanism& mechanism;
+    const Tableau& tableau;
+    int n;
+    int stages;
+    std::vector<Jet<double>> stage;
+    std::vector<double> V;      // (s, n) stage velocities: the guess, then the root
+    std::vector<double> Q;      // (s, n)
+    std::vector<double> slope;  // (s, n) L_q + F
+
+    // Solve the step equation from the guess in V.
+    //
+    // The first factorization is kept at least until a second correction shows how fast it contracts, and for as long
+    // as three more would do. Gives up when a correction exceeds half of the one before (natural monotonicity, Deuflhard
+    // 2004), unless the residual is down at its rounding floor. A last correction is not looked at again if that
+    // contraction takes the residual below a tenth of the tolerance: slopes are then corrected to first order. Where
+    // `jets_wanted`, it ends with the jets of the root.
+    Outcome solve(double h, const Start& start, double tolerance, bool jets_wanted, Effort& effort) {
+        double before = infinity, worst = infinity;
+        bool fresh = true;
+        for (int iteration = 0; iteration < most_corrections + 2; ++iteration) {
+            sweep(h, start, fresh, effort);
+            worst = residuals(h, start);
+            if (worst <= tolerance) {
+                if (fresh || !jets_wanted) break;
+                fresh = true;
+                continue;
+            }
+            if (!(worst < infinity)) return Outcome::not_finite;
+            if (fresh && !factor(h)) return Outcome::fold;
+            solve_factored(residual.data(), delta.data());
+            const double size = kinetic_size(delta.data());
+            if (iteration >= most_corrections || !(size <= 0.25 * before)) break;
+            for (int k = 0; k < stages * n; ++k) V[k] += delta[k];
+            ++effort.newton_iterations;
+            fresh = false;
+            if (before < infinity) {
+                const double contraction = std::sqrt(size / before);
+                if (sure * contraction * worst <= tolerance && !jets_wanted) {
+                    correct_slopes(h);
+                    worst *= contraction;
+                    break;
+                }
+                fresh = !(worst * contraction * contraction * contraction <= tolerance);
+            }
+            before = size;
+        }
+        if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
+        effort.residual = std::max(effort.residual, worst);
+        return Outcome::solved;
+    }
+
+    // Factor N from the stages' jets; false where its determinant is not positive.
+    bool factor(double h) {
+        double* matrix = lu.data();
+        int* rows = order.data();
+        for (const Block& block : mechanism.tree.blocks) {
+            const int size = stages * (block.end - block.begin);
+            assemble(h, block, matrix);
+            if (stages == 1) {
+                // The symmetric part is positive definite on the branch sought.
+                if (!factor_lu(matrix, size, {0, size})) return false;
+            } else if (factor_lu_pivoting(matrix, size, rows) <= 0) {
+                return false;
+            }
+            matrix += size * size;
+            rows += size;
+        }
+        return true;
+    }
+
+    // Derivatives at the root, from the jets of its stages: dV (s, n, 3n), and of (q1, p1), all in (q0, p0, f); Jx is
+    // (2n, 2n), Jf (2n, n). Blocks alone are written into dV.
+    void derivatives(double h, std::vector<double>& dV, double* Jx, double* Jf) {
+        const auto& blocks = mechanism.tree.blocks;
+        if (blocks.size() > 1) {
+            std::fill(Jx, Jx + 4 * n * n, 0.0);
+            std::fill(Jf, Jf + 2 * n * n, 0.0);
+        }
+        factor(h);
+        const double* matrix = lu.data();
+        const int* rows = order.data();
+        for (const Block& block : blocks) {
+            const int width = block.end - block.begin, size = stages * width;
+            right_sides(h, block, dV);
+            solve_columns(matrix, rows, block, dV);
+            end_derivatives(h, block, dV, Jx, Jf);
+            matrix += size * size;
+            rows += size;
+        }
+    }
+
+    // x with N x = right (s, n), from what `factor` left.
+    void solve_factored(const double* right, double* x) {
+        solve_blocks(right, x, [this](const double* matrix, int size, const int* rows, double* b, double* y) {
+            if (stages == 1) {
+                solve_lu(matrix, size, {0, size}, b, y);
+            } else {
+                solve_lu_pivoting(matrix, size, rows, b, y);
+            }
+        });
+    }
+
+    // x with N' x = right.
+    void solve_transposed(const double* right, double* x) {
+        solve_blocks(right, x, [this](const double* matrix, int size, const int* rows, double* b, double* y) {
+            solve_lu_transposed(matrix, size, stages == 1 ? nullptr : rows, b, y);
+        });
+    }
+
+   private:
+    template <class Solve>
+    void solve_blocks(const double* right, double* x, const Solve& solve_block) {
+        const double* matrix = lu.data();
+        const int* rows = order.data();
+        for (const Block& block : mechanism.tree.blocks) {
+            const int width = block.end - block.begin, size = stages * width;
+            double *b = local.data(), *y = b + size;
+            for (int i = 0; i < stages; ++i)
+                std::copy(right + i * n + block.begin, right + i * n + block.end, b + i * width);
+            solve_block(matrix, size, rows, b, y);
+            for (int i = 0; i < stages; ++i) std::copy(y + i * width, y + (i + 1) * width, x + i * n + block.begin);
+            matrix += size * size;
+            rows += size;
+        }
+    }
+
+    static constexpr int most_corrections = 10;
+    // In rounding units: a residual below may stagnate; without rounding's own scatter it would be 1.
+    static constexpr double stagnation = 100.0;
+    // A residual that is expected this far below the tolerance need not be looked at.
+    static constexpr double sure = 10.0;
+
+    std::vector<double> residual, delta;  // (s, n)
+    std::vector<double> lu;               // the factors of each block, one after another
+    std::vector<int> order;               // of their rows
+    std::vector<double> change, local, columns, shift;
+
+    void sweep(double h, const Start& start, bool second, Effort& effort) {
+        for (int i = 0; i < stages; ++i) {
+            for (int c = 0; c < n; ++c) {
+                double total = 0.0;
+                for (int j = 0; j < stages; ++j) total += tableau.a[i * stages + j] * V[j * n + c];
+                Q[i * n + c] = start.place[c].place.high + (start.place[c].place.low + h * total);
+            }
+        }
+        for (int i = 0; i < stages; ++i) {
+            if (second) {
+                lagrangian_jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
+            } else {
+                first_order(mechanism, &Q[i * n], &V[i * n], stage[i]);
+            }
+        }
+        (second ? effort.jets : effort.sweeps) += stages;
+    }
+
+    // r(V); returns its largest entry in rounding units of its terms.
+    double residuals(double h, const Start& start) {
+        double worst = 0.0;
+        for (int i = 0; i < stages; ++i) {
+            for (int c = 0; c < n; ++c)
+                slope[i * n + c] = stage[i].Lq[c] + (start.force[c] - mechanism.damping[c] * V[i * n + c]);
+        }
+        for (int i = 0; i < stages; ++i) {
+            const double* abar = &tableau.gradient[i * stages];
+            const double* f = &tableau.force[i * stages];
+            for (int c = 0; c < n; ++c) {
+                double total = 0.0, scale = 0.0;
+                for (int j = 0; j < stages; ++j) {
+                    const double drag = mechanism.damping[c] * V[j * n + c];
+                    total += abar[j] * stage[j].Lq[c] + f[j] * (start.force[c] - drag);
+                    scale += std::abs(abar[j]) * stage[j].Lq_scale[c] +
+                             std::abs(f[j]) * (std::abs(start.force[c]) + std::abs(drag));
+                }
+                double error = (start.p[c].high - stage[i].Lv[c]) + (start.p[c].low + h * total);
+                residual[i * n + c] = error;
+                scale = h * scale + std::abs(start.p[c].high) + stage[i].Lv_scale[c];
+                if (scale > nothing) error = std::abs(error) / (rounding_unit * scale);
+                if (!(error <= worst)) worst = error;  // NaN ends up in worst
+            }
+        }
+        return worst;
+    }
+
+    // The block's part of N, (s width, s width).
+    void assemble(double h, Block block, double* matrix) {
+        const int width = block.end - block.begin, size = stages * width;
+        std::fill(matrix, matrix + size * size, 0.0);
+        // Row r of slope j's derivative in all of V, of which the rows of N take their share in one long loop.
+        for (int r = 0; r < width; ++r) {
+            const int row = block.begin + r;
+            for (int j = 0; j < stages; ++j) {
+                double* own = &change[j * size];
+                for (int m = 0; m < stages; ++m) {
+                    const double factor = h * tableau.a[j * stages + m];
+                    const double* curvature = &stage[j].Lqq[row * n + block.begin];
+                    for (int c = 0; c < width; ++c) own[m * width + c] = factor * curvature[c];
+                }
+                for (int c = 0; c < width; ++c) own[j * width + c] += stage[j].A[(block.begin + c) * n + row];
+            }
+            for (int i = 0; i < stages; ++i) {
+                double* __restrict line = matrix + (i * width + r) * size;
+                for (int j = 0; j < stages; ++j) {
+                    const double factor = h * tableau.gradient[i * stages + j];
+                    const double* __restrict own = &change[j * size];
+                    for (int k = 0; k < size; ++k) line[k] -= factor * own[k];
+                }
+                for (int j = 0; j < stages; ++j) {
+                    const double factor = h * tableau.a[i * stages + j];
+                    const double* A = &stage[i].A[row * n + block.begin];
+                    for (int c = 0; c < width; ++c) line[j * width + c] += factor * A[c];
+                    line[j * width + r] += h * tableau.force[i * stages + j] * mechanism.damping[row];
+                }
+                const double* M = &stage[i].M[row * n + block.begin];
+                for (int c = 0; c < width; ++c) line[i * width + c] += M[c];
+            }
+        }
+    }
+
+    // The square of x (s, n) in the metric of the kinetic energy, averaged over the step.
+    double kinetic_size(const double* x) const {
+        double total = 0.0;
+        for (int i = 0; i < stages; ++i) {
+            for (const Block& block : mechanism.tree.blocks)
+                total += tableau.b[i] * quadratic_form(stage[i].M.data(), n, block, x + i * n);
+        }
+        return total;
+    }
+
+    // Bring L_q + F to where the correction in `delta` has taken the stages, to first order in it.
+    void correct_slopes(double h) {
+        std::vector<double>& moved = residual;
+        for (int i = 0; i < stages; ++i) {
+            for (int c = 0; c < n; ++c) {
+                double total = 0.0;
+                for (int j = 0; j < stages; ++j) total += tableau.a[i * stages + j] * delta[j * n + c];
+                moved[i * n + c] = h * total;
+            }
+        }
+        for (int i = 0; i < stages; ++i) {
+            for (const Block& block : mechanism.tree.blocks) {
+                for (int r = block.begin; r < block.end; ++r) {
+                    double total = -mechanism.damping[r] * delta[i * n + r];
+                    for (int c = block.begin; c < block.end; ++c)
+                        total += stage[i].Lqq[r * n + c] * moved[i * n + c] + stage[i].A[c * n + r] * delta[i * n + c];
+                    slope[i * n + r] += total;
+                }
+            }
+        }
+    }
+
+    // dr_i in (q0, p0, f): h sum_j abar_ij L_qq,j - A_i, 1, and h sum_j f_ij.
+    void right_sides(double h, Block block, std::vector<double>& dV) const {
+        for (int i = 0; i < stages; ++i) {
+            double share = 0.0;
+            for (int j = 0; j < stages; ++j) share += tableau.force[i * stages + j];
+            for (int r = block.begin; r < block.end; ++r) {
+                double* row = &dV[(i * n + r) * 3 * n];
+                for (int c = block.begin; c < block.end; ++c) {
+                    double total = 0.0;
+                    for (int j = 0; j < stages; ++j)
+                        total += tableau.gradient[i * stages + j] * stage[j].Lqq[r * n + c];
+                    row[c] = h * total - stage[i].A[r * n + c];
+                    row[n + c] = r == c ? 1.0 : 0.0;
+                    row[2 * n + c] = r == c ? h * share : 0.0;
+                }
+            }
+        }
+    }
+
+    // N dV = dr in place, whole rows at a time.
+    void solve_columns(const double* matrix, const int* rows, Block block, std::vector<double>& dV) {
+        const int width = block.end - block.begin, size = stages * width;
+        columns.resize(size * 3 * width);
+        // Row k of the block's own system, which stands at (stage, coordinate) in dV.
+        const auto line = [&](int k) { return &dV[((k / width) * n + block.begin + k % width) * 3 * n]; };
+        for (int k = 0; k < size; ++k) {
+            const double* from = line(stages == 1 ? k : rows[k]);
+            for (int kind = 0; kind < 3; ++kind)
+                std::copy(from + kind * n + block.begin, from + kind * n + block.end,
+                          &columns[(k * 3 + kind) * width]);
+        }
+        solve_lu_rows(matrix, size, {0, size}, columns.data(), 3 * width, 3 * width);
+        for (int k = 0; k < size; ++k) {
+            double* to = line(k);
+            for (int kind = 0; kind < 3; ++kind)
+                std::copy(&columns[(k * 3 + kind) * width], &columns[(k * 3 + kind + 1) * width],
+                          to + kind * n + block.begin);
+        }
+    }
+
+    // dq1 = dq0 + h sum_i b_i dV_i,  dp1 = dp0 + h sum_i b_i (L_qq,i dQ_i + A_i' dV_i - D dV_i + df).
+    void end_derivatives(double h, Block block, const std::vector<double>& dV, double* Jx, double* Jf) {
+        const int width = block.end - block.begin;
+        shift.resize(width * 3 * width);
+        const auto entry = [&](int r, int kind, int c) -> double& {
+            return kind == 2 ? Jf[r * n + c] : Jx[r * 2 * n + kind * n + c];
+        };
+        for (int r = block.begin; r < block.end; ++r) {
+            for (int kind = 0; kind < 3; ++kind) {
+                for (int c = block.begin; c < block.end; ++c) {
+                    double total = 0.0;
+                    for (int i = 0; i < stages; ++i) total += tableau.b[i] * dV[(i * n + r) * 3 * n + kind * n + c];
+                    entry(r, kind, c) = h * total + (kind == 0 && r == c ? 1.0 : 0.0);
+                    entry(n + r, kind, c) = r != c ? 0.0 : kind == 1 ? 1.0 : kind == 2 ? h : 0.0;
+                }
+            }
+        }
+        for (int i = 0; i < stages; ++i) {
+            for (int r = 0; r < width; ++r) {
+                for (int kind = 0; kind < 3; ++kind) {
+                    double* row = &shift[(r * 3 + kind) * width];
+                    for (int c = 0; c < width; ++c) row[c] = kind == 0 && r == c ? 1.0 : 0.0;
+                    for (int j = 0; j < stages; ++j) {
+                        const double factor = h * tableau.a[i * stages + j];
+                        const double* from = &dV[(j * n + block.begin + r) * 3 * n + kind * n + block.begin];
+                        for (int c = 0; c < width; ++c) row[c] += factor * from[c];
+                    }
+                }
+            }
+            const double weight = h * tableau.b[i];
+            for (int r = block.begin; r < block.end; ++r) {
+                for (int m = block.begin; m < block.end; ++m) {
+                    const double curvature = weight * stage[i].Lqq[r * n + m];
+                    const double coupling =
+                        weight * (stage[i].A[m * n + r] - (m == r ? mechanism.damping[r] : 0.0));
+                    for (int kind = 0; kind < 3; ++kind) {
+                        const double* __restrict dQ = &shift[((m - block.begin) * 3 + kind) * width];
+                        const double* __restrict dv = &dV[(i * n + m) * 3 * n + kind * n + block.begin];
+                        double* __restrict out = &entry(n + r, kind, block.begin);
+                        for (int c = 0; c < width; ++c) out[c] += curvature * dQ[c] + coupling * dv[c];
+                    }
+                }
+            }
+        }
+    }
+
+};
+
+}  // namespace varpin

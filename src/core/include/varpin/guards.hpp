@@ -1,0 +1,393 @@
+// When a step is accepted. docs/mathematics.md, "The principal branch".
+//
+// Branch: the step equation has other roots than the one that is connected to h -> 0. There the symmetric part of
+// N = -dr/dv is positive definite; its pivots are compared with those of M, the destabilising term exaggerated.
+//
+// Energy: |dE - work of the forces| over a substep must be a small part of the energy turned over, for each mechanically
+// independent group. What rides on something far heavier is lost in that balance, so light parts have one of their own:
+// with coordinates i of its own and a of what carries it, the Jacobi energy J = sum_i p_i v_i - L of the part's bodies
+// changes by dJ = sum_i F_i dq_i - sum_a (L_q,a dq_a + L_v,a dv_a), L_q,a and L_v,a by the trapezoidal rule.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "varpin/collocation.hpp"
+#include "varpin/compensated.hpp"
+#include "varpin/dense.hpp"
+#include "varpin/jet.hpp"
+
+namespace varpin {
+
+struct Guards {
+    bool active = true;             // else a step is accepted whenever its equation is solved
+    double branch_margin = 0.5;     // how far from the fold a root must stay, in [0, 1)
+    double energy_balance = 0.005;  // largest energy error of a substep, in units of the energy it turns over
+    double energy_budget = 0.02;    // of the errors added up, in units of the most energy that moved in a substep so far
+    int most_halvings = 12;
+};
+
+// The energy of one group at the last node.
+struct Ledger {
+    double kinetic = 0.0;
+    double potential = 0.0;
+    double defect = 0.0;  // errors added up
+    double most = 0.0;    // largest kinetic energy that moved in a substep
+};
+
+// What of the kinetic energy is one coordinate's own while those before it are free; its bounds of late.
+struct Share {
+    double now = 0.0;
+    double least = 0.0;
+    double largest = 0.0;
+};
+
+// The balance of a light part at a node; the carrier's L_q and L_v in all coordinates.
+struct PartLedger {
+    double jacobi = 0.0;
+    double potential = 0.0;
+    double scale = 0.0;  // of the terms that make them up
+    double defect = 0.0;
+    double most = 0.0;
+    std::vector<double> Lq, Lv;  // (n)
+};
+
+// Energies of a path at its last node.
+struct Energies {
+    explicit Energies(const Tree& tree) : group(tree.groups), share(tree.dof()), part(tree.light_parts.size()) {
+        for (PartLedger& own : part) {
+            own.Lq.resize(tree.dof());
+            own.Lv.resize(tree.dof());
+        }
+    }
+    std::vector<Ledger> group;
+    std::vector<Share> share;
+    std::vector<PartLedger> part;
+
+    double total() const {
+        double sum = 0.0;
+        for (const Ledger& own : group) sum += own.kinetic + own.potential;
+        return sum;
+    }
+    double defect() const {
+        double sum = 0.0;
+        for (const Ledger& own : group) sum += std::abs(own.defect);
+        return sum;
+    }
+};
+
+// A node that a substep has reached.
+struct Trial {
+    explicit Trial(int n) : place(n), p(n), at(n), momentum(n), v(n), work(n), dissipated(n) {}
+    std::vector<Place> place;
+    std::vector<Compensated> p;
+    std::vector<double> at, momentum;  // (n) the same as plain numbers, for sweeps
+    std::vector<double> v;             // (n) M^-1 p
+    std::vector<double> work;          // (n) of the forces on each coordinate over the substep [J]
+    std::vector<double> dissipated;    // (n) by friction [J]
+};
+
+class EnergyGuard {
+   public:
+    EnergyGuard(const Mechanism& mechanism)
+        : mechanism(mechanism),
+          n(mechanism.dof()),
+          jet(mechanism.tree),
+          ldl(n * n),
+          kinetic(mechanism.tree.groups),
+          moved(mechanism.tree.groups),
+          work(mechanism.tree.groups),
+          lost(mechanism.tree.groups),
+          share(n),
+          curved(n * n),
+          mass(n * n),
+          part(Energies(mechanism.tree).part) {}
+
+    // v = M(q)^-1 p at a node, and the kinetic and potential energy there; false where M is not positive definite.
+    // Leaves the factors of M.
+    bool node(const double* q, const double* p, double* v) {
+        mass_matrix(mechanism, q, jet);
+        for (const Block& block : mechanism.tree.blocks) {
+            for (int i = block.begin; i < block.end; ++i)
+                std::copy(&jet.M[i * n + block.begin], &jet.M[i * n + i + 1], &ldl[i * n + block.begin]);
+            if (!factor_ldl(ldl.data(), n, block)) return false;
+        }
+        velocity(p, v);
+        return true;
+    }
+
+    // v = M^-1 p from the factors L D L' that `node` left. The terms of the kinetic energy 1/2 y' D^-1 y with L y = p,
+    // none of which is negative, are the coordinates' shares.
+    void velocity(const double* p, double* v) {
+        std::fill(kinetic.begin(), kinetic.end(), 0.0);
+        for (const Block& block : mechanism.tree.blocks) {
+            solve_lower(ldl.data(), n, block, p, v);
+            for (int i = block.begin; i < block.end; ++i) {
+                const double y = v[i];
+                v[i] /= ldl[i * n + i];
+                share[i] = 0.5 * v[i] * y;
+                kinetic[mechanism.tree.group[i]] += share[i];
+            }
+            solve_upper(ldl.data(), n, block, v);
+        }
+    }
+
+    // x = M^-1 b.
+    void solve(const double* b, double* x) const {
+        for (const Block& block : mechanism.tree.blocks) solve_ldl(ldl.data(), n, block, b, x);
+    }
+
+    // A fresh start at a node: no errors lie behind it.
+    void begin(const double* q, const double* p, const double* v, Energies& energies) {
+        for (int r = 0; r < mechanism.tree.groups; ++r) energies.group[r] = {kinetic[r], jet.potential[r], 0.0, 0.0};
+        for (int i = 0; i < n; ++i) energies.share[i] = {share[i], share[i], share[i]};
+        light_parts(q, p, v);
+        for (std::size_t r = 0; r < part.size(); ++r) {
+            part[r].defect = part[r].most = 0.0;
+            energies.part[r] = part[r];
+        }
+    }
+
+    // The momentum has been kicked: velocity and energy come along, and no error is entered.
+    void kicked(const double* q, const double* p, double* v, Energies& energies) {
+        velocity(p, v);
+        find_moved(energies);
+        for (int r = 0; r < mechanism.tree.groups; ++r) {
+            energies.group[r].kinetic = kinetic[r];
+            energies.group[r].most = std::max(energies.group[r].most, moved[r]);
+        }
+        enter_shares(0.0, energies);
+        light_parts(q, p, v);
+        for (std::size_t r = 0; r < part.size(); ++r) {
+            part[r].defect = energies.part[r].defect;
+            part[r].most = energies.part[r].most;
+            energies.part[r] = part[r];
+        }
+    }
+
+    // How far the root is from the fold where branches of solutions meet: 1 as h -> 0, <= 0 where refused. The smallest
+    // ratio of a pivot of M + (h/2) D + h skew (A + A') - h^2 reach L_qq / (1 - margin) to the same pivot of M, all
+    // averaged over the stages with b.
+    double branch_margin(double h, const Guards& guards, const Collocation& step) {
+        const Tableau& tableau = step.tableau;
+        const double exaggerated = h * h * tableau.reach / (1.0 - guards.branch_margin);
+        double least = infinity;
+        for (const Block& block : mechanism.tree.blocks) {
+            for (int i = block.begin; i < block.end; ++i) {
+                for (int j = block.begin; j <= i; ++j) {
+                    double inertia = 0.0, curvature = 0.0, coupling = 0.0;
+                    for (int s = 0; s < step.stages; ++s) {
+                        inertia += tableau.b[s] * step.stage[s].M[i * n + j];
+                        curvature += tableau.b[s] * step.stage[s].Lqq[i * n + j];
+                        if (tableau.skew != 0.0)
+                            coupling += tableau.b[s] * (step.stage[s].A[i * n + j] + step.stage[s].A[j * n + i]);
+                    }
+                    curved[i * n + j] = inertia - exaggerated * curvature + h * tableau.skew * coupling;
+                    mass[i * n + j] = inertia;
+                }
+                curved[i * n + i] += 0.5 * h * mechanism.damping[i];
+            }
+            least = std::min(least, least_pivot_ratio(curved.data(), mass.data(), n, block));
+        }
+        return least;
+    }
+
+    // Velocity and energy of the node that a substep has reached, and whether its energy balance closes; enters it if so.
+    Outcome settle(const Guards& guards, double off_middle, Energies& energies, const std::vector<Place>& from,
+                   const std::vector<double>& from_v, Trial& trial) {
+        for (int i = 0; i < n; ++i) {
+            trial.at[i] = trial.place[i].place.high;
+            trial.momentum[i] = trial.p[i].high;
+        }
+        if (!node(trial.at.data(), trial.momentum.data(), trial.v.data())) return Outcome::singular;
+        find_moved(energies);
+        const Tree& tree = mechanism.tree;
+        std::fill(work.begin(), work.end(), 0.0);
+        std::fill(lost.begin(), lost.end(), 0.0);
+        for (int i = 0; i < n; ++i) {
+            work[tree.group[i]] += trial.work[i];
+            lost[tree.group[i]] += trial.dissipated[i];
+        }
+        const Limit limit{guards.energy_balance * (1.0 + 9.0 * off_middle), guards.energy_budget};
+        if (guards.active) {
+            for (int r = 0; r < tree.groups; ++r) {
+                if (!balanced(limit, off_middle, energies.group[r], r)) return Outcome::energy;
+            }
+        }
+        if (!part.empty()) {
+            light_parts(trial.at.data(), trial.momentum.data(), trial.v.data());
+            for (std::size_t r = 0; r < part.size(); ++r) {
+                if (!part_balanced(limit, energies, from, from_v, trial, r) && guards.active) return Outcome::energy;
+            }
+            std::copy(part.begin(), part.end(), energies.part.begin());
+        }
+        for (int r = 0; r < tree.groups; ++r) enter(energies.group[r], r);
+        enter_shares(fade, energies);
+        return Outcome::solved;
+    }
+
+   private:
+    static constexpr double fade = 1.0 / 256.0;     // by which a substep forgets how far kinetic energies have varied
+    static constexpr double rounding = 1e-12;       // of the magnitudes that make up an energy
+    static constexpr double part_room = 4.0;        // times the limits of whole groups: the trapezoidal rule errs too
+    static constexpr double least_room = 0.02;      // is always left, or a full ledger could never be worked off
+
+    struct Limit {
+        double balance = 0.0;
+        double budget = 0.0;
+
+        // The largest error over a substep. An error that adds to those before it has less room the fuller the ledger.
+        double of(double error, double defect, double moved, double exchanged, double most) const {
+            double limit = balance * (moved + exchanged);
+            if (std::abs(defect + error) > std::abs(defect)) {
+                const double room = budget * std::max({most, moved, exchanged});
+                if (room > 0.0) limit *= std::max(least_room, 1.0 - std::abs(defect) / room);
+            }
+            return limit;
+        }
+    };
+
+    const Mechanism& mechanism;
+    int n;
+    Jet<double> jet;
+    std::vector<double> ldl;             // (n, n) factors of M
+    std::vector<double> kinetic, moved;  // of each group [J]
+    std::vector<double> work, lost;      // of each group over the substep, and by friction [J]
+    std::vector<double> share;           // (n)
+    std::vector<double> curved, mass;    // (n, n) of the branch guard
+    std::vector<PartLedger> part;        // of the node that is tried
+
+    // The kinetic energy that a coordinate may be said to turn over. Its share counts as far as it has varied of late: a
+    // heavy wheel that turns on and on would else leave room for any error of what it carries.
+    double varied(const Energies& energies, int i) const {
+        const Share& own = energies.share[i];
+        return std::min(std::max(own.now, share[i]), std::max(own.largest, share[i]) - std::min(own.least, share[i]));
+    }
+
+    void find_moved(const Energies& energies) {
+        std::fill(moved.begin(), moved.end(), 0.0);
+        for (int i = 0; i < n; ++i) moved[mechanism.tree.group[i]] += varied(energies, i);
+        for (std::size_t r = 0; r < moved.size(); ++r)
+            moved[r] = std::min(moved[r], std::max(kinetic[r], energies.group[r].kinetic));
+    }
+
+    void enter_shares(double forget, Energies& energies) const {
+        for (int i = 0; i < n; ++i) {
+            Share& own = energies.share[i];
+            const double now = share[i];
+            own.now = now;
+            own.least = std::min(own.least + forget * (now - own.least), now);
+            own.largest = std::max(own.largest + forget * (now - own.largest), now);
+        }
+    }
+
+    // How much the energy of group r has changed that no force accounts for [J].
+    double error_of(const Ledger& ledger, int r) const {
+        return (kinetic[r] - ledger.kinetic) + (jet.potential[r] - ledger.potential) - work[r];
+    }
+
+    bool balanced(const Limit& limit, double off_middle, const Ledger& ledger, int r) const {
+        const double error = error_of(ledger, r);
+        const double exchanged = std::abs(jet.potential[r] - ledger.potential) + std::abs(work[r]);
+        const double scale = jet.potential_scale[r];
+        const double room = rounding * (scale + kinetic[r]) + 1e-3 * off_middle * scale + nothing;
+        return std::abs(error) <= limit.of(error, ledger.defect, moved[r], exchanged, ledger.most) + room;
+    }
+
+    // Enter an accepted substep. What friction takes, it takes of the errors too.
+    void enter(Ledger& ledger, int r) const {
+        double defect = ledger.defect + error_of(ledger, r);
+        if (lost[r] > 0.0) defect *= std::max(0.0, 1.0 - lost[r] / (lost[r] + std::max(kinetic[r], ledger.kinetic)));
+        ledger = {kinetic[r], jet.potential[r], defect, std::max(ledger.most, moved[r])};
+    }
+
+    // Whether a body is `top` or hangs on it; parents come first.
+    bool below(int body, int top) const {
+        while (body > top) body = mechanism.tree.bodies[body].parent;
+        return body == top;
+    }
+
+    // Jacobi energy, potential energy and the carrier's derivatives of each light part at a node.
+    void light_parts(const double* q, const double* p, const double* v) {
+        if (part.empty()) return;
+        const Tree& tree = mechanism.tree;
+        const Vec3<double>& g = mechanism.gravity;
+        const double strength = detail::norm1(g);
+        first_order(mechanism, q, v, jet);
+        for (std::size_t r = 0; r < part.size(); ++r) {
+            const LightPart& light = tree.light_parts[r];
+            PartLedger& own = part[r];
+            const auto& top = jet.body[light.body];
+            const int carrier = tree.bodies[light.body].parent;
+            const double carried = 0.5 * dot(jet.body[carrier].velocity, top.momentum);
+            // Of what carries the part's origin up and down the carrier's L_q is spared too.
+            own.potential = -dot(g, top.inertia.moment);
+            own.scale = strength * detail::norm1(top.inertia.moment) + std::abs(carried);
+            for (int b = light.body; b < tree.size(); ++b) {
+                const Body& link = tree.bodies[b];
+                if (!link.origin || !below(b, light.body)) continue;
+                const auto& there = jet.body[b];
+                // Moments past an origin are about it, and it slides.
+                if (b > light.body) {
+                    own.potential -= dot(g, there.inertia.moment);
+                    own.scale += strength * detail::norm1(there.inertia.moment);
+                }
+                if (link.prismatic) {
+                    const double slid = link.ratio * q[link.coordinate] + link.offset;
+                    own.potential -= there.inertia.mass * slid * dot(g, there.axis.linear);
+                    own.scale += strength * there.inertia.mass * std::abs(slid);
+                }
+            }
+            own.jacobi = -carried;
+            std::fill(own.Lq.begin(), own.Lq.end(), 0.0);
+            std::fill(own.Lv.begin(), own.Lv.end(), 0.0);
+            for (int c = 0; c < n; ++c) {
+                if (!light.carried[c]) continue;
+                const double stretch = q[c] - mechanism.rest[c];
+                own.potential += 0.5 * mechanism.stiffness[c] * stretch * stretch;
+                own.jacobi += 0.5 * p[c] * v[c];
+                own.scale += std::abs(p[c] * v[c]);
+            }
+            const Force<double> weight{top.inertia.mass * g, cross(top.inertia.moment, g)};
+            for (int a = carrier; a >= 0; a = tree.bodies[a].parent) {
+                const Body& link = tree.bodies[a];
+                const auto& there = jet.body[a];
+                double slope = dot(there.axis_rate, top.momentum);
+                if (!(link.origin && link.prismatic)) slope += dot(there.axis, weight);
+                own.Lq[link.coordinate] += link.ratio * slope;
+                own.Lv[link.coordinate] += link.ratio * dot(there.axis, top.momentum);
+            }
+            own.jacobi += own.potential;
+        }
+    }
+
+    // Whether the balance of light part r closes over a substep; leaves its ledger in `part`.
+    bool part_balanced(const Limit& limit, const Energies& energies, const std::vector<Place>& from,
+                       const std::vector<double>& from_v, const Trial& trial, std::size_t r) {
+        const PartLedger& old = energies.part[r];
+        PartLedger& own = part[r];
+        double work = 0.0, drive = 0.0, exchanged = 0.0, turned = 0.0;
+        for (int c = 0; c < n; ++c) {
+            if (mechanism.tree.light_parts[r].carried[c]) {
+                work += trial.work[c];
+                turned += varied(energies, c);
+                continue;
+            }
+            const Compensated &now = trial.place[c].place, &then = from[c].place;
+            const double by_place =
+                0.5 * (old.Lq[c] + own.Lq[c]) * ((now.high - then.high) + (now.low - then.low));
+            const double by_rate = 0.5 * (old.Lv[c] + own.Lv[c]) * (trial.v[c] - from_v[c]);
+            drive += by_place + by_rate;
+            exchanged += std::abs(by_place) + std::abs(by_rate);
+        }
+        const double error = (own.jacobi - old.jacobi) - work + drive;
+        exchanged += std::abs(own.potential - old.potential) + std::abs(work);
+        const double most = limit.of(error, old.defect, turned, exchanged, part_room * old.most);
+        own.defect = old.defect + error;
+        own.most = std::max(old.most, turned);
+        return std::abs(error) <= part_room * most + rounding * (old.scale + own.scale + exchanged) + nothing;
+    }
+};
+
+}  // namespace varpin

@@ -1,0 +1,27 @@
+// Collocation over a step of unit length. docs/mathematics.md, "Higher order". With s stages, Q_i = q0 + h sum_j a_ij V_j
+// and the momentum equation of stage i weighted with abar (L_q) and f (forces):
+//
+//     L_v(Q_i, V_i) = p0 + h sum_j (abar_ij L_q + f_ij F)(Q_j, V_j)
+//     q1 = q0 + h sum_i b_i V_i,    p1 = p0 + h sum_i b_i (L_q + F)(Q_i, V_i)
+//
+// Gauss and Radau IIA: a = abar = f. The midpoint rule: a = alpha, abar = 1 - alpha, f = 1/2.
+#pragma once
+
+#include <vector>
+
+namespace varpin {
+
+struct Tableau {
+    int stages = 0;
+    std::vector<double> a;         // (s, s)
+    std::vector<double> gradient;  // (s, s) abar
+    std::vector<double> force;     // (s, s) f
+    std::vector<double> b;         // (s)
+    std::vector<double> c;         // (s)
+    std::vector<double> ahead;     // (s, s + 1) values at the next step's stages of the polynomial through this one's
+                                   // stages and its end
+    double reach = 0.0;            // the largest Rayleigh quotient of abar a in the metric of b
+    double skew = 0.0;             // alpha - 1/2 of the midpoint rule: off the middle it is of first order
+};
+
+}  // namespace varpin

@@ -1,0 +1,306 @@
+// The variational stepper: collocation steps, accepted by the guards or else taken in halves, and halves of halves; kicks
+// of noise before the step, or half before and half after. docs/mathematics.md, "The principal branch" and "Noise".
+#pragma once
+
+#include <algorithm>
+#include <vector>
+
+#include "varpin/collocation.hpp"
+#include "varpin/guards.hpp"
+#include "varpin/nodes.hpp"
+#include "varpin/policy.hpp"
+
+namespace varpin {
+
+// Where a path stands.
+struct PathState {
+    PathState(const Mechanism& mechanism, int stages)
+        : place(mechanism.dof()),
+          p(mechanism.dof()),
+          q(mechanism.dof()),
+          momentum(mechanism.dof()),
+          v(mechanism.dof()),
+          energies(mechanism.tree),
+          center(mechanism.dof() * mechanism.diffusion.processes),
+          past(stages * mechanism.dof()),
+          miss(stages * mechanism.dof()),
+          past_end(mechanism.dof()),
+          past_force(mechanism.dof()) {}
+
+    std::vector<Place> place;
+    std::vector<Compensated> p;
+    std::vector<double> q;         // (n) as it is shown
+    std::vector<double> momentum;  // (n) p, rounded
+    std::vector<double> v;         // (n) M(q)^-1 p
+    Energies energies;
+    std::vector<double> center;      // (n, k) of the diffusion fields, for this rollout
+    std::vector<double> past;        // (s, n) stage velocities of the last whole step
+    std::vector<double> miss;        // (s, n) by how much its guess had missed them
+    std::vector<double> past_end;    // (n) velocity at its end
+    std::vector<double> past_force;  // (n)
+    int known = 0;                   // of the past: 0, 1, or 2 with `miss`
+    int level = 0;                   // halvings of the last step
+};
+
+// A part of a step, to be differentiated later.
+struct Part {
+    std::vector<Place> place;
+    std::vector<Compensated> p;
+    std::vector<double> V;  // (s, n) at its root
+    double length = 0.0;    // [s]
+};
+
+class VariationalStepper {
+   public:
+    VariationalStepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
+                       double left)
+        : mechanism(mechanism),
+          tableau(tableau),
+          tolerance(tolerance),
+          guards(guards),
+          left(left),
+          step_equation(mechanism, this->tableau),
+          energy_guard(mechanism),
+          n(mechanism.dof()),
+          force(n),
+          trial(n),
+          guess(step_equation.stages * n),
+          bend(2 * n),
+          at(n) {}
+    VariationalStepper(const VariationalStepper&) = delete;
+    VariationalStepper& operator=(const VariationalStepper&) = delete;
+
+    const Mechanism& mechanism;
+    const Tableau tableau;
+    double tolerance;
+    Guards guards;
+    double left;  // part of each kick that comes before the step; the rest comes after it
+    Collocation step_equation;
+    EnergyGuard energy_guard;
+    int n;
+    std::vector<double> force;  // (n) constant over the step
+    Effort effort;              // of the last step
+    std::vector<Part>* trail = nullptr;  // where the parts of steps are noted down, if anybody asks
+
+    // Put a path at (q, p), with nothing known of the past; false where M(q) is not positive definite.
+    bool begin_at(const double* q, const double* p, PathState& state) {
+        for (int i = 0; i < n; ++i) {
+            state.place[i] = {{q[i], 0.0}, 0.0};
+            unwind(i, state);
+            state.q[i] = q[i];
+            state.p[i] = {p[i], 0.0};
+            state.momentum[i] = p[i];
+        }
+        diffusion_centers(mechanism, q, state.center.data());
+        state.known = state.level = 0;
+        if (!look_at(state)) return false;
+        energy_guard.begin(at.data(), state.momentum.data(), state.v.data(), state.energies);
+        return true;
+    }
+
+    // Put a path at (q, v).
+    bool begin(const double* q, const double* v, PathState& state) {
+        Jet<double>& jet = step_equation.stage[0];
+        mass_matrix(mechanism, q, jet);
+        for (int i = 0; i < n; ++i) {
+            double total = 0.0;
+            for (int j = 0; j < n; ++j) total += jet.M[i * n + j] * v[j];
+            bend[i] = total;
+        }
+        if (!begin_at(q, bend.data(), state)) return false;
+        std::copy(v, v + n, state.v.begin());
+        return true;
+    }
+
+    // The factors of M at a path's node, for kicks and guesses.
+    bool look_at(PathState& state) {
+        for (int i = 0; i < n; ++i) at[i] = state.place[i].place.high;
+        return energy_guard.node(at.data(), state.momentum.data(), state.v.data());
+    }
+
+    // Add an impulse (n) to the momentum. What it does to the energy is work, and no error.
+    void kick(const double* impulse, PathState& state) {
+        for (int i = 0; i < n; ++i) {
+            state.p[i] = state.p[i].plus(impulse[i]);
+            state.momentum[i] = state.p[i].high;
+            at[i] = state.place[i].place.high;
+        }
+        energy_guard.kicked(at.data(), state.momentum.data(), state.v.data(), state.energies);
+    }
+
+    // One whole step with the force in `force`, in as many substeps as the guards ask for.
+    //
+    // The first attempt starts from the extrapolated past, the others from the current velocity. A failed attempt halves
+    // the substep, unless only the guess may be to blame; after a success at an even place it is doubled again.
+    Outcome step(double h, PathState& state) {
+        effort = {};
+        int level = std::max(state.level - 1, 0), deepest = level;
+        bool extrapolated = level == 0 && state.known > 0;
+        std::int64_t place = 0;  // in units of h / 2^level
+        while (place < (std::int64_t{1} << level)) {
+            if (extrapolated) {
+                extrapolate(h, state);
+            } else {
+                for (int i = 0; i < step_equation.stages; ++i)
+                    std::copy(state.v.begin(), state.v.end(), step_equation.V.begin() + i * n);
+            }
+            const Outcome outcome = attempt(h / static_cast<double>(std::int64_t{1} << level), state);
+            if (outcome == Outcome::solved) {
+                ++place;
+                if (level > 0 && place % 2 == 0) {
+                    --level;
+                    place /= 2;
+                }
+            } else if (!(extrapolated && outcome != Outcome::energy)) {
+                if (level == guards.most_halvings) return outcome;
+                ++level;
+                place *= 2;
+            }
+            deepest = std::max(deepest, level);
+            extrapolated = false;
+        }
+        state.level = deepest;
+        if (deepest > 0) {
+            state.known = 0;
+        } else {
+            remember(state);
+        }
+        return Outcome::solved;
+    }
+
+    // Steps of every path from where it stands. Writes into `nodes` the node after each step, what was applied in it and
+    // what it took. A path that fails stops there; nodes.ended and nodes.done say how and where. `increments` of the
+    // Wiener processes (P, N, k) and `drift`, a force besides the controls' (P, N, n), may be null.
+    void roll(double h, const Commands& commands, const double* increments, const double* drift,
+              std::vector<PathState>& states, const Nodes& nodes) {
+        const std::int64_t steps = nodes.steps;
+        const int m = mechanism.controls, k = mechanism.diffusion.processes;
+        const bool noisy = increments != nullptr && k > 0;
+        for (std::int64_t path = 0; path < nodes.paths; ++path) {
+            PathState& state = states[path];
+            double* u = nodes.u + path * steps * m;
+            look_at(state);
+            nodes.ended[path] = static_cast<std::int64_t>(Outcome::solved);
+            nodes.done[path] = 0;
+            for (std::int64_t s = 0; s < steps; ++s) {
+                const std::int64_t row = path * steps + s;
+                const double* dw = noisy ? increments + row * k : nullptr;
+                apply_policy(commands, static_cast<int>(path), static_cast<int>(s), n, state.q.data(),
+                             state.momentum.data(), u);
+                if (noisy) noise_kick(left, u + s * m, dw, state);
+                constant_force(mechanism, drift ? drift + row * n : nullptr, u + s * m, force.data());
+                const Outcome outcome = step(h, state);
+                record_effort(nodes, row);
+                nodes.ended[path] = static_cast<std::int64_t>(outcome);
+                if (outcome != Outcome::solved) break;
+                if (noisy && left < 1.0) noise_kick(1.0 - left, u + s * m, dw, state);
+                record_node(nodes, row, state);
+                nodes.done[path] = s + 1;
+            }
+        }
+    }
+
+    void unwind(int i, PathState& state) const {
+        if (mechanism.tree.periodic[i] && mechanism.stiffness[i] == 0.0) state.place[i].unwind();
+    }
+
+   private:
+    Trial trial;
+    std::vector<double> guess;  // (s, n) what was extrapolated
+    std::vector<double> bend;   // (2, n)
+    std::vector<double> at;     // (n)
+
+    // One substep from where the path stands and the guess in step_equation.V; moves the path only if it is accepted.
+    Outcome attempt(double h, PathState& state) {
+        Collocation& equation = step_equation;
+        const Outcome solved =
+            equation.solve(h, {state.place.data(), state.p.data(), force.data()}, tolerance, false, effort);
+        if (solved != Outcome::solved) return solved;
+        const double margin = guards.active ? energy_guard.branch_margin(h, guards, equation) : infinity;
+        if (!(margin > 0.0)) return Outcome::fold;
+        for (int c = 0; c < n; ++c) {
+            double move = 0.0, impulse = 0.0;
+            trial.work[c] = trial.dissipated[c] = 0.0;
+            for (int i = 0; i < equation.stages; ++i) {
+                const double share = h * tableau.b[i], velocity = equation.V[i * n + c];
+                const double drag = mechanism.damping[c] * velocity;
+                move += tableau.b[i] * velocity;
+                impulse += tableau.b[i] * equation.slope[i * n + c];
+                trial.work[c] += share * (force[c] - drag) * velocity;
+                trial.dissipated[c] += share * drag * velocity;
+            }
+            trial.place[c] = {state.place[c].place.plus(h * move), state.place[c].turns};
+            trial.p[c] = state.p[c].plus(h * impulse);
+        }
+        const Outcome outcome =
+            energy_guard.settle(guards, 2.0 * std::abs(tableau.skew), state.energies, state.place, state.v, trial);
+        if (outcome != Outcome::solved) return outcome;
+        if (trail != nullptr) trail->push_back({state.place, state.p, equation.V, h});
+        effort.branch_margin = std::min(effort.branch_margin, margin);
+        ++effort.substeps;
+        std::swap(state.place, trial.place);
+        std::swap(state.p, trial.p);
+        for (int i = 0; i < n; ++i) {
+            unwind(i, state);
+            state.q[i] = state.place[i].shown();
+        }
+        std::copy(trial.momentum.begin(), trial.momentum.end(), state.momentum.begin());
+        std::copy(trial.v.begin(), trial.v.end(), state.v.begin());
+        return Outcome::solved;
+    }
+
+    // Extrapolate the last whole step into the stage velocities. The polynomial through them and the velocity at its end
+    // goes on, moved by what a kick has since done to the velocity, and bent by what has changed in the force. Where
+    // nothing kicks, it misses by much the same from step to step.
+    void extrapolate(double h, const PathState& state) {
+        const int stages = step_equation.stages;
+        const bool smooth = state.known > 1 && mechanism.diffusion.processes == 0;
+        double *change = bend.data(), *acceleration = change + n;
+        for (int c = 0; c < n; ++c) change[c] = force[c] - state.past_force[c];
+        energy_guard.solve(change, acceleration);
+        for (int i = 0; i < stages; ++i) {
+            const double* ahead = &tableau.ahead[i * (stages + 1)];
+            for (int c = 0; c < n; ++c) {
+                double total = state.v[c] - state.past_end[c];
+                for (int j = 0; j < stages; ++j) total += ahead[j] * state.past[j * n + c];
+                total += ahead[stages] * state.past_end[c];
+                const int k = i * n + c;
+                guess[k] = total + h * tableau.c[i] * acceleration[c];
+                step_equation.V[k] = smooth ? guess[k] + state.miss[k] : guess[k];
+            }
+        }
+    }
+
+    void remember(PathState& state) {
+        std::copy(step_equation.V.begin(), step_equation.V.end(), state.past.begin());
+        for (std::size_t k = 0; k < guess.size(); ++k) state.miss[k] = step_equation.V[k] - guess[k];
+        std::copy(state.v.begin(), state.v.end(), state.past_end.begin());
+        std::copy(force.begin(), force.end(), state.past_force.begin());
+        state.known = std::min(state.known + 1, 2);
+    }
+
+    void noise_kick(double part, const double* u, const double* dw, PathState& state) {
+        noise_impulse(mechanism, part, state.q.data(), state.center.data(), u, dw, bend.data());
+        kick(bend.data(), state);
+    }
+
+    void record_effort(const Nodes& nodes, std::int64_t row) const {
+        std::int64_t* tally = nodes.tally + 4 * row;
+        tally[0] = effort.newton_iterations;
+        tally[1] = effort.jets;
+        tally[2] = effort.sweeps;
+        tally[3] = effort.substeps;
+        nodes.quality[3 * row] = effort.residual;
+        nodes.quality[3 * row + 1] = effort.branch_margin;
+    }
+
+    void record_node(const Nodes& nodes, std::int64_t row, const PathState& state) const {
+        std::copy(state.q.begin(), state.q.end(), nodes.q + row * n);
+        std::copy(state.momentum.begin(), state.momentum.end(), nodes.p + row * n);
+        std::copy(state.v.begin(), state.v.end(), nodes.v + row * n);
+        nodes.energy[row] = state.energies.total();
+        nodes.quality[3 * row + 2] = state.energies.defect();
+    }
+};
+
+}  // namespace varpin
