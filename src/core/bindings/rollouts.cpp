@@ -1,8 +1,193 @@
+// Rollouts of the variational integrators, and the derivatives of their steps.
+#include <nanobind/stl/tuple.h>
+
+#include <memory>
+#include <tuple>
+#include <vector>
+
 #include "arrays.hpp"
 #include "registrations.hpp"
+#include "rollout_arrays.hpp"
+#include "varpin/linearization.hpp"
+#include "varpin/variational.hpp"
 
 namespace varpin::border {
 
-void register_rollouts(nb::module_&) {}
+namespace {
+
+using namespace nanobind::literals;
+
+Tableau tableau_of(In<2> a, In<2> gradient, In<2> force, In<1> b, In<1> c, In<2> ahead, double reach, double skew) {
+    const std::size_t s = b.shape(0);
+    if (s == 0) throw std::invalid_argument("a tableau has at least one stage");
+    for (const auto& [array, name] : {std::pair{&a, "a"}, {&gradient, "gradient"}, {&force, "force"}})
+        require(*array, name, {s, s});
+    require(c, "c", {s});
+    require(ahead, "ahead", {s, s + 1});
+    const auto copied = [](const auto& array) {
+        return std::vector<double>(array.data(), array.data() + array.size());
+    };
+    return {static_cast<int>(s), copied(a), copied(gradient),
+            copied(force),       copied(b), copied(c),
+            copied(ahead),       reach,     skew};
+}
+
+Guards guards_of(bool active, double branch_margin, double energy_balance, double energy_budget, int most_halvings) {
+    return {active, branch_margin, energy_balance, energy_budget, most_halvings};
+}
+
+// P paths with the work arrays of a step; forks share them, so only one of them moves at a time.
+class VariationalRollout {
+  public:
+    VariationalRollout(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
+                       double left, std::size_t paths)
+        : stepper_(std::make_shared<VariationalStepper>(mechanism, tableau, tolerance, guards, left)),
+          states_(paths, PathState(mechanism, tableau.stages)) {}
+
+    VariationalRollout fork() const { return *this; }
+
+    // Put each path at its row of q and v (P, n); false where an M(q) is not positive definite.
+    bool begin(In<2> q, In<2> v) {
+        const std::size_t n = size();
+        require(q, "q", {states_.size(), n});
+        require(v, "v", {states_.size(), n});
+        nb::gil_scoped_release release;
+        for (std::size_t i = 0; i < states_.size(); ++i) {
+            if (!stepper_->begin(q.data() + i * n, v.data() + i * n, states_[i])) return false;
+        }
+        return true;
+    }
+
+    void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes) {
+        const Mechanism& mechanism = stepper_->mechanism;
+        const NodeArrays written(mechanism, nodes);
+        if (written.paths() != states_.size())
+            throw std::invalid_argument("there is not one row of nodes for each path");
+        const CommandArrays given_commands(mechanism, commands, written.paths(), written.steps());
+        const double* dw = increments_of(mechanism, increments, written);
+        const double* extra = drift_of(mechanism, drift, written);
+        nb::gil_scoped_release release;
+        stepper_->roll(h, given_commands.view(), dw, extra, states_, written.view());
+    }
+
+    // Add an impulse (P, n) to the momenta.
+    void kick(In<2> impulse) {
+        require(impulse, "impulse", {states_.size(), size()});
+        for (std::size_t i = 0; i < states_.size(); ++i) {
+            stepper_->look_at(states_[i]);
+            stepper_->kick(impulse.data() + i * size(), states_[i]);
+        }
+    }
+
+    // Configurations, momenta, velocities (P, n) and energies (P).
+    std::tuple<Out, Out, Out, Out> nodes() const {
+        const std::size_t n = size(), P = states_.size();
+        double *q = nullptr, *p = nullptr, *v = nullptr, *energy = nullptr;
+        const Out Q = array_for(q, {P, n}), MV = array_for(p, {P, n}), V = array_for(v, {P, n});
+        const Out E = array_for(energy, {P});
+        for (std::size_t i = 0; i < P; ++i) {
+            std::copy(states_[i].q.begin(), states_[i].q.end(), q + i * n);
+            std::copy(states_[i].momentum.begin(), states_[i].momentum.end(), p + i * n);
+            std::copy(states_[i].v.begin(), states_[i].v.end(), v + i * n);
+            energy[i] = states_[i].energies.total();
+        }
+        return {Q, MV, V, E};
+    }
+
+  private:
+    std::shared_ptr<VariationalStepper> stepper_;
+    std::vector<PathState> states_;
+
+    std::size_t size() const { return static_cast<std::size_t>(stepper_->n); }
+};
+
+// The arrays that derivatives of N steps are taken at.
+struct StepsAt {
+    In<2> q, p;
+    In<3> guess;
+    In<2> force;
+    Integers<1> substeps;
+
+    std::size_t check(std::size_t n, std::size_t stages) const {
+        const std::size_t N = q.shape(0);
+        for (const auto& [array, name] : {std::pair{&q, "q"}, {&p, "p"}, {&force, "force"}})
+            require(*array, name, {N, n});
+        require(guess, "guess", {N, stages, n});
+        require(substeps, "substeps", {N});
+        return N;
+    }
+};
+
+// How the first step that was not solved ended, and how many were done before it.
+template <class Step>
+std::pair<Outcome, std::size_t> each_step(std::size_t N, const Step& step) {
+    nb::gil_scoped_release release;
+    for (std::size_t s = 0; s < N; ++s) {
+        const Outcome outcome = step(s);
+        if (outcome != Outcome::solved) return {outcome, s};
+    }
+    return {Outcome::solved, N};
+}
+
+// d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n) of each step; how it ended and how many were done.
+std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(const Mechanism& mechanism,
+                                                                        const Tableau& tableau, double tolerance,
+                                                                        const Guards& guards, double h, In<2> q,
+                                                                        In<2> p, In<3> guess, In<2> force,
+                                                                        Integers<1> substeps) {
+    const auto n = static_cast<std::size_t>(mechanism.dof()), stages = static_cast<std::size_t>(tableau.stages);
+    const StepsAt at{q, p, guess, force, substeps};
+    const std::size_t N = at.check(n, stages);
+    double *Jx = nullptr, *Jf = nullptr;
+    const Out X = array_for(Jx, {N, 2 * n, 2 * n}), F = array_for(Jf, {N, 2 * n, n});
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, 1.0);
+    const auto [outcome, done] = each_step(N, [&](std::size_t s) {
+        return work.first(h, q.data() + s * n, p.data() + s * n, guess.data() + s * stages * n, force.data() + s * n,
+                          substeps(s), Jx + s * 4 * n * n, Jf + s * 2 * n * n);
+    });
+    return {X, F, static_cast<std::int64_t>(outcome), done};
+}
+
+// z . d2(q1, p1)/d(q0, p0, f)2 of each step (N, 3n, 3n), for the rows of z (N, 2n).
+std::tuple<Out, std::int64_t, std::size_t> variational_curvatures(const Mechanism& mechanism, const Tableau& tableau,
+                                                                  double tolerance, const Guards& guards, double h,
+                                                                  In<2> q, In<2> p, In<3> guess, In<2> force,
+                                                                  Integers<1> substeps, In<2> z) {
+    const auto n = static_cast<std::size_t>(mechanism.dof()), stages = static_cast<std::size_t>(tableau.stages);
+    const StepsAt at{q, p, guess, force, substeps};
+    const std::size_t N = at.check(n, stages);
+    require(z, "z", {N, 2 * n});
+    double* H = nullptr;
+    const Out curvatures = array_for(H, {N, 3 * n, 3 * n});
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, 1.0);
+    const auto [outcome, done] = each_step(N, [&](std::size_t s) {
+        return work.second(h, q.data() + s * n, p.data() + s * n, guess.data() + s * stages * n, force.data() + s * n,
+                           substeps(s), z.data() + s * 2 * n, H + s * 9 * n * n);
+    });
+    return {curvatures, static_cast<std::int64_t>(outcome), done};
+}
+
+}  // namespace
+
+void register_rollouts(nb::module_& m) {
+    nb::class_<Tableau>(m, "Tableau")
+        .def_static("make", &tableau_of, nb::kw_only(), "a"_a, "gradient"_a, "force"_a, "b"_a, "c"_a, "ahead"_a,
+                    "reach"_a, "skew"_a);
+    nb::class_<Guards>(m, "Guards")
+        .def_static("make", &guards_of, nb::kw_only(), "active"_a, "branch_margin"_a, "energy_balance"_a,
+                    "energy_budget"_a, "most_halvings"_a);
+    nb::class_<VariationalRollout>(m, "VariationalRollout")
+        .def(nb::init<const Mechanism&, const Tableau&, double, const Guards&, double, std::size_t>(), "mechanism"_a,
+             "tableau"_a, "tolerance"_a, "guards"_a, "left"_a, "paths"_a, nb::keep_alive<1, 2>())
+        .def("fork", &VariationalRollout::fork, nb::keep_alive<0, 1>())
+        .def("begin", &VariationalRollout::begin, "q"_a, "v"_a)
+        .def("roll", &VariationalRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a)
+        .def("kick", &VariationalRollout::kick, "impulse"_a)
+        .def("nodes", &VariationalRollout::nodes);
+    m.def("variational_derivatives", &variational_derivatives, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
+          "dt"_a, "q"_a, "p"_a, "guess"_a, "force"_a, "substeps"_a);
+    m.def("variational_curvatures", &variational_curvatures, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
+          "dt"_a, "q"_a, "p"_a, "guess"_a, "force"_a, "substeps"_a, "z"_a);
+}
 
 }  // namespace varpin::border

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from varpin.checks import count
-from varpin.errors import InputError, LinearizationError
-from varpin.integrators.base import Segment, drifts, read_only, segments_of, steps_of
-from varpin.integrators.variational import REASONS, Variational, VariationalRun
-from varpin.kernels import gauss as kernels
-from varpin.kernels import gauss_equation as stage_equation
-from varpin.kernels import midpoint_equation as equation
-from varpin.kernels.gauss_linearize import linearize
-from varpin.kernels.gauss_tableau import tableau
-from varpin.kernels.tree import Commands, new_nodes
-from varpin.scene import Scene
+from varpin.core import Guards, Tableau
+from varpin.errors import InputError
+from varpin.integrators.tableau import gauss, gauss_coefficients
+from varpin.integrators.variational import Variational
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -78,74 +72,19 @@ class Gauss(Variational):
         """See :meth:`Integrator.order`; 2 s."""
         return 2 * int(self.stages)
 
-    def _gauss_options(self) -> equation.Options:
-        options = self._options(0.5)
+    def _tableau(self) -> Tableau:
+        return gauss(int(self.stages))
+
+    def _guards(self) -> Guards:
         if self.stages == 1:
-            return options
-        return options._replace(balance=BALANCE_SHARE * options.balance, budget=BUDGET_SHARE * options.budget)
-
-    def _arrays(self, scene: Scene, paths: int) -> tuple[equation.State, stage_equation.Stages]:
-        stages, dof = int(self.stages), scene.robot.dof
-        processes, loads = scene.mechanism.diffusion.constant.shape[1], scene.robot.tree.loads.size
-        state = stage_equation.new_gauss_state(stages, paths, dof, processes, loads)
-        return state, stage_equation.new_stages(stages, dof)
-
-    def rollout_compiled(
-        self,
-        scene: Scene,
-        state: VariationalRun,
-        commands: Commands,
-        increments: Floats,
-        drift: Floats,
-        dt: float,
-    ) -> list[Segment]:
-        """See :meth:`Integrator.rollout_compiled`."""
-        nodes = new_nodes(len(state.state.q), steps_of(commands), scene.robot.dof, scene.controls)
-        kernels.rollout(
-            scene.mechanism,
-            tableau(int(self.stages)),
-            self._gauss_options(),
-            dt,
-            commands,
-            increments,
-            drift,
-            state.state,
-            state.work,
-            state.stages,
-            nodes,
+            return super()._guards()
+        strict = replace(
+            self,
+            stages=1,
+            energy_balance=BALANCE_SHARE * self.energy_balance,
+            energy_budget=BUDGET_SHARE * self.energy_budget,
         )
-        return segments_of(nodes, REASONS)
-
-    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
-        """See :meth:`Integrator.linearize`; the state is (q, p).
-
-        A step that was taken in parts is taken in parts again, and their derivatives are chained.
-        """
-        steps, n = trajectory.steps, scene.robot.dof
-        q, p = (read_only(getattr(trajectory, name)[:-1]) for name in ("q", "p"))
-        force = trajectory.u @ scene.actuation.T + self.drift_share * drifts(scene, trajectory)
-        Jx, Jf = np.empty((steps, 2 * n, 2 * n)), np.empty((steps, 2 * n, n))
-        state, stages = self._arrays(scene, 1)
-        outcome, done = linearize(
-            scene.mechanism,
-            tableau(int(self.stages)),
-            # A root that is known to 1e-10 is good enough for derivatives.
-            self._gauss_options()._replace(tolerance=1e6),
-            trajectory.dt,
-            q,
-            p,
-            read_only(self._guess(trajectory)),
-            read_only(force),
-            read_only(trajectory.statistics.substeps),
-            state,
-            equation.new_work(scene.robot.tree.parent.size, n, scene.robot.tree.loads.size, derivatives=True),
-            stages,
-            Jx,
-            Jf,
-        )
-        if outcome != equation.SOLVED:
-            raise LinearizationError(done, done * trajectory.dt, REASONS[outcome])
-        return Jx, Jf, Jx[:, :, n:]
+        return strict._guards()
 
     def _guess(self, trajectory: Trajectory) -> Floats:
         """Stage velocities (N, s, n) of the cubic through the nodes and their velocities.
@@ -153,10 +92,12 @@ class Gauss(Variational):
         With noise the step at dw = 0 starts from another momentum, and its velocity is all there is to go by.
         """
         q, v = trajectory.q, trajectory.v
-        c = tableau(int(self.stages)).c[None, :, None]
+        c = gauss_coefficients(int(self.stages))[2][None, :, None]
         if trajectory.dw.any():
             return v[:-1, None] + np.zeros_like(c)
         mean = (np.diff(q, axis=0) / trajectory.dt)[:, None]
+        if self.stages == 1:
+            return mean
         guess: Floats = (
             (1.0 - c) * (1.0 - 3.0 * c) * v[:-1, None] + c * (3.0 * c - 2.0) * v[1:, None] + 6.0 * c * (1.0 - c) * mean
         )

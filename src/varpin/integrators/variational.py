@@ -10,38 +10,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.checks import count, fraction, is_one_of, positive
-from varpin.errors import InputError, SingularMassMatrix
-from varpin.integrators.base import Integrator, Segment, control_of, diffusion_and_drift, open_loop, segments_of
-from varpin.kernels import midpoint as kernels
-from varpin.kernels import midpoint_equation as equation
+from varpin.core import Guards, Tableau, VariationalRollout, variational_curvatures, variational_derivatives
+from varpin.errors import InputError, LinearizationError, SingularMassMatrix
+from varpin.integrators.base import (
+    Integrator,
+    Segment,
+    control_of,
+    diffusion_and_drift,
+    drifts,
+    open_loop,
+    segments_of,
+    steps_of,
+)
 from varpin.kernels.tree import Commands, new_nodes
 from varpin.scene import Scene
+from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
+# By the numbers of nodes.hpp.
 REASONS = {
-    equation.DIVERGED: "Newton's iteration does not contract, however small the substep",
-    equation.NOT_FINITE: "the step equation gives values that are not finite",
-    equation.FOLD: "the step is at a fold of the step equation's solutions (its branch margin is not positive)",
-    equation.ENERGY: "the energy balance of the step does not close",
-    equation.SINGULAR: "the mass matrix at the end of the step is not positive definite",
+    1: "Newton's iteration does not contract, however small the substep",
+    2: "the step equation gives values that are not finite",
+    3: "the step is at a fold of the step equation's solutions (its branch margin is not positive)",
+    4: "the energy balance of the step does not close",
+    5: "the mass matrix at the end of the step is not positive definite",
 }
 
 
 @dataclass(frozen=True)
 class VariationalRun:
-    """Where a rollout stands, with its work arrays.
+    """Where a rollout stands.
 
     Attributes:
-        state: Of each path.
-        work: Of a step.
-        stages: More work arrays, of integrators that have stages.
+        paths: In the core.
         start: Configurations at which the rollout started (P, n) [rad or m].
     """
 
-    state: equation.State
-    work: equation.Work
-    stages: Any
+    paths: VariationalRollout
     start: Floats
 
 
@@ -81,55 +87,98 @@ class Variational(Integrator):
         """The part of a step's kick that comes before the step."""
         return 1.0 if self.kick == "left" else 0.5
 
-    def _options(self, alpha: float) -> equation.Options:
-        return equation.Options(
-            float(alpha),
-            float(self.tolerance),
-            float(self.branch_margin),
-            float(self.energy_balance),
-            float(self.energy_budget),
-            int(self.max_halvings),
-            self.left,
-        )
-
     @abstractmethod
-    def _arrays(self, scene: Scene, paths: int) -> tuple[equation.State, Any]:
-        """The states of several paths, and the work arrays of the stages, if there are any."""
+    def _tableau(self) -> Tableau:
+        """Its coefficients."""
+
+    def _guards(self) -> Guards:
+        return Guards.make(
+            active=True,
+            branch_margin=float(self.branch_margin),
+            energy_balance=float(self.energy_balance),
+            energy_budget=float(self.energy_budget),
+            most_halvings=int(self.max_halvings),
+        )
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[VariationalRun, list[Segment]]:
         """See :meth:`Integrator.start`; p0 = M(q0) v0."""
-        robot = scene.robot
         paths, n = q0.shape
-        state, stages = self._arrays(scene, paths)
-        work = equation.new_work(robot.tree.parent.size, n, robot.tree.loads.size)
-        run = VariationalRun(state, work, stages, q0.copy())
-        if not kernels.begin_paths(scene.mechanism, q0, v0, run.state, run.work):
-            raise SingularMassMatrix(robot.joint_names, q0)
+        rollout = VariationalRollout(
+            scene.core, self._tableau(), float(self.tolerance), self._guards(), self.left, paths
+        )
+        if not rollout.begin(np.ascontiguousarray(q0), np.ascontiguousarray(v0)):
+            raise SingularMassMatrix(scene.robot.joint_names, q0)
         nodes = new_nodes(paths, 1, n, scene.controls)
-        nodes.q[:, 0], nodes.p[:, 0], nodes.v[:, 0] = run.state.q, run.state.p, run.state.v
-        nodes.energy[:, 0] = run.state.energy[:, :, :2].sum(axis=(1, 2))
+        nodes.q[:, 0], nodes.p[:, 0], nodes.v[:, 0], nodes.energy[:, 0] = rollout.nodes()
         nodes.done[:] = 1
-        return run, segments_of(nodes, REASONS)
+        return VariationalRun(rollout, q0.copy()), segments_of(nodes, REASONS)
 
     def fork(self, state: VariationalRun) -> VariationalRun:
         """See :meth:`Integrator.fork`."""
-        return replace(state, state=equation.State._make(array.copy() for array in state.state))
+        return replace(state, paths=state.paths.fork())
+
+    def rollout_compiled(
+        self,
+        scene: Scene,
+        state: VariationalRun,
+        commands: Commands,
+        increments: Floats,
+        drift: Floats,
+        dt: float,
+    ) -> list[Segment]:
+        """See :meth:`Integrator.rollout_compiled`."""
+        nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
+        state.paths.roll(dt, commands, increments, drift, nodes)
+        return segments_of(nodes, REASONS)
 
     def step_in_python(
         self, scene: Scene, state: VariationalRun, command: Commands, increment: Floats, dt: float
     ) -> Segment:
         """One step of one path with diffusion fields that are evaluated in Python."""
-        now = state.state
-        control = control_of(command, 0, np.concatenate([now.q[0], now.p[0]]), command.before)
-        F, drift = diffusion_and_drift(scene, now.q[0], now.v[0], control, state.start[0])
+        q, p, v, _ = state.paths.nodes()
+        control = control_of(command, 0, np.concatenate([q[0], p[0]]), command.before)
+        F, drift = diffusion_and_drift(scene, q[0], v[0], control, state.start[0])
         if len(increment):
-            kernels.apply_impulse(scene.mechanism, self.left * (F @ increment[0, 0]), now, state.work)
-        nothing = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
+            state.paths.kick(self.left * (F @ increment[0, 0])[None])
+        nothing = np.zeros((0, 0, 0))
         (segment,) = self.rollout_compiled(
             scene, state, open_loop(control[None]), nothing, self.drift_share * drift[None, None], dt
         )
         if len(increment) and self.left < 1.0 and segment.failure is None:
-            F, _ = diffusion_and_drift(scene, now.q[0], now.v[0], control, state.start[0])
-            kernels.apply_impulse(scene.mechanism, (1.0 - self.left) * (F @ increment[0, 0]), now, state.work)
-            segment.p[-1], segment.v[-1], segment.energy[-1] = now.p[0], now.v[0], now.energy[0, :, :2].sum()
+            q, p, v, _ = state.paths.nodes()
+            F, _ = diffusion_and_drift(scene, q[0], v[0], control, state.start[0])
+            state.paths.kick((1.0 - self.left) * (F @ increment[0, 0])[None])
+            _, segment.p[-1:], segment.v[-1:], segment.energy[-1:] = state.paths.nodes()
         return segment
+
+    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
+        """See :meth:`Integrator.linearize`; the state is (q, p).
+
+        A step that was taken in parts is taken in parts again, and their derivatives are chained.
+        """
+        Jx, Jf, outcome, done = variational_derivatives(*self._steps(scene, trajectory))
+        if outcome in REASONS:
+            raise LinearizationError(done, done * trajectory.dt, REASONS[outcome])
+        return Jx, Jf, Jx[:, :, scene.robot.dof :]
+
+    def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
+        """See :meth:`Integrator.contract`; steps that were taken in parts are chained as in :meth:`linearize`."""
+        H, outcome, done = variational_curvatures(*self._steps(scene, trajectory), np.ascontiguousarray(z))
+        if outcome in REASONS:
+            raise LinearizationError(done, done * trajectory.dt, REASONS[outcome])
+        return H
+
+    def _steps(self, scene: Scene, trajectory: Trajectory) -> tuple[Any, ...]:
+        """What the core takes the derivatives of every step at dw = 0 from."""
+        q, p = (np.ascontiguousarray(getattr(trajectory, name)[:-1]) for name in ("q", "p"))
+        force = trajectory.u @ scene.actuation.T
+        if scene.noise.velocity_dependent:
+            force = force + self.drift_share * drifts(scene, trajectory)
+        guess = np.ascontiguousarray(self._guess(trajectory))
+        substeps = np.ascontiguousarray(trajectory.statistics.substeps)
+        map_of = scene.core, self._tableau(), float(self.tolerance), self._guards()
+        return *map_of, float(trajectory.dt), q, p, guess, np.ascontiguousarray(force), substeps
+
+    @abstractmethod
+    def _guess(self, trajectory: Trajectory) -> Floats:
+        """Stage velocities (N, s, n) next to the roots of every step at dw = 0."""

@@ -45,7 +45,7 @@ struct Start {
 };
 
 class Collocation {
-   public:
+  public:
     Collocation(const Mechanism& mechanism, const Tableau& tableau)
         : mechanism(mechanism),
           tableau(tableau),
@@ -81,10 +81,10 @@ class Collocation {
     // Solve the step equation from the guess in V.
     //
     // The first factorization is kept at least until a second correction shows how fast it contracts, and for as long
-    // as three more would do. Gives up when a correction exceeds half of the one before (natural monotonicity, Deuflhard
-    // 2004), unless the residual is down at its rounding floor. A last correction is not looked at again if that
-    // contraction takes the residual below a tenth of the tolerance: slopes are then corrected to first order. Where
-    // `jets_wanted`, it ends with the jets of the root.
+    // as three more would do. Gives up when a correction exceeds half of the one before (natural monotonicity,
+    // Deuflhard 2004), unless the residual is down at its rounding floor. A last correction is not looked at again if
+    // that contraction takes the residual below a tenth of the tolerance: slopes are then corrected to first order.
+    // Where `jets_wanted`, it ends with the jets of the root.
     Outcome solve(double h, const Start& start, double tolerance, bool jets_wanted, Effort& effort) {
         double before = infinity, worst = infinity;
         bool fresh = true;
@@ -100,7 +100,13 @@ class Collocation {
             if (fresh && !factor(h)) return Outcome::fold;
             solve_factored(residual.data(), delta.data());
             const double size = kinetic_size(delta.data());
-            if (iteration >= most_corrections || !(size <= 0.25 * before)) break;
+            if (iteration >= most_corrections) break;
+            if (!(size <= 0.25 * before)) {
+                // The factors may be to blame, if they are of another iterate.
+                if (fresh) break;
+                fresh = true;
+                continue;
+            }
             for (int k = 0; k < stages * n; ++k) V[k] += delta[k];
             ++effort.newton_iterations;
             fresh = false;
@@ -178,7 +184,7 @@ class Collocation {
         });
     }
 
-   private:
+  private:
     template <class Solve>
     void solve_blocks(const double* right, double* x, const Solve& solve_block) {
         const double* matrix = lu.data();
@@ -347,8 +353,7 @@ class Collocation {
         for (int k = 0; k < size; ++k) {
             const double* from = line(stages == 1 ? k : rows[k]);
             for (int kind = 0; kind < 3; ++kind)
-                std::copy(from + kind * n + block.begin, from + kind * n + block.end,
-                          &columns[(k * 3 + kind) * width]);
+                std::copy(from + kind * n + block.begin, from + kind * n + block.end, &columns[(k * 3 + kind) * width]);
         }
         solve_lu_rows(matrix, size, {0, size}, columns.data(), 3 * width, 3 * width);
         for (int k = 0; k < size; ++k) {
@@ -392,8 +397,7 @@ class Collocation {
             for (int r = block.begin; r < block.end; ++r) {
                 for (int m = block.begin; m < block.end; ++m) {
                     const double curvature = weight * stage[i].Lqq[r * n + m];
-                    const double coupling =
-                        weight * (stage[i].A[m * n + r] - (m == r ? mechanism.damping[r] : 0.0));
+                    const double coupling = weight * (stage[i].A[m * n + r] - (m == r ? mechanism.damping[r] : 0.0));
                     for (int kind = 0; kind < 3; ++kind) {
                         const double* __restrict dQ = &shift[((m - block.begin) * 3 + kind) * width];
                         const double* __restrict dv = &dV[(i * n + m) * 3 * n + kind * n + block.begin];
@@ -404,7 +408,6 @@ class Collocation {
             }
         }
     }
-
 };
 
 }  // namespace varpin

@@ -1,8 +1,8 @@
 // Sums that keep what rounding takes from them, and angles with whole turns taken off.
 //
 // A joint that has turned a million times stands at an angle of which floating point keeps nine decimals, and a sweep
-// would see no more of it. The Lagrangian does not know how often an angle went round, so sweeps see it within one turn;
-// the turns are counted beside it, and the angle that is shown is continuous.
+// would see no more of it. The Lagrangian does not know how often an angle went round, so sweeps see it within one
+// turn; the turns are counted beside it, and the angle that is shown is continuous.
 #pragma once
 
 #include <cmath>

@@ -3,10 +3,11 @@
 // Branch: the step equation has other roots than the one that is connected to h -> 0. There the symmetric part of
 // N = -dr/dv is positive definite; its pivots are compared with those of M, the destabilising term exaggerated.
 //
-// Energy: |dE - work of the forces| over a substep must be a small part of the energy turned over, for each mechanically
-// independent group. What rides on something far heavier is lost in that balance, so light parts have one of their own:
-// with coordinates i of its own and a of what carries it, the Jacobi energy J = sum_i p_i v_i - L of the part's bodies
-// changes by dJ = sum_i F_i dq_i - sum_a (L_q,a dq_a + L_v,a dv_a), L_q,a and L_v,a by the trapezoidal rule.
+// Energy: |dE - work of the forces| over a substep must be a small part of the energy turned over, for each
+// mechanically independent group. What rides on something far heavier is lost in that balance, so light parts have one
+// of their own: with coordinates i of its own and a of what carries it, the Jacobi energy J = sum_i p_i v_i - L of the
+// part's bodies changes by dJ = sum_i F_i dq_i - sum_a (L_q,a dq_a + L_v,a dv_a), L_q,a and L_v,a by the trapezoidal
+// rule.
 #pragma once
 
 #include <algorithm>
@@ -24,7 +25,7 @@ struct Guards {
     bool active = true;             // else a step is accepted whenever its equation is solved
     double branch_margin = 0.5;     // how far from the fold a root must stay, in [0, 1)
     double energy_balance = 0.005;  // largest energy error of a substep, in units of the energy it turns over
-    double energy_budget = 0.02;    // of the errors added up, in units of the most energy that moved in a substep so far
+    double energy_budget = 0.02;  // of the errors added up, in units of the most energy that moved in a substep so far
     int most_halvings = 12;
 };
 
@@ -89,7 +90,7 @@ struct Trial {
 };
 
 class EnergyGuard {
-   public:
+  public:
     EnergyGuard(const Mechanism& mechanism)
         : mechanism(mechanism),
           n(mechanism.dof()),
@@ -193,7 +194,8 @@ class EnergyGuard {
         return least;
     }
 
-    // Velocity and energy of the node that a substep has reached, and whether its energy balance closes; enters it if so.
+    // Velocity and energy of the node that a substep has reached, and whether its energy balance closes; enters it if
+    // so.
     Outcome settle(const Guards& guards, double off_middle, Energies& energies, const std::vector<Place>& from,
                    const std::vector<double>& from_v, Trial& trial) {
         for (int i = 0; i < n; ++i) {
@@ -227,11 +229,11 @@ class EnergyGuard {
         return Outcome::solved;
     }
 
-   private:
-    static constexpr double fade = 1.0 / 256.0;     // by which a substep forgets how far kinetic energies have varied
-    static constexpr double rounding = 1e-12;       // of the magnitudes that make up an energy
-    static constexpr double part_room = 4.0;        // times the limits of whole groups: the trapezoidal rule errs too
-    static constexpr double least_room = 0.02;      // is always left, or a full ledger could never be worked off
+  private:
+    static constexpr double fade = 1.0 / 256.0;  // by which a substep forgets how far kinetic energies have varied
+    static constexpr double rounding = 1e-12;    // of the magnitudes that make up an energy
+    static constexpr double part_room = 4.0;     // times the limits of whole groups: the trapezoidal rule errs too
+    static constexpr double least_room = 0.02;   // is always left, or a full ledger could never be worked off
 
     struct Limit {
         double balance = 0.0;
@@ -258,8 +260,8 @@ class EnergyGuard {
     std::vector<double> curved, mass;    // (n, n) of the branch guard
     std::vector<PartLedger> part;        // of the node that is tried
 
-    // The kinetic energy that a coordinate may be said to turn over. Its share counts as far as it has varied of late: a
-    // heavy wheel that turns on and on would else leave room for any error of what it carries.
+    // The kinetic energy that a coordinate may be said to turn over. Its share counts as far as it has varied of late:
+    // a heavy wheel that turns on and on would else leave room for any error of what it carries.
     double varied(const Energies& energies, int i) const {
         const Share& own = energies.share[i];
         return std::min(std::max(own.now, share[i]), std::max(own.largest, share[i]) - std::min(own.least, share[i]));
@@ -375,8 +377,7 @@ class EnergyGuard {
                 continue;
             }
             const Compensated &now = trial.place[c].place, &then = from[c].place;
-            const double by_place =
-                0.5 * (old.Lq[c] + own.Lq[c]) * ((now.high - then.high) + (now.low - then.low));
+            const double by_place = 0.5 * (old.Lq[c] + own.Lq[c]) * ((now.high - then.high) + (now.low - then.low));
             const double by_rate = 0.5 * (old.Lv[c] + own.Lv[c]) * (trial.v[c] - from_v[c]);
             drive += by_place + by_rate;
             exchanged += std::abs(by_place) + std::abs(by_rate);

@@ -1,5 +1,5 @@
-// Derivatives of the steps of a trajectory, first and second. docs/mathematics.md, "Structured linearization" and "Second
-// order".
+// Derivatives of the steps of a trajectory, first and second. docs/mathematics.md, "Structured linearization" and
+// "Second order".
 //
 // For z = (zq, zp) the step equation is joined to phi = zq . q1 + zp . p1 with multipliers lam_i that make the sum
 // stationary in V: N' lam = dphi/dV. What is not linear in (q0, p0, f, V) there is
@@ -11,6 +11,8 @@
 #pragma once
 
 #include <algorithm>
+#include <bit>
+#include <cstdint>
 #include <vector>
 
 #include "varpin/variational.hpp"
@@ -18,7 +20,7 @@
 namespace varpin {
 
 class VariationalLinearization {
-   public:
+  public:
     VariationalLinearization(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
                              double left)
         : stepper(mechanism, tableau, tolerance, guards, left),
@@ -37,17 +39,17 @@ class VariationalLinearization {
           at_v(n),
           inner(2 * n * 3 * n) {}
 
-    // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a constant force f. A step that
-    // was taken whole is solved once more from a guess (s, n) next to its root; another is taken again, guards and all,
-    // and the derivatives of its parts are chained.
-    Outcome first(double h, const double* q, const double* p, const double* guess, const double* force, bool whole,
-                  double* Jx, double* Jf) {
-        if (whole) {
+    // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a constant force f. A step
+    // that was taken whole is solved once more from a guess (s, n) next to its root; another is taken again, guards and
+    // all, and the derivatives of its parts are chained.
+    Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
+                  std::int64_t substeps, double* Jx, double* Jf) {
+        if (substeps == 1) {
             const Outcome outcome = root(h, q, p, guess, force);
             if (outcome == Outcome::solved) stepper.step_equation.derivatives(h, dV, Jx, Jf);
             return outcome;
         }
-        const Outcome outcome = parts(h, q, p, force);
+        const Outcome outcome = parts(h, q, p, force, substeps);
         if (outcome != Outcome::solved) return outcome;
         identity(Jx, Jf);
         for (const Part& part : trail) {
@@ -61,17 +63,17 @@ class VariationalLinearization {
 
     // z . d2(q1, p1)/d(q0, p0, f)2 of one step, into H (3n, 3n). A step taken in parts: z goes back by each part's
     // derivative, and the curvature of each part to the start of the step.
-    Outcome second(double h, const double* q, const double* p, const double* guess, const double* force, bool whole,
-                   const double* z, double* H) {
+    Outcome second(double h, const double* q, const double* p, const double* guess, const double* force,
+                   std::int64_t substeps, const double* z, double* H) {
         std::fill(H, H + 9 * n * n, 0.0);
-        if (whole) {
+        if (substeps == 1) {
             const Outcome outcome = root(h, q, p, guess, force);
             if (outcome != Outcome::solved) return outcome;
             stepper.step_equation.derivatives(h, dV, link.data(), link_f.data());
             add_curvature(h, z, nullptr, H);
             return Outcome::solved;
         }
-        const Outcome outcome = parts(h, q, p, force);
+        const Outcome outcome = parts(h, q, p, force, substeps);
         if (outcome != Outcome::solved) return outcome;
         // Derivatives (2n, 3n) from the start of the step to the start of each part.
         std::vector<std::vector<double>> starts(1, std::vector<double>(6 * n * n));
@@ -100,7 +102,7 @@ class VariationalLinearization {
         return Outcome::solved;
     }
 
-   private:
+  private:
     // A root that is known to 1e-10 is good enough for derivatives.
     static constexpr double loose = 1e6;
 
@@ -135,14 +137,20 @@ class VariationalLinearization {
                                            true, stepper.effort);
     }
 
-    // Take the step again, with its parts noted down.
-    Outcome parts(double h, const double* q, const double* p, const double* force) {
+    // Take the step again, with its parts noted down. The motion's own step may have begun with shorter parts than a
+    // fresh start does: then it is taken once more, beginning with those.
+    Outcome parts(double h, const double* q, const double* p, const double* force, std::int64_t substeps) {
         std::copy(force, force + n, stepper.force.begin());
-        if (!stepper.begin_at(q, p, state)) return Outcome::singular;
-        trail.clear();
-        stepper.trail = &trail;
-        const Outcome outcome = stepper.step(h, state);
-        stepper.trail = nullptr;
+        Outcome outcome = Outcome::solved;
+        for (const bool again : {false, true}) {
+            if (!stepper.begin_at(q, p, state)) return Outcome::singular;
+            if (again) state.level = std::bit_width(static_cast<std::uint64_t>(substeps - 1)) + 1;
+            trail.clear();
+            stepper.trail = &trail;
+            outcome = stepper.step(h, state);
+            stepper.trail = nullptr;
+            if (stepper.effort.substeps == substeps) break;
+        }
         return outcome;
     }
 
@@ -209,8 +217,7 @@ class VariationalLinearization {
             for (int c = 0; c < n; ++c) {
                 for (int k = 0; k < w; ++k) {
                     double total = start == nullptr ? (c == k ? 1.0 : 0.0) : start[c * w + k];
-                    for (int j = 0; j < stages; ++j)
-                        total += h * tableau.a[i * stages + j] * dV[(j * n + c) * w + k];
+                    for (int j = 0; j < stages; ++j) total += h * tableau.a[i * stages + j] * dV[(j * n + c) * w + k];
                     dQ[c * w + k] = total;
                 }
             }

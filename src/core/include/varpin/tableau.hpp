@@ -1,5 +1,5 @@
-// Collocation over a step of unit length. docs/mathematics.md, "Higher order". With s stages, Q_i = q0 + h sum_j a_ij V_j
-// and the momentum equation of stage i weighted with abar (L_q) and f (forces):
+// Collocation over a step of unit length. docs/mathematics.md, "Higher order". With s stages, Q_i = q0 + h sum_j a_ij
+// V_j and the momentum equation of stage i weighted with abar (L_q) and f (forces):
 //
 //     L_v(Q_i, V_i) = p0 + h sum_j (abar_ij L_q + f_ij F)(Q_j, V_j)
 //     q1 = q0 + h sum_i b_i V_i,    p1 = p0 + h sum_i b_i (L_q + F)(Q_i, V_i)

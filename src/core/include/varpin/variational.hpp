@@ -1,5 +1,6 @@
-// The variational stepper: collocation steps, accepted by the guards or else taken in halves, and halves of halves; kicks
-// of noise before the step, or half before and half after. docs/mathematics.md, "The principal branch" and "Noise".
+// The variational stepper: collocation steps, accepted by the guards or else taken in halves, and halves of halves;
+// kicks of noise before the step, or half before and half after. docs/mathematics.md, "The principal branch" and
+// "Noise".
 #pragma once
 
 #include <algorithm>
@@ -51,7 +52,7 @@ struct Part {
 };
 
 class VariationalStepper {
-   public:
+  public:
     VariationalStepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
                        double left)
         : mechanism(mechanism),
@@ -78,8 +79,8 @@ class VariationalStepper {
     Collocation step_equation;
     EnergyGuard energy_guard;
     int n;
-    std::vector<double> force;  // (n) constant over the step
-    Effort effort;              // of the last step
+    std::vector<double> force;           // (n) constant over the step
+    Effort effort;                       // of the last step
     std::vector<Part>* trail = nullptr;  // where the parts of steps are noted down, if anybody asks
 
     // Put a path at (q, p), with nothing known of the past; false where M(q) is not positive definite.
@@ -130,8 +131,8 @@ class VariationalStepper {
 
     // One whole step with the force in `force`, in as many substeps as the guards ask for.
     //
-    // The first attempt starts from the extrapolated past, the others from the current velocity. A failed attempt halves
-    // the substep, unless only the guess may be to blame; after a success at an even place it is doubled again.
+    // The first attempt starts from the extrapolated past, the others from the current velocity. A failed attempt
+    // halves the substep, unless only the guess may be to blame; after a success at an even place it is doubled again.
     Outcome step(double h, PathState& state) {
         effort = {};
         int level = std::max(state.level - 1, 0), deepest = level;
@@ -168,9 +169,9 @@ class VariationalStepper {
         return Outcome::solved;
     }
 
-    // Steps of every path from where it stands. Writes into `nodes` the node after each step, what was applied in it and
-    // what it took. A path that fails stops there; nodes.ended and nodes.done say how and where. `increments` of the
-    // Wiener processes (P, N, k) and `drift`, a force besides the controls' (P, N, n), may be null.
+    // Steps of every path from where it stands. Writes into `nodes` the node after each step, what was applied in it
+    // and what it took. A path that fails stops there; nodes.ended and nodes.done say how and where. `increments` of
+    // the Wiener processes (P, N, k) and `drift`, a force besides the controls' (P, N, n), may be null.
     void roll(double h, const Commands& commands, const double* increments, const double* drift,
               std::vector<PathState>& states, const Nodes& nodes) {
         const std::int64_t steps = nodes.steps;
@@ -204,7 +205,7 @@ class VariationalStepper {
         if (mechanism.tree.periodic[i] && mechanism.stiffness[i] == 0.0) state.place[i].unwind();
     }
 
-   private:
+  private:
     Trial trial;
     std::vector<double> guess;  // (s, n) what was extrapolated
     std::vector<double> bend;   // (2, n)
@@ -249,9 +250,9 @@ class VariationalStepper {
         return Outcome::solved;
     }
 
-    // Extrapolate the last whole step into the stage velocities. The polynomial through them and the velocity at its end
-    // goes on, moved by what a kick has since done to the velocity, and bent by what has changed in the force. Where
-    // nothing kicks, it misses by much the same from step to step.
+    // Extrapolate the last whole step into the stage velocities. The polynomial through them and the velocity at its
+    // end goes on, moved by what a kick has since done to the velocity, and bent by what has changed in the force.
+    // Where nothing kicks, it misses by much the same from step to step.
     void extrapolate(double h, const PathState& state) {
         const int stages = step_equation.stages;
         const bool smooth = state.known > 1 && mechanism.diffusion.processes == 0;

@@ -1,0 +1,60 @@
+"""Coefficients of collocation: Gauss-Legendre points, and the generalized midpoint rule."""
+
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.core import Tableau
+
+Floats = NDArray[np.float64]
+
+
+def interpolation(nodes: Floats, at: Floats) -> Floats:
+    """Values at ``at`` (r,) of the Lagrange polynomials on ``nodes`` (s,): (r, s)."""
+    values = np.ones((at.size, nodes.size))
+    for j in range(nodes.size):
+        for k in range(nodes.size):
+            if k != j:
+                values[:, j] *= (at - nodes[k]) / (nodes[j] - nodes[k])
+    return values
+
+
+def gauss_coefficients(stages: int) -> tuple[Floats, Floats, Floats]:
+    """a (s, s), b (s,) and c (s,) of the Gauss-Legendre method with s stages, of order 2 s, over a unit step."""
+    x, w = np.polynomial.legendre.leggauss(stages)
+    c, b = 0.5 * (1.0 + x), 0.5 * w
+    # The rule itself integrates the Lagrange polynomials from 0 to each node, exactly.
+    a = np.array([c[i] * (b @ interpolation(c, c[i] * c)) for i in range(stages)])
+    # Symplectic, b_i a_ij + b_j a_ji = b_i b_j, to the last digit.
+    half = b[:, None] * a
+    return 0.5 * b + 0.5 * (half - half.T) / b[:, None], b, c
+
+
+@functools.cache
+def gauss(stages: int) -> Tableau:
+    """The Gauss-Legendre tableau of ``stages`` stages, of order 2 ``stages``."""
+    a, b, c = gauss_coefficients(stages)
+    root = np.sqrt(b)
+    square = (root[:, None] * (a @ a)) / root[None, :]
+    reach = float(np.linalg.eigvalsh(0.5 * (square + square.T))[-1])
+    ahead = interpolation(np.append(c, 1.0), 1.0 + c)
+    return Tableau.make(a=a, gradient=a, force=a, b=b, c=c, ahead=ahead, reach=reach, skew=0.0)
+
+
+@functools.cache
+def midpoint(alpha: float) -> Tableau:
+    """The generalized midpoint rule: the Lagrangian at ``alpha``, each half-step with half of the forces' impulse."""
+    one = np.ones(1)
+    # At its end the polynomial through the one stage meets the next step's; at alpha = 1 they are the same point.
+    ahead = interpolation(np.array([0.5, 1.0]), np.array([1.5]))
+    return Tableau.make(
+        a=np.full((1, 1), alpha),
+        gradient=np.full((1, 1), 1.0 - alpha),
+        force=np.full((1, 1), 0.5),
+        b=one,
+        c=0.5 * one,
+        ahead=ahead,
+        reach=alpha * (1.0 - alpha),
+        skew=alpha - 0.5,
+    )
