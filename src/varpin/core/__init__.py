@@ -1,3 +1,8 @@
 """The compiled core: C++ in ``src/core``, one header an idea, built when the package is."""
 
+from varpin.core._core import BackwardPass as BackwardPass
+from varpin.core._core import ExpandedSteps as ExpandedSteps
+from varpin.core._core import Gains as Gains
 from varpin.core._core import Mechanism as Mechanism
+from varpin.core._core import box_minimum as box_minimum
+from varpin.core._core import triangular as triangular
