@@ -20,6 +20,7 @@
 
 #include "varpin/box.hpp"
 #include "varpin/dense.hpp"
+#include "varpin/linear_step.hpp"
 #include "varpin/steps.hpp"
 #include "varpin/tiles.hpp"
 
@@ -37,11 +38,7 @@ class BackwardPass {
           gradient(size),
           costate(size),
           scale(size),
-          J(x, size),
-          rates(x, n),
-          speeds(n, size),
-          D(x, size),
-          P(x, x),
+          step(dof, controls),
           S(x, x),
           T(size, size),
           Q(size, size),
@@ -90,17 +87,14 @@ class BackwardPass {
     // Q and its gradients from the value after step s. The control is that of the next step, or what its change is
     // counted from, where the value has rows of its own for it: `held`.
     void carry(const ExpandedSteps& steps, std::ptrdiff_t s, bool held) {
-        for (int i = 0; i < x; ++i) {
-            std::copy_n(steps.A + (s * x + i) * x, x, J[i]);
-            std::copy_n(steps.B + (s * x + i) * m, m, J[i] + x);
-        }
+        step.load(steps, s);
         std::fill_n(terms.begin(), size, 0.0);
         for (int c = 0; c < size; ++c) {
             Qz[c] = c < x ? 0.0 : gradient[c];
             Cz[c] = c < x ? 0.0 : costate[c];
         }
         for (int i = 0; i < x; ++i) {
-            const double* __restrict own = J[i];
+            const double* __restrict own = step.J[i];
             double* __restrict magnitude = terms.data();
             for (int c = 0; c < size; ++c) magnitude[c] += std::abs(own[c]) * scale[i];
             add_row(gradient[i], own, Qz);
@@ -112,32 +106,12 @@ class BackwardPass {
             for (int r = 0; r < size; ++r) std::copy_n(steps.curvature + (s * size + r) * size, size, Q[r]);
         }
         T.clear();
-        add_transposed_product(W, J, x, T, held ? size : x);
-        add_transposed_product(J, T, x, Q, size, Part::upper);
+        add_transposed_product(W, step.J, x, T, held ? size : x);
+        add_transposed_product(step.J, T, x, Q, size, Part::upper);
         if (!held) return;
         for (int r = x; r < size; ++r) {
             for (int c = 0; c < size; ++c) Q[c][r] += T[r][c];
             for (int c = x; c < size; ++c) Q[r][c] += T[r][c] + W[r][c];
-        }
-    }
-
-    // Derivatives of (q, v) at a sample in (x, u), from those of the velocities at the nodes.
-    void expand_sample(const Sample& sample, const ExpandedSteps& steps, std::ptrdiff_t s) {
-        for (int half = 0; half < 2; ++half) {
-            const Sample::Sum& of = half == 0 ? sample.q : sample.v;
-            for (int i = 0; i < n; ++i) {
-                double* __restrict out = D[half * n + i];
-                const double* __restrict places = J[i];
-                const double* __restrict rates = speeds[i];
-                for (int c = 0; c < size; ++c) out[c] = of.q1 * places[c] + of.v1 * rates[c];
-                out[i] += of.q0;
-                if (!steps.velocity) {
-                    out[n + i] += of.v0;
-                } else if (of.v0 != 0.0) {
-                    const double* before = steps.velocity + (s * n + i) * x;
-                    for (int c = 0; c < x; ++c) out[c] += of.v0 * before[c];
-                }
-            }
         }
     }
 
@@ -163,35 +137,25 @@ class BackwardPass {
     // The samples h w l(z) of step s, with z = D (x, u).
     void add_running_cost(double h, const ExpandedSteps& steps, std::ptrdiff_t s) {
         const auto samples = static_cast<std::ptrdiff_t>(steps.rule.size());
-        if (steps.velocity) {
-            const double* after = steps.velocity + (s + 1) * n * x;
-            for (int i = 0; i < n; ++i) {
-                for (int c = 0; c < x; ++c) rates[c][i] = after[i * x + c];
-            }
-            speeds.clear();
-            add_transposed_product(rates, J, x, speeds, n);
-        } else {
-            for (int i = 0; i < n; ++i) std::copy_n(J[n + i], size, speeds[i]);
-        }
         for (std::ptrdiff_t sample = 0; sample < samples; ++sample) {
             const std::ptrdiff_t point = s * samples + sample;
             const double* g = steps.gradient_at(point);
             const double* H = steps.hessian_at(point);
             const double weight = h * steps.rule[sample].weight;
-            expand_sample(steps.rule[sample], steps, s);
+            step.expand(steps.rule[sample]);
             std::fill_n(row.begin(), x, 0.0);
             std::copy_n(g + x, m, row.begin() + x);
-            for (int i = 0; i < x; ++i) add_row(g[i], D[i], row);
+            for (int i = 0; i < x; ++i) add_row(g[i], step.D[i], row);
             add_row(weight, row.data(), Qz);
             add_row(weight, row.data(), Cz);
-            const int rows = weigh(weight, H, D);
-            add_transposed_product(D, T, rows, Q, size, Part::upper);
+            const int rows = weigh(weight, H, step.D);
+            add_transposed_product(step.D, T, rows, Q, size, Part::upper);
             for (int r = x; r < size; ++r) {
                 for (int i = 0; i < x; ++i) {
                     const double entry = weight * H[r * size + i];
                     if (entry == 0.0) continue;
-                    for (int c = 0; c < size; ++c) Q[c][r] += entry * D[i][c];
-                    for (int c = x; c < size; ++c) Q[r][c] += entry * D[i][c];
+                    for (int c = 0; c < size; ++c) Q[c][r] += entry * step.D[i][c];
+                    for (int c = x; c < size; ++c) Q[r][c] += entry * step.D[i][c];
                 }
                 for (int c = x; c < size; ++c) Q[r][c] += weight * H[r * size + c];
             }
@@ -201,57 +165,29 @@ class BackwardPass {
     // The terms of the noise, and S into `spread`. Where the running cost is sampled after the kick, it counts too.
     void add_noise(double h, const ExpandedSteps& steps, std::ptrdiff_t s, double* spread) {
         const auto samples = static_cast<std::ptrdiff_t>(steps.rule.size());
-        const int processes = steps.processes;
         for (int i = 0; i < x; ++i) {
             for (int j = 0; j < x; ++j) S[i][j] = h * W[i][j];
         }
         for (std::ptrdiff_t k = 0; k < samples; ++k) {
-            const Sample& sample = steps.rule[k];
-            if (sample.q.q1 == 0.0 && sample.q.v1 == 0.0 && sample.v.q1 == 0.0 && sample.v.v1 == 0.0) continue;
-            expand_after(sample, steps, s);
-            const int rows = weigh(h * h * sample.weight, steps.hessian_at(s * samples + k), P);
-            add_transposed_product(P, T, rows, S, x, Part::upper);
+            if (!step.expand_after(steps.rule[k])) continue;
+            const int rows = weigh(h * h * steps.rule[k].weight, steps.hessian_at(s * samples + k), step.P);
+            add_transposed_product(step.P, T, rows, S, x, Part::upper);
         }
         mirror(S, x);
         for (int i = 0; i < x; ++i) std::copy_n(S[i], x, spread + i * x);
-        for (int w = 0; w < processes; ++w) {
-            bool multiplicative = false;
+        for (int w = 0; w < steps.processes; ++w) {
+            const bool depends = step.load_process(steps, s, w);
             std::fill_n(row.begin(), x, 0.0);
+            for (int i = 0; i < x; ++i) add_row(step.jump[i], S[i], row, x);
+            for (int i = 0; i < x; ++i) found.noise += 0.5 * step.jump[i] * row[i];
+            if (!depends) continue;
             for (int i = 0; i < x; ++i) {
-                const std::ptrdiff_t own = (s * x + i) * processes + w;
-                std::copy_n(steps.Gx + own * x, x, D[i]);
-                std::copy_n(steps.Gu + own * m, m, D[i] + x);
-                for (int c = 0; c < size; ++c) multiplicative = multiplicative || D[i][c] != 0.0;
-                for (int j = 0; j < x; ++j) row[j] += steps.G[own] * S[i][j];
+                add_row(row[i], step.F[i], Qz);
+                add_row(row[i], step.F[i], Cz);
             }
-            for (int i = 0; i < x; ++i) {
-                found.noise += 0.5 * steps.G[(s * x + i) * processes + w] * row[i];
-                if (!multiplicative) continue;
-                add_row(row[i], D[i], Qz);
-                add_row(row[i], D[i], Cz);
-            }
-            if (!multiplicative) continue;
             T.clear();
-            add_transposed_product(S, D, x, T, x);
-            add_transposed_product(D, T, x, Q, size, Part::upper);
-        }
-    }
-
-    // Derivatives P (2n, 2n) of (q, v) at a sample in the state after step s.
-    void expand_after(const Sample& sample, const ExpandedSteps& steps, std::ptrdiff_t s) {
-        P.clear();
-        for (int half = 0; half < 2; ++half) {
-            const Sample::Sum& of = half == 0 ? sample.q : sample.v;
-            for (int i = 0; i < n; ++i) {
-                double* out = P[half * n + i];
-                out[i] = of.q1;
-                if (!steps.velocity) {
-                    out[n + i] = of.v1;
-                } else {
-                    const double* after = steps.velocity + ((s + 1) * n + i) * x;
-                    for (int c = 0; c < x; ++c) out[c] += of.v1 * after[c];
-                }
-            }
+            add_transposed_product(S, step.F, x, T, x);
+            add_transposed_product(step.F, T, x, Q, size, Part::upper);
         }
     }
 
@@ -415,11 +351,7 @@ class BackwardPass {
     std::vector<double> scale;    // rounding has left entry (i, j) of W off by about eps scale_i scale_j
 
     // Work arrays of a step.
-    TiledMatrix J;              // (x, size) [A B]
-    TiledMatrix rates;          // (x, n) transposed derivative of v after the step in x there
-    TiledMatrix speeds;         // (n, size) of v after the step in (x, u)
-    TiledMatrix D;              // (x, size) of (q, v) at the sample in (x, u)
-    TiledMatrix P;              // (x, x) of the same in the state after the step
+    LinearStep step;
     TiledMatrix S;              // (x, x)
     TiledMatrix T;              // (size, size) a product
     TiledMatrix Q;              // (size, size); upper triangle alone until the decision
