@@ -10,7 +10,7 @@
 #include "arrays.hpp"
 #include "registrations.hpp"
 #include "varpin/box.hpp"
-#include "varpin/orthogonal.hpp"
+#include "varpin/square_root.hpp"
 #include "varpin/steps.hpp"
 
 namespace varpin::border {
@@ -131,14 +131,64 @@ void make_pass(BackwardPass* self, int controls, In<1> gradient, In<2> hessian) 
     new (self) BackwardPass(static_cast<int>(x / 2), controls, gradient.data(), hessian.data());
 }
 
+// Squares that keep the arrays they look at.
+struct HeldSquares {
+    HeldSquares(In<3> root_, In<2> shift_, In<2> linear_) : root(root_), shift(shift_), linear(linear_) {
+        const std::size_t N = shift.shape(0), z = shift.shape(1);
+        require(root, "root", {root.shape(0) == 1 ? 1 : N, z, z});
+        require(linear, "linear", {N, z});
+    }
+
+    // Views, once it is known that there are `count` functions of `size` variables.
+    Squares fitting(const char* name, std::size_t count, std::size_t size) const {
+        require(shift, name, {count, size});
+        return {.root = root.data(), .one_root = root.shape(0) == 1, .shift = shift.data(), .linear = linear.data()};
+    }
+
+    In<3> root;
+    In<2> shift, linear;
+};
+
+void make_root_pass(RootPass* self, int controls, const HeldSquares& terminal, In<1> gradient) {
+    const std::size_t x = gradient.shape(0);
+    if (x % 2 != 0) throw std::invalid_argument("gradient has an odd size");
+    if (controls < 0) throw std::invalid_argument("controls must not be negative");
+    new (self) RootPass(static_cast<int>(x / 2), controls, terminal.fitting("terminal", 1, x), gradient.data());
+}
+
 template <class Pass>
-std::ptrdiff_t run(Pass& pass, double h, int hold, double regularization, const HeldSteps& given,
-                   const HeldGains& held) {
+void require_same(const Pass& pass, const HeldSteps& given) {
     if (given.steps.dof != pass.dof() || given.steps.controls != pass.controls())
         throw std::invalid_argument("the steps have other states or controls than the pass");
+}
+
+std::ptrdiff_t run(BackwardPass& pass, double h, int hold, double regularization, const HeldSteps& given,
+                   const HeldGains& held) {
+    require_same(pass, given);
     const Gains gains = held.fitting(given, hold);
     nb::gil_scoped_release release;
     return pass.run(h, hold, regularization, given.steps, gains);
+}
+
+std::ptrdiff_t run_on_roots(RootPass& pass, double h, int hold, double regularization, const HeldSteps& given,
+                            const HeldGains& held, const HeldSquares& running, const HeldSquares* change) {
+    require_same(pass, given);
+    const Gains gains = held.fitting(given, hold);
+    const ExpandedSteps& steps = given.steps;
+    if (steps.rate && !change) throw std::invalid_argument("where a control's change costs, change is needed");
+    const Squares samples = running.fitting("running", given.gradient.shape(0), given.gradient.shape(1));
+    const Squares changes =
+        steps.rate ? change->fitting("change", given.rate.shape(0), given.rate.shape(1)) : Squares{};
+    nb::gil_scoped_release release;
+    return pass.run(h, hold, regularization, steps, samples, changes, gains);
+}
+
+template <class Pass>
+void define_results(nb::class_<Pass>& type) {
+    type.def_prop_ro("slope", [](const Pass& pass) { return pass.found.slope; })
+        .def_prop_ro("curvature", [](const Pass& pass) { return pass.found.curvature; })
+        .def_prop_ro("noise", [](const Pass& pass) { return pass.found.noise; })
+        .def_prop_ro("loss", [](const Pass& pass) { return pass.found.loss; });
 }
 
 // The minimum, the factors of its free part, and which entries the box holds.
@@ -159,15 +209,6 @@ std::optional<std::tuple<Out, Out, nb::ndarray<nb::numpy, bool>>> box_minimum(In
     return std::tuple{out, array_of(box.factors.data(), {m, m}), nb::ndarray<nb::numpy, bool>(held, {m}, owner)};
 }
 
-// R (c, c) with R'R = rows'rows, of `rows` (r, c).
-Out triangular(In<2> rows) {
-    const std::size_t r = rows.shape(0), c = rows.shape(1);
-    std::vector<double> room(std::max(r, c) * c), work(c);
-    std::copy_n(rows.data(), r * c, room.begin());
-    triangularize(room.data(), static_cast<int>(std::max(r, c)), static_cast<int>(c), work.data());
-    return array_of(room.data(), {c, c});
-}
-
 }  // namespace
 
 void register_backward(nb::module_& m) {
@@ -179,15 +220,17 @@ void register_backward(nb::module_& m) {
         .def(nb::init<InOut<2>, InOut<3>, InOut<3>, InOut<2>, InOut<2>, InOut<3>>(), nb::kw_only(),
              "feedforward"_a.noconvert(), "feedback"_a.noconvert(), "previous"_a.noconvert(),
              "control_gradient"_a.noconvert(), "costate"_a.noconvert(), "spread"_a.noconvert());
-    nb::class_<BackwardPass>(m, "BackwardPass")
-        .def("__init__", &make_pass, "controls"_a, "gradient"_a, "hessian"_a)
-        .def("run", &run<BackwardPass>, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a)
-        .def_prop_ro("slope", [](const BackwardPass& pass) { return pass.found.slope; })
-        .def_prop_ro("curvature", [](const BackwardPass& pass) { return pass.found.curvature; })
-        .def_prop_ro("noise", [](const BackwardPass& pass) { return pass.found.noise; })
-        .def_prop_ro("loss", [](const BackwardPass& pass) { return pass.found.loss; });
+    nb::class_<HeldSquares>(m, "Squares").def(nb::init<In<3>, In<2>, In<2>>(), "root"_a, "shift"_a, "linear"_a);
+    auto pass = nb::class_<BackwardPass>(m, "BackwardPass");
+    pass.def("__init__", &make_pass, "controls"_a, "gradient"_a, "hessian"_a)
+        .def("run", &run, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a);
+    define_results(pass);
+    auto root_pass = nb::class_<RootPass>(m, "RootPass");
+    root_pass.def("__init__", &make_root_pass, "controls"_a, "terminal"_a, "gradient"_a)
+        .def("run", &run_on_roots, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "running"_a,
+             "change"_a.none() = nb::none());
+    define_results(root_pass);
     m.def("box_minimum", &box_minimum, "H"_a, "g"_a, "limits"_a, "guess"_a);
-    m.def("triangular", &triangular, "rows"_a);
 }
 
 }  // namespace varpin::border

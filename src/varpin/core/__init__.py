@@ -4,5 +4,6 @@ from varpin.core._core import BackwardPass as BackwardPass
 from varpin.core._core import ExpandedSteps as ExpandedSteps
 from varpin.core._core import Gains as Gains
 from varpin.core._core import Mechanism as Mechanism
+from varpin.core._core import RootPass as RootPass
+from varpin.core._core import Squares as Squares
 from varpin.core._core import box_minimum as box_minimum
-from varpin.core._core import triangular as triangular

@@ -7,14 +7,14 @@
 
 namespace varpin {
 
-// R in place of a (rows, columns), rows >= columns, the rows below it zero; signs of rows are as they come. `work` is
-// (columns).
+// The leading rows of R in place of those of a (rows, columns), whose `leading` first columns are triangular then;
+// `leading` is no more than rows or columns, and signs of rows are as they come. `work` is (columns).
 //
 // The row that is largest in a column leads it: otherwise a large row that has nothing there would take the digits of
 // small ones that have (Powell and Reid, "On applying Householder transformations to linear least squares problems",
 // 1969).
-inline void triangularize(double* a, int rows, int columns, double* __restrict work) {
-    for (int k = 0; k < columns; ++k) {
+inline void triangularize(double* a, int rows, int columns, int leading, double* __restrict work) {
+    for (int k = 0; k < leading; ++k) {
         int best = k;
         for (int i = k + 1; i < rows; ++i) {
             if (std::abs(a[i * columns + k]) > std::abs(a[best * columns + k])) best = i;
