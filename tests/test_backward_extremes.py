@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import varpin as vp
-from varpin.kernels import backward as kernels
+from varpin import core
 from varpin.linearization import linearize_steps
 from varpin.sddp.backward import TRUSTED, _one_pass, backward
-from varpin.sddp.square_root import RootPass, squares_of
+from varpin.sddp.square_root import squares_of
 from varpin.simulation import simulate
 
 INERTIAS = {"unit": np.ones(3), "finger": np.array([1e-5, 1e-6, 1e-7]), "mixed": np.array([1.0, 1e-3, 1e-6])}
@@ -77,24 +77,24 @@ def passes(A, B, gradient, hessian, end_gradient, end_hessian, h):
     N, x, m = B.shape
     rule = np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
     nothing = np.zeros((N, x, 0))
-    steps = kernels.Steps(
-        A, B, nothing, np.zeros((N, x, 0, x)), np.zeros((N, x, 0, m)), rule, gradient, hessian,
-        np.zeros((0, x // 2, x)), np.zeros((0, x + m, x + m)), np.zeros((0, 2, m)), np.zeros((0, m, m)),
-        np.zeros((0, m)),
+    steps = core.ExpandedSteps(
+        A=A, B=B, G=nothing, Gx=np.zeros((N, x, 0, x)), Gu=np.zeros((N, x, 0, m)), rule=rule,
+        gradient=gradient, hessian=hessian, velocity=np.zeros((0, x // 2, x)), curvature=np.zeros((0, x + m, x + m)),
+        slack=np.zeros((0, 2, m)), rate=np.zeros((0, m, m)), pull=np.zeros((0, m)),
     )  # fmt: skip
     for roots in (False, True):
-        value, room = kernels.new_value(x // 2, m), kernels.new_room(x // 2, m)
-        value.gradient[:x] = value.costate[:x] = end_gradient
-        value.hessian[:x, :x] = end_hessian
-        value.scale[:x] = np.sqrt(np.diagonal(end_hessian))
-        empty = np.zeros((0, x)), np.zeros((0, x, x))
-        gains = kernels.Gains(np.zeros((N, m)), np.zeros((N, m, x)), np.zeros((0, m, m)), np.zeros((N, m)), *empty)
+        feedforward, feedback = np.zeros((N, m)), np.zeros((N, m, x))
+        gains = core.Gains(
+            feedforward=feedforward, feedback=feedback, previous=np.zeros((0, m, m)), control_gradient=np.zeros((N, m)),
+            costate=np.zeros((0, x)), spread=np.zeros((0, x, x)),
+        )  # fmt: skip
         if roots:
-            start = RootPass(squares_of(end_gradient[None], end_hessian[None])[0], value)
-            failed = start.run(h, 1, 0.0, steps, squares_of(gradient, hessian), gains)
+            run = core.RootPass(m, squares_of(end_gradient[None], end_hessian[None]).core, end_gradient)
+            failed = run.run(h, 1, 0.0, steps, gains, squares_of(gradient, hessian).core)
         else:
-            failed = kernels.backward_pass(h, 1, True, 0.0, steps, value, gains, room)
-        yield failed, gains.feedback, gains.feedforward, value.loss[0]
+            run = core.BackwardPass(m, end_gradient, end_hessian)
+            failed = run.run(h, 1, 0.0, steps, gains)
+        yield failed, feedback, feedforward, run.loss
 
 
 def off(found, right):

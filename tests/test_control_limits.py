@@ -6,7 +6,7 @@ from scipy.optimize import lsq_linear
 from test_sddp import sliders
 
 import varpin as vp
-from varpin.kernels.box import solve_box
+from varpin.core import box_minimum
 from varpin.robot.kinematics import frame_kinematics
 from varpin.sddp.backward import backward
 
@@ -35,9 +35,7 @@ def test_box_minimum(m, condition):
         L = np.linalg.cholesky(H)
         wide = np.where(np.isfinite(limits), limits, np.sign(limits) * 1e12)
         reference = lsq_linear(L.T, -np.linalg.solve(L, g), wide, method="bvls", tol=1e-14, max_iter=200).x
-        x, F, work = 5.0 * rng.normal(size=m), np.zeros((m, m)), np.zeros((3, m))
-        assert solve_box(H, g, limits, x, F, work)
-        held = work[0] == 1.0
+        x, F, held = box_minimum(H, g, limits, 5.0 * rng.normal(size=m))
         held_at_all += held.sum()
         assert ((x >= limits[0]) & (x <= limits[1])).all()
         assert ((x == limits[0]) | (x == limits[1]))[held].all()
@@ -59,7 +57,7 @@ def test_box_minimum(m, condition):
 def test_box_refuses_what_has_no_minimum():
     limits = np.array([[-1.0, -1.0], [1.0, 1.0]])
     for H in (np.diag([1.0, -1.0]), np.full((2, 2), np.nan)):
-        assert not solve_box(H, np.zeros(2), limits, np.zeros(2), np.zeros((2, 2)), np.zeros((3, 2)))
+        assert box_minimum(H, np.zeros(2), limits, np.zeros(2)) is None
 
 
 def pushed(limits=None, **options):

@@ -1,8 +1,236 @@
+// Backward passes: on the Hessian of the value, and on its square root.
+#include "varpin/backward.hpp"
+
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include <optional>
+#include <tuple>
+
 #include "arrays.hpp"
 #include "registrations.hpp"
+#include "varpin/box.hpp"
+#include "varpin/square_root.hpp"
+#include "varpin/steps.hpp"
 
 namespace varpin::border {
 
-void register_backward(nb::module_&) {}
+namespace {
+
+using namespace nanobind::literals;
+
+std::vector<Sample> rule_of(In<2> rule) {
+    require(rule, "rule", {rule.shape(0), 9});
+    std::vector<Sample> samples;
+    for (std::size_t k = 0; k < rule.shape(0); ++k) {
+        samples.push_back({rule(k, 0),
+                           {rule(k, 1), rule(k, 2), rule(k, 3), rule(k, 4)},
+                           {rule(k, 5), rule(k, 6), rule(k, 7), rule(k, 8)}});
+    }
+    return samples;
+}
+
+// Steps that keep the arrays they look at; what may be left out is empty then.
+struct HeldSteps {
+    HeldSteps(In<3> A_, In<3> B_, In<3> G_, In<4> Gx_, In<4> Gu_, In<2> rule, In<2> gradient_, In<3> hessian_,
+              In<3> velocity_, In<3> curvature_, In<3> slack_, In<3> rate_, In<2> pull_)
+        : A(A_),
+          B(B_),
+          G(G_),
+          Gx(Gx_),
+          Gu(Gu_),
+          gradient(gradient_),
+          hessian(hessian_),
+          velocity(velocity_),
+          curvature(curvature_),
+          slack(slack_),
+          rate(rate_),
+          pull(pull_) {
+        const std::size_t N = A.shape(0), x = A.shape(1), m = B.shape(2), k = G.shape(2), size = x + m;
+        const std::size_t points = N * rule.shape(0), R = slack.shape(0), rated = rate.shape(0);
+        if (x % 2 != 0) throw std::invalid_argument("A has an odd number of states");
+        require(A, "A", {N, x, x});
+        require(B, "B", {N, x, m});
+        require(G, "G", {N, x, k});
+        require(Gx, "Gx", {N, x, k, x});
+        require(Gu, "Gu", {N, x, k, m});
+        require(gradient, "gradient", {points, size});
+        const bool one_hessian = hessian.shape(0) == 1;
+        require(hessian, "hessian", {one_hessian ? 1 : points, size, size});
+        steps = {.steps = static_cast<std::ptrdiff_t>(N),
+                 .dof = static_cast<int>(x / 2),
+                 .controls = static_cast<int>(m),
+                 .processes = static_cast<int>(k),
+                 .A = A.data(),
+                 .B = B.data(),
+                 .G = G.data(),
+                 .Gx = Gx.data(),
+                 .Gu = Gu.data(),
+                 .rule = rule_of(rule),
+                 .gradient = gradient.data(),
+                 .hessian = hessian.data(),
+                 .one_hessian = one_hessian,
+                 .velocity = given(velocity, "velocity", {N + 1, x / 2, x}) ? velocity.data() : nullptr,
+                 .curvature = given(curvature, "curvature", {N, size, size}) ? curvature.data() : nullptr,
+                 .slack = R > 0 && given(slack, "slack", {R, 2, m}) ? slack.data() : nullptr,
+                 .rate = rated > 0 && given(rate, "rate", {rated, m, m}) ? rate.data() : nullptr,
+                 .pull = rated > 0 ? pull.data() : nullptr};
+        require(pull, "pull", {rated, m});
+    }
+
+    In<3> A, B, G;
+    In<4> Gx, Gu;
+    In<2> gradient;
+    In<3> hessian, velocity, curvature, slack, rate;
+    In<2> pull;
+    ExpandedSteps steps;
+};
+
+// Arrays of gains to be filled in; what is not asked for is empty.
+struct HeldGains {
+    HeldGains(InOut<2> feedforward_, InOut<3> feedback_, InOut<3> previous_, InOut<2> control_gradient_,
+              InOut<2> costate_, InOut<3> spread_)
+        : feedforward(feedforward_),
+          feedback(feedback_),
+          previous(previous_),
+          control_gradient(control_gradient_),
+          costate(costate_),
+          spread(spread_) {}
+
+    // Views, once it is known that they fit these steps, each control held over `hold` of them.
+    Gains fitting(const HeldSteps& held, int hold) const {
+        const ExpandedSteps& steps = held.steps;
+        if (hold < 1 || steps.steps % hold != 0) throw std::invalid_argument("hold does not divide the steps");
+        const auto N = static_cast<std::size_t>(steps.steps), R = N / static_cast<std::size_t>(hold);
+        const auto x = static_cast<std::size_t>(steps.states()), m = static_cast<std::size_t>(steps.controls);
+        given(held.slack, "slack", {R, 2, m});
+        if (given(held.rate, "rate", {R, m, m})) require(previous, "previous", {R, m, m});
+        if (steps.processes > 0) require(spread, "spread", {N, x, x});
+        require(feedforward, "feedforward", {R, m});
+        require(feedback, "feedback", {R, m, x});
+        require(control_gradient, "control_gradient", {R, m});
+        return {.feedforward = feedforward.data(),
+                .feedback = feedback.data(),
+                .previous = previous.data(),
+                .control_gradient = control_gradient.data(),
+                .costate = given(costate, "costate", {N, x}) ? costate.data() : nullptr,
+                .spread = spread.data()};
+    }
+
+    InOut<2> feedforward;
+    InOut<3> feedback, previous;
+    InOut<2> control_gradient, costate;
+    InOut<3> spread;
+};
+
+void make_pass(BackwardPass* self, int controls, In<1> gradient, In<2> hessian) {
+    const std::size_t x = gradient.shape(0);
+    if (x % 2 != 0) throw std::invalid_argument("gradient has an odd size");
+    if (controls < 0) throw std::invalid_argument("controls must not be negative");
+    require(hessian, "hessian", {x, x});
+    new (self) BackwardPass(static_cast<int>(x / 2), controls, gradient.data(), hessian.data());
+}
+
+// Squares that keep the arrays they look at.
+struct HeldSquares {
+    HeldSquares(In<3> root_, In<2> shift_, In<2> linear_) : root(root_), shift(shift_), linear(linear_) {
+        const std::size_t N = shift.shape(0), z = shift.shape(1);
+        require(root, "root", {root.shape(0) == 1 ? 1 : N, z, z});
+        require(linear, "linear", {N, z});
+    }
+
+    // Views, once it is known that there are `count` functions of `size` variables.
+    Squares fitting(const char* name, std::size_t count, std::size_t size) const {
+        require(shift, name, {count, size});
+        return {.root = root.data(), .one_root = root.shape(0) == 1, .shift = shift.data(), .linear = linear.data()};
+    }
+
+    In<3> root;
+    In<2> shift, linear;
+};
+
+void make_root_pass(RootPass* self, int controls, const HeldSquares& terminal, In<1> gradient) {
+    const std::size_t x = gradient.shape(0);
+    if (x % 2 != 0) throw std::invalid_argument("gradient has an odd size");
+    if (controls < 0) throw std::invalid_argument("controls must not be negative");
+    new (self) RootPass(static_cast<int>(x / 2), controls, terminal.fitting("terminal", 1, x), gradient.data());
+}
+
+template <class Pass>
+void require_same(const Pass& pass, const HeldSteps& given) {
+    if (given.steps.dof != pass.dof() || given.steps.controls != pass.controls())
+        throw std::invalid_argument("the steps have other states or controls than the pass");
+}
+
+std::ptrdiff_t run(BackwardPass& pass, double h, int hold, double regularization, const HeldSteps& given,
+                   const HeldGains& held) {
+    require_same(pass, given);
+    const Gains gains = held.fitting(given, hold);
+    nb::gil_scoped_release release;
+    return pass.run(h, hold, regularization, given.steps, gains);
+}
+
+std::ptrdiff_t run_on_roots(RootPass& pass, double h, int hold, double regularization, const HeldSteps& given,
+                            const HeldGains& held, const HeldSquares& running, const HeldSquares* change) {
+    require_same(pass, given);
+    const Gains gains = held.fitting(given, hold);
+    const ExpandedSteps& steps = given.steps;
+    if (steps.rate && !change) throw std::invalid_argument("where a control's change costs, change is needed");
+    const Squares samples = running.fitting("running", given.gradient.shape(0), given.gradient.shape(1));
+    const Squares changes =
+        steps.rate ? change->fitting("change", given.rate.shape(0), given.rate.shape(1)) : Squares{};
+    nb::gil_scoped_release release;
+    return pass.run(h, hold, regularization, steps, samples, changes, gains);
+}
+
+template <class Pass>
+void define_results(nb::class_<Pass>& type) {
+    type.def_prop_ro("slope", [](const Pass& pass) { return pass.found.slope; })
+        .def_prop_ro("curvature", [](const Pass& pass) { return pass.found.curvature; })
+        .def_prop_ro("noise", [](const Pass& pass) { return pass.found.noise; })
+        .def_prop_ro("loss", [](const Pass& pass) { return pass.found.loss; });
+}
+
+// The minimum, the factors of its free part, and which entries the box holds.
+std::optional<std::tuple<Out, Out, nb::ndarray<nb::numpy, bool>>> box_minimum(In<2> H, In<1> g, In<2> limits,
+                                                                              In<1> guess) {
+    const std::size_t m = g.shape(0);
+    require(H, "H", {m, m});
+    require(limits, "limits", {2, m});
+    require(guess, "guess", {m});
+    BoxMinimum box(static_cast<int>(m));
+    double* x = nullptr;
+    Out out = array_for(x, {m});
+    std::copy_n(guess.data(), m, x);
+    if (!box.solve(H.data(), g.data(), limits.data(), limits.data() + m, x)) return std::nullopt;
+    bool* held = new bool[m]();
+    std::copy(box.held.begin(), box.held.end(), held);
+    nb::capsule owner(held, [](void* flags) noexcept { delete[] static_cast<bool*>(flags); });
+    return std::tuple{out, array_of(box.factors.data(), {m, m}), nb::ndarray<nb::numpy, bool>(held, {m}, owner)};
+}
+
+}  // namespace
+
+void register_backward(nb::module_& m) {
+    nb::class_<HeldSteps>(m, "ExpandedSteps")
+        .def(nb::init<In<3>, In<3>, In<3>, In<4>, In<4>, In<2>, In<2>, In<3>, In<3>, In<3>, In<3>, In<3>, In<2>>(),
+             nb::kw_only(), "A"_a, "B"_a, "G"_a, "Gx"_a, "Gu"_a, "rule"_a, "gradient"_a, "hessian"_a, "velocity"_a,
+             "curvature"_a, "slack"_a, "rate"_a, "pull"_a);
+    nb::class_<HeldGains>(m, "Gains")
+        .def(nb::init<InOut<2>, InOut<3>, InOut<3>, InOut<2>, InOut<2>, InOut<3>>(), nb::kw_only(),
+             "feedforward"_a.noconvert(), "feedback"_a.noconvert(), "previous"_a.noconvert(),
+             "control_gradient"_a.noconvert(), "costate"_a.noconvert(), "spread"_a.noconvert());
+    nb::class_<HeldSquares>(m, "Squares").def(nb::init<In<3>, In<2>, In<2>>(), "root"_a, "shift"_a, "linear"_a);
+    auto pass = nb::class_<BackwardPass>(m, "BackwardPass");
+    pass.def("__init__", &make_pass, "controls"_a, "gradient"_a, "hessian"_a)
+        .def("run", &run, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a);
+    define_results(pass);
+    auto root_pass = nb::class_<RootPass>(m, "RootPass");
+    root_pass.def("__init__", &make_root_pass, "controls"_a, "terminal"_a, "gradient"_a)
+        .def("run", &run_on_roots, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "running"_a,
+             "change"_a.none() = nb::none());
+    define_results(root_pass);
+    m.def("box_minimum", &box_minimum, "H"_a, "g"_a, "limits"_a, "guess"_a);
+}
 
 }  // namespace varpin::border

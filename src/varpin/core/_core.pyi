@@ -127,3 +127,98 @@ def variational_curvatures(
     z: Floats,
 ) -> tuple[Floats, int, int]:
     """z . d2(q1, p1)/d(q0, p0, f)2 (N, 3n, 3n) for z (N, 2n); how it ended, and how many steps were done."""
+class ExpandedSteps:
+    """The linearized dynamics and the expanded costs of N steps; what may be left out is empty then.
+
+    See src/core/include/varpin/steps.hpp for the fields.
+    """
+
+    def __init__(
+        self,
+        *,
+        A: Floats,
+        B: Floats,
+        G: Floats,
+        Gx: Floats,
+        Gu: Floats,
+        rule: Floats,
+        gradient: Floats,
+        hessian: Floats,
+        velocity: Floats,
+        curvature: Floats,
+        slack: Floats,
+        rate: Floats,
+        pull: Floats,
+    ) -> None:
+        """Raises ValueError for arrays that do not fit each other."""
+
+class Gains:
+    """Arrays of R decisions and N steps that a backward pass fills in: u + k + K (x - x_nominal).
+
+    ``feedforward`` (R, m), ``feedback`` (R, m, 2n), ``previous`` (R, m, m) on the control before where its change costs
+    something, ``control_gradient`` (R, m) of the cost, ``costate`` (N, 2n) its gradient in the state after each step,
+    empty if not asked for, and ``spread`` (N, 2n, 2n) S where there is noise.
+    """
+
+    def __init__(
+        self,
+        *,
+        feedforward: Floats,
+        feedback: Floats,
+        previous: Floats,
+        control_gradient: Floats,
+        costate: Floats,
+        spread: Floats,
+    ) -> None: ...
+
+class Squares:
+    """N functions (1/2) |L z + r|^2 + c . z: root L (N, z, z) or (1, z, z), shift r and linear c (N, z)."""
+
+    def __init__(self, root: Floats, shift: Floats, linear: Floats) -> None: ...
+
+class _Found:
+    @property
+    def slope(self) -> float:
+        """Sum of Qu . k."""
+    @property
+    def curvature(self) -> float:
+        """Sum of k . Quu k."""
+    @property
+    def noise(self) -> float:
+        """What noise adds to the cost."""
+    @property
+    def loss(self) -> float:
+        """The largest part of a pivot of Quu, or of its root, that rounding may have changed."""
+
+class BackwardPass(_Found):
+    """The recursion from the terminal cost's gradient (2n,) and Hessian (2n, 2n) in x."""
+
+    def __init__(self, controls: int, gradient: Floats, hessian: Floats) -> None: ...
+    def run(self, h: float, hold: int, regularization: float, steps: ExpandedSteps, gains: Gains) -> int:
+        """Over a block of steps, the last block first; -1, or the decision that has no minimum.
+
+        Each control is held over ``hold`` steps.
+        """
+
+class RootPass(_Found):
+    """The same on square roots, from the terminal cost in x as one function of squares, and its gradient (2n,)."""
+
+    def __init__(self, controls: int, terminal: Squares, gradient: Floats) -> None: ...
+    def run(
+        self,
+        h: float,
+        hold: int,
+        regularization: float,
+        steps: ExpandedSteps,
+        gains: Gains,
+        running: Squares,
+        change: Squares | None = None,
+    ) -> int:
+        """As that of :class:`BackwardPass`; ``running`` are the samples' costs, ``change`` those of R changes."""
+
+def box_minimum(H: Floats, g: Floats, limits: Floats, guess: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]] | None:
+    """The x (m,) within ``limits`` (2, m) that minimizes g . x + (1/2) x'Hx; None where H is not positive definite.
+
+    With it, L D L' of H with held rows and columns replaced by those of the identity (unit L below the diagonal, D on
+    it), and which entries the box holds.
+    """

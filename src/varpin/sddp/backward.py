@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin import core
 from varpin.costs import CostError, Expansion
 from varpin.errors import LinearizationError
-from varpin.kernels import backward as kernels
 from varpin.linearization import (
     Linearization,
     linearize_steps,
@@ -19,7 +20,7 @@ from varpin.linearization import (
 )
 from varpin.sddp.descent import Model
 from varpin.sddp.problem import OptimalControlProblem
-from varpin.sddp.square_root import RootPass, Squares, squares_of
+from varpin.sddp.square_root import Squares, squares_of
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -157,6 +158,14 @@ def _pass(
     return plain if by_roots[0] is None else by_roots
 
 
+class _ByRoots(NamedTuple):
+    """A pass on square roots, and the costs of samples and of changes of the control as squares."""
+
+    run: core.RootPass
+    running: Squares
+    change: Squares
+
+
 def _one_pass(
     problem: OptimalControlProblem,
     trajectory: Trajectory,
@@ -169,8 +178,7 @@ def _one_pass(
     scene = problem.scene
     n, m, k, N, R = scene.robot.dof, scene.controls, scene.processes, problem.steps, problem.decisions
     size = 2 * n + m
-    value, room = kernels.new_value(n, m), kernels.new_room(n, m)
-    terminal = _set_terminal(problem, trajectory, value, curvature is not None)
+    terminal, D, by_state, by_states = _terminal(problem, trajectory, curvature is not None)
     running = problem.expand_running(trajectory)
     for name, array in (("gradient", running.gradient), ("Hessian", running.hessian)):
         if not np.isfinite(array).all():
@@ -184,14 +192,13 @@ def _one_pass(
     previous = np.empty(rate.shape)
     costate = np.empty((N if costates else 0, 2 * n))
     hessian = running.hessian
-    by_roots, squares = None, None
+    plain, by_roots = core.BackwardPass(m, by_state, by_states), None
     if roots:
-        final, squares = squares_of(*terminal[:2]), squares_of(running.gradient, hessian)
-        if final is None or squares is None:
+        final, squares = squares_of(terminal.gradient, terminal.hessian), squares_of(running.gradient, hessian)
+        change = squares_of(pull, rate)
+        if final is None or squares is None or change is None:
             return None, costate
-        D = terminal[2]
-        by_roots = RootPass(Squares(final.root[0] @ D, final.shift[0], D.T @ final.linear[0]), value)
-    in_velocity = bool(hessian[:, n : 2 * n].any())
+        by_roots = _ByRoots(core.RootPass(m, final.after(D).core, by_state), squares, change)
     rule = problem.rule
     samples = len(rule)
     # Velocities at nodes are needed where they are sampled and x does not hold them.
@@ -209,9 +216,9 @@ def _one_pass(
             jumps[steps] = lin.J
         velocity = velocity_at_nodes(scene, part.q, part.v) if nodes else np.zeros((0, n, 2 * n))
         points = slice(begin * samples, end * samples)
-        given = kernels.Steps(
+        given = core.ExpandedSteps(
             A=lin.A,
-            B=np.ascontiguousarray(lin.B),
+            B=lin.B,
             G=lin.G,
             Gx=lin.Gx,
             Gu=lin.Gu,
@@ -224,37 +231,38 @@ def _one_pass(
             rate=rate[rows],
             pull=pull[rows],
         )
-        gains = kernels.Gains(
-            feedforward[rows],
-            feedback[rows],
-            previous[rows],
-            gradient[rows],
-            costate[steps] if costates else costate,
-            spread[steps],
+        gains = core.Gains(
+            feedforward=feedforward[rows],
+            feedback=feedback[rows],
+            previous=previous[rows],
+            control_gradient=gradient[rows],
+            costate=costate[steps] if costates else costate,
+            spread=spread[steps],
         )
-        if by_roots is not None and squares is not None:
-            failed = by_roots.run(problem.dt, problem.hold, regularization, given, squares[points], gains)
+        how = (problem.dt, problem.hold, float(regularization))
+        if by_roots is None:
+            failed = plain.run(*how, given, gains)
         else:
-            failed = kernels.backward_pass(
-                problem.dt, problem.hold, in_velocity, float(regularization), given, value, gains, room
-            )
+            running_squares, change_squares = by_roots.running[points].core, by_roots.change[rows].core
+            failed = by_roots.run.run(*how, given, gains, running_squares, change_squares)
         if failed >= 0:
             return None, costate
-    if not np.isfinite(value.decrease).all():
+    found = plain if by_roots is None else by_roots.run
+    if not (np.isfinite(found.slope) and np.isfinite(found.curvature)):
         return None, costate
     plan = Plan(
         feedforward,
         feedback,
         None if problem.rate is None else previous,
         gradient,
-        float(value.decrease[0]),
-        float(value.decrease[1]),
-        float(value.noise[0]),
+        found.slope,
+        found.curvature,
+        found.noise,
         jumps,
         spread,
         problem.limited,
-        float(value.loss[0]),
-        Model(running, Expansion(*terminal[:2])),
+        found.loss,
+        Model(running, terminal),
     )
     return plan, costate
 
@@ -267,10 +275,10 @@ def _linearize(problem: OptimalControlProblem, part: Trajectory, begin: int) -> 
         raise LinearizationError(step, step * problem.dt, error.reason) from None
 
 
-def _set_terminal(
-    problem: OptimalControlProblem, trajectory: Trajectory, value: kernels.Value, exact: bool
-) -> tuple[Floats, Floats, Floats]:
-    """The terminal cost in x; returns gradient and Hessian in (q, v), with one axis before, and d(q, v)/dx."""
+def _terminal(
+    problem: OptimalControlProblem, trajectory: Trajectory, exact: bool
+) -> tuple[Expansion, Floats, Floats, Floats]:
+    """The terminal cost in (q, v), d(q, v)/dx, and the cost's gradient (2n,) and Hessian (2n, 2n) in x."""
     n = problem.scene.robot.dof
     end = problem.expand_terminal(trajectory)
     x = slice(0, 2 * n)
@@ -282,7 +290,4 @@ def _set_terminal(
         if exact:
             H = H + velocity_curvature(problem.scene, trajectory.q[-1:], trajectory.v[-1:], g[None, n:])[0]
         g = D.T @ g
-    value.gradient[x] = value.costate[x] = g
-    value.hessian[x, x] = H
-    value.scale[x] = np.sqrt(np.abs(np.diagonal(H)))
-    return gradient, hessian, D
+    return Expansion(gradient, hessian), D, g, H

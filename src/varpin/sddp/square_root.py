@@ -1,17 +1,7 @@
-"""The backward pass on a square root of the value's Hessian, for where the plain recursion runs out of digits.
+"""Convex quadratic functions as sums of squares, which the backward pass on square roots is made of.
 
-The value is kept as a sum of squares (1/2) |R x + r|^2, and its Hessian R'R never formed. With the running cost as
-squares (1/2) |L z + l|^2 too, the cost to go from a step is a sum of squares in (u, x). An orthogonal transformation
-brings their rows to
-
-    ( R_uu  R_ux  r_u )        K = -R_uu^-1 R_ux,  k = -R_uu^-1 r_u,
-    (   0   R_xx  r_x )        and the last rows are the value before the step
-
-(Kailath, Sayed and Hassibi, *Linear Estimation*, 2000, chapter 12). What is eps of the Hessian's largest terms to the
-plain recursion is eps of their root here, so that weights may be twice as many digits apart. Every Hessian must be
-positive semidefinite; the part of a gradient that it knows nothing of is carried along as it is. Where the change of
-the control costs something, the control before is part of x. Node by node in NumPy, many times as slow as the compiled
-recursion.
+Where the plain recursion runs out of digits, the value is kept as a sum of squares (1/2) |R x + r|^2 and its Hessian
+R'R never formed: see ``square_root.hpp`` in ``src/core``. Every Hessian must be positive semidefinite.
 """
 
 from __future__ import annotations
@@ -20,11 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
-from varpin.kernels.backward import EPS, Gains, Steps, Value
-from varpin.kernels.box import solve_box
-from varpin.kernels.orthogonal import triangularize
+from varpin import core
 
 Floats = NDArray[np.float64]
 
@@ -34,14 +21,23 @@ _ROUNDING = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Squares:
-    """Convex quadratic functions (1/2) |L z + r|^2 + c . z, but for constants."""
+    """N functions (1/2) |L z + r|^2 + c . z, but for constants."""
 
-    root: Floats  # L (..., z, z)
-    shift: Floats  # r (..., z)
-    linear: Floats  # c (..., z)
+    root: Floats  # L (N, z, z), or (1, z, z) for all
+    shift: Floats  # r (N, z)
+    linear: Floats  # c (N, z)
 
-    def __getitem__(self, rows: slice | int) -> Squares:
-        return Squares(self.root[rows], self.shift[rows], self.linear[rows])
+    def __getitem__(self, rows: slice) -> Squares:
+        return Squares(self.root if len(self.root) == 1 else self.root[rows], self.shift[rows], self.linear[rows])
+
+    def after(self, D: Floats) -> Squares:
+        """As functions of x, where z = D x."""
+        return Squares(self.root @ D, self.shift, self.linear @ D)
+
+    @property
+    def core(self) -> core.Squares:
+        """The same for the compiled core."""
+        return core.Squares(self.root, self.shift, self.linear)
 
 
 def squares_of(gradient: Floats, hessian: Floats) -> Squares | None:
@@ -59,155 +55,4 @@ def squares_of(gradient: Floats, hessian: Floats) -> Squares | None:
     along = (across @ (gradient / unit)[..., None])[..., 0]
     shift = np.where(known, along / np.where(known, weight, 1.0), 0.0)
     linear = unit * (vectors @ np.where(known, 0.0, along)[..., None])[..., 0]
-    root = np.broadcast_to(weight[..., :, None] * across * unit[..., None, :], (*gradient.shape, gradient.shape[-1]))
-    return Squares(root, shift, linear)
-
-
-def triangular(rows: Floats) -> Floats:
-    """The upper triangular R (z, z) with R'R = rows'rows."""
-    size = rows.shape[1]
-    room = np.zeros((max(len(rows), size), size))
-    room[: len(rows)] = rows
-    triangularize(room)
-    return room[:size]
-
-
-def _at_sample(part: Floats, velocity: Floats, node: int, dof: int) -> Floats:
-    """Derivative (2n, 2n) of (q, v) at a sample in x at ``node``; ``part`` holds q of q, v and v of q, v there."""
-    one = np.eye(dof)
-    rate = velocity[node] if len(velocity) else np.eye(dof, 2 * dof, dof)
-    places = np.hstack([one, np.zeros((dof, dof))])
-    return np.vstack([part[0] * places + part[1] * rate, part[2] * places + part[3] * rate])
-
-
-class RootPass:
-    """The pass so far; blocks of steps are taken from the last to the first."""
-
-    def __init__(self, terminal: Squares, value: Value) -> None:
-        """From the terminal cost in x, and its gradient as the costate in ``value``."""
-        x, size = terminal.root.shape[-1], value.gradient.size
-        self.root, self.linear = np.zeros((len(terminal.root), size + 1)), np.zeros(size)
-        self.root[:, :x], self.root[:, -1], self.linear[:x] = terminal.root, terminal.shift, terminal.linear
-        self.value = value
-        value.scale[:] = np.sqrt((self.root[:, :-1] ** 2).sum(axis=0))
-
-    def run(self, h: float, hold: int, regularization: float, steps: Steps, running: Squares, gains: Gains) -> int:
-        """Over a block, as :func:`varpin.kernels.backward.backward_pass`; ``running`` costs are of the samples."""
-        for s in range(len(steps.A) - 1, -1, -1):
-            if len(gains.costate):
-                gains.costate[s] = self.value.costate[: steps.A.shape[1]]
-            held = len(steps.rate) > 0 or (s + 1) % hold != 0
-            rows, linear, costate = self._step(h, s, held, steps, running, gains)
-            if s % hold == 0:
-                if not self._decide(regularization, s // hold, steps, rows, linear, costate, gains):
-                    return s // hold
-                continue
-            self.root, self.linear = triangular(rows)[:-1], linear
-            self.value.costate[:] = costate
-        return -1
-
-    def _step(
-        self, h: float, s: int, held: bool, steps: Steps, running: Squares, gains: Gains
-    ) -> tuple[Floats, Floats, Floats]:
-        """Rows (L r) of the squares that add up to the cost in (x, u); the linear part; the gradient of the motion."""
-        value, x, size = self.value, steps.A.shape[1], steps.A.shape[1] + steps.B.shape[2]
-        n, samples = x // 2, len(steps.rule)
-        J = np.hstack([steps.A[s], steps.B[s]])
-        carried = np.hstack([self.root[:, :x] @ J, self.root[:, -1:]])
-        linear, costate = J.T @ self.linear[:x], J.T @ value.costate[:x]
-        scale = np.abs(J).T @ value.scale[:x]
-        if held:
-            carried[:, x:-1] += self.root[:, x:-1]
-            linear[x:] += self.linear[x:]
-            costate[x:] += value.costate[x:]
-            scale[x:] = np.hypot(scale[x:], value.scale[x:])
-        value.scale[:] = scale
-        rows, kicked = [carried], [np.sqrt(h) * self.root[:, :x]]
-        for k in range(samples):
-            rule, point = steps.rule[k], s * samples + k
-            own = running[point]
-            after = _at_sample(rule[[3, 4, 7, 8]], steps.velocity, s + 1, n)
-            D = np.eye(size)
-            D[:x] = after @ J
-            D[:x, :x] += _at_sample(rule[[1, 2, 5, 6]], steps.velocity, s, n)
-            rows.append(np.sqrt(h * rule[0]) * np.column_stack([own.root @ D, own.shift]))
-            linear += h * rule[0] * (D.T @ own.linear)
-            costate += h * rule[0] * (D.T @ steps.gradient[point])
-            kicked.append(h * np.sqrt(rule[0]) * (own.root[:, :x] @ after))
-        if steps.G.shape[2]:
-            N = np.vstack(kicked)
-            gains.spread[s] = N.T @ N
-            for w in range(steps.G.shape[2]):
-                jump = N @ steps.G[s, :, w]
-                spread = N @ np.hstack([steps.Gx[s, :, w], steps.Gu[s, :, w]])
-                rows.append(np.column_stack([spread, jump]))
-                value.noise[0] += 0.5 * jump @ jump
-                costate += spread.T @ jump
-        return np.vstack(rows), linear, costate
-
-    def _decide(
-        self, regularization: float, r: int, steps: Steps, rows: Floats, linear: Floats, costate: Floats, gains: Gains
-    ) -> bool:
-        value, m, slack, rated = self.value, gains.feedforward.shape[1], steps.slack, len(steps.rate) > 0
-        x = rows.shape[1] - 1 - m
-        # Columns: of the control, of x, of the control before if its change costs something, and the shift.
-        stack = np.hstack([rows[:, x:-1], rows[:, :x], rows[:, -1:]])
-        if rated:
-            change = squares_of(steps.pull[r : r + 1], steps.rate[r : r + 1])
-            if change is None:
-                return False
-            L, shift = change.root[0], change.shift[0]
-            stack = np.vstack(
-                [
-                    np.hstack([stack[:, :-1], np.zeros((len(stack), m)), stack[:, -1:]]),
-                    np.hstack([L, np.zeros((m, x)), -L, shift[:, None]]),
-                ]
-            )
-            costate = np.append(costate[:x], costate[x:] + steps.pull[r])
-        size = stack.shape[1] - 1 - m
-        R = triangular(stack)
-        top, own = R[:m], np.sqrt((stack[:, :m] ** 2).sum(axis=0))
-        if not own.any() or not np.isfinite(R).all():
-            return False
-        Qu = top[:, :m].T @ top[:, -1] + linear[x:]
-        idle = (own == 0.0) & (Qu == 0.0)
-        weight = np.where(idle, own.max(), np.sqrt(regularization) * own)
-        firm = top
-        if weight.any():
-            firm = triangular(np.vstack([top, np.hstack([np.diag(weight), np.zeros((m, size + 1))])]))[:m]
-        k, K, free = np.zeros(m), np.zeros((m, size)), np.ones(m, dtype=bool)
-        if len(slack):
-            U, work = firm[:, :m], np.zeros((3, m))
-            if not (np.diag(U) != 0.0).all() or not solve_box(U.T @ U, Qu, slack[r], k, np.zeros((m, m)), work):
-                return False
-            free = work[0] == 0.0
-        if free.any():
-            held = firm[:, -1] + firm[:, :m][:, ~free] @ k[~free]
-            F = triangular(np.column_stack([firm[:, :m][:, free], firm[:, m:-1], held]))
-            count = int(free.sum())
-            F, pivots = F[:count], np.abs(np.diag(F)[:count])
-            if not (pivots > 0.0).all():
-                return False
-            U = F[:, :count]
-            K[free] = -solve_triangular(U, F[:, count:-1])
-            k[free] = -solve_triangular(U, F[:, -1] + solve_triangular(U, linear[x:][free], trans="T"))
-            lost = (EPS * np.maximum(value.scale[x:], own)[free] / pivots)[~idle[free]]
-            value.loss[0] = max(value.loss[0], float(lost.max(initial=0.0)))
-        if len(slack):
-            k = np.clip(k, *slack[r])
-        gains.feedforward[r], gains.feedback[r], gains.control_gradient[r] = k, K[:, :x], costate[x:]
-        moved = top[:, :m] @ k
-        value.decrease[:] += np.array([Qu @ k, moved @ moved])
-        self.linear = np.concatenate([linear[:x] + K[:, :x].T @ linear[x:], np.zeros(m)])
-        value.costate[:x], value.costate[x:] = costate[:x], 0.0
-        value.scale[:x], value.scale[x:] = np.sqrt((rows[:, :x] ** 2).sum(axis=0)), 0.0
-        if rated:
-            gains.previous[r] = K[:, x:]
-            self.linear[x:] = K[:, x:].T @ linear[x:]
-            value.costate[x:], value.scale[x:] = -steps.pull[r], np.sqrt(np.diagonal(steps.rate[r]))
-        # What no control takes away. Without regularization and limits it is zero, but for rounding.
-        rest = R[m:-1]
-        if weight.any() or not free.all():
-            rest = np.vstack([top + np.hstack([np.zeros((m, m)), top[:, :m] @ K, moved[:, None]]), rest])
-        self.root = np.hstack([rest[:, m:-1], np.zeros((len(rest), m + x - size)), rest[:, -1:]])
-        return True
+    return Squares(weight[..., :, None] * across * unit[..., None, :], shift, linear)

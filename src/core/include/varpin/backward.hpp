@@ -1,0 +1,369 @@
+// The backward pass of stochastic differential dynamic programming (Theodorou, Tassa and Todorov 2010).
+// docs/mathematics.md, "The backward pass", "Digits", "Limits" and "Smooth controls".
+//
+// The value after a step is v0 + Wx . x' + Wu . u + (1/2) (x', u) W (x', u), in deviations from the nominal trajectory;
+// u is in it only while a control is held over several steps. With x' = A x + B u + sum_i (g_i + Gx_i x + Gu_i u) dw_i,
+// the cost of the step expanded at its samples z = D (x, u), and S = h (Wxx + h dz/dx'' l_zz dz/dx'),
+//
+//     Q_x  = h D'l_z + A'Wx + sum_i Gx_i' S g_i,        Q_xx = h D'l_zz D + A'Wxx A + sum_i Gx_i' S Gx_i,
+//     k    = -Q_uu^-1 Q_u,    K = -Q_uu^-1 Q_ux,        V_xx = Q_xx + K'(Q_uu K + Q_ux) + Q_ux'K,
+//
+// and so on in u; v0 grows by (1/2) sum_i g_i' S g_i. Where the change of the control costs (1/2) (u - w)' R (u - w),
+// w the control before, the decision adds R to Q_uu and to Q_ww and -R to Q_uw: gains on w are those on x with -R in
+// place of Q_ux, and the value before it is one of (x, w).
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include "varpin/box.hpp"
+#include "varpin/dense.hpp"
+#include "varpin/linear_step.hpp"
+#include "varpin/steps.hpp"
+#include "varpin/tiles.hpp"
+
+namespace varpin {
+
+class BackwardPass {
+  public:
+    // From the gradient (2n) and the Hessian (2n, 2n) of the terminal cost in x.
+    BackwardPass(int dof, int controls, const double* terminal_gradient, const double* terminal_hessian)
+        : n(dof),
+          m(controls),
+          x(2 * dof),
+          size(2 * dof + controls),
+          W(size, size),
+          gradient(size),
+          costate(size),
+          scale(size),
+          step(dof, controls),
+          S(x, x),
+          T(size, size),
+          Q(size, size),
+          Qz(size),
+          Cz(size),
+          terms(size),
+          row(size),
+          Quu(m * m),
+          factors(m * m),
+          K(m, x),
+          Qux(m, x),
+          rest(m, x),
+          residual(m),
+          box(m) {
+        for (int i = 0; i < x; ++i) {
+            gradient[i] = costate[i] = terminal_gradient[i];
+            std::copy_n(terminal_hessian + i * x, x, W[i]);
+            scale[i] = std::sqrt(std::abs(W[i][i]));
+        }
+    }
+
+    // Over a block of steps, which follow each other from the last to the first, each control held over `hold` of them;
+    // -1, or the decision that has no minimum.
+    std::ptrdiff_t run(double h, int hold, double regularization, const ExpandedSteps& steps, const Gains& gains) {
+        for (std::ptrdiff_t s = steps.steps - 1; s >= 0; --s) {
+            if (gains.costate) std::copy_n(costate.data(), x, gains.costate + s * x);
+            carry(steps, s, steps.rate || (s + 1) % hold != 0);
+            if (steps.processes > 0) add_noise(h, steps, s, gains.spread + s * x * x);
+            add_running_cost(h, steps, s);
+            mirror(Q, size);
+            if (s % hold != 0) {
+                keep();
+            } else if (!decide(regularization, steps, s / hold, gains)) {
+                return s / hold;
+            }
+        }
+        return -1;
+    }
+
+    int dof() const { return n; }
+    int controls() const { return m; }
+
+    Found found;
+
+  private:
+    // Q and its gradients from the value after step s. The control is that of the next step, or what its change is
+    // counted from, where the value has rows of its own for it: `held`.
+    void carry(const ExpandedSteps& steps, std::ptrdiff_t s, bool held) {
+        step.load(steps, s);
+        std::fill_n(terms.begin(), size, 0.0);
+        for (int c = 0; c < size; ++c) {
+            Qz[c] = c < x ? 0.0 : gradient[c];
+            Cz[c] = c < x ? 0.0 : costate[c];
+        }
+        for (int i = 0; i < x; ++i) {
+            const double* __restrict own = step.J[i];
+            double* __restrict magnitude = terms.data();
+            for (int c = 0; c < size; ++c) magnitude[c] += std::abs(own[c]) * scale[i];
+            add_row(gradient[i], own, Qz);
+            add_row(costate[i], own, Cz);
+        }
+        for (int c = x; c < size; ++c) terms[c] = std::sqrt(terms[c] * terms[c] + scale[c] * scale[c]);
+        Q.clear();
+        if (steps.curvature) {
+            for (int r = 0; r < size; ++r) std::copy_n(steps.curvature + (s * size + r) * size, size, Q[r]);
+        }
+        T.clear();
+        add_transposed_product(W, step.J, x, T, held ? size : x);
+        add_transposed_product(step.J, T, x, Q, size, Part::upper);
+        if (!held) return;
+        for (int r = x; r < size; ++r) {
+            for (int c = 0; c < size; ++c) Q[c][r] += T[r][c];
+            for (int c = x; c < size; ++c) Q[r][c] += T[r][c] + W[r][c];
+        }
+    }
+
+    // T = factor H D for the leading rows of the running cost's Hessian that are not zero; how many there are.
+    int weigh(double factor, const double* H, const TiledMatrix& of) {
+        int rows = x;
+        while (rows > 0 &&
+               std::all_of(H + (rows - 1) * size, H + (rows - 1) * size + x, [](double entry) { return entry == 0.0; }))
+            --rows;
+        for (int i = 0; i < rows; ++i) {
+            double* __restrict out = T[i];
+            std::fill_n(out, T.stride(), 0.0);
+            for (int j = 0; j < rows; ++j) {
+                const double entry = factor * H[i * size + j];
+                if (entry == 0.0) continue;
+                const double* __restrict other = of[j];
+                for (int c = 0; c < of.stride(); ++c) out[c] += entry * other[c];
+            }
+        }
+        return rows;
+    }
+
+    // The samples h w l(z) of step s, with z = D (x, u).
+    void add_running_cost(double h, const ExpandedSteps& steps, std::ptrdiff_t s) {
+        const auto samples = static_cast<std::ptrdiff_t>(steps.rule.size());
+        for (std::ptrdiff_t sample = 0; sample < samples; ++sample) {
+            const std::ptrdiff_t point = s * samples + sample;
+            const double* g = steps.gradient_at(point);
+            const double* H = steps.hessian_at(point);
+            const double weight = h * steps.rule[sample].weight;
+            step.expand(steps.rule[sample]);
+            std::fill_n(row.begin(), x, 0.0);
+            std::copy_n(g + x, m, row.begin() + x);
+            for (int i = 0; i < x; ++i) add_row(g[i], step.D[i], row);
+            add_row(weight, row.data(), Qz);
+            add_row(weight, row.data(), Cz);
+            const int rows = weigh(weight, H, step.D);
+            add_transposed_product(step.D, T, rows, Q, size, Part::upper);
+            for (int r = x; r < size; ++r) {
+                for (int i = 0; i < x; ++i) {
+                    const double entry = weight * H[r * size + i];
+                    if (entry == 0.0) continue;
+                    for (int c = 0; c < size; ++c) Q[c][r] += entry * step.D[i][c];
+                    for (int c = x; c < size; ++c) Q[r][c] += entry * step.D[i][c];
+                }
+                for (int c = x; c < size; ++c) Q[r][c] += weight * H[r * size + c];
+            }
+        }
+    }
+
+    // The terms of the noise, and S into `spread`. Where the running cost is sampled after the kick, it counts too.
+    void add_noise(double h, const ExpandedSteps& steps, std::ptrdiff_t s, double* spread) {
+        const auto samples = static_cast<std::ptrdiff_t>(steps.rule.size());
+        for (int i = 0; i < x; ++i) {
+            for (int j = 0; j < x; ++j) S[i][j] = h * W[i][j];
+        }
+        for (std::ptrdiff_t k = 0; k < samples; ++k) {
+            if (!step.expand_after(steps.rule[k])) continue;
+            const int rows = weigh(h * h * steps.rule[k].weight, steps.hessian_at(s * samples + k), step.P);
+            add_transposed_product(step.P, T, rows, S, x, Part::upper);
+        }
+        mirror(S, x);
+        for (int i = 0; i < x; ++i) std::copy_n(S[i], x, spread + i * x);
+        for (int w = 0; w < steps.processes; ++w) {
+            const bool depends = step.load_process(steps, s, w);
+            std::fill_n(row.begin(), x, 0.0);
+            for (int i = 0; i < x; ++i) add_row(step.jump[i], S[i], row, x);
+            for (int i = 0; i < x; ++i) found.noise += 0.5 * step.jump[i] * row[i];
+            if (!depends) continue;
+            for (int i = 0; i < x; ++i) {
+                add_row(row[i], step.F[i], Qz);
+                add_row(row[i], step.F[i], Cz);
+            }
+            T.clear();
+            add_transposed_product(S, step.F, x, T, x);
+            add_transposed_product(step.F, T, x, Q, size, Part::upper);
+        }
+    }
+
+    // The value before a step whose control is held: Q itself.
+    void keep() {
+        for (int c = 0; c < size; ++c) {
+            gradient[c] = Qz[c];
+            costate[c] = Cz[c];
+            scale[c] = c < x ? std::sqrt(std::abs(Q[c][c])) : terms[c];
+            std::copy_n(Q[c], size, W[c]);
+        }
+    }
+
+    // Gains of decision r, and the value under them; false where Quu is not positive definite.
+    //
+    // Within limits the feed-forward part minimizes the model there, and controls at a limit have no feedback (Tassa,
+    // Mansard and Todorov 2014).
+    bool decide(double regularization, const ExpandedSteps& steps, std::ptrdiff_t r, const Gains& gains) {
+        const double* rate = steps.rate ? steps.rate + r * m * m : nullptr;
+        const double* pull = steps.rate ? steps.pull + r * m : nullptr;
+        if (rate) add_rate(rate, pull);
+        if (!regularize(regularization)) return false;
+        factors = Quu;
+        if (!factor_ldl(factors.data(), m, {0, m})) return false;
+        double* k = gains.feedforward + r * m;
+        for (int i = 0; i < m; ++i) k[i] = -Qz[x + i];
+        solve_ldl(factors.data(), m, {0, m}, k, k);
+        if (steps.slack) {
+            const double* slack = steps.slack + r * 2 * m;
+            if (!box.solve(Quu.data(), Qz.data() + x, slack, slack + m, k)) return false;
+            factors = box.factors;
+        }
+        for (int i = 0; i < m; ++i) {
+            if (box.held[i]) continue;
+            const double largest = std::max(terms[x + i] * terms[x + i], std::abs(Q[x + i][x + i]));
+            found.loss = std::max(found.loss, epsilon * largest / factors[i * m + i]);
+        }
+        find_feedback();
+        for (int i = 0; i < m; ++i) std::copy_n(K[i], x, gains.feedback + (r * m + i) * x);
+        std::copy_n(Cz.begin() + x, m, gains.control_gradient + r * m);
+        minimized_value(k);
+        if (rate) value_of_previous(rate, pull, k, gains.previous + r * m * m);
+        return true;
+    }
+
+    // What the change of a control costs, its part in that control.
+    void add_rate(const double* rate, const double* pull) {
+        for (int i = 0; i < m; ++i) {
+            Qz[x + i] += pull[i];
+            Cz[x + i] += pull[i];
+            for (int j = 0; j < m; ++j) Q[x + i][x + j] += rate[i * m + j];
+        }
+    }
+
+    // Quu with each control regularized by its own diagonal entry, whatever the others' units; one that nothing depends
+    // on stays as it is, if there are others. False where the diagonal is not positive.
+    bool regularize(double regularization) {
+        double largest = 0.0;
+        for (int i = 0; i < m; ++i) largest = std::max(largest, std::abs(Q[x + i][x + i]));
+        for (int i = 0; i < m; ++i) {
+            std::copy_n(Q[x + i] + x, m, &Quu[i * m]);
+            double& own = Quu[i * m + i];
+            own += regularization * std::abs(own);
+            if (largest > 0.0 && own == 0.0 && is_idle(i)) own = largest;
+            if (!(own > 0.0)) return false;
+        }
+        return true;
+    }
+
+    // Whether nothing depends on control i.
+    bool is_idle(int i) const {
+        return Qz[x + i] == 0.0 && std::all_of(Q[x + i], Q[x + i] + size, [](double entry) { return entry == 0.0; });
+    }
+
+    // K, with no feedback for controls that the box holds.
+    void find_feedback() {
+        for (int i = 0; i < m; ++i) {
+            for (int c = 0; c < x; ++c) {
+                Qux[i][c] = Q[x + i][c];
+                K[i][c] = box.held[i] ? 0.0 : -Qux[i][c];
+            }
+        }
+        solve_ldl_rows(factors.data(), m, K[0], K.stride());
+    }
+
+    // The value in x before a decision: V_xx = Q_xx + K'(Quu K + Qux) + Qux'K, whatever the regularization.
+    void minimized_value(const double* k) {
+        for (int i = 0; i < m; ++i) {
+            double moved = 0.0;
+            std::copy_n(Qux[i], x, rest[i]);
+            for (int j = 0; j < m; ++j) {
+                const double entry = Q[x + i][x + j];
+                moved += entry * k[j];
+                const double* __restrict other = K[j];
+                double* __restrict own = rest[i];
+                for (int c = 0; c < x; ++c) own[c] += entry * other[c];
+            }
+            found.slope += Qz[x + i] * k[i];
+            found.curvature += k[i] * moved;
+            residual[i] = moved + Qz[x + i];
+            add_row(residual[i], K[i], Qz, x);
+            add_row(k[i], Qux[i], Qz, x);
+        }
+        W.clear();
+        for (int b = 0; b < x; ++b) {
+            gradient[b] = Qz[b];
+            costate[b] = Cz[b];
+            scale[b] = std::sqrt(std::abs(Q[b][b]));
+            std::copy_n(Q[b], x, W[b]);
+        }
+        for (int c = x; c < size; ++c) gradient[c] = costate[c] = scale[c] = 0.0;
+        add_transposed_product(K, rest, m, W, x, Part::upper);
+        add_transposed_product(Qux, K, m, W, x, Part::upper);
+        mirror(W, x);
+    }
+
+    // Gains G on the control before a decision, and the value's rows and columns in it.
+    void value_of_previous(const double* R, const double* pull, const double* k, double* G) {
+        for (int i = 0; i < m; ++i) {
+            for (int c = 0; c < m; ++c) G[i * m + c] = box.held[i] ? 0.0 : R[i * m + c];
+        }
+        solve_ldl_rows(factors.data(), m, G, m);
+        for (int c = 0; c < m; ++c) {
+            gradient[x + c] = costate[x + c] = -pull[c];
+            scale[x + c] = std::sqrt(std::abs(R[c * m + c]));
+            for (int i = 0; i < m; ++i) gradient[x + c] += G[i * m + c] * residual[i] - R[i * m + c] * k[i];
+        }
+        for (int c = 0; c < m; ++c) {
+            // V_xw = (Quu K + Qux)' G - K' R
+            for (int b = 0; b < x; ++b) {
+                double total = 0.0;
+                for (int i = 0; i < m; ++i) total += rest[i][b] * G[i * m + c] - K[i][b] * R[i * m + c];
+                W[b][x + c] = W[x + c][b] = total;
+            }
+            // V_ww = R + G' (Quu G - R) - R G
+            for (int b = 0; b <= c; ++b) {
+                double total = R[b * m + c];
+                for (int i = 0; i < m; ++i) {
+                    double product = -R[i * m + c];
+                    for (int j = 0; j < m; ++j) product += Q[x + i][x + j] * G[j * m + c];
+                    total += G[i * m + b] * product - R[i * m + b] * G[i * m + c];
+                }
+                W[x + b][x + c] = W[x + c][x + b] = total;
+            }
+        }
+    }
+
+    static void add_row(double factor, const double* __restrict from, std::vector<double>& to, int count) {
+        double* __restrict out = to.data();
+        for (int c = 0; c < count; ++c) out[c] += factor * from[c];
+    }
+    void add_row(double factor, const double* from, std::vector<double>& to) const { add_row(factor, from, to, size); }
+
+    static constexpr double epsilon = std::numeric_limits<double>::epsilon();
+
+    int n, m, x, size;  // x = 2n states, and controls
+    // The value: its Hessian, its gradient, and
+    TiledMatrix W;
+    std::vector<double> gradient;
+    std::vector<double> costate;  // the gradient without feedback and feed-forward: of the cost itself
+    std::vector<double> scale;    // rounding has left entry (i, j) of W off by about eps scale_i scale_j
+
+    // Work arrays of a step.
+    LinearStep step;
+    TiledMatrix S;              // (x, x)
+    TiledMatrix T;              // (size, size) a product
+    TiledMatrix Q;              // (size, size); upper triangle alone until the decision
+    std::vector<double> Qz;     // (size) gradient
+    std::vector<double> Cz;     // (size) gradient of the cost itself
+    std::vector<double> terms;  // (size) of Q, as the scale of the value
+    std::vector<double> row;    // (size)
+    // And of a decision.
+    std::vector<double> Quu, factors;  // (m, m) regularized; L D L' of its free part
+    TiledMatrix K, Qux, rest;          // (m, x); the last is Quu K + Qux
+    std::vector<double> residual;      // (m) Quu k + Qu
+    BoxMinimum box;
+};
+
+}  // namespace varpin

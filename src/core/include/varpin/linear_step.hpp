@@ -1,0 +1,110 @@
+// One step of a backward pass as (x, u) sees it: where it leads, the samples of its running cost, what noise does.
+// docs/mathematics.md, "The backward pass".
+#pragma once
+
+#include <algorithm>
+#include <cstddef>
+#include <vector>
+
+#include "varpin/steps.hpp"
+#include "varpin/tiles.hpp"
+
+namespace varpin {
+
+class LinearStep {
+  public:
+    LinearStep(int dof, int controls)
+        : J(2 * dof, 2 * dof + controls),
+          D(2 * dof, 2 * dof + controls),
+          P(2 * dof, 2 * dof),
+          F(2 * dof, 2 * dof + controls),
+          jump(2 * dof),
+          n(dof),
+          x(2 * dof),
+          size(2 * dof + controls),
+          rates(2 * dof, dof),
+          speeds(dof, 2 * dof + controls) {}
+
+    // Step s: J, and what the other functions need.
+    void load(const ExpandedSteps& steps, std::ptrdiff_t s) {
+        const int m = size - x;
+        for (int i = 0; i < x; ++i) {
+            std::copy_n(steps.A + (s * x + i) * x, x, J[i]);
+            std::copy_n(steps.B + (s * x + i) * m, m, J[i] + x);
+        }
+        before = steps.velocity ? steps.velocity + s * n * x : nullptr;
+        after = steps.velocity ? before + n * x : nullptr;
+        if (!after) {
+            for (int i = 0; i < n; ++i) std::copy_n(J[n + i], size, speeds[i]);
+            return;
+        }
+        for (int i = 0; i < n; ++i) {
+            for (int c = 0; c < x; ++c) rates[c][i] = after[i * x + c];
+        }
+        speeds.clear();
+        add_transposed_product(rates, J, x, speeds, n);
+    }
+
+    // D, of (q, v) at a sample.
+    void expand(const Sample& sample) {
+        for (int half = 0; half < 2; ++half) {
+            const Sample::Sum& of = half == 0 ? sample.q : sample.v;
+            for (int i = 0; i < n; ++i) {
+                double* __restrict out = D[half * n + i];
+                const double* __restrict places = J[i];
+                const double* __restrict own = speeds[i];
+                for (int c = 0; c < size; ++c) out[c] = of.q1 * places[c] + of.v1 * own[c];
+                add_node(of.q0, of.v0, before, i, out);
+            }
+        }
+    }
+
+    // P, of (q, v) at a sample in the state after the step; false where that does not matter.
+    bool expand_after(const Sample& sample) {
+        P.clear();
+        for (int i = 0; i < n; ++i) {
+            add_node(sample.q.q1, sample.q.v1, after, i, P[i]);
+            add_node(sample.v.q1, sample.v.v1, after, i, P[n + i]);
+        }
+        return sample.q.q1 != 0.0 || sample.q.v1 != 0.0 || sample.v.q1 != 0.0 || sample.v.v1 != 0.0;
+    }
+
+    // The jump of process w, and F; false where F is zero.
+    bool load_process(const ExpandedSteps& steps, std::ptrdiff_t s, int w) {
+        const int m = size - x;
+        bool depends = false;
+        for (int i = 0; i < x; ++i) {
+            const std::ptrdiff_t entry = (s * x + i) * steps.processes + w;
+            jump[i] = steps.G[entry];
+            std::copy_n(steps.Gx + entry * x, x, F[i]);
+            std::copy_n(steps.Gu + entry * m, m, F[i] + x);
+            for (int c = 0; c < size; ++c) depends = depends || F[i][c] != 0.0;
+        }
+        return depends;
+    }
+
+    TiledMatrix J;             // (2n, 2n + m) [A B]
+    TiledMatrix D;             // (2n, 2n + m) of (q, v) at the sample
+    TiledMatrix P;             // (2n, 2n) of the same in the state after the step
+    TiledMatrix F;             // (2n, 2n + m) of a process' jump
+    std::vector<double> jump;  // (2n)
+
+  private:
+    // Row i of in_q dq/dx + in_v dv/dx at a node, where dv/dx (n, 2n) is null if x holds v itself.
+    void add_node(double in_q, double in_v, const double* velocity, int i, double* out) const {
+        out[i] += in_q;
+        if (!velocity) {
+            out[n + i] += in_v;
+        } else if (in_v != 0.0) {
+            for (int c = 0; c < x; ++c) out[c] += in_v * velocity[i * x + c];
+        }
+    }
+
+    int n, x, size;
+    TiledMatrix rates;   // (2n, n) transposed dv/dx after the step
+    TiledMatrix speeds;  // (n, 2n + m) of v after the step
+    const double* before = nullptr;
+    const double* after = nullptr;
+};
+
+}  // namespace varpin

@@ -1,0 +1,58 @@
+// Triangular form of a stack of rows by Householder's transformations, which leave every sum of squares as it is:
+// a = Q R, a'a = R'R. docs/mathematics.md, "Digits".
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+
+namespace varpin {
+
+// The leading rows of R in place of those of a (rows, columns), whose `leading` first columns are triangular then;
+// `leading` is no more than rows or columns, and signs of rows are as they come. `work` is (columns).
+//
+// The row that is largest in a column leads it: otherwise a large row that has nothing there would take the digits of
+// small ones that have (Powell and Reid, "On applying Householder transformations to linear least squares problems",
+// 1969).
+inline void triangularize(double* a, int rows, int columns, int leading, double* __restrict work) {
+    for (int k = 0; k < leading; ++k) {
+        int best = k;
+        for (int i = k + 1; i < rows; ++i) {
+            if (std::abs(a[i * columns + k]) > std::abs(a[best * columns + k])) best = i;
+        }
+        const double largest = std::abs(a[best * columns + k]);
+        if (!(largest > 0.0)) continue;
+        double total = 0.0;
+        for (int i = k; i < rows; ++i) {
+            const double part = a[i * columns + k] / largest;
+            total += part * part;
+        }
+        double* __restrict top = a + k * columns;
+        if (best != k) std::swap_ranges(top, top + columns, a + best * columns);
+        const double norm = largest * std::sqrt(total);
+        const double end = top[k] > 0.0 ? -norm : norm;
+        // Scaled by its first entry the vector of the reflection is (1, w), of length^2 = 2 norm / (norm + |a_kk|).
+        const double first = top[k] - end, factor = (norm + std::abs(top[k])) / norm;
+        for (int j = k + 1; j < columns; ++j) work[j] = top[j];
+        for (int i = k + 1; i < rows; ++i) {
+            double* __restrict row = a + i * columns;
+            row[k] /= first;
+            const double own = row[k];
+            if (own == 0.0) continue;
+            for (int j = k + 1; j < columns; ++j) work[j] += own * row[j];
+        }
+        for (int j = k + 1; j < columns; ++j) {
+            work[j] *= factor;
+            top[j] -= work[j];
+        }
+        for (int i = k + 1; i < rows; ++i) {
+            double* __restrict row = a + i * columns;
+            const double own = row[k];
+            row[k] = 0.0;
+            if (own == 0.0) continue;
+            for (int j = k + 1; j < columns; ++j) row[j] -= own * work[j];
+        }
+        top[k] = end;
+    }
+}
+
+}  // namespace varpin

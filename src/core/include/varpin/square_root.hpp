@@ -1,0 +1,446 @@
+// The backward pass on a square root of the value's Hessian, for where the plain recursion runs out of digits.
+// docs/mathematics.md, "Digits".
+//
+// The value is kept as a sum of squares (1/2) |R x + r|^2, and its Hessian R'R never formed. With the running cost as
+// squares (1/2) |L z + l|^2 too, the cost to go from a step is a sum of squares in (u, x). An orthogonal transformation
+// brings their rows to
+//
+//     ( R_uu  R_ux  r_u )        K = -R_uu^-1 R_ux,  k = -R_uu^-1 r_u,
+//     (   0   R_xx  r_x )        and the last rows are the value before the step
+//
+// (Kailath, Sayed and Hassibi, Linear Estimation, 2000, chapter 12). What is eps of the Hessian's largest terms to the
+// plain recursion is eps of their root here, so that weights may be twice as many digits apart. Every Hessian must be
+// positive semidefinite; the part of a gradient that it knows nothing of is carried along as it is. Where the change of
+// the control costs something, the control before is part of x.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <limits>
+#include <vector>
+
+#include "varpin/box.hpp"
+#include "varpin/linear_step.hpp"
+#include "varpin/orthogonal.hpp"
+#include "varpin/steps.hpp"
+
+namespace varpin {
+
+// Convex quadratic functions (1/2) |L z + r|^2 + c . z, but for constants.
+struct Squares {
+    const double* root = nullptr;  // L (N, z, z), or one for all
+    bool one_root = false;
+    const double* shift = nullptr;   // r (N, z)
+    const double* linear = nullptr;  // c (N, z)
+
+    const double* root_of(std::ptrdiff_t point, int size) const { return one_root ? root : root + point * size * size; }
+};
+
+// Rows of equal length, one below the other.
+class RowStack {
+  public:
+    void reset(int width) {
+        width_ = width;
+        rows_ = 0;
+    }
+    int rows() const { return rows_; }
+    int width() const { return width_; }
+    double* operator[](int i) { return values_.data() + i * width_; }
+    const double* operator[](int i) const { return values_.data() + i * width_; }
+
+    // One more row, of zeros. Rows from before may move.
+    double* push() {
+        const auto end = static_cast<std::size_t>(rows_ + 1) * width_;
+        if (values_.size() < end) values_.resize(end);
+        double* row = (*this)[rows_++];
+        std::fill_n(row, width_, 0.0);
+        return row;
+    }
+
+    // Orthogonally to rows whose leading columns are triangular, as many as there are leading columns or more.
+    void triangularize(int leading) {
+        while (rows_ < leading) push();
+        work_.resize(width_);
+        varpin::triangularize(values_.data(), rows_, width_, leading, work_.data());
+    }
+
+  private:
+    int rows_ = 0, width_ = 0;
+    std::vector<double> values_, work_;
+};
+
+class RootPass {
+  public:
+    // From the terminal cost in x (2n), and its gradient.
+    RootPass(int dof, int controls, const Squares& terminal, const double* terminal_gradient)
+        : n(dof),
+          m(controls),
+          x(2 * dof),
+          size(2 * dof + controls),
+          linear(size),
+          costate(size),
+          scale(size),
+          step(dof, controls),
+          before(size),
+          gradient(size),
+          terms(size),
+          own(m),
+          weight(m),
+          Qu(m),
+          moved(m),
+          forced(m),
+          H(m * m),
+          K(m * size),
+          free(m),
+          box(m) {
+        root.reset(size + 1);
+        for (int i = 0; i < x; ++i) {
+            double* row = root.push();
+            std::copy_n(terminal.root + i * x, x, row);
+            row[size] = terminal.shift[i];
+            linear[i] = terminal.linear[i];
+            costate[i] = terminal_gradient[i];
+        }
+        column_norms(root, 0, scale.data(), x);
+    }
+
+    // Over a block of steps, as BackwardPass::run. `running` costs are those of the samples; `change` is what the
+    // changes of the control cost as a function of them, where they do.
+    std::ptrdiff_t run(double h, int hold, double regularization, const ExpandedSteps& steps, const Squares& running,
+                       const Squares& change, const Gains& gains) {
+        for (std::ptrdiff_t s = steps.steps - 1; s >= 0; --s) {
+            if (gains.costate) std::copy_n(costate.data(), x, gains.costate + s * x);
+            const bool decides = s % hold == 0;
+            stack.reset(decides && steps.rate ? size + m + 1 : size + 1);
+            carry(steps, s, steps.rate || (s + 1) % hold != 0);
+            kicked.reset(x);
+            if (steps.processes > 0) kick(std::sqrt(h));
+            add_running_cost(h, steps, s, running);
+            if (steps.processes > 0) add_noise(steps, s, gains.spread + s * x * x);
+            linear.swap(before);
+            costate.swap(gradient);
+            scale.swap(terms);
+            if (!decides) {
+                keep();
+            } else if (!decide(regularization, steps, s / hold, change, gains)) {
+                return s / hold;
+            }
+        }
+        return -1;
+    }
+
+    int dof() const { return n; }
+    int controls() const { return m; }
+
+    Found found;
+
+  private:
+    // Rows of `stack` are in (u, x, the control before if its change costs something, shift); all else is in (x, u).
+    void add_to_row(double factor, const double* from, double* row) const {
+        if (factor == 0.0) return;
+        for (int c = 0; c < x; ++c) row[m + c] += factor * from[c];
+        for (int c = 0; c < m; ++c) row[c] += factor * from[x + c];
+    }
+    void add_row(double factor, const double* from, std::vector<double>& to) const {
+        for (int c = 0; c < size; ++c) to[c] += factor * from[c];
+    }
+    double& shift(int i) { return stack[i][stack.width() - 1]; }
+
+    // The value after step s as rows in (x, u); what is linear in it, the gradient, and the size of its terms.
+    void carry(const ExpandedSteps& steps, std::ptrdiff_t s, bool held) {
+        step.load(steps, s);
+        for (int i = 0; i < root.rows(); ++i) {
+            double* row = stack.push();
+            for (int j = 0; j < x; ++j) add_to_row(root[i][j], step.J[j], row);
+            if (held) {
+                for (int c = 0; c < m; ++c) row[c] += root[i][x + c];
+            }
+            shift(stack.rows() - 1) = root[i][size];
+        }
+        for (int c = 0; c < size; ++c) {
+            before[c] = held && c >= x ? linear[c] : 0.0;
+            gradient[c] = held && c >= x ? costate[c] : 0.0;
+            terms[c] = 0.0;
+        }
+        for (int i = 0; i < x; ++i) {
+            add_row(linear[i], step.J[i], before);
+            add_row(costate[i], step.J[i], gradient);
+            for (int c = 0; c < size; ++c) terms[c] += std::abs(step.J[i][c]) * scale[i];
+        }
+        if (!held) return;
+        for (int c = x; c < size; ++c) terms[c] = std::hypot(terms[c], scale[c]);
+    }
+
+    // Rows N of what a jump of the state meets: first the value, then the samples after it. S = N'N.
+    void kick(double factor) {
+        for (int i = 0; i < root.rows(); ++i) {
+            double* row = kicked.push();
+            for (int c = 0; c < x; ++c) row[c] = factor * root[i][c];
+        }
+    }
+
+    void add_running_cost(double h, const ExpandedSteps& steps, std::ptrdiff_t s, const Squares& running) {
+        const auto samples = static_cast<std::ptrdiff_t>(steps.rule.size());
+        for (std::ptrdiff_t sample = 0; sample < samples; ++sample) {
+            const std::ptrdiff_t point = s * samples + sample;
+            const Sample& at = steps.rule[sample];
+            const double weight = h * at.weight, factor = std::sqrt(weight);
+            const double* L = running.root_of(point, size);
+            step.expand(at);
+            for (int i = 0; i < size; ++i) {
+                double* row = stack.push();
+                for (int j = 0; j < x; ++j) add_to_row(factor * L[i * size + j], step.D[j], row);
+                for (int c = 0; c < m; ++c) row[c] += factor * L[i * size + x + c];
+                shift(stack.rows() - 1) = factor * running.shift[point * size + i];
+            }
+            expand_gradient(weight, running.linear + point * size, before);
+            expand_gradient(weight, steps.gradient_at(point), gradient);
+            if (steps.processes == 0 || !step.expand_after(at)) continue;
+            for (int i = 0; i < size; ++i) {
+                double* row = kicked.push();
+                for (int j = 0; j < x; ++j) {
+                    const double entry = h * std::sqrt(at.weight) * L[i * size + j];
+                    for (int c = 0; c < x; ++c) row[c] += entry * step.P[j][c];
+                }
+            }
+        }
+    }
+
+    // A gradient in (q, v, u) at the sample, as one in (x, u).
+    void expand_gradient(double weight, const double* from, std::vector<double>& to) const {
+        for (int i = 0; i < x; ++i) add_row(weight * from[i], step.D[i], to);
+        for (int c = x; c < size; ++c) to[c] += weight * from[c];
+    }
+
+    void add_noise(const ExpandedSteps& steps, std::ptrdiff_t s, double* spread) {
+        kicked.triangularize(x);
+        std::fill_n(spread, x * x, 0.0);
+        for (int l = 0; l < x; ++l) {
+            for (int i = 0; i < x; ++i) {
+                for (int j = 0; j < x; ++j) spread[i * x + j] += kicked[l][i] * kicked[l][j];
+            }
+        }
+        for (int w = 0; w < steps.processes; ++w) {
+            const bool depends = step.load_process(steps, s, w);
+            for (int i = 0; i < x; ++i) {
+                double jump = 0.0;
+                for (int j = 0; j < x; ++j) jump += kicked[i][j] * step.jump[j];
+                found.noise += 0.5 * jump * jump;
+                if (!depends) continue;
+                double* row = stack.push();
+                for (int j = 0; j < x; ++j) {
+                    add_to_row(kicked[i][j], step.F[j], row);
+                    add_row(jump * kicked[i][j], step.F[j], gradient);
+                }
+                shift(stack.rows() - 1) = jump;
+            }
+        }
+    }
+
+    // The value before a step whose control is held: the rows themselves.
+    void keep() {
+        stack.triangularize(size);
+        root.reset(size + 1);
+        for (int i = 0; i < size; ++i) {
+            double* row = root.push();
+            std::copy_n(stack[i] + m, x, row);
+            std::copy_n(stack[i], m, row + x);
+            row[size] = shift(i);
+        }
+    }
+
+    // Gains of decision r, and the value under them; false where there is no minimum.
+    bool decide(double regularization, const ExpandedSteps& steps, std::ptrdiff_t r, const Squares& change,
+                const Gains& gains) {
+        if (steps.rate) add_change(change, steps.pull + r * m, r);
+        column_norms(stack, 0, own.data(), m);
+        column_norms(stack, m, terms.data(), x);
+        const int others = stack.width() - 1 - m;  // x, and the control before
+        stack.triangularize(m + others);
+        if (!std::all_of(stack[0], stack[m + others],
+                         [](double entry) { return std::abs(entry) < std::numeric_limits<double>::infinity(); }))
+            return false;
+        const double largest = m > 0 ? *std::max_element(own.begin(), own.end()) : 0.0;
+        if (!(largest > 0.0)) return false;
+        for (int i = 0; i < m; ++i) {
+            Qu[i] = linear[x + i];
+            for (int l = 0; l <= i; ++l) Qu[i] += stack[l][i] * shift(l);
+        }
+        const bool regular = regularize(regularization, largest);
+        double* k = gains.feedforward + r * m;
+        if (!minimize(steps.slack ? steps.slack + r * 2 * m : nullptr, others, k)) return false;
+        for (int i = 0; i < m; ++i) {
+            std::copy_n(&K[i * others], x, gains.feedback + (r * m + i) * x);
+            if (steps.rate) std::copy_n(&K[i * others + x], m, gains.previous + (r * m + i) * m);
+            gains.control_gradient[r * m + i] = costate[x + i];
+            moved[i] = 0.0;
+            for (int j = i; j < m; ++j) moved[i] += stack[i][j] * k[j];
+            found.slope += Qu[i] * k[i];
+            found.curvature += moved[i] * moved[i];
+        }
+        // What no control takes away. Without regularization and limits it is zero, but for rounding.
+        const bool whole = regular && std::none_of(box.held.begin(), box.held.end(), [](char held) { return held; });
+        minimized_value(others, !whole);
+        set_control_before(steps, r, others);
+        return true;
+    }
+
+    // What the change of a control costs, in the control and the one before.
+    void add_change(const Squares& change, const double* pull, std::ptrdiff_t r) {
+        const double* L = change.root_of(r, m);
+        for (int i = 0; i < m; ++i) {
+            double* row = stack.push();
+            for (int c = 0; c < m; ++c) {
+                row[c] = L[i * m + c];
+                row[m + x + c] = -L[i * m + c];
+            }
+            shift(stack.rows() - 1) = change.shift[r * m + i];
+            costate[x + i] += pull[i];
+        }
+    }
+
+    // The controls' rows with each regularized by the norm of its own column; one that nothing depends on stays as it
+    // is, if there are others. True where there is nothing to add.
+    bool regularize(double regularization, double largest) {
+        bool regular = true;
+        for (int i = 0; i < m; ++i) {
+            const bool idle = own[i] == 0.0 && Qu[i] == 0.0;
+            weight[i] = idle ? largest : std::sqrt(regularization) * own[i];
+            regular = regular && weight[i] == 0.0;
+        }
+        firm.reset(stack.width());
+        for (int i = 0; i < m; ++i) std::copy_n(stack[i], stack.width(), firm.push());
+        if (regular) return true;
+        for (int i = 0; i < m; ++i) firm.push()[i] = weight[i];
+        firm.triangularize(m);
+        return false;
+    }
+
+    // k and K (m, others) from the firm rows, within limits if there are any.
+    bool minimize(const double* slack, int others, double* k) {
+        std::fill_n(k, m, 0.0);
+        std::fill_n(K.begin(), m * others, 0.0);
+        if (slack) {
+            for (int i = 0; i < m; ++i) {
+                if (firm[i][i] == 0.0) return false;
+                for (int j = 0; j < m; ++j) {
+                    H[i * m + j] = 0.0;
+                    for (int l = 0; l <= std::min(i, j); ++l) H[i * m + j] += firm[l][i] * firm[l][j];
+                }
+            }
+            if (!box.solve(H.data(), Qu.data(), slack, slack + m, k)) return false;
+        }
+        int count = 0;
+        for (int i = 0; i < m; ++i) {
+            if (!box.held[i]) free[count++] = i;
+        }
+        U.reset(count + others + 1);
+        for (int i = 0; i < m; ++i) {
+            double* row = U.push();
+            for (int j = 0; j < count; ++j) row[j] = firm[i][free[j]];
+            std::copy_n(firm[i] + m, others + 1, row + count);
+            for (int j = 0; j < m; ++j) {
+                if (box.held[j]) row[count + others] += firm[i][j] * k[j];
+            }
+        }
+        U.triangularize(count);
+        for (int i = 0; i < count; ++i) {
+            const double pivot = std::abs(U[i][i]);
+            const int control = free[i];
+            if (!(pivot > 0.0)) return false;
+            const bool idle = own[control] == 0.0 && Qu[control] == 0.0;
+            if (!idle) found.loss = std::max(found.loss, epsilon * std::max(scale[x + control], own[control]) / pivot);
+        }
+        solve_free(count, others, k);
+        if (slack) {
+            for (int i = 0; i < m; ++i) k[i] = std::min(std::max(k[i], slack[i]), slack[m + i]);
+        }
+        return true;
+    }
+
+    // k and K of the free controls: U (k, K) = -(U_shift + U'^-1 linear, U_others).
+    void solve_free(int count, int others, double* k) {
+        for (int i = 0; i < count; ++i) {
+            double total = linear[x + free[i]];
+            for (int j = 0; j < i; ++j) total -= U[j][i] * forced[j];
+            forced[i] = total / U[i][i];
+        }
+        for (int i = count - 1; i >= 0; --i) {
+            const double* row = U[i];
+            double* __restrict gains = &K[free[i] * others];
+            double total = -row[count + others] - forced[i];
+            for (int c = 0; c < others; ++c) gains[c] = -row[count + c];
+            for (int j = i + 1; j < count; ++j) {
+                const double* __restrict other = &K[free[j] * others];
+                total -= row[j] * k[free[j]];
+                for (int c = 0; c < others; ++c) gains[c] -= row[j] * other[c];
+            }
+            k[free[i]] = total / row[i];
+            for (int c = 0; c < others; ++c) gains[c] /= row[i];
+        }
+    }
+
+    // The value before a decision: the rows that know no control, and what is left of the others.
+    void minimized_value(int others, bool left) {
+        root.reset(size + 1);
+        for (int i = left ? 0 : m; i < m + others; ++i) {
+            double* row = root.push();
+            std::copy_n(stack[i] + m, others, row);
+            row[size] = shift(i);
+            if (i >= m) continue;
+            for (int j = i; j < m; ++j) {
+                for (int c = 0; c < others; ++c) row[c] += stack[i][j] * K[j * others + c];
+            }
+            row[size] += moved[i];
+        }
+        std::copy_n(terms.begin(), x, scale.begin());
+    }
+
+    // The linear parts of the value before decision r, of which those in u become those in the control before.
+    void set_control_before(const ExpandedSteps& steps, std::ptrdiff_t r, int others) {
+        std::fill_n(before.begin(), size, 0.0);
+        std::copy_n(linear.begin(), x, before.begin());
+        for (int i = 0; i < m; ++i) {
+            for (int c = 0; c < others; ++c) before[c] += K[i * others + c] * linear[x + i];
+        }
+        linear.swap(before);
+        for (int c = 0; c < m; ++c) {
+            costate[x + c] = steps.rate ? -steps.pull[r * m + c] : 0.0;
+            scale[x + c] = steps.rate ? std::sqrt(steps.rate[(r * m + c) * m + c]) : 0.0;
+        }
+    }
+
+    static void column_norms(const RowStack& rows, int first, double* norms, int count) {
+        std::fill_n(norms, count, 0.0);
+        for (int i = 0; i < rows.rows(); ++i) {
+            for (int c = 0; c < count; ++c) norms[c] += rows[i][first + c] * rows[i][first + c];
+        }
+        for (int c = 0; c < count; ++c) norms[c] = std::sqrt(norms[c]);
+    }
+
+    static constexpr double epsilon = std::numeric_limits<double>::epsilon();
+
+    int n, m, x, size;  // x = 2n states, and controls
+    // The value: rows (R r) in (x, u), what is linear in it, and as in BackwardPass:
+    RowStack root;
+    std::vector<double> linear;
+    std::vector<double> costate;
+    std::vector<double> scale;
+
+    // Work arrays of a step.
+    LinearStep step;
+    RowStack stack;                // of what adds up to the cost in (u, x, ...)
+    RowStack kicked;               // (., x) N
+    std::vector<double> before;    // (size) the next `linear`
+    std::vector<double> gradient;  // (size) the next costate
+    std::vector<double> terms;     // (size) the next scale
+    // And of a decision.
+    RowStack firm, U;                             // rows of the controls, regularized; of the free ones
+    std::vector<double> own, weight;              // (m) norms of the controls' columns; regularization
+    std::vector<double> Qu, moved, forced, H, K;  // gradient; R_uu k; U'^-1 linear; (m, m); (m, others)
+    std::vector<int> free;
+    BoxMinimum box;
+};
+
+}  // namespace varpin

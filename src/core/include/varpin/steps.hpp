@@ -1,0 +1,67 @@
+// What a backward pass is given of N steps, and what it writes: views of arrays, row by row, with x = (q, p) or (q, v)
+// of 2n entries and m controls. docs/mathematics.md, "The backward pass".
+#pragma once
+
+#include <cstddef>
+#include <vector>
+
+namespace varpin {
+
+// A sample of the running cost in a step. Its q and v are sums of those of the nodes before (0) and after (1) the step.
+struct Sample {
+    struct Sum {
+        double q0, v0, q1, v1;
+    };
+    double weight;
+    Sum q, v;
+};
+
+// The linearized dynamics and the expanded costs.
+struct ExpandedSteps {
+    std::ptrdiff_t steps = 0;  // N
+    int dof = 0;
+    int controls = 0;
+    int processes = 0;                 // k
+    const double* A = nullptr;         // (N, 2n, 2n)
+    const double* B = nullptr;         // (N, 2n, m)
+    const double* G = nullptr;         // (N, 2n, k) what each process does to x
+    const double* Gx = nullptr;        // (N, 2n, k, 2n)
+    const double* Gu = nullptr;        // (N, 2n, k, m)
+    std::vector<Sample> rule;          // s in each step
+    const double* gradient = nullptr;  // (N s, 2n + m) of the running cost at the samples (q, v, u)
+    const double* hessian = nullptr;   // (N s, 2n + m, 2n + m), or one for all
+    bool one_hessian = false;
+    const double* velocity = nullptr;   // (N + 1, n, 2n) dv/dx at the nodes, or null where x holds v itself
+    const double* curvature = nullptr;  // (N, 2n + m, 2n + m) to be added to the Hessian in (x, u), or null
+    // Of R decisions:
+    const double* slack = nullptr;  // (R, 2, m) least and greatest change of each control, or null without limits
+    const double* rate = nullptr;   // (R, m, m) Hessian of what the change from the control before costs, or null
+    const double* pull = nullptr;   // (R, m) its gradient in the control
+
+    int states() const { return 2 * dof; }
+    int size() const { return 2 * dof + controls; }
+    const double* gradient_at(std::ptrdiff_t point) const { return gradient + point * size(); }
+    const double* hessian_at(std::ptrdiff_t point) const {
+        return one_hessian ? hessian : hessian + point * size() * size();
+    }
+};
+
+// u + k + K (x - x_nominal), for each of R decisions, and what goes with them.
+struct Gains {
+    double* feedforward = nullptr;       // (R, m)
+    double* feedback = nullptr;          // (R, m, 2n)
+    double* previous = nullptr;          // (R, m, m) gains on the control before, where its change costs something
+    double* control_gradient = nullptr;  // (R, m) of the cost in each control
+    double* costate = nullptr;           // (N, 2n) gradient of the cost after each step in the state there, or null
+    double* spread = nullptr;            // (N, 2n, 2n) S, where there is noise
+};
+
+// Sums over a pass.
+struct Found {
+    double slope = 0.0;      // of Qu . k
+    double curvature = 0.0;  // of k . Quu k
+    double noise = 0.0;      // what noise adds to the cost
+    double loss = 0.0;       // the largest relative error of a pivot of Quu, or of its root, by rounding
+};
+
+}  // namespace varpin
