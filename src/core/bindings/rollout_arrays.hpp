@@ -1,0 +1,133 @@
+// What a rollout reads and writes at the border: Python's named tuples Commands and Nodes, checked in this one place
+// and seen as those of policy.hpp and nodes.hpp.
+#pragma once
+
+#include <cstdint>
+#include <stdexcept>
+#include <string>
+#include <utility>
+
+#include "arrays.hpp"
+#include "varpin/nodes.hpp"
+#include "varpin/policy.hpp"
+
+namespace varpin::border {
+
+// An array of a named tuple. It is never converted: what is written to it is for its owner.
+template <class Array>
+Array field(nb::handle record, const char* name) {
+    Array array;
+    if (!nb::try_cast(record.attr(name), array, false)) {
+        throw nb::type_error((std::string(name) + " is no contiguous array of the right kind").c_str());
+    }
+    return array;
+}
+
+// Nodes of P paths over N steps.
+class NodeArrays {
+  public:
+    NodeArrays(const Mechanism& mechanism, nb::handle nodes)
+        : q(field<InOut<3>>(nodes, "q")),
+          p(field<InOut<3>>(nodes, "p")),
+          v(field<InOut<3>>(nodes, "v")),
+          energy(field<InOut<2>>(nodes, "energy")),
+          u(field<InOut<3>>(nodes, "u")),
+          tally(field<IntegersInOut<3>>(nodes, "tally")),
+          quality(field<InOut<3>>(nodes, "quality")),
+          ended(field<IntegersInOut<1>>(nodes, "ended")),
+          done(field<IntegersInOut<1>>(nodes, "done")) {
+        const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
+        const std::size_t P = paths(), N = steps();
+        for (const auto& [array, name] : {std::pair{&q, "q"}, {&p, "p"}, {&v, "v"}}) require(*array, name, {P, N, n});
+        require(energy, "energy", {P, N});
+        require(u, "u", {P, N, m});
+        require(tally, "tally", {P, N, 4});
+        require(quality, "quality", {P, N, 3});
+        for (const auto& [array, name] : {std::pair{&ended, "ended"}, {&done, "done"}}) require(*array, name, {P});
+    }
+
+    std::size_t paths() const { return q.shape(0); }
+    std::size_t steps() const { return q.shape(1); }
+    Nodes view() const {
+        return {static_cast<std::int64_t>(paths()),
+                static_cast<std::int64_t>(steps()),
+                q.data(),
+                p.data(),
+                v.data(),
+                energy.data(),
+                u.data(),
+                tally.data(),
+                quality.data(),
+                ended.data(),
+                done.data()};
+    }
+
+  private:
+    InOut<3> q, p, v;
+    InOut<2> energy;
+    InOut<3> u;
+    IntegersInOut<3> tally;
+    InOut<3> quality;
+    IntegersInOut<1> ended, done;
+};
+
+// Commands for P paths over N steps.
+class CommandArrays {
+  public:
+    CommandArrays(const Mechanism& mechanism, nb::handle commands, std::size_t paths, std::size_t steps)
+        : u(field<In<2>>(commands, "u")),
+          gains(field<In<3>>(commands, "gains")),
+          reference(field<In<2>>(commands, "reference")),
+          limits(field<In<2>>(commands, "limits")),
+          before(field<In<2>>(commands, "before")),
+          hold(nb::cast<int>(commands.attr("hold"))) {
+        const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
+        const std::size_t decisions = u.shape(0), width = gains.shape(2);
+        if (hold < 1 || decisions * static_cast<std::size_t>(hold) != steps)
+            throw std::invalid_argument("the commands are not for as many steps as there are nodes");
+        require(u, "u", {decisions, m});
+        feedback = given(gains, "gains", {decisions, m, width}) && decisions > 0;
+        if (feedback) {
+            if (width != 2 * n && width != 2 * n + m)
+                throw std::invalid_argument("gains have a column for each of (q, p) or (q, p, control before)");
+            require(reference, "reference", {decisions, width});
+        }
+        require(limits, "limits", {2, m});
+        earlier = given(before, "before", {paths, m});
+    }
+
+    Commands view() const {
+        const int m = static_cast<int>(u.shape(1));
+        return {m,
+                hold,
+                u.data(),
+                feedback ? gains.data() : nullptr,
+                feedback ? reference.data() : nullptr,
+                static_cast<int>(gains.shape(2)),
+                limits.data(),
+                limits.data() + m,
+                earlier ? before.data() : nullptr};
+    }
+
+  private:
+    In<2> u;
+    In<3> gains;
+    In<2> reference, limits, before;
+    int hold;
+    bool feedback = false;  // whether there are gains
+    bool earlier = false;   // whether the controls before the first are known
+};
+
+// Increments of Wiener processes (P, N, k), or null where there are none: (0, 0, k), or k = 0.
+inline const double* increments_of(const Mechanism& mechanism, const In<3>& increments, const NodeArrays& nodes) {
+    const auto k = static_cast<std::size_t>(mechanism.diffusion.processes);
+    return given(increments, "increments", {nodes.paths(), nodes.steps(), k}) && k > 0 ? increments.data() : nullptr;
+}
+
+// A force on top of the controls' (P, N, n), or null for (0, 0, n).
+inline const double* drift_of(const Mechanism& mechanism, const In<3>& drift, const NodeArrays& nodes) {
+    const auto n = static_cast<std::size_t>(mechanism.dof());
+    return given(drift, "drift", {nodes.paths(), nodes.steps(), n}) ? drift.data() : nullptr;
+}
+
+}  // namespace varpin::border
