@@ -50,3 +50,36 @@ class Mechanism:
 
     def jets_along(self, q: Floats, v: Floats, alpha: Floats, beta: Floats) -> tuple[Floats, Floats, Floats]:
         """Derivatives of M, L_vq and L_qq (N, n, n) at each row of q and v along that of alpha and beta (N, n)."""
+
+class Links:
+    """Some bodies of a tree with all their ancestors; see src/core/include/varpin/kinematics.hpp."""
+
+    @staticmethod
+    def make(
+        *,
+        parent: Integers,
+        prismatic: Integers,
+        rotation: Floats,
+        translation: Floats,
+        coordinate: Integers,
+        ratio: Floats,
+        offset: Floats,
+        dof: int,
+    ) -> Links:
+        """Raises ValueError for arrays that do not fit each other or describe no tree."""
+
+    def place(self, q: Floats) -> tuple[Floats, Floats]:
+        """World rotations (N, c, 3, 3) and positions (N, c, 3) [m] of the bodies at q (N, n)."""
+
+    def place_frame(self, turned: Floats, shifted: Floats, q: Floats, jacobian: bool) -> tuple[Floats, Floats, Floats]:
+        """World rotations (N, 3, 3) and positions (N, 3) of a frame on the last body, its Jacobians (N, 6, n) if asked.
+
+        The frame stands at (turned (3, 3), shifted (3,)) in the body; Jacobians are linear over angular velocity in
+        world axes, and (0, 6, n) where nobody asks for them.
+        """
+
+def rotation_logarithms(target: Floats, R: Floats, derivative: bool) -> tuple[Floats, Floats]:
+    """Logarithms (N, 3) of target' R for R (N, 3, 3), and their derivatives (N, 3, 3) or (0, 3, 3).
+
+    Targets (T, 3, 3) repeat after T. The derivative is in a turn of R about its own axes.
+    """
