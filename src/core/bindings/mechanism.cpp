@@ -5,6 +5,7 @@
 #include <utility>
 
 #include "arrays.hpp"
+#include "bodies.hpp"
 #include "registrations.hpp"
 #include "varpin/jet.hpp"
 
@@ -26,13 +27,8 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
                        In<1> rest, In<2> actuation, In<2> constant, In<3> control, In<2> quadratic, In<2> centers) {
     const std::size_t bodies = parent.shape(0), n = armature.shape(0), m = actuation.shape(1);
     const std::size_t processes = constant.shape(1);
-    for (const auto& [array, name] :
-         {std::pair{&prismatic, "prismatic"}, {&coordinate, "coordinate"}, {&origin, "origin"}})
-        require(*array, name, {bodies});
-    for (const auto& [array, name] : {std::pair{&mass, "mass"}, {&ratio, "ratio"}, {&offset, "offset"}})
-        require(*array, name, {bodies});
-    require(rotation, "rotation", {bodies, 3, 3});
-    require(translation, "translation", {bodies, 3});
+    require(origin, "origin", {bodies});
+    require(mass, "mass", {bodies});
     require(center, "center", {bodies, 3});
     require(inertia, "inertia", {bodies, 6});
     require(carried, "carried", {loads.shape(0), n});
@@ -46,27 +42,14 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
     require(quadratic, "quadratic", {n, processes});
     require(centers, "centers", {n, processes});
     Mechanism out;
+    out.tree.bodies = jointed_bodies(parent, prismatic, rotation, translation, coordinate, ratio, offset, n);
     for (std::size_t j = 0; j < bodies; ++j) {
-        if (parent(j) < -1 || parent(j) >= static_cast<std::int64_t>(j))
-            throw std::invalid_argument("parents come before their children");
-        if (coordinate(j) < 0 || coordinate(j) >= static_cast<std::int64_t>(n))
-            throw std::invalid_argument("a body's coordinate is out of range");
         if (origin(j) == 0 && parent(j) < 0) throw std::invalid_argument("a root is an origin");
-        Body link;
-        link.parent = static_cast<int>(parent(j));
-        link.prismatic = prismatic(j) != 0;
-        link.rotation = {{rotation(j, 0, 0), rotation(j, 1, 0), rotation(j, 2, 0)},
-                         {rotation(j, 0, 1), rotation(j, 1, 1), rotation(j, 2, 1)},
-                         {rotation(j, 0, 2), rotation(j, 1, 2), rotation(j, 2, 2)}};
-        link.translation = {translation(j, 0), translation(j, 1), translation(j, 2)};
+        Body& link = out.tree.bodies[j];
         link.mass = mass(j);
         link.center = {center(j, 0), center(j, 1), center(j, 2)};
         link.inertia = {inertia(j, 0), inertia(j, 1), inertia(j, 2), inertia(j, 3), inertia(j, 4), inertia(j, 5)};
-        link.coordinate = static_cast<int>(coordinate(j));
-        link.ratio = ratio(j);
-        link.offset = offset(j);
         link.origin = origin(j) != 0;
-        out.tree.bodies.push_back(link);
     }
     for (std::size_t c = 0; c < n; ++c) {
         if (group(c) < 0 || group(c) >= groups) throw std::invalid_argument("a coordinate's group is out of range");

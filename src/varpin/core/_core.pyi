@@ -1,9 +1,11 @@
 """The compiled core: src/core, bound by nanobind."""
 
-from typing import Any
+from enum import Enum, IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
+
+from varpin.kernels.tree import Commands, Nodes
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -126,7 +128,8 @@ def variational_curvatures(
     substeps: Integers,
     z: Floats,
 ) -> tuple[Floats, int, int]:
-    """z . d2(q1, p1)/d(q0, p0, f)2 (N, 3n, 3n) for z (N, 2n); how it ended, and how many steps were done."""
+    """Z . d2(q1, p1)/d(q0, p0, f)2 (N, 3n, 3n) for z (N, 2n); how it ended, and how many steps were done."""
+
 class ExpandedSteps:
     """The linearized dynamics and the expanded costs of N steps; what may be left out is empty then.
 
@@ -221,4 +224,104 @@ def box_minimum(H: Floats, g: Floats, limits: Floats, guess: Floats) -> tuple[Fl
 
     With it, L D L' of H with held rows and columns replaced by those of the identity (unit L below the diagonal, D on
     it), and which entries the box holds.
+    """
+
+class Links:
+    """Some bodies of a tree with all their ancestors; see src/core/include/varpin/kinematics.hpp."""
+
+    @staticmethod
+    def make(
+        *,
+        parent: Integers,
+        prismatic: Integers,
+        rotation: Floats,
+        translation: Floats,
+        coordinate: Integers,
+        ratio: Floats,
+        offset: Floats,
+        dof: int,
+    ) -> Links:
+        """Raises ValueError for arrays that do not fit each other or describe no tree."""
+
+    def place(self, q: Floats) -> tuple[Floats, Floats]:
+        """World rotations (N, c, 3, 3) and positions (N, c, 3) [m] of the bodies at q (N, n)."""
+
+    def place_frame(self, turned: Floats, shifted: Floats, q: Floats, jacobian: bool) -> tuple[Floats, Floats, Floats]:
+        """World rotations (N, 3, 3) and positions (N, 3) of a frame on the last body, its Jacobians (N, 6, n) if asked.
+
+        The frame stands at (turned (3, 3), shifted (3,)) in the body; Jacobians are linear over angular velocity in
+        world axes, and (0, 6, n) where nobody asks for them.
+        """
+
+def rotation_logarithms(target: Floats, R: Floats, derivative: bool) -> tuple[Floats, Floats]:
+    """Logarithms (N, 3) of target' R for R (N, 3, 3), and their derivatives (N, 3, 3) or (0, 3, 3).
+
+    Targets (T, 3, 3) repeat after T. The derivative is in a turn of R about its own axes.
+    """
+
+class Outcome(IntEnum):
+    """Why a rollout of a path ended; see src/core/include/varpin/nodes.hpp."""
+
+    solved = ...
+    diverged = ...
+    not_finite = ...
+    fold = ...
+    energy = ...
+    singular = ...
+
+class ForwardDynamics:
+    """Forward dynamics at one state after another."""
+
+    def __init__(self, mechanism: Mechanism) -> None: ...
+    def rate(self, x: Floats, force: Floats) -> tuple[Floats, bool]:
+        """The rate (v, a) of x = (q, v) (2n,) under a force (n,), and whether the mass matrix is positive definite."""
+
+    def node(self, x: Floats) -> tuple[Floats, float, bool]:
+        """Momentum (n,) and energy [J] at x = (q, v) (2n,), and whether the mass matrix is positive definite."""
+
+def accelerations(mechanism: Mechanism, q: Floats, v: Floats, force: Floats) -> tuple[Floats, Floats, int]:
+    """Accelerations (N, n) at each row of q, v and force (N, n), and their derivatives (N, n, 3n) in all three.
+
+    With them, how many rows there are before the first whose mass matrix is not positive definite.
+    """
+
+class ExplicitMethod(Enum):
+    """See src/core/include/varpin/explicit.hpp."""
+
+    euler = ...
+    semi_implicit = ...
+    runge_kutta = ...
+
+class ExplicitRollout:
+    """P paths of an explicit method on their way."""
+
+    @staticmethod
+    def start(mechanism: Mechanism, method: ExplicitMethod, q: Floats, v: Floats) -> ExplicitRollout:
+        """Paths at q and v (P, n)."""
+
+    @property
+    def q(self) -> Floats:
+        """Where the paths stand (P, n) [rad or m]; what is written to it moves them."""
+
+    @property
+    def v(self) -> Floats:
+        """Their velocities (P, n), in the same way."""
+
+    def copy(self) -> ExplicitRollout: ...
+    def first_nodes(self, nodes: Nodes) -> bool:
+        """Enter where each path stands as its node 0; False where a mass matrix is not positive definite."""
+
+    def roll(self, dt: float, commands: Commands, increments: Floats, drift: Floats, nodes: Nodes) -> None:
+        """All N steps of length dt [s] of all paths.
+
+        With increments of the Wiener processes (P, N, k), or (0, 0, k) for none, and a force (P, N, n) on top of that
+        of the controls, or (0, 0, n) for none.
+        """
+
+def linearize_explicit(
+    mechanism: Mechanism, method: ExplicitMethod, dt: float, q: Floats, v: Floats, force: Floats
+) -> tuple[Floats, int]:
+    """Derivatives (N, 2n, 3n) of (q, v) after one step in (q, v, force), from each row of them (N, n).
+
+    With them, how many rows there are before the first with a mass matrix that is not positive definite.
     """

@@ -8,6 +8,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin import core
+from varpin.core import ExplicitMethod, Outcome
 from varpin.errors import LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
     Integrator,
@@ -16,12 +18,9 @@ from varpin.integrators.base import (
     diffusion_and_drift,
     drifts,
     open_loop,
-    read_only,
     segments_of,
     steps_of,
 )
-from varpin.kernels import explicit as kernels
-from varpin.kernels.dynamics import Dynamics, forward_derivatives, new_dynamics
 from varpin.kernels.tree import Commands, new_nodes
 from varpin.lagrangian import lagrangian_jet
 from varpin.scene import Scene
@@ -29,19 +28,22 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-REASONS = {
-    kernels.NOT_FINITE: "the state is no longer finite",
-    kernels.SINGULAR: "the mass matrix is not positive definite",
+REASONS: dict[int, str] = {
+    Outcome.not_finite: "the state is no longer finite",
+    Outcome.singular: "the mass matrix is not positive definite",
 }
 
 
 @dataclass(frozen=True)
 class ExplicitRun:
-    """Where a rollout stands, with its work arrays."""
+    """Where a rollout stands.
 
-    state: kernels.ExplicitState
-    dynamics: Dynamics
-    room: Floats
+    Attributes:
+        paths: On their way, with their work arrays.
+        start: Configurations at which the rollout started (P, n) [rad or m].
+    """
+
+    paths: core.ExplicitRollout
     start: Floats
 
 
@@ -49,26 +51,21 @@ class ExplicitRun:
 class _Explicit(Integrator):
     """What the explicit methods share."""
 
-    scheme: ClassVar[int]
+    method: ClassVar[ExplicitMethod]
     variational = False
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[ExplicitRun, list[Segment]]:
         """See :meth:`Integrator.start`."""
         paths, n = q0.shape
-        run = ExplicitRun(
-            kernels.new_explicit_state(q0, v0, scene.mechanism.diffusion.center),
-            new_dynamics(scene.robot.tree.parent.size, n),
-            np.zeros((8, n)),
-            q0.copy(),
-        )
+        run = ExplicitRun(core.ExplicitRollout.start(scene.core, self.method, q0, v0), q0.copy())
         nodes = new_nodes(paths, 1, n, scene.controls)
-        if not kernels.first_nodes(scene.mechanism, run.state, run.dynamics, nodes):
+        if not run.paths.first_nodes(nodes):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         return run, segments_of(nodes, REASONS)
 
     def fork(self, state: ExplicitRun) -> ExplicitRun:
         """See :meth:`Integrator.fork`."""
-        return replace(state, state=kernels.ExplicitState._make(array.copy() for array in state.state))
+        return replace(state, paths=state.paths.copy())
 
     def step_in_python(
         self, scene: Scene, state: ExplicitRun, command: Commands, increment: Floats, dt: float
@@ -78,12 +75,12 @@ class _Explicit(Integrator):
         The impulse is handed over as the drift of a constant force is: spread over the step for explicit Euler, which
         is the same there, and as a jump of the velocity before the step for the others.
         """
-        q, v = state.state.q[0], state.state.v[0]
+        q, v = state.paths.q[0], state.paths.v[0]
         control = control_of(command, 0, np.concatenate([q, v]), command.before)
         F, drift = diffusion_and_drift(scene, q, v, control, state.start[0])
         if len(increment):
             impulse = F @ increment[0, 0]
-            if self.scheme == kernels.EULER:
+            if self.method is ExplicitMethod.euler:
                 drift = drift + impulse / dt
             else:
                 v += np.linalg.solve(mass(scene, q), impulse)
@@ -95,20 +92,23 @@ class _Explicit(Integrator):
         self, scene: Scene, state: ExplicitRun, commands: Commands, increments: Floats, drift: Floats, dt: float
     ) -> list[Segment]:
         """See :meth:`Integrator.rollout_compiled`."""
-        nodes = new_nodes(len(state.state.q), steps_of(commands), scene.robot.dof, scene.controls)
-        kernels.rollout(
-            scene.mechanism,
-            self.scheme,
-            dt,
-            commands,
-            increments,
-            drift,
-            state.state,
-            state.dynamics,
-            state.room,
-            nodes,
-        )
+        nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
+        state.paths.roll(dt, commands, increments, drift, nodes)
         return segments_of(nodes, REASONS)
+
+    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
+        """See :meth:`Integrator.linearize`; the state is (q, v)."""
+        h, n = trajectory.dt, scene.robot.dof
+        q, v = (np.ascontiguousarray(x[:-1]) for x in (trajectory.q, trajectory.v))
+        force = trajectory.u @ scene.actuation.T + drifts(scene, trajectory)
+        J, done = core.linearize_explicit(scene.core, self.method, h, q, v, force)
+        if done < len(q):
+            raise LinearizationError(done, done * h, REASONS[Outcome.singular])
+        return J[:, :, : 2 * n], J[:, :, 2 * n :], self._jump(J[:, :, n : 2 * n])
+
+    def _jump(self, in_v: Floats) -> Floats:
+        """Derivatives of each step in a jump (N, 2n, n), from those in the velocity."""
+        return in_v
 
 
 def mass(scene: Scene, q: Floats) -> Floats:
@@ -122,76 +122,38 @@ def accelerations(scene: Scene, q: Floats, v: Floats, force: Floats) -> tuple[Fl
     Raises:
         LinearizationError: A mass matrix is not positive definite.
     """
-    N, n = q.shape
-    bodies = scene.robot.tree.parent.size
-    a, aq, av, af = np.empty((N, n)), np.empty((N, n, n)), np.empty((N, n, n)), np.empty((N, n, n))
-    Z, P, Q = np.zeros((3, bodies, 6))
-    q, v, force = read_only(q), read_only(v), read_only(force)
-    if not forward_derivatives(scene.mechanism, q, v, force, Z, P, Q, new_dynamics(bodies, n), a, aq, av, af):
-        raise LinearizationError(0, 0.0, REASONS[kernels.SINGULAR])
-    return a, aq, av, af
-
-
-def _forces(scene: Scene, trajectory: Trajectory) -> Floats:
-    """The constant force of each step (N, n): of the controls and of the noise's drift."""
-    force: Floats = trajectory.u @ scene.actuation.T + drifts(scene, trajectory)
-    return force
+    n = q.shape[1]
+    q, v, force = (np.ascontiguousarray(x) for x in (q, v, force))
+    a, J, done = core.accelerations(scene.core, q, v, force)
+    if done < len(q):
+        raise LinearizationError(0, 0.0, REASONS[Outcome.singular])
+    return a, J[:, :, :n], J[:, :, n : 2 * n], J[:, :, 2 * n :]
 
 
 @dataclass(frozen=True)
 class ExplicitEuler(_Explicit):
     """q1 = q0 + h v0, v1 = v0 + h a(q0, v0): of first order, and the paper's comparison."""
 
-    scheme: ClassVar[int] = kernels.EULER
+    method: ClassVar[ExplicitMethod] = ExplicitMethod.euler
     order = 1
 
-    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
-        """See :meth:`Integrator.linearize`; the state is (q, v)."""
-        h, n = trajectory.dt, scene.robot.dof
-        _, aq, av, af = accelerations(scene, trajectory.q[:-1], trajectory.v[:-1], _forces(scene, trajectory))
-        one, zero = np.broadcast_to(np.eye(n), aq.shape), np.zeros_like(aq)
-        Jx = np.block([[one, h * one], [h * aq, one + h * av]])
-        return Jx, np.concatenate([zero, h * af], axis=1), np.concatenate([zero, one], axis=1)
+    def _jump(self, in_v: Floats) -> Floats:
+        # Noise acts beside the step: what it adds to the velocity stays as it is.
+        n = in_v.shape[2]
+        return np.broadcast_to(np.eye(2 * n, n, -n), in_v.shape)
 
 
 @dataclass(frozen=True)
 class SemiImplicitEuler(_Explicit):
     """v1 = v0 + h a(q0, v0), q1 = q0 + h v1: of first order; most physics engines step so."""
 
-    scheme: ClassVar[int] = kernels.SEMI_IMPLICIT
+    method: ClassVar[ExplicitMethod] = ExplicitMethod.semi_implicit
     order = 1
-
-    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
-        """See :meth:`Integrator.linearize`; the state is (q, v)."""
-        h, n = trajectory.dt, scene.robot.dof
-        _, aq, av, af = accelerations(scene, trajectory.q[:-1], trajectory.v[:-1], _forces(scene, trajectory))
-        one = np.broadcast_to(np.eye(n), aq.shape)
-        Jx = np.block([[one + h * h * aq, h * (one + h * av)], [h * aq, one + h * av]])
-        return Jx, np.concatenate([h * h * af, h * af], axis=1), Jx[:, :, n:]
 
 
 @dataclass(frozen=True)
 class RungeKutta4(_Explicit):
     """The classical method of Runge and Kutta: of fourth order without noise."""
 
-    scheme: ClassVar[int] = kernels.RUNGE_KUTTA
+    method: ClassVar[ExplicitMethod] = ExplicitMethod.runge_kutta
     order = 4
-
-    def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
-        """See :meth:`Integrator.linearize`; the state is (q, v). The four stages are differentiated in turn."""
-        h, n = trajectory.dt, scene.robot.dof
-        q, v, force = trajectory.q[:-1], trajectory.v[:-1], _forces(scene, trajectory)
-        steps = len(q)
-        identity = np.broadcast_to(np.eye(2 * n), (steps, 2 * n, 2 * n))
-        at_q, at_v = q, v
-        in_x, in_f = identity, np.zeros((steps, 2 * n, n))
-        Jx, Jf = identity.copy(), np.zeros((steps, 2 * n, n))
-        for weight, ahead in ((h / 6.0, 0.5 * h), (h / 3.0, 0.5 * h), (h / 3.0, h), (h / 6.0, 0.0)):
-            a, aq, av, af = accelerations(scene, at_q, at_v, force)
-            slope_x = np.concatenate([in_x[:, n:], aq @ in_x[:, :n] + av @ in_x[:, n:]], axis=1)
-            slope_f = np.concatenate([in_f[:, n:], aq @ in_f[:, :n] + av @ in_f[:, n:] + af], axis=1)
-            Jx += weight * slope_x
-            Jf += weight * slope_f
-            at_q, at_v = q + ahead * at_v, v + ahead * a
-            in_x, in_f = identity + ahead * slope_x, ahead * slope_f
-        return Jx, Jf, Jx[:, :, n:]

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from varpin.checks import positive
+from varpin.core import ExplicitMethod, ExplicitRollout, ForwardDynamics
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import Failure, Integrator, Segment, control_of, drifts, segments_of, steps_of
 from varpin.integrators.explicit import REASONS, accelerations
-from varpin.kernels import explicit as kernels
-from varpin.kernels.dynamics import Dynamics, forward_dynamics, new_dynamics
 from varpin.kernels.tree import Commands, Nodes, new_nodes
 from varpin.scene import Scene
 from varpin.trajectory import Trajectory
@@ -35,12 +34,12 @@ class ReferenceRun:
 
     Attributes:
         x: (q, v) of each path (P, 2n).
-        dynamics: Work arrays.
+        dynamics: At one state of them after another.
         tried: The last length of a step inside [s], 0 for none: the next begins with it.
     """
 
     x: Floats
-    dynamics: Dynamics
+    dynamics: ForwardDynamics
     tried: float
 
 
@@ -86,12 +85,11 @@ class Reference(Integrator):
         paths, n = q0.shape
         run = ReferenceRun(
             x=np.hstack([q0, v0]),
-            dynamics=new_dynamics(scene.robot.tree.parent.size, n),
+            dynamics=ForwardDynamics(scene.core),
             tried=0.0,
         )
         nodes = new_nodes(paths, 1, n, scene.controls)
-        states = kernels.new_explicit_state(q0, v0, scene.mechanism.diffusion.center)
-        if not kernels.first_nodes(scene.mechanism, states, run.dynamics, nodes):
+        if not ExplicitRollout.start(scene.core, ExplicitMethod.runge_kutta, q0, v0).first_nodes(nodes):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         return run, segments_of(nodes, REASONS)
 
@@ -135,23 +133,23 @@ class Reference(Integrator):
             u[s] = before[0] if held else control_of(commands, decision, state.x[i], before)
             force = scene.actuation @ u[s] + (drift[i, s] if len(drift) else 0.0)
             try:
-                x, nodes.tally[i, s, 2] = self._step(scene, state, i, force, dt)
+                x, nodes.tally[i, s, 2] = self._step(state, i, force, dt)
             except _RunsAway:
                 return Failure(TOO_STEEP, 0.0)
             state.x[i] = x
-            if kernels.enter_node(scene.mechanism, x, state.dynamics, nodes, i, s) != kernels.SOLVED:
+            nodes.p[i, s], nodes.energy[i, s], regular = state.dynamics.node(x)
+            nodes.q[i, s], nodes.v[i, s] = np.split(x, 2)
+            if not (regular and np.isfinite(nodes.energy[i, s])):
                 return Failure(TOO_STEEP, 0.0)
             nodes.done[i] = s + 1
         return None
 
-    def _step(self, scene: Scene, state: ReferenceRun, i: int, force: Floats, dt: float) -> tuple[Floats, int]:
+    def _step(self, state: ReferenceRun, i: int, force: Floats, dt: float) -> tuple[Floats, int]:
         """(q, v) of path ``i`` after one step, and how many evaluations of forward dynamics it took."""
-        n = scene.robot.dof
-        mechanism, dynamics = scene.mechanism, state.dynamics
 
         def rate(_: float, x: Floats) -> Floats:
-            slope = np.empty(2 * n)
-            if not (forward_dynamics(mechanism, x, force, dynamics, slope) and np.isfinite(slope).all()):
+            slope, regular = state.dynamics.rate(x, force)
+            if not (regular and np.isfinite(slope).all()):
                 raise _RunsAway
             return slope
 

@@ -3,40 +3,55 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.core import Links as Core
+from varpin.core import rotation_logarithms
 from varpin.errors import InputError
 from varpin.frozen import Frozen
-from varpin.kernels.kinematics import Bodies, place, place_frame, rotation_logarithms
 from varpin.kernels.tree import Tree
 from varpin.robot.model import Robot
 from varpin.robot.tree import frame_on_body
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class Links(Frozen):
-    """Some bodies of a robot's tree with all their ancestors.
+    """Some bodies of a robot's tree with all their ancestors, each on one joint.
 
     Attributes:
-        bodies: For the kernel.
+        parent: Index among these bodies (c,), -1 at a root; parents come first.
+        prismatic: 1 for a prismatic joint, 0 for a revolute one (c,).
+        rotation: Of the joint's frame in its parent's at joint position 0 (c, 3, 3).
+        translation: The same (c, 3) [m].
+        coordinate: Which one moves the joint (c,), among all n.
+        ratio: Of the joint's position to the coordinate (c,).
+        offset: The joint's position where the coordinate is 0 (c,) [rad or m].
         gear: What each coordinate does to each of their c joints (c, n): a selection, but for mimic joints.
     """
 
-    bodies: Bodies
+    parent: Integers
+    prismatic: Integers
+    rotation: Floats
+    translation: Floats
+    coordinate: Integers
+    ratio: Floats
+    offset: Floats
     gear: Floats
+
+    @cached_property
+    def core(self) -> Core:
+        """The same for the compiled core."""
+        return Core.make(**{name: getattr(self, name) for name in _JOINT}, dof=self.gear.shape[1])
 
     def place(self, q: Floats) -> tuple[Floats, Floats]:
         """World rotations (N, c, 3, 3) and positions (N, c, 3) [m] at q (N, n)."""
-        count = len(self.gear)
-        # A copy, so that the kernel meets one kind of array.
-        q = np.array(q, order="C")
-        rotation, position = np.empty((len(q), count, 3, 3)), np.empty((len(q), count, 3))
-        place(self.bodies, q, rotation, position)
-        return rotation, position
+        return self.core.place(np.ascontiguousarray(q))
 
     def motions(self, rotation: Floats, lever: Floats) -> tuple[Floats, Floats]:
         """Angular (N, c, 3) and linear velocity (N, c, 3) that each joint gives to a point at ``lever`` from it.
@@ -44,9 +59,12 @@ class Links(Frozen):
         In world axes and per unit of the joint's rate; ``lever`` is (N, c, 3).
         """
         z = rotation[:, :, :, 2]
-        turns = (self.bodies.prismatic == 0)[:, None]
+        turns = (self.prismatic == 0)[:, None]
         angular = np.where(turns, z, 0.0)
         return angular, np.where(turns, cross(z, lever), z)
+
+
+_JOINT = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset")
 
 
 def links(tree: Tree, body: int | None = None) -> Links:
@@ -62,8 +80,7 @@ def links(tree: Tree, body: int | None = None) -> Links:
     gear = np.zeros((len(members), tree.armature.size))
     gear[np.arange(len(members)), tree.coordinate[members]] = tree.ratio[members]
     parent = np.array([index.get(int(tree.parent[b]), -1) for b in members], dtype=np.int64)
-    bodies = Bodies(parent, *(np.ascontiguousarray(getattr(tree, name)[members]) for name in Bodies._fields[1:]))
-    return Links(bodies, gear)
+    return Links(parent, **{name: getattr(tree, name)[members] for name in _JOINT[1:]}, gear=gear)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,19 +144,14 @@ class FrameKinematics(Frozen):
 
     def placements(self, q: Floats) -> tuple[Floats, Floats]:
         """World rotations (N, 3, 3) and positions (N, 3) [m] at q (N, n)."""
-        return self._placed(q, 0)[:2]
+        return self._placed(q, jacobian=False)[:2]
 
     def jacobians(self, q: Floats) -> tuple[Floats, Floats, Floats]:
         """:meth:`placements`, and the frame's Jacobian (N, 6, n): linear over angular velocity in world axes, in v."""
-        return self._placed(q, len(q))
+        return self._placed(q, jacobian=True)
 
-    def _placed(self, q: Floats, wanted: int) -> tuple[Floats, Floats, Floats]:
-        N, count = len(q), len(self.links.gear)
-        q = np.array(q, order="C")
-        R, p, J = np.empty((N, 3, 3)), np.empty((N, 3)), np.empty((wanted, 6, q.shape[1]))
-        room = np.empty((N, count, 3, 3)), np.empty((N, count, 3))
-        place_frame(self.links.bodies, self.rotation, self.translation, q, *room, R, p, J)
-        return R, p, J
+    def _placed(self, q: Floats, *, jacobian: bool) -> tuple[Floats, Floats, Floats]:
+        return self.links.core.place_frame(self.rotation, self.translation, np.ascontiguousarray(q), jacobian)
 
     def motion(self, q: Floats) -> FrameMotion:
         """How each joint moves the frame at q (N, n)."""
@@ -193,7 +205,7 @@ class CenterOfMass(Frozen):
         # The joint moves that part as one body: its share times the lever to its centre.
         lever = self.after @ moments - moved[:, None] * position
         _, linear = self.links.motions(rotation, lever)
-        linear = np.where(self.links.bodies.prismatic[:, None] == 0, linear, moved[:, None] * linear)
+        linear = np.where(self.links.prismatic[:, None] == 0, linear, moved[:, None] * linear)
         return moments.sum(axis=1), np.swapaxes(linear, 1, 2) @ self.links.gear
 
 
@@ -222,8 +234,7 @@ def rotation_errors(target: Floats, R: Floats, *, derivative: bool = False) -> t
     if len(target) not in (1, R.shape[-3]):
         raise InputError(f"{len(target)} targets do not go with {R.shape[-3]} rotations")
     rows = np.ascontiguousarray(R).reshape(-1, 3, 3)
-    r, D = np.empty((len(rows), 3)), np.empty((len(rows) if derivative else 0, 3, 3))
-    rotation_logarithms(np.ascontiguousarray(target), rows, np.empty((3, 3)), np.empty(4), r, D)
+    r, D = rotation_logarithms(np.ascontiguousarray(target), rows, derivative)
     return r.reshape(*R.shape[:-2], 3), D
 
 

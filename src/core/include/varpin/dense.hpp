@@ -182,26 +182,32 @@ inline void solve_ldl(const double* ldl, int n, Block block, const double* b, do
     solve_upper(ldl, n, block, x);
 }
 
-// The X with L D L' X = B (n, columns), in place, whole rows at a time.
-inline void solve_ldl_rows(const double* ldl, int n, double* b, int columns) {
-    for (int i = 0; i < n; ++i) {
-        double* __restrict row = b + i * columns;
-        for (int j = 0; j < i; ++j) {
+// The X with L D L' X = B, B and X (size of the block, columns) row by row and in one place, all columns at once.
+// Row i of the block stands at x + (i - begin) * stride.
+inline void solve_ldl_rows(const double* ldl, int n, Block block, double* x, int columns, int stride) {
+    for (int i = block.begin; i < block.end; ++i) {
+        double* __restrict row = x + (i - block.begin) * stride;
+        for (int j = block.begin; j < i; ++j) {
             const double factor = ldl[i * n + j];
-            const double* __restrict other = b + j * columns;
+            const double* __restrict other = x + (j - block.begin) * stride;
             for (int c = 0; c < columns; ++c) row[c] -= factor * other[c];
         }
     }
-    for (int i = n - 1; i >= 0; --i) {
-        double* __restrict row = b + i * columns;
+    for (int i = block.end - 1; i >= block.begin; --i) {
+        double* __restrict row = x + (i - block.begin) * stride;
         const double inverse = 1.0 / ldl[i * n + i];
         for (int c = 0; c < columns; ++c) row[c] *= inverse;
-        for (int j = i + 1; j < n; ++j) {
+        for (int j = i + 1; j < block.end; ++j) {
             const double factor = ldl[j * n + i];
-            const double* __restrict other = b + j * columns;
+            const double* __restrict other = x + (j - block.begin) * stride;
             for (int c = 0; c < columns; ++c) row[c] -= factor * other[c];
         }
     }
+}
+
+// The same over a whole matrix, for X (n, columns).
+inline void solve_ldl_rows(const double* ldl, int n, double* x, int columns) {
+    solve_ldl_rows(ldl, n, {0, n}, x, columns, columns);
 }
 
 // x' a x over one block.

@@ -94,12 +94,20 @@ constexpr Motion<T> operator+(const Motion<T>& a, const Motion<T>& b) {
     return {a.linear + b.linear, a.angular + b.angular};
 }
 template <class T>
+constexpr Motion<T>& operator+=(Motion<T>& a, const Motion<T>& b) {
+    return a = a + b;
+}
+template <class T>
 constexpr Motion<T> operator*(const T& s, const Motion<T>& a) {
     return {s * a.linear, s * a.angular};
 }
 template <class T>
 constexpr Force<T> operator+(const Force<T>& a, const Force<T>& b) {
     return {a.linear + b.linear, a.angular + b.angular};
+}
+template <class T>
+constexpr Force<T> operator*(const T& s, const Force<T>& f) {
+    return {s * f.linear, s * f.angular};
 }
 template <class T>
 constexpr Force<T>& operator+=(Force<T>& a, const Force<T>& b) {

@@ -1,0 +1,178 @@
+// Forward dynamics and the explicit methods.
+#include "varpin/explicit.hpp"
+
+#include <nanobind/stl/shared_ptr.h>
+#include <nanobind/stl/tuple.h>
+
+#include <memory>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+#include "arrays.hpp"
+#include "registrations.hpp"
+#include "rollout_arrays.hpp"
+
+namespace varpin::border {
+
+namespace {
+
+using namespace nanobind::literals;
+
+using SharedMechanism = std::shared_ptr<Mechanism>;
+
+// What works on a mechanism, and keeps it alive.
+struct BoundDynamics {
+    explicit BoundDynamics(SharedMechanism of) : mechanism(std::move(of)), own(*mechanism) {}
+
+    SharedMechanism mechanism;
+    ForwardDynamics own;
+};
+
+struct BoundRollout {
+    BoundRollout(SharedMechanism of, ExplicitMethod method, const In<2>& q, const In<2>& v)
+        : mechanism(std::move(of)), own(*mechanism, method, static_cast<int>(q.shape(0)), q.data(), v.data()) {}
+
+    SharedMechanism mechanism;
+    ExplicitRollout own;
+
+    Out view(std::vector<double>& values) const {
+        return Out(values.data(), {static_cast<std::size_t>(own.paths()), static_cast<std::size_t>(own.dof())});
+    }
+
+    void require_paths(const NodeArrays& nodes) const {
+        if (nodes.paths() != static_cast<std::size_t>(own.paths()))
+            throw std::invalid_argument("the nodes are not those of as many paths");
+    }
+};
+
+void require_rows(const Mechanism& mechanism, const In<2>& q, const In<2>& v, const In<2>& force) {
+    const auto n = static_cast<std::size_t>(mechanism.dof());
+    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}, {&force, "force"}})
+        require(*array, name, {q.shape(0), n});
+}
+
+// The rate (v, a) of x = (q, v) under a force, and whether the mass matrix is positive definite.
+std::tuple<Out, bool> rate(BoundDynamics& dynamics, In<1> x, In<1> force) {
+    const auto n = static_cast<std::size_t>(dynamics.own.dof());
+    require(x, "x", {2 * n});
+    require(force, "force", {n});
+    double* values = nullptr;
+    const Out out = array_for(values, {2 * n});
+    const bool regular = dynamics.own.at(x.data(), x.data() + n);
+    std::copy(x.data() + n, x.data() + 2 * n, values);
+    dynamics.own.acceleration(force.data(), values + n);
+    return {out, regular};
+}
+
+// Momentum and energy at x = (q, v), and whether the mass matrix is positive definite.
+std::tuple<Out, double, bool> node(BoundDynamics& dynamics, In<1> x) {
+    const auto n = static_cast<std::size_t>(dynamics.own.dof());
+    require(x, "x", {2 * n});
+    double* p = nullptr;
+    const Out momentum = array_for(p, {n});
+    const bool regular = dynamics.own.at(x.data(), x.data() + n);
+    const double energy = dynamics.own.energy(x.data() + n, p);
+    return {momentum, energy, regular};
+}
+
+// Accelerations (N, n) at each row of q, v and force (N, n), and their derivatives (N, n, 3n) in all three; how many
+// rows have a positive definite mass matrix before the first that has not.
+std::tuple<Out, Out, std::size_t> accelerations(const Mechanism& mechanism, In<2> q, In<2> v, In<2> force) {
+    require_rows(mechanism, q, v, force);
+    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
+    double *a = nullptr, *J = nullptr;
+    const Out values = array_for(a, {rows, n}), derivatives = array_for(J, {rows, n, 3 * n});
+    std::size_t s = 0;
+    {
+        nb::gil_scoped_release release;
+        ForwardDynamics dynamics(mechanism);
+        for (; s < rows && dynamics.at(q.data() + s * n, v.data() + s * n); ++s) {
+            dynamics.acceleration(force.data() + s * n, a + s * n);
+            dynamics.differentiate(v.data() + s * n, a + s * n);
+            dynamics.derivatives(J + s * 3 * n * n);
+        }
+    }
+    return {values, derivatives, s};
+}
+
+// Derivatives (N, 2n, 3n) in (q, v, force) of one step from each row; how many rows went before one with a mass matrix
+// that is not positive definite.
+std::tuple<Out, std::size_t> linearize(const Mechanism& mechanism, ExplicitMethod method, double dt, In<2> q, In<2> v,
+                                       In<2> force) {
+    require_rows(mechanism, q, v, force);
+    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
+    double* J = nullptr;
+    const Out derivatives = array_for(J, {rows, 2 * n, 3 * n});
+    std::size_t s = 0;
+    {
+        nb::gil_scoped_release release;
+        ExplicitStepper stepper(mechanism, method, true);
+        for (; s < rows; ++s) {
+            std::copy_n(q.data() + s * n, n, stepper.state.q.data());
+            std::copy_n(v.data() + s * n, n, stepper.state.v.data());
+            if (!stepper.dynamics.at(q.data() + s * n, v.data() + s * n)) break;
+            if (!stepper.step(dt, force.data() + s * n)) break;
+            stepper.write_derivatives(J + s * 6 * n * n);
+        }
+    }
+    return {derivatives, s};
+}
+
+BoundRollout rollout(SharedMechanism mechanism, ExplicitMethod method, In<2> q, In<2> v) {
+    const std::size_t n = static_cast<std::size_t>(mechanism->dof()), paths = q.shape(0);
+    require(q, "q", {paths, n});
+    require(v, "v", {paths, n});
+    return BoundRollout(std::move(mechanism), method, q, v);
+}
+
+bool first_nodes(BoundRollout& rollout, nb::handle nodes) {
+    const NodeArrays arrays(*rollout.mechanism, nodes);
+    rollout.require_paths(arrays);
+    if (arrays.steps() < 1) throw std::invalid_argument("there is no room for the first nodes");
+    return rollout.own.first_nodes(arrays.view());
+}
+
+void roll(BoundRollout& rollout, double dt, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes) {
+    const Mechanism& mechanism = *rollout.mechanism;
+    const NodeArrays to(mechanism, nodes);
+    rollout.require_paths(to);
+    const CommandArrays by(mechanism, commands, to.paths(), to.steps());
+    const double* dw = increments_of(mechanism, increments, to);
+    const double* more = drift_of(mechanism, drift, to);
+    nb::gil_scoped_release release;
+    rollout.own.roll(dt, by.view(), dw, more, to.view());
+}
+
+}  // namespace
+
+void register_explicit(nb::module_& m) {
+    nb::enum_<Outcome>(m, "Outcome", nb::is_arithmetic())
+        .value("solved", Outcome::solved)
+        .value("diverged", Outcome::diverged)
+        .value("not_finite", Outcome::not_finite)
+        .value("fold", Outcome::fold)
+        .value("energy", Outcome::energy)
+        .value("singular", Outcome::singular);
+    nb::enum_<ExplicitMethod>(m, "ExplicitMethod")
+        .value("euler", ExplicitMethod::euler)
+        .value("semi_implicit", ExplicitMethod::semi_implicit)
+        .value("runge_kutta", ExplicitMethod::runge_kutta);
+    nb::class_<BoundDynamics>(m, "ForwardDynamics")
+        .def(nb::init<SharedMechanism>(), "mechanism"_a)
+        .def("rate", &rate, "x"_a, "force"_a)
+        .def("node", &node, "x"_a);
+    nb::class_<BoundRollout>(m, "ExplicitRollout")
+        .def_static("start", &rollout, "mechanism"_a, "method"_a, "q"_a, "v"_a)
+        .def_prop_ro(
+            "q", [](BoundRollout& rollout) { return rollout.view(rollout.own.q); }, nb::rv_policy::reference_internal)
+        .def_prop_ro(
+            "v", [](BoundRollout& rollout) { return rollout.view(rollout.own.v); }, nb::rv_policy::reference_internal)
+        .def("copy", [](const BoundRollout& rollout) { return BoundRollout(rollout); })
+        .def("first_nodes", &first_nodes, "nodes"_a)
+        .def("roll", &roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a);
+    m.def("accelerations", &accelerations, "mechanism"_a, "q"_a, "v"_a, "force"_a);
+    m.def("linearize_explicit", &linearize, "mechanism"_a, "method"_a, "dt"_a, "q"_a, "v"_a, "force"_a);
+}
+
+}  // namespace varpin::border

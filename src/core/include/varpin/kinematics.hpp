@@ -1,0 +1,113 @@
+// Where bodies and frames are, a frame's Jacobian, and by how much rotations differ. docs/mathematics.md, "Costs in
+// the task". Positions are the world's, unlike those of the jet.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "varpin/spatial.hpp"
+#include "varpin/tree.hpp"
+
+namespace varpin {
+
+struct Placement {
+    Mat3<double> rotation{};
+    Vec3<double> position{};  // [m]
+};
+
+constexpr Placement operator*(const Placement& a, const Placement& b) {
+    return {a.rotation * b.rotation, a.position + a.rotation * b.position};
+}
+
+// Some bodies of a tree and all their ancestors, among n coordinates. Masses play no part.
+struct Links {
+    std::vector<Body> bodies;
+    int dof = 0;
+
+    int size() const { return static_cast<int>(bodies.size()); }
+};
+
+// The placement of every body at q.
+inline void place(const Links& links, const double* q, Placement* at) {
+    for (int j = 0; j < links.size(); ++j) {
+        const Body& link = links.bodies[j];
+        Placement here{link.rotation, link.translation};
+        if (link.parent >= 0) here = at[link.parent] * here;
+        const double angle = link.ratio * q[link.coordinate] + link.offset;
+        const Mat3<double>& R = here.rotation;
+        if (link.prismatic) {
+            here.position += angle * R.z;
+        } else {
+            const double c = std::cos(angle), s = std::sin(angle);
+            here.rotation = {c * R.x + s * R.y, c * R.y - s * R.x, R.z};
+        }
+        at[j] = here;
+    }
+}
+
+// The Jacobian (6, n) of a frame at a point that the last body carries: linear over angular velocity in world axes.
+inline void frame_jacobian(const Links& links, const Placement* at, const Vec3<double>& point, double* J) {
+    const int n = links.dof;
+    std::fill(J, J + 6 * n, 0.0);
+    for (int j = 0; j < links.size(); ++j) {
+        const Body& link = links.bodies[j];
+        const Vec3<double>& axis = at[j].rotation.z;
+        const Motion<double> gives =
+            link.prismatic ? Motion<double>{axis, {}} : Motion<double>{cross(axis, point - at[j].position), axis};
+        double* column = J + link.coordinate;
+        column[0] += link.ratio * gives.linear.x;
+        column[n] += link.ratio * gives.linear.y;
+        column[2 * n] += link.ratio * gives.linear.z;
+        column[3 * n] += link.ratio * gives.angular.x;
+        column[4 * n] += link.ratio * gives.angular.y;
+        column[5 * n] += link.ratio * gives.angular.z;
+    }
+}
+
+struct Quaternion {
+    double w = 1.0;
+    Vec3<double> vector{};
+};
+
+// A multiple of the quaternion of a rotation, w not negative. From the largest of its entries, so that none is a
+// difference of what cancels (Shepperd, "Quaternion from rotation matrix", 1978).
+inline Quaternion quaternion(const Mat3<double>& R) {
+    const auto& [x, y, z] = R;
+    const double trace = x.x + y.y + z.z;
+    Quaternion out;
+    if (trace >= std::max({x.x, y.y, z.z})) {
+        return {1.0 + trace, {y.z - z.y, z.x - x.z, x.y - y.x}};
+    }
+    if (x.x >= y.y && x.x >= z.z) {
+        out = {y.z - z.y, {1.0 + x.x - y.y - z.z, x.y + y.x, x.z + z.x}};
+    } else if (y.y >= z.z) {
+        out = {z.x - x.z, {x.y + y.x, 1.0 + y.y - z.z - x.x, y.z + z.y}};
+    } else {
+        out = {x.y - y.x, {x.z + z.x, y.z + z.y, 1.0 + z.z - x.x - y.y}};
+    }
+    return out.w < 0.0 ? Quaternion{-out.w, -1.0 * out.vector} : out;
+}
+
+// The rotation vector of E, of length a in [0, pi].
+inline Vec3<double> logarithm(const Mat3<double>& E) {
+    const Quaternion z = quaternion(E);
+    const double sine = std::sqrt(dot(z.vector, z.vector));
+    return (sine > 0.0 ? 2.0 * std::atan2(sine, z.w) / sine : 0.0) * z.vector;
+}
+
+// The D with dr = D w dt for the logarithm r of a rotation that turns with w in its own axes,
+//     D = 1 + [r]/2 + (1 - (a/2) cot(a/2)) [r]^2 / a^2,    a = |r|
+// (Chirikjian, Stochastic Models, Information Theory, and Lie Groups 2, 2011, 10.86).
+inline Mat3<double> logarithm_derivative(const Vec3<double>& r) {
+    const double square = dot(r, r), angle = std::sqrt(square), half = 0.5 * angle;
+    const double factor = angle < 1e-3 ? 1.0 / 12.0 + square / 720.0 : (1.0 - half / std::tan(half)) / square;
+    // [r]^2 = r r' - a^2
+    const double diagonal = 1.0 - factor * square;
+    const auto column = [&](const Vec3<double>& unit, double along) {
+        return (factor * along) * r + diagonal * unit + 0.5 * cross(r, unit);
+    };
+    return {column({1.0, 0.0, 0.0}, r.x), column({0.0, 1.0, 0.0}, r.y), column({0.0, 0.0, 1.0}, r.z)};
+}
+
+}  // namespace varpin
