@@ -210,7 +210,8 @@ def simulate_ensemble(
         workers: Threads; as many as there are cores if left out.
         executor: Any ``concurrent.futures.Executor`` instead of threads: a ``ProcessPoolExecutor``, Dask's
             ``client.get_executor()``, an ``mpi4py.futures.MPIPoolExecutor``. It stays open. The work of a worker that
-            is lost is done again.
+            is lost is done again. Chunks of paths that wait, run or have come back before their turn are four for each
+            worker at most, and no more than 2 GiB of results, but two at least.
         progress: Called now and then with (paths done, P).
 
     Raises:
@@ -263,7 +264,7 @@ def _parts(pool: Executor, sums: _Sums, q0: Floats, v0: Floats) -> Generator[Par
     tasks = sums.tasks(q0, v0)
     if sums.estimated:
         yield from in_order(pool, simulate_paths, itertools.islice(tasks, 1))
-    yield from in_order(pool, simulate_paths, tasks)
+    yield from in_order(pool, simulate_paths, tasks, result_bytes=sums.part_bytes())
 
 
 def _require_memory(scene: Scene, steps: int, paths: int, *, store: bool) -> None:
@@ -610,6 +611,20 @@ class _Sums:
                 grid=None if self.histogram is None else self.histogram.grid,
             )
 
+    def part_bytes(self) -> int:
+        """What comes of a chunk [bytes], its arrays alone."""
+        nodes, size = self.shared.steps + 1, 2 * self.shared.scene.robot.dof
+        _, paths = next(chunks(self.shared.steps, self.paths))
+        numbers = nodes * (size**2 + size + 3) + paths
+        if self.store:
+            numbers += paths * (nodes * (3 * size // 2 + 1) + self.shared.steps * self.shared.scene.controls)
+        if self.values is not None:
+            numbers += paths * nodes * size
+        if self.histogram is not None:
+            bins = self.histogram.grid[1] + 2
+            numbers += nodes * size * (2 + math.ceil(bins / 4))
+        return 8 * numbers
+
     def add(self, part: Part) -> None:
         """The next chunk."""
         here = slice(part.first, part.first + part.paths)
@@ -756,7 +771,8 @@ def warm_up(shared: Shared, q0: Floats, v0: Floats) -> None:
     """Compile here what many workers would else compile at the same time, each for itself."""
     if shared.steps:
         few = rows(shared.commands, 0, 1)
-        motions = Motions(shared.scene, shared.integrator, q0, v0, shared.dt)
+        # Copies, as tasks have: to numba an array that must not be written to is another type.
+        motions = Motions(shared.scene, shared.integrator, q0.copy(), v0.copy(), shared.dt)
         motions.under(few, increments=np.zeros((few.hold, shared.scene.processes)))
 
 
