@@ -116,7 +116,9 @@ def test_workers_compile_nothing_that_was_not_compiled_before(monkeypatch):
     assert kinds == {(True, True, True, True)}
 
 
-def test_meshes_stay_at_home():
+@pytest.fixture
+def meshed():
+    """A robot of two joints, with a mesh of megabytes that came along in memory."""
     import coal  # noqa: PLC0415
     import pinocchio as pin  # noqa: PLC0415
 
@@ -126,10 +128,14 @@ def test_meshes_stay_at_home():
     mesh.addVertices(np.random.default_rng(0).normal(size=(60_000, 3)))
     mesh.endModel()
     visuals.addGeometryObject(pin.GeometryObject("mesh", 1, pin.SE3.Identity(), mesh))
-    robot = vp.load_robot(pin.RobotWrapper(vp.planar_chain(2).model.copy(), visual_model=visuals))
-    scene = vp.Scene(robot, noise=vp.AdditiveNoise(0.1))
-    shipping = Shipping()
+    return vp.load_robot(pin.RobotWrapper(vp.planar_chain(2).model.copy(), visual_model=visuals))
+
+
+def test_meshes_stay_at_home(meshed):
+    scene, shipping = vp.Scene(meshed, noise=vp.AdditiveNoise(0.1)), Shipping()
     run(scene, executor=shipping)
+    options = {"duration": 0.02, "integrators": [vp.Midpoint()], "dts": [0.01], "repeats": 1}
+    vp.work_precision(vp.Scene(meshed), [0.5, 0.2], [0.0, 0.0], executor=shipping, **options)
     assert shipping.most < 50_000
     assert scene.robot.visuals is not None
 
