@@ -26,7 +26,7 @@ from varpin.integrators import Gauss, Integrator
 from varpin.lagrangian import lagrangian_jet
 from varpin.markup import facts, listed
 from varpin.policy import LinearPolicy, OpenLoop
-from varpin.scene import Scene, require_scene
+from varpin.scene import Scene, closest_controls, require_scene
 from varpin.simulation import simulate
 from varpin.trajectory import Trajectory, require_motion
 
@@ -253,8 +253,7 @@ class OptimalControlProblem(Frozen):
 
     def holding_controls(self) -> Floats:
         """The constant control (m,) that comes closest to holding the robot at q0 at rest, within its limits."""
-        force = lagrangian_jet(self.scene, self.q0, np.zeros_like(self.q0)).Lq
-        u = np.linalg.lstsq(self.scene.actuation, -force, rcond=None)[0]
+        u = closest_controls(self.scene, self.scene.holding_torque(self.q0))
         return np.asarray(np.clip(u, *self.control_limits), dtype=np.float64)
 
     def holding_policy(self) -> LinearPolicy:
@@ -349,8 +348,8 @@ class OptimalControlProblem(Frozen):
         return self.terminal.expand(trajectory.q[-1:], trajectory.v[-1:], np.zeros((1, self.scene.controls)))
 
 
-def default_integrator() -> Integrator:
-    """What plans are made with where nothing is said.
+def default_integrator() -> Gauss:
+    """What plans are made with where nothing is said, in Python and in scene files.
 
     Two stages are of the cost's order. Light joints of an arm with friction need more: their velocities settle within a
     fraction of a step. Four stages follow that where friction is up to ten times as fast as the step, for a third more
