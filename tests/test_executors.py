@@ -185,6 +185,13 @@ def test_monte_carlo_tells_of_what_its_paths_do(caplog):
     with caplog.at_level(logging.WARNING, "varpin.sddp.monte_carlo"):
         found = plan.monte_carlo(60, 0)
     assert any("coarse" in warning for warning in found.warnings)
+
+    def interrupt(done, paths):
+        raise KeyboardInterrupt
+
+    with pytest.raises(vp.MonteCarloInterrupted) as caught:
+        plan.monte_carlo(600, 0, progress=interrupt)
+    assert any("coarse" in warning for warning in caught.value.result.warnings)
     for warning in found.warnings:
         assert f"warning: {warning}" in str(found)
     assert f"{len(found.warnings)} warning" in repr(found)
