@@ -72,18 +72,27 @@ class UnsupportedJoint(RobotError):
 
 
 class SingularMassMatrix(RobotError):
-    """The mass matrix is not positive definite: a moving part has no inertia.
+    """The mass matrix is not positive definite: a moving part has no inertia, or a negative one.
 
     Attributes:
-        joints: The joints whose motion carries no inertia.
+        joints: The joints whose motion carries no inertia, or a negative one.
+        negative: Which of the two.
     """
 
-    def __init__(self, joints: Iterable[str], q: object) -> None:
+    def __init__(self, joints: Iterable[str], q: object, *, negative: bool = False) -> None:
         self.joints = tuple(joints)
-        super().__init__(
-            f"the mass matrix is singular at q = {q}: motion of {', '.join(map(repr, self.joints))} carries no "
-            "inertia; give the links it moves mass and inertia, add armature to the joint, or lock it"
-        )
+        self.negative = negative
+        moving = f"motion of {', '.join(map(repr, self.joints))} carries"
+        if negative:
+            super().__init__(
+                f"the mass matrix is not positive definite at q = {q}: {moving} negative inertia; correct the masses "
+                "and inertias of the links it moves, add armature to the joint, or lock it"
+            )
+        else:
+            super().__init__(
+                f"the mass matrix is singular at q = {q}: {moving} no inertia; give the links it moves mass and "
+                "inertia, add armature to the joint, or lock it"
+            )
 
 
 class InputError(VarpinError, ValueError):

@@ -110,8 +110,6 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
         center[body] = turn[joint].T @ link.lever
         about_center = turn[joint].T @ link.inertia @ turn[joint]
         inertia[body] = about_center[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]
-        if mass[body] < 0.0:
-            raise RobotError(f"the link moved by joint {model.names[joint]!r} has mass {mass[body]} < 0 [kg]")
         if joint in tied:
             tie = tied[joint]
             coordinate[body], ratio[body], offset[body] = index[tie.leader], tie.ratio, tie.offset
