@@ -76,8 +76,8 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
 
     Raises:
         UnsupportedJoint: A joint has no single axis.
-        RobotError: A link's mass, centre or inertia is NaN or infinite, its mass is negative, or a joint's placement
-            is no rotation and translation.
+        RobotError: A link's mass, centre or inertia is NaN or infinite, or a joint's placement is no rotation and
+            translation.
     """
     bodies = model.njoints - 1
     tied = {tie.follower: tie for tie in ties}
