@@ -14,7 +14,7 @@ from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from varpin.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
 from varpin.errors import InputError, VarpinError
@@ -176,7 +176,7 @@ def simulate_ensemble(
     steps: int,
     paths: int,
     rng: np.random.Generator | int,
-    controls: ArrayLike | LinearPolicy | OpenLoop | None = None,
+    controls: JointValues | LinearPolicy | OpenLoop | None = None,
     integrator: Integrator | None = None,
     store: bool = True,
     quantiles: Sequence[float] = (0.05, 0.5, 0.95),
@@ -197,8 +197,8 @@ def simulate_ensemble(
         steps: N.
         paths: P.
         rng: Seed or generator.
-        controls: None, (N, m), (m,), :class:`OpenLoop`, or a :class:`LinearPolicy` that each path evaluates at its own
-            state.
+        controls: None, (N, m), (m,), by joint name, :class:`OpenLoop`, or a :class:`LinearPolicy` that each path
+            evaluates at its own state.
 
     Other Args:
         integrator: ``Midpoint()`` if left out.

@@ -37,7 +37,7 @@ class RobotNotFound(RobotError):
 
 
 class UnknownJoint(RobotError):
-    """A joint name that the robot does not have.
+    """A joint name that the robot does not have, or that no control has.
 
     Attributes:
         joint: The name given.
@@ -45,11 +45,11 @@ class UnknownJoint(RobotError):
         matches: Those that come close.
     """
 
-    def __init__(self, joint: str, joints: Iterable[str], where: str) -> None:
+    def __init__(self, joint: str, joints: Iterable[str], where: str, lack: str = "the robot has no joint") -> None:
         self.joint = joint
         self.joints = tuple(joints)
         self.matches, hint = _meant(joint, self.joints)
-        super().__init__(f"{where}: the robot has no joint {joint!r}; {hint}joints: {', '.join(self.joints)}")
+        super().__init__(f"{where}: {lack} {joint!r}; {hint}joints: {', '.join(self.joints)}")
 
 
 class UnsupportedJoint(RobotError):

@@ -136,6 +136,15 @@ class Scene(Frozen):
         return int(self.actuation.shape[1])
 
     @property
+    def control_joints(self) -> tuple[str, ...] | None:
+        """The joint whose force each of the m controls is; None where one is anything else, a share of several say."""
+        joints = np.argmax(self.actuation, axis=0)
+        alone = len(set(joints.tolist())) == self.controls
+        if not alone or not np.array_equal(self.actuation, np.eye(self.robot.dof)[:, joints]):
+            return None
+        return tuple(self.robot.joint_names[j] for j in joints)
+
+    @property
     def processes(self) -> int:
         """k, the number of Wiener processes."""
         return self.noise.processes

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from varpin.checks import JointValues, count, positive, writable
 from varpin.ensemble import without_geometry
@@ -176,7 +176,7 @@ def work_precision(
     v0: JointValues,
     *,
     duration: float,
-    controls: ArrayLike | None = None,
+    controls: JointValues | None = None,
     integrators: Sequence[Integrator] | None = None,
     dts: Sequence[float] | None = None,
     reference: Reference | None = None,
@@ -195,7 +195,7 @@ def work_precision(
         q0: Initial configuration, (n,) or by joint name [rad or m].
         v0: Initial velocity, (n,) or by joint name [rad/s or m/s].
         duration: Of the motion [s].
-        controls: None for none, one row (m,), or rows (R, m) that are held over duration / R each.
+        controls: None for none, one row (m,), by joint name too, or rows (R, m) that are held over duration / R each.
         integrators: varpin's own fixed-step ones if left out.
         dts: Time steps [s], each rounded so that the controls' intervals hold whole numbers of steps.
 
