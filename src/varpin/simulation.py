@@ -333,6 +333,7 @@ def simulate(
         chunk = max(1, _CHUNK // (n + n**3 // 100))
         # One step at a time where noise calls Python functions, so that what came before one that fails is recorded.
         stepwise = scene.noise.diffusion is None
+        interrupted = False
         try:
             while record.steps < steps:
                 done = record.steps
@@ -364,8 +365,6 @@ def simulate(
                     progress(record.steps, steps)
         except KeyboardInterrupt:
             interrupted = True
-        else:
-            interrupted = False
         try:
             trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
         except KeyboardInterrupt:
