@@ -162,12 +162,84 @@ def test_unknown_names_in_noise_and_costs(make):
         make({"elbow": 1.0})
 
 
-def test_weights_by_name_are_not_negative_and_not_of_controls():
+def test_controls_that_are_torques_of_joints_take_names():
+    """Whether all joints are driven or some, in another order."""
+    push, row = {"elbow_joint": 3.0, "wrist_1_joint": -1.0}, np.array([0, 0, 3.0, -1.0, 0, 0])
+    driven = ["wrist_1_joint", "elbow_joint", "wrist_3_joint"]
+    for actuation, controls in ((None, row), (driven, np.array([-1.0, 3.0, 0.0]))):
+        scene = vp.Scene(UR5, actuation=actuation, noise=vp.AdditiveNoise(0.1))
+        assert scene.control_joints == (NAMES if actuation is None else tuple(driven))
+        options = {"dt": 2e-3, "steps": 10}
+        by_row = vp.simulate(scene, ROW, np.zeros(6), controls=controls, **options)
+        assert same(vp.simulate(scene, ROW, np.zeros(6), controls=push, **options), by_row)
+        assert np.array_equal(by_row.u[4], controls)
+        (one,) = vp.simulate_ensemble(scene, ROW, np.zeros(6), controls=push, paths=1, rng=0, **options).u
+        assert np.array_equal(one, by_row.u)
+        weight, by_name = np.abs(controls), {joint: abs(value) for joint, value in push.items()}
+        for named, plain in (
+            (vp.ControlCost(by_name, push), vp.ControlCost(weight, controls)),
+            (
+                vp.ControlRateCost(by_name, push) + vp.ControlCost(),
+                vp.ControlRateCost(weight, controls) + vp.ControlCost(),
+            ),
+        ):
+            values = []
+            for cost in (named, plain):
+                problem = vp.OptimalControlProblem(scene, cost, ROW, 0.5 * ROW, **options)
+                values.append(problem.cost_of(problem.simulate(np.linspace(0, 1, scene.controls))))
+            assert values[0] == values[1] > 0.0
+        limits = ({"elbow_joint": -2.0}, {"elbow_joint": 2.5, "wrist_1_joint": np.inf})
+        problem = vp.OptimalControlProblem(scene, vp.ControlCost(), ROW, ROW, control_limits=limits, **options)
+        at = scene.control_joints.index("elbow_joint")
+        assert problem.control_limits[:, at].tolist() == [-2.0, 2.5]
+        assert np.isinf(np.delete(problem.control_limits, at, axis=1)).all()
+        start = vp.solve(problem, push, max_iterations=0, check=False)
+        np.testing.assert_array_equal(start.controls[3], np.clip(controls, *problem.control_limits))
+    quiet = vp.Scene(UR5)
+    record = vp.work_precision(
+        quiet, ROW, ROW, controls=push, duration=0.02, integrators=[vp.Midpoint()], dts=[0.01], repeats=1
+    )
+    same_record = vp.work_precision(
+        quiet, ROW, ROW, controls=row, duration=0.02, integrators=[vp.Midpoint()], dts=[0.01], repeats=1
+    )
+    assert record.runs[0].error == same_record.runs[0].error
+
+
+USES = [
+    lambda scene, value: vp.simulate(scene, ROW, ROW, controls=value, dt=1e-3, steps=1),
+    lambda scene, value: vp.OptimalControlProblem(scene, vp.ControlCost(value), ROW, ROW, dt=1e-3, steps=1),
+    lambda scene, value: vp.OptimalControlProblem(scene, vp.ControlCost(1.0, value), ROW, ROW, dt=1e-3, steps=1),
+    lambda scene, value: vp.OptimalControlProblem(
+        scene, vp.ControlCost() + vp.ControlRateCost(value), ROW, ROW, dt=1e-3, steps=1
+    ),
+    lambda scene, value: vp.OptimalControlProblem(
+        scene, vp.ControlCost(), ROW, ROW, control_limits=(-np.inf, value), dt=1e-3, steps=1
+    ),
+]
+
+
+@pytest.mark.parametrize("use", USES)
+def test_names_of_controls_that_have_none_are_refused(use):
+    shared = np.eye(6)
+    shared[1, 2] = 0.5
+    for actuation in (shared, 2.0 * np.eye(6), np.ones((6, 1))):
+        scene = vp.Scene(UR5, actuation=actuation)
+        assert scene.control_joints is None
+        with pytest.raises(vp.InputError, match="by joint name, but not every control is the force of one joint"):
+            use(scene, {"elbow_joint": 1.0})
+    with pytest.raises(vp.UnknownJoint, match="no control is the force of a joint 'elbow_joint'"):
+        use(vp.Scene(UR5, actuation=["wrist_1_joint"]), {"elbow_joint": 1.0})
+    with pytest.raises(vp.InputError, match=r"\['elbow_joint'\] must be a number, got 'a'"):
+        use(vp.Scene(UR5), {"elbow_joint": "a"})
+
+
+def test_weights_by_name_are_not_negative():
     cost = vp.VelocityCost({"elbow_joint": -1.0}) + vp.ControlCost()
     with pytest.raises(vp.InputError, match="VelocityCost weight must be positive semidefinite"):
         vp.OptimalControlProblem(vp.Scene(UR5), cost, ROW, ROW, dt=1e-2, steps=1)
-    with pytest.raises(vp.InputError, match="ControlCost weight must be an array of real numbers"):
-        vp.ControlCost({"elbow_joint": 1.0})
+    cost = vp.ControlCost({"elbow_joint": -1.0})
+    with pytest.raises(vp.InputError, match="ControlCost weight must be positive semidefinite"):
+        vp.OptimalControlProblem(vp.Scene(UR5), cost, ROW, ROW, dt=1e-2, steps=1)
 
 
 def test_a_torque_limit_by_name_leaves_the_others_their_own():

@@ -365,6 +365,52 @@ def test_a_coarse_step_is_told_of(caplog):
     assert run(vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(1e-2)), dt=1e-3).warnings == ()
 
 
+COARSE = {"dt": 0.05, "steps": 40, "controls": None, "integrator": vp.ExplicitEuler(), "store": False}
+
+
+@pytest.mark.parametrize("paths", [5, 10])
+def test_every_path_of_few_is_looked_at(paths):
+    """One falls among others that hang; of ten it is neither the first nor the fastest nor that of most energy."""
+    v0, q0 = np.zeros((10, 2)), np.zeros((10, 2))
+    q0[:, 0] = -np.pi / 2
+    q0[4, 0], v0[7] = 0.0, [40.0, -40.0]
+    scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(1e-9))
+    end = run(scene, **COARSE | {"paths": paths, "q0": q0[:paths], "v0": v0[:paths]})
+    assert any(warning.startswith("path 4: ") for warning in end.warnings)
+
+
+def test_an_interrupted_ensemble_carries_warnings(monkeypatch):
+    """Those of the same ensemble of as many paths; without a look after a second Ctrl-C."""
+
+    def interrupt(done, total):
+        raise KeyboardInterrupt
+
+    def stop(*given):
+        raise KeyboardInterrupt
+
+    scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(1e-2))
+    with pytest.raises(vp.EnsembleInterrupted) as caught:
+        run(scene, **COARSE | {"paths": 300}, progress=interrupt)
+    part = caught.value.ensemble
+    assert part.warnings == run(scene, **COARSE | {"paths": int(part.statistics.count[0])}).warnings != ()
+    monkeypatch.setattr(varpin.ensemble, "_look", stop)
+    with pytest.raises(vp.EnsembleInterrupted) as caught:
+        run(scene, **COARSE | {"paths": 300}, progress=interrupt)
+    assert caught.value.ensemble.warnings == ()
+
+
+def test_the_failures_of_an_interrupted_ensemble_are_told():
+    def interrupt(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(vp.EnsembleInterrupted) as caught:
+        run(fragile_scene(), **FRAGILE | {"paths": 100, "q0": starts(100), "v0": np.zeros(3)}, progress=interrupt)
+    part = caught.value.ensemble
+    done, lost = int(part.statistics.count[0]), len(part.failures)
+    assert 0 < lost < done < 100
+    assert part.warnings[0].startswith(f"{lost} of {done} paths failed, the first at step ")
+
+
 def test_the_paths_that_stand_out_are_looked_at():
     """One of 200 starts so fast that its steps are taken in parts."""
     v0 = np.zeros((200, 2))

@@ -8,6 +8,7 @@ import signal
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,13 +35,14 @@ class Shipping(Executor):
     """Takes tasks and gives results as bytes, in this process, and counts them."""
 
     def __init__(self):
-        self.sent, self.returned, self.most = 0, 0, 0
+        self.sent, self.returned, self.most, self.answers = 0, 0, 0, []
 
     def submit(self, fn, /, *args, **kwargs):
         task = pickle.dumps((fn, args, kwargs))
         fn, args, kwargs = pickle.loads(task)
         answer = pickle.dumps(fn(*args, **kwargs))
         self.sent, self.returned, self.most = self.sent + 1, self.returned + len(answer), max(self.most, len(task))
+        self.answers.append(len(answer))
         done = Future()
         done.set_result(pickle.loads(answer))
         return done
@@ -101,7 +103,22 @@ def test_nothing_comes_back_that_was_not_asked_for():
     assert whole.returned > 8 * paths * steps * 9
 
 
-def test_meshes_stay_at_home():
+def test_workers_compile_nothing_that_was_not_compiled_before(monkeypatch):
+    """What is warmed up takes arrays of the kinds that workers meet; else each of them compiles for itself."""
+    kinds, start = set(), vp.Midpoint.start
+
+    def listening(self, scene, q0, v0):
+        kinds.add((q0.flags.writeable, v0.flags.writeable, q0.flags.c_contiguous, v0.flags.c_contiguous))
+        return start(self, scene, q0, v0)
+
+    monkeypatch.setattr(vp.Midpoint, "start", listening)
+    run(executor=Shipping())
+    assert kinds == {(True, True, True, True)}
+
+
+@pytest.fixture
+def meshed():
+    """A robot of two joints, with a mesh of megabytes that came along in memory."""
     import coal  # noqa: PLC0415
     import pinocchio as pin  # noqa: PLC0415
 
@@ -111,10 +128,14 @@ def test_meshes_stay_at_home():
     mesh.addVertices(np.random.default_rng(0).normal(size=(60_000, 3)))
     mesh.endModel()
     visuals.addGeometryObject(pin.GeometryObject("mesh", 1, pin.SE3.Identity(), mesh))
-    robot = vp.load_robot(pin.RobotWrapper(vp.planar_chain(2).model.copy(), visual_model=visuals))
-    scene = vp.Scene(robot, noise=vp.AdditiveNoise(0.1))
-    shipping = Shipping()
+    return vp.load_robot(pin.RobotWrapper(vp.planar_chain(2).model.copy(), visual_model=visuals))
+
+
+def test_meshes_stay_at_home(meshed):
+    scene, shipping = vp.Scene(meshed, noise=vp.AdditiveNoise(0.1)), Shipping()
     run(scene, executor=shipping)
+    options = {"duration": 0.02, "integrators": [vp.Midpoint()], "dts": [0.01], "repeats": 1}
+    vp.work_precision(vp.Scene(meshed), [0.5, 0.2], [0.0, 0.0], executor=shipping, **options)
     assert shipping.most < 50_000
     assert scene.robot.visuals is not None
 
@@ -164,6 +185,13 @@ def test_monte_carlo_tells_of_what_its_paths_do(caplog):
     with caplog.at_level(logging.WARNING, "varpin.sddp.monte_carlo"):
         found = plan.monte_carlo(60, 0)
     assert any("coarse" in warning for warning in found.warnings)
+
+    def interrupt(done, paths):
+        raise KeyboardInterrupt
+
+    with pytest.raises(vp.MonteCarloInterrupted) as caught:
+        plan.monte_carlo(600, 0, progress=interrupt)
+    assert any("coarse" in warning for warning in caught.value.result.warnings)
     for warning in found.warnings:
         assert f"warning: {warning}" in str(found)
     assert f"{len(found.warnings)} warning" in repr(found)
@@ -202,11 +230,93 @@ def once_deadly(task):
     return number**2
 
 
+class Silent(Executor):
+    """Does tasks when they are asked for, and says nothing of its workers."""
+
+    def __init__(self):
+        self.begun = 0
+
+    def submit(self, fn, /, *args, **kwargs):
+        self.begun += 1
+        done = Future()
+        done.set_result(fn(*args, **kwargs))
+        return done
+
+
+class Cluster(Silent):
+    """Tells of its workers as Dask's executor does, whose client knows the threads of each."""
+
+    def __init__(self, **threads):
+        super().__init__()
+        self._client = SimpleNamespace(ncores=lambda: threads)
+
+
+@pytest.mark.parametrize(
+    ("executor", "result_bytes", "ahead"),
+    [
+        (Silent(), 0, 1024),
+        (Silent(), 2**26, 32),
+        (Silent(), 2**40, 2),
+        (Cluster(a=2, b=3), 0, 20),
+        (Cluster(a=2, b=3), 2**28, 8),
+        (Cluster(), 2**26, 32),
+    ],
+)
+def test_tasks_ahead_are_bounded_by_workers_and_by_bytes(executor, result_bytes, ahead):
+    results = in_order(executor, abs, range(5000), result_bytes=result_bytes)
+    assert next(results) == 0
+    assert executor.begun == ahead
+    results.close()
+
+
+@pytest.mark.parametrize("options", [{"store": True}, {"quantiles": ()}, {}, {"exact": 1000}])
+def test_what_a_chunk_takes_is_known_beforehand(options, monkeypatch):
+    """The bytes that come back, against those that bound how many chunks are ahead."""
+    told, real = [], varpin.ensemble.in_order
+
+    def listening(*args, result_bytes=0):
+        told.append(result_bytes)
+        return real(*args, result_bytes=result_bytes)
+
+    monkeypatch.setattr(varpin.ensemble, "in_order", listening)
+    monkeypatch.setattr(varpin.ensemble, "_EXACT", options.pop("exact", 2**25))
+    shipping = Shipping()
+    run(paths=1024, executor=shipping, **{"store": False} | options)
+    # Of a chunk that is not the first, from which bins are made where they are.
+    assert shipping.answers[1] == pytest.approx(max(told), abs=3000)
+
+
 def test_a_lost_worker_is_made_up_for(tmp_path, caplog):
     tasks = [(number, str(tmp_path / "marker")) for number in range(12)]
     with ProcessPoolExecutor(2) as pool, caplog.at_level(logging.WARNING, "varpin.executors"):
         assert list(in_order(pool, once_deadly, tasks)) == [number**2 for number in range(12)]
     assert "a worker was lost" in caplog.text
+
+
+def prepared(marker):
+    os.environ["VARPIN_TEST_MARKER"] = marker
+
+
+def deadly_once(number):
+    """The marker that the initializer left; ends its process the first time that it is called with 3."""
+    marker = os.environ["VARPIN_TEST_MARKER"]
+    once_deadly((number, marker))
+    return marker, os.getpid()
+
+
+def test_a_pool_made_anew_is_like_the_one_that_broke_and_told_of_once(tmp_path, caplog):
+    marker = str(tmp_path / "marker")
+    with (
+        ProcessPoolExecutor(
+            2, multiprocessing.get_context("spawn"), initializer=prepared, initargs=(marker,), max_tasks_per_child=1
+        ) as pool,
+        caplog.at_level(logging.WARNING, "varpin.executors"),
+    ):
+        results = list(in_order(pool, deadly_once, range(12)))
+    assert Path(marker).exists()
+    assert {left for left, _ in results} == {marker}
+    assert len({process for _, process in results}) == 12
+    assert [record.getMessage().startswith("a worker was lost") for record in caplog.records] == [True]
 
 
 def killing(task):

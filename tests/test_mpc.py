@@ -7,6 +7,7 @@ import pytest
 from mechanisms import slider
 
 import varpin as vp
+import varpin.mpc
 from varpin.mpc import _decision
 
 
@@ -176,6 +177,32 @@ def test_a_plant_that_fails_keeps_the_motion():
     with pytest.raises(vp.StepFailure) as caught:
         mpc.run(plant, duration=1.0)
     assert caught.value.trajectory.dt == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("whose", ["simulate", "solve"])
+def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whose, monkeypatch):
+    """In the third tick's simulation, or in the search of the fourth."""
+    mpc, calls, real = vp.Mpc(tracking(), iterations=1), [], getattr(varpin.mpc, whose)
+    harsh = vp.Scene(mpc.problem.scene.robot, gravity=(0, 0, -1e6))
+
+    def failing(*given, **options):
+        calls.append(given)
+        if len(calls) < (3 if whose == "simulate" else 4):
+            return real(*given, **options)
+        return vp.simulate(harsh, np.zeros(3), np.zeros(3), dt=0.1, steps=5, integrator=vp.Midpoint(max_halvings=0))
+
+    whole = mpc.run(duration=0.1).motion
+    monkeypatch.setattr(varpin.mpc, whose, failing)
+    with pytest.raises(vp.StepFailure) as caught:
+        mpc.run(duration=0.1)
+    part = caught.value.trajectory
+    ticks = 2 if whose == "simulate" else 3
+    np.testing.assert_array_equal(part.q[: 10 * ticks + 1], whole.q[: 10 * ticks + 1])
+    assert (caught.value.step, caught.value.time) == (part.steps, pytest.approx(0.02 * ticks))
+    if whose == "solve":
+        assert part.steps == 10 * ticks
+        assert "no plan can be made from here" in str(caught.value)
+        assert isinstance(caught.value.__cause__, vp.StepFailure)
 
 
 def test_mistakes_are_named():

@@ -212,6 +212,16 @@ def test_an_ensemble_goes_round():
         assert repr(way(end)) == repr(end)
 
 
+def test_a_report_on_a_robot_goes_round():
+    report = vp.inspect_robot("ur5", lock={"elbow_joint": 0.3})
+    for way in WAYS:
+        back = way(report)
+        assert same_arrays(report, back) > 20
+        assert str(back) == str(report)
+        assert back.joints[0].name == report.joints[0].name
+        assert dict(back.locked) == {"elbow_joint": 0.3}
+
+
 @pytest.mark.parametrize("name", scenes())
 def test_problems_of_scene_files_go_round(name):
     """Their references are functions of time."""

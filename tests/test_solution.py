@@ -227,7 +227,7 @@ def test_monte_carlo_interrupted_holds_the_paths_done():
     assert len(seen) == 1
     done = seen[0][0]
     assert done < 600
-    assert dataclasses.replace(sol.monte_carlo(done, 5, workers=2), warnings=()) == caught.value.result
+    assert sol.monte_carlo(done, 5, workers=2) == caught.value.result
     own = vp.CustomNoise(lambda q, v, u: 0.1 * np.eye(2), 2)
 
     def stop_at_once(done, paths):

@@ -256,6 +256,42 @@ def test_interrupted_measurement_goes_on_where_it_stopped(tmp_path, monkeypatch,
     assert set(more.runs) > set(whole.runs)
 
 
+def test_interruption_of_the_reference_loses_nothing(tmp_path, monkeypatch):
+    def stop(*given):
+        raise KeyboardInterrupt
+
+    path = tmp_path / "a.npz"
+    options = {"duration": 1.0, "repeats": 1, "save": path}
+    with monkeypatch.context() as patch:
+        patch.setattr(precision, "_Exact", stop)
+        none = vp.work_precision(spring(), [0.7], [0.3], integrators=[vp.Midpoint()], dts=[0.1], **options)
+    assert (none.runs, none.missing, path.exists()) == ((), 1, False)
+    assert math.isnan(none.reference_error)
+    assert "1 missing" in repr(none)
+    first = vp.work_precision(spring(), [0.7], [0.3], integrators=[vp.Midpoint()], dts=[0.1, 0.05], **options)
+    monkeypatch.setattr(precision, "_Exact", stop)
+    both = [vp.RungeKutta4(), vp.Midpoint()]
+    part = vp.work_precision(spring(), [0.7], [0.3], integrators=both, dts=[0.05], **options)
+    assert (set(part.runs), part.missing) == (set(first.runs), 1)
+    assert part.reference_error == first.reference_error
+    assert vp.WorkPrecision.load(path).runs == first.runs
+
+
+def test_interruption_keeps_saved_runs_that_come_later(tmp_path):
+    """Of a measurement that begins with other integrators than the saved one."""
+    path = tmp_path / "a.npz"
+    options = {"duration": 1.0, "repeats": 1, "dts": [0.1], "save": path}
+    first = vp.work_precision(spring(), [0.7], [0.3], integrators=[vp.Midpoint()], **options)
+
+    def interrupt(done, runs):
+        raise KeyboardInterrupt
+
+    both = [vp.RungeKutta4(), vp.Midpoint()]
+    part = vp.work_precision(spring(), [0.7], [0.3], integrators=both, progress=interrupt, **options)
+    assert (len(part.runs), part.missing) == (2, 0)
+    assert part.runs[1] == first.runs[0] == vp.WorkPrecision.load(path).runs[1]
+
+
 def test_saved_record_takes_other_steps(tmp_path, monkeypatch):
     """What is there stays as it is; what is new is what it would have been, at the times that both share."""
     measured, path = count_runs(monkeypatch), tmp_path / "a.npz"

@@ -114,6 +114,27 @@ ODD = {
         lambda text: text.replace('<mass value="1.3"/>', "", 1),
         "link 'l1': its <inertial> has no <mass>: it is massless",
     ),
+    "a mass that is none": (
+        lambda text: text.replace('"1.3"', '"1.3 kg"', 1),
+        "link 'l1': its mass is '1.3 kg', no finite number: it is massless, as Pinocchio reads it",
+    ),
+    "an infinite mass": (lambda text: text.replace('"1.3"', '"inf"', 1), "link 'l1': its mass is 'inf', no finite"),
+    "a negative mass": (
+        lambda text: '"-0.1"'.join(text.rsplit('"1.3"', 1)),
+        "link 'tool' has mass -0.1 < 0 [kg]",
+    ),
+    "a moment that is none": (
+        lambda text: text.replace('ixx="0.02"', 'ixx="nan"', 1),
+        "link 'l1': its <inertial> has ixx 'nan', no finite number: it is a point mass, as Pinocchio reads it",
+    ),
+    "a centre of two numbers": (
+        lambda text: text.replace('xyz="0.02 0.05 0.1"', 'xyz="0.02 0.05"', 1),
+        "link 'l1': the xyz of its <inertial> is '0.02 0.05', no three finite numbers: it is massless",
+    ),
+    "a turn that is none": (
+        lambda text: text.replace('rpy="0.3 0.2 0.1"', 'rpy="0 0 -inf"', 1),
+        "link 'l1': the rpy of its <inertial> is '0 0 -inf', no three finite numbers: it is massless",
+    ),
     "an empty inertial": (lambda text: text.replace(INERTIAL, "<inertial/>", 1), "link 'l1': its <inertial> has no"),
     "an ampersand": (lambda text: text.replace("</robot>", "<a>b & c</a></robot>"), "not well-formed XML"),
     "something behind it": (lambda text: text + "<more/>", "junk after document element"),
@@ -140,6 +161,10 @@ class TestOdd:
         report = vp.inspect_robot(path)
         assert len(report.joints) == 2
         assert not words or any(words in said for said in (*report.warnings, caplog.text))
+
+    def test_masses_that_cancel_are_no_masses_that_are_lost(self, tmp_path, two):
+        path = written(tmp_path, two.replace('"1.3"', '"-2.6"', 1))
+        assert sum(body.mass for body in build_model(read_urdf(path)).inertias) == pytest.approx(0.0, abs=1e-15)
 
     @pytest.mark.parametrize("encoding", ["iso-8859-1", "latin-1", "cp1252", "UTF-8"])
     def test_names_in_the_encoding_that_is_declared(self, tmp_path, two, caplog, encoding):
@@ -211,6 +236,20 @@ class TestInertia:
         vp.load_robot(pin.buildModelFromUrdf(str(path)))
         for text in (record.getMessage(), "".join(vp.inspect_robot(path).warnings), caplog.text):
             assert re.search(words, text)
+
+    def test_negative_inertia_is_told_from_none(self, tmp_path):
+        """Of a joint, and of a motion of several; without a warning of NumPy's."""
+        path = arm(tmp_path, THIN.format("0.1").replace('iyy="0.1"', 'iyy="-3"'))
+        with pytest.raises(vp.SingularMassMatrix, match=r"motion of 'j1' carries negative inertia; correct") as caught:
+            vp.load_robot(path)
+        assert (caught.value.negative, caught.value.joints) == (True, ("j1",))
+        model = pin.Model()
+        for k in range(2):
+            model.addJoint(k, pin.JointModelPZ(), pin.SE3.Identity(), f"s{k}")
+        for joint_index, mass in ((1, 3.0), (2, -1.0)):
+            model.appendBodyToJoint(joint_index, pin.Inertia(mass, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+        with pytest.raises(vp.SingularMassMatrix, match=r"motion of 's1' carries negative inertia"):
+            vp.load_robot(model)
 
     def test_hidden_on_a_fixed_joint_is_told(self, tmp_path, caplog):
         # The body that the two links make has no fault.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -64,6 +64,40 @@ def joint_array(name: str, value: JointValues, joints: Sequence[str], *, uniform
         if joint not in joints:
             raise UnknownJoint(str(joint), joints, name)
         array[joints.index(joint)] = finite(f"{name}[{joint!r}]", number)
+    return array
+
+
+def control_array(
+    name: str,
+    value: Mapping[str, float],
+    joints: Sequence[str] | None,
+    *,
+    absent: float = 0.0,
+    read: Callable[[str, Any], float] | None = None,
+) -> Floats:
+    """``value``, by the names of the joints whose forces the m controls are, as a new float array (m,).
+
+    Args:
+        name: What it is, for the error.
+        value: Numbers by joint.
+        joints: The joint of each control; None where controls are no forces of one joint each.
+        absent: The number of joints that are not named.
+        read: Makes a float of an entry or refuses it; :func:`finite` if left out.
+
+    Raises:
+        UnknownJoint: A name that is no driven joint's.
+        InputError: Controls have no names, or an entry that ``read`` refuses.
+    """
+    if joints is None:
+        raise InputError(
+            f"{name} is given by joint name, but not every control is the force of one joint under this actuation: "
+            "give numbers in the order of the controls"
+        )
+    array = np.full(len(joints), absent)
+    for joint, number in value.items():
+        if joint not in joints:
+            raise UnknownJoint(str(joint), joints, name, "no control is the force of a joint")
+        array[joints.index(joint)] = (read or finite)(f"{name}[{joint!r}]", number)
     return array
 
 

@@ -8,13 +8,13 @@ import itertools
 import logging
 import math
 import os
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from varpin.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
 from varpin.errors import InputError, VarpinError
@@ -51,8 +51,8 @@ _EXACT, _BINS, _REACH = 2**25, 2**25, 0.75
 _FEWEST_BINS, _MOST_BINS = 64, 1000
 # Numbers that a part of the nodes may have whose quantiles are taken at a time.
 _SPAN = 100_000
-# Paths that are looked at once more, at most, and of how many each is one.
-_LOOKS, _LOOKED_AT = 4, 5
+# So few paths are all looked at once more.
+_ALL_LOOKED_AT = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ class Ensemble(Frozen):
         failures: Paths that stopped early; they are left out of the statistics from there on.
         warnings: What varpin says of the paths, a sentence each: dt too coarse, energy off, paths that stopped early.
             A few paths are looked at, as :func:`varpin.simulate` looks at its motion: the first, the one with the most
-            split steps, the one with the most energy and the fastest.
+            split steps, the one with the most energy and the fastest; up to ten are all looked at.
     """
 
     t: Floats
@@ -176,7 +176,7 @@ def simulate_ensemble(
     steps: int,
     paths: int,
     rng: np.random.Generator | int,
-    controls: ArrayLike | LinearPolicy | OpenLoop | None = None,
+    controls: JointValues | LinearPolicy | OpenLoop | None = None,
     integrator: Integrator | None = None,
     store: bool = True,
     quantiles: Sequence[float] = (0.05, 0.5, 0.95),
@@ -197,8 +197,8 @@ def simulate_ensemble(
         steps: N.
         paths: P.
         rng: Seed or generator.
-        controls: None, (N, m), (m,), :class:`OpenLoop`, or a :class:`LinearPolicy` that each path evaluates at its own
-            state.
+        controls: None, (N, m), (m,), by joint name, :class:`OpenLoop`, or a :class:`LinearPolicy` that each path
+            evaluates at its own state.
 
     Other Args:
         integrator: ``Midpoint()`` if left out.
@@ -210,7 +210,8 @@ def simulate_ensemble(
         workers: Threads; as many as there are cores if left out.
         executor: Any ``concurrent.futures.Executor`` instead of threads: a ``ProcessPoolExecutor``, Dask's
             ``client.get_executor()``, an ``mpi4py.futures.MPIPoolExecutor``. It stays open. The work of a worker that
-            is lost is done again.
+            is lost is done again. Chunks of paths that wait, run or have come back before their turn are four for each
+            worker at most, and no more than 2 GiB of results, but two at least.
         progress: Called now and then with (paths done, P).
 
     Raises:
@@ -247,15 +248,15 @@ def simulate_ensemble(
                         progress(sums.done, paths)
             found = looked_at(pool, shared, start[0], start[1], sums.extremes)
         except KeyboardInterrupt:
-            raise EnsembleInterrupted(sums.ensemble() if sums.done else None) from None
-    if lost := sums.failures:
-        first = min(lost, key=lambda failure: failure.step)
-        text = f"{len(lost)} of {paths} paths failed, the first at step {first.step}: {first.reason}"
-        if len(lost) == paths:
-            raise VarpinError(text)
-        found = (Finding("failed paths", f"{text}; they are left out of the statistics from there on"), *found)
+            if not sums.done:
+                raise EnsembleInterrupted(None) from None
+            seen = looked_at_here(shared, start[0][: sums.done], start[1][: sums.done], sums.extremes)
+            raise EnsembleInterrupted(sums.ensemble((*sums.lost(), *seen))) from None
+    if len(sums.failures) == paths:
+        raise VarpinError(sums.failing())
+    found = (*sums.lost(), *found)
     announce(logger, scene, dt, found)
-    return dataclasses.replace(sums.ensemble(), warnings=tuple(finding.sentence for finding in found))
+    return sums.ensemble(found)
 
 
 def _parts(pool: Executor, sums: _Sums, q0: Floats, v0: Floats) -> Generator[Part, None, None]:
@@ -263,7 +264,7 @@ def _parts(pool: Executor, sums: _Sums, q0: Floats, v0: Floats) -> Generator[Par
     tasks = sums.tasks(q0, v0)
     if sums.estimated:
         yield from in_order(pool, simulate_paths, itertools.islice(tasks, 1))
-    yield from in_order(pool, simulate_paths, tasks)
+    yield from in_order(pool, simulate_paths, tasks, result_bytes=sums.part_bytes())
 
 
 def _require_memory(scene: Scene, steps: int, paths: int, *, store: bool) -> None:
@@ -610,6 +611,20 @@ class _Sums:
                 grid=None if self.histogram is None else self.histogram.grid,
             )
 
+    def part_bytes(self) -> int:
+        """What comes of a chunk [bytes], its arrays alone."""
+        nodes, size = self.shared.steps + 1, 2 * self.shared.scene.robot.dof
+        _, paths = next(chunks(self.shared.steps, self.paths))
+        numbers = nodes * (size**2 + size + 3) + paths
+        if self.store:
+            numbers += paths * (nodes * (3 * size // 2 + 1) + self.shared.steps * self.shared.scene.controls)
+        if self.values is not None:
+            numbers += paths * nodes * size
+        if self.histogram is not None:
+            bins = self.histogram.grid[1] + 2
+            numbers += nodes * size * (2 + math.ceil(bins / 4))
+        return 8 * numbers
+
     def add(self, part: Part) -> None:
         """The next chunk."""
         here = slice(part.first, part.first + part.paths)
@@ -630,8 +645,19 @@ class _Sums:
             self.values[:, :, here] = part.values
         self.done = here.stop
 
-    def ensemble(self) -> Ensemble:
-        """Of the paths that were taken in."""
+    def lost(self) -> tuple[Finding, ...]:
+        """What is to be said of failures, if there are any."""
+        if not self.failures:
+            return ()
+        return (Finding("failed paths", f"{self.failing()}; they are left out of the statistics from there on"),)
+
+    def failing(self) -> str:
+        """How many paths failed, and the first of them."""
+        first = min(self.failures, key=lambda failure: failure.step)
+        return f"{len(self.failures)} of {self.done} paths failed, the first at step {first.step}: {first.reason}"
+
+    def ensemble(self, found: Sequence[Finding]) -> Ensemble:
+        """Of the paths that were taken in, with what is to be said of them."""
         own, n2 = self.moments, 2 * self.shared.scene.robot.dof
         assert own is not None
         there = own.count > 0
@@ -656,6 +682,7 @@ class _Sums:
             u=stored.get("u"),
             energy=stored.get("energy"),
             failures=tuple(self.failures),
+            warnings=tuple(finding.sentence for finding in found),
         )
 
     def _quantiles(self) -> tuple[Floats, Floats]:
@@ -756,23 +783,44 @@ def warm_up(shared: Shared, q0: Floats, v0: Floats) -> None:
     """Compile here what many workers would else compile at the same time, each for itself."""
     if shared.steps:
         few = rows(shared.commands, 0, 1)
-        motions = Motions(shared.scene, shared.integrator, q0, v0, shared.dt)
+        # Copies, as tasks have: to numba an array that must not be written to is another type.
+        motions = Motions(shared.scene, shared.integrator, q0.copy(), v0.copy(), shared.dt)
         motions.under(few, increments=np.zeros((few.hold, shared.scene.processes)))
 
 
 def looked_at(pool: Executor, shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> tuple[Finding, ...]:
     """What is to be said of a few paths, each kind of finding once, of the first path that shows it."""
-    if not shared.steps:
-        return ()
-    split = [path for amount, path in (extremes["split"],) if amount > 0]
-    paths = [0, *split, extremes["energy"][1], extremes["speed"][1]]
-    few = list(dict.fromkeys(paths))[: min(_LOOKS, max(1, len(q0) // _LOOKED_AT))]
-    tasks = [Task(shared, path, q0[path : path + 1].copy(), v0[path : path + 1].copy()) for path in few]
-    found: dict[str, Finding] = {}
+    tasks = _looks(shared, q0, v0, extremes)
     with closing(in_order(pool, _look, tasks)) as looks:
-        for path, findings in zip(few, looks, strict=True):
-            for finding in findings:
-                found.setdefault(finding.kind, Finding(finding.kind, f"path {path}: {finding.sentence}"))
+        return _found(tasks, looks)
+
+
+def looked_at_here(shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> tuple[Finding, ...]:
+    """The same after an interruption, without workers, which it may have reached too; nothing after another one."""
+    tasks = _looks(shared, q0, v0, extremes)
+    try:
+        return _found(tasks, map(_look, tasks))
+    except KeyboardInterrupt:
+        return ()
+
+
+def _looks(shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> list[Task]:
+    """The paths that are worth a look, each by itself."""
+    if not shared.steps:
+        return []
+    if len(q0) <= _ALL_LOOKED_AT:
+        paths = list(range(len(q0)))
+    else:
+        split = [path for amount, path in (extremes["split"],) if amount > 0]
+        paths = list(dict.fromkeys([0, *split, extremes["energy"][1], extremes["speed"][1]]))
+    return [Task(shared, path, q0[path : path + 1].copy(), v0[path : path + 1].copy()) for path in paths]
+
+
+def _found(tasks: Sequence[Task], looks: Iterable[tuple[Finding, ...]]) -> tuple[Finding, ...]:
+    found: dict[str, Finding] = {}
+    for task, findings in zip(tasks, looks, strict=True):
+        for finding in findings:
+            found.setdefault(finding.kind, Finding(finding.kind, f"path {task.first}: {finding.sentence}"))
     return tuple(found.values())
 
 

@@ -37,7 +37,7 @@ class RobotNotFound(RobotError):
 
 
 class UnknownJoint(RobotError):
-    """A joint name that the robot does not have.
+    """A joint name that the robot does not have, or that no control has.
 
     Attributes:
         joint: The name given.
@@ -45,11 +45,11 @@ class UnknownJoint(RobotError):
         matches: Those that come close.
     """
 
-    def __init__(self, joint: str, joints: Iterable[str], where: str) -> None:
+    def __init__(self, joint: str, joints: Iterable[str], where: str, lack: str = "the robot has no joint") -> None:
         self.joint = joint
         self.joints = tuple(joints)
         self.matches, hint = _meant(joint, self.joints)
-        super().__init__(f"{where}: the robot has no joint {joint!r}; {hint}joints: {', '.join(self.joints)}")
+        super().__init__(f"{where}: {lack} {joint!r}; {hint}joints: {', '.join(self.joints)}")
 
 
 class UnsupportedJoint(RobotError):
@@ -72,18 +72,27 @@ class UnsupportedJoint(RobotError):
 
 
 class SingularMassMatrix(RobotError):
-    """The mass matrix is not positive definite: a moving part has no inertia.
+    """The mass matrix is not positive definite: a moving part has no inertia, or a negative one.
 
     Attributes:
-        joints: The joints whose motion carries no inertia.
+        joints: The joints whose motion carries no inertia, or a negative one.
+        negative: Which of the two.
     """
 
-    def __init__(self, joints: Iterable[str], q: object) -> None:
+    def __init__(self, joints: Iterable[str], q: object, *, negative: bool = False) -> None:
         self.joints = tuple(joints)
-        super().__init__(
-            f"the mass matrix is singular at q = {q}: motion of {', '.join(map(repr, self.joints))} carries no "
-            "inertia; give the links it moves mass and inertia, add armature to the joint, or lock it"
-        )
+        self.negative = negative
+        moving = f"motion of {', '.join(map(repr, self.joints))} carries"
+        if negative:
+            super().__init__(
+                f"the mass matrix is not positive definite at q = {q}: {moving} negative inertia; correct the masses "
+                "and inertias of the links it moves, add armature to the joint, or lock it"
+            )
+        else:
+            super().__init__(
+                f"the mass matrix is singular at q = {q}: {moving} no inertia; give the links it moves mass and "
+                "inertia, add armature to the joint, or lock it"
+            )
 
 
 class InputError(VarpinError, ValueError):

@@ -19,8 +19,9 @@ Result = TypeVar("Result")
 
 logger = logging.getLogger(__name__)
 
-# Tasks that wait or run for each worker; and in all, where an executor does not say how many it has.
-_AHEAD, _AHEAD_OF_ANY = 4, 1024
+# Tasks that wait or run for each worker; in all, where an executor does not say how many it has; and the bytes that
+# their results may take in all.
+_AHEAD, _AHEAD_OF_ANY, _BYTES_AHEAD = 4, 1024, 2**31
 # Losses without a result between them after which it is no accident.
 _LOSSES = 3
 
@@ -82,12 +83,19 @@ class _Guarded(Generic[Task, Result]):
 
 
 def in_order(
-    executor: Executor, function: Callable[[Task], Result], tasks: Iterable[Task]
+    executor: Executor, function: Callable[[Task], Result], tasks: Iterable[Task], *, result_bytes: int = 0
 ) -> Generator[Result, None, None]:
     """``function`` of each task, in their order.
 
     A task whose worker is lost is done again, in a pool that has broken by a new one like it. Few tasks are ahead of
-    the result that is waited for, so that results do not pile up. Close the iterator to call off what has not begun.
+    the result that is waited for, so that results do not pile up: four for each worker, and so many that their results
+    take 2 GiB, but two at least. Close the iterator to call off what has not begun.
+
+    Args:
+        executor: Where ``function`` is called.
+        function: Of a task.
+        tasks: Asked for one by one.
+        result_bytes: What a result takes [bytes].
 
     Raises:
         VarpinError: Workers get lost again and again.
@@ -96,21 +104,32 @@ def in_order(
     work: _Guarded[Task, Result] = _Guarded(function)
     own: Executor | None = None
     waiting: deque[tuple[Task, Future[Result | _Raised]]] = deque()
-    ahead, left, losses = _ahead(executor), iter(tasks), 0
+    left, losses = iter(tasks), 0
 
     def submitted(task: Task) -> Future[Result | _Raised]:
-        nonlocal executor, own
+        while True:
+            try:
+                return executor.submit(work, task)
+            except BrokenExecutor as error:
+                renew(error)
+
+    def renew(error: BrokenExecutor) -> None:
+        """Go on in a new pool with all that the broken one has not done."""
+        nonlocal executor, own, losses
+        executor, losses = _renewed(executor, error), _counted(losses, error)
+        if own is not None:
+            own.shutdown(wait=False, cancel_futures=True)
+        own = executor
         try:
-            return executor.submit(work, task)
-        except BrokenExecutor as error:
-            executor = _renewed(executor, error)
-            if own is not None:
-                own.shutdown(wait=False, cancel_futures=True)
-            own = executor
-            return executor.submit(work, task)
+            for place, (task, future) in enumerate(waiting):
+                if not future.done() or future.cancelled() or future.exception() is not None:
+                    waiting[place] = task, executor.submit(work, task)
+        except BrokenExecutor as again:
+            renew(again)
 
     try:
         while True:
+            ahead = _ahead(executor, result_bytes)
             while len(waiting) < ahead:
                 try:
                     task = next(left)
@@ -119,7 +138,7 @@ def in_order(
                 waiting.append((task, submitted(task)))
             if not waiting:
                 return
-            task, future = waiting.popleft()
+            task, future = waiting[0]
             try:
                 result = future.result()
             except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -127,13 +146,14 @@ def in_order(
                     f"what the workers need cannot be sent to them: {error}; functions must be importable there, "
                     "defined at the top of a module and not in place"
                 ) from error
-            except Exception as error:
-                losses += 1
-                if losses > _LOSSES:
-                    raise VarpinError(f"workers get lost again and again, at last by {error!r}") from error
-                logger.warning("a worker was lost (%r); its work is done again", error)
-                waiting.appendleft((task, submitted(task)))
+            except BrokenExecutor as error:
+                renew(error)
                 continue
+            except Exception as error:
+                losses = _counted(losses, error)
+                waiting[0] = task, submitted(task)
+                continue
+            waiting.popleft()
             losses = 0
             if isinstance(result, _Raised):
                 raise result.error
@@ -145,15 +165,33 @@ def in_order(
             own.shutdown(wait=False, cancel_futures=True)
 
 
+def _counted(losses: int, error: Exception) -> int:
+    """The losses without a result between them, this one among them.
+
+    Raises:
+        VarpinError: They are too many for an accident.
+    """
+    if losses == _LOSSES:
+        raise VarpinError(f"workers get lost again and again, at last by {error!r}") from error
+    logger.warning("a worker was lost (%r); its work is done again", error)
+    return losses + 1
+
+
 def _workers(executor: Executor) -> int | None:
-    """How many it has, if it says."""
+    """How many it has now, if it says."""
     workers = getattr(executor, "_max_workers", None) or getattr(executor, "num_workers", None)
-    return workers if isinstance(workers, int) else None
+    client = getattr(executor, "_client", None)
+    if client is not None and hasattr(client, "ncores"):
+        # Dask's, whose workers come and go, with so many threads each.
+        workers = sum(client.ncores().values())
+    return workers if isinstance(workers, int) and workers > 0 else None
 
 
-def _ahead(executor: Executor) -> int:
+def _ahead(executor: Executor, result_bytes: int) -> int:
+    """How many tasks may be ahead of the result that is waited for."""
     workers = _workers(executor)
-    return _AHEAD_OF_ANY if workers is None else _AHEAD * workers
+    most = _AHEAD_OF_ANY if workers is None else _AHEAD * workers
+    return max(2, min(most, _BYTES_AHEAD // max(1, result_bytes)))
 
 
 def _renewed(executor: Executor, error: BrokenExecutor) -> Executor:
@@ -169,4 +207,5 @@ def _renewed(executor: Executor, error: BrokenExecutor) -> Executor:
         executor._mp_context,
         initializer=executor._initializer,
         initargs=executor._initargs,
+        max_tasks_per_child=getattr(executor, "_max_tasks_per_child", None),
     )

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import JointValues, joint_array
 from varpin.errors import InputError, RobotError, SingularMassMatrix
+from varpin.frozen import Frozen
 from varpin.inspection_tables import parts_of
 from varpin.integrators import Midpoint, largest_step
 from varpin.lagrangian import lagrangian_jet
@@ -44,7 +45,7 @@ DENSITY = 22_600.0
 
 
 @dataclass(frozen=True, eq=False)
-class JointReport:
+class JointReport(Frozen):
     """A joint that moves.
 
     Attributes:
@@ -71,7 +72,7 @@ class JointReport:
 
 
 @dataclass(frozen=True, eq=False)
-class LinkReport:
+class LinkReport(Frozen):
     """A link with mass or inertia; for a model in memory, a joint's links taken together.
 
     Attributes:
@@ -109,7 +110,7 @@ class FrameReport:
 
 
 @dataclass(frozen=True, eq=False)
-class RobotReport:
+class RobotReport(Frozen):
     """A robot as its description has it, and what looks wrong; ``print`` shows all of it in tables.
 
     Attributes:

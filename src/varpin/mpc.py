@@ -252,8 +252,8 @@ class Mpc:
 
         Raises:
             InputError: A plant with other controls or joints.
-            StepFailure: The plant's motion, or the first motion of a search, cannot be integrated; of the plant's it
-                holds what came before.
+            StepFailure: The plant's motion, or the first motion of a search, cannot be integrated; it holds the plant's
+                motion so far. Of a search its cause is the search's own.
             Interrupted: Ctrl-C; holds the plant's motion so far.
         """
         problem = self.problem
@@ -276,7 +276,10 @@ class Mpc:
             for tick in range(ticks):
                 if tick > 0:
                     begin = time.perf_counter()
-                    fresh = self.plan(problem.t0 + tick * self.period, q, v, active, age + 1, before)
+                    try:
+                        fresh = self.plan(problem.t0 + tick * self.period, q, v, active, age + 1, before)
+                    except StepFailure as failure:
+                        raise _unplanned(failure, chained(parts)) from failure
                     seconds[tick] = time.perf_counter() - begin
                     iterations[tick] = fresh.iterations
                     late[tick] = seconds[tick] > self.budget
@@ -327,6 +330,12 @@ def _decision(plan: Solution, age: int, q: Floats, v: Floats, before: Floats | N
         # The last decision is repeated, and expects itself before.
         before = before - policy.u[last] + policy.previous[last]
     return policy.control(min(age, last), np.concatenate([q, v]), before)
+
+
+def _unplanned(failure: StepFailure, motion: Trajectory) -> StepFailure:
+    """The end of a run whose next plan's first motion fails; it holds the plant's motion so far."""
+    reason = f"no plan can be made from here, as step {failure.step} of its first motion fails: {failure.reason}"
+    return StepFailure(motion.steps, motion.t[-1], Failure(reason, failure.residual), motion)
 
 
 def _simulated(

@@ -136,6 +136,15 @@ class Scene(Frozen):
         return int(self.actuation.shape[1])
 
     @property
+    def control_joints(self) -> tuple[str, ...] | None:
+        """The joint whose force each of the m controls is; None where one is anything else, a share of several say."""
+        joints = np.argmax(self.actuation, axis=0)
+        alone = len(set(joints.tolist())) == self.controls
+        if not alone or not np.array_equal(self.actuation, np.eye(self.robot.dof)[:, joints]):
+            return None
+        return tuple(self.robot.joint_names[j] for j in joints)
+
+    @property
     def processes(self) -> int:
         """k, the number of Wiener processes."""
         return self.noise.processes
@@ -203,7 +212,7 @@ class Scene(Frozen):
             UnknownJoint: As :meth:`holding_torque`.
         """
         torque = self.holding_torque(q)
-        controls = np.linalg.lstsq(self.actuation, torque, rcond=None)[0]
+        controls = closest_controls(self, torque)
         left = torque - self.actuation @ controls
         # Where nothing pulls, rounding leaves a trace of the weights' own moments, those at a metre say.
         weight = float(self.robot.tree.mass.sum() * np.linalg.norm(self.gravity))
@@ -213,7 +222,12 @@ class Scene(Frozen):
                 f"no controls hold the robot at this q: joint {self.robot.joint_names[c]!r} is left with {left[c]:.4g} "
                 "N m or N that no actuator takes"
             )
-        return np.asarray(controls, dtype=np.float64)
+        return controls
+
+
+def closest_controls(scene: Scene, torque: Floats) -> Floats:
+    """The controls (m,) whose forces come closest to ``torque`` (n,) [N m or N]; of several that do, the smallest."""
+    return np.asarray(np.linalg.lstsq(scene.actuation, torque, rcond=None)[0], dtype=np.float64)
 
 
 def require_scene(scene: object) -> Scene:

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
+from varpin.checks import (
+    JointValues,
+    as_floats,
+    control_array,
+    count,
+    finite_array,
+    joint_array,
+    positive,
+    require_finite,
+)
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
@@ -248,7 +257,7 @@ def simulate(
     *,
     dt: float,
     steps: int,
-    controls: ArrayLike | ControlLaw | LinearPolicy | OpenLoop | None = None,
+    controls: JointValues | ControlLaw | LinearPolicy | OpenLoop | None = None,
     period: int = 1,
     integrator: Integrator | None = None,
     rng: np.random.Generator | int | None = None,
@@ -264,7 +273,8 @@ def simulate(
         v0: Initial velocity, the same [rad/s or m/s].
         dt: Time step [s].
         steps: N, their number.
-        controls: None for none; an array (N, m), one row a step; one row (m,) for all steps; a
+        controls: None for none; an array (N, m), one row a step; one row (m,) for all steps, by joint name too where
+            each control is the force of a joint, with 0 for joints that are not named; a
             :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that returns (m,); or
             :class:`varpin.OpenLoop`, a function of time alone. Controls are constant over each step. A law is a digital
             controller: it is called once where each of its periods begins, with the time and the state of that node,
@@ -285,7 +295,8 @@ def simulate(
     Raises:
         InputError: Wrong shapes, values that are not finite, dt <= 0, steps < 0, a law of other arguments than
             (t, q, v), a period without a law.
-        UnknownJoint: ``q0`` or ``v0`` names a joint that is no coordinate of the robot.
+        UnknownJoint: ``q0`` or ``v0`` names a joint that is no coordinate of the robot, or ``controls`` one that no
+            control drives.
         ControlError: The control function returned something unusable; holds the trajectory so far.
         NoiseError: A function of a CustomNoise did; holds the trajectory so far.
         StepFailure: A step has no trustworthy solution; holds the trajectory so far.
@@ -322,6 +333,7 @@ def simulate(
         chunk = max(1, _CHUNK // (n + n**3 // 100))
         # One step at a time where noise calls Python functions, so that what came before one that fails is recorded.
         stepwise = scene.noise.diffusion is None
+        interrupted = False
         try:
             while record.steps < steps:
                 done = record.steps
@@ -353,8 +365,6 @@ def simulate(
                     progress(record.steps, steps)
         except KeyboardInterrupt:
             interrupted = True
-        else:
-            interrupted = False
         try:
             trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
         except KeyboardInterrupt:
@@ -385,11 +395,14 @@ def _require_memory(scene: Scene, steps: int) -> None:
 
 
 def commands_of(
-    scene: Scene, integrator: Integrator, controls: ArrayLike | LinearPolicy | OpenLoop | None, steps: int, dt: float
+    scene: Scene, integrator: Integrator, controls: JointValues | LinearPolicy | OpenLoop | None, steps: int, dt: float
 ) -> Commands:
-    """Controls of ``steps`` steps of ``dt`` [s] as kernels take them: None, (steps, m), (m,), a function or a policy.
+    """Controls of ``steps`` steps of ``dt`` [s] as kernels take them.
+
+    They are None, (steps, m), (m,), by joint name, a function or a policy.
 
     Raises:
+        UnknownJoint: A name that is no driven joint's.
         InputError: The array is neither (steps, m) nor (m,), or not finite; the policy is for something else; a law.
         ControlError: The function of an OpenLoop failed; it holds no trajectory.
     """
@@ -407,15 +420,18 @@ def commands_of(
     return open_loop(control_rows(scene, controls, steps))
 
 
-def control_rows(scene: Scene, controls: ArrayLike | None, steps: int) -> Floats:
+def control_rows(scene: Scene, controls: JointValues | None, steps: int) -> Floats:
     """Controls as one row a step, (steps, m).
 
     Raises:
+        UnknownJoint: A name that is no driven joint's.
         InputError: The array is neither (steps, m) nor (m,), or not finite.
     """
     shape = (steps, scene.controls)
     if controls is None:
         return np.zeros(shape)
+    if isinstance(controls, Mapping):
+        controls = control_array("controls", controls, scene.control_joints)
     array = as_floats("controls", controls)
     if array.shape != shape and array.shape != shape[1:]:
         raise InputError(f"controls must have shape {shape}, one row a step, or {shape[1:]}, got {array.shape}")

@@ -49,6 +49,7 @@ class Points(Frozen):
         controls: m.
         t0: When the horizon begins [s].
         joints: Names of the coordinates, if costs are to find theirs by name.
+        control_joints: The joint whose force each control is; None where controls are something else.
     """
 
     t: Floats
@@ -58,6 +59,7 @@ class Points(Frozen):
     controls: int
     t0: float = 0.0
     joints: tuple[str, ...] = ()
+    control_joints: tuple[str, ...] | None = None
 
     @property
     def elapsed(self) -> Floats:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeGuard
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from varpin.checks import JointValues, as_floats, joint_array
+from varpin.checks import JointValues, as_floats, control_array, joint_array
 from varpin.costs.base import BoundCost, Cost, Expansion, Points, Reference, checked_weight, sample, weight_matrix
 
 Floats = NDArray[np.float64]
@@ -23,13 +22,16 @@ class _Quadratic(Cost):
     block: str
 
     def __init__(self, reference: Reference | Mapping[str, float], weight: JointValues) -> None:
-        self.weight = weight if self._by_name(weight) else checked_weight(type(self).__name__, weight)
-        given = callable(reference) or self._by_name(reference)
+        self.weight = weight if isinstance(weight, Mapping) else checked_weight(type(self).__name__, weight)
+        given = callable(reference) or isinstance(reference, Mapping)
         self.reference = reference if given else as_floats(f"{type(self).__name__} reference", reference)
 
-    def _by_name(self, values: object) -> TypeGuard[Mapping[str, float]]:
-        """Whether values are by the names of joints, which controls do not have."""
-        return isinstance(values, Mapping) and self.block != "u"
+    def _named(self, what: str, values: Mapping[str, float], points: Points) -> Floats:
+        """What is given by the names of joints, in the order of the block."""
+        name = f"{type(self).__name__} {what}"
+        if self.block == "u":
+            return control_array(name, values, points.control_joints)
+        return joint_array(name, values, points.joints)
 
     def __repr__(self) -> str:
         weight = dict(self.weight) if isinstance(self.weight, Mapping) else self.weight.tolist()
@@ -46,9 +48,9 @@ class _Quadratic(Cost):
         begin = {"q": 0, "v": points.dof, "u": 2 * points.dof}[self.block]
         name, weight, values = type(self).__name__, self.weight, self.reference
         if isinstance(weight, Mapping):
-            weight = checked_weight(name, joint_array(f"{name} weight", weight, points.joints))
+            weight = checked_weight(name, self._named("weight", weight, points))
         if isinstance(values, Mapping):
-            values = joint_array(f"{name} reference", values, points.joints)
+            values = self._named("reference", values, points)
         W = weight_matrix(name, weight, size)
         hessian = np.zeros((1, points.size, points.size))
         hessian[0, begin : begin + size, begin : begin + size] = 2.0 * W
@@ -112,13 +114,15 @@ class ControlCost(_Quadratic):
 
     block = "u"
 
-    def __init__(self, weight: ArrayLike = 1.0, reference: Reference = 0.0) -> None:
+    def __init__(self, weight: JointValues = 1.0, reference: Reference | Mapping[str, float] = 0.0) -> None:
         """Describe the cost; see :class:`TrackingCost`, with m controls for n coordinates.
 
         Args:
-            weight: One number, (m,), or a matrix (m, m), positive semidefinite.
-            reference: u_r: a function of the time [s], a constant, or an array of rows of m: N + 1 of them as there,
-                or N, one for each step and constant over it, as controls are; for example those of another solution.
+            weight: One number, (m,), by joint name where each control is the force of a joint, or a matrix (m, m),
+                positive semidefinite.
+            reference: u_r: a function of the time [s], a constant, by joint name too, or an array of rows of m: N + 1
+                of them as there, or N, one for each step and constant over it, as controls are; for example those of
+                another solution.
         """
         super().__init__(reference, weight)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from varpin.checks import as_floats, finite_array, require_finite
+from varpin.checks import JointValues, as_floats, control_array, finite_array, require_finite
 from varpin.costs.base import BoundCost, Cost, CostSum, Points, Scaled, checked_weight, weight_matrix
 from varpin.errors import InputError
 from varpin.frozen import Frozen
@@ -24,31 +24,34 @@ class ControlRateCost(Cost):
     ``dt`` for controls that are smooth in time, up to a part of the size of T.
     """
 
-    def __init__(self, weight: ArrayLike = 1.0, before: ArrayLike | None = None) -> None:
+    weight: Floats | Mapping[str, float]
+    before: Floats | Mapping[str, float] | None
+
+    def __init__(self, weight: JointValues = 1.0, before: JointValues | None = None) -> None:
         """Describe the cost.
 
         Args:
-            weight: One number, (m,), or a matrix (m, m), positive semidefinite [cost s / control^2].
-            before: The control applied before the horizon, one number or (m,), from which the first change counts.
-                Left out, the first control is free.
+            weight: One number, (m,), by joint name where each control is the force of a joint, or a matrix (m, m),
+                positive semidefinite [cost s / control^2].
+            before: The control applied before the horizon, one number, (m,) or by joint name, from which the first
+                change counts. Left out, the first control is free.
 
         Raises:
             InputError: A weight that is not finite, indefinite, or neither number, vector nor square matrix; or a
                 control that is neither number nor vector, or not finite.
         """
-        self.weight = checked_weight("ControlRateCost", weight)
-        self.before: Floats | None = None
-        if before is not None:
-            self.before = require_finite("ControlRateCost before", as_floats("ControlRateCost before", before))
-            if self.before.ndim > 1:
-                raise InputError(
-                    f"ControlRateCost before must be one number or a vector, got shape {self.before.shape}"
-                )
-            self.before.setflags(write=False)
+        self.weight = weight if isinstance(weight, Mapping) else checked_weight("ControlRateCost", weight)
+        self.before = before if isinstance(before, Mapping) else None
+        if before is not None and not isinstance(before, Mapping):
+            start = require_finite("ControlRateCost before", as_floats("ControlRateCost before", before))
+            if start.ndim > 1:
+                raise InputError(f"ControlRateCost before must be one number or a vector, got shape {start.shape}")
+            start.setflags(write=False)
+            self.before = start
 
     def __repr__(self) -> str:
-        start = "" if self.before is None else f", before={self.before.tolist()}"
-        return f"ControlRateCost(weight={self.weight.tolist()}{start})"
+        start = "" if self.before is None else f", before={_shown(self.before)}"
+        return f"ControlRateCost(weight={_shown(self.weight)}{start})"
 
     @property
     def of_controls(self) -> bool:
@@ -67,6 +70,10 @@ class ControlRateCost(Cost):
             InputError: It is part of another cost than a sum.
         """
         raise InputError(f"{self!r} must be a term of a problem's cost, scaled or not, and no part of another")
+
+
+def _shown(values: Floats | Mapping[str, float]) -> object:
+    return dict(values) if isinstance(values, Mapping) else values.tolist()
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,26 +107,39 @@ class ControlRate(Frozen):
         return 2.0 / period * (self.changes(u) @ self.weight), hessian
 
 
-def control_rate(cost: Cost, controls: int) -> ControlRate | None:
+def control_rate(cost: Cost, controls: int, joints: Sequence[str] | None = None) -> ControlRate | None:
     """All terms on the rate of controls in a cost together, for m controls; None if there is none.
 
+    Args:
+        cost: The cost.
+        controls: m.
+        joints: The joint whose force each control is; None where controls are something else.
+
     Raises:
+        UnknownJoint: A name that is no driven joint's.
         InputError: Weights or controls of a wrong size, or terms with different controls before.
     """
     terms = list(_terms(cost))
     if not terms:
         return None
     name = "ControlRateCost"
-    weight = sum(factor * weight_matrix(name, term.weight, controls) for factor, term in terms)
+    weight = np.zeros((controls, controls))
+    for factor, term in terms:
+        own = term.weight
+        if isinstance(own, Mapping):
+            own = checked_weight(name, control_array(f"{name} weight", own, joints))
+        weight += factor * weight_matrix(name, own, controls)
     starts: list[Floats | None] = []
     for _, term in terms:
         start = term.before
+        if isinstance(start, Mapping):
+            start = control_array(f"{name} before", start, joints)
         if start is not None and start.ndim == 0:
             start = np.full(controls, float(start))
         starts.append(None if start is None else finite_array(f"{name} before", start, (controls,)))
     if len({None if start is None else tuple(start.tolist()) for start in starts}) > 1:
         raise InputError(f"{name} terms of one cost must have the same control before")
-    return ControlRate(np.asarray(weight, dtype=np.float64), starts[0])
+    return ControlRate(weight, starts[0])
 
 
 def is_control_rate(term: Cost) -> bool:
@@ -127,7 +147,7 @@ def is_control_rate(term: Cost) -> bool:
     return any(True for _ in _terms(term))
 
 
-def with_control_before(cost: Cost, before: ArrayLike) -> Cost:
+def with_control_before(cost: Cost, before: JointValues) -> Cost:
     """The same cost with another control before the horizon."""
     if isinstance(cost, ControlRateCost):
         return ControlRateCost(cost.weight, before)

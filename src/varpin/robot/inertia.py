@@ -22,7 +22,9 @@ def principal_moments(inertia: Floats) -> Floats:
 
 
 def fault(link: str, mass: float, moments: Floats) -> str:
-    """What is wrong with a link's principal moments (3,), ascending [kg m^2]; empty if a body can have them."""
+    """What is wrong with a link's mass [kg] or principal moments (3,), ascending [kg m^2]; empty if nothing is."""
+    if mass < 0.0:
+        return f"link {link!r} has mass {mass:g} < 0 [kg]"
     if np.abs(moments).max() <= POINT * mass:
         return ""
     low, middle, high = moments

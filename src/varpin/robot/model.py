@@ -240,11 +240,12 @@ def load_robot(
     Raises:
         RobotNotFound: No such file or name; close matches are listed.
         RobotError: The file is not a URDF, its XML is broken, or a mass, an inertia or a mimic multiplier is no
-            number of use.
+            number of use. Of a URDF only what Pinocchio does not read: masses and inertias that it leaves out, and
+            negative ones, are told in the log.
         UnsupportedJoint: A joint has no single axis (free-flyer, spherical, planar, screw).
         UnknownJoint: ``lock`` names a joint that is not there.
         UnknownFrame: A payload hangs on a frame that is not there.
-        SingularMassMatrix: A joint moves no inertia.
+        SingularMassMatrix: A joint moves no inertia, or a negative one.
     """
     robot, description = _built(source, package_dirs, lock, mimic, payload)
     for remark in (*description.remarks, *faults(robot.free_model, description.inertials)):
@@ -487,14 +488,15 @@ def check_inertia(robot: Robot) -> None:
                 f"the mass matrix of robot {robot.name!r} is not finite at q = {q}: masses, inertias, distances or "
                 "mimic multipliers are beyond the range of floating-point numbers"
             )
-        scale = np.sqrt(np.diag(M))
-        if not (np.diag(M) > 0.0).all():
-            raise SingularMassMatrix(
-                [name for name, m in zip(robot.joint_names, np.diag(M), strict=True) if not m > 0.0], q
-            )
+        own = np.diag(M)
+        if not (own > 0.0).all():
+            negative = bool((own < 0.0).any())
+            wrong = own < 0.0 if negative else own == 0.0
+            raise SingularMassMatrix(np.array(robot.joint_names)[wrong].tolist(), q, negative=negative)
+        scale = np.sqrt(own)
         values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
-        if values[0] <= robot.dof * np.finfo(float).eps:
+        rounding = robot.dof * np.finfo(float).eps
+        if values[0] <= rounding:
             worst = np.abs(vectors[:, 0])
-            raise SingularMassMatrix(
-                [name for name, x in zip(robot.joint_names, worst, strict=True) if x >= 0.5 * worst.max()], q
-            )
+            moving = [name for name, x in zip(robot.joint_names, worst, strict=True) if x >= 0.5 * worst.max()]
+            raise SingularMassMatrix(moving, q, negative=bool(values[0] < -rounding))

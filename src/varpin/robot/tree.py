@@ -76,8 +76,8 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
 
     Raises:
         UnsupportedJoint: A joint has no single axis.
-        RobotError: A link's mass, centre or inertia is NaN or infinite, its mass is negative, or a joint's placement
-            is no rotation and translation.
+        RobotError: A link's mass, centre or inertia is NaN or infinite, or a joint's placement is no rotation and
+            translation.
     """
     bodies = model.njoints - 1
     tied = {tie.follower: tie for tie in ties}
@@ -110,8 +110,6 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
         center[body] = turn[joint].T @ link.lever
         about_center = turn[joint].T @ link.inertia @ turn[joint]
         inertia[body] = about_center[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]
-        if mass[body] < 0.0:
-            raise RobotError(f"the link moved by joint {model.names[joint]!r} has mass {mass[body]} < 0 [kg]")
         if joint in tied:
             tie = tied[joint]
             coordinate[body], ratio[body], offset[body] = index[tie.leader], tie.ratio, tie.offset

@@ -16,7 +16,7 @@ import sys
 import tempfile
 import threading
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -117,7 +117,7 @@ def read_urdf(path: Path) -> Urdf:
 
     Raises:
         FileError: The file cannot be read.
-        RobotError: It is no URDF, or not one of a tree of bodies with finite masses and inertias.
+        RobotError: It is no URDF, or not one of a tree of bodies, or a number of a mimic element is none.
     """
     text, remarks = _decoded(path)
     if not text.strip("\0 \t\r\n"):
@@ -130,9 +130,9 @@ def read_urdf(path: Path) -> Urdf:
         return Urdf(path, text, None, remarks=tuple(remarks), fault=f"it is not well-formed XML: {error}")
     _require_robot(root, path)
     _require_tree(root, path)
-    inertials = [_inertial(link, path, remarks) for link in root.findall("link")]
+    found = [_inertial(link, remarks) for link in root.findall("link")]
     mimics = {joint.get("name", ""): _mimic(joint, path) for joint in root.findall("joint[mimic]")}
-    return Urdf(path, text, root, tuple(x for x in inertials if x is not None), mimics, tuple(remarks))
+    return Urdf(path, text, root, tuple(x for x in found if x is not None), mimics, tuple(remarks))
 
 
 def build_model(urdf: Urdf, *, mimic: bool = False) -> pin.Model:
@@ -141,7 +141,8 @@ def build_model(urdf: Urdf, *, mimic: bool = False) -> pin.Model:
     Raises:
         RobotError: Pinocchio cannot read it, or reads less than there is.
     """
-    text = urdf.text if urdf.root is None else _written(urdf, _dynamics(urdf.root))
+    massive = {inertial.link for inertial in urdf.inertials}
+    text = urdf.text if urdf.root is None else _written(urdf, _dynamics(urdf.root, massive))
     options = {"mimic": True} if mimic else {}
     with _captured_stderr() as complaints:
         try:
@@ -154,7 +155,8 @@ def build_model(urdf: Urdf, *, mimic: bool = False) -> pin.Model:
             logger.warning("%s: %s", urdf.path, line)
     described = sum(inertial.mass for inertial in urdf.inertials)
     read = sum(body.mass for body in model.inertias)
-    if urdf.root is not None and not math.isclose(described, read, rel_tol=1e-9):
+    largest = max((abs(inertial.mass) for inertial in urdf.inertials), default=0.0)
+    if urdf.root is not None and not math.isclose(described, read, rel_tol=1e-9, abs_tol=1e-9 * largest):
         raise RobotError(
             f"{urdf.path} describes links of {described:.6g} kg in all, of which Pinocchio reads {read:.6g} kg"
         )
@@ -297,41 +299,57 @@ def _require_tree(root: ET.Element, path: Path) -> None:
         rooted.update(way)
 
 
-def _inertial(link: ET.Element, path: Path, remarks: list[str]) -> Inertial | None:
-    """Mass and inertia of a link, or None if it has none; what is left out is added to ``remarks``.
+def _inertial(link: ET.Element, remarks: list[str]) -> Inertial | None:
+    """Mass and inertia of a link as Pinocchio reads them, or None if it has none.
 
-    Raises:
-        RobotError: A number is none, or the mass is negative.
+    What is left out of the link's ``<inertial>``, or is no number, is added to ``remarks``.
     """
     inertial = link.find("inertial")
     if inertial is None:
         return None
     name = link.get("name", "")
-    where = f"{path}: link {name!r}"
     mass, moments, origin = inertial.find("mass"), inertial.find("inertia"), inertial.find("origin")
+
+    fault, value = "", None if mass is None else _finite(mass.get("value"))
     if mass is None or mass.get("value") is None:
-        remarks.append(f"link {name!r}: its <inertial> has no <mass>: it is massless, as Pinocchio reads it")
-        return None
-    value = _number(mass.get("value"), f"{where}: its mass")
-    if value < 0.0:
-        raise RobotError(f"{where} has mass {mass.get('value')} < 0 [kg]")
-    given = {} if moments is None else {key: moments.get(key) for key in _MOMENTS if moments.get(key) is not None}
-    numbers = {key: _number(word, f"{where}: its inertia {key}") for key, word in given.items()}
-    if len(numbers) < len(_MOMENTS):
-        absent = "no <inertia>" if moments is None else f"no {', '.join(x for x in _MOMENTS if x not in given)}"
-        remarks.append(f"link {name!r}: its <inertial> has {absent}: it is a point mass, as Pinocchio reads it")
-        numbers = dict.fromkeys(_MOMENTS, 0.0)
+        fault = "its <inertial> has no <mass>"
+    elif value is None:
+        fault = f"its mass is {reprlib.repr(mass.get('value'))}, no finite number"
     place = np.zeros((2, 3))
     for row, entry in zip(place, ("xyz", "rpy"), strict=True):
         words = ("0 0 0" if origin is None else origin.get(entry, "0 0 0")).split()
-        if len(words) != 3:  # Pinocchio would drop the whole <inertial> in silence
-            raise RobotError(f"{where}: the {entry} of its <inertial> must be three numbers, got {' '.join(words)!r}")
-        row[:] = [_number(word, f"{where}: the {entry} of its <inertial>") for word in words]
-    xx, xy, xz, yy, yz, zz = (numbers[key] for key in _MOMENTS)
+        numbers = [number for word in words if (number := _finite(word)) is not None]
+        if len(words) == len(numbers) == 3:
+            row[:] = numbers
+        else:
+            given = reprlib.repr(" ".join(words))
+            fault = fault or f"the {entry} of its <inertial> is {given}, no three finite numbers"
+    if fault or value is None:
+        remarks.append(f"link {name!r}: {fault}: it is massless, as Pinocchio reads it")
+        return None
+    numbers_given = _moments(moments)
+    if numbers_given is None:
+        absent = [key for key in _MOMENTS if key not in _words(moments)]
+        wrong = [f"{key} {reprlib.repr(word)}" for key, word in _words(moments).items() if _finite(word) is None]
+        fault = f"no {', '.join(absent)}" if absent else f"{', '.join(wrong)}, no finite number"
+        fault = "no <inertia>" if moments is None else fault
+        remarks.append(f"link {name!r}: its <inertial> has {fault}: it is a point mass, as Pinocchio reads it")
+    xx, xy, xz, yy, yz, zz = numbers_given or np.zeros(6)
     turn = pin.rpy.rpyToMatrix(*place[1])
     own = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     with np.errstate(over="ignore", invalid="ignore"):
         return Inertial(name, value, place[0], turn @ own @ turn.T)
+
+
+def _words(moments: ET.Element | None) -> dict[str, str]:
+    """Those of an ``<inertia>`` that are given."""
+    return {} if moments is None else {key: moments.get(key, "") for key in _MOMENTS if moments.get(key) is not None}
+
+
+def _moments(moments: ET.Element | None) -> list[float] | None:
+    """The six numbers of an ``<inertia>``; None, which is a point mass, unless all of them are there and finite."""
+    numbers = [number for word in _words(moments).values() if (number := _finite(word)) is not None]
+    return numbers if len(numbers) == len(_MOMENTS) else None
 
 
 def _mimic(joint: ET.Element, path: Path) -> Mimic:
@@ -347,20 +365,25 @@ def _mimic(joint: ET.Element, path: Path) -> Mimic:
     )
 
 
-def _number(word: str | None, what: str) -> float:
+def _finite(word: str | None) -> float | None:
+    """The number that a word is, if it is a finite one."""
     number = float(word) if word is not None and _NUMBER.fullmatch(word.strip()) else math.nan
-    if not math.isfinite(number):
-        found = "missing" if word is None else reprlib.repr(word)
-        raise RobotError(f"{what} is {found}, where a finite number belongs")
+    return number if math.isfinite(number) else None
+
+
+def _number(word: str, what: str) -> float:
+    if (number := _finite(word)) is None:
+        raise RobotError(f"{what} is {reprlib.repr(word)}, where a finite number belongs")
     return number
 
 
-def _dynamics(root: ET.Element) -> ET.Element:
-    """What Pinocchio makes a model of: links with their inertias, and joints."""
+def _dynamics(root: ET.Element, massive: Collection[str]) -> ET.Element:
+    """What Pinocchio makes a model of: links, the massive ones with their inertias, and joints."""
     small = ET.Element("robot", {"name": root.get("name", "")})
     for link in root.findall("link"):
         part = ET.SubElement(small, "link", _named(link))
-        part.extend(_tidy(inertial) for inertial in link.findall("inertial")[:1] if _weighs(inertial))
+        if link.get("name", "") in massive:
+            part.extend(_tidy(inertial) for inertial in link.findall("inertial")[:1])
     small.extend(root.findall("joint"))
     return small
 
@@ -415,20 +438,15 @@ def _named(link: ET.Element) -> dict[str, str]:
     return {key: value for key, value in link.items() if key == "name"}
 
 
-def _weighs(inertial: ET.Element) -> bool:
-    mass = inertial.find("mass")
-    return mass is not None and mass.get("value") is not None
-
-
 def _tidy(inertial: ET.Element) -> ET.Element:
-    """An ``<inertial>`` that was looked at, whole and without white space that Pinocchio would stumble over."""
+    """The ``<inertial>`` of a massive link, whole and without white space that Pinocchio would stumble over."""
     tidy = ET.Element("inertial")
     mass, moments, origin = inertial.find("mass"), inertial.find("inertia"), inertial.find("origin")
     if origin is not None:
         ET.SubElement(tidy, "origin", {key: " ".join(origin.get(key, "0 0 0").split()) for key in ("xyz", "rpy")})
     ET.SubElement(tidy, "mass", {"value": "" if mass is None else mass.get("value", "").strip()})
-    words = {key: "" if moments is None else moments.get(key, "").strip() for key in _MOMENTS}
-    ET.SubElement(tidy, "inertia", words if all(words.values()) else dict.fromkeys(_MOMENTS, "0"))
+    words = {key: word.strip() for key, word in _words(moments).items()}
+    ET.SubElement(tidy, "inertia", dict.fromkeys(_MOMENTS, "0") if _moments(moments) is None else words)
     return tidy
 
 

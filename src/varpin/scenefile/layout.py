@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from varpin.costs import Cost, CostSum, Terminal
 from varpin.errors import InputError, RobotError, RobotNotFound, UnknownFrame, UnknownJoint, VarpinError
-from varpin.lagrangian import lagrangian_jet
 from varpin.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
 from varpin.robot import Robot, load_robot
-from varpin.scene import Scene
+from varpin.scene import Scene, closest_controls
 from varpin.scenefile.references import Timeline, constant
 from varpin.scenefile.spec import CostSpec, SceneSpec, degrees_for_radians
 from varpin.scenefile.table import Floats, SceneFileError, Table, suggestion
@@ -181,8 +180,7 @@ def _part(term: CostTerm, index: NDArray[np.int64]) -> CostTerm:
 
 def holding_controls(scene: Scene, q: Floats) -> Floats:
     """The controls (m,) that come closest to holding the robot at q at rest."""
-    force = lagrangian_jet(scene, q, np.zeros_like(q), backend="pinocchio").Lq
-    return np.asarray(np.linalg.lstsq(scene.actuation, -force, rcond=None)[0], dtype=np.float64)
+    return closest_controls(scene, scene.holding_torque(q))
 
 
 def joints_of_frame(robot: Robot, frame: str) -> NDArray[np.bool_]:

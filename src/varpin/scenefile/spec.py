@@ -18,11 +18,10 @@ from varpin.robot import Payload, models_dir
 from varpin.scenefile.references import Reference, read_reference
 from varpin.scenefile.table import ByName, SceneFileError, Table, inside, shown, suggestion
 from varpin.scenefile.terms import TERMS, Term
+from varpin.sddp.problem import default_integrator
 
 # A motion of seven joints over so many steps takes gigabytes.
 MOST_STEPS = 10**7
-# Of Gauss in scene files, and of problems that name no integrator.
-DEFAULT_STAGES = 4
 # Steps times terms of a cost: references are evaluated for each.
 MOST_EVALUATIONS = 10**6
 # Of a file: bytes, dots outside numbers, tables within tables, characters of a word, tables or words of a list.
@@ -432,7 +431,7 @@ def _integrator(table: Table) -> Integrator:
     if "alpha" in table:
         given["alpha"] = table.number("alpha", least=0.0, most=1.0)
     if kind == "gauss":
-        given["stages"] = table.whole("stages", DEFAULT_STAGES, least=1)
+        given["stages"] = table.whole("stages", default_integrator().stages, least=1)
     if "kick" in table:
         given["kick"] = table.choice("kick", ("left", "split"))
     try:

@@ -6,7 +6,7 @@ import copy
 import logging
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from varpin.ensemble import (
     chunks,
     greater,
     looked_at,
+    looked_at_here,
     said,
     simulate_paths,
     warm_up,
@@ -181,15 +182,22 @@ def monte_carlo(
             elif np.isfinite(costs[0]).all():
                 found = _look_alone(_Alone(sent, policy, seeds, 0))
         except KeyboardInterrupt:
-            raise MonteCarloInterrupted(_mean(costs, predicted)) from None
+            so_far = _mean(costs, predicted)
+            if so_far is None:
+                raise MonteCarloInterrupted(None) from None
+            if shared is not None:
+                found = looked_at_here(shared, q0[:done], v0[:done], extremes)
+            elif np.isfinite(costs[0]).all():
+                # Nothing after another Ctrl-C.
+                with suppress(KeyboardInterrupt):
+                    found = _look_alone(_Alone(sent, policy, seeds, 0))
+            raise MonteCarloInterrupted(_warned(so_far, (*_lost(so_far), *found))) from None
     result = _mean(costs, predicted)
     if result is None:
         raise VarpinError(f"fewer than two of {paths} paths got to the end; a smaller dt may help")
-    if result.failures:
-        text = f"{result.failures} of {paths} paths could not be finished, and are not counted; a smaller dt may help"
-        found = (Finding("failed paths", text), *found)
+    found = (*_lost(result), *found)
     announce(logger, problem.scene, problem.dt, found)
-    return replace(result, warnings=tuple(finding.sentence for finding in found))
+    return _warned(result, found)
 
 
 def _sent(problem: OptimalControlProblem) -> OptimalControlProblem:
@@ -226,6 +234,18 @@ def _look_alone(given: _Alone) -> tuple[Finding, ...]:
     motion = given.problem.simulate(given.policy, rng=child)
     _, found = examined_in_loop(given.problem.scene, given.problem.integrator, motion, given.policy.hold)
     return tuple(Finding(finding.kind, f"path {given.path}: {finding.sentence}") for finding in found)
+
+
+def _lost(result: MonteCarlo) -> tuple[Finding, ...]:
+    """What is to be said of failures, if there are any."""
+    if not result.failures:
+        return ()
+    lost = f"{result.failures} of {result.paths + result.failures} paths could not be finished, and are not counted"
+    return (Finding("failed paths", f"{lost}; a smaller dt may help"),)
+
+
+def _warned(result: MonteCarlo, found: Sequence[Finding]) -> MonteCarlo:
+    return replace(result, warnings=tuple(finding.sentence for finding in found))
 
 
 def _mean(costs: Sequence[Floats], predicted: float) -> MonteCarlo | None:

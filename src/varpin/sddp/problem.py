@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from varpin.checks import JointValues, checked_limits, count, is_one_of, joint_array, positive, real
+from varpin.checks import JointValues, checked_limits, control_array, count, is_one_of, joint_array, positive, real
 from varpin.costs import (
     BoundSum,
     ControlRate,
@@ -26,7 +27,7 @@ from varpin.integrators import Gauss, Integrator
 from varpin.lagrangian import lagrangian_jet
 from varpin.markup import facts, listed
 from varpin.policy import LinearPolicy, OpenLoop
-from varpin.scene import Scene, require_scene
+from varpin.scene import Scene, closest_controls, require_scene
 from varpin.simulation import simulate
 from varpin.trajectory import Trajectory, require_motion
 
@@ -107,13 +108,15 @@ class OptimalControlProblem(Frozen):
         sampling: Sampling = "gauss",
         hold: int = 1,
         t0: float = 0.0,
-        control_limits: tuple[ArrayLike, ArrayLike] | None = None,
+        control_limits: tuple[JointValues, JointValues] | None = None,
     ) -> None:
         """Describe a problem; the class says what each argument is.
 
-        ``control_limits`` are (lower, upper), each one number or (m,); infinite where a control has no limit.
+        ``control_limits`` are (lower, upper), each one number, (m,), or by joint name where each control is the force
+        of a joint; infinite where a control has no limit, and for joints that are not named.
 
         Raises:
+            UnknownJoint: A name that is no joint's, or of controls no driven joint's.
             InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
                 reference that does not fit the problem's grid, or limits that leave a control nothing.
             CostError: A reference that is a function fails.
@@ -133,7 +136,7 @@ class OptimalControlProblem(Frozen):
         places, rule = _rule(sampling, dt)
         times = ((np.arange(steps, dtype=np.float64)[:, None] + places) * dt).reshape(-1)
         t0 = real("t0", t0)
-        points = Points(t0 + times, dt * steps, steps, n, m, t0, scene.robot.joint_names)
+        points = Points(t0 + times, dt * steps, steps, n, m, t0, scene.robot.joint_names, scene.control_joints)
         running, terminal = bind_cost(cost, t0 + times, points)
         values = {
             "scene": scene,
@@ -146,11 +149,11 @@ class OptimalControlProblem(Frozen):
             "sampling": sampling,
             "hold": hold,
             "t0": t0,
-            "control_limits": checked_limits("control_limits", control_limits, m),
+            "control_limits": _limits(scene, control_limits),
             "running": running,
             "terminal": terminal,
             "rule": rule,
-            "rate": control_rate(cost, m),
+            "rate": control_rate(cost, m, scene.control_joints),
         }
         for name, value in values.items():
             if isinstance(value, np.ndarray):
@@ -199,12 +202,12 @@ class OptimalControlProblem(Frozen):
         sampling: Sampling | None = None,
         hold: int | None = None,
         t0: float | None = None,
-        before: ArrayLike | None = None,
+        before: JointValues | None = None,
     ) -> OptimalControlProblem:
         """The same problem, discretized otherwise or from another state.
 
         With ``dt`` alone the horizon stays, and the number of steps follows. ``before`` is the control applied before
-        the horizon, one number or (m,), for its :class:`ControlRateCost`.
+        the horizon, one number, (m,) or by joint name, for its :class:`ControlRateCost`.
 
         Raises:
             InputError: The horizon is no multiple of ``dt``, or ``before`` is given and changes of controls cost
@@ -253,8 +256,7 @@ class OptimalControlProblem(Frozen):
 
     def holding_controls(self) -> Floats:
         """The constant control (m,) that comes closest to holding the robot at q0 at rest, within its limits."""
-        force = lagrangian_jet(self.scene, self.q0, np.zeros_like(self.q0)).Lq
-        u = np.linalg.lstsq(self.scene.actuation, -force, rcond=None)[0]
+        u = closest_controls(self.scene, self.scene.holding_torque(self.q0))
         return np.asarray(np.clip(u, *self.control_limits), dtype=np.float64)
 
     def holding_policy(self) -> LinearPolicy:
@@ -320,7 +322,7 @@ class OptimalControlProblem(Frozen):
         return float(self.costs(trajectory.q, trajectory.v, trajectory.u))
 
     def simulate(
-        self, controls: ArrayLike | LinearPolicy | OpenLoop, *, rng: np.random.Generator | int | None = None
+        self, controls: JointValues | LinearPolicy | OpenLoop, *, rng: np.random.Generator | int | None = None
     ) -> Trajectory:
         """The motion from (q0, v0) under controls (N, m), a policy or an OpenLoop; with noise if rng is given.
 
@@ -349,8 +351,21 @@ class OptimalControlProblem(Frozen):
         return self.terminal.expand(trajectory.q[-1:], trajectory.v[-1:], np.zeros((1, self.scene.controls)))
 
 
-def default_integrator() -> Integrator:
-    """What plans are made with where nothing is said.
+def _limits(scene: Scene, limits: tuple[JointValues, JointValues] | None) -> Floats:
+    """Limits of controls (2, m), of which a side may be by joint name."""
+    sides: Any = limits
+    if isinstance(limits, tuple | list) and len(limits) == 2:
+        sides = tuple(
+            control_array(f"control_limits: {side}", value, scene.control_joints, absent=none, read=real)
+            if isinstance(value, Mapping)
+            else value
+            for side, value, none in zip(("lower", "upper"), limits, (-np.inf, np.inf), strict=True)
+        )
+    return checked_limits("control_limits", sides, scene.controls)
+
+
+def default_integrator() -> Gauss:
+    """What plans are made with where nothing is said, in Python and in scene files.
 
     Two stages are of the cost's order. Light joints of an arm with friction need more: their velocities settle within a
     fraction of a step. Four stages follow that where friction is up to ten times as fast as the step, for a third more

@@ -5,14 +5,24 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, is_dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from varpin.checks import as_floats, count, finite_array, fraction, is_one_of, positive, real
+from varpin.checks import (
+    JointValues,
+    as_floats,
+    control_array,
+    count,
+    finite_array,
+    fraction,
+    is_one_of,
+    positive,
+    real,
+)
 from varpin.costs import CostError
 from varpin.errors import InputError, LinearizationError
 from varpin.integrators import Integrator, Segment
@@ -63,7 +73,7 @@ _CUT, _DEAR = "its steps are cut into many parts", "it costs too much already"
 
 def solve(
     problem: OptimalControlProblem,
-    controls: ArrayLike | LinearPolicy | Solution | None = None,
+    controls: JointValues | LinearPolicy | Solution | None = None,
     *,
     tolerance: float = 1e-7,
     max_iterations: int = 100,
@@ -101,8 +111,8 @@ def solve(
     Main args:
         problem: What to minimize.
         controls: To start from: None to hold the robot at q0; an array (R, m) or (m,), R the number of
-            decisions; a :class:`LinearPolicy`; or a :class:`Solution`, whose policy then runs on this problem. What
-            leaves the problem's limits is brought within them.
+            decisions; by joint name; a :class:`LinearPolicy`; or a :class:`Solution`, whose policy then runs on this
+            problem. What leaves the problem's limits is brought within them.
         tolerance: Stop when the decrease that the quadratic model promises is below this part of the cost at stake:
             what the cost would lose by its own quadratic models along the motion if each state and control were free,
             and no more than it changes by over what moves. Of squared distances that is about their value; of
@@ -177,7 +187,7 @@ def solve(
     return looked_at(solution) if check else solution
 
 
-def _first_commands(problem: OptimalControlProblem, controls: ArrayLike | LinearPolicy | Solution | None) -> Commands:
+def _first_commands(problem: OptimalControlProblem, controls: JointValues | LinearPolicy | Solution | None) -> Commands:
     R, m = problem.decisions, problem.scene.controls
     variational = problem.integrator.variational
     if isinstance(controls, Solution):
@@ -193,6 +203,8 @@ def _first_commands(problem: OptimalControlProblem, controls: ArrayLike | Linear
         if problem.rate is not None and problem.rate.before is not None:
             commands = commands._replace(before=problem.rate.before[None].copy())
         return commands._replace(limits=narrowed)
+    if isinstance(controls, Mapping):
+        controls = control_array("controls", controls, problem.scene.control_joints)
     rows = as_floats("controls", controls)
     rows = finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m))
     return _held(np.broadcast_to(rows, (R, m)), problem)

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from varpin.checks import JointValues, positive
 from varpin.errors import InputError, VarpinError
@@ -331,7 +331,7 @@ def advise(
     v0: JointValues,
     *,
     duration: float,
-    controls: ArrayLike | None = None,
+    controls: JointValues | None = None,
     tolerance: float | None = None,
     budget: float | None = None,
     integrators: Sequence[Integrator] | None = None,
@@ -352,7 +352,7 @@ def advise(
         budget: Wall time to keep to [s], instead.
 
     Other Args:
-        controls: None for none, one row (m,), or rows (R, m) that are held over duration / R each.
+        controls: None for none, one row (m,), by joint name too, or rows (R, m) that are held over duration / R each.
         integrators: To choose from; varpin's own fixed-step ones if left out.
         patience: Time after which no further run is begun [s], compilation not counted.
 

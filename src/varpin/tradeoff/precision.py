@@ -7,18 +7,20 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from varpin.checks import JointValues, count, positive, writable
+from varpin.ensemble import without_geometry
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.executors import in_order, require_executor
 from varpin.integrators import Integrator, Reference
-from varpin.scene import Scene
+from varpin.scene import Scene, require_scene
 from varpin.tradeoff.records import Record, pareto_front
 from varpin.tradeoff.setting import PARTS, Outcome, Setting, integrators_of
 
@@ -113,7 +115,8 @@ class WorkPrecision(Record):
         duration: [s].
         reference: What errors are measured against, as text.
         reference_error: Largest distance in q from the same at a ten times looser tolerance, in twice as long
-            intervals [rad or m]. It is above the reference's own error; errors below it say that, and no more.
+            intervals [rad or m]. It is above the reference's own error; errors below it say that, and no more. NaN
+            where the measurement was interrupted before it was known; then there are no runs.
         tip_reference_error: The same of the end effector [m].
         samples: K: errors are taken at K evenly spaced times, the end being the last. A run that was added to a saved
             record with a step that does not share these times has fewer of them.
@@ -173,7 +176,7 @@ def work_precision(
     v0: JointValues,
     *,
     duration: float,
-    controls: ArrayLike | None = None,
+    controls: JointValues | None = None,
     integrators: Sequence[Integrator] | None = None,
     dts: Sequence[float] | None = None,
     reference: Reference | None = None,
@@ -192,7 +195,7 @@ def work_precision(
         q0: Initial configuration, (n,) or by joint name [rad or m].
         v0: Initial velocity, (n,) or by joint name [rad/s or m/s].
         duration: Of the motion [s].
-        controls: None for none, one row (m,), or rows (R, m) that are held over duration / R each.
+        controls: None for none, one row (m,), by joint name too, or rows (R, m) that are held over duration / R each.
         integrators: varpin's own fixed-step ones if left out.
         dts: Time steps [s], each rounded so that the controls' intervals hold whole numbers of steps.
 
@@ -211,47 +214,43 @@ def work_precision(
         FileError: ``save`` cannot be written, or holds runs of another motion or reference.
         VarpinError: The reference cannot integrate the motion.
     """
-    setting = Setting.of(scene, q0, v0, controls, duration)
+    setting = Setting.of(without_geometry(require_scene(scene)), q0, v0, controls, duration)
     members, repeats = integrators_of(integrators), count("repeats", repeats, least=1)
     executor = None if executor is None else require_executor(executor)
     reference = Reference(rtol=1e-13) if reference is None else reference
     if not isinstance(reference, Reference):
         raise InputError(f"reference must be a varpin.Reference, got {reference!r}")
     grids = _grids(setting, dts)
-    plan = [(member, steps) for member in members for steps in grids]
+    plan = {(repr(member), steps): member for member in members for steps in grids}
     path = None if save is None else writable(save)
     known = _known(path, setting, reference)
-    samples = _samples(grids, len(setting.controls)) if known is None else known.samples
-    if known is None:
-        exact = _Exact(setting, reference, samples)
-        base = _record(setting, exact)
-    else:
-        exact, base = None, known
+    base = _record(setting, reference, _samples(grids, len(setting.controls))) if known is None else known
     done = {(run.options, run.steps): run for run in base.runs}
-    wanted = {(repr(member), steps) for member, steps in plan}
-    kept = tuple(run for run in base.runs if (run.options, run.steps) not in wanted)
-    finished: list[WorkPrecisionRun] = []
+    kept = tuple(run for key, run in done.items() if key not in plan)
 
     def now() -> WorkPrecision:
-        return replace(base, runs=(*kept, *finished), missing=len(plan) - len(finished))
+        runs = [done[key] for key in plan if key in done]
+        return replace(base, runs=(*kept, *runs), missing=len(plan) - len(runs))
 
-    missing = [(member, steps) for member, steps in plan if (repr(member), steps) not in done]
-    if missing and exact is None:
-        exact = _Exact(setting, reference, samples)
-    cells = [] if exact is None else [_Cell(setting, exact, member, steps, repeats) for member, steps in missing]
-    fresh = (_measure(cell) for cell in cells) if executor is None else in_order(executor, _measure, cells)
+    missing = [(member, key[1]) for key, member in plan.items() if key not in done]
     try:
-        for member, steps in plan:
-            run = done.get((repr(member), steps))
-            finished.append(next(fresh) if run is None else run)
-            if path is not None:
-                now().save(path)
-            if progress is not None:
-                progress(len(finished), len(plan))
+        cells: list[_Cell] = []
+        if missing:
+            exact = _Exact(setting, reference, base.samples)
+            cells = [_Cell(setting, exact, member, steps, repeats) for member, steps in missing]
+            if known is None:
+                base = replace(base, reference_error=exact.error, tip_reference_error=exact.tip_error)
+        fresh = (_measure(cell) for cell in cells) if executor is None else in_order(executor, _measure, cells)
+        with closing(fresh):
+            for finished, key in enumerate(plan, 1):
+                if key not in done:
+                    done[key] = next(fresh)
+                if path is not None:
+                    now().save(path)
+                if progress is not None:
+                    progress(finished, len(plan))
     except KeyboardInterrupt:
-        logger.warning("interrupted after %d of %d runs, which are kept", len(finished), len(plan))
-    finally:
-        fresh.close()
+        logger.warning("interrupted after %d of %d runs, which are kept", len(plan) - now().missing, len(plan))
     return now()
 
 
@@ -267,22 +266,22 @@ class _Exact:
         for outcome in (tight, loose):
             if outcome.failure:
                 raise VarpinError(f"the reference cannot integrate this motion: {outcome.failure}")
-        self.reference = str(reference)
         self.q = tight.q
         self.tip = setting.scene.robot.frame_positions(tight.q)
         self.error = float(np.abs(tight.q - loose.q).max())
         self.tip_error = _largest(setting.scene.robot.frame_positions(loose.q) - self.tip)
 
 
-def _record(setting: Setting, exact: _Exact) -> WorkPrecision:
+def _record(setting: Setting, reference: Reference, samples: int) -> WorkPrecision:
+    """A record without runs, whose reference has not been integrated."""
     return WorkPrecision(
         runs=(),
         robot=setting.scene.robot.name,
         duration=setting.duration,
-        reference=exact.reference,
-        reference_error=exact.error,
-        tip_reference_error=exact.tip_error,
-        samples=len(exact.q) - 1,
+        reference=str(reference),
+        reference_error=math.nan,
+        tip_reference_error=math.nan,
+        samples=samples,
         fingerprint=setting.fingerprint,
     )
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from varpin.checks import JointValues, as_floats, joint_array, positive, require_finite
+from varpin.checks import JointValues, as_floats, control_array, joint_array, positive, require_finite
 from varpin.errors import InputError
 from varpin.frozen import Frozen
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
@@ -88,7 +88,9 @@ class Setting(Frozen):
     duration: float
 
     @classmethod
-    def of(cls, scene: Scene, q0: JointValues, v0: JointValues, controls: ArrayLike | None, duration: float) -> Setting:
+    def of(
+        cls, scene: Scene, q0: JointValues, v0: JointValues, controls: JointValues | None, duration: float
+    ) -> Setting:
         """Checked.
 
         Raises:
@@ -99,6 +101,8 @@ class Setting(Frozen):
             raise InputError("errors of single motions are compared here: leave the noise out of the scene")
         if controls is None:
             rows = np.zeros((1, m))
+        elif isinstance(controls, Mapping):
+            rows = control_array("controls", controls, scene.control_joints)[None]
         elif callable(controls):
             raise InputError("controls must be rows (R, m), each held over duration / R, or one row (m,)")
         else:
