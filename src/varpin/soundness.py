@@ -64,12 +64,15 @@ class Finding:
     """One thing to be said about a motion.
 
     Attributes:
-        kind: What it is about, in a word or two; the log has each kind once for a scene and a time step.
+        kind: What it is about, in a word or two.
         sentence: For the user, with numbers.
+        joint: The coordinate that it names, if it is about one; the log has each kind once for a scene, a time step
+            and a joint.
     """
 
     kind: str
     sentence: str
+    joint: int | None = None
 
 
 @dataclass(frozen=True)
@@ -127,10 +130,11 @@ def with_warnings(trajectory: Trajectory, found: Iterable[Finding]) -> Trajector
 
 
 def announce(logger: logging.Logger, scene: Scene, dt: float, found: Iterable[Finding]) -> None:
-    """Log what was found, each kind once for this scene and time step."""
+    """Log what was found, each kind once for this scene, time step and joint, whatever its numbers."""
     for finding in found:
-        if (finding.kind, dt) not in scene.announced:
-            scene.announced.add((finding.kind, dt))
+        key = finding.kind, dt, finding.joint
+        if key not in scene.announced:
+            scene.announced.add(key)
             logger.warning(finding.sentence)
 
 
