@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.chatter import alternation
+from varpin.chatter import RUN, Alternation, alternation
 from varpin.errors import SingularMassMatrix
 from varpin.integrators import ExplicitEuler, Integrator, Reference
 from varpin.integrators.base import open_loop
@@ -104,23 +104,42 @@ def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tu
         trajectory = replace(trajectory, statistics=own)
     found = (
         *_looked_for(scene, integrator, trajectory),
-        *alternating(scene, trajectory),
+        *alternating(scene, integrator, trajectory),
         *_beyond_limits(scene, trajectory),
     )
     return with_warnings(trajectory, found), found
 
 
-def alternating(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Says if velocities alternate from step to step with neither controls nor noise that make them."""
+def alternating(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Says if velocities alternate from step to step with neither controls nor noise that make them.
+
+    What smaller steps do as well is the robot's own, seen at about two nodes a period.
+    """
     found = None if trajectory.dw.any() else alternation(trajectory.v, trajectory.u)
-    if found is None:
+    if found is None or _does_so_in_smaller_steps(scene, integrator, trajectory, found):
         return ()
     sentence = (
         f"the velocity of {scene.robot.joint_names[found.joint]} alternates from step to step, {found.changes} times "
         f"in a row from t = {trajectory.t[found.first]:.4g} s on: dt = {trajectory.dt:g} s is too long for what is "
         "stiff, damped or fed back here"
     )
-    return (Finding("alternating velocities", sentence),)
+    return (Finding("alternating velocities", sentence, found.joint),)
+
+
+def _does_so_in_smaller_steps(scene: Scene, integrator: Integrator, trajectory: Trajectory, found: Alternation) -> bool:
+    """Whether a stretch of alternating velocities alternates alike when its first steps are halved."""
+    place = found.first
+    count, parts = _affordable(trajectory, place, RUN + 2, 1)
+    if isinstance(integrator, Reference) or count < RUN:
+        return False
+    try:
+        again = _taken_again(scene, integrator, trajectory, place, count, parts)
+    except SingularMassMatrix:
+        return False
+    if again is None:
+        return False
+    own = np.diff(trajectory.v[place : place + count + 1, found.joint], n=2)
+    return bool(np.abs(np.diff(again[1][:, found.joint], n=2) - own).sum() <= 0.5 * np.abs(own).sum())
 
 
 def with_warnings(trajectory: Trajectory, found: Iterable[Finding]) -> Trajectory:
@@ -225,10 +244,11 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
             f"{100 * error.position:.3g}% of its way over a period, and its velocity by {100 * error.velocity:.3g}%"
         )
         if rate := _fast_damping(scene, trajectory):
-            found.append(Finding("fast damping", f"{_ringing(rate, dt)}; {off}"))
+            found.append(Finding("fast damping", f"{_ringing(rate, dt)}; {off}", error.joint))
         else:
             split = f" ({_in_parts(trajectory)})" if _in_parts(trajectory) else ""
-            found.append(Finding("coarse steps", f"dt = {dt:g} s is coarse for {integrator} here: {off}{split}"))
+            sentence = f"dt = {dt:g} s is coarse for {integrator} here: {off}{split}"
+            found.append(Finding("coarse steps", sentence, error.joint))
     return tuple(found)
 
 
@@ -324,8 +344,8 @@ def _changed(v: Floats) -> Floats:
 def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
     """What the energy is off by after each step (N,) [J], of what no control, damper or kick accounts for.
 
-    From the record alone, for integrators that keep no ledger of their own. Velocities are taken for linear over a
-    step. Zeros with noise that only Python can evaluate.
+    From the record alone, for integrators that keep no ledger of their own. For what dampers take, velocities are taken
+    for linear over a step. Zeros with noise that only Python can evaluate.
     """
     if scene.noise.diffusion is None:
         return np.zeros(trajectory.steps)
@@ -339,13 +359,14 @@ def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
 def _works(scene: Scene, trajectory: Trajectory, kicked: Floats | float = 0.0) -> tuple[Floats, Floats]:
     """Work of the controls, and the least that the dampers can take, at each joint in each step (N, n) [J].
 
-    A kick of v (N, n) begins each step. Dampers take least where the velocity is even, and q knows its mean.
+    Controls are constant over a step, and do the work of its way. A kick of v (N, n) begins each step. Dampers take
+    least where the velocity is even, and q knows its mean.
     """
     h, before, after = trajectory.dt, trajectory.v[:-1] + kicked, trajectory.v[1:]
-    force = trajectory.u @ scene.actuation.T
     with np.errstate(over="ignore", invalid="ignore"):
-        work = 0.5 * h * force * (before + after)
-        even = (np.diff(trajectory.q, axis=0) / h) ** 2
+        way = np.diff(trajectory.q, axis=0)
+        work = (trajectory.u @ scene.actuation.T) * way
+        even = (way / h) ** 2
         heat = h * np.minimum((before**2 + before * after + after**2) / 3.0, even) * scene.damping
     return work, heat
 
