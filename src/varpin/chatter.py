@@ -47,6 +47,8 @@ def alternation(v: Floats, u: Floats | None = None) -> Alternation | None:
     if len(v) < RUN + 3:
         return None
     bend = np.diff(v, n=2, axis=0)
+    if not (np.count_nonzero(bend[1:] * bend[:-1] < 0.0, axis=0) >= RUN).any():
+        return None
     counts = (np.abs(bend) > _COUNTS * fastest) & (np.abs(bend) > _IDLE * fastest.max())
     size = np.abs(bend)
     even = (size[1:] < _EVEN * size[:-1]) & (size[:-1] < _EVEN * size[1:])

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from varpin.chatter import RUN, alternation
 from varpin.errors import LinearizationError
 from varpin.integrators import Integrator
 from varpin.integrators.explicit import accelerations
@@ -27,6 +28,7 @@ from varpin.trajectory import Trajectory
 Floats = NDArray[np.float64]
 
 KIND = "unstable loop"
+_FLIPS = "flipping controls"
 # Growth of the controls from the first quarter of a motion to its end, and over each of the last two quarters, that is
 # spoken of. A steady growth by 1e3 is one by 1e3 ** (3/4) from the end of the first quarter.
 _GREW, _GROWS = 1e2, 2.0
@@ -42,6 +44,12 @@ _EXCITED, _CHANGED = 1e-9, 1e-3
 _WANTS = 1.5
 # Angle over a period [rad] from which on they do: goals that move, and plants, take many periods for a turn.
 _TURNS = np.pi / 6.0
+# Part of its size at first that what alternates has at the end if it does not calm down.
+_CALMS = 0.5
+# Growth of the controls up to a step that fails that is spoken of.
+_OUTGROWN = 10.0
+# Nodes at one extreme value from which on a control saturates there.
+_SATURATED = 3
 # Beyond this nothing can be squared.
 _HUGE = 1e120
 # Newton's iterations from one start, and halvings of one of its steps.
@@ -138,8 +146,59 @@ def examined_in_loop(
     """:func:`varpin.soundness.examined`, and the loop too; ``hold`` is its period in steps, None without feedback."""
     trajectory, found = examined(scene, integrator, trajectory)
     if hold is not None:
-        found = (*unstable_loop(scene, trajectory, hold), *found)
+        found = (*(unstable_loop(scene, trajectory, hold) or _flipping(scene, trajectory, hold)), *found)
     return with_warnings(trajectory, found), found
+
+
+def _flipping(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding, ...]:
+    """Says if a law that may saturate flips from period to period and does not calm down.
+
+    Controls that alternate are no excuse for velocities that do: they are made of them.
+    """
+    if trajectory.dw.any():
+        return ()
+    period, v, u = hold * trajectory.dt, trajectory.v[::hold], trajectory.u[::hold]
+    advice = f"the law is too fast for its period of {period:g} s; take a shorter period or lower gains"
+    found = alternation(v)
+    if found is not None:
+        size = np.abs(np.diff(v[found.first : found.first + found.changes + 3, found.joint], n=2))
+        if size[-1] >= _CALMS * size[0]:
+            sentence = (
+                f"under the control law the velocity of {scene.robot.joint_names[found.joint]} alternates from period "
+                f"to period, {found.changes} times in a row from t = {trajectory.t[hold * found.first]:.4g} s on: "
+                f"{advice}"
+            )
+            return (Finding(_FLIPS, sentence, found.joint),)
+    late = u[len(u) // 2 :]
+    high, low = late == u.max(axis=0, initial=-np.inf), late == u.min(axis=0, initial=np.inf)
+    flips = ((high[1:] & low[:-1]) | (low[1:] & high[:-1])).sum(axis=0)
+    flips[np.ptp(u, axis=0) == 0.0] = 0
+    if len(late) <= RUN or not 2 * flips.max(initial=0) > len(late):
+        return ()
+    worst = int(np.argmax(flips))
+    sentence = (
+        f"control {worst} goes from one of its limits to the other at {flips[worst]} of the last {len(late)} periods: "
+        f"{advice}"
+    )
+    return (Finding(_FLIPS, sentence),)
+
+
+def outgrown(u: Floats, period: float) -> tuple[Finding, ...]:
+    """Of a motion that cannot go on: controls (P, m) of its periods [s] that have grown by much, in words.
+
+    A loop that is fast enough ends a motion before its law can be told.
+    """
+    size = np.abs(u).max(axis=1, initial=0.0)
+    first = int(np.argmax(size > 0.0)) if size.any() else 0
+    if len(u) < 2 or not size[-1] >= _OUTGROWN * size[first] > 0.0:
+        return ()
+    return (
+        Finding(
+            KIND,
+            f"the control loop may be unstable at its period of {period:g} s: controls grow from {size[first]:.3g} to "
+            f"{size[-1]:.3g} within {len(u) - 1 - first} periods; take a shorter period or lower gains",
+        ),
+    )
 
 
 def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[Finding, ...]:
@@ -225,6 +284,9 @@ def _by_last_changes(x: Floats, u: Floats, period: float) -> tuple[Finding, ...]
 def _by_theory(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Finding, ...]:
     """The spectral radius of the loop, where the record determines the law."""
     law = fitted_law(scene, x, u)
+    free = _unsaturated(u)
+    if law is None and not free.all():
+        law = fitted_law(scene, x[free], u[free])
     if law is None:
         return ()
     loop = loop_at_rest(scene, law)
@@ -248,6 +310,17 @@ def _by_theory(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Findi
             f"(linearized at {place} = [{', '.join(f'{value:.4g}' for value in loop.q)}]); {advice}",
         ),
     )
+
+
+def _unsaturated(u: Floats) -> NDArray[np.bool_]:
+    """Rows of u (P, m) in which no control is at its largest or smallest value (P,), where it stays there at times."""
+    free = np.ones(len(u), dtype=bool)
+    for column in u.T[np.ptp(u, axis=0) > 0.0]:
+        for extreme in (column.min(), column.max()):
+            at = column == extreme
+            if at.sum() >= _SATURATED:
+                free &= ~at
+    return free
 
 
 def fitted_law(scene: Scene, x: Floats, u: Floats) -> Law | None:

@@ -50,8 +50,8 @@ class Scene(Frozen):
     rest: Floats
     actuation: Floats = field(repr=False)
     noise: BoundNoise = field(repr=False)
-    # Kinds of warnings that the log has had, and at which time step [s].
-    announced: set[tuple[str, float]] = field(repr=False)
+    # Warnings that the log of this process has had: their kind, the time step [s] and the joint, if one is named.
+    announced: set[tuple[str, float, int | None]] = field(repr=False)
 
     def __init__(
         self,
@@ -105,6 +105,11 @@ class Scene(Frozen):
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
             object.__setattr__(self, name, value)
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = super().__getstate__()
+        # Another process, or a copy, has a log of its own.
+        return state | {"values": state["values"] | {"announced": set()}}
 
     def __repr__(self) -> str:
         parts = [f"gravity {self.gravity.tolist()}" if self.gravity.any() else "no gravity"]

@@ -24,7 +24,7 @@ from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
 from varpin.kernels._compile import announced_compilation
 from varpin.kernels.tree import Commands
-from varpin.loop_stability import examined_in_loop, unstable_loop
+from varpin.loop_stability import examined_in_loop, outgrown, unstable_loop
 from varpin.policy import LinearPolicy, OpenLoop, takes
 from varpin.scene import Scene, require_scene
 from varpin.soundness import Finding, announce, evident, with_warnings
@@ -359,7 +359,11 @@ def simulate(
                 if segment.failure is not None:
                     node = record.trajectory()
                     if hold is not None and check:
-                        node = with_warnings(node, unstable_loop(scene, node, hold))
+                        # What a law has just decided is in no step yet.
+                        last = node.u[:0] if law is None else block.u
+                        decided = np.concatenate([node.u[: node.steps if law is None else done : hold], last])
+                        loop = unstable_loop(scene, node, hold) or outgrown(decided, hold * dt)
+                        node = with_warnings(node, loop)
                     raise StepFailure(node.steps, node.t[-1], segment.failure, node)
                 if progress is not None and (done // chunk < record.steps // chunk or record.steps == steps):
                     progress(record.steps, steps)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.chatter import alternation
+from varpin.chatter import RUN, Alternation, alternation
 from varpin.errors import SingularMassMatrix
 from varpin.integrators import ExplicitEuler, Integrator, Reference
 from varpin.integrators.base import open_loop
@@ -26,21 +26,29 @@ from varpin.trajectory import Trajectory
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Error of the energy balance that is spoken of, in units of the energy that was turned over.
-ENERGY_BUDGET = 0.1
-# Error of a joint's position that is spoken of, in units of its way over a period; and of its velocity, in units of its
-# largest one: velocities have peaks, which a small shift in time moves by much.
-COARSE, COARSE_VELOCITY = 0.05, 0.2
+# What is spoken of: error of the energy balance, in units of the energy that was turned over; of a joint's position, in
+# units of its way over a period, and of the way of the joint that goes furthest; of its velocity, in units of its
+# largest one: velocities have peaks, which a small shift in time moves by much. All are half of what is wrong by
+# :mod:`varpin.extremes`, for an estimate is good to about a factor of two.
+ENERGY_BUDGET = 0.05
+COARSE, COARSE_WAY, COARSE_VELOCITY = 0.05, 0.025, 0.125
 # Steps taken again at the start, and at each other place looked at.
 _FIRST, _WINDOW = 384, 64
 # Later on, errors in units of what is spoken of at the start: by then a motion has gone further than from there.
 _LATER = 0.5
 # Other places looked at: where velocities change most, and as many spread over the motion.
 _VIOLENT, _SPREAD = 4, 3
+# And where single steps have most of the energy's error.
+_JUMPS = 2
+# Steps after which a start is judged by its way so far; before that a method of first order is behind by half a step.
+_SOON = (80, 160)
+# Windows that are taken again in steps of twice the length, beside those where velocities change most; and how many
+# times the error of a window counts, for over a period it grows.
+_WINDOWS, _MARGIN = 16, 4.0
 # Nodes on either side of a place within which a joint's period is looked for.
 _HORIZON = 1024
 # A small disturbance that grows by this is the motion's own doing: from there on no single motion can be told.
-_PREDICTABLE, _DISTURBANCE = 30.0, 1e-7
+_PREDICTABLE, _DISTURBANCE = 10.0, 1e-7
 # What a joint does that moves this much less than others of its kind, and with this much less speed than would have
 # their energy, is measured in these parts of theirs.
 _LITTLE, _LIGHT = 1e-2, 1e-2
@@ -64,12 +72,15 @@ class Finding:
     """One thing to be said about a motion.
 
     Attributes:
-        kind: What it is about, in a word or two; the log has each kind once for a scene and a time step.
+        kind: What it is about, in a word or two.
         sentence: For the user, with numbers.
+        joint: The coordinate that it names, if it is about one; the log has each kind once for a scene, a time step
+            and a joint.
     """
 
     kind: str
     sentence: str
+    joint: int | None = None
 
 
 @dataclass(frozen=True)
@@ -81,17 +92,19 @@ class MotionError:
         joint: Which coordinate.
         position: Error of q there over a period, in units of the joint's way over it.
         velocity: Error of v, in units of the joint's largest.
+        motion: Error of q, in units of the way of the joint that goes furthest.
     """
 
     step: int
     joint: int
     position: float
     velocity: float
+    motion: float
 
     @property
     def worst(self) -> float:
         """The larger error, in units of what is spoken of."""
-        return max(self.position / COARSE, self.velocity / COARSE_VELOCITY)
+        return max(self.position / COARSE, self.velocity / COARSE_VELOCITY, self.motion / COARSE_WAY)
 
 
 def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Trajectory, tuple[Finding, ...]]:
@@ -101,23 +114,42 @@ def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tu
         trajectory = replace(trajectory, statistics=own)
     found = (
         *_looked_for(scene, integrator, trajectory),
-        *alternating(scene, trajectory),
+        *alternating(scene, integrator, trajectory),
         *_beyond_limits(scene, trajectory),
     )
     return with_warnings(trajectory, found), found
 
 
-def alternating(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Says if velocities alternate from step to step with neither controls nor noise that make them."""
+def alternating(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Says if velocities alternate from step to step with neither controls nor noise that make them.
+
+    What smaller steps do as well is the robot's own, seen at about two nodes a period.
+    """
     found = None if trajectory.dw.any() else alternation(trajectory.v, trajectory.u)
-    if found is None:
+    if found is None or _does_so_in_smaller_steps(scene, integrator, trajectory, found):
         return ()
     sentence = (
         f"the velocity of {scene.robot.joint_names[found.joint]} alternates from step to step, {found.changes} times "
         f"in a row from t = {trajectory.t[found.first]:.4g} s on: dt = {trajectory.dt:g} s is too long for what is "
         "stiff, damped or fed back here"
     )
-    return (Finding("alternating velocities", sentence),)
+    return (Finding("alternating velocities", sentence, found.joint),)
+
+
+def _does_so_in_smaller_steps(scene: Scene, integrator: Integrator, trajectory: Trajectory, found: Alternation) -> bool:
+    """Whether a stretch of alternating velocities alternates alike when its first steps are halved."""
+    place, count = found.first, RUN + 1
+    parts = 2 * int(np.maximum(trajectory.statistics.substeps[place : place + count], 1).max())
+    if isinstance(integrator, Reference) or count * parts > max(4 * _FIRST, int(trajectory.statistics.substeps.sum())):
+        return False
+    try:
+        again = _taken_again(scene, integrator, trajectory, place, count, parts)
+    except SingularMassMatrix:
+        return False
+    if again is None:
+        return False
+    own = np.diff(trajectory.v[place : place + count + 1, found.joint], n=2)
+    return bool(np.abs(np.diff(again[1][:, found.joint], n=2) - own).sum() <= 0.5 * np.abs(own).sum())
 
 
 def with_warnings(trajectory: Trajectory, found: Iterable[Finding]) -> Trajectory:
@@ -127,10 +159,11 @@ def with_warnings(trajectory: Trajectory, found: Iterable[Finding]) -> Trajector
 
 
 def announce(logger: logging.Logger, scene: Scene, dt: float, found: Iterable[Finding]) -> None:
-    """Log what was found, each kind once for this scene and time step."""
+    """Log what was found, each kind once for this scene, time step and joint, whatever its numbers."""
     for finding in found:
-        if (finding.kind, dt) not in scene.announced:
-            scene.announced.add((finding.kind, dt))
+        key = finding.kind, dt, finding.joint
+        if key not in scene.announced:
+            scene.announced.add(key)
             logger.warning(finding.sentence)
 
 
@@ -194,6 +227,17 @@ def _fast_damping(scene: Scene, trajectory: Trajectory) -> float:
     return fastest if trajectory.dt * fastest > 2.0 else 0.0
 
 
+def _fast_pull(scene: Scene, trajectory: Trajectory) -> bool:
+    """Whether springs or gravity turn a mode by more than a radian a step, at the first node or the last."""
+    still = np.zeros(scene.robot.dof)
+    for q in trajectory.q[[0, -1]]:
+        _, _, _, Lqq, _, M = scene.core.jet(np.ascontiguousarray(q), still)
+        turns = trajectory.dt**2 * np.linalg.solve(M, Lqq)
+        if not np.isfinite(turns).all() or np.abs(np.linalg.eigvals(turns)).max() > 1.0:
+            return True
+    return False
+
+
 def _ringing(rate: float, dt: float) -> str:
     return (
         f"damping is faster than the step (dt * {rate:.3g}/s = {dt * rate:.3g} > 2): velocities that it should stop "
@@ -208,11 +252,19 @@ def _masses(scene: Scene, q: Floats) -> Floats:
     return scene.core.jets(q, np.zeros_like(q))[0]
 
 
+def _inertias(scene: Scene, q: Floats) -> Floats:
+    """What each joint has to move, its entry on the diagonal of M, at most at some configurations: (n,) of (K, n)."""
+    largest: Floats = np.diagonal(_masses(scene, q), axis1=1, axis2=2).max(axis=0)
+    return largest
+
+
 def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
     """What the balance of the energy and steps taken again tell."""
     if not trajectory.steps:
         return ()
     found = [*_energy(scene, integrator, trajectory)]
+    if resolved(scene, integrator, trajectory):
+        return tuple(found)
     error = motion_error(scene, integrator, trajectory)
     if error is not None and not error.worst <= 1.0:
         dt, start = trajectory.dt, trajectory.t[error.step]
@@ -221,10 +273,11 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
             f"{100 * error.position:.3g}% of its way over a period, and its velocity by {100 * error.velocity:.3g}%"
         )
         if rate := _fast_damping(scene, trajectory):
-            found.append(Finding("fast damping", f"{_ringing(rate, dt)}; {off}"))
+            found.append(Finding("fast damping", f"{_ringing(rate, dt)}; {off}", error.joint))
         else:
             split = f" ({_in_parts(trajectory)})" if _in_parts(trajectory) else ""
-            found.append(Finding("coarse steps", f"dt = {dt:g} s is coarse for {integrator} here: {off}{split}"))
+            sentence = f"dt = {dt:g} s is coarse for {integrator} here: {off}{split}"
+            found.append(Finding("coarse steps", sentence, error.joint))
     return tuple(found)
 
 
@@ -304,7 +357,7 @@ def energy_scale(scene: Scene, trajectory: Trajectory) -> float:
 def _turned_over(scene: Scene, trajectory: Trajectory) -> Floats:
     """Of each joint, the kinetic energy of the largest change of its velocity (n,) [J], for all it has to move."""
     at = np.unique(np.linspace(0, trajectory.steps, _NODES).astype(np.int64))
-    inertia = np.array([np.diag(M) for M in _masses(scene, trajectory.q[at])]).max(axis=0)
+    inertia = _inertias(scene, trajectory.q[at])
     with np.errstate(over="ignore", invalid="ignore"):
         turned: Floats = 0.5 * inertia * _changed(trajectory.v) ** 2
     return turned
@@ -320,8 +373,8 @@ def _changed(v: Floats) -> Floats:
 def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
     """What the energy is off by after each step (N,) [J], of what no control, damper or kick accounts for.
 
-    From the record alone, for integrators that keep no ledger of their own. Velocities are taken for linear over a
-    step. Zeros with noise that only Python can evaluate.
+    From the record alone, for integrators that keep no ledger of their own. For what dampers take, velocities are taken
+    for linear over a step. Zeros with noise that only Python can evaluate.
     """
     if scene.noise.diffusion is None:
         return np.zeros(trajectory.steps)
@@ -335,13 +388,14 @@ def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
 def _works(scene: Scene, trajectory: Trajectory, kicked: Floats | float = 0.0) -> tuple[Floats, Floats]:
     """Work of the controls, and the least that the dampers can take, at each joint in each step (N, n) [J].
 
-    A kick of v (N, n) begins each step. Dampers take least where the velocity is even, and q knows its mean.
+    Controls are constant over a step, and do the work of its way. A kick of v (N, n) begins each step. Dampers take
+    least where the velocity is even, and q knows its mean.
     """
     h, before, after = trajectory.dt, trajectory.v[:-1] + kicked, trajectory.v[1:]
-    force = trajectory.u @ scene.actuation.T
     with np.errstate(over="ignore", invalid="ignore"):
-        work = 0.5 * h * force * (before + after)
-        even = (np.diff(trajectory.q, axis=0) / h) ** 2
+        way = np.diff(trajectory.q, axis=0)
+        work = (trajectory.u @ scene.actuation.T) * way
+        even = (way / h) ** 2
         heat = h * np.minimum((before**2 + before * after + after**2) / 3.0, even) * scene.damping
     return work, heat
 
@@ -357,6 +411,58 @@ def _kicks(scene: Scene, trajectory: Trajectory) -> tuple[Floats | float, Floats
     return change, impulse * (v + 0.5 * change)
 
 
+def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
+    """Whether even steps of twice the length make the same motion, so that there is nothing more to look for.
+
+    Windows all over the motion, or some of them, are taken again from their first nodes, all at once. That takes half
+    as long as the motion, or less; a motion of whole steps without noise or fast dampers can pass.
+    """
+    steps, n = trajectory.steps, scene.robot.dof
+    length = min(_WINDOW, steps - steps % 2)
+    if isinstance(integrator, Reference) or not length or trajectory.dw.any() or scene.noise.diffusion is None:
+        return False
+    if not np.abs(trajectory.v).max() > _STILL:
+        return True
+    # Dampers and springs far faster than the step do as little in two.
+    if (trajectory.statistics.substeps > 1).any() or _fast_damping(scene, trajectory) or _fast_pull(scene, trajectory):
+        return False
+    begins = np.unique(np.linspace(0, steps - length, min(-(-steps // length), _WINDOWS)).astype(np.int64))
+    begins = np.union1d(begins, _blows(trajectory.v, length)) if len(begins) == _WINDOWS else begins
+    nodes = begins[:, None] + np.arange(length + 1)
+    q, v, u = trajectory.q[nodes], trajectory.v[nodes], trajectory.u
+    commands, drift = open_loop(u[:length:2]), np.zeros((0, 0, n))
+    if np.ptp(u, axis=0).any():
+        # Commands are the same for all paths; their forces need not be.
+        force = u[nodes[:, :-1]].reshape(len(begins), length // 2, 2, -1).mean(axis=2) @ scene.actuation.T
+        commands, drift = open_loop(np.zeros_like(u[:length:2])), np.ascontiguousarray(force)
+    none = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
+    try:
+        state, _ = integrator.start(scene, np.ascontiguousarray(q[:, 0]), np.ascontiguousarray(v[:, 0]))
+    except SingularMassMatrix:
+        return False
+    again = integrator.rollout_compiled(scene, state, commands, none, drift, 2.0 * trajectory.dt)
+    if any(len(part.q) < length // 2 for part in again):
+        return False
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.array(
+            [
+                np.abs(np.array([part.q for part in again]) - q[:, 2::2]).max(axis=1),
+                np.abs(np.array([part.v for part in again]) - v[:, 2::2]).max(axis=1),
+            ]
+        )
+        way, speed = np.ptp(q, axis=1), np.abs(v).max(axis=1)
+        root = np.sqrt(_inertias(scene, q[:, 0]))
+        light = _LIGHT * (root * np.clip(np.ptp(v, axis=1), _EVEN * speed, speed)).max(axis=1)[:, None] / root
+        for values, least in ((way, light * length * trajectory.dt), (speed, light)):
+            for kind in (slides := _slides(scene), ~slides):
+                others = _LITTLE * values[:, kind].max(axis=1, initial=0.0)
+                values[:, kind] = np.maximum(values[:, kind], np.minimum(others[:, None], least[:, kind]))
+        rounding = 1e3 * np.finfo(np.float64).eps * (1.0 + np.abs(q[:, 0]).max(axis=1))[:, None]
+        off[0] = np.where(off[0] <= rounding, 0.0, off[0])
+        allowed = np.array([COARSE_WAY * way, COARSE_VELOCITY * speed])
+        return bool((_MARGIN * off <= (2.0**integrator.order - 1.0) * allowed).all())
+
+
 def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> MotionError | None:
     """The error of a motion, by taking parts of it again from their first nodes, in steps of half the length.
 
@@ -368,8 +474,10 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     if isinstance(integrator, Reference) or not trajectory.steps or not moved > _STILL:
         return None
     worst = None
-    places = _places(trajectory.v)
-    inertia = np.array([np.diag(M) for M in _masses(scene, trajectory.q[places])]).max(axis=0)
+    # Where a joint goes to and fro within the first steps, what comes after is to be looked at, too.
+    first = _judged(*_periods(scene, trajectory.q[: _HORIZON + 1], trajectory.v[: _HORIZON + 1])).min()
+    places = _places(trajectory.v, trajectory.statistics.energy_defect, min(_FIRST, int(first)))
+    inertia = _inertias(scene, trajectory.q[places])
     # Half a step is as little as a whole one to dampers that are far faster.
     fast = trajectory.dt * _fast_damping(scene, trajectory)
     finer = int(2 ** np.clip(np.ceil(np.log2(max(1.0, fast))), 0, 3))
@@ -383,26 +491,40 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     return worst
 
 
-def _places(v: Floats) -> Integers:
-    """Where a motion is looked at: the first steps of its windows (K,); of v (N + 1, n)."""
+def _places(v: Floats, defect: Floats, first: int) -> Integers:
+    """Where a motion is looked at: the first steps of its windows (K,); of v (N + 1, n) and of the energy defect (N,).
+
+    One window has the ``first`` steps.
+    """
     steps = len(v) - 1
     seen = np.zeros(steps, dtype=bool)
-    seen[:_FIRST] = True
-    found = [0]
+    seen[:first] = True
+    found = [0, *_blows(v, _WINDOW, seen)]
+    for place in np.linspace(0, max(0, steps - _WINDOW), _SPREAD + 1)[1:].astype(np.int64):
+        if not seen[place : place + _WINDOW].all():
+            found.append(int(place))
+    # Single steps that are worse than others, as a whole one is among steps in parts.
+    jumps = np.abs(np.diff(defect, prepend=0.0))
+    found += np.argsort(-np.nan_to_num(jumps, nan=np.inf), kind="stable")[:_JUMPS].tolist()
+    return np.unique(found)
+
+
+def _blows(v: Floats, length: int, seen: NDArray[np.bool_] | None = None) -> list[int]:
+    """The first steps of windows of some length about the largest changes of v (N + 1, n); they are marked as seen."""
+    steps = len(v) - 1
+    seen = np.zeros(steps, dtype=bool) if seen is None else seen
     change = np.abs(np.diff(v, axis=0))
     most = change.max(axis=0)
     # A joint's changes in units of its own largest.
     change = ((change / np.where(most > 0.0, most, np.inf)) ** 2).sum(axis=1)
+    found: list[int] = []
     for _ in range(_VIOLENT):
         if seen.all():
             break
         peak = int(np.argmax(np.where(seen, -1.0, change)))
-        found.append(min(max(0, peak - _WINDOW // 4), max(0, steps - _WINDOW)))
-        seen[found[-1] : found[-1] + _WINDOW] = True
-    for place in np.linspace(0, max(0, steps - _WINDOW), _SPREAD + 1)[1:].astype(np.int64):
-        if not seen[place : place + _WINDOW].all():
-            found.append(int(place))
-    return np.unique(found)
+        found.append(min(max(0, peak - length // 4), max(0, steps - length)))
+        seen[found[-1] : found[-1] + length] = True
+    return found
 
 
 def _error_at(
@@ -412,8 +534,7 @@ def _error_at(
     ahead = slice(place, place + _HORIZON + 1)
     span, whole = _periods(scene, trajectory.q[ahead], trajectory.v[ahead])
     variation = np.abs(np.diff(trajectory.v[ahead], axis=0)).cumsum(axis=0)
-    # A period is two thirds of it.
-    judged = np.where(whole, (2 * span + 2) // 3, span)
+    judged = _judged(span, whole)
     count, parts = _affordable(trajectory, place, int(judged.max()), finer)
     if not parts:
         return None
@@ -450,18 +571,16 @@ def _error_at(
             rounding = 1e3 * np.finfo(np.float64).eps * (1.0 + np.abs(trajectory.q[place]).max())
             position = np.where(off[0] <= rounding, 0.0, off[0] * growth / units[0])
             velocity = np.where(off[1] <= 1e-9 * units[1], 0.0, off[1] / units[1])
-        if place:
-            position, velocity = _LATER * position, _LATER * velocity
-        share = np.nan_to_num(np.maximum(position / COARSE, velocity / COARSE_VELOCITY), nan=np.inf)
-        joint = int(np.argmax(share))
-        return MotionError(place, joint, float(position[joint]), float(velocity[joint]))
+            motion = position * units[0] / units[0].max()
+        errors = np.array([position, velocity, motion]) * (_LATER if place else 1.0)
+        levels = np.array([[COARSE], [COARSE_VELOCITY], [COARSE_WAY]])
+        joint = int(np.argmax(np.nan_to_num(errors / levels, nan=np.inf).max(axis=0)))
+        return MotionError(place, joint, *errors[:, joint].tolist())
 
-    found = error(count)
-    if not found.worst <= 1.0:
-        known = _predictable(scene, integrator, trajectory, place, count)
-        if known < count:
-            found = error(known)
-    return found
+    known = _predictable(scene, integrator, trajectory, place, count)
+    # What dies out soon is judged by the way that it takes, too.
+    untils = [until for until in _SOON if until < known] if place == 0 else []
+    return max((error(until) for until in (*untils, known)), key=lambda found: np.nan_to_num(found.worst, nan=np.inf))
 
 
 def _periods(scene: Scene, q: Floats, v: Floats) -> tuple[Integers, NDArray[np.bool_]]:
@@ -479,6 +598,12 @@ def _periods(scene: Scene, q: Floats, v: Floats) -> tuple[Integers, NDArray[np.b
     whole = np.asarray(over.any(axis=0))
     span: Integers = np.where(whole, over.argmax(axis=0) + 1, len(q) - 1)
     return span, whole
+
+
+def _judged(span: Integers, whole: NDArray[np.bool_]) -> Integers:
+    """Over how many steps errors count (n,), of what :func:`_periods` gives: a period is two thirds of it."""
+    judged: Integers = np.where(whole, (2 * span + 2) // 3, span)
+    return judged
 
 
 def _affordable(trajectory: Trajectory, place: int, span: int, finer: int) -> tuple[int, int]:

@@ -140,8 +140,9 @@ def _reference(setup: Setup, dt: float, nodes: NDArray[np.int64], late: bool) ->
     begin = time.process_time()
     try:
         for plain, moved in zip(*paths, strict=True):
-            found.append(plain)
             grown = np.abs(moved[0] - plain[0]).max() > _PREDICTABLE * _DISTURBANCE
+            if not (grown and found):
+                found.append(plain)
             if grown or time.process_time() - begin > _PATIENCE:
                 break
     except VarpinError:

@@ -163,14 +163,11 @@ class Robot(Frozen):
         Where both are 0, which is how a URDF has it that gives none, there are none; to hold a joint still, lock it.
         """
         lower, upper = np.full(self.dof, -np.inf), np.full(self.dof, np.inf)
-        index = joint_index(self.model)
+        joints, lowest, highest = self.model.joints, self.model.lowerPositionLimit, self.model.upperPositionLimit
         for c, name in enumerate(self.joint_names):
-            joint = self.model.joints[index[name]]
+            joint = joints[self.model.getJointId(name)]
             if joint.nq == 1:
-                lower[c], upper[c] = (
-                    self.model.lowerPositionLimit[joint.idx_q],
-                    self.model.upperPositionLimit[joint.idx_q],
-                )
+                lower[c], upper[c] = lowest[joint.idx_q], highest[joint.idx_q]
         # Pinocchio writes the absence of a limit as the largest double, a URDF as 0 and 0.
         none = (lower == 0.0) & (upper == 0.0)
         lower[none | (lower <= -1e300)], upper[none | (upper >= 1e300)] = -np.inf, np.inf
