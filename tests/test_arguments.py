@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as arrays
 
 import varpin as vp
 from varpin.costs import BoundCost, Cost, Expansion
-from varpin.kernels.tree import Diffusion
+from varpin.core.arrays import Diffusion
 from varpin.noise import CompiledFields, Noise
 
 ROBOT = vp.planar_chain(2)

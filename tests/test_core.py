@@ -8,7 +8,7 @@ import pytest
 import varpin as vp
 from varpin.core import Mechanism
 from varpin.kernels.jet import lagrangian_sweep
-from varpin.kernels.tree import new_sweep
+from varpin.core.arrays import new_sweep
 
 rng = np.random.default_rng(3)
 ROBOTS = ("finger", "ur5", "panda", "chain")

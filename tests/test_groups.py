@@ -9,7 +9,7 @@ from mechanisms import joint, link, mimic, random_inertia, random_rotation, rand
 
 import varpin as vp
 from varpin.kernels import dynamics, linalg, midpoint_equation
-from varpin.kernels.tree import block
+from varpin.core.arrays import block
 from varpin.robot.tree import block_ends, independent_groups
 
 INTEGRATORS = [vp.Midpoint(), vp.Midpoint(0.3), vp.Gauss(2), vp.SemiImplicitEuler(), vp.RungeKutta4()]

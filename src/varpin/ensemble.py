@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
+from varpin.core.arrays import Commands
 from varpin.errors import InputError, VarpinError
-from varpin.executors import executing, in_order, in_process
+from varpin.executors import executing, in_order
 from varpin.frozen import Frozen
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, rows
-from varpin.kernels._compile import announced_compilation
-from varpin.kernels.tree import Commands
 from varpin.loop_stability import examined_in_loop
 from varpin.markup import facts, table
 from varpin.policy import LinearPolicy, OpenLoop
@@ -39,7 +38,7 @@ Extremes = dict[str, tuple[float, int]]
 
 logger = logging.getLogger(__name__)
 
-# Paths that one kernel call takes, and numbers that a block of nodes holds.
+# Paths that one call of the core takes, and numbers that a block of nodes holds.
 _GROUP = 32
 _BLOCK = 1_000_000
 # A chunk of paths is what a worker does at a time. Its size depends on the ensemble alone, and so does every sum: so
@@ -190,7 +189,7 @@ def simulate_ensemble(
     bytes for any number of workers, threads, processes or machines of one kind.
 
     Main args:
-        scene: The scene, with noise that kernels can evaluate (not a ``CustomNoise``).
+        scene: The scene, with noise that the core can evaluate (not a ``CustomNoise``).
         q0: Initial configuration, (n,) or by joint name for all paths, or (P, n) [rad or m].
         v0: Initial velocity, the same [rad/s or m/s].
         dt: Time step [s].
@@ -215,7 +214,7 @@ def simulate_ensemble(
         progress: Called now and then with (paths done, P).
 
     Raises:
-        InputError: Wrong shapes, values that are not finite, or a scene whose noise kernels cannot evaluate.
+        InputError: Wrong shapes, values that are not finite, or a scene whose noise the core cannot evaluate.
         VarpinError: Every path failed, or workers get lost again and again.
         EnsembleInterrupted: Ctrl-C; holds the paths that were done. It is a KeyboardInterrupt.
     """
@@ -224,7 +223,7 @@ def simulate_ensemble(
     _require_memory(scene, steps, paths, store=store)
     start = [_per_path(name, value, paths, scene.robot.joint_names) for name, value in (("q0", q0), ("v0", v0))]
     if scene.noise.diffusion is None:
-        raise InputError("an ensemble needs noise that kernels evaluate; a CustomNoise is simulated path by path")
+        raise InputError("an ensemble needs noise that the core evaluates; a CustomNoise is simulated path by path")
     levels = require_finite("quantiles", as_floats("quantiles", quantiles))
     if levels.ndim != 1 or ((levels < 0.0) | (levels > 1.0)).any():
         raise InputError(f"quantiles must be levels in [0, 1], got {quantiles}")
@@ -232,14 +231,9 @@ def simulate_ensemble(
     if not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
     commands = commands_of(scene, integrator, controls, steps, dt)
-    with (
-        executing(executor, workers) as pool,
-        announced_compilation(f"simulate_ensemble with {type(integrator).__name__}"),
-    ):
+    with executing(executor, workers) as pool:
         shared = Shared(without_geometry(scene), integrator, commands, dt, steps, children(rng, paths))
         sums = _Sums(shared, paths, levels, store=store)
-        if not in_process(pool):
-            warm_up(shared, start[0][0], start[1][0])
         try:
             with closing(_parts(pool, sums, start[0], start[1])) as parts:
                 for part in parts:
@@ -777,15 +771,6 @@ class _Histogram:
 def greater(one: Extremes, other: Extremes) -> Extremes:
     """Of each extreme the greater, of equal ones that of ``one``."""
     return {name: max(one.get(name, found), found, key=lambda x: x[0]) for name, found in other.items()}
-
-
-def warm_up(shared: Shared, q0: Floats, v0: Floats) -> None:
-    """Compile here what many workers would else compile at the same time, each for itself."""
-    if shared.steps:
-        few = rows(shared.commands, 0, 1)
-        # Copies, as tasks have: to numba an array that must not be written to is another type.
-        motions = Motions(shared.scene, shared.integrator, q0.copy(), v0.copy(), shared.dt)
-        motions.under(few, increments=np.zeros((few.hold, shared.scene.processes)))
 
 
 def looked_at(pool: Executor, shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> tuple[Finding, ...]:

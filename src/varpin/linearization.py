@@ -12,7 +12,6 @@ from varpin.checks import as_floats, finite_array
 from varpin.errors import InputError, LinearizationError
 from varpin.integrators import Integrator, integrator_of
 from varpin.integrators.base import diffusion_and_drift, open_loop
-from varpin.kernels._compile import announced_compilation
 from varpin.markup import facts, table
 from varpin.noise import Fields
 from varpin.scene import Scene, require_scene
@@ -104,8 +103,7 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     """
     require_scene(scene)
     integrator = _matching(scene, trajectory, integrator)
-    with announced_compilation(f"linearize with {type(integrator).__name__}"):
-        return linearize_steps(scene, trajectory, integrator, trajectory.q[0])
+    return linearize_steps(scene, trajectory, integrator, trajectory.q[0])
 
 
 def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator, first: Floats) -> Linearization:
@@ -210,8 +208,7 @@ def second_order(
     rows = as_floats("z", z)
     if rows.shape == (2 * n,):
         rows = np.tile(rows, (steps, 1))
-    with announced_compilation(f"second_order with {type(integrator).__name__}"):
-        return second_order_steps(scene, trajectory, finite_array("z", rows, (steps, 2 * n)), integrator)
+    return second_order_steps(scene, trajectory, finite_array("z", rows, (steps, 2 * n)), integrator)
 
 
 def second_order_steps(scene: Scene, trajectory: Trajectory, z: Floats, integrator: Integrator) -> Curvature:
@@ -338,10 +335,9 @@ def _quiet_ends(scene: Scene, trajectory: Trajectory, integrator: Integrator, fi
         force += integrator.drift_share * np.array([diffusion_and_drift(scene, *node, first)[1] for node in nodes])
     # Every step is a path of its own, whose controls come with the drift: commands are the same for all paths.
     state, _ = integrator.start(scene, q, v)
-    silence = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
     commands = open_loop(np.zeros((1, scene.controls)))
     ends = integrator.rollout_compiled(
-        scene, state, commands, silence, np.ascontiguousarray(force[:, None]), trajectory.dt
+        scene, state, commands, scene.silence, np.ascontiguousarray(force[:, None]), trajectory.dt
     )
     for j, end in enumerate(ends):
         if end.failure is not None:

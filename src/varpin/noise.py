@@ -26,9 +26,9 @@ from varpin.checks import (
     joint_array,
     require_finite,
 )
+from varpin.core.arrays import Diffusion
 from varpin.errors import InputError
 from varpin.frozen import Frozen
-from varpin.kernels.tree import Diffusion
 
 Floats = NDArray[np.float64]
 
@@ -94,7 +94,7 @@ class BoundNoise(Frozen, ABC):
 
     @property
     def diffusion(self) -> Diffusion | None:
-        """The form that kernels evaluate, or None for fields in Python."""
+        """The form that the core evaluates, or None for fields in Python."""
         return None
 
     def curvature(self, weight: Floats) -> Floats:
@@ -111,7 +111,7 @@ class BoundNoise(Frozen, ABC):
 
 @dataclass(frozen=True, eq=False)
 class CompiledFields(BoundNoise):
-    """Fields of the form that kernels evaluate: constant, linear in u, quadratic in q."""
+    """Fields of the form that the core evaluates: constant, linear in u, quadratic in q."""
 
     arrays: Diffusion
 
@@ -445,7 +445,7 @@ def _terms(noise: Noise) -> tuple[Noise, ...]:
 
 
 def _sound(model: Noise, bound: BoundNoise, n: int, m: int) -> BoundNoise:
-    """What a model's own ``bind`` gave, if kernels can take it: they check no shapes."""
+    """What a model's own ``bind`` gave, if the core can take it."""
     name = type(model).__name__
     if not isinstance(bound, BoundNoise):
         raise InputError(f"bind of {name} must return a BoundNoise, got {type(bound).__name__}")

@@ -1,4 +1,4 @@
-"""Controls that are neither rows nor a law: a torque of time alone, and feedback that kernels can evaluate."""
+"""Controls that are neither rows nor a law: a torque of time alone, and feedback that the core evaluates."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, checked_limits, count, finite_array, is_one_of
+from varpin.core.arrays import Commands
 from varpin.errors import InputError
 from varpin.frozen import Frozen
-from varpin.kernels.tree import Commands
 
 Floats = NDArray[np.float64]
 
@@ -178,7 +178,7 @@ class LinearPolicy(Frozen):
         return np.asarray(np.clip(u, *self.limits), dtype=np.float64)
 
     def commands(self, steps: int, controls: int, dof: int, variational: bool) -> Commands:
-        """The policy as kernels take it, for an integrator on (q, p) if it is ``variational``, else on (q, v).
+        """The policy as the core takes it, for an integrator on (q, p) if it is ``variational``, else on (q, v).
 
         Raises:
             InputError: It is for another number of steps, controls or coordinates, or for the other x.

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import JointValues, as_floats, finite_array, joint_array
 from varpin.core import Mechanism as Core
+from varpin.core.arrays import Diffusion
 from varpin.errors import InputError, RobotError
 from varpin.frozen import Frozen
-from varpin.kernels.tree import Diffusion, Mechanism
 from varpin.markup import facts, listed
 from varpin.noise import BoundNoise, Noise, bind
 from varpin.robot import Robot, require_sound
@@ -157,13 +157,11 @@ class Scene(Frozen):
     @cached_property
     def core(self) -> Core:
         """The scene as the compiled core takes it; without fields that only Python can evaluate."""
-        tree, (n, m) = self.robot.tree, self.actuation.shape
-        nothing = Diffusion(np.zeros((n, 0)), np.zeros((n, 0, m)), np.zeros((n, 0)), np.zeros((n, 0)))
-        fields = self.noise.diffusion or nothing
+        tree, fields = self.robot.tree, self.diffusion
         return Core.make(
             **{name: getattr(tree, name) for name in _TREE},
             groups=tree.groups,
-            ends=np.array(tree.ends, dtype=np.int64),
+            ends=tree.ends,
             gravity=self.gravity,
             damping=self.damping,
             stiffness=self.stiffness,
@@ -175,20 +173,17 @@ class Scene(Frozen):
             centers=fields.center,
         )
 
-    @cached_property
-    def mechanism(self) -> Mechanism:
-        """The scene as flat arrays for the kernels; without fields that only Python can evaluate."""
+    @property
+    def diffusion(self) -> Diffusion:
+        """The noise's fields that the core can evaluate; without those that only Python can."""
         n, m = self.actuation.shape
         nothing = Diffusion(np.zeros((n, 0)), np.zeros((n, 0, m)), np.zeros((n, 0)), np.zeros((n, 0)))
-        return Mechanism(
-            tree=self.robot.tree,
-            gravity=self.gravity,
-            damping=self.damping,
-            stiffness=self.stiffness,
-            rest=self.rest,
-            actuation=self.actuation,
-            diffusion=self.noise.diffusion or nothing,
-        )
+        return self.noise.diffusion or nothing
+
+    @property
+    def silence(self) -> Floats:
+        """The increments of Wiener processes that a rollout without noise is given."""
+        return np.zeros((0, 0, self.diffusion.constant.shape[1]))
 
     def holding_torque(self, q: JointValues) -> Floats:
         """The generalized forces (n,) that hold the robot at rest at ``q``, against gravity and springs [N m or N].

@@ -19,11 +19,10 @@ from varpin.checks import (
     positive,
     require_finite,
 )
+from varpin.core.arrays import Commands
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
-from varpin.kernels._compile import announced_compilation
-from varpin.kernels.tree import Commands
 from varpin.loop_stability import examined_in_loop, outgrown, unstable_loop
 from varpin.policy import LinearPolicy, OpenLoop, takes
 from varpin.scene import Scene, require_scene
@@ -326,55 +325,54 @@ def simulate(
         commands = commands_of(scene, integrator, controls, steps, dt)
     hold = period if law is not None else controls.hold if isinstance(controls, LinearPolicy) else None
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
-    with announced_compilation(f"simulate with {type(integrator).__name__}"):
-        state, (start,) = integrator.start(scene, q0[None], v0[None])
-        record = _Record(scene, integrator, dt, steps, dw, start)
-        # A sweep takes as long as the robot has joints, an elimination as their cube.
-        chunk = max(1, _CHUNK // (n + n**3 // 100))
-        # One step at a time where noise calls Python functions, so that what came before one that fails is recorded.
-        stepwise = scene.noise.diffusion is None
-        interrupted = False
-        try:
-            while record.steps < steps:
-                done = record.steps
-                if law is not None:
-                    held = min(1 if stepwise else period, steps - done)
-                    u = record.u[done - 1 : done] if done % period else _decision(law, record)
-                    block = open_loop(u)._replace(hold=held)
-                elif isinstance(controls, OpenLoop):
-                    block = open_loop(_sampled(controls, record, 1 if stepwise else min(chunk, steps - done)))
-                elif stepwise:
-                    block = _next(commands, record)
-                else:
-                    first = record.steps // commands.hold
-                    before = record.u[None, record.steps - 1] if record.steps else None
-                    block = rows(commands, first, first + max(1, chunk // commands.hold), before)
-                drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
-                try:
-                    (segment,) = integrator.rollout(scene, state, block, drawn, dt)
-                except InputError as error:
-                    now = record.trajectory()
-                    raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
-                record.add(segment)
-                if segment.failure is not None:
-                    node = record.trajectory()
-                    if hold is not None and check:
-                        # What a law has just decided is in no step yet.
-                        last = node.u[:0] if law is None else block.u
-                        decided = np.concatenate([node.u[: node.steps if law is None else done : hold], last])
-                        loop = unstable_loop(scene, node, hold) or outgrown(decided, hold * dt)
-                        node = with_warnings(node, loop)
-                    raise StepFailure(node.steps, node.t[-1], segment.failure, node)
-                if progress is not None and (done // chunk < record.steps // chunk or record.steps == steps):
-                    progress(record.steps, steps)
-        except KeyboardInterrupt:
-            interrupted = True
-        try:
-            trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
-        except KeyboardInterrupt:
-            raise Interrupted(record.trajectory()) from None
-        if interrupted:
-            raise Interrupted(trajectory)
+    state, (start,) = integrator.start(scene, q0[None], v0[None])
+    record = _Record(scene, integrator, dt, steps, dw, start)
+    # A sweep takes as long as the robot has joints, an elimination as their cube.
+    chunk = max(1, _CHUNK // (n + n**3 // 100))
+    # One step at a time where noise calls Python functions, so that what came before one that fails is recorded.
+    stepwise = scene.noise.diffusion is None
+    interrupted = False
+    try:
+        while record.steps < steps:
+            done = record.steps
+            if law is not None:
+                held = min(1 if stepwise else period, steps - done)
+                u = record.u[done - 1 : done] if done % period else _decision(law, record)
+                block = open_loop(u)._replace(hold=held)
+            elif isinstance(controls, OpenLoop):
+                block = open_loop(_sampled(controls, record, 1 if stepwise else min(chunk, steps - done)))
+            elif stepwise:
+                block = _next(commands, record)
+            else:
+                first = record.steps // commands.hold
+                before = record.u[None, record.steps - 1] if record.steps else None
+                block = rows(commands, first, first + max(1, chunk // commands.hold), before)
+            drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
+            try:
+                (segment,) = integrator.rollout(scene, state, block, drawn, dt)
+            except InputError as error:
+                now = record.trajectory()
+                raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
+            record.add(segment)
+            if segment.failure is not None:
+                node = record.trajectory()
+                if hold is not None and check:
+                    # What a law has just decided is in no step yet.
+                    last = node.u[:0] if law is None else block.u
+                    decided = np.concatenate([node.u[: node.steps if law is None else done : hold], last])
+                    loop = unstable_loop(scene, node, hold) or outgrown(decided, hold * dt)
+                    node = with_warnings(node, loop)
+                raise StepFailure(node.steps, node.t[-1], segment.failure, node)
+            if progress is not None and (done // chunk < record.steps // chunk or record.steps == steps):
+                progress(record.steps, steps)
+    except KeyboardInterrupt:
+        interrupted = True
+    try:
+        trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
+    except KeyboardInterrupt:
+        raise Interrupted(record.trajectory()) from None
+    if interrupted:
+        raise Interrupted(trajectory)
     announce(logger, scene, dt, found)
     return trajectory
 
@@ -401,7 +399,7 @@ def _require_memory(scene: Scene, steps: int) -> None:
 def commands_of(
     scene: Scene, integrator: Integrator, controls: JointValues | LinearPolicy | OpenLoop | None, steps: int, dt: float
 ) -> Commands:
-    """Controls of ``steps`` steps of ``dt`` [s] as kernels take them.
+    """Controls of ``steps`` steps of ``dt`` [s] as the core takes them.
 
     They are None, (steps, m), (m,), by joint name, a function or a policy.
 
@@ -439,7 +437,6 @@ def control_rows(scene: Scene, controls: JointValues | None, steps: int) -> Floa
     array = as_floats("controls", controls)
     if array.shape != shape and array.shape != shape[1:]:
         raise InputError(f"controls must have shape {shape}, one row a step, or {shape[1:]}, got {array.shape}")
-    # A copy: to numba a view that must not be written to is another type, and every kernel would be compiled anew.
     return np.broadcast_to(require_finite("controls", array), shape).copy()
 
 

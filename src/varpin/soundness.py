@@ -435,12 +435,11 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
         # Commands are the same for all paths; their forces need not be.
         force = u[nodes[:, :-1]].reshape(len(begins), length // 2, 2, -1).mean(axis=2) @ scene.actuation.T
         commands, drift = open_loop(np.zeros_like(u[:length:2])), np.ascontiguousarray(force)
-    none = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
     try:
         state, _ = integrator.start(scene, np.ascontiguousarray(q[:, 0]), np.ascontiguousarray(v[:, 0]))
     except SingularMassMatrix:
         return False
-    again = integrator.rollout_compiled(scene, state, commands, none, drift, 2.0 * trajectory.dt)
+    again = integrator.rollout_compiled(scene, state, commands, scene.silence, drift, 2.0 * trajectory.dt)
     if any(len(part.q) < length // 2 for part in again):
         return False
     with np.errstate(over="ignore", invalid="ignore"):
@@ -699,7 +698,7 @@ def _taken_again(
     """
     steps = slice(place, place + count)
     q, v = trajectory.q[place][None] + moved[0], trajectory.v[place][None] + moved[1]
-    drawn = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
+    drawn = scene.silence
     if trajectory.dw.any() and scene.noise.diffusion is not None:
         drawn = np.zeros((1, count * parts, trajectory.dw.shape[1]))
         if isinstance(integrator, ExplicitEuler):

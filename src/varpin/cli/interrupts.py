@@ -22,7 +22,7 @@ _ENDING = "Ctrl-C a third time: ending"
 class Interrupts:
     """Handles SIGINT within a ``with`` block, if that is in the main thread.
 
-    Python runs a handler between two of its own instructions, and a kernel may run for seconds; so a thread says what
+    Python runs a handler between two of its own instructions, and the core may run for seconds; so a thread says what
     is going to happen, and the handler makes it happen. Outside :meth:`keeping` every Ctrl-C raises KeyboardInterrupt.
     Within it the first does, unless files are being :meth:`written`; the second only asks to finish, and the third
     raises again.
@@ -92,7 +92,7 @@ class Interrupts:
                 say(self._console, answer)
 
     def _handle(self, _number: int, _frame: FrameType | None) -> None:
-        # Several within one call of a kernel come as one.
+        # Several within one call of the core come as one.
         self._handled = max(self._handled + 1, self._heard)
         if self._keeping:
             self.ended = self._handled > 2

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 from rich.console import Console
 from rich.table import Table
 
@@ -30,12 +29,10 @@ from varpin.cli.console import complain, file_size, progress_bar, say
 from varpin.cli.exits import INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import Output, add_outputs, outputs_of, write_all
 from varpin.errors import InputError
-from varpin.integrators import Integrator
 from varpin.replay import frame_names
 from varpin.scene import Scene
 from varpin.simulation import Interrupted, StepFailure, simulate
 from varpin.tables import WIDTH, add_row, facts
-from varpin.tradeoff.setting import Setting
 from varpin.trajectory import Trajectory
 
 # More steps than anyone can hold in memory, said before NumPy says it in its own words.
@@ -72,13 +69,11 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
         file = scene_file(request, request.robot, "simulate", *_OF_MOTIONS)
         driven = bool(file.scene.damping.any() or file.controls() is not None or file.spec.seed is not None)
         outputs = outputs_of(request, file.marks)
-        _warm_up(file.scene, file.q0, file.v0, None, file.spec.integrator)
         return _run(request, errors, file.scene, driven, file.spec.steps, lambda p: file.simulate(progress=p), outputs)
     outputs = outputs_of(request)
     steps = _steps(request)
     integrator = integrator_asked_for(request)
     scene, q0, v0, torque = motion_of(request)
-    _warm_up(scene, q0, v0, torque, integrator)
 
     def run(progress: Callable[[int, int], None]) -> Trajectory:
         return simulate(
@@ -86,11 +81,6 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
         )
 
     return _run(request, errors, scene, bool(scene.damping.any() or torque is not None), steps, run, outputs)
-
-
-def _warm_up(scene: Scene, q0: ArrayLike, v0: ArrayLike, torque: ArrayLike | None, integrator: Integrator) -> None:
-    """Compile what a run needs, which is no part of its wall time."""
-    Setting.of(scene, q0, v0, torque, 1.0).warm_up(integrator)
 
 
 def _run(

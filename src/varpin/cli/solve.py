@@ -76,7 +76,7 @@ def _plan_table(file: SceneFile, solution: Solution, wall_time: float, files: It
     add_row(table, "status", solution.status.value, style="" if solution.status.converged else "bold yellow")
     noise = f", and {solution.noise_cost:.6g} by noise" if solution.noise_cost else ""
     add_row(table, "cost", f"{solution.cost:.6g}{noise}, after {solution.iterations} iterations")
-    add_row(table, "wall time", f"{wall_time:.3g} s, loading of kernels included")
+    add_row(table, "wall time", f"{wall_time:.3g} s")
     most = np.abs(solution.trajectory.u).max(axis=0, initial=0.0)
     add_row(table, "largest controls", "  ".join(f"{value:.4g}" for value in most))
     add_row(table, "q at the end [rad or m]", "  ".join(f"{value:.6g}" for value in solution.trajectory.q[-1]))

@@ -5,7 +5,7 @@ from enum import Enum, IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.kernels.tree import Commands, Nodes
+from varpin.core.arrays import Commands, Nodes
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -92,7 +92,7 @@ class VariationalRollout:
     def begin(self, q: Floats, v: Floats) -> bool:
         """Put each path at its row of q and v (P, n); False where an M(q) is not positive definite."""
 
-    def roll(self, dt: float, commands: Any, increments: Floats, drift: Floats, nodes: Any) -> None:
+    def roll(self, dt: float, commands: Commands, increments: Floats, drift: Floats, nodes: Nodes) -> None:
         """Take the steps that the commands are for, and write them into the nodes; named tuples of arrays."""
 
     def kick(self, impulse: Floats) -> None:

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.core.arrays import Commands, Nodes
 from varpin.errors import InputError
-from varpin.kernels.tree import Commands, Nodes
 from varpin.lagrangian import lagrangian_jet
 from varpin.scene import Scene
 from varpin.trajectory import StepStatistics, Trajectory
@@ -62,7 +62,7 @@ class Integrator(ABC):
 
     1. ``start``, which makes the state of a rollout at (q0, v0) and returns it with the first node, and ``fork``, which
        copies it;
-    2. ``rollout_compiled`` and ``step_in_python``, which move a state on: many steps of many paths in a kernel, and one
+    2. ``rollout_compiled`` and ``step_in_python``, which move a state on: many steps of many paths in the core, and one
        step of one path with noise that only Python can evaluate;
     3. ``linearize``, the derivatives of its steps;
     4. ``variational``, which says whether it maps (q, p) or (q, v), and ``order``.
@@ -127,7 +127,7 @@ class Integrator(ABC):
         each path; with diffusion fields that only Python can evaluate there is one path.
         """
         if scene.noise.diffusion is not None:
-            commands = uniform(commands)
+            commands = contiguous(commands)
             return self.rollout_compiled(scene, state, commands, increments, np.zeros((0, 0, scene.robot.dof)), dt)
         segments: list[Segment] = []
         for j in range(steps_of(commands)):
@@ -143,7 +143,7 @@ class Integrator(ABC):
     def rollout_compiled(
         self, scene: Scene, state: Any, commands: Commands, increments: Floats, drift: Floats, dt: float
     ) -> list[Segment]:
-        """:meth:`rollout` with fields that kernels evaluate; ``drift`` is a force (P, N, n), or (0, 0, n) for none."""
+        """:meth:`rollout` with fields that the core evaluates; ``drift`` is a force (P, N, n), or (0, 0, n)."""
 
     @abstractmethod
     def step_in_python(self, scene: Scene, state: Any, command: Commands, increment: Floats, dt: float) -> Segment:
@@ -215,7 +215,7 @@ def drifts(scene: Scene, trajectory: Trajectory) -> Floats:
 
 
 def segments_of(nodes: Nodes, reasons: Mapping[int, str]) -> list[Segment]:
-    """What a kernel wrote, path by path, without copies."""
+    """What the core wrote, path by path, without copies."""
     segments = []
     for i, done in enumerate(nodes.done):
         tally, quality = nodes.tally[i], nodes.quality[i]
@@ -248,7 +248,7 @@ def segments_of(nodes: Nodes, reasons: Mapping[int, str]) -> list[Segment]:
 def open_loop(u: Floats) -> Commands:
     """Controls (N, m) without feedback."""
     m = u.shape[1]
-    return uniform(Commands(u, np.zeros((0, m, 0)), np.zeros((0, 0)), 1, no_limits(m), np.zeros((0, m))))
+    return contiguous(Commands(u, np.zeros((0, m, 0)), np.zeros((0, 0)), 1, no_limits(m), np.zeros((0, m))))
 
 
 def no_limits(controls: int) -> Floats:
@@ -257,7 +257,7 @@ def no_limits(controls: int) -> Floats:
 
 
 def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> Floats:
-    """The control (m,) of a decision at a state x (2n,), as kernels find it.
+    """The control (m,) of a decision at a state x (2n,), as the core finds it.
 
     ``before`` is the control before (1, m), or (0, m) for what the reference has.
     """
@@ -271,24 +271,13 @@ def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> 
     return limited
 
 
-def read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """A contiguous view that cannot be written to, or such a copy.
-
-    Kernels are compiled for each kind of array that they meet: of what comes from users and from trajectories they
-    shall meet one.
-    """
-    view = np.ascontiguousarray(array).view()
-    view.setflags(write=False)
-    return view
-
-
-def uniform(commands: Commands) -> Commands:
-    """Commands as kernels take them: arrays of one kind."""
+def contiguous(commands: Commands) -> Commands:
+    """Commands as the core takes them: rows of numbers one after another."""
     return commands._replace(
-        u=read_only(commands.u),
-        gains=read_only(commands.gains),
-        reference=read_only(commands.reference),
-        limits=read_only(commands.limits),
+        u=np.ascontiguousarray(commands.u),
+        gains=np.ascontiguousarray(commands.gains),
+        reference=np.ascontiguousarray(commands.reference),
+        limits=np.ascontiguousarray(commands.limits),
     )
 
 

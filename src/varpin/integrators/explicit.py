@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from varpin import core
 from varpin.core import ExplicitMethod, Outcome
+from varpin.core.arrays import Commands, new_nodes
 from varpin.errors import LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
     Integrator,
@@ -21,7 +22,6 @@ from varpin.integrators.base import (
     segments_of,
     steps_of,
 )
-from varpin.kernels.tree import Commands, new_nodes
 from varpin.lagrangian import lagrangian_jet
 from varpin.scene import Scene
 from varpin.trajectory import Trajectory
@@ -84,8 +84,7 @@ class _Explicit(Integrator):
                 drift = drift + impulse / dt
             else:
                 v += np.linalg.solve(mass(scene, q), impulse)
-        nothing = np.zeros((0, 0, scene.mechanism.diffusion.constant.shape[1]))
-        (segment,) = self.rollout_compiled(scene, state, open_loop(control[None]), nothing, drift[None, None], dt)
+        (segment,) = self.rollout_compiled(scene, state, open_loop(control[None]), scene.silence, drift[None, None], dt)
         return segment
 
     def rollout_compiled(

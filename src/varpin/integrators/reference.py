@@ -11,10 +11,10 @@ from scipy.integrate import solve_ivp
 
 from varpin.checks import positive
 from varpin.core import ExplicitMethod, ExplicitRollout, ForwardDynamics
+from varpin.core.arrays import Commands, Nodes, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import Failure, Integrator, Segment, control_of, drifts, segments_of, steps_of
 from varpin.integrators.explicit import REASONS, accelerations
-from varpin.kernels.tree import Commands, Nodes, new_nodes
 from varpin.scene import Scene
 from varpin.trajectory import Trajectory
 

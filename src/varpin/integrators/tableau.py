@@ -21,7 +21,7 @@ def interpolation(nodes: Floats, at: Floats) -> Floats:
 
 
 def gauss_coefficients(stages: int) -> tuple[Floats, Floats, Floats]:
-    """a (s, s), b (s,) and c (s,) of the Gauss-Legendre method with s stages, of order 2 s, over a unit step."""
+    """A (s, s), b (s,) and c (s,) of the Gauss-Legendre method with s stages, of order 2 s, over a unit step."""
     x, w = np.polynomial.legendre.leggauss(stages)
     c, b = 0.5 * (1.0 + x), 0.5 * w
     # The rule itself integrates the Lagrange polynomials from 0 to each node, exactly.

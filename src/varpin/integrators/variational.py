@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from varpin.checks import count, fraction, is_one_of, positive
 from varpin.core import Guards, Tableau, VariationalRollout, variational_curvatures, variational_derivatives
+from varpin.core.arrays import Commands, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
     Integrator,
@@ -22,7 +23,6 @@ from varpin.integrators.base import (
     segments_of,
     steps_of,
 )
-from varpin.kernels.tree import Commands, new_nodes
 from varpin.scene import Scene
 from varpin.trajectory import Trajectory
 
@@ -140,9 +140,8 @@ class Variational(Integrator):
         F, drift = diffusion_and_drift(scene, q[0], v[0], control, state.start[0])
         if len(increment):
             state.paths.kick(self.left * (F @ increment[0, 0])[None])
-        nothing = np.zeros((0, 0, 0))
         (segment,) = self.rollout_compiled(
-            scene, state, open_loop(control[None]), nothing, self.drift_share * drift[None, None], dt
+            scene, state, open_loop(control[None]), scene.silence, self.drift_share * drift[None, None], dt
         )
         if len(increment) and self.left < 1.0 and segment.failure is None:
             q, p, v, _ = state.paths.nodes()

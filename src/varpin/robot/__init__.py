@@ -1,4 +1,4 @@
-"""Robots: found, parsed, locked and laid out as the flat tree that the kernels run on."""
+"""Robots: found, parsed, locked and laid out as the flat tree that the core runs on."""
 
 from varpin.robot.chain import planar_chain as planar_chain
 from varpin.robot.model import Robot as Robot

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from varpin.core import Links as Core
 from varpin.core import rotation_logarithms
+from varpin.core.arrays import Tree
 from varpin.errors import InputError
 from varpin.frozen import Frozen
-from varpin.kernels.tree import Tree
 from varpin.robot.model import Robot
 from varpin.robot.tree import frame_on_body
 

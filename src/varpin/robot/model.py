@@ -1,4 +1,4 @@
-"""The robot: a Pinocchio model, its generalized coordinates, and the tree the kernels run on."""
+"""The robot: a Pinocchio model, its generalized coordinates, and the tree that the core runs on."""
 
 import logging
 import os
@@ -13,9 +13,9 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, is_one_of, require_finite
+from varpin.core.arrays import Tree
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint
 from varpin.frozen import Frozen
-from varpin.kernels.tree import Tree
 from varpin.markup import facts, listed, table
 from varpin.robot.inertia import faults
 from varpin.robot.mimic import Tie, joint_index, rebuild, tied_model
@@ -52,7 +52,7 @@ class Robot(Frozen):
         joint_names: The joints that are coordinates, in order.
         free_model: The same with mimic joints on their own, on which Pinocchio computes every derivative.
         ties: The mimic joints, by index in ``free_model``.
-        tree: Flat arrays for the kernels.
+        tree: Flat arrays for the core.
         locked: Joints that were locked, and where.
         urdf: The file the robot was read from, or None.
         package_dirs: Where its meshes are looked up.

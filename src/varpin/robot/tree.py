@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from varpin.core.arrays import Tree
 from varpin.errors import InputError, RobotError, UnknownFrame, UnsupportedJoint
-from varpin.kernels.tree import Ends, Tree
 from varpin.robot.mimic import Tie
 
 Floats = NDArray[np.float64]
@@ -286,7 +286,7 @@ def periodic_coordinates(coordinate: Integers, prismatic: Integers, ratio: Float
 
 
 def require_sound(tree: Tree) -> None:
-    """Refuse arrays that kernels, which check no bounds, would read or write beyond their ends.
+    """Refuse arrays that do not fit each other or point beyond their ends.
 
     :func:`flatten` makes none; a tree that was changed afterwards may be one.
 
@@ -318,14 +318,13 @@ def require_sound(tree: Tree) -> None:
         values = getattr(tree, name)
         if ((values < low) | (values >= high)).any():
             raise RobotError(f"the robot's tree is damaged: its {name} points to what is not there")
-    ends, known = tree.ends, block_ends(tree.group)
-    indices = not isinstance(ends, np.ndarray) or ends.dtype == np.int64
-    if type(ends) is not type(known) or not indices or not np.array_equal(ends, known):
+    known = block_ends(tree.group)
+    if not isinstance(tree.ends, np.ndarray) or tree.ends.dtype != np.int64 or not np.array_equal(tree.ends, known):
         raise RobotError("the robot's tree is damaged: its blocks do not end where groups do")
 
 
 def tree_mass_matrix(tree: Tree, q: Floats) -> Floats:
-    """M(q) (n, n), armature included: M_ij = S_i . Y_j S_j for an ancestor i of j, or j itself; see kernels.jet.
+    """M(q) (n, n), armature included: M_ij = S_i . Y_j S_j for an ancestor i of j, or j itself; see jet.hpp.
 
     In plain NumPy and n^2 memory, where Pinocchio's data take n^3.
     """
@@ -398,8 +397,8 @@ def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Inte
     return np.asarray(label, dtype=np.int64)
 
 
-def block_ends(group: Integers) -> Ends:
-    """Where runs of coordinates end that hold whole groups (c,); a tuple if there is one.
+def block_ends(group: Integers) -> Integers:
+    """Where runs of coordinates end that hold whole groups (c,).
 
     Mostly each group is one run; groups whose coordinates take turns share one.
 
@@ -409,5 +408,4 @@ def block_ends(group: Integers) -> Ends:
     n = group.size
     last = np.zeros(n, dtype=np.int64)
     np.maximum.at(last, group, np.arange(n))
-    ends = np.flatnonzero(np.maximum.accumulate(last[group]) == np.arange(n)) + 1
-    return ends if len(ends) > 1 else (n,)
+    return np.flatnonzero(np.maximum.accumulate(last[group]) == np.arange(n)) + 1

@@ -24,11 +24,10 @@ from varpin.ensemble import (
     looked_at_here,
     said,
     simulate_paths,
-    warm_up,
     without_geometry,
 )
 from varpin.errors import VarpinError
-from varpin.executors import executing, in_order, in_process
+from varpin.executors import executing, in_order
 from varpin.frozen import Frozen
 from varpin.loop_stability import examined_in_loop
 from varpin.markup import facts
@@ -118,7 +117,7 @@ class _Costs(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class _Chunk(Frozen):
-    """Paths of a problem; ``task`` for those that kernels can take."""
+    """Paths of a problem; ``task`` for those that the core can take."""
 
     problem: OptimalControlProblem
     task: Task
@@ -159,8 +158,6 @@ def monte_carlo(
         if compiled:
             commands = commands_of(sent.scene, sent.integrator, policy, sent.steps, sent.dt)
             shared = Shared(sent.scene, sent.integrator, commands, sent.dt, sent.steps, seeds)
-            if not in_process(pool):
-                warm_up(shared, sent.q0, sent.v0)
         try:
             parts: Generator[_Costs, None, None]
             if shared is not None:

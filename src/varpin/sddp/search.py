@@ -23,13 +23,12 @@ from varpin.checks import (
     positive,
     real,
 )
+from varpin.core.arrays import Commands
 from varpin.costs import CostError
 from varpin.errors import InputError, LinearizationError
 from varpin.integrators import Integrator, Segment
 from varpin.integrators.base import open_loop
 from varpin.integrators.variational import Variational
-from varpin.kernels._compile import announced_compilation
-from varpin.kernels.tree import Commands
 from varpin.noise import NoiseFieldError
 from varpin.policy import LinearPolicy
 from varpin.sddp.backward import Plan, backward, noise_shares
@@ -172,17 +171,16 @@ def solve(
             # Convergence may take a last look after the last iteration.
             progress(min(item.index + 1 - known, max_iterations), max_iterations)
 
-    with announced_compilation(f"solve with {type(problem.integrator).__name__}"):
-        search = _Search(problem, second_order, forward, armijo, backtracking, regularization)
-        if resume is None:
-            search.begin(_first_commands(problem, controls))
-        else:
-            search.resume(_search_of(problem, controls, resume))
-        known = len(search.history)
-        try:
-            status = search.run(tolerance, max_iterations, deadline, report)
-        except KeyboardInterrupt:
-            status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
+    search = _Search(problem, second_order, forward, armijo, backtracking, regularization)
+    if resume is None:
+        search.begin(_first_commands(problem, controls))
+    else:
+        search.resume(_search_of(problem, controls, resume))
+    known = len(search.history)
+    try:
+        status = search.run(tolerance, max_iterations, deadline, report)
+    except KeyboardInterrupt:
+        status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
     solution = search.solution(status)
     return looked_at(solution) if check else solution
 

@@ -16,7 +16,6 @@ from varpin.checks import count, is_one_of, positive
 from varpin.costs import barriers_of
 from varpin.errors import InputError
 from varpin.frozen import Frozen
-from varpin.kernels._compile import announced_compilation
 from varpin.linearization import velocity_at_nodes
 from varpin.markup import facts, folded, listed, table
 from varpin.policy import LinearPolicy
@@ -287,16 +286,15 @@ class Solution(Frozen):
         """
         positive("tolerance", tolerance, "1")
         count("max_substeps", max_substeps, least=2)
-        with announced_compilation("Solution.verify"):
-            return verify(
-                self.problem,
-                self.trajectory,
-                self.cost,
-                lambda substeps: self.policy_on("velocity", substeps),
-                tolerance=tolerance,
-                max_substeps=max_substeps,
-                progress=progress,
-            )
+        return verify(
+            self.problem,
+            self.trajectory,
+            self.cost,
+            lambda substeps: self.policy_on("velocity", substeps),
+            tolerance=tolerance,
+            max_substeps=max_substeps,
+            progress=progress,
+        )
 
     def monte_carlo(
         self,

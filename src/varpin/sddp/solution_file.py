@@ -97,7 +97,7 @@ def _most_bytes(problem: OptimalControlProblem) -> int:
 def _surroundings(problem: OptimalControlProblem) -> dict[str, Floats]:
     """What of a problem's scene tells it from others; of a noise that only Python can evaluate nothing but its size."""
     arrays = {f"scene.{name}": getattr(problem.scene, name) for name in _SURROUNDINGS}
-    fields_of_noise = problem.scene.mechanism.diffusion._asdict()
+    fields_of_noise = problem.scene.diffusion._asdict()
     return arrays | {f"noise.{name}": array for name, array in fields_of_noise.items()}
 
 

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.core.arrays import Commands
 from varpin.costs import BoundSum
 from varpin.integrators import Integrator, RungeKutta4
 from varpin.integrators.base import open_loop
-from varpin.kernels._compile import announced_compilation
-from varpin.kernels.tree import Commands
 from varpin.markup import facts, table
 from varpin.policy import LinearPolicy
 from varpin.sddp.problem import OptimalControlProblem, bind_cost
@@ -174,8 +173,7 @@ def accurate_cost(
     """
     scene, h = problem.scene, problem.dt / substeps
     n, m = scene.robot.dof, scene.controls
-    with announced_compilation("accurate integration"):
-        motion, failure = rollout(scene, integrator or RungeKutta4(), problem.q0, problem.v0, commands, h)
+    motion, failure = rollout(scene, integrator or RungeKutta4(), problem.q0, problem.v0, commands, h)
     if failure is not None:
         return np.nan, np.full(n, np.nan)
     running, terminal = _fine_costs(problem, substeps) if costs is None else costs

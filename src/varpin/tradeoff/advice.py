@@ -367,10 +367,7 @@ def advise(
     if (tolerance is None) == (budget is None):
         raise InputError("give either a tolerance [rad or m] or a budget [s]")
     patience = positive("patience", patience, "s")
-    # Compilation is not to be part of the time.
     first = _first_steps(setting)
-    for member in members:
-        setting.warm_up(member)
     begin = time.perf_counter()
     methods = [_Method(setting, member, first) for member in members]
     search = _Search(methods, begin + patience)

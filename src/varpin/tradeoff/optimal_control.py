@@ -239,8 +239,6 @@ def _measured(problem: OptimalControlProblem, repeats: int, options: dict[str, A
     iterations, status = 0, ""
     # Whatever goes wrong with one run, the others are worth having.
     try:
-        # One iteration compiles all that the solver needs; held controls need kernels of their own.
-        solve(problem, **{"check": False, **options, "max_iterations": 1, "callback": None})
         solution, seconds, spread = fastest(lambda: _solved(problem, options), repeats)
         truth = solution.verify()
         planned, opened, closed = truth.planned_cost, truth.open_loop_cost, truth.closed_loop_cost

@@ -342,7 +342,6 @@ def _measure(cell: _Cell) -> WorkPrecisionRun:
     samples = _samples([steps, len(exact.q) - 1], len(setting.controls))
     shared = slice(None, None, (len(exact.q) - 1) // samples)
     try:
-        setting.warm_up(member)
         outcome = setting.run(member, steps, samples=samples, repeats=cell.repeats)
     except Exception as reason:
         lost = np.full_like(exact.q[shared], np.nan)

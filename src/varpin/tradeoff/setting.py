@@ -17,7 +17,6 @@ from varpin.errors import InputError
 from varpin.frozen import Frozen
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
 from varpin.integrators.base import Segment, open_loop
-from varpin.kernels._compile import announced_compilation
 from varpin.scene import Scene, require_scene
 
 Floats = NDArray[np.float64]
@@ -125,7 +124,12 @@ class Setting(Frozen):
     @property
     def fingerprint(self) -> str:
         """SHA-256 over each part that the motion depends on, by :data:`PARTS`."""
-        parts = self.scene.mechanism, (self.q0, self.v0), self.controls, self.duration
+        scene = self.scene
+        surroundings = (
+            *(scene.robot.tree, scene.gravity, scene.damping, scene.stiffness, scene.rest, scene.actuation),
+            scene.diffusion,
+        )
+        parts = surroundings, (self.q0, self.v0), self.controls, self.duration
         return " ".join(digest(part) for part in parts)
 
     def run(self, integrator: Integrator, steps: int, *, samples: int = 1, repeats: int = 0) -> Outcome:
@@ -140,13 +144,6 @@ class Setting(Frozen):
             return first
         best, _, spread = fastest(once, repeats, (first, seconds))
         return replace(best, spread=spread)
-
-    def warm_up(self, integrator: Integrator) -> None:
-        """Compile what a run needs."""
-        rows = len(self.controls)
-        few = Setting(self.scene, self.q0, self.v0, self.controls, 1e-9 * rows)
-        with announced_compilation(f"simulate with {type(integrator).__name__}"):
-            few.run(integrator, rows)
 
     def _once(self, integrator: Integrator, steps: int, samples: int) -> Outcome:
         n, stride, hold = self.scene.robot.dof, steps // samples, steps // len(self.controls)

@@ -1,1 +1,0 @@
-"""Compiled kernels: functions of plain arrays, which know numpy and numba and nothing else."""
