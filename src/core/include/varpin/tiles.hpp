@@ -3,6 +3,7 @@
 #pragma once
 
 #include <algorithm>
+#include <cstddef>
 #include <vector>
 
 namespace varpin {
@@ -42,11 +43,12 @@ inline void add_tile(const double* __restrict a, int a_stride, const double* __r
 
 enum class Part { all, upper };  // upper: the tiles on and above the diagonal
 
-// The leading `rows` rows of out += a'b, over the leading `depth` rows of a and b.
+// The leading `rows` rows of out += a'b, over the leading `depth` rows of a and b, for the columns that both have.
 inline void add_transposed_product(const TiledMatrix& a, const TiledMatrix& b, int depth, TiledMatrix& out, int rows,
                                    Part part = Part::all) {
+    const int columns = std::min(b.stride(), out.stride());
     for (int i = 0; i < rows; i += tile) {
-        for (int j = part == Part::upper ? i : 0; j < b.stride(); j += tile)
+        for (int j = part == Part::upper ? i : 0; j < columns; j += tile)
             add_tile(a[0] + i, a.stride(), b[0] + j, b.stride(), depth, out[i] + j, out.stride());
     }
 }

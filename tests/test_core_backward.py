@@ -1,0 +1,237 @@
+"""Backward passes of the core: on any model against the equations with whole matrices, and what they refuse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from varpin import core
+from varpin.sddp.square_root import squares_of
+
+H = 0.1  # the step
+
+
+def random_steps(dof, m, k, *, seed, steps=6, hold=1, samples=2, velocity=True, rated=False, curved=False):
+    """Arrays of :class:`varpin.core.ExpandedSteps` with nothing special about them, every Hessian positive definite."""
+    rng = np.random.default_rng(seed)
+    x, size, decisions = 2 * dof, 2 * dof + m, steps // hold
+
+    def definite(*shape):
+        root = rng.normal(size=(*shape, shape[-1]))
+        return np.swapaxes(root, -1, -2) @ root + 0.1 * np.eye(shape[-1])
+
+    curvature = definite(steps, size)
+    return {
+        "A": np.eye(x) + 0.3 * rng.normal(size=(steps, x, x)),
+        "B": rng.normal(size=(steps, x, m)),
+        "G": rng.normal(size=(steps, x, k)),
+        "Gx": 0.3 * rng.normal(size=(steps, x, k, x)),
+        "Gu": 0.3 * rng.normal(size=(steps, x, k, m)),
+        "rule": np.hstack([np.full((samples, 1), 1.0 / samples), rng.normal(size=(samples, 8))]),
+        "gradient": rng.normal(size=(steps * samples, size)),
+        "hessian": definite(steps * samples, size),
+        "velocity": rng.normal(size=(steps + 1, dof, x) if velocity else (0, dof, x)),
+        "curvature": curvature if curved else np.zeros((0, size, size)),
+        "slack": np.zeros((0, 2, m)),
+        "rate": definite(decisions, m) if rated else np.zeros((0, m, m)),
+        "pull": rng.normal(size=(decisions if rated else 0, m)),
+    }
+
+
+def gains_for(given, hold):
+    """Empty arrays for a pass to fill in."""
+    (N, x, m), k = given["B"].shape, given["G"].shape[2]
+    R = N // hold
+    return {
+        "feedforward": np.full((R, m), np.nan),
+        "feedback": np.full((R, m, x), np.nan),
+        "previous": np.full(given["rate"].shape, np.nan),
+        "control_gradient": np.full((R, m), np.nan),
+        "costate": np.full((N, x), np.nan),
+        "spread": np.full((N if k else 0, x, x), np.nan),
+    }
+
+
+def at_node(velocity, node, in_q, in_v, dof):
+    """Rows in_q dq/dx + in_v dv/dx."""
+    rates = velocity[node] if len(velocity) else np.eye(dof, 2 * dof, dof)
+    return in_q * np.eye(dof, 2 * dof) + in_v * rates
+
+
+def plainly(given, hold, regularization, end_gradient, end_hessian):
+    """The equations of docs/mathematics.md with whole matrices: the state is (x, the control before) throughout."""
+    A, B, G, Gx, Gu, rule = (given[name] for name in ("A", "B", "G", "Gx", "Gu", "rule"))
+    (N, x, m), k, n, s = B.shape, G.shape[2], A.shape[1] // 2, len(rule)
+    size, rated = x + m, len(given["rate"]) > 0
+    out = gains_for(given, hold)
+    V, g, z = np.zeros((size, size)), np.zeros(size), np.zeros(size)
+    V[:x, :x], g[:x], z[:x] = end_hessian, end_gradient, end_gradient
+    slope = curvature = noise = 0.0
+    for i in range(N - 1, -1, -1):
+        out["costate"][i] = z[:x]
+        step = np.block([[A[i], B[i]], [np.zeros((m, x)), np.eye(m)]])
+        Q, Qz, Qc = step.T @ V @ step, step.T @ g, step.T @ z
+        S = H * V[:x, :x]
+        if len(given["curvature"]):
+            Q = Q + given["curvature"][i]
+        for j in range(s):
+            weight, q0, v0, q1, v1, *of_v = rule[j]
+            point = i * s + j
+            after, before = (
+                np.vstack([at_node(given["velocity"], node, *in_q, n), at_node(given["velocity"], node, *in_v, n)])
+                for node, in_q, in_v in ((i + 1, (q1, v1), of_v[2:]), (i, (q0, v0), of_v[:2]))
+            )
+            D = np.eye(size)
+            D[:x] = after @ step[:x]
+            D[:x, :x] += before
+            Q = Q + H * weight * D.T @ given["hessian"][point] @ D
+            Qz, Qc = (part + H * weight * D.T @ given["gradient"][point] for part in (Qz, Qc))
+            S = S + H * H * weight * after.T @ given["hessian"][point, :x, :x] @ after
+        for w in range(k):
+            F = np.hstack([Gx[i, :, w], Gu[i, :, w]])
+            Q = Q + F.T @ S @ F
+            Qz, Qc = Qz + F.T @ S @ G[i, :, w], Qc + F.T @ S @ G[i, :, w]
+            noise += 0.5 * G[i, :, w] @ S @ G[i, :, w]
+        if k:
+            out["spread"][i] = S
+        if i % hold:
+            V, g, z = Q, Qz, Qc
+            continue
+        r = i // hold
+        rate = given["rate"][r] if rated else np.zeros((m, m))
+        pull = given["pull"][r] if rated else np.zeros(m)
+        # In (x, u, w), where the change u - w costs.
+        whole, gradient = np.zeros((size + m, size + m)), np.concatenate([Qz, np.zeros(m)])
+        whole[:size, :size] = Q
+        change = np.hstack([np.zeros((m, x)), np.eye(m), -np.eye(m)])
+        whole, gradient = whole + change.T @ rate @ change, gradient + change.T @ pull
+        u, others = slice(x, size), np.r_[0:x, size : size + m]
+        firm = whole[u, u] + regularization * np.diag(np.diagonal(whole[u, u]))
+        K, kk = -np.linalg.solve(firm, whole[u, others]), -np.linalg.solve(firm, gradient[u])
+        out["feedforward"][r], out["feedback"][r] = kk, K[:, :x]
+        if rated:
+            out["previous"][r] = K[:, x:]
+        out["control_gradient"][r] = Qc[u] + pull
+        slope, curvature = slope + gradient[u] @ kk, curvature + kk @ whole[u, u] @ kk
+        closed = np.zeros((size + m, size))
+        closed[others], closed[u] = np.eye(size), K
+        V = closed.T @ whole @ closed
+        g = closed.T @ (gradient + whole[:, u] @ kk)
+        z = np.concatenate([Qc[:x], -pull])
+        # The control after this decision is the one before the next: it has a state of its own where it costs only.
+        if not rated:
+            V[x:], V[:, x:], g[x:] = 0.0, 0.0, 0.0
+    return out, (slope, curvature, noise)
+
+
+def close(ours, theirs, digits):
+    for name, right in theirs.items():
+        if right.size:
+            scale = np.abs(right).max()
+            np.testing.assert_allclose(ours[name], right, rtol=0, atol=10.0**-digits * scale, err_msg=name)
+
+
+def terminal(x):
+    rng = np.random.default_rng(7)
+    root = rng.normal(size=(x, x))
+    return rng.normal(size=x), root.T @ root
+
+
+@pytest.mark.parametrize("regularization", [0.0, 0.3])
+@pytest.mark.parametrize("k", [0, 2])
+@pytest.mark.parametrize("options", [{}, {"rated": True}, {"velocity": False, "samples": 1}], ids=str)
+@pytest.mark.parametrize("hold", [1, 3])
+@pytest.mark.parametrize(("dof", "m"), [(1, 1), (2, 3), (6, 6)])
+def test_both_passes_are_the_equations(dof, m, hold, options, k, regularization):
+    given = random_steps(dof, m, k, seed=dof, hold=hold, **options)
+    gradient, hessian = terminal(2 * dof)
+    right, sums = plainly(given, hold, regularization, gradient, hessian)
+    steps = core.ExpandedSteps(**given)
+    plain = core.BackwardPass(m, gradient, hessian)
+    ours = gains_for(given, hold)
+    assert plain.run(H, hold, regularization, steps, core.Gains(**ours)) == -1
+    close(ours, right, 10)
+    np.testing.assert_allclose((plain.slope, plain.curvature, plain.noise), sums, rtol=1e-10)
+    roots = core.RootPass(m, squares_of(gradient[None], hessian[None]).core, gradient)
+    ours = gains_for(given, hold)
+    running, change = squares_of(given["gradient"], given["hessian"]), squares_of(given["pull"], given["rate"])
+    assert roots.run(H, hold, regularization, steps, core.Gains(**ours), running.core, change.core) == -1
+    close(ours, right, 9)
+    np.testing.assert_allclose((roots.slope, roots.curvature, roots.noise), sums, rtol=1e-9)
+
+
+def test_curvature_and_blocks():
+    """Second derivatives are added, and two blocks of steps are one."""
+    given = random_steps(3, 2, 1, seed=1, hold=2, curved=True)
+    gradient, hessian = terminal(6)
+    right, sums = plainly(given, 2, 0.0, gradient, hessian)
+    ours = gains_for(given, 2)
+    run = core.BackwardPass(2, gradient, hessian)
+    for begin, end in ((4, 6), (0, 4)):
+        part = dict(given)
+        for name, array in given.items():
+            each = {"rule": 0, "gradient": 2, "hessian": 2}.get(name, 1)
+            if each and len(array):
+                part[name] = array[begin * each : end * each + (name == "velocity")]
+        views = {
+            name: array[begin:end] if name in ("costate", "spread") else array[begin // 2 : end // 2]
+            for name, array in ours.items()
+        }
+        assert run.run(H, 2, 0.0, core.ExpandedSteps(**part), core.Gains(**views)) == -1
+    close(ours, right, 10)
+    np.testing.assert_allclose((run.slope, run.curvature, run.noise), sums, rtol=1e-10)
+
+
+def test_the_decision_without_a_minimum_is_told():
+    given = random_steps(2, 2, 0, seed=2)
+    given["hessian"][2 * 3 : 2 * 4, 4:, 4:] = -1e6 * np.eye(2)
+    gradient, hessian = terminal(4)
+    assert core.BackwardPass(2, gradient, hessian).run(
+        H, 1, 0.0, core.ExpandedSteps(**given), core.Gains(**gains_for(given, 1))
+    ) == 3  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "match"),
+    [
+        ("A", (6, 3, 3), "odd number of states"),
+        ("B", (6, 3, 2), "B has size 3 along axis 1, not 4"),
+        ("Gx", (6, 4, 1, 3), "Gx has size 3 along axis 3, not 4"),
+        ("rule", (2, 8), "rule has size 8 along axis 1, not 9"),
+        ("hessian", (5, 6, 6), "hessian has size 5 along axis 0, not 12"),
+        ("velocity", (6, 2, 4), "velocity has size 6 along axis 0, not 7"),
+        ("pull", (1, 2), "pull has size 1 along axis 0, not 0"),
+    ],
+)
+def test_steps_that_do_not_fit_are_refused(name, shape, match):
+    given = random_steps(2, 2, 1, seed=3) | {name: np.zeros(shape)}
+    with pytest.raises(ValueError, match=match):
+        core.ExpandedSteps(**given)
+
+
+def test_gains_that_do_not_fit_are_refused():
+    """Before anything is written; what is written to is never a copy."""
+    given = random_steps(2, 2, 1, seed=3, rated=True)
+    steps, (gradient, hessian) = core.ExpandedSteps(**given), terminal(4)
+    for name, shape, match in (
+        ("feedback", (6, 2, 3), "feedback has size 3 along axis 2, not 4"),
+        ("previous", (0, 2, 2), "previous has size 0 along axis 0, not 6"),
+        ("spread", (0, 4, 4), "spread has size 0 along axis 0, not 6"),
+    ):
+        gains = core.Gains(**gains_for(given, 1) | {name: np.zeros(shape)})
+        with pytest.raises(ValueError, match=match):
+            core.BackwardPass(2, gradient, hessian).run(H, 1, 0.0, steps, gains)
+    for strided in (np.zeros((6, 4))[:, ::2], np.zeros((6, 2), dtype=np.float32)):
+        with pytest.raises(TypeError):
+            core.Gains(**gains_for(given, 1) | {"feedforward": strided})
+    gains = core.Gains(**gains_for(given, 1))
+    with pytest.raises(ValueError, match="hold does not divide the steps"):
+        core.BackwardPass(2, gradient, hessian).run(H, 4, 0.0, steps, gains)
+    with pytest.raises(ValueError, match="other states or controls"):
+        core.BackwardPass(1, gradient, hessian).run(H, 1, 0.0, steps, gains)
+    with pytest.raises(ValueError, match="change is needed"):
+        core.RootPass(2, squares_of(gradient[None], hessian[None]).core, gradient).run(
+            H, 1, 0.0, steps, gains, squares_of(given["gradient"], given["hessian"]).core
+        )
+    with pytest.raises(ValueError, match="hessian has size 3 along axis 0, not 4"):
+        core.BackwardPass(2, gradient, hessian[:3])
