@@ -1,4 +1,4 @@
-"""Whatever is given as an argument: an error of varpin's, or a motion without NaN; never a kernel beyond its arrays."""
+"""Whatever is given as an argument: an error of varpin's, or a motion without NaN; never the core beyond its arrays."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 import varpin as vp
-from varpin.costs import BoundCost, Cost, Expansion
 from varpin.core.arrays import Diffusion
+from varpin.costs import BoundCost, Cost, Expansion
 from varpin.noise import CompiledFields, Noise
 
 ROBOT = vp.planar_chain(2)

@@ -7,7 +7,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from varpin.cli import console, exits, main
 from varpin.paper import Reproduction
 from varpin.paper.claims import Claim
 from varpin.robot import load_robot
-from varpin.tradeoff.setting import Setting
 
 ROD = '<mass value="1"/><origin xyz="0.5 0 0"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.083" iyz="0" izz="0.083"/>'
 
@@ -151,37 +149,6 @@ def test_forced_motion_has_an_energy_change_and_no_error(arm, capsys):
     out = capsys.readouterr().out
     assert re.search(r"energy change +│ \+\S+ J from start to end, \S+ J at most in between", out)
     assert "energy error" not in out
-    assert "s, without compiling" in out
-
-
-def test_wall_time_leaves_compilation_out(arm, capsys, monkeypatch):
-    monkeypatch.setattr(Setting, "warm_up", lambda *_: time.sleep(1.0))
-    begin = time.perf_counter()
-    assert main(["simulate", arm, "--steps", "10"]) == 0
-    elapsed = time.perf_counter() - begin
-    shown = float(re.search(r"wall time +│ (\S+) s, without compiling", capsys.readouterr().out)[1])
-    assert shown < 1.01 * (elapsed - 1.0)
-
-
-def test_a_run_needs_nothing_compiled_that_warming_up_does_not():
-    """Kernels are compiled, or loaded, once for each kind of arguments they meet."""
-    code = """
-import numpy as np, varpin as vp
-from varpin.kernels import midpoint
-from varpin.tradeoff.setting import Setting
-
-scene, rest, torque = vp.Scene(vp.planar_chain(2), damping=0.1), np.zeros(2), np.ones(2)
-kernels = midpoint.rollout, midpoint.begin_paths
-signatures = lambda: [len(kernel.signatures) for kernel in kernels]
-Setting.of(scene, rest, rest, torque, 1e-3).warm_up(vp.Midpoint())
-before = signatures()
-vp.simulate(scene, rest, rest, dt=1e-3, steps=3, controls=torque)
-vp.simulate(scene, rest, rest, dt=1e-3, steps=3)
-assert min(before) > 0
-assert before == signatures(), (before, signatures())
-"""
-    done = subprocess.run([sys.executable, "-c", code], check=False, timeout=300, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
 
 
 def test_energy_of_a_damped_motion_is_what_it_lost(arm, tmp_path, capsys):

@@ -271,7 +271,7 @@ def random_policy(scene, steps, hold=1, before=None, limits=None):
     ids=str,
 )
 def test_policies_feed_the_control_before_back(monkeypatch, integrator, limits, before):
-    """In kernels, in SciPy's integrator, and across the pieces that a long simulation is made in."""
+    """In the core, in SciPy's integrator, and across the pieces that a long simulation is made in."""
     monkeypatch.setattr("varpin.simulation._CHUNK", 8)
     scene = vp.Scene(sliders(2), gravity=False, damping=0.3)
     policy = random_policy(scene, 10, 2, before, limits)

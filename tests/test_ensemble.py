@@ -158,7 +158,7 @@ def feedback(scene, steps, seed=1):
 
 @pytest.mark.parametrize("kick", ["left", "split"])
 def test_linear_feedback(kick):
-    """Applied in the kernel, against single steps with the control worked out in NumPy."""
+    """Applied in the core, against single steps with the control worked out in NumPy."""
     scene, integrator = make_scene(actuation=["joint2"]), vp.Midpoint(kick=kick)
     policy = feedback(scene, 50)
     # The center of StateNoise must stay the same over single steps.
@@ -427,7 +427,7 @@ CUSTOM = vp.CustomNoise(lambda q, v, u: np.eye(2), 2)
     ("options", "message"),
     [
         ({"scene": "chain"}, "scene must be a varpin.Scene, got str"),
-        ({"scene": vp.Scene(vp.planar_chain(2), noise=CUSTOM)}, "an ensemble needs noise that kernels evaluate"),
+        ({"scene": vp.Scene(vp.planar_chain(2), noise=CUSTOM)}, "an ensemble needs noise that the core evaluates"),
         ({"dt": 0.0}, r"dt must be positive and finite \[s\], got 0.0"),
         ({"steps": -1}, "steps must be at least 0, got -1"),
         ({"steps": 2.5}, "steps must be an integer, got 2.5"),

@@ -17,7 +17,7 @@ from varpin.cli import main
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 
 # The command as installed, with a run and writers that take their time and say where they are. PBKDF2 keeps the main
-# thread in C without the GIL, as kernels do, where no Python handler runs.
+# thread in C without the GIL, as the core does, where no Python handler runs.
 SLOW = """
 import hashlib, sys, time
 import varpin as vp
@@ -86,7 +86,7 @@ LONG = ("simulate", "finger", "--no-gravity", "--v0", "0.1", "--dt", "1e-4", "--
 SHORT = ("simulate", "finger", "--no-gravity", "--v0", "0.1", "--steps", "10")
 
 
-def test_the_first_is_answered_at_once_even_within_a_kernel(tmp_path):
+def test_the_first_is_answered_at_once_even_within_the_core(tmp_path):
     path = tmp_path / "a.npz"
     command = Command(*LONG, "--save", str(path), run=4.0)
     command.wait_for("RUNNING")
@@ -153,7 +153,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_three_within_one_kernel_end_it_too(tmp_path):
+def test_three_within_one_call_end_it_too(tmp_path):
     path = tmp_path / "a.npz"
     command = Command(*LONG, "--save", str(path), run=3.0, save=60.0)
     command.wait_for("RUNNING")

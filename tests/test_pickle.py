@@ -4,14 +4,12 @@ import copy
 import dataclasses
 import io
 import pickle
-import sys
 from functools import cached_property
 
 import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from numba.core.dispatcher import Dispatcher
 
 import varpin as vp
 from varpin.robot.model import geometry
@@ -130,31 +128,6 @@ def same_plan(one, other):
         other.status,
         other.reason,
     )
-
-
-def kinds_met():
-    """The kinds of arguments that each kernel was compiled or loaded for."""
-    modules = [module for name, module in sys.modules.items() if name.startswith("varpin.kernels.")]
-    kernels = {value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
-    return {kernel.py_func.__qualname__ + kernel.py_func.__module__: len(kernel.signatures) for kernel in kernels}
-
-
-def test_kernels_are_not_compiled_anew_for_what_comes_back():
-    scene = scene_of(vp.planar_chain(2))
-    policy = vp.LinearPolicy(np.zeros((5, 2)), np.ones((5, 2, 4)), np.zeros((5, 4)), on="momentum")
-
-    def use(scene, policy):
-        motion = motion_of(scene, controls=policy)
-        vp.linearize(scene, motion)
-        vp.simulate_ensemble(scene, [0.1, 0.2], [0.0, 0.0], dt=1e-3, steps=5, paths=3, rng=0, controls=policy)
-        return motion
-
-    motion = use(scene, policy)
-    for way in WAYS:
-        before = kinds_met()
-        same_motion(use(way(scene), way(policy)), motion)
-        vp.linearize(way(scene), way(motion))
-        assert kinds_met() == before
 
 
 def test_arrays_keep_their_kind():

@@ -12,10 +12,9 @@ import numpy as np
 class Frozen:
     """Base of frozen dataclasses that are pickled and deep-copied.
 
-    Kernels are compiled for each kind of array that they meet, and pickle forgets of which kind arrays were: read-only
-    ones come back writable, and writable ones read-only where their bytes travelled beside the pickle. So attributes,
-    and what tuples among them hold, keep their kind here. Views of mappings, which pickle refuses, travel as mappings;
-    cached properties stay behind and are made again on use.
+    Pickle forgets which arrays were read-only, and arrays whose bytes travelled beside it come back read-only. So
+    attributes, and what tuples among them hold, keep their kind here. Views of mappings, which pickle refuses, travel as
+    mappings; cached properties stay behind and are made again on use.
     """
 
     def __getstate__(self) -> dict[str, Any]:

@@ -199,8 +199,5 @@ class LinearPolicy(Frozen):
         if self.previous_gains is not None and self.previous is not None:
             gains = np.concatenate([gains, self.previous_gains], axis=2)
             reference = np.concatenate([reference, self.previous], axis=1)
-            # To numba arrays that may be written to are of another type.
-            gains.setflags(write=False)
-            reference.setflags(write=False)
         before = np.zeros((0, controls)) if self.before is None else self.before[None].copy()
         return Commands(self.u, gains, reference, self.hold, self.limits, before)

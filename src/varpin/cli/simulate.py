@@ -141,7 +141,7 @@ def _summary(trajectory: Trajectory, asked: int, wall_time: float, driven: bool,
     statistics, steps = trajectory.statistics, trajectory.steps
     of = f" of {asked}" if steps < asked else ""
     add_row(table, "steps", f"{steps}{of}, {trajectory.dt:g} s each, {trajectory.duration:g} s in all")
-    add_row(table, "wall time", f"{wall_time:.3g} s, without compiling")
+    add_row(table, "wall time", f"{wall_time:.3g} s")
     if steps:
         newton, split = statistics.newton_iterations, statistics.split_steps
         add_row(table, "Newton iterations", f"{newton.mean():.2f} a step, {newton.max()} at most")

@@ -290,16 +290,11 @@ def fill(store: Store, *, quick: bool, progress: Progress | None = None) -> dict
     """
     todo = list(tasks(quick=quick))
     cells: dict[str, Cell] = {}
-    warm = False
     for number, task in enumerate(todo):
         if progress is not None:
             progress(number, len(todo), task.name)
         cell = store.load(task)
         if cell is None:
-            if not warm:  # compilation is not to be part of the first times
-                for method in (*METHODS, cases.FOURTH_ORDER):
-                    solve(cases.problem(MAIN, CASES[0], method, cases.COARSEST), max_iterations=1)
-                warm = True
             cell = run(task)
             store.save(task, cell)
         cells[task.name] = cell

@@ -91,7 +91,7 @@ class Advice:
             this motion; infinite if none is too large.
         tolerance: What was asked for [rad or m], or None.
         budget: What was asked for [s], or None.
-        calibration: What finding out took [s], compilation not counted.
+        calibration: What finding out took [s].
         reason: In words.
     """
 
@@ -354,7 +354,7 @@ def advise(
     Other Args:
         controls: None for none, one row (m,), by joint name too, or rows (R, m) that are held over duration / R each.
         integrators: To choose from; varpin's own fixed-step ones if left out.
-        patience: Time after which no further run is begun [s], compilation not counted.
+        patience: Time after which no further run is begun [s].
 
     Raises:
         InputError: Wrong arguments, or both or none of ``tolerance`` and ``budget``.

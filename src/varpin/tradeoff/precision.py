@@ -187,7 +187,7 @@ def work_precision(
 ) -> WorkPrecision:
     """Measure errors and wall times of integrators over steps, on one motion.
 
-    A run has one thread to itself, and is compiled before it is timed. A run that fails is in the record with its
+    A run has one thread to itself. A run that fails is in the record with its
     reason, and the others go on; Ctrl-C ends the measurement, and what is done is returned.
 
     Main args:
