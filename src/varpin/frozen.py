@@ -13,8 +13,8 @@ class Frozen:
     """Base of frozen dataclasses that are pickled and deep-copied.
 
     Pickle forgets which arrays were read-only, and arrays whose bytes travelled beside it come back read-only. So
-    attributes, and what tuples among them hold, keep their kind here. Views of mappings, which pickle refuses, travel as
-    mappings; cached properties stay behind and are made again on use.
+    attributes, and what tuples among them hold, keep their kind here. Views of mappings, which pickle refuses, travel
+    as mappings; cached properties stay behind and are made again on use.
     """
 
     def __getstate__(self) -> dict[str, Any]:
