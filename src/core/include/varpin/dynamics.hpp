@@ -1,5 +1,5 @@
-// Forward dynamics and its derivatives, for the integrators that work on (q, v). docs/mathematics.md, "Forward
-// dynamics". Inverse dynamics by the recursive Newton-Euler algorithm is tau = S . Phi, with Phi the force that moves
+// Forward dynamics and its derivatives, for the integrators that work on (q, v). docs/mathematics.md, "Explicit
+// methods". Inverse dynamics by the recursive Newton-Euler algorithm is tau = S . Phi, with Phi the force that moves
 // what a joint carries. Its derivatives follow from the rotate-along rule of the jet. For a body b below i, with V_p
 // and A_p velocity and acceleration (gravity taken off) of i's parent, (dq_i, dv_i) change velocity and acceleration by
 //
@@ -8,8 +8,8 @@
 // so that with U_i = (W_i, S_i), X_i = (Z_i, 2 W_i), columns for (dq_i, dv_i), C of `Coupling`, summed over what a
 // joint carries like its inertia Y, and i above j or j itself
 //
-//     dtau_j/d(q,v)_i = F_j . X_i + (C_j' S_j) . U_i     dtau_i/d(q,v)_j = S_i . (Y_j X_j + C_j U_j + (S_j x* Phi_j,
-//     0))
+//     dtau_j/d(q,v)_i = F_j . X_i + (C_j' S_j) . U_i
+//     dtau_i/d(q,v)_j = S_i . (Y_j X_j + C_j U_j + (S_j x* Phi_j, 0))
 #pragma once
 
 #include <algorithm>
