@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import gc
+
 import numpy as np
+import pinocchio as pin
 import pytest
+from mechanisms import joint, link, mimic, random_tree, write_urdf
+from test_linearization import difference
 
 import varpin as vp
-from varpin.core import Mechanism
+from varpin.core import ExplicitMethod, ExplicitRollout, Links, Mechanism, Outcome, accelerations, linearize_explicit
+from varpin.core.arrays import new_nodes
+from varpin.integrators.base import open_loop
+from varpin.robot.kinematics import links
 
 rng = np.random.default_rng(3)
 ROBOTS = ("finger", "ur5", "panda", "chain")
@@ -78,3 +86,147 @@ def test_what_is_no_tree_is_refused(field, value, match):
     own |= {"quadratic": np.zeros((2, 0)), "centers": np.zeros((2, 0))}
     with pytest.raises(ValueError, match=match):
         Mechanism.make(**own, groups=tree.groups, gravity=np.zeros(3))
+
+
+def mimicking(folder):
+    """Two branches, the first joint of one tied to that of the other."""
+    parts = [
+        joint("a1", "base", "a_1"),
+        joint("a2", "a_1", "a_2"),
+        joint("b1", "base", "b_1", inside=mimic("a1", -2.0)),
+    ]
+    return vp.load_robot(write_urdf(folder, *map(link, ("a_1", "a_2", "b_1")), *parts, name="mimicking"))
+
+
+@pytest.mark.parametrize("robot", [*range(6), "mimic"])
+def test_accelerations_with_their_derivatives(robot, tmp_path):
+    """On trees with branches, sliders and armature, against inverse dynamics and differences."""
+    own = mimicking(tmp_path) if robot == "mimic" else vp.load_robot(random_tree(robot, 6, armature=0.1))
+    n = own.dof
+    scene = vp.Scene(own, gravity=(1.0, -2.0, -9.0), damping=0.3, stiffness=2.0, rest=0.1)
+    q, v, force = rng.uniform(-1.0, 1.0, (3, 4, n))
+    a, *slopes, done = accelerations(scene.core, q, v, force)
+    assert done == 4
+    for k in range(4):
+        # d/dt L_v = L_q + forces, with d/dt L_v = L_vq v + M a.
+        _, Lq, _, _, Lvq, M = scene.core.jet(q[k], v[k])
+        assert np.abs(M @ a[k] + Lvq @ v[k] - Lq + 0.3 * v[k] - force[k]).max() < 1e-11 * np.abs(M @ a[k]).max() + 1e-11
+
+        def acceleration(x):
+            return accelerations(scene.core, *x.reshape(3, 1, n))[0][0]
+
+        x = np.concatenate([q[k], v[k], force[k]])
+        numeric = difference(acceleration, x, np.full(3 * n, 1e-2))
+        given = np.hstack([slope[k] for slope in slopes])
+        assert np.abs(given - numeric).max() < 1e-8 * np.abs(numeric).max()
+
+
+def sliding():
+    """A slider on a turning axis, a point mass: about the axis it has no inertia where it stands on it."""
+    model = pin.Model()
+    turns = model.addJoint(0, pin.JointModelRZ(), pin.SE3.Identity(), "turns")
+    slides = model.addJoint(turns, pin.JointModelPX(), pin.SE3(np.eye(3), np.array([0.5, 0.0, 0.0])), "slides")
+    model.appendBodyToJoint(slides, pin.Inertia(1.0, np.zeros(3), np.zeros((3, 3))), pin.SE3.Identity())
+    return vp.Scene(vp.load_robot(model))
+
+
+@pytest.mark.parametrize("method", ExplicitMethod)
+def test_where_a_mass_matrix_is_singular(method):
+    scene = sliding()
+    at = np.array([[0.0, 1.0], [0.0, 2.0], [0.0, -0.5], [0.0, 1.0]])
+    nothing = np.zeros_like(at)
+    assert accelerations(scene.core, at, nothing, nothing)[-1] == 2
+    assert linearize_explicit(scene.core, method, 1e-3, at, nothing, nothing)[-1] == 2
+    nodes = new_nodes(4, 3, 2, 2)
+    assert not ExplicitRollout.start(scene.core, method, at, nothing).first_nodes(nodes)
+    ExplicitRollout.start(scene.core, method, at, nothing).roll(
+        1e-3, open_loop(np.zeros((3, 2))), np.zeros((0, 0, 0)), np.zeros((0, 0, 2)), nodes
+    )
+    assert nodes.done.tolist() == [3, 3, 0, 3]
+    assert nodes.ended.tolist() == [Outcome.solved, Outcome.solved, Outcome.singular, Outcome.solved]
+
+
+class TestRollouts:
+    @pytest.fixture
+    def scene(self):
+        return vp.Scene(vp.planar_chain(2))
+
+    def roll(self, rollout, nodes, commands=None, increments=None, drift=None):
+        commands = open_loop(np.zeros((nodes.q.shape[1], 2))) if commands is None else commands
+        nothing = np.zeros((0, 0, 0)), np.zeros((0, 0, 2))
+        rollout.roll(
+            1e-2,
+            commands,
+            nothing[0] if increments is None else increments,
+            nothing[1] if drift is None else drift,
+            nodes,
+        )
+
+    def test_a_copy_moves_by_itself_and_the_mechanism_stays(self):
+        # Nothing else holds the mechanism.
+        rollout = ExplicitRollout.start(
+            vp.Scene(vp.planar_chain(2)).core, ExplicitMethod.runge_kutta, np.ones((3, 2)), np.zeros((3, 2))
+        )
+        other = rollout.copy()
+        q, first = other.q, rollout.q.copy()
+        nodes, again = new_nodes(3, 5, 2, 2), new_nodes(3, 5, 2, 2)
+        self.roll(other, nodes)
+        assert np.array_equal(rollout.q, first)
+        self.roll(rollout, again)
+        assert np.array_equal(nodes.q, again.q)
+        assert np.array_equal(other.q, nodes.q[:, -1])
+        del other
+        gc.collect()
+        assert np.array_equal(q, nodes.q[:, -1])
+
+    def test_what_is_written_to_its_state_moves_it(self, scene):
+        one, other = (
+            ExplicitRollout.start(scene.core, ExplicitMethod.euler, np.ones((1, 2)), v) for v in np.eye(2)[:, None]
+        )
+        one.v[:] = other.v
+        nodes, expected = new_nodes(1, 1, 2, 2), new_nodes(1, 1, 2, 2)
+        self.roll(one, nodes)
+        self.roll(other, expected)
+        assert np.array_equal(nodes.v, expected.v)
+
+    @pytest.mark.parametrize(
+        ("change", "error", "match"),
+        [
+            (lambda nodes: {"nodes": nodes._replace(q=nodes.q[:, :, ::-1])}, TypeError, "q is no contiguous array"),
+            (lambda nodes: {"nodes": nodes._replace(done=nodes.done.astype(np.int32))}, TypeError, "done is no"),
+            (lambda nodes: {"nodes": nodes._replace(p=np.zeros((3, 4, 3)))}, ValueError, "p has size 3 along axis 2"),
+            (lambda nodes: {"nodes": new_nodes(2, 4, 2, 2)}, ValueError, "as many paths"),
+            (lambda nodes: {"commands": open_loop(np.zeros((3, 2)))}, ValueError, "as many steps"),
+            (lambda nodes: {"commands": open_loop(np.zeros((4, 1)))}, ValueError, "u has size 1 along axis 1"),
+            (lambda nodes: {"commands": open_loop(np.zeros((4, 2)))._replace(hold=0)}, ValueError, "as many steps"),
+            (
+                lambda nodes: {"commands": open_loop(np.zeros((4, 2)))._replace(gains=np.zeros((4, 2, 3)))},
+                ValueError,
+                "a column for each",
+            ),
+            (lambda nodes: {"drift": np.zeros((3, 1, 2))}, ValueError, "drift has size 1 along axis 1"),
+            (lambda nodes: {"increments": np.zeros((3, 4, 1))}, ValueError, "increments has size 1 along axis 2"),
+        ],
+    )
+    def test_what_does_not_fit_is_refused(self, scene, change, error, match):
+        rollout = ExplicitRollout.start(scene.core, ExplicitMethod.euler, np.zeros((3, 2)), np.zeros((3, 2)))
+        given = {"nodes": new_nodes(3, 4, 2, 2)}
+        self.roll(rollout, **given)
+        with pytest.raises(error, match=match):
+            self.roll(rollout, **(given | change(given["nodes"])))
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"parent": np.array([-1, 1])}, "parents come before"),
+        ({"coordinate": np.array([0, 2])}, "coordinate is out of range"),
+        ({"ratio": np.ones(3)}, "ratio has size 3"),
+        ({"rotation": np.zeros((2, 3, 2))}, "rotation has size 2 along axis 2"),
+    ],
+)
+def test_what_are_no_links_is_refused(change, match):
+    own = links(vp.planar_chain(2).tree)
+    names = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset")
+    with pytest.raises(ValueError, match=match):
+        Links.make(**({name: getattr(own, name) for name in names} | change), dof=2)

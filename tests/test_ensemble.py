@@ -229,7 +229,7 @@ def test_policies_that_do_not_fit_the_scene(shape, problem):
 
 
 # Without halvings a coarse step fails on a chain that falls from the horizontal, and never on one that hangs still.
-FRAGILE = {"dt": 0.05, "steps": 60, "integrator": vp.Midpoint(max_halvings=0), "controls": None}
+FRAGILE = {"dt": 0.05, "steps": 60, "integrator": vp.Midpoint(guard=vp.Guard(max_halvings=0)), "controls": None}
 
 
 def fragile_scene(links=3):

@@ -279,7 +279,7 @@ def test_no_silent_energy_jump_at_coarse_steps(stages, duration):
 
 def test_without_the_guards_there_are_silent_jumps():
     """What the guards are for: without them the same run jumps to other branches of solutions."""
-    unguarded = vp.Gauss(2, branch_margin=0.0, energy_balance=1e12, energy_budget=1e12)
+    unguarded = vp.Gauss(2, guard=None)
     scene = vp.Scene(vp.planar_chain(3))
     try:
         motion = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=0.1, steps=2000, integrator=unguarded)
@@ -444,8 +444,7 @@ def test_stiff_springs_and_dampers(stages, stiffness, damping):
         ({"stages": 2.5}, "stages must be an integer, got 2.5"),
         ({"stages": "two"}, "stages must be an integer, got 'two'"),
         ({"tolerance": 0.0}, r"tolerance must be positive and finite \[rounding units\], got 0.0"),
-        ({"branch_margin": 1.0}, r"branch_margin must be in \[0, 1\), got 1"),
-        ({"max_halvings": 31}, "max_halvings must be at most 30, got 31"),
+        ({"guard": 3}, "guard must be a varpin.Guard, or None for no guards, got 3"),
         ({"kick": "right"}, "kick must be 'left' or 'split', got 'right'"),
     ],
 )

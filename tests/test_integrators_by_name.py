@@ -13,9 +13,9 @@ from varpin.scenefile.spec import _INTEGRATORS
 
 MADE = [
     vp.Midpoint(),
-    vp.Midpoint(alpha=1 / 3, kick="split", max_halvings=3),
+    vp.Midpoint(alpha=1 / 3, kick="split", guard=vp.Guard(max_halvings=3)),
     vp.Gauss(),
-    vp.Gauss(4, energy_budget=1e-3, kick="split"),
+    vp.Gauss(4, vp.Guard(energy_budget=1e-3), kick="split"),
     vp.ExplicitEuler(),
     vp.SemiImplicitEuler(),
     vp.RungeKutta4(),
@@ -38,7 +38,7 @@ def test_text_makes_it_again(made):
     kick=st.sampled_from(["left", "split"]),
 )
 def test_no_digit_is_lost(alpha, tolerance, halvings, kick):
-    made = vp.Midpoint(alpha=alpha, tolerance=tolerance, max_halvings=halvings, kick=kick)
+    made = vp.Midpoint(alpha=alpha, tolerance=tolerance, guard=vp.Guard(max_halvings=halvings), kick=kick)
     assert integrator_of(str(made)) == made
 
 
@@ -98,7 +98,7 @@ def test_what_made_a_motion_is_held_against_what_is_given():
     scene = vp.Scene(vp.planar_chain(1))
     motion = vp.simulate(scene, [0.4], [1.0], dt=0.01, steps=3)
     # Guards decide which steps are cut, not what a step is.
-    strict = vp.linearize(scene, motion, integrator=vp.Midpoint(max_halvings=0))
+    strict = vp.linearize(scene, motion, integrator=vp.Midpoint(guard=vp.Guard(max_halvings=0)))
     np.testing.assert_array_equal(strict.A, vp.linearize(scene, motion).A)
     for other in (vp.Gauss(), vp.Midpoint(alpha=0.4), vp.Midpoint(kick="split"), vp.RungeKutta4()):
         with pytest.raises(vp.InputError, match=r"was made with Midpoint\(alpha=0\.5\), not"):

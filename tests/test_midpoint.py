@@ -237,7 +237,7 @@ def test_no_silent_energy_jump_at_coarse_steps(links, dt):
 
 def test_without_the_energy_guard_there_are_silent_jumps():
     """What the guard is for: without it the same runs jump to other branches of solutions."""
-    unguarded = vp.Midpoint(energy_balance=1e12, energy_budget=1e12)
+    unguarded = vp.Midpoint(guard=vp.Guard(energy_balance=1e12, energy_budget=1e12))
     scene = vp.Scene(vp.planar_chain(2))
     try:
         motion = vp.simulate(scene, np.zeros(2), np.zeros(2), dt=0.1, steps=2000, integrator=unguarded)
@@ -295,7 +295,7 @@ def test_split_steps_are_reported(caplog):
 def test_branch_margin_bounds_the_smallest_eigenvalue():
     """The recorded margin against dense eigenvalues of M^-1 (M - h^2/4 L_qq / (1 - 1/2)) at the root."""
     scene = vp.Scene(vp.planar_chain(3))
-    unguarded = vp.Midpoint(energy_balance=1e12, energy_budget=1e12)
+    unguarded = vp.Midpoint(guard=vp.Guard(energy_balance=1e12, energy_budget=1e12))
     rng = np.random.default_rng(0)
     margins = []
     for _ in range(40):
@@ -398,14 +398,37 @@ def test_dampers_faster_than_the_step_are_reported(caplog):
     [
         ({"alpha": 1.5}, r"alpha must be in \[0, 1\], got 1.5"),
         ({"tolerance": 0.0}, r"tolerance must be positive and finite \[rounding units\], got 0.0"),
-        ({"branch_margin": 1.0}, r"branch_margin must be in \[0, 1\), got 1"),
-        ({"energy_balance": -1.0}, r"energy_balance must be positive and finite \[1\], got -1.0"),
-        ({"energy_budget": np.nan}, r"energy_budget must be positive and finite \[1\], got nan"),
-        ({"max_halvings": 31}, "max_halvings must be at most 30, got 31"),
-        ({"max_halvings": 1.5}, "max_halvings must be an integer, got 1.5"),
         ({"kick": "right"}, "kick must be 'left' or 'split', got 'right'"),
     ],
 )
 def test_options_out_of_range(option, words):
     with pytest.raises(vp.InputError, match=words):
         vp.Midpoint(**option)
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ({"branch_margin": 1.0}, r"branch_margin must be in \[0, 1\), got 1"),
+        ({"energy_balance": -1.0}, r"energy_balance must be positive and finite \[1\], got -1.0"),
+        ({"energy_budget": np.nan}, r"energy_budget must be positive and finite \[1\], got nan"),
+        ({"max_halvings": 31}, "max_halvings must be at most 30, got 31"),
+        ({"max_halvings": 1.5}, "max_halvings must be an integer, got 1.5"),
+    ],
+)
+def test_options_of_a_guard_out_of_range(option, words):
+    with pytest.raises(vp.InputError, match=words):
+        vp.Guard(**option)
+
+
+def test_without_a_guard_no_step_is_cut():
+    scene = vp.Scene(vp.planar_chain(3))
+    start = {"q0": np.zeros(3), "v0": np.full(3, 8.0), "dt": 0.1, "steps": 20}
+    guarded = vp.simulate(scene, **start)
+    assert guarded.statistics.split_steps > 0
+    try:
+        plain = vp.simulate(scene, **start, integrator=vp.Midpoint(guard=None))
+    except vp.StepFailure as failure:
+        plain = failure.trajectory
+    assert (plain.statistics.substeps <= 1).all()
+    assert np.isinf(plain.statistics.branch_margin).all()

@@ -173,7 +173,9 @@ def test_interruption_keeps_the_motion():
 
 def test_a_plant_that_fails_keeps_the_motion():
     mpc = vp.Mpc(tracking(), iterations=1)
-    plant = vp.Plant(vp.Scene(mpc.problem.scene.robot, gravity=(0, 0, -1e6)), vp.Midpoint(max_halvings=0), 1)
+    plant = vp.Plant(
+        vp.Scene(mpc.problem.scene.robot, gravity=(0, 0, -1e6)), vp.Midpoint(guard=vp.Guard(max_halvings=0)), 1
+    )
     with pytest.raises(vp.StepFailure) as caught:
         mpc.run(plant, duration=1.0)
     assert caught.value.trajectory.dt == pytest.approx(0.02)
@@ -189,7 +191,9 @@ def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whos
         calls.append(given)
         if len(calls) < (3 if whose == "simulate" else 4):
             return real(*given, **options)
-        return vp.simulate(harsh, np.zeros(3), np.zeros(3), dt=0.1, steps=5, integrator=vp.Midpoint(max_halvings=0))
+        return vp.simulate(
+            harsh, np.zeros(3), np.zeros(3), dt=0.1, steps=5, integrator=vp.Midpoint(guard=vp.Guard(max_halvings=0))
+        )
 
     whole = mpc.run(duration=0.1).motion
     monkeypatch.setattr(varpin.mpc, whose, failing)

@@ -52,8 +52,10 @@ from varpin.inspection import RobotReport as RobotReport
 from varpin.inspection import inspect_robot as inspect_robot
 from varpin.integrators import ExplicitEuler as ExplicitEuler
 from varpin.integrators import Gauss as Gauss
+from varpin.integrators import Guard as Guard
 from varpin.integrators import Integrator as Integrator
 from varpin.integrators import Midpoint as Midpoint
+from varpin.integrators import Radau as Radau
 from varpin.integrators import Reference as Reference
 from varpin.integrators import RungeKutta4 as RungeKutta4
 from varpin.integrators import SemiImplicitEuler as SemiImplicitEuler

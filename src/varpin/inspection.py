@@ -15,7 +15,7 @@ from varpin.checks import JointValues, joint_array
 from varpin.errors import InputError, RobotError, SingularMassMatrix
 from varpin.frozen import Frozen
 from varpin.inspection_tables import parts_of
-from varpin.integrators import Midpoint, largest_step
+from varpin.integrators import Guard, largest_step
 from varpin.lagrangian import lagrangian_jet
 from varpin.markup import facts, folded, table
 from varpin.robot import Robot, build_robot, check_inertia
@@ -233,7 +233,7 @@ def inspect_robot(
         raise RobotError(
             f"robot {robot.name!r} cannot be looked into: its mass matrix or its derivatives are not finite"
         )
-    margin = Midpoint().branch_margin
+    margin = Guard().branch_margin
     condition, scaled = _condition_numbers(jet.Lvv)
     urdf = None if robot.urdf is None else read_urdf(robot.urdf)
     joints, links = _joints(robot), _links(robot, urdf)

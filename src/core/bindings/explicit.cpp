@@ -76,13 +76,14 @@ std::tuple<Out, double, bool> node(BoundDynamics& dynamics, In<1> x) {
     return {momentum, energy, regular};
 }
 
-// Accelerations (N, n) at each row of q, v and force (N, n), and their derivatives (N, n, 3n) in all three; how many
-// rows have a positive definite mass matrix before the first that has not.
-std::tuple<Out, Out, std::size_t> accelerations(const Mechanism& mechanism, In<2> q, In<2> v, In<2> force) {
+// Accelerations (N, n) at each row of q, v and force (N, n), and their derivatives in each, (N, n, n); how many rows
+// went before one with a mass matrix that is not positive definite.
+std::tuple<Out, Out, Out, Out, std::size_t> accelerations(const Mechanism& mechanism, In<2> q, In<2> v, In<2> force) {
     require_rows(mechanism, q, v, force);
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    double *a = nullptr, *J = nullptr;
-    const Out values = array_for(a, {rows, n}), derivatives = array_for(J, {rows, n, 3 * n});
+    double *a = nullptr, *in_q = nullptr, *in_v = nullptr, *in_force = nullptr;
+    const Out values = array_for(a, {rows, n}), aq = array_for(in_q, {rows, n, n}), av = array_for(in_v, {rows, n, n}),
+              af = array_for(in_force, {rows, n, n});
     std::size_t s = 0;
     {
         nb::gil_scoped_release release;
@@ -90,33 +91,33 @@ std::tuple<Out, Out, std::size_t> accelerations(const Mechanism& mechanism, In<2
         for (; s < rows && dynamics.at(q.data() + s * n, v.data() + s * n); ++s) {
             dynamics.acceleration(force.data() + s * n, a + s * n);
             dynamics.differentiate(v.data() + s * n, a + s * n);
-            dynamics.derivatives(J + s * 3 * n * n);
+            dynamics.derivatives(in_q + s * n * n, in_v + s * n * n, in_force + s * n * n);
         }
     }
-    return {values, derivatives, s};
+    return {values, aq, av, af, s};
 }
 
-// Derivatives (N, 2n, 3n) in (q, v, force) of one step from each row; how many rows went before one with a mass matrix
-// that is not positive definite.
-std::tuple<Out, std::size_t> linearize(const Mechanism& mechanism, ExplicitMethod method, double dt, In<2> q, In<2> v,
-                                       In<2> force) {
+// Derivatives of one step from each row of q and v, in (q, v), (N, 2n, 2n), and in the force, (N, 2n, n); how many rows
+// went before one with a mass matrix that is not positive definite.
+std::tuple<Out, Out, std::size_t> linearize(const Mechanism& mechanism, ExplicitMethod method, double dt, In<2> q,
+                                            In<2> v, In<2> force) {
     require_rows(mechanism, q, v, force);
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    double* J = nullptr;
-    const Out derivatives = array_for(J, {rows, 2 * n, 3 * n});
+    double *in_x = nullptr, *in_force = nullptr;
+    const Out Jx = array_for(in_x, {rows, 2 * n, 2 * n}), Jf = array_for(in_force, {rows, 2 * n, n});
     std::size_t s = 0;
     {
         nb::gil_scoped_release release;
         ExplicitStepper stepper(mechanism, method, true);
         for (; s < rows; ++s) {
-            std::copy_n(q.data() + s * n, n, stepper.state.q.data());
-            std::copy_n(v.data() + s * n, n, stepper.state.v.data());
+            std::copy_n(q.data() + s * n, n, stepper.q.data());
+            std::copy_n(v.data() + s * n, n, stepper.v.data());
             if (!stepper.dynamics.at(q.data() + s * n, v.data() + s * n)) break;
             if (!stepper.step(dt, force.data() + s * n)) break;
-            stepper.write_derivatives(J + s * 6 * n * n);
+            stepper.write_derivatives(dt, in_x + s * 4 * n * n, in_force + s * 2 * n * n);
         }
     }
-    return {derivatives, s};
+    return {Jx, Jf, s};
 }
 
 BoundRollout rollout(SharedMechanism mechanism, ExplicitMethod method, In<2> q, In<2> v) {

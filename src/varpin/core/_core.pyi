@@ -279,8 +279,10 @@ class ForwardDynamics:
     def node(self, x: Floats) -> tuple[Floats, float, bool]:
         """Momentum (n,) and energy [J] at x = (q, v) (2n,), and whether the mass matrix is positive definite."""
 
-def accelerations(mechanism: Mechanism, q: Floats, v: Floats, force: Floats) -> tuple[Floats, Floats, int]:
-    """Accelerations (N, n) at each row of q, v and force (N, n), and their derivatives (N, n, 3n) in all three.
+def accelerations(
+    mechanism: Mechanism, q: Floats, v: Floats, force: Floats
+) -> tuple[Floats, Floats, Floats, Floats, int]:
+    """Accelerations (N, n) at each row of q, v and force (N, n), and their derivatives (N, n, n) in each.
 
     With them, how many rows there are before the first whose mass matrix is not positive definite.
     """
@@ -320,8 +322,10 @@ class ExplicitRollout:
 
 def linearize_explicit(
     mechanism: Mechanism, method: ExplicitMethod, dt: float, q: Floats, v: Floats, force: Floats
-) -> tuple[Floats, int]:
-    """Derivatives (N, 2n, 3n) of (q, v) after one step in (q, v, force), from each row of them (N, n).
+) -> tuple[Floats, Floats, int]:
+    """Derivatives of (q, v) after one step from each row of q, v and force (N, n).
+
+    In (q, v) (N, 2n, 2n), and in the force (N, 2n, n).
 
     With them, how many rows there are before the first with a mass matrix that is not positive definite.
     """

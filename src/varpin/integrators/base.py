@@ -77,14 +77,7 @@ class Integrator(ABC):
 
         A trajectory keeps it as what made it.
         """
-        name = type(self).__name__
-        given: dict[str, Any] = {item.name: item.default for item in fields(self)} if is_dataclass(self) else {}
-        options = [
-            f"{option}={_text(getattr(self, option))}"
-            for option, default in given.items()
-            if option in self.named or getattr(self, option) != default
-        ]
-        return f"{name}({', '.join(options)})" if options else name
+        return written(self, self.named)
 
     def same_map(self, other: Integrator) -> bool:
         """Whether ``other`` takes the same steps, wherever both take them whole."""
@@ -170,6 +163,18 @@ class Integrator(ABC):
         raise InputError(f"{self} has no second-order linearization; varpin.Midpoint(...) has")
 
 
+def written(made: object, named: Sequence[str] = ()) -> str:
+    """A dataclass as the call that makes it, with the options in ``named`` and those that are not the default."""
+    given: dict[str, Any] = {item.name: item.default for item in fields(made)} if is_dataclass(made) else {}
+    options = [
+        f"{option}={_text(getattr(made, option))}"
+        for option, default in given.items()
+        if option in named or getattr(made, option) != default
+    ]
+    name = type(made).__name__
+    return f"{name}({', '.join(options)})" if options else name
+
+
 def _text(value: object) -> str:
     """A number in as few digits as tell it from others; a word as it is."""
     if isinstance(value, str):
@@ -178,7 +183,7 @@ def _text(value: object) -> str:
         number = float(value)
         short = f"{number:g}"
         return short if float(short) == number else repr(number)
-    return str(value)
+    return repr(value) if is_dataclass(value) else str(value)
 
 
 def join(segments: Sequence[Segment]) -> Segment:

@@ -100,10 +100,10 @@ class _Explicit(Integrator):
         h, n = trajectory.dt, scene.robot.dof
         q, v = (np.ascontiguousarray(x[:-1]) for x in (trajectory.q, trajectory.v))
         force = trajectory.u @ scene.actuation.T + drifts(scene, trajectory)
-        J, done = core.linearize_explicit(scene.core, self.method, h, q, v, force)
+        Jx, Jf, done = core.linearize_explicit(scene.core, self.method, h, q, v, force)
         if done < len(q):
             raise LinearizationError(done, done * h, REASONS[Outcome.singular])
-        return J[:, :, : 2 * n], J[:, :, 2 * n :], self._jump(J[:, :, n : 2 * n])
+        return Jx, Jf, self._jump(Jx[:, :, n:])
 
     def _jump(self, in_v: Floats) -> Floats:
         """Derivatives of each step in a jump (N, 2n, n), from those in the velocity."""
@@ -121,12 +121,11 @@ def accelerations(scene: Scene, q: Floats, v: Floats, force: Floats) -> tuple[Fl
     Raises:
         LinearizationError: A mass matrix is not positive definite.
     """
-    n = q.shape[1]
     q, v, force = (np.ascontiguousarray(x) for x in (q, v, force))
-    a, J, done = core.accelerations(scene.core, q, v, force)
+    a, aq, av, af, done = core.accelerations(scene.core, q, v, force)
     if done < len(q):
         raise LinearizationError(0, 0.0, REASONS[Outcome.singular])
-    return a, J[:, :, :n], J[:, :, n : 2 * n], J[:, :, 2 * n :]
+    return a, aq, av, af
 
 
 @dataclass(frozen=True)
@@ -139,7 +138,7 @@ class ExplicitEuler(_Explicit):
     def _jump(self, in_v: Floats) -> Floats:
         # Noise acts beside the step: what it adds to the velocity stays as it is.
         n = in_v.shape[2]
-        return np.broadcast_to(np.eye(2 * n, n, -n), in_v.shape)
+        return np.tile(np.eye(2 * n, n, -n), (len(in_v), 1, 1))
 
 
 @dataclass(frozen=True)

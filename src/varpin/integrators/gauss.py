@@ -12,8 +12,7 @@ from varpin.checks import count
 from varpin.core import Guards, Tableau
 from varpin.errors import InputError
 from varpin.integrators.tableau import gauss, gauss_coefficients
-from varpin.integrators.variational import Variational
-from varpin.trajectory import Trajectory
+from varpin.integrators.variational import Guard, Variational
 
 Floats = NDArray[np.float64]
 
@@ -41,23 +40,16 @@ class Gauss(Variational):
         stages: s, from 1 to 6.
 
     Other Args:
-        tolerance: As of :class:`Midpoint`, and so are the others.
-        branch_margin: Of the stages' mean mass matrix and curvature.
-        energy_balance: Largest error in the energy balance of a substep, in units of the energy it turns over; of more
-            than one stage 1/25 of it is asked.
-        energy_budget: The errors of all substeps together, in units of the largest kinetic energy so far; of more than
-            one stage 1/100 of it is asked. That costs few substeps and keeps fifty times the energy: a chaotic
-            motion gathers its energy error in a few violent moments.
-        max_halvings: A step is never cut into more than 2**max_halvings parts.
+        guard: As of :class:`Midpoint`, and so are the others; of more than one stage 1/25 of its ``energy_balance`` is
+            asked, and 1/100 of its ``energy_budget``. That costs few substeps and keeps fifty times the energy: a
+            chaotic motion gathers its energy error in a few violent moments.
+        tolerance: On the residual, in units of the rounding error of the terms that cancel in it.
         kick: When noise kicks the momentum, ``"left"`` or ``"split"``.
     """
 
     stages: int = 2
+    guard: Guard | None = Guard()  # noqa: RUF009
     tolerance: float = 0.5
-    branch_margin: float = 0.5
-    energy_balance: float = 0.005
-    energy_budget: float = 0.02
-    max_halvings: int = 12
     kick: Literal["left", "split"] = "left"
 
     named = ("stages",)
@@ -75,30 +67,15 @@ class Gauss(Variational):
     def _tableau(self) -> Tableau:
         return gauss(int(self.stages))
 
+    def _times(self) -> Floats:
+        return gauss_coefficients(int(self.stages))[2]
+
     def _guards(self) -> Guards:
-        if self.stages == 1:
+        if self.stages == 1 or self.guard is None:
             return super()._guards()
         strict = replace(
-            self,
-            stages=1,
-            energy_balance=BALANCE_SHARE * self.energy_balance,
-            energy_budget=BUDGET_SHARE * self.energy_budget,
+            self.guard,
+            energy_balance=BALANCE_SHARE * self.guard.energy_balance,
+            energy_budget=BUDGET_SHARE * self.guard.energy_budget,
         )
-        return strict._guards()
-
-    def _guess(self, trajectory: Trajectory) -> Floats:
-        """Stage velocities (N, s, n) of the cubic through the nodes and their velocities.
-
-        With noise the step at dw = 0 starts from another momentum, and its velocity is all there is to go by.
-        """
-        q, v = trajectory.q, trajectory.v
-        c = gauss_coefficients(int(self.stages))[2][None, :, None]
-        if trajectory.dw.any():
-            return v[:-1, None] + np.zeros_like(c)
-        mean = (np.diff(q, axis=0) / trajectory.dt)[:, None]
-        if self.stages == 1:
-            return mean
-        guess: Floats = (
-            (1.0 - c) * (1.0 - 3.0 * c) * v[:-1, None] + c * (3.0 * c - 2.0) * v[1:, None] + 6.0 * c * (1.0 - c) * mean
-        )
-        return guess
+        return replace(self, stages=1, guard=strict)._guards()

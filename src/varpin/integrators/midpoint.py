@@ -12,8 +12,7 @@ from scipy.linalg import eigh
 from varpin.checks import fraction
 from varpin.core import Tableau
 from varpin.integrators.tableau import midpoint
-from varpin.integrators.variational import Variational
-from varpin.trajectory import Trajectory
+from varpin.integrators.variational import Guard, Variational
 
 Floats = NDArray[np.float64]
 
@@ -47,24 +46,16 @@ class Midpoint(Variational):
             energy at nodes swings by as much.
 
     Other Args:
+        guard: When a step is accepted; None takes every root that Newton's method finds, and cuts no step.
         tolerance: On the residual, in units of the rounding error of the terms that cancel in it.
-        branch_margin: How far from the fold of solutions a root must stay: the destabilising term of the step
-            equation's Jacobian is exaggerated by 1 / (1 - branch_margin), in [0, 1).
-        energy_balance: Largest error in the energy balance of a substep, in units of the energy it turns over.
-        energy_budget: The errors of all substeps together, in units of the largest kinetic energy so far (plus
-            the work done by forces); a fuller ledger leaves less room for errors of its own sign.
-        max_halvings: A step is never cut into more than 2**max_halvings parts.
         kick: When noise kicks the momentum: ``"left"``, before the step (the paper's scheme); or ``"split"``, half
             of it before and half after, at the state then reached, which for constant mass and additive noise is of
             weak order 2 instead of 1.
     """
 
     alpha: float = 0.5
+    guard: Guard | None = Guard()  # noqa: RUF009
     tolerance: float = 0.5
-    branch_margin: float = 0.5
-    energy_balance: float = 0.005
-    energy_budget: float = 0.02
-    max_halvings: int = 12
     kick: Literal["left", "split"] = "left"
 
     named = ("alpha",)
@@ -81,7 +72,5 @@ class Midpoint(Variational):
     def _tableau(self) -> Tableau:
         return midpoint(float(self.alpha))
 
-    def _guess(self, trajectory: Trajectory) -> Floats:
-        # Without noise the root is known; with it the step at dw = 0 starts from another momentum.
-        v = trajectory.v[:-1] if trajectory.dw.any() else np.diff(trajectory.q, axis=0) / trajectory.dt
-        return v[:, None]
+    def _times(self) -> Floats:
+        return np.array([float(self.alpha)])

@@ -13,9 +13,11 @@ from varpin.integrators.base import Integrator
 from varpin.integrators.explicit import ExplicitEuler, RungeKutta4, SemiImplicitEuler
 from varpin.integrators.gauss import Gauss
 from varpin.integrators.midpoint import Midpoint
+from varpin.integrators.radau import Radau
 from varpin.integrators.reference import Reference
+from varpin.integrators.variational import Guard
 
-_OWN: tuple[type[Integrator], ...] = (Midpoint, Gauss, ExplicitEuler, SemiImplicitEuler, RungeKutta4, Reference)
+_OWN: tuple[type[Integrator], ...] = (Midpoint, Gauss, Radau, ExplicitEuler, SemiImplicitEuler, RungeKutta4, Reference)
 # By the names of their classes. A new integrator enters here.
 BY_NAME: Mapping[str, type[Integrator]] = MappingProxyType({kind.__name__: kind for kind in _OWN})
 
@@ -62,9 +64,15 @@ def integrator_of(text: str) -> Integrator:
 
 
 def _value(node: ast.expr) -> Any:
-    """A number, None, or a word with or without quotes."""
-    if isinstance(node, ast.Name):
-        return node.id
+    """A number, None, a word with or without quotes, or a guard."""
+    match node:
+        case ast.Name(id=name):
+            return name
+        case ast.Call(func=ast.Name(id="Guard"), args=[], keywords=keywords):
+            given = {str(keyword.arg): _value(keyword.value) for keyword in keywords}
+            if odd := [option for option in given if option not in (known := [item.name for item in fields(Guard)])]:
+                raise InputError(f"Guard has no option {odd[0]!r}; its options are {', '.join(known)}")
+            return Guard(**given)
     try:
         return ast.literal_eval(node)
     except ValueError:

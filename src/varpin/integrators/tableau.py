@@ -1,9 +1,10 @@
-"""Coefficients of collocation: Gauss-Legendre points, and the generalized midpoint rule."""
+"""Coefficients of collocation: Gauss-Legendre and Radau points, and the generalized midpoint rule."""
 
 import functools
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import roots_jacobi
 
 from varpin.core import Tableau
 
@@ -31,15 +32,40 @@ def gauss_coefficients(stages: int) -> tuple[Floats, Floats, Floats]:
     return 0.5 * b + 0.5 * (half - half.T) / b[:, None], b, c
 
 
+def radau_coefficients(stages: int) -> tuple[Floats, Floats, Floats]:
+    """A (s, s), b (s,) and c (s,) of the Radau IIA method with s stages, of order 2 s - 1, over a unit step.
+
+    Its points are the end of the step and the roots of a Jacobi polynomial (Hairer and Wanner, Solving Ordinary
+    Differential Equations II, IV.5).
+    """
+    inner, _ = roots_jacobi(stages - 1, 1.0, 0.0) if stages > 1 else (np.zeros(0), None)
+    c = np.append(0.5 * (1.0 + inner), 1.0)
+    # Gauss's rule of as many points integrates the Lagrange polynomials exactly.
+    _, weights, points = gauss_coefficients(stages)
+    a = np.array([c[i] * (weights @ interpolation(c, c[i] * points)) for i in range(stages)])
+    return a, a[-1].copy(), c
+
+
+def _reach(a: Floats, b: Floats) -> float:
+    root = np.sqrt(b)
+    square = (root[:, None] * (a @ a)) / root[None, :]
+    return float(np.linalg.eigvalsh(0.5 * (square + square.T))[-1])
+
+
 @functools.cache
 def gauss(stages: int) -> Tableau:
     """The Gauss-Legendre tableau of ``stages`` stages, of order 2 ``stages``."""
     a, b, c = gauss_coefficients(stages)
-    root = np.sqrt(b)
-    square = (root[:, None] * (a @ a)) / root[None, :]
-    reach = float(np.linalg.eigvalsh(0.5 * (square + square.T))[-1])
     ahead = interpolation(np.append(c, 1.0), 1.0 + c)
-    return Tableau.make(a=a, gradient=a, force=a, b=b, c=c, ahead=ahead, reach=reach, skew=0.0)
+    return Tableau.make(a=a, gradient=a, force=a, b=b, c=c, ahead=ahead, reach=_reach(a, b), skew=0.0)
+
+
+@functools.cache
+def radau(stages: int) -> Tableau:
+    """The Radau IIA tableau of ``stages`` stages, of order 2 ``stages`` - 1. Its last stage is the end of the step."""
+    a, b, c = radau_coefficients(stages)
+    ahead = np.column_stack([interpolation(c, 1.0 + c), np.zeros(stages)])
+    return Tableau.make(a=a, gradient=a, force=a, b=b, c=c, ahead=ahead, reach=_reach(a, b), skew=0.0)
 
 
 @functools.cache

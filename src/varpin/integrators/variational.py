@@ -22,6 +22,7 @@ from varpin.integrators.base import (
     open_loop,
     segments_of,
     steps_of,
+    written,
 )
 from varpin.scene import Scene
 from varpin.trajectory import Trajectory
@@ -51,36 +52,62 @@ class VariationalRun:
     start: Floats
 
 
-_GUARDS = ("tolerance", "branch_margin", "energy_balance", "energy_budget", "max_halvings")
+@dataclass(frozen=True)
+class Guard:
+    """When a variational step is accepted; one that is not is taken in halves, and halves of halves.
+
+    Its step equation has other roots than the one that is connected to dt -> 0, and Newton's method finds them
+    (docs/mathematics.md, "The principal branch").
+
+    Args:
+        branch_margin: How far from the fold of solutions a root must stay: the destabilising term of the step
+            equation's Jacobian is exaggerated by 1 / (1 - branch_margin), in [0, 1).
+        energy_balance: Largest error in the energy balance of a substep, in units of the energy it turns over.
+        energy_budget: The errors of all substeps together, in units of the largest kinetic energy so far (plus the work
+            done by forces); a fuller ledger leaves less room for errors of its own sign.
+        max_halvings: A step is never cut into more than 2**max_halvings parts, at most 30.
+
+    Raises:
+        InputError: A value is out of its range.
+    """
+
+    branch_margin: float = 0.5
+    energy_balance: float = 0.005
+    energy_budget: float = 0.02
+    max_halvings: int = 12
+
+    def __post_init__(self) -> None:
+        if fraction("branch_margin", self.branch_margin) == 1.0:
+            raise InputError("branch_margin must be in [0, 1), got 1")
+        positive("energy_balance", self.energy_balance, "1")
+        positive("energy_budget", self.energy_budget, "1")
+        if count("max_halvings", self.max_halvings) > 30:
+            raise InputError(f"max_halvings must be at most 30, got {self.max_halvings}")
+
+    def __repr__(self) -> str:
+        return written(self)
 
 
 class Variational(Integrator):
     """A variational integrator on (q, p) whose steps are guarded, cut and kicked."""
 
+    guard: Guard | None
     tolerance: float
-    branch_margin: float
-    energy_balance: float
-    energy_budget: float
-    max_halvings: int
     kick: Literal["left", "split"]
 
     variational = True
 
     def same_map(self, other: Integrator) -> bool:
         """See :meth:`Integrator.same_map`: guards decide which steps are cut, not what a step is."""
-        own, others = ({k: v for k, v in vars(x).items() if k not in _GUARDS} for x in (self, other))
+        own, others = ({k: v for k, v in vars(x).items() if k not in ("guard", "tolerance")} for x in (self, other))
         return type(self) is type(other) and own == others
 
     def __post_init__(self) -> None:
+        if not (self.guard is None or isinstance(self.guard, Guard)):
+            raise InputError(f"guard must be a varpin.Guard, or None for no guards, got {self.guard!r}")
         positive("tolerance", self.tolerance, "rounding units")
-        if fraction("branch_margin", self.branch_margin) == 1.0:
-            raise InputError("branch_margin must be in [0, 1), got 1")
-        positive("energy_balance", self.energy_balance, "1")
-        positive("energy_budget", self.energy_budget, "1")
         if not is_one_of(self.kick, ("left", "split")):
             raise InputError(f"kick must be 'left' or 'split', got {self.kick!r}")
-        if count("max_halvings", self.max_halvings) > 30:
-            raise InputError(f"max_halvings must be at most 30, got {self.max_halvings}")
 
     @property
     def left(self) -> float:
@@ -92,12 +119,13 @@ class Variational(Integrator):
         """Its coefficients."""
 
     def _guards(self) -> Guards:
+        own = self.guard or Guard(max_halvings=0)
         return Guards.make(
-            active=True,
-            branch_margin=float(self.branch_margin),
-            energy_balance=float(self.energy_balance),
-            energy_budget=float(self.energy_budget),
-            most_halvings=int(self.max_halvings),
+            active=self.guard is not None,
+            branch_margin=float(own.branch_margin),
+            energy_balance=float(own.energy_balance),
+            energy_budget=float(own.energy_budget),
+            most_halvings=int(own.max_halvings),
         )
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[VariationalRun, list[Segment]]:
@@ -178,6 +206,22 @@ class Variational(Integrator):
         map_of = scene.core, self._tableau(), float(self.tolerance), self._guards()
         return *map_of, float(trajectory.dt), q, p, guess, np.ascontiguousarray(force), substeps
 
-    @abstractmethod
     def _guess(self, trajectory: Trajectory) -> Floats:
-        """Stage velocities (N, s, n) next to the roots of every step at dw = 0."""
+        """Stage velocities (N, s, n) next to the roots of every step at dw = 0: of the cubic through both nodes.
+
+        With noise that step starts from another momentum, and its velocity is all there is to go by.
+        """
+        q, v, c = trajectory.q, trajectory.v, self._times()[None, :, None]
+        if trajectory.dw.any():
+            return v[:-1, None] + np.zeros_like(c)
+        mean = (np.diff(q, axis=0) / trajectory.dt)[:, None]
+        if c.size == 1:
+            return mean  # of one stage the root itself
+        guess: Floats = (
+            (1.0 - c) * (1.0 - 3.0 * c) * v[:-1, None] + c * (3.0 * c - 2.0) * v[1:, None] + 6.0 * c * (1.0 - c) * mean
+        )
+        return guess
+
+    @abstractmethod
+    def _times(self) -> Floats:
+        """Where its stages stand in a step of unit length (s,)."""

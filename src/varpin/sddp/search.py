@@ -590,12 +590,13 @@ class _Search:
     def _bounds(self) -> list[_Bounds]:
         """What trials may take, one after another while nothing else helps."""
         integrator = self.problem.integrator
-        if not (self.bounded and isinstance(integrator, Variational) and is_dataclass(integrator)):
+        guard = integrator.guard if isinstance(integrator, Variational) else None
+        if not (self.bounded and guard is not None and is_dataclass(integrator)):
             return [_Bounds(integrator, np.inf, watched=False)]
         # As many parts as a step of the motion so far has take fewer halvings of halves.
         few = max(_HALVINGS, int(self.trajectory.statistics.substeps.max()) - 1)
         first, second = (
-            replace(integrator, max_halvings=min(halvings, integrator.max_halvings))
+            replace(integrator, guard=replace(guard, max_halvings=min(halvings, guard.max_halvings)))
             for halvings in (few, few + _MORE_HALVINGS)
         )
         return [

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from varpin.checks import JointValues, positive
 from varpin.errors import InputError, VarpinError
-from varpin.integrators import Integrator, Midpoint, Reference, largest_step
+from varpin.integrators import Guard, Integrator, Reference, largest_step
 from varpin.lagrangian import lagrangian_jet
 from varpin.markup import facts, table
 from varpin.scene import Scene
@@ -528,7 +528,7 @@ def _largest_step(setting: Setting, methods: Sequence[_Method]) -> float:
     parts = method.last.steps // rows
     samples = rows * max(k for k in range(1, max(1, _NODES // rows) + 1) if parts % k == 0)
     motion = setting.run(method.integrator, method.last.steps, samples=samples)
-    margin = Midpoint().branch_margin
+    margin = Guard().branch_margin
     bounds = []
     for q, v in zip(motion.q, motion.v, strict=True):
         jet = lagrangian_jet(setting.scene, q, v)

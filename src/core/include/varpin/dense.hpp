@@ -182,26 +182,37 @@ inline void solve_ldl(const double* ldl, int n, Block block, const double* b, do
     solve_upper(ldl, n, block, x);
 }
 
+// row -= sum_k factor(k) other(k) over k in [begin, end), four rows at a time.
+template <class Factor, class Row>
+void subtract_rows(double* __restrict row, int columns, int begin, int end, Factor factor, Row other) {
+    int k = begin;
+    for (; k + 3 < end; k += 4) {
+        const double f0 = factor(k), f1 = factor(k + 1), f2 = factor(k + 2), f3 = factor(k + 3);
+        const double* __restrict x0 = other(k);
+        const double* __restrict x1 = other(k + 1);
+        const double* __restrict x2 = other(k + 2);
+        const double* __restrict x3 = other(k + 3);
+        for (int c = 0; c < columns; ++c) row[c] -= (f0 * x0[c] + f1 * x1[c]) + (f2 * x2[c] + f3 * x3[c]);
+    }
+    for (; k < end; ++k) {
+        const double f = factor(k);
+        const double* __restrict x = other(k);
+        for (int c = 0; c < columns; ++c) row[c] -= f * x[c];
+    }
+}
+
 // The X with L D L' X = B, B and X (size of the block, columns) row by row and in one place, all columns at once.
 // Row i of the block stands at x + (i - begin) * stride.
 inline void solve_ldl_rows(const double* ldl, int n, Block block, double* x, int columns, int stride) {
+    const auto row = [&](int i) { return x + (i - block.begin) * stride; };
     for (int i = block.begin; i < block.end; ++i) {
-        double* __restrict row = x + (i - block.begin) * stride;
-        for (int j = block.begin; j < i; ++j) {
-            const double factor = ldl[i * n + j];
-            const double* __restrict other = x + (j - block.begin) * stride;
-            for (int c = 0; c < columns; ++c) row[c] -= factor * other[c];
-        }
+        subtract_rows(row(i), columns, block.begin, i, [&](int j) { return ldl[i * n + j]; }, row);
     }
     for (int i = block.end - 1; i >= block.begin; --i) {
-        double* __restrict row = x + (i - block.begin) * stride;
+        double* __restrict own = row(i);
         const double inverse = 1.0 / ldl[i * n + i];
-        for (int c = 0; c < columns; ++c) row[c] *= inverse;
-        for (int j = i + 1; j < block.end; ++j) {
-            const double factor = ldl[j * n + i];
-            const double* __restrict other = x + (j - block.begin) * stride;
-            for (int c = 0; c < columns; ++c) row[c] -= factor * other[c];
-        }
+        for (int c = 0; c < columns; ++c) own[c] *= inverse;
+        subtract_rows(own, columns, i + 1, block.end, [&](int j) { return ldl[j * n + i]; }, row);
     }
 }
 

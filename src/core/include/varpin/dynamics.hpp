@@ -1,14 +1,15 @@
-// Forward dynamics and its derivatives, for the integrators that work on (q, v). docs/mathematics.md, "Forward
-// dynamics". Inverse dynamics by the recursive Newton-Euler algorithm is tau = S . Phi, with Phi the force that moves
-// what a joint carries. Its derivatives follow from the rotate-along rule of the jet: for a body b below i, with V_p
-// and A_p velocity and acceleration (gravity taken off) of i's parent,
+// Forward dynamics and its derivatives, for the integrators that work on (q, v). docs/mathematics.md, "Explicit
+// methods". Inverse dynamics by the recursive Newton-Euler algorithm is tau = S . Phi, with Phi the force that moves
+// what a joint carries. Its derivatives follow from the rotate-along rule of the jet. For a body b below i, with V_p
+// and A_p velocity and acceleration (gravity taken off) of i's parent, (dq_i, dv_i) change velocity and acceleration by
 //
-//     dV_b = W_i,    dA_b = Z_i + W_i x V_b,    Z_i = A_p x S_i + V_p x W_i,
+//     dV_b = W_i dq_i + S_i dv_i,    dA_b = Z_i dq_i + 2 W_i dv_i + dV_b x V_b,    Z_i = A_p x S_i + V_p x W_i,
 //
-// and with C of `Coupling`, summed over what a joint carries like its inertia Y, for i above j or j itself,
+// so that with U_i = (W_i, S_i), X_i = (Z_i, 2 W_i), columns for (dq_i, dv_i), C of `Coupling`, summed over what a
+// joint carries like its inertia Y, and i above j or j itself
 //
-//     dtau_j/dq_i = F_j . Z_i + (C_j' S_j) . W_i        dtau_i/dq_j = S_i . (Y_j Z_j + C_j W_j + S_j x* Phi_j)
-//     dtau_j/dv_i = 2 F_j . W_i + (C_j' S_j) . S_i      dtau_i/dv_j = S_i . (2 Y_j W_j + C_j S_j)
+//     dtau_j/d(q,v)_i = F_j . X_i + (C_j' S_j) . U_i
+//     dtau_i/d(q,v)_j = S_i . (Y_j X_j + C_j U_j + (S_j x* Phi_j, 0))
 #pragma once
 
 #include <algorithm>
@@ -21,10 +22,28 @@
 
 namespace varpin {
 
-// C x = Y (x x V) + x x* H + V x* Y x. Of a body with mass m, first moment h, second moments J, velocity (u, w) and
-// linear momentum P it is
+// Derivatives of something in a coordinate and in its velocity.
+struct Slopes {
+    double q = 0.0, v = 0.0;
+};
+
+constexpr Slopes operator+(Slopes a, Slopes b) { return {a.q + b.q, a.v + b.v}; }
+constexpr Slopes operator-(Slopes a, Slopes b) { return {a.q - b.q, a.v - b.v}; }
+constexpr Slopes operator*(double s, Slopes a) { return {s * a.q, s * a.v}; }
+constexpr Slopes operator*(Slopes a, double s) { return s * a; }
+constexpr Slopes& operator+=(Slopes& a, Slopes b) { return a = a + b; }
+
+constexpr Vec3<Slopes> slopes(const Vec3<double>& q, const Vec3<double>& v) {
+    return {{q.x, v.x}, {q.y, v.y}, {q.z, v.z}};
+}
+constexpr Motion<Slopes> slopes(const Motion<double>& q, const Motion<double>& v) {
+    return {slopes(q.linear, v.linear), slopes(q.angular, v.angular)};
+}
+
+// C x = Y (x x V) + x x* H + V x* Y x. Of a body with first moment h, second moments J, velocity (u, w) and linear
+// momentum P it is
 //
-//     C (a, b) = (2 b x P, D b),    D b = w x (2 J b - tr(J) b) + 2 h x (b x u);
+//     C (a, b) = (2 b x P, D b),    D b = w x T b + 2 (h . u) b - 2 (h . b) u,    T = 2 J - tr J;
 //
 // a drops out by Jacobi's identity. P and D add up over bodies.
 struct Coupling {
@@ -32,12 +51,22 @@ struct Coupling {
     Mat3<double> turn{};      // D
 
     static Coupling of(const Inertia<double>& Y, const Motion<double>& V, const Force<double>& H) {
-        const double trace = Y.second.xx + Y.second.yy + Y.second.zz;
-        const auto column = [&](const Vec3<double>& unit) {
-            const Vec3<double> turned = 2.0 * (Y.second * unit) - trace * unit;
-            return cross(V.angular, turned) + 2.0 * cross(Y.moment, cross(unit, V.linear));
-        };
-        return {H.linear, {column({1.0, 0.0, 0.0}), column({0.0, 1.0, 0.0}), column({0.0, 0.0, 1.0})}};
+        const auto& [xx, xy, yy, xz, yz, zz] = Y.second;
+        const Vec3<double>& h = Y.moment;
+        const double along = 2.0 * dot(h, V.linear);
+        Mat3<double> D{cross(V.angular, Vec3<double>{xx - yy - zz, 2.0 * xy, 2.0 * xz}) - (2.0 * h.x) * V.linear,
+                       cross(V.angular, Vec3<double>{2.0 * xy, yy - xx - zz, 2.0 * yz}) - (2.0 * h.y) * V.linear,
+                       cross(V.angular, Vec3<double>{2.0 * xz, 2.0 * yz, zz - xx - yy}) - (2.0 * h.z) * V.linear};
+        D.x.x += along;
+        D.y.y += along;
+        D.z.z += along;
+        return {H.linear, D};
+    }
+
+    // The angular part of C' x; the linear one vanishes.
+    Vec3<double> back(const Motion<double>& x) const {
+        const Vec3<double>& b = x.angular;
+        return 2.0 * cross(momentum, x.linear) + Vec3<double>{dot(turn.x, b), dot(turn.y, b), dot(turn.z, b)};
     }
 };
 
@@ -48,12 +77,9 @@ constexpr Coupling& operator+=(Coupling& a, const Coupling& b) {
     a.turn.z += b.turn.z;
     return a;
 }
-constexpr Force<double> operator*(const Coupling& C, const Motion<double>& x) {
+template <class T>
+constexpr Force<T> operator*(const Coupling& C, const Motion<T>& x) {
     return {2.0 * cross(x.angular, C.momentum), C.turn * x.angular};
-}
-// C' x.
-constexpr Force<double> transposed_times(const Coupling& C, const Motion<double>& x) {
-    return {{}, 2.0 * cross(C.momentum, x.linear) + transposed(C.turn) * x.angular};
 }
 
 // Forward dynamics M a = force - bias at one state after another, with work arrays.
@@ -66,8 +92,7 @@ class ForwardDynamics {
           bias_(jet_.dof),
           room_(jet_.dof),
           ldl_(jet_.M.size()),
-          dq_(jet_.M.size()),
-          dv_(jet_.M.size()) {}
+          slopes_(jet_.M.size()) {}
 
     int dof() const { return jet_.dof; }
 
@@ -135,22 +160,20 @@ class ForwardDynamics {
     void differentiate(const double* v, const double* a) {
         const Tree& tree = mechanism_->tree;
         const int n = jet_.dof;
-        detail::clear_blocks(tree, dq_);
-        detail::clear_blocks(tree, dv_);
-        for (int i = 0; i < n; ++i) {
-            dq_[i * n + i] = mechanism_->stiffness[i];
-            dv_[i * n + i] = mechanism_->damping[i];
-        }
+        detail::clear_blocks(tree, slopes_);
+        for (int i = 0; i < n; ++i) slopes_[i * n + i] = {mechanism_->stiffness[i], mechanism_->damping[i]};
         for (int j = 0; j < tree.size(); ++j) {
             const auto& here = jet_.body[j];
             accelerate(j, v, a);
             body_[j].coupling = Coupling::of(body_[j].inertia, here.velocity, here.momentum);
-            body_[j].turning = cross(acceleration_above(j), here.axis);
             const int k = tree.bodies[j].parent;
-            if (k >= 0) body_[j].turning += cross(jet_.body[k].velocity, here.axis_rate);
+            Motion<double> Z = cross(acceleration_above(j), here.axis);
+            if (k >= 0) Z += cross(jet_.body[k].velocity, here.axis_rate);
+            body_[j].velocity_slopes = slopes(here.axis_rate, here.axis);
+            body_[j].acceleration_slopes = slopes(Z, 2.0 * here.axis_rate);
         }
         for (int j = tree.size() - 1; j >= 0; --j) {
-            project_derivatives(j);
+            project_slopes(j);
             const int k = tree.bodies[j].parent;
             if (k >= 0) {
                 body_[k].force += body_[j].force;
@@ -159,42 +182,44 @@ class ForwardDynamics {
         }
     }
 
-    // Derivatives (n, 3n) of the accelerations in q, v and force into J, zero outside of blocks already.
-    void derivatives(double* J) const {
+    // The derivatives (n, n) of the accelerations in q, v and force, once after differentiate(), into arrays that are
+    // zero outside of blocks already.
+    void derivatives(double* in_q, double* in_v, double* in_force) const {
         const int n = jet_.dof;
         for (const Block& block : mechanism_->tree.blocks) {
-            const int size = block.end - block.begin;
-            double* first = J + block.begin * 3 * n + block.begin;
-            for (int i = 0; i < size; ++i) {
-                const int from = (block.begin + i) * n + block.begin;
-                double* row = first + i * 3 * n;
+            const int size = block.end - block.begin, corner = block.begin * n + block.begin;
+            for (int at = corner; at < block.end * n; at += n) {
                 for (int j = 0; j < size; ++j) {
-                    row[j] = -dq_[from + j];
-                    row[n + j] = -dv_[from + j];
+                    in_q[at + j] = -slopes_[at + j].q;
+                    in_v[at + j] = -slopes_[at + j].v;
                 }
-                row[2 * n + i] = 1.0;
+                in_force[at + at / n - block.begin] = 1.0;
             }
-            for (int part = 0; part < 3; ++part) {
-                solve_ldl_rows(ldl_.data(), n, block, first + part * n, size, 3 * n);
+            for (double* x : {in_q, in_v, in_force}) {
+                solve_ldl_rows(ldl_.data(), n, block, x + corner, size, n);
             }
         }
     }
 
-    // Of one block of b coordinates: how accelerations change with what q and v (b, columns) change with, and with the
-    // force itself, which the last b columns stand for: a' = M^-1 (-dq q - dv v + (0, 1)).
-    void slope(Block block, const double* q, const double* v, int columns, double* a) const {
-        const int n = jet_.dof, size = block.end - block.begin;
+    // How the accelerations of one block of b coordinates change (b, 3b) with q, v and force, once after
+    // differentiate(): M^-1 (-tau_q, -tau_v - reach tau_q, 1) with reach = 0. Where q and v change with reach v and
+    // with other accelerations x_k (b, 3b) themselves, by in_q[k] x_k and in_v[k] x_k, that is added.
+    void slope(Block block, double* a, double reach, int others, const double* const* x, const double* in_q,
+               const double* in_v) const {
+        const int n = jet_.dof, size = block.end - block.begin, columns = 3 * size;
         for (int i = 0; i < size; ++i) {
-            const double* in_q = dq_.data() + (block.begin + i) * n + block.begin;
-            const double* in_v = dv_.data() + (block.begin + i) * n + block.begin;
-            double* __restrict row = a + i * columns;
-            std::fill(row, row + columns, 0.0);
-            row[columns - size + i] = 1.0;
+            const Slopes* by = slopes_.data() + (block.begin + i) * n + block.begin;
+            double* row = a + i * columns;
             for (int j = 0; j < size; ++j) {
-                const double by_q = in_q[j], by_v = in_v[j];
-                const double* __restrict row_q = q + j * columns;
-                const double* __restrict row_v = v + j * columns;
-                for (int c = 0; c < columns; ++c) row[c] -= by_q * row_q[c] + by_v * row_v[c];
+                row[j] = -by[j].q;
+                row[size + j] = -by[j].v - reach * by[j].q;
+                row[2 * size + j] = i == j ? 1.0 : 0.0;
+            }
+            for (int k = 0; k < others; ++k) {
+                if (in_q[k] == 0.0 && in_v[k] == 0.0) continue;
+                subtract_rows(
+                    row, columns, 0, size, [&](int j) { return in_q[k] * by[j].q + in_v[k] * by[j].v; },
+                    [&](int j) { return x[k] + j * columns; });
             }
         }
         solve_ldl_rows(ldl_.data(), n, block, a, columns, columns);
@@ -202,10 +227,11 @@ class ForwardDynamics {
 
   private:
     struct BodyState {
-        Inertia<double> inertia{};      // of the body alone
-        Motion<double> acceleration{};  // A
-        Motion<double> turning{};       // Z
-        Force<double> force{};          // Phi
+        Inertia<double> inertia{};             // of the body alone
+        Motion<double> acceleration{};         // A
+        Motion<Slopes> velocity_slopes{};      // U
+        Motion<Slopes> acceleration_slopes{};  // X
+        Force<double> force{};                 // Phi
         Coupling coupling{};
     };
 
@@ -239,29 +265,27 @@ class ForwardDynamics {
         own.force = own.inertia * own.acceleration + cross(here.velocity, here.momentum);
     }
 
-    // The share of what body j carries in dq and dv.
-    void project_derivatives(int j) {
+    // The share of what body j carries in the derivatives of inverse dynamics.
+    void project_slopes(int j) {
         const Tree& tree = mechanism_->tree;
         const int n = jet_.dof;
         const Body& link = tree.bodies[j];
         const auto& here = jet_.body[j];
         const BodyState& own = body_[j];
         const Force<double> F = here.inertia * here.axis;
-        const Force<double> back = transposed_times(own.coupling, here.axis);
-        const Force<double> by_q =
-            here.inertia * own.turning + own.coupling * here.axis_rate + cross(here.axis, own.force);
-        const Force<double> by_v = 2.0 * (here.inertia * here.axis_rate) + own.coupling * here.axis;
+        const Vec3<double> back = own.coupling.back(here.axis);
+        const Force<double> turned = cross(here.axis, own.force);
+        Force<Slopes> moved = here.inertia * own.acceleration_slopes + own.coupling * own.velocity_slopes;
+        moved += {slopes(turned.linear, {}), slopes(turned.angular, {})};
         const int cj = link.coordinate;
         for (int i = j; i >= 0; i = tree.bodies[i].parent) {
             const Body& above = tree.bodies[i];
-            const auto& there = jet_.body[i];
+            const BodyState& there = body_[i];
             const int ci = above.coordinate;
             const double ratio = above.ratio * link.ratio;
-            dq_[cj * n + ci] += ratio * (dot(body_[i].turning, F) + dot(there.axis_rate, back));
-            dv_[cj * n + ci] += ratio * (2.0 * dot(there.axis_rate, F) + dot(there.axis, back));
-            if (i == j) continue;
-            dq_[ci * n + cj] += ratio * dot(there.axis, by_q);
-            dv_[ci * n + cj] += ratio * dot(there.axis, by_v);
+            slopes_[cj * n + ci] +=
+                ratio * (dot(there.acceleration_slopes, F) + dot(there.velocity_slopes.angular, back));
+            if (i != j) slopes_[ci * n + cj] += ratio * dot(jet_.body[i].axis, moved);
         }
     }
 
@@ -269,7 +293,8 @@ class ForwardDynamics {
     Jet<double> jet_;  // placements, velocities, inertias of what bodies carry, M, potential
     std::vector<BodyState> body_;
     std::vector<double> bias_, room_;
-    std::vector<double> ldl_, dq_, dv_;  // (n, n), of which blocks are used
+    std::vector<double> ldl_;     // (n, n) factors of M
+    std::vector<Slopes> slopes_;  // (n, n) of inverse dynamics
 };
 
 }  // namespace varpin

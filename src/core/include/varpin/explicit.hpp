@@ -1,11 +1,11 @@
-// Explicit integrators of q' = v, M v' = force - bias (docs/mathematics.md, "Explicit methods"), one step of length h:
+// Explicit integrators of q' = v, M v' = force - bias (docs/mathematics.md, "Explicit methods"). One step of length h
+// from (q0, v0), in the form of Nystroem: with accelerations a_i at the stages
 //
-//     Euler                 q1 = q0 + h v0,  v1 = v0 + h a(q0, v0)
-//     semi-implicit Euler   v1 = v0 + h a(q0, v0),  q1 = q0 + h v1
-//     Runge and Kutta       the classical four stages
+//     Q_i = q0 + c_i h v0 + h^2 sum_j k_ij a_j     V_i = v0 + h sum_j l_ij a_j     (j < i)
+//     q1  = q0 +     h v0 + h^2 sum_i x_i a_i      v1  = v0 + h sum_i y_i a_i
 //
-// Derivatives of (q, v) follow the same stages as (q, v) itself. Noise makes the velocity jump by M^-1 sum_i F_i dw_i:
-// in Euler's method beside the step, in the others before it.
+// The derivatives of (q1, v1) in (q0, v0, force) are the same sums of the derivatives of a_i. Noise makes the velocity
+// jump by M^-1 sum_i F_i dw_i: in Euler's method beside the step, in the others before it.
 #pragma once
 
 #include <algorithm>
@@ -21,162 +21,147 @@ namespace varpin {
 
 enum class ExplicitMethod { euler, semi_implicit, runge_kutta };
 
-// What moves with q' = v, v' = a through the stages of a step: a state, or derivatives of one.
-struct Flow {
-    explicit Flow(int size) : q(size), v(size), stage_q(size), stage_v(size), stage_a(size), sum_q(size), sum_v(size) {}
-
-    std::vector<double> q, v;                       // at the beginning, then at the end of the step
-    std::vector<double> stage_q, stage_v, stage_a;  // at a stage
-    std::vector<double> sum_q, sum_v;               // of what stages add
-
-    int size() const { return static_cast<int>(q.size()); }
-
-    void begin() {
-        stage_q = q;
-        stage_v = v;
-        std::fill(sum_q.begin(), sum_q.end(), 0.0);
-        std::fill(sum_v.begin(), sum_v.end(), 0.0);
-    }
-
-    // Enter the slopes of this stage with a weight, and go where the next one is.
-    void pass(double weight, double ahead) {
-        for (int i = 0; i < size(); ++i) {
-            sum_q[i] += weight * stage_v[i];
-            sum_v[i] += weight * stage_a[i];
-            stage_q[i] = q[i] + ahead * stage_v[i];
-            stage_v[i] = v[i] + ahead * stage_a[i];
-        }
-    }
-
-    void end() {
-        for (int i = 0; i < size(); ++i) {
-            q[i] += sum_q[i];
-            v[i] += sum_v[i];
-        }
-    }
-
-    void euler(double h) {
-        for (int i = 0; i < size(); ++i) {
-            q[i] += h * v[i];
-            v[i] += h * stage_a[i];
-        }
-    }
-
-    void semi_implicit(double h) {
-        for (int i = 0; i < size(); ++i) {
-            v[i] += h * stage_a[i];
-            q[i] += h * v[i];
-        }
-    }
+struct Tableau {
+    int stages = 1;
+    double reach[4] = {};                           // c
+    double stage_q[4][4] = {}, stage_v[4][4] = {};  // k, l
+    double end_q[4] = {}, end_v[4] = {1.0};         // x, y
 };
+
+constexpr Tableau tableau_of(ExplicitMethod method) {
+    Tableau of;
+    if (method == ExplicitMethod::semi_implicit) of.end_q[0] = 1.0;
+    if (method == ExplicitMethod::runge_kutta) {
+        // The classical method of fourth order.
+        of = {4,
+              {0.0, 0.5, 0.5, 1.0},
+              {},
+              {},
+              {1.0 / 6.0, 1.0 / 6.0, 1.0 / 6.0, 0.0},
+              {1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0}};
+        of.stage_v[1][0] = of.stage_v[2][1] = 0.5;
+        of.stage_v[3][2] = 1.0;
+        of.stage_q[2][0] = 0.25;
+        of.stage_q[3][1] = 0.5;
+    }
+    return of;
+}
 
 // One step after another from any state; with derivatives in (q, v, force), if asked for.
 class ExplicitStepper {
   public:
     ExplicitStepper(const Mechanism& mechanism, ExplicitMethod method, bool derivatives)
-        : state(mechanism.dof()),
+        : q(mechanism.dof()),
+          v(mechanism.dof()),
           dynamics(mechanism),
           mechanism_(&mechanism),
-          method_(method),
+          tableau_(tableau_of(method)),
           derivatives_(derivatives),
-          tangent_(derivatives ? tangent_size(mechanism.tree) : 0) {}
+          stage_q_(mechanism.dof()),
+          stage_v_(mechanism.dof()) {
+        for (int i = 0; i < stages(); ++i) {
+            a_[i].resize(mechanism.dof());
+            if (derivatives) slope_[i].resize(blocks_size(mechanism.tree));
+        }
+    }
 
-    Flow state;                // of which q and v are the state
+    std::vector<double> q, v;  // the state
     ForwardDynamics dynamics;  // at the state, when a step begins
 
-    int stages() const { return method_ == ExplicitMethod::runge_kutta ? 4 : 1; }
+    int stages() const { return tableau_.stages; }
 
     // From the state that `dynamics` is at; false where a mass matrix on the way is not positive definite.
     bool step(double h, const double* force) {
-        begin();
-        if (method_ == ExplicitMethod::runge_kutta) return runge_kutta(h, force);
-        slopes(force);
-        if (method_ == ExplicitMethod::euler) {
-            each([h](Flow& flow) { flow.euler(h); });
-        } else {
-            each([h](Flow& flow) { flow.semi_implicit(h); });
+        for (int i = 0; i < stages(); ++i) {
+            move(h, tableau_.reach[i], tableau_.stage_q[i], tableau_.stage_v[i], i, stage_q_.data(), stage_v_.data());
+            if (i > 0 && !dynamics.at(stage_q_.data(), stage_v_.data())) return false;
+            dynamics.acceleration(force, a_[i].data());
+            if (derivatives_) differentiate(h, i);
         }
+        move(h, 1.0, tableau_.end_q, tableau_.end_v, stages(), q.data(), v.data());
         return true;
     }
 
-    // The derivatives of the last step into J (2n, 3n), zero outside of blocks already.
-    void write_derivatives(double* J) const {
-        const int n = state.size();
+    // The derivatives of the last step in (q, v) and in the force into Jx (2n, 2n) and Jf (2n, n), of which everything
+    // outside of blocks is zero already.
+    void write_derivatives(double h, double* Jx, double* Jf) const {
+        const int n = mechanism_->dof();
         int first = 0;
         for (const Block& block : mechanism_->tree.blocks) {
             const int size = block.end - block.begin;
-            for (int i = 0; i < size; ++i) {
-                for (int part = 0; part < 3; ++part) {
-                    const int from = first + i * 3 * size + part * size;
-                    const int to = (block.begin + i) * 3 * n + part * n + block.begin;
-                    std::copy_n(&tangent_.q[from], size, J + to);
-                    std::copy_n(&tangent_.v[from], size, J + n * 3 * n + to);
+            for (int i = 0; i < size; ++i, first += 3 * size) {
+                const int row = block.begin + i;
+                double* const in_q = Jx + row * 2 * n;
+                double* const in_v = Jx + (n + row) * 2 * n;
+                for (int part = 0; part < 2; ++part) {
+                    const int from = first + part * size, to = part * n + block.begin;
+                    add_up(size, from, h * h, tableau_.end_q, in_q + to);
+                    add_up(size, from, h, tableau_.end_v, in_v + to);
                 }
+                in_q[row] += 1.0;
+                in_q[n + row] += h;
+                in_v[n + row] += 1.0;
+                add_up(size, first + 2 * size, h * h, tableau_.end_q, Jf + row * n + block.begin);
+                add_up(size, first + 2 * size, h, tableau_.end_v, Jf + (n + row) * n + block.begin);
             }
-            first += 3 * size * size;
         }
     }
 
   private:
-    // Of each block of b coordinates derivatives (b, 3b) in its q, v and force, block after block.
-    static int tangent_size(const Tree& tree) {
+    static int blocks_size(const Tree& tree) {
         int size = 0;
         for (const Block& block : tree.blocks) size += 3 * (block.end - block.begin) * (block.end - block.begin);
         return size;
     }
 
-    template <class Change>
-    void each(Change change) {
-        change(state);
-        if (derivatives_) change(tangent_);
-    }
-
-    void begin() {
-        if (derivatives_) {
-            std::fill(tangent_.q.begin(), tangent_.q.end(), 0.0);
-            std::fill(tangent_.v.begin(), tangent_.v.end(), 0.0);
-            int first = 0;
-            for (const Block& block : mechanism_->tree.blocks) {
-                const int size = block.end - block.begin;
-                for (int i = 0; i < size; ++i) {
-                    tangent_.q[first + i * 3 * size + i] = 1.0;
-                    tangent_.v[first + i * 3 * size + size + i] = 1.0;
-                }
-                first += 3 * size * size;
+    // To q + reach h v + h^2 sum_i in_q[i] a_i and v + h sum_i in_v[i] a_i over the first stages.
+    void move(double h, double reach, const double* in_q, const double* in_v, int stages, double* to_q,
+              double* to_v) const {
+        for (int r = 0; r < mechanism_->dof(); ++r) {
+            double sum_q = 0.0, sum_v = 0.0;
+            for (int i = 0; i < stages; ++i) {
+                sum_q += in_q[i] * a_[i][r];
+                sum_v += in_v[i] * a_[i][r];
             }
+            to_q[r] = q[r] + h * (reach * v[r] + h * sum_q);
+            to_v[r] = v[r] + h * sum_v;
         }
-        each([](Flow& flow) { flow.begin(); });
     }
 
-    // Accelerations at the stage that `dynamics` is at.
-    void slopes(const double* force) {
-        dynamics.acceleration(force, state.stage_a.data());
-        if (!derivatives_) return;
-        dynamics.differentiate(state.stage_v.data(), state.stage_a.data());
+    // The derivatives of the accelerations at stage i, which `dynamics` is at.
+    void differentiate(double h, int i) {
+        dynamics.differentiate(stage_v_.data(), a_[i].data());
+        double in_q[4], in_v[4];
+        for (int k = 0; k < i; ++k) {
+            in_q[k] = h * h * tableau_.stage_q[i][k];
+            in_v[k] = h * tableau_.stage_v[i][k];
+        }
         int first = 0;
         for (const Block& block : mechanism_->tree.blocks) {
             const int size = block.end - block.begin;
-            dynamics.slope(block, &tangent_.stage_q[first], &tangent_.stage_v[first], 3 * size,
-                           &tangent_.stage_a[first]);
+            const double* before[4] = {};
+            for (int k = 0; k < i; ++k) before[k] = slope_[k].data() + first;
+            dynamics.slope(block, slope_[i].data() + first, h * tableau_.reach[i], i, before, in_q, in_v);
             first += 3 * size * size;
         }
     }
 
-    bool runge_kutta(double h, const double* force) {
-        constexpr double shares[4] = {6.0, 3.0, 3.0, 6.0}, reach[4] = {0.5, 0.5, 1.0, 0.0};
-        for (int stage = 0; stage < 4; ++stage) {
-            if (stage > 0 && !dynamics.at(state.stage_q.data(), state.stage_v.data())) return false;
-            slopes(force);
-            each([&](Flow& flow) { flow.pass(h / shares[stage], reach[stage] * h); });
+    // to += scale sum_i weight[i] slope_i over some entries.
+    void add_up(int size, int from, double scale, const double* weight, double* __restrict to) const {
+        for (int i = 0; i < stages(); ++i) {
+            const double factor = scale * weight[i];
+            if (factor == 0.0) continue;
+            const double* __restrict x = slope_[i].data() + from;
+            for (int c = 0; c < size; ++c) to[c] += factor * x[c];
         }
-        each([](Flow& flow) { flow.end(); });
-        return true;
     }
 
     const Mechanism* mechanism_;
-    ExplicitMethod method_;
+    Tableau tableau_;
     bool derivatives_;
-    Flow tangent_;
+    std::vector<double> stage_q_, stage_v_;
+    std::vector<double> a_[4];      // (n) of each stage
+    std::vector<double> slope_[4];  // their derivatives (b, 3b) in q, v and force, block after block
 };
 
 // P paths on their way, each from its own state.
@@ -234,22 +219,22 @@ class ExplicitRollout {
     double* center(int path) { return center_.data() + path * dof() * mechanism_->diffusion.processes; }
 
     void load(int path) {
-        std::copy_n(q.data() + path * dof(), dof(), stepper_.state.q.data());
-        std::copy_n(v.data() + path * dof(), dof(), stepper_.state.v.data());
+        std::copy_n(q.data() + path * dof(), dof(), stepper_.q.data());
+        std::copy_n(v.data() + path * dof(), dof(), stepper_.v.data());
     }
     void store(int path) {
-        std::copy_n(stepper_.state.q.data(), dof(), q.data() + path * dof());
-        std::copy_n(stepper_.state.v.data(), dof(), v.data() + path * dof());
+        std::copy_n(stepper_.q.data(), dof(), q.data() + path * dof());
+        std::copy_n(stepper_.v.data(), dof(), v.data() + path * dof());
     }
 
-    bool at_state() { return stepper_.dynamics.at(stepper_.state.q.data(), stepper_.state.v.data()); }
+    bool at_state() { return stepper_.dynamics.at(stepper_.q.data(), stepper_.v.data()); }
 
     // One step of a path, with its node; the dynamics are at its state before and after.
     Outcome step(double h, const Commands& commands, const double* dw, const double* drift, bool regular,
                  const Nodes& nodes, int path, int s) {
         const int n = dof(), m = mechanism_->controls;
-        std::vector<double>& at_q = stepper_.state.q;
-        std::vector<double>& at_v = stepper_.state.v;
+        std::vector<double>& at_q = stepper_.q;
+        std::vector<double>& at_v = stepper_.v;
         double* u = nodes.u + path * nodes.steps * m;
         apply_policy(commands, path, s, n, at_q.data(), at_v.data(), u);
         u += s * m;
@@ -271,16 +256,16 @@ class ExplicitRollout {
     }
 
     void add_jump() {
-        for (int r = 0; r < dof(); ++r) stepper_.state.v[r] += jump_[r];
+        for (int r = 0; r < dof(); ++r) stepper_.v[r] += jump_[r];
     }
 
     // Enter the state as node s of a path; the dynamics are at it then.
     Outcome enter_node(const Nodes& nodes, int path, int s) {
         const std::int64_t row = path * nodes.steps + s;
         const bool regular = at_state();
-        std::copy_n(stepper_.state.q.data(), dof(), nodes.q + row * dof());
-        std::copy_n(stepper_.state.v.data(), dof(), nodes.v + row * dof());
-        nodes.energy[row] = stepper_.dynamics.energy(stepper_.state.v.data(), nodes.p + row * dof());
+        std::copy_n(stepper_.q.data(), dof(), nodes.q + row * dof());
+        std::copy_n(stepper_.v.data(), dof(), nodes.v + row * dof());
+        nodes.energy[row] = stepper_.dynamics.energy(stepper_.v.data(), nodes.p + row * dof());
         if (!std::isfinite(nodes.energy[row])) return Outcome::not_finite;
         return regular ? Outcome::solved : Outcome::singular;
     }

@@ -217,10 +217,10 @@ class EnergyGuard {
                 if (!balanced(limit, off_middle, energies.group[r], r)) return Outcome::energy;
             }
         }
-        if (!part.empty()) {
+        if (guards.active && !part.empty()) {
             light_parts(trial.at.data(), trial.momentum.data(), trial.v.data());
             for (std::size_t r = 0; r < part.size(); ++r) {
-                if (!part_balanced(limit, energies, from, from_v, trial, r) && guards.active) return Outcome::energy;
+                if (!part_balanced(limit, energies, from, from_v, trial, r)) return Outcome::energy;
             }
             std::copy(part.begin(), part.end(), energies.part.begin());
         }

@@ -113,8 +113,8 @@ template <class T>
 constexpr Force<T>& operator+=(Force<T>& a, const Force<T>& b) {
     return a = a + b;
 }
-template <class T>
-constexpr T dot(const Motion<T>& a, const Force<T>& f) {
+template <class T, class U>
+constexpr auto dot(const Motion<T>& a, const Force<U>& f) -> decltype(a.linear.x * f.linear.x) {
     return a.linear.x * f.linear.x + a.linear.y * f.linear.y + a.linear.z * f.linear.z + a.angular.x * f.angular.x +
            a.angular.y * f.angular.y + a.angular.z * f.angular.z;
 }
@@ -137,8 +137,8 @@ struct Inertia {
     Sym3<T> second{};
 };
 
-template <class T>
-constexpr Force<T> operator*(const Inertia<T>& Y, const Motion<T>& a) {
+template <class T, class U>
+constexpr auto operator*(const Inertia<T>& Y, const Motion<U>& a) -> Force<decltype(Y.mass * a.linear.x)> {
     return {Y.mass * a.linear + cross(a.angular, Y.moment), Y.second * a.angular + cross(Y.moment, a.linear)};
 }
 
