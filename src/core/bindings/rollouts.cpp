@@ -17,7 +17,8 @@ namespace {
 
 using namespace nanobind::literals;
 
-Tableau tableau_of(In<2> a, In<2> gradient, In<2> force, In<1> b, In<1> c, In<2> ahead, double reach, double skew) {
+Tableau tableau_of(In<2> a, In<2> gradient, In<2> force, In<1> b, In<1> c, In<2> ahead, double reach, double skew,
+                   bool stiffly_accurate) {
     const std::size_t s = b.shape(0);
     if (s == 0) throw std::invalid_argument("a tableau has at least one stage");
     for (const auto& [array, name] : {std::pair{&a, "a"}, {&gradient, "gradient"}, {&force, "force"}})
@@ -29,7 +30,8 @@ Tableau tableau_of(In<2> a, In<2> gradient, In<2> force, In<1> b, In<1> c, In<2>
     };
     return {static_cast<int>(s), copied(a), copied(gradient),
             copied(force),       copied(b), copied(c),
-            copied(ahead),       reach,     skew};
+            copied(ahead),       reach,     skew,
+            stiffly_accurate};
 }
 
 Guards guards_of(bool active, double branch_margin, double energy_balance, double energy_budget, int most_halvings) {
@@ -172,7 +174,7 @@ std::tuple<Out, std::int64_t, std::size_t> variational_curvatures(const Mechanis
 void register_rollouts(nb::module_& m) {
     nb::class_<Tableau>(m, "Tableau")
         .def_static("make", &tableau_of, nb::kw_only(), "a"_a, "gradient"_a, "force"_a, "b"_a, "c"_a, "ahead"_a,
-                    "reach"_a, "skew"_a);
+                    "reach"_a, "skew"_a, "stiffly_accurate"_a);
     nb::class_<Guards>(m, "Guards")
         .def_static("make", &guards_of, nb::kw_only(), "active"_a, "branch_margin"_a, "energy_balance"_a,
                     "energy_budget"_a, "most_halvings"_a);
@@ -187,7 +189,7 @@ void register_rollouts(nb::module_& m) {
     m.def("variational_derivatives", &variational_derivatives, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
           "dt"_a, "q"_a, "p"_a, "guess"_a, "force"_a, "substeps"_a);
     m.def("variational_curvatures", &variational_curvatures, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
-          "dt"_a, "q"_a, "p"_a, "guess"_a, "force"_a, "substeps"_a, "z"_a);
+          "dt"_a, "q"_a, "p"_a, "guess"_a, "force"_a, "substeps"_a, nb::kw_only(), "z"_a);
 }
 
 }  // namespace varpin::border

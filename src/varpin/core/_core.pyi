@@ -69,6 +69,7 @@ class Tableau:
         ahead: Floats,
         reach: float,
         skew: float,
+        stiffly_accurate: bool,
     ) -> Tableau:
         """Raises ValueError for arrays that do not fit each other."""
 
@@ -126,6 +127,7 @@ def variational_curvatures(
     guess: Floats,
     force: Floats,
     substeps: Integers,
+    *,
     z: Floats,
 ) -> tuple[Floats, int, int]:
     """Z . d2(q1, p1)/d(q0, p0, f)2 (N, 3n, 3n) for z (N, 2n); how it ended, and how many steps were done."""

@@ -30,7 +30,7 @@ class Radau(Variational):
     Steps are accepted or taken in parts as :class:`Midpoint` does.
 
     Main args:
-        stages: s, from 1 to 6; one stage is the implicit Euler method.
+        stages: s, from 2 to 6. One would be the implicit Euler method, whose error is in percents of the motion.
 
     Other Args:
         guard: As of :class:`Midpoint`, and so are the others.
@@ -46,7 +46,7 @@ class Radau(Variational):
     named = ("stages",)
 
     def __post_init__(self) -> None:
-        if count("stages", self.stages, 1) > MOST_STAGES:
+        if count("stages", self.stages, 2) > MOST_STAGES:
             raise InputError(f"stages must be at most {MOST_STAGES}, got {self.stages}")
         super().__post_init__()
 

@@ -57,7 +57,9 @@ def gauss(stages: int) -> Tableau:
     """The Gauss-Legendre tableau of ``stages`` stages, of order 2 ``stages``."""
     a, b, c = gauss_coefficients(stages)
     ahead = interpolation(np.append(c, 1.0), 1.0 + c)
-    return Tableau.make(a=a, gradient=a, force=a, b=b, c=c, ahead=ahead, reach=_reach(a, b), skew=0.0)
+    return Tableau.make(
+        a=a, gradient=a, force=a, b=b, c=c, ahead=ahead, reach=_reach(a, b), skew=0.0, stiffly_accurate=False
+    )
 
 
 @functools.cache
@@ -65,7 +67,9 @@ def radau(stages: int) -> Tableau:
     """The Radau IIA tableau of ``stages`` stages, of order 2 ``stages`` - 1. Its last stage is the end of the step."""
     a, b, c = radau_coefficients(stages)
     ahead = np.column_stack([interpolation(c, 1.0 + c), np.zeros(stages)])
-    return Tableau.make(a=a, gradient=a, force=a, b=b, c=c, ahead=ahead, reach=_reach(a, b), skew=0.0)
+    return Tableau.make(
+        a=a, gradient=a, force=a, b=b, c=c, ahead=ahead, reach=_reach(a, b), skew=0.0, stiffly_accurate=True
+    )
 
 
 @functools.cache
@@ -83,4 +87,5 @@ def midpoint(alpha: float) -> Tableau:
         ahead=ahead,
         reach=alpha * (1.0 - alpha),
         skew=alpha - 0.5,
+        stiffly_accurate=False,
     )

@@ -13,15 +13,16 @@ namespace varpin {
 
 struct Tableau {
     int stages = 0;
-    std::vector<double> a;         // (s, s)
-    std::vector<double> gradient;  // (s, s) abar
-    std::vector<double> force;     // (s, s) f
-    std::vector<double> b;         // (s)
-    std::vector<double> c;         // (s)
-    std::vector<double> ahead;     // (s, s + 1) values at the next step's stages of the polynomial through this one's
-                                   // stages and its end
-    double reach = 0.0;            // the largest Rayleigh quotient of abar a in the metric of b
-    double skew = 0.0;             // alpha - 1/2 of the midpoint rule: off the middle it is of first order
+    std::vector<double> a;          // (s, s)
+    std::vector<double> gradient;   // (s, s) abar
+    std::vector<double> force;      // (s, s) f
+    std::vector<double> b;          // (s)
+    std::vector<double> c;          // (s)
+    std::vector<double> ahead;      // (s, s + 1) values at the next step's stages of the polynomial through this one's
+                                    // stages and its end
+    double reach = 0.0;             // the largest Rayleigh quotient of abar a in the metric of b
+    double skew = 0.0;              // alpha - 1/2 of the midpoint rule: off the middle it is of first order
+    bool stiffly_accurate = false;  // ends in its last stage, and damps what friction damps faster than the step
 };
 
 }  // namespace varpin

@@ -233,8 +233,7 @@ class VariationalStepper {
             trial.place[c] = {state.place[c].place.plus(h * move), state.place[c].turns};
             trial.p[c] = state.p[c].plus(h * impulse);
         }
-        const Outcome outcome =
-            energy_guard.settle(guards, 2.0 * std::abs(tableau.skew), state.energies, state.place, state.v, trial);
+        const Outcome outcome = energy_guard.settle(guards, tableau, state.energies, state.place, state.v, trial);
         if (outcome != Outcome::solved) return outcome;
         if (trail != nullptr) trail->push_back({state.place, state.p, equation.V, h});
         effort.branch_margin = std::min(effort.branch_margin, margin);

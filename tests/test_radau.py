@@ -1,0 +1,123 @@
+"""Radau IIA collocation: its tableau, its order, its derivatives, and motions under damping faster than the step."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+
+import varpin as vp
+from varpin.integrators.tableau import radau_coefficients
+
+STAGES = (2, 3, 4)
+
+
+def test_tableau_of_two_stages():
+    """Hairer and Wanner II, table IV.5.5."""
+    a, b, c = radau_coefficients(2)
+    np.testing.assert_allclose(a, [[5 / 12, -1 / 12], [3 / 4, 1 / 4]], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(b, [3 / 4, 1 / 4], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(c, [1 / 3, 1], rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("stages", [2, 3, 4, 6])
+def test_tableau(stages):
+    """Quadrature of order 2s - 1, collocation of order s, and stiffly accurate."""
+    a, b, c = radau_coefficients(stages)
+    for k in range(1, 2 * stages):
+        assert b @ c ** (k - 1) == pytest.approx(1 / k, rel=1e-14)
+    for k in range(1, stages + 1):
+        np.testing.assert_allclose(a @ c ** (k - 1), c**k / k, rtol=0, atol=1e-14)
+    assert c[-1] == 1.0
+    np.testing.assert_array_equal(b, a[-1])
+
+
+@pytest.mark.parametrize("stages", STAGES)
+def test_order(stages):
+    scene = vp.Scene(vp.planar_chain(3), damping=0.1)
+    start = {"q0": np.zeros(3), "v0": np.ones(3)}
+    exact = vp.simulate(scene, **start, dt=0.5, steps=1, integrator=vp.Reference()).q[-1]
+    errors = [
+        np.abs(vp.simulate(scene, **start, dt=0.5 / n, steps=n, integrator=vp.Radau(stages)).q[-1] - exact).max()
+        for n in (15, 30)
+    ]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2 * stages - 1, abs=0.3)
+
+
+def test_an_oscillator_damped_far_faster_than_the_step_is_at_rest_after_it():
+    """The rational stability function: at h rate = 1000 what is left is below 1e-3, of Gauss nearly everything."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=1e5)
+    left = {
+        kind: abs(vp.simulate(scene, [0.0], [1.0], dt=1e-2, steps=1, integrator=kind, check=False).v[-1, 0])
+        for kind in (vp.Radau(2), vp.Radau(3), vp.Gauss(2))
+    }
+    assert left[vp.Radau(2)] < 1e-2
+    assert left[vp.Radau(3)] < 1e-2
+    assert left[vp.Gauss(2)] > 0.9
+
+
+@pytest.mark.parametrize("damping", [[10, 10, 5, 5, 5, 2, 2], 0.1], ids=["the file's", "0.1"])
+def test_torques_that_jump_on_a_damped_arm(damping):
+    """Against SciPy's Radau on Pinocchio's forward dynamics: q within 1 % of the way, node velocities within 10 %."""
+    robot = vp.load_robot("xarm7")
+    scene = vp.Scene(robot, damping=damping)
+    n, steps, dt = robot.dof, 20, 1e-2
+    q0 = np.full(n, 0.3)
+    hold = scene.holding_torque(q0)
+    u = hold + np.random.default_rng(0).normal(size=(steps, n)) * np.maximum(1.0, 0.2 * np.abs(hold)) / 2
+    model, data = robot.model, robot.model.createData()
+    x, nodes = np.concatenate([q0, np.zeros(n)]), []
+    for torque in u:
+
+        def rate(_, x, torque=torque):
+            return np.append(
+                x[n:], pin.aba(model, data, robot.configuration(x[:n]), x[n:], torque - scene.damping * x[n:])
+            )
+
+        x = solve_ivp(rate, (0.0, dt), x, method="Radau", rtol=1e-8, atol=1e-10).y[:, -1]
+        nodes.append(x)
+    exact = np.array(nodes)
+    motion = vp.simulate(scene, q0, np.zeros(n), dt=dt, steps=steps, controls=u, integrator=vp.Radau(3))
+    assert motion.statistics.split_steps == 0
+    way = np.ptp(exact[:, :n], axis=0)
+    assert (np.abs(motion.q[1:] - exact[:, :n]).max(axis=0) <= 0.01 * way.max()).all()
+    speed = np.abs(exact[:, n:]).max(axis=0)
+    assert (np.abs(motion.v[1:] - exact[:, n:]).max(axis=0) <= 0.1 * speed).all()
+
+
+@pytest.mark.parametrize("stages", STAGES)
+def test_derivatives_against_differences(stages):
+    scene = vp.Scene(vp.load_robot("ur5"), damping=2.0, stiffness=3.0)
+    integrator, dt = vp.Radau(stages), 2e-2
+    q0, v0, u0 = np.random.default_rng(1).normal(size=(3, 6))
+    motion = vp.simulate(scene, q0, v0, dt=dt, steps=1, controls=u0, integrator=integrator)
+    lin = vp.linearize(scene, motion)
+    p0 = motion.p[0]
+
+    def end(x):
+        q, p, u = x[:6], x[6:12], x[12:]
+        v = np.linalg.solve(vp.lagrangian_jet(scene, q, np.zeros(6)).Lvv, p)
+        out = vp.simulate(scene, q, v, dt=dt, steps=1, controls=u, integrator=integrator, check=False)
+        return np.append(out.q[-1], out.p[-1])
+
+    x, step = np.concatenate([q0, p0, u0]), 1e-5
+    differences = np.array([(end(x + step * e) - end(x - step * e)) / (2 * step) for e in np.eye(18)]).T
+    given = np.hstack([lin.A[0], lin.B[0]])
+    assert np.abs(given - differences).max() <= 1e-8 * np.abs(differences).max()
+
+
+def test_energy_of_an_undamped_motion_decays_with_its_order():
+    scene = vp.Scene(vp.planar_chain(2))
+    lost = []
+    for n in (100, 200):
+        motion = vp.simulate(scene, [0.5, 0.5], [0.0, 0.0], dt=1.0 / n, steps=n, integrator=vp.Radau(2))
+        lost.append(abs(motion.energy[-1] - motion.energy[0]))
+    assert 2.5 < np.log2(lost[0] / lost[1]) < 3.6
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [({"stages": 1}, "stages must be at least 2, got 1"), ({"stages": 7}, "stages must be at most 6, got 7")],
+)
+def test_options_out_of_range(option, words):
+    with pytest.raises(vp.InputError, match=words):
+        vp.Radau(**option)
