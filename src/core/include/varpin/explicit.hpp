@@ -11,6 +11,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <utility>
 #include <vector>
 
 #include "varpin/dynamics.hpp"
@@ -58,10 +59,12 @@ class ExplicitStepper {
           tableau_(tableau_of(method)),
           derivatives_(derivatives),
           stage_q_(mechanism.dof()),
-          stage_v_(mechanism.dof()) {
+          stage_v_(mechanism.dof()),
+          sum_q_(derivatives ? blocks_size(mechanism.tree) : 0),
+          sum_v_(sum_q_.size()) {
         for (int i = 0; i < stages(); ++i) {
             a_[i].resize(mechanism.dof());
-            if (derivatives) slope_[i].resize(blocks_size(mechanism.tree));
+            if (derivatives) slope_[i].resize(sum_q_.size());
         }
     }
 
@@ -84,25 +87,26 @@ class ExplicitStepper {
 
     // The derivatives of the last step in (q, v) and in the force into Jx (2n, 2n) and Jf (2n, n), of which everything
     // outside of blocks is zero already.
-    void write_derivatives(double h, double* Jx, double* Jf) const {
+    void write_derivatives(double h, double* Jx, double* Jf) {
+        add_up(h * h, tableau_.end_q, sum_q_);
+        add_up(h, tableau_.end_v, sum_v_);
         const int n = mechanism_->dof();
-        int first = 0;
+        const double *in_q = sum_q_.data(), *in_v = sum_v_.data();
         for (const Block& block : mechanism_->tree.blocks) {
             const int size = block.end - block.begin;
-            for (int i = 0; i < size; ++i, first += 3 * size) {
-                const int row = block.begin + i;
-                double* const in_q = Jx + row * 2 * n;
-                double* const in_v = Jx + (n + row) * 2 * n;
-                for (int part = 0; part < 2; ++part) {
-                    const int from = first + part * size, to = part * n + block.begin;
-                    add_up(size, from, h * h, tableau_.end_q, in_q + to);
-                    add_up(size, from, h, tableau_.end_v, in_v + to);
+            for (int row = block.begin; row < block.end; ++row, in_q += 3 * size, in_v += 3 * size) {
+                for (auto [sum, at] : {std::pair{in_q, row}, {in_v, n + row}}) {
+                    double* const x = Jx + at * 2 * n + block.begin;
+                    double* const f = Jf + at * n + block.begin;
+                    for (int c = 0; c < size; ++c) {
+                        x[c] = sum[c];
+                        x[n + c] = sum[size + c];
+                        f[c] = sum[2 * size + c];
+                    }
                 }
-                in_q[row] += 1.0;
-                in_q[n + row] += h;
-                in_v[n + row] += 1.0;
-                add_up(size, first + 2 * size, h * h, tableau_.end_q, Jf + row * n + block.begin);
-                add_up(size, first + 2 * size, h, tableau_.end_v, Jf + (n + row) * n + block.begin);
+                Jx[row * 2 * n + row] += 1.0;
+                Jx[row * 2 * n + n + row] += h;
+                Jx[(n + row) * 2 * n + n + row] += 1.0;
             }
         }
     }
@@ -146,13 +150,18 @@ class ExplicitStepper {
         }
     }
 
-    // to += scale sum_i weight[i] slope_i over some entries.
-    void add_up(int size, int from, double scale, const double* weight, double* __restrict to) const {
+    // scale sum_i weight[i] slope_i.
+    void add_up(double scale, const double* weight, std::vector<double>& to) const {
+        const int size = static_cast<int>(to.size());
+        double* __restrict sum = to.data();
         for (int i = 0; i < stages(); ++i) {
             const double factor = scale * weight[i];
-            if (factor == 0.0) continue;
-            const double* __restrict x = slope_[i].data() + from;
-            for (int c = 0; c < size; ++c) to[c] += factor * x[c];
+            const double* __restrict x = slope_[i].data();
+            if (i == 0) {
+                for (int c = 0; c < size; ++c) sum[c] = factor * x[c];
+            } else {
+                for (int c = 0; c < size; ++c) sum[c] += factor * x[c];
+            }
         }
     }
 
@@ -160,8 +169,9 @@ class ExplicitStepper {
     Tableau tableau_;
     bool derivatives_;
     std::vector<double> stage_q_, stage_v_;
-    std::vector<double> a_[4];      // (n) of each stage
-    std::vector<double> slope_[4];  // their derivatives (b, 3b) in q, v and force, block after block
+    std::vector<double> a_[4];           // (n) of each stage
+    std::vector<double> slope_[4];       // their derivatives (b, 3b) in q, v and force, block after block
+    std::vector<double> sum_q_, sum_v_;  // of those at the end of a step
 };
 
 // P paths on their way, each from its own state.
