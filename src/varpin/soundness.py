@@ -578,9 +578,9 @@ def _error_at(
             position = np.where(off[0] <= rounding, 0.0, off[0] * growth / units[0])
             velocity = np.where(off[1] <= 1e-9 * units[1], 0.0, off[1] / units[1])
             motion = position * units[0] / units[0].max()
-        errors = np.array([position, velocity, motion]) * (_LATER if place else 1.0)
-        levels = np.array([[COARSE], [COARSE_VELOCITY], [COARSE_WAY]])
-        joint = int(np.argmax(np.nan_to_num(errors / levels, nan=np.inf).max(axis=0)))
+            errors = np.array([position, velocity, motion]) * (_LATER if place else 1.0)
+            shares = errors / np.array([[COARSE], [COARSE_VELOCITY], [COARSE_WAY]])
+        joint = int(np.argmax(np.nan_to_num(shares, nan=np.inf).max(axis=0)))
         return MotionError(place, joint, *errors[:, joint].tolist())
 
     known = _predictable(scene, integrator, trajectory, place, count)
