@@ -395,13 +395,7 @@ def test_the_command_fails_where_anything_is_silent_wrong(capsys, monkeypatch):
     assert capsys.readouterr().out.count("silent wrong: a lie, ") == len(INTEGRATORS)
 
 
-# Some motions near the levels of the checks pass unsaid, and so do energies of first-order methods under torques that
-# flip at each step, where work by velocities and by ways differ.
-UNSAID = pytest.mark.xfail(reason="some motions that the checks find wrong are not told of yet", strict=False)
-
-
 @pytest.mark.slow
-@UNSAID
 def test_nothing_on_the_finger_is_silent_wrong(load):
     record = extremes.run(load("finger"))
     assert record.missing == 0
@@ -441,7 +435,6 @@ def test_the_table_of_robots_counts_every_cell(benchmark, load, tmp_path):
 
 
 @pytest.mark.slow
-@UNSAID
 @pytest.mark.parametrize("name", ["double_pendulum", "z1", "xarm7", *(f"tree{20 * k + k}" for k in range(10))])
 def test_nothing_on_robots_and_trees_is_silent_wrong(benchmark, name):
     robot = benchmark.robot_of(name)

@@ -46,8 +46,8 @@ dt { padding: 0 0.5rem; } dd { margin: 0; }
 
 def false_alarms(record: Record) -> str:
     """How many warnings were needless, in words."""
-    warned = record.counts()[Kind.DEGRADED]
-    return f"Of {warned} cells that varpin warns of, {len(record.needless())} fail no check: false alarms."
+    warned, needless = record.counts()[Kind.DEGRADED], len(record.needless())
+    return f"Of {warned} cells that varpin warns of, {needless} are far from failing any check: false alarms."
 
 
 def entry(cell: Cell) -> str:

@@ -233,6 +233,9 @@ def _fast_pull(scene: Scene, trajectory: Trajectory) -> bool:
     for q in trajectory.q[[0, -1]]:
         _, _, _, Lqq, _, M = scene.core.jet(np.ascontiguousarray(q), still)
         turns = trajectory.dt**2 * np.linalg.solve(M, Lqq)
+        # A matrix is no larger than its rows.
+        if np.abs(turns).sum(axis=1).max() <= 1.0:
+            continue
         if not np.isfinite(turns).all() or np.abs(np.linalg.eigvals(turns)).max() > 1.0:
             return True
     return False
@@ -418,7 +421,9 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
     as long as the motion, or less; a motion of whole steps without noise or fast dampers can pass.
     """
     steps, n = trajectory.steps, scene.robot.dof
-    length = min(_WINDOW, steps - steps % 2)
+    # Windows of like lengths, which are even.
+    pieces = min(-(-steps // _WINDOW), _WINDOWS)
+    length = min(_WINDOW, 2 * -(-steps // (2 * pieces)), steps - steps % 2) if pieces else 0
     if isinstance(integrator, Reference) or not length or trajectory.dw.any() or scene.noise.diffusion is None:
         return False
     if not np.abs(trajectory.v).max() > _STILL:
@@ -426,8 +431,9 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
     # Dampers and springs far faster than the step do as little in two.
     if (trajectory.statistics.substeps > 1).any() or _fast_damping(scene, trajectory) or _fast_pull(scene, trajectory):
         return False
-    begins = np.unique(np.linspace(0, steps - length, min(-(-steps // length), _WINDOWS)).astype(np.int64))
-    begins = np.union1d(begins, _blows(trajectory.v, length)) if len(begins) == _WINDOWS else begins
+    begins = np.unique(np.linspace(0, steps - length, max(pieces, 1 + steps % 2)).astype(np.int64))
+    if pieces == _WINDOWS:
+        begins = np.union1d(begins, _blows(trajectory.v, length))
     nodes = begins[:, None] + np.arange(length + 1)
     q, v, u = trajectory.q[nodes], trajectory.v[nodes], trajectory.u
     commands, drift = open_loop(u[:length:2]), np.zeros((0, 0, n))
@@ -571,9 +577,9 @@ def _error_at(
             position = np.where(off[0] <= rounding, 0.0, off[0] * growth / units[0])
             velocity = np.where(off[1] <= 1e-9 * units[1], 0.0, off[1] / units[1])
             motion = position * units[0] / units[0].max()
-        errors = np.array([position, velocity, motion]) * (_LATER if place else 1.0)
-        levels = np.array([[COARSE], [COARSE_VELOCITY], [COARSE_WAY]])
-        joint = int(np.argmax(np.nan_to_num(errors / levels, nan=np.inf).max(axis=0)))
+            errors = np.array([position, velocity, motion]) * (_LATER if place else 1.0)
+            shares = errors / np.array([[COARSE], [COARSE_VELOCITY], [COARSE_WAY]])
+        joint = int(np.argmax(np.nan_to_num(shares, nan=np.inf).max(axis=0)))
         return MotionError(place, joint, *errors[:, joint].tolist())
 
     known = _predictable(scene, integrator, trajectory, place, count)

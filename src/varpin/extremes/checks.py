@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.errors import LinearizationError, VarpinError
-from varpin.extremes.trial import Setup
+from varpin.extremes.trial import LEVELS, Setup
 from varpin.integrators import Gauss, Integrator, Midpoint, Reference
 from varpin.integrators.base import open_loop
 from varpin.lagrangian import lagrangian_jet
@@ -26,20 +26,6 @@ from varpin.simulation import simulate
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
-
-# From here on a result is wrong. Accuracy in units of the motion itself, structure in units of rounding with room for
-# ill-conditioned mass matrices.
-LEVELS = {
-    "error": 0.05,
-    "joint": 0.1,
-    "velocity": 0.25,
-    "energy": 0.1,
-    "momentum": 0.1,
-    "kept momentum": 1e-6,
-    "reversal": 1e-4,
-    "symplecticity": 1e-7,
-    "record": 1e-6,
-}
 
 # Growth of a small disturbance up to which motions are compared one by one; beyond it by their energies.
 _PREDICTABLE = 10.0
