@@ -13,8 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from varpin.chatter import RUN, alternation
 from varpin.errors import LinearizationError
@@ -120,7 +120,7 @@ class Loop:
     def multiplier(self, period: float) -> complex:
         """By what a period [s] multiplies deviations: of the loop with a zero-order hold the largest eigenvalue."""
         size, m = self.B.shape
-        held = expm(period * np.block([[self.A, self.B], [np.zeros((m, size + m))]]))
+        held = scipy.linalg.expm(period * np.block([[self.A, self.B], [np.zeros((m, size + m))]]))
         values = self.span.values(held[:size, :size] + held[:size, size:] @ self.K)
         return complex(values[np.argmax(np.abs(values))])
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from varpin.checks import as_floats, positive, require_finite
 from varpin.costs.base import CostError, Points, Reference, sample
@@ -154,7 +154,8 @@ def _sample_rotations(target: Floats | Callable[[float], ArrayLike], points: Poi
             f"for each of the problem's nodes; got {target.shape}"
         )
     nodes = np.linspace(0.0, points.duration, points.steps + 1)
-    turns = Slerp(nodes, Rotation.from_matrix(_require_rotations(f"{name} target", target)))
+    rotations = scipy.spatial.transform.Rotation.from_matrix(_require_rotations(f"{name} target", target))
+    turns = scipy.spatial.transform.Slerp(nodes, rotations)
     between: Floats = turns(np.clip(points.elapsed, 0.0, points.duration)).as_matrix()
     return between
 

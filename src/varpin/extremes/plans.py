@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicHermiteSpline
 
 from varpin.costs import ControlCost, Cost, Terminal, TrackingCost
 from varpin.errors import VarpinError
@@ -69,7 +69,7 @@ class Task:
         """The cost of a motion, summed by hand at two Gauss points of each step, on the cubic through its nodes."""
         t, q, u, dt = motion.t, motion.q, motion.u, motion.dt
         rows = np.broadcast_to(np.atleast_2d(self.reference), q.shape)
-        path, tracking = CubicHermiteSpline(t, q, motion.v), 0.0
+        path, tracking = scipy.interpolate.CubicHermiteSpline(t, q, motion.v), 0.0
         for place in (0.5 - math.sqrt(3.0) / 6.0, 0.5 + math.sqrt(3.0) / 6.0):
             off = path(t[:-1] + place * dt) - ((1.0 - place) * rows[:-1] + place * rows[1:])
             tracking += 0.5 * (off**2).sum()

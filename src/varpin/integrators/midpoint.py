@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import eigh
 
 from varpin.checks import fraction
 from varpin.core import Tableau
@@ -23,7 +23,7 @@ def largest_step(M: Floats, Lqq: Floats, margin: float) -> float:
     Where M - dt^2 / (4 (1 - margin)) L_qq ceases to be positive definite; infinite where no direction is unstable. It
     says nothing of accuracy.
     """
-    rates = eigh(Lqq, M, eigvals_only=True)
+    rates = scipy.linalg.eigh(Lqq, M, eigvals_only=True)
     # Of a direction without curvature rounding leaves a tiny one, of either sign.
     rounding = 1e-12 * float(np.abs(rates).max())
     return 2.0 * float(np.sqrt((1.0 - margin) / rates[-1])) if rates[-1] > rounding else np.inf

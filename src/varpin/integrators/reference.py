@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
 
 from varpin.checks import positive
 from varpin.core import ExplicitMethod, ExplicitRollout, ForwardDynamics
@@ -210,7 +210,7 @@ class Reference(Integrator):
 def _integrate(rate: Rate, x: Floats, dt: float, rtol: float, atol: Floats, tried: float) -> tuple[Floats, int, float]:
     """X after ``dt`` [s], the number of evaluations, and the length of the last whole step inside [s]."""
     first = min(tried, dt) if tried > 0.0 else None
-    solution = solve_ivp(rate, (0.0, dt), x, method="DOP853", rtol=rtol, atol=atol, first_step=first)
+    solution = scipy.integrate.solve_ivp(rate, (0.0, dt), x, method="DOP853", rtol=rtol, atol=atol, first_step=first)
     if not solution.success:
         raise _RunsAway
     # The last step inside is cut at the end of the interval, so the longest one is what the method wanted.

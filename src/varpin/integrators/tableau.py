@@ -3,8 +3,8 @@
 import functools
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import roots_jacobi
 
 from varpin.core import Tableau
 
@@ -38,7 +38,7 @@ def radau_coefficients(stages: int) -> tuple[Floats, Floats, Floats]:
     Its points are the end of the step and the roots of a Jacobi polynomial (Hairer and Wanner, Solving Ordinary
     Differential Equations II, IV.5).
     """
-    inner, _ = roots_jacobi(stages - 1, 1.0, 0.0) if stages > 1 else (np.zeros(0), None)
+    inner, _ = scipy.special.roots_jacobi(stages - 1, 1.0, 0.0) if stages > 1 else (np.zeros(0), None)
     c = np.append(0.5 * (1.0 + inner), 1.0)
     # Gauss's rule of as many points integrates the Lagrange polynomials exactly.
     _, weights, points = gauss_coefficients(stages)

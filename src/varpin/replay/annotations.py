@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 import pinocchio as pin
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from varpin.checks import JointValues, as_floats, joint_array, require_finite
 from varpin.errors import InputError
@@ -187,7 +187,7 @@ def target_tracks(given: Mapping[str, object] | None, end: float) -> dict[str, t
         rigid = np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max() < 1e-6 and (np.linalg.det(R) > 0.0).all()
         if not rigid or np.abs(array[:, 3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-9:
             raise InputError(f"{what} is no pose: a rotation and a place above the row 0 0 0 1")
-        found[str(name)] = times, array[:, :3, 3], Rotation.from_matrix(R).as_quat()
+        found[str(name)] = times, array[:, :3, 3], scipy.spatial.transform.Rotation.from_matrix(R).as_quat()
     return found
 
 
@@ -207,8 +207,8 @@ def target(name: str, track: tuple[Floats, Floats, Floats | None], times: Floats
     at = _at(times, t, places)
     if turns is None:
         return Target(name, at)
-    quaternions = Slerp(t, Rotation.from_quat(turns))(np.minimum(times, t[-1])).as_quat()
-    return Target(name, at, quaternions)
+    between = scipy.spatial.transform.Slerp(t, scipy.spatial.transform.Rotation.from_quat(turns))
+    return Target(name, at, between(np.minimum(times, t[-1])).as_quat())
 
 
 def torque_shares(

@@ -4,9 +4,8 @@ import math
 
 import numpy as np
 import pinocchio as pin
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from varpin.core.arrays import Tree
 from varpin.errors import InputError, RobotError, UnknownFrame, UnsupportedJoint
@@ -392,8 +391,10 @@ def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Inte
         dof: n.
     """
     tied = parent >= 0
-    links = coo_array((np.ones(tied.sum()), (coordinate[tied], coordinate[parent[tied]])), shape=(dof, dof))
-    _, label = connected_components(links, directed=False)
+    links = scipy.sparse.coo_array(
+        (np.ones(tied.sum()), (coordinate[tied], coordinate[parent[tied]])), shape=(dof, dof)
+    )
+    _, label = scipy.sparse.csgraph.connected_components(links, directed=False)
     return np.asarray(label, dtype=np.int64)
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TextIO
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
 from varpin.archive import read_npz
 from varpin.checks import is_file
@@ -89,7 +89,7 @@ class _Sines:
 
 @dataclass(frozen=True, eq=False)
 class _Smooth:
-    curve: PchipInterpolator
+    curve: scipy.interpolate.PchipInterpolator
     first: float
     last: float
 
@@ -195,7 +195,7 @@ class Reference:
 def _between(times: Floats, rows: Floats, *, smooth: bool) -> Timeline:
     """Rows over time, the first and the last held before and after."""
     if smooth:
-        return Timeline(_Smooth(PchipInterpolator(times, rows), times[0], times[-1]), constant=False)
+        return Timeline(_Smooth(scipy.interpolate.PchipInterpolator(times, rows), times[0], times[-1]), constant=False)
     return Timeline(_Linear(times, rows), constant=False)
 
 

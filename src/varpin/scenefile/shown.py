@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from varpin.scenefile.layout import CostTerm, Layout
 from varpin.scenefile.table import Floats
@@ -70,7 +70,7 @@ def _where(place: CostTerm, turn: CostTerm | None, duration: float) -> Floats:
     poses = np.tile(np.eye(4), (rows, 1, 1))
     poses[:, :3, 3] = points
     # As in a URDF: Rz(yaw) Ry(pitch) Rx(roll).
-    poses[:, :3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
+    poses[:, :3, :3] = scipy.spatial.transform.Rotation.from_euler("xyz", angles).as_matrix()
     return poses
 
 

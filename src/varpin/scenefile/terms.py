@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from varpin.costs import (
     CenterOfMassCost,
@@ -77,7 +77,7 @@ class _Turning:
 
 def _matrix(angles: Floats) -> Floats:
     """Rz(yaw) Ry(pitch) Rx(roll), as in a URDF."""
-    return np.asarray(Rotation.from_euler("xyz", angles).as_matrix())
+    return np.asarray(scipy.spatial.transform.Rotation.from_euler("xyz", angles).as_matrix())
 
 
 @dataclass(frozen=True, eq=False)
