@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from varpin.chatter import RUN, Alternation, alternation
 from varpin.errors import SingularMassMatrix
-from varpin.integrators import ExplicitEuler, Integrator, Reference
+from varpin.integrators import ExplicitEuler, Integrator, Radau, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.lagrangian import lagrangian_jet
@@ -175,7 +175,7 @@ def evident(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tup
     found = []
     rate = _fast_damping(scene, trajectory)
     # With more stages what dampers are faster than a step leaves is less.
-    if trajectory.dt * rate > 2.0 * getattr(integrator, "stages", 1):
+    if not isinstance(integrator, Radau) and trajectory.dt * rate > 2.0 * getattr(integrator, "stages", 1):
         found.append(Finding("fast damping", _ringing(rate, trajectory.dt)))
     if split := _in_parts(trajectory):
         found.append(Finding("split steps", f"{split}: dt = {trajectory.dt:g} s is coarse here"))
@@ -245,7 +245,7 @@ def _ringing(rate: float, dt: float) -> str:
     return (
         f"damping is faster than the step (dt * {rate:.3g}/s = {dt * rate:.3g} > 2): velocities that it should stop "
         "will ring; "
-        f"dt below {2.0 / rate:.3g} s resolves it"
+        f"dt below {2.0 / rate:.3g} s resolves it, varpin.Radau(3) stops them"
     )
 
 
@@ -275,7 +275,8 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
             f"smaller steps from t = {start:.4g} s on move joint {trajectory.joint_names[error.joint]!r} by "
             f"{100 * error.position:.3g}% of its way over a period, and its velocity by {100 * error.velocity:.3g}%"
         )
-        if rate := _fast_damping(scene, trajectory):
+        rate = 0.0 if isinstance(integrator, Radau) else _fast_damping(scene, trajectory)
+        if rate:
             found.append(Finding("fast damping", f"{_ringing(rate, dt)}; {off}", error.joint))
         else:
             split = f" ({_in_parts(trajectory)})" if _in_parts(trajectory) else ""
