@@ -55,9 +55,16 @@ def test_defaults():
     assert reach(vp.planar_chain(2), 0, steps=2, integrator=vp.Midpoint()).sampling == "gauss"
 
 
-def test_second_order_asks_for_the_midpoint_rule():
+def test_second_order_under_defaults():
+    problem = reach(vp.planar_chain(2), 0, steps=40)
+    exact, usual = vp.solve(problem, second_order=True), vp.solve(problem)
+    assert exact.cost == pytest.approx(usual.cost, rel=1e-6)
+    assert exact.iterations <= usual.iterations + 2
+
+
+def test_explicit_methods_have_no_second_order():
     with pytest.raises(vp.InputError, match=r"no second-order linearization; varpin.Midpoint\(...\) has"):
-        vp.solve(reach(vp.planar_chain(2), 0, steps=5), second_order=True)
+        vp.solve(reach(vp.planar_chain(2), 0, steps=5, integrator=vp.RungeKutta4()), second_order=True)
 
 
 def test_a_reach_of_a_heavy_arm_under_defaults(load):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 
@@ -10,8 +11,18 @@ import pinocchio as pin
 import pytest
 
 import varpin as vp
+from varpin.chatter import alternation
 from varpin.robot.chain import rod_chain
-from varpin.soundness import COARSE, energy_defects, energy_scale, motion_error
+from varpin.soundness import (
+    COARSE,
+    Finding,
+    alternating,
+    announce,
+    energy_defects,
+    energy_scale,
+    motion_error,
+    resolved,
+)
 
 ROD = rod_chain([1.0], [1.0])
 EXPLICIT = (vp.ExplicitEuler(), vp.SemiImplicitEuler(), vp.RungeKutta4())
@@ -154,6 +165,91 @@ def test_a_loop_logs_each_kind_of_warning_once_for_a_scene_and_a_step(caplog):
     assert logged(scene, 1e-2, 1) == 0
     assert logged(scene, 2e-2, 1) == 1
     assert logged(vp.Scene(vp.planar_chain(1), damping=1e3), 1e-2, 1) == 1
+
+
+def test_the_log_has_each_joint_once_whatever_the_numbers(caplog):
+    scene = vp.Scene(vp.planar_chain(1))
+    found = [Finding("kind", f"{number} of joint {joint}", joint) for number in range(3) for joint in (0, 1, None)]
+    logger = logging.getLogger("varpin")
+    with caplog.at_level(logging.WARNING, logger="varpin"):
+        announce(logger, scene, 1e-2, found)
+        announce(logger, scene, 1e-2, found)
+    assert [record.message for record in caplog.records] == ["0 of joint 0", "0 of joint 1", "0 of joint None"]
+
+
+@pytest.mark.parametrize("integrator", EXPLICIT, ids=str)
+def test_controls_do_the_work_of_the_way(integrator):
+    """A torque that flips at each step: its work is that of the recorded way, by Pinocchio's energies."""
+    scene = vp.Scene(vp.planar_chain(2))
+    controls = np.where(np.arange(200) % 2 == 0, 60.0, -60.0)[:, None] * np.ones(2)
+    motion = vp.simulate(scene, [0.3, 0.3], [0.0, 0.0], dt=2e-3, steps=200, controls=controls, integrator=integrator)
+    work = np.cumsum((controls * np.diff(motion.q, axis=0)).sum(axis=1))
+    off = motion.energy[1:] - motion.energy[0] - work
+    np.testing.assert_allclose(motion.statistics.energy_defect, off, rtol=0, atol=1e-9 * np.abs(off).max() + 1e-12)
+    told = any("the energy is off by" in text for text in motion.warnings)
+    assert told == (integrator.order == 1)
+
+
+@pytest.mark.parametrize("controls", [None, "constant", "changing"])
+@pytest.mark.parametrize("integrator", [*EXPLICIT, vp.Midpoint(), vp.Gauss(4)], ids=str)
+def test_what_doubled_steps_agree_with_needs_no_other_look(integrator, controls):
+    """It is the motion of DOP853, whose error is far below what is spoken of; and a coarse motion does not pass."""
+    scene, t = vp.Scene(vp.planar_chain(2), damping=0.1), np.arange(64) / 64
+    rows = {None: None, "constant": np.array([3.0, -1.0]), "changing": np.sin(4.0 * t)[:, None] * [5.0, 2.0]}[controls]
+    passed = []
+    start = [0.3, 0.2], [0.5, 0.0]
+    exact = vp.simulate(scene, *start, dt=1 / 64, steps=64, controls=rows, integrator=vp.Reference(rtol=1e-10))
+    for every in (1, 4, 16):
+        u = np.repeat(rows, every, axis=0) if controls == "changing" else rows
+        options = {"dt": 1.0 / 64 / every, "steps": 64 * every, "controls": u, "check": False}
+        motion = vp.simulate(scene, *start, integrator=integrator, **options)
+        if resolved(scene, integrator, motion):
+            passed.append(every)
+            off = np.abs(motion.q[::every] - exact.q).max(axis=0) / np.ptp(exact.q, axis=0)
+            assert off.max() < 0.5 * COARSE
+    assert 16 in passed or integrator.order == 1
+    coarse = vp.simulate(scene, [0.3, 0.2], [0.5, 0.0], dt=0.1, steps=20, integrator=vp.ExplicitEuler(), check=False)
+    assert not resolved(scene, vp.ExplicitEuler(), coarse)
+
+
+@pytest.mark.parametrize("frozen", [{"stiffness": 3e7}, {"damping": 1e7}, {"gravity": [0.0, 0.0, -1e8]}])
+def test_what_stands_still_in_any_step_is_not_taken_for_resolved(frozen):
+    """Modes far faster than the step hardly move with an even number of stages, in two steps or in one."""
+    scene = vp.Scene(ROD, **({"gravity": False} | frozen))
+    for stages in (2, 4):
+        motion = vp.simulate(scene, [0.5], [0.1], dt=1e-2, steps=50, integrator=vp.Gauss(stages), check=False)
+        assert not resolved(scene, vp.Gauss(stages), motion)
+
+
+def test_velocities_that_alternate_in_smaller_steps_too_are_the_robots_own():
+    """A spring that turns by nearly half a turn a step: resolved by four stages it alternates, and that is right."""
+    for integrator, right in ((vp.Gauss(4), True), (vp.Midpoint(), False)):
+        scene, motion = oscillator(3.0, integrator, steps=12)
+        exact = 0.5 * np.cos(3.0 * np.arange(13))
+        assert (np.abs(motion.q[:, 0] - exact).max() < 0.01) == right
+        assert alternation(motion.v) is not None or not right
+        assert bool(alternating(scene, integrator, motion)) <= (not right)
+        assert (motion.warnings == ()) == right
+
+
+def test_a_single_bad_step_is_found():
+    """One step of a long motion is off, where nothing is violent: its energy tells where to look."""
+    scene, steps = vp.Scene(ROD), 4000
+    motion = vp.simulate(scene, [0.3], [0.0], dt=1e-3, steps=steps)
+    assert motion.warnings == ()
+    later = vp.simulate(scene, motion.q[2501] + 0.15, motion.v[2501], dt=1e-3, steps=steps - 2501)
+    energy = np.concatenate([motion.energy[:2501], later.energy])
+    broken = dataclasses.replace(
+        motion,
+        q=np.concatenate([motion.q[:2501], later.q]),
+        v=np.concatenate([motion.v[:2501], later.v]),
+        p=np.concatenate([motion.p[:2501], later.p]),
+        energy=energy,
+        statistics=dataclasses.replace(motion.statistics, energy_defect=energy[1:] - energy[0]),
+    )
+    error = motion_error(scene, vp.Midpoint(), broken)
+    assert error.step == 2500
+    assert error.worst > 1.0
 
 
 def spindled(kind, *, spindle=True):

@@ -203,9 +203,10 @@ def unforced(scene: Scene, trajectory: Trajectory) -> bool:
 
 
 def energy_error(scene: Scene, trajectory: Trajectory) -> float:
-    """Largest error of the energy balance over all nodes, in units of the kinetic energy and work there is.
+    """Largest error of the energy balance over all nodes, in units of the kinetic energy and work that change hands.
 
-    Of damped motions only what they gain counts, noisy ones have no balance.
+    What turns evenly, however fast, has next to no part in that. Of damped motions only what they gain counts, noisy
+    ones have no balance.
     """
     if trajectory.dw.any() or not trajectory.steps:
         return math.nan
@@ -214,7 +215,11 @@ def energy_error(scene: Scene, trajectory: Trajectory) -> float:
     work = np.append(0.0, np.cumsum(np.einsum("ki,ki->k", force, np.diff(trajectory.q, axis=0))))
     off = trajectory.energy - trajectory.energy[0] - work
     off = np.maximum(off, 0.0) if scene.damping.any() else np.abs(off)
-    scale = kinetic.max() + np.abs(work).max()
+    fastest = np.abs(trajectory.v).max(axis=0)
+    change = np.clip(np.ptp(trajectory.v, axis=0), _EVEN * fastest, fastest)
+    some = trajectory.q[np.unique(np.linspace(0, trajectory.steps, _DYING).astype(np.int64))]
+    inertia = np.max([np.diag(_pinocchio(scene, q, np.zeros_like(q))[2]) for q in some], axis=0)
+    scale = min(kinetic.max(), 0.5 * inertia @ change**2) + np.abs(work).max()
     # A robot at rest turns nothing over: there rounding of the potential is all there is.
     scale = max(scale, 1e-9 * np.abs(trajectory.energy).max())
     if not np.isfinite(scale):
