@@ -195,7 +195,7 @@ def second_order(
         z: One vector for each step (N, 2n), or one for all of them (2n,).
 
     Other Args:
-        integrator: As for :func:`linearize`. Only :class:`Midpoint` provides second derivatives.
+        integrator: As for :func:`linearize`. Variational integrators alone provide second derivatives.
 
     Raises:
         InputError: As for :func:`linearize`; an integrator that has no second derivatives; noise fields that depend on

@@ -285,13 +285,8 @@ def simulate(
         rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero.
         increments: The increments themselves, (N, k) [s^0.5], to replay or refine a path; see :mod:`varpin.wiener`.
         check: Look at the finished motion, whether the balance of its energy closes, its steps resolve it and its
-<<<<<<< HEAD
             control loop is stable, for ``Trajectory.warnings`` and the log. It takes about as long as the motion, and
             at most as some thousands of steps where these are in doubt.
-=======
-            control loop is stable, for ``Trajectory.warnings`` and the log. It takes about as long as the motion, or
-            as some thousands of steps where these are in doubt.
->>>>>>> h3
         progress: Called now and then with (steps done, steps in all).
 
     Returns:

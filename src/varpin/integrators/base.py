@@ -160,7 +160,9 @@ class Integrator(ABC):
             InputError: The integrator does not provide them.
             LinearizationError: A step has no solution at dw = 0.
         """
-        raise InputError(f"{self} has no second-order linearization; varpin.Midpoint(...) has")
+        raise InputError(
+            f"{self} has no second-order linearization; variational integrators have, varpin.Gauss(...) for one"
+        )
 
 
 def written(made: object, named: Sequence[str] = ()) -> str:
