@@ -1,4 +1,4 @@
-"""Second derivatives of the midpoint step against differences of the first, and of the steps themselves."""
+"""Second derivatives of variational steps against differences of the first, and of the steps themselves."""
 
 import numpy as np
 import pytest
@@ -44,14 +44,15 @@ def whole(curvature):
     return np.block([[curvature.xx[0], curvature.ux[0].T], [curvature.ux[0], curvature.uu[0]]])
 
 
-@pytest.mark.parametrize("alpha", [0.5, 0.2])
+@pytest.mark.parametrize(
+    "integrator", [vp.Midpoint(), vp.Midpoint(0.2), vp.Gauss(2), vp.Gauss(4), vp.Radau(2)], ids=str
+)
 @pytest.mark.parametrize("name", ARMS)
-def test_against_differences_of_the_first(name, alpha):
+def test_against_differences_of_the_first(name, integrator):
     load, dt, extras = ARMS[name]
     scene = vp.Scene(load(), **extras)
     n, m = scene.robot.dof, scene.controls
     rng = np.random.default_rng(len(name))
-    integrator = vp.Midpoint(alpha=alpha)
     q, v = rng.normal(size=n), 2.0 * rng.normal(size=n)
     u = 0.1 * rng.normal(size=m) * np.abs(vp.lagrangian_jet(scene, q, v).Lq).max()
     motion = vp.simulate(scene, q, v, dt=dt, steps=1, controls=u, integrator=integrator)
@@ -63,13 +64,14 @@ def test_against_differences_of_the_first(name, alpha):
     np.testing.assert_allclose(given, given.T, rtol=1e-12, atol=1e-12 * np.abs(given).max())
 
 
-def test_a_step_in_parts_is_chained():
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)], ids=str)
+def test_a_step_in_parts_is_chained(integrator):
     scene = vp.Scene(planar_chain(3))
-    motion = vp.simulate(scene, [0.3, 0.8, -1.0], [6.0, -5.0, 9.0], dt=0.1, steps=1)
+    motion = vp.simulate(scene, [0.3, 0.8, -1.0], [6.0, -5.0, 9.0], dt=0.1, steps=1, integrator=integrator)
     assert motion.statistics.substeps[0] > 1
     z = np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.4])
     given = whole(vp.second_order(scene, motion, z))
-    expected, units = differences_of_the_first(scene, motion, z, vp.Midpoint(), 1e-4)
+    expected, units = differences_of_the_first(scene, motion, z, integrator, 1e-4)
     assert np.abs((given - expected) * units).max() <= 1e-6 * np.abs(expected * units).max()
 
 
