@@ -54,14 +54,14 @@ struct Part {
 class VariationalStepper {
   public:
     VariationalStepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                       double left)
+                       double left, Solver solver)
         : mechanism(mechanism),
           tableau(tableau),
           tolerance(tolerance),
           guards(guards),
           left(left),
-          step_equation(mechanism, this->tableau),
-          energy_guard(mechanism),
+          step_equation(mechanism, this->tableau, solver),
+          energy_guard(mechanism, solver, !step_equation.elimination),
           n(mechanism.dof()),
           force(n),
           trial(n),
@@ -102,13 +102,8 @@ class VariationalStepper {
     // Put a path at (q, v).
     bool begin(const double* q, const double* v, PathState& state) {
         Jet<double>& jet = step_equation.stage[0];
-        mass_matrix(mechanism, q, jet);
-        for (int i = 0; i < n; ++i) {
-            double total = 0.0;
-            for (int j = 0; j < n; ++j) total += jet.M[i * n + j] * v[j];
-            bend[i] = total;
-        }
-        if (!begin_at(q, bend.data(), state)) return false;
+        first_order(mechanism, q, v, jet);
+        if (!begin_at(q, jet.Lv.data(), state)) return false;
         std::copy(v, v + n, state.v.begin());
         return true;
     }
