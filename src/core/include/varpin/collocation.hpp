@@ -134,7 +134,7 @@ class Collocation {
             diagonal[c] = mechanism.tree.armature[c] + h * tableau.force[0] * mechanism.damping[c] +
                           curvature * mechanism.stiffness[c];
         }
-        return elimination->factor({1.0, h * tableau.a[0], -h * tableau.gradient[0], -curvature}, diagonal.data());
+        return elimination->factor(h * tableau.a[0], h * tableau.gradient[0], diagonal.data());
     }
 
     // The same of the matrices in the stages' jets.
@@ -328,9 +328,8 @@ class Collocation {
         }
     }
 
-    // The square of x (s, n), which has just been solved for, in the metric of the kinetic energy, averaged over the
-    // step.
-    double kinetic_size(const double* x) const {
+    // The square of x (s, n) in the metric of the kinetic energy, averaged over the step.
+    double kinetic_size(const double* x) {
         if (elimination) return elimination->kinetic_size(x);
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
@@ -352,7 +351,7 @@ class Collocation {
         }
         if (elimination) {
             const double ahead = h * tableau.a[0];
-            elimination->multiply({0.0, 0.0, 1.0, ahead}, moved.data());
+            elimination->change_of_slope(delta.data(), moved.data());
             for (int r = 0; r < n; ++r)
                 slope[r] += moved[r] - (mechanism.damping[r] + ahead * mechanism.stiffness[r]) * delta[r];
             return;

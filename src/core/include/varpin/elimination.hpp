@@ -1,22 +1,20 @@
-// Solves with the second derivatives of L by elimination from the leaves to the roots: work in proportion to the number
-// of bodies, and no matrix. docs/mathematics.md, "Linear in the number of joints".
+// Solves with the matrix of a midpoint step by elimination from the leaves to the roots: work in proportion to the
+// number of bodies, and no matrix. docs/mathematics.md, "Linear in the number of joints". Between a joint j and one
+// above it, i,
 //
-// With vectors of the jet (jet.hpp), f momentum and I inertia of each body by itself, s = (S(angular) x g, 0), and for
+//     N = M + ha A - hb A' - ha hb L_qq + diag(d)
+//     N_ij = row_i . (Y_j column_j) + row_i . u0_j,      u0 = ha (S x* H, g x (Y S)(linear))
+//     N_ji = (Y_j row_j) . column_i + l0_j . column_i,   l0 = -hb (S x* H, -g x (Y S)(linear))
 //
-//     N = c_M M + c_A A + c_T A' + c_Q L_qq + diag(d)
+// with nine entries each, row = (S - hb W, hb S(angular)) and column = (S + ha W, ha S(angular)), of which the inertia
+// Y of all that j carries takes the first six. Once all that j carries is eliminated, what is left of it answers a
+// motion w by X w + z, and so, x being the coordinate and w = w_parent + column x,
 //
-// a body moves by w = w_parent + G x with G = (S, W), x its coordinate, and
+//     u = X column + u0,  l = X' row + l0,  D = d + row . u:      x = (r - row . z) / D - l . w_parent / D
+//     handed on to the parent: X - u l' / D,  z + u (r - row . z) / D.
 //
-//     (N x)_j = L_j . (sum over what j carries of X w) + l_j . w_parent + d_j x_j,      X = (I 0; C I),  C a = a x* f
-//     L = (c_M S + c_T W - c_Q s,  c_A S + c_Q W),      l = ((c_A + c_T) P + c_Q R,  c_Q P)
-//     P = S x* H,    R = W x* H + Y s - (0, g x (Y S)(linear)).
-//
-// Once all that j carries is eliminated, what is left of it answers w_j by X w_j + z, and so
-//
-//     u = X G,  D = d + L . u,  l += L' X:      x = (r - L . z) / D - l . w_parent / D
-//     handed on to the parent: X - u l' / D,  z + u (r - L . z) / D.
-//
-// For N = M + diag(armature) this is the articulated body algorithm (Featherstone 2008), where u = l = X S.
+// The symmetric part M + c (A + A') - k L_qq goes alike with rows and columns (S, W) of twelve entries, M alone with S:
+// that is the articulated body algorithm (Featherstone 2008).
 #pragma once
 
 #include <algorithm>
@@ -29,25 +27,16 @@
 
 namespace varpin {
 
-// Times of dense work per pair and per cubed size of a block, in units of what an eliminated body costs; measured with
-// benchmarks/joints.py.
-inline constexpr double pair_cost = 0.04, factor_cost = 0.002;
-
-// Coefficients of M, L_vq, its transpose and L_qq in a matrix.
-struct Combination {
-    double M = 1.0;
-    double A = 0.0;
-    double At = 0.0;
-    double Lqq = 0.0;
-};
-
 // How to solve with M and with the matrix of a step; elimination cannot where two bodies share a coordinate.
 enum class Solver { automatic, dense, elimination };
+
+// Times of dense work per pair of a body and one above it and per cubed size of a block, in units of what a body costs
+// that is eliminated; measured with benchmarks/joints.py.
+inline constexpr double pair_cost = 0.04, factor_cost = 0.002;
 
 inline bool eliminates(const Tree& tree, Solver solver) {
     if (solver == Solver::dense || tree.size() != tree.dof()) return false;
     if (solver == Solver::elimination) return true;
-    // Dense work: sums over pairs of a body and one above it, and factors of blocks.
     double dense = 0.0;
     std::vector<int> depth(tree.size(), 1);
     for (int j = 0; j < tree.size(); ++j) {
@@ -101,8 +90,8 @@ inline void write(const Force<double>& f, double* x) {
 }
 inline Motion<double> motion_at(const double* x) { return {{x[0], x[1], x[2]}, {x[3], x[4], x[5]}}; }
 
-// Functions of vectors (size) and matrices (size, size), row by row. Sums of products have two parts, of even and odd
-// terms: a processor adds both at once.
+// Functions of vectors (size) and matrices (size, size), row by row, sizes being even. Sums of products have two parts,
+// of even and odd terms: a processor adds both at once.
 template <int size>
 double product(const double* a, const double* b) {
     double even = 0.0, odd = 0.0;
@@ -113,11 +102,11 @@ double product(const double* a, const double* b) {
     return even + odd;
 }
 template <int size>
-void multiply(const double* X, const double* x, double* __restrict y) {
-    for (int r = 0; r < size; ++r) y[r] = product<size>(X + r * size, x);
+void add_product(const double* X, const double* x, double* __restrict y) {
+    for (int r = 0; r < size; ++r) y[r] += product<size>(X + r * size, x);
 }
 template <int size>
-void add_transposed(const double* X, const double* x, double* __restrict y) {
+void add_transposed_product(const double* X, const double* x, double* __restrict y) {
     for (int r = 0; r < size; ++r) {
         for (int c = 0; c < size; ++c) y[c] += x[r] * X[r * size + c];
     }
@@ -129,33 +118,40 @@ void subtract_outer(const double* u, const double* l, double* __restrict X) {
     }
 }
 
-// The matrix of a x, and that of an inertia, added to a part of a matrix whose rows have length `stride`.
-inline void add_cross(const Vec3<double>& a, int stride, double* x) {
-    x[1] -= a.z, x[2] += a.y;
-    x[stride] += a.z, x[stride + 2] -= a.x;
-    x[2 * stride] -= a.y, x[2 * stride + 1] += a.x;
-}
-inline void add_inertia(const Inertia<double>& I, int stride, double* x) {
-    for (int r = 0; r < 3; ++r) x[r * stride + r] += I.mass;
-    add_cross(-1.0 * I.moment, stride, x + 3);
-    double* angular = x + 3 * stride;
-    add_cross(I.moment, stride, angular);
-    angular[3] += I.second.xx, angular[4] += I.second.xy, angular[5] += I.second.xz;
+// s I added to a part of a matrix whose rows have length `stride`.
+inline void add_inertia(double s, const Inertia<double>& I, int stride, double* x) {
+    const double m = s * I.mass;
+    const Vec3<double> h = s * I.moment;
+    double *linear = x, *angular = x + 3 * stride;
+    linear[0] += m, linear[4] += h.z, linear[5] -= h.y;
+    linear += stride;
+    linear[1] += m, linear[3] -= h.z, linear[5] += h.x;
+    linear += stride;
+    linear[2] += m, linear[3] += h.y, linear[4] -= h.x;
+    const double xy = s * I.second.xy, xz = s * I.second.xz, yz = s * I.second.yz;
+    angular[1] -= h.z, angular[2] += h.y, angular[3] += s * I.second.xx, angular[4] += xy, angular[5] += xz;
     angular += stride;
-    angular[3] += I.second.xy, angular[4] += I.second.yy, angular[5] += I.second.yz;
+    angular[0] += h.z, angular[2] -= h.x, angular[3] += xy, angular[4] += s * I.second.yy, angular[5] += yz;
     angular += stride;
-    angular[3] += I.second.xz, angular[4] += I.second.yz, angular[5] += I.second.zz;
+    angular[0] -= h.y, angular[1] += h.x, angular[3] += xz, angular[4] += yz, angular[5] += s * I.second.zz;
 }
 
-// Above an origin all slide: they see linear parts alone, which are the same about any point.
+// Above an origin all slide: they see linear parts alone, which are the same about any point. `linear` says which
+// entries those are.
+template <int size>
+constexpr bool linear(int entry) {
+    return entry < 9 ? entry % 6 < 3 && (size == 12 || entry < 6) : false;
+}
 template <int size>
 void keep_linear(double* z) {
-    for (int part = 3; part < size; part += 6) std::fill(z + part, z + part + 3, 0.0);
+    for (int r = 0; r < size; ++r) {
+        if (!linear<size>(r)) z[r] = 0.0;
+    }
 }
 template <int size>
 void keep_linear_rows(double* X) {
     for (int r = 0; r < size; ++r) {
-        if (r % 6 < 3) {
+        if (linear<size>(r)) {
             keep_linear<size>(X + r * size);
         } else {
             std::fill(X + r * size, X + (r + 1) * size, 0.0);
@@ -203,9 +199,9 @@ class ArticulatedBodies {
     ArticulatedBodies(const ArticulatedBodies&) = delete;
     ArticulatedBodies& operator=(const ArticulatedBodies&) = delete;
 
-    // Bodies where the jet has them, each with its inertia by itself, in the order of a sweep.
+    // What coordinate moves body j how, and the body's inertia by itself.
     void place(int j, const Motion<double>& axis, const Inertia<double>& inertia) {
-        detail::write(tree_->bodies[j].ratio * axis, body_[j].axis);
+        detail::write(axis, body_[j].axis);
         body_[j].inertia = inertia;
     }
 
@@ -222,13 +218,14 @@ class ArticulatedBodies {
         const Body& link = tree_->bodies[j];
         State& own = body_[j];
         double* X = inertia_.of(j);
-        detail::add_inertia(own.inertia, 6, X);
-        detail::multiply<6>(X, own.axis, own.u);
+        detail::write(own.inertia * detail::motion_at(own.axis), own.u);
+        detail::add_transposed_product<6>(X, own.axis, own.u);  // X being symmetric
         own.pivot = tree_->armature[link.coordinate] + detail::product<6>(own.axis, own.u);
         if (!(own.pivot > 0.0)) return false;
         for (int r = 0; r < 6; ++r) own.answer[r] = own.u[r] / own.pivot;
         if (link.parent < 0) return true;
         detail::subtract_outer<6>(own.answer, own.u, X);
+        detail::add_inertia(1.0, own.inertia, 6, X);
         if (link.origin) detail::keep_linear_rows<6>(X);
         inertia_.hand_on(j, link.parent);
         return true;
@@ -278,7 +275,7 @@ class ArticulatedBodies {
     std::vector<double> motion_;  // (b + 1, 6) of each body, after what stands still
 };
 
-// Combinations of all second derivatives, at one (q, v) after another.
+// The matrix of a midpoint step and its symmetric part, at one (q, v) after another.
 class Elimination {
   public:
     explicit Elimination(const Mechanism& mechanism)
@@ -288,8 +285,9 @@ class Elimination {
           body_(mechanism.tree.size()),
           factors_(mechanism.tree.size()),
           matrix_(order_),
+          symmetric_(order_),
           force_(order_),
-          motion_(12 * (mechanism.tree.size() + 1)),
+          motion_(width * (mechanism.tree.size() + 1)),
           masses_(mechanism.tree) {}
     Elimination(const Elimination&) = delete;
     Elimination& operator=(const Elimination&) = delete;
@@ -302,39 +300,42 @@ class Elimination {
             const auto& here = jet.body[j];
             State& own = body_[j];
             own.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
-            own.momentum = own.inertia * here.velocity;
-            masses_.place(j, here.axis, own.inertia);
-            const Motion<double> S = link.ratio * here.axis, W = link.ratio * here.axis_rate;
-            const Motion<double> s{cross(S.angular, g), {}};
-            const Vec3<double>& h = here.inertia.moment;
-            const Vec3<double> YS = here.inertia.mass * S.linear + cross(S.angular, h);
-            const Force<double> Ys{here.inertia.mass * s.linear, cross(h, s.linear) - cross(g, YS)};
-            detail::write(S, own.G);
-            detail::write(W, own.G + 6);
-            detail::write(s, own.s);
-            detail::write(cross(S, here.momentum), own.P);
-            detail::write(cross(W, here.momentum) + Ys, own.R);
+            own.axis = link.ratio * here.axis;
+            own.rate = link.ratio * here.axis_rate;
+            own.turned = cross(own.axis, here.momentum);
+            own.lifted = cross(g, here.inertia.mass * own.axis.linear + cross(own.axis.angular, here.inertia.moment));
         }
     }
 
     // Factor N; false at a pivot that is not positive.
-    bool factor(const Combination& of, const double* diagonal) {
+    bool factor(double ahead, double behind, const double* diagonal) {
+        ahead_ = ahead;
         for (int j = tree_->size() - 1; j >= 0; --j) {
-            if (!eliminate(j, of, diagonal[tree_->bodies[j].coordinate], factors_[j])) return false;
+            const Body& link = tree_->bodies[j];
+            const State& state = body_[j];
+            Factors& own = factors_[j];
+            const Motion<double> row = state.axis + (-behind) * state.rate, column = state.axis + ahead * state.rate;
+            write(row, behind * state.axis.angular, own.row);
+            write(column, ahead * state.axis.angular, own.column);
+            write(state.inertia * column + ahead * state.turned, ahead * state.lifted, own.u);
+            write(state.inertia * row + (-behind) * state.turned, behind * state.lifted, own.l);
+            double* X = matrix_.of(j);
+            detail::add_product<width>(X, own.column, own.u);
+            own.pivot = diagonal[link.coordinate] + detail::product<width>(own.row, own.u);
+            if (!(own.pivot > 0.0)) return false;
+            if (link.parent < 0) {
+                std::fill(own.l, own.l + width, 0.0);
+                continue;
+            }
+            detail::add_transposed_product<width>(X, own.row, own.l);
+            const double inverse = 1.0 / own.pivot;
+            for (double& entry : own.l) entry *= inverse;
+            detail::subtract_outer<width>(own.u, own.l, X);
+            detail::add_inertia(1.0, state.inertia, width, X);
+            if (link.origin) detail::keep_linear_rows<width>(X);
+            matrix_.hand_on(j, link.parent);
         }
         return true;
-    }
-
-    // The smallest ratio of a pivot of N to the same one of M, armature included; 0 if one is not positive. What
-    // `factor` left remains.
-    double least_pivot_ratio(const Combination& of, const double* diagonal) {
-        Factors own;
-        double least = std::numeric_limits<double>::infinity();
-        for (int j = tree_->size() - 1; j >= 0; --j) {
-            if (!eliminate(j, of, diagonal[tree_->bodies[j].coordinate], own) || !masses_.eliminate(j)) return 0.0;
-            least = std::min(least, own.pivot / masses_.pivot(j));
-        }
-        return least;
     }
 
     // x with N x = b.
@@ -343,113 +344,129 @@ class Elimination {
             const Body& link = tree_->bodies[j];
             const Factors& own = factors_[j];
             double* z = force_.of(j);
-            const double t = (b[link.coordinate] - detail::product<12>(own.L, z)) / own.pivot;
+            const double t = (b[link.coordinate] - detail::product<width>(own.row, z)) / own.pivot;
             x[link.coordinate] = t;
             if (link.parent < 0) continue;
-            for (int r = 0; r < 12; ++r) z[r] += own.u[r] * t;
-            if (link.origin) detail::keep_linear<12>(z);
+            for (int r = 0; r < width; ++r) z[r] += own.u[r] * t;
+            if (link.origin) detail::keep_linear<width>(z);
             force_.hand_on(j, link.parent);
         }
         for (int j = 0; j < tree_->size(); ++j) {
             const Body& link = tree_->bodies[j];
-            const double* above = &motion_[12 * (link.parent + 1)];
-            x[link.coordinate] -= detail::product<12>(factors_[j].l, above);
-            for (int r = 0; r < 12; ++r) motion_[12 * (j + 1) + r] = above[r] + body_[j].G[r] * x[link.coordinate];
+            const Factors& own = factors_[j];
+            const double* above = motion_above(j);
+            double* __restrict moved = motion_.data() + width * (j + 1);
+            x[link.coordinate] -= detail::product<width>(own.l, above);
+            for (int r = 0; r < width; ++r) moved[r] = above[r] + own.column[r] * x[link.coordinate];
         }
     }
 
-    // x' M x, armature included, of the x that `solve` left.
-    double kinetic_size(const double* x) const {
+    // y = (A' + ha L_qq) x of the x that `solve` left.
+    void change_of_slope(const double* x, double* y) {
+        for (int j = tree_->size() - 1; j >= 0; --j) {
+            const Body& link = tree_->bodies[j];
+            const State& state = body_[j];
+            double* z = force_.of(j);
+            const double* above = motion_above(j);
+            const double own = ahead_ * x[link.coordinate];
+            double added[width];
+            write(state.inertia * detail::motion_at(motion_.data() + width * (j + 1)) + own * state.turned,
+                  own * state.lifted, added);
+            for (int r = 0; r < width; ++r) z[r] += added[r];
+            const Force<double> force{{z[0], z[1], z[2]}, {z[3], z[4], z[5]}};
+            const Vec3<double> lifted{z[6], z[7], z[8]}, turn{above[6], above[7], above[8]};
+            y[link.coordinate] = dot(state.rate, force) - dot(state.axis.angular, lifted) +
+                                 dot(detail::motion_at(above), state.turned) - dot(turn, state.lifted);
+            if (link.parent < 0) continue;
+            if (link.origin) detail::keep_linear<width>(z);
+            force_.hand_on(j, link.parent);
+        }
+    }
+
+    // x' M x, armature included.
+    double kinetic_size(const double* x) {
         double total = 0.0;
         for (int j = 0; j < tree_->size(); ++j) {
-            const Motion<double> moved = detail::motion_at(&motion_[12 * (j + 1)]);
-            total += dot(moved, body_[j].inertia * moved);
+            const Body& link = tree_->bodies[j];
+            State& own = body_[j];
+            own.moved = x[link.coordinate] * own.axis;
+            if (link.parent >= 0) own.moved += body_[link.parent].moved;
+            total += dot(own.moved, own.inertia * own.moved);
         }
         for (int c = 0; c < tree_->dof(); ++c) total += tree_->armature[c] * x[c] * x[c];
         return total;
     }
 
-    // y = N x of the x that `solve` left, apart from diag(d).
-    void multiply(const Combination& of, double* y) {
-        Factors own;
+    // The smallest ratio of a pivot of M + c (A + A') - k L_qq + diag(d) to the same one of M, armature included; 0 if
+    // one is not positive. What `factor` left remains.
+    double least_pivot_ratio(double c, double k, const double* diagonal) {
+        double least = std::numeric_limits<double>::infinity();
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
             const State& state = body_[j];
-            double* z = force_.of(j);
-            const double* w = &motion_[12 * (j + 1)];
-            const Motion<double> by_S = detail::motion_at(w), by_W = detail::motion_at(w + 6);
-            double added[12];
-            detail::write(state.inertia * by_S, added);
-            detail::write(cross(by_S, state.momentum) + state.inertia * by_W, added + 6);
-            for (int r = 0; r < 12; ++r) z[r] += added[r];
-            rows(j, of, own);
-            const double* above = &motion_[12 * (link.parent + 1)];
-            y[link.coordinate] = detail::product<12>(own.L, z) + detail::product<12>(own.l, above);
+            double row[12], u[12], answer[12];
+            detail::write(state.axis, row);
+            detail::write(state.rate, row + 6);
+            const Force<double> by_axis = state.inertia * state.axis,
+                                by_rate = state.inertia * state.rate + state.turned;
+            detail::write(by_axis + c * by_rate + Force<double>{{}, k * state.lifted}, u);
+            detail::write(c * by_axis + (-k) * by_rate, u + 6);
+            double* X = symmetric_.of(j);
+            detail::add_transposed_product<12>(X, row, u);
+            const double pivot = diagonal[link.coordinate] + detail::product<12>(row, u);
+            masses_.place(j, state.axis, state.inertia);
+            if (!(pivot > 0.0) || !masses_.eliminate(j)) return 0.0;
+            least = std::min(least, pivot / masses_.pivot(j));
             if (link.parent < 0) continue;
-            if (link.origin) detail::keep_linear<12>(z);
-            force_.hand_on(j, link.parent);
+            const double inverse = 1.0 / pivot;
+            for (int r = 0; r < 12; ++r) answer[r] = u[r] * inverse;
+            detail::subtract_outer<12>(answer, u, X);
+            detail::add_inertia(1.0, state.inertia, 12, X);
+            detail::add_inertia(-k, state.inertia, 12, X + 6 * 12 + 6);
+            if (c != 0.0) {
+                detail::add_inertia(c, state.inertia, 12, X + 6);
+                detail::add_inertia(c, state.inertia, 12, X + 6 * 12);
+            }
+            if (link.origin) detail::keep_linear_rows<12>(X);
+            symmetric_.hand_on(j, link.parent);
         }
+        return least;
     }
 
   private:
+    static constexpr int width = 10;  // nine entries and a zero
+
     struct State {
-        Inertia<double> inertia{};     // of the body by itself
-        Force<double> momentum{};      // f
-        double G[12] = {}, s[6] = {};  // (S, W); the turn of gravity
-        double P[6] = {}, R[6] = {};   // of what the body carries
+        Inertia<double> inertia{};      // of the body by itself
+        Motion<double> axis{}, rate{};  // S, W
+        Force<double> turned{};         // S x* H
+        Vec3<double> lifted{};          // g x (Y S)(linear)
+        Motion<double> moved{};         // under some x
     };
     struct Factors {
-        double L[12] = {}, l[12] = {}, u[12] = {};  // l by the pivot, once factored
+        double row[width] = {}, column[width] = {};
+        double u[width] = {}, l[width] = {};  // l by the pivot
         double pivot = 0.0;
     };
 
-    // L and, before any elimination, l.
-    void rows(int j, const Combination& of, Factors& own) const {
-        const State& state = body_[j];
-        const double *S = state.G, *W = state.G + 6;
-        for (int r = 0; r < 6; ++r) {
-            own.L[r] = of.M * S[r] + of.At * W[r] - of.Lqq * state.s[r];
-            own.L[6 + r] = of.A * S[r] + of.Lqq * W[r];
-            own.l[r] = (of.A + of.At) * state.P[r] + of.Lqq * state.R[r];
-            own.l[6 + r] = of.Lqq * state.P[r];
-        }
+    template <class Six>
+    static void write(const Six& a, const Vec3<double>& b, double* x) {
+        detail::write(a, x);
+        x[6] = b.x, x[7] = b.y, x[8] = b.z, x[9] = 0.0;
     }
 
-    bool eliminate(int j, const Combination& of, double diagonal, Factors& own) {
-        const Body& link = tree_->bodies[j];
-        const State& state = body_[j];
-        double* X = matrix_.of(j);
-        detail::add_inertia(state.inertia, 12, X);
-        detail::add_inertia(state.inertia, 12, X + 6 * 12 + 6);
-        // C a = a x* f
-        const Vec3<double> linear = -1.0 * state.momentum.linear;
-        detail::add_cross(linear, 12, X + 6 * 12 + 3);
-        detail::add_cross(linear, 12, X + 9 * 12);
-        detail::add_cross(-1.0 * state.momentum.angular, 12, X + 9 * 12 + 3);
-        rows(j, of, own);
-        detail::multiply<12>(X, state.G, own.u);
-        own.pivot = diagonal + detail::product<12>(own.L, own.u);
-        if (!(own.pivot > 0.0)) return false;
-        if (link.parent < 0) {
-            std::fill(own.l, own.l + 12, 0.0);
-            return true;
-        }
-        detail::add_transposed<12>(X, own.L, own.l);
-        for (double& entry : own.l) entry /= own.pivot;
-        detail::subtract_outer<12>(own.u, own.l, X);
-        if (link.origin) detail::keep_linear_rows<12>(X);
-        matrix_.hand_on(j, link.parent);
-        return true;
-    }
+    const double* motion_above(int j) const { return motion_.data() + width * (tree_->bodies[j].parent + 1); }
 
     const Mechanism* mechanism_;
     const Tree* tree_;
     Gathering order_;
     std::vector<State> body_;
     std::vector<Factors> factors_;
-    detail::Gathered<144> matrix_;
-    detail::Gathered<12> force_;
-    std::vector<double> motion_;  // (b + 1, 12) of each body under the x of `solve`, after what stands still
+    detail::Gathered<width * width> matrix_;
+    detail::Gathered<144> symmetric_;
+    detail::Gathered<width> force_;
+    std::vector<double> motion_;  // (b + 1, 10) of each body under the x of `solve`, after what stands still
+    double ahead_ = 0.0;
     ArticulatedBodies masses_;
 };
 

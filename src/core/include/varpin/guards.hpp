@@ -123,7 +123,10 @@ class EnergyGuard {
     bool node(const double* q, const double* p, double* v) {
         if (articulated) {
             inertias(
-                mechanism, q, jet, [&](int j) { articulated->place(j, jet.body[j].axis, jet.body[j].inertia); },
+                mechanism, q, jet,
+                [&](int j) {
+                    articulated->place(j, mechanism.tree.bodies[j].ratio * jet.body[j].axis, jet.body[j].inertia);
+                },
                 [](int) {});
             if (!articulated->factor()) return false;
             velocity(p, v);
@@ -205,8 +208,7 @@ class EnergyGuard {
                 diagonal[i] =
                     mechanism.tree.armature[i] + 0.5 * h * mechanism.damping[i] + exaggerated * mechanism.stiffness[i];
             }
-            const double coupling = h * tableau.skew;
-            return step.elimination->least_pivot_ratio({1.0, coupling, coupling, -exaggerated}, diagonal.data());
+            return step.elimination->least_pivot_ratio(h * tableau.skew, exaggerated, diagonal.data());
         }
         double least = infinity;
         for (const Block& block : mechanism.tree.blocks) {
