@@ -22,6 +22,7 @@
 #include <vector>
 
 #include "varpin/jet.hpp"
+#include "varpin/pair.hpp"
 #include "varpin/spatial.hpp"
 #include "varpin/tree.hpp"
 
@@ -30,22 +31,22 @@ namespace varpin {
 // How to solve with M and with the matrix of a step; elimination cannot where two bodies share a coordinate.
 enum class Solver { automatic, dense, elimination };
 
-// Times of dense work per pair of a body and one above it and per cubed size of a block, in units of what a body costs
-// that is eliminated; measured with benchmarks/joints.py.
-inline constexpr double pair_cost = 0.04, factor_cost = 0.002;
+// Times of a dense step for each body, for each pair of a body and one above it, and for each cubed size of a block; in
+// units of what a body costs that is eliminated. Measured with benchmarks/joints.py.
+inline constexpr double body_cost = 0.6, pair_cost = 0.033, block_cost = 0.0004;
 
 inline bool eliminates(const Tree& tree, Solver solver) {
     if (solver == Solver::dense || tree.size() != tree.dof()) return false;
     if (solver == Solver::elimination) return true;
-    double dense = 0.0;
+    double dense = body_cost * tree.size();
     std::vector<int> depth(tree.size(), 1);
     for (int j = 0; j < tree.size(); ++j) {
         if (tree.bodies[j].parent >= 0) depth[j] += depth[tree.bodies[j].parent];
         dense += pair_cost * depth[j];
     }
     for (const Block& block : tree.blocks) {
-        const double width = block.end - block.begin;
-        dense += factor_cost * width * width * width;
+        const double size = block.end - block.begin;
+        dense += block_cost * size * size * size;
     }
     return tree.size() < dense;
 }
@@ -91,7 +92,7 @@ inline void write(const Force<double>& f, double* x) {
 inline Motion<double> motion_at(const double* x) { return {{x[0], x[1], x[2]}, {x[3], x[4], x[5]}}; }
 
 // Functions of vectors (size) and matrices (size, size), row by row, sizes being even. Sums of products have two parts,
-// of even and odd terms: a processor adds both at once.
+// of even and odd terms.
 template <int size>
 double product(const double* a, const double* b) {
     double even = 0.0, odd = 0.0;
@@ -102,19 +103,39 @@ double product(const double* a, const double* b) {
     return even + odd;
 }
 template <int size>
-void add_product(const double* X, const double* x, double* __restrict y) {
-    for (int r = 0; r < size; ++r) y[r] += product<size>(X + r * size, x);
-}
+struct Pairs {
+    explicit Pairs(const double* x) {
+        for (int c = 0; c < size; c += 2) at[c / 2] = pair_at(x + c);
+    }
+    Pair at[size / 2];
+};
+// y += X x
 template <int size>
-void add_transposed_product(const double* X, const double* x, double* __restrict y) {
-    for (int r = 0; r < size; ++r) {
-        for (int c = 0; c < size; ++c) y[c] += x[r] * X[r * size + c];
+void add_product(const double* X, const double* x, double* y) {
+    const Pairs<size> factor(x);
+    for (int r = 0; r < size; ++r, X += size) {
+        Pair sum = pair_at(X) * factor.at[0];
+        for (int c = 2; c < size; c += 2) sum = sum + pair_at(X + c) * factor.at[c / 2];
+        y[r] += sum[0] + sum[1];
     }
 }
+// y += X' x
 template <int size>
-void subtract_outer(const double* u, const double* l, double* __restrict X) {
-    for (int r = 0; r < size; ++r) {
-        for (int c = 0; c < size; ++c) X[r * size + c] -= u[r] * l[c];
+void add_transposed_product(const double* X, const double* x, double* y) {
+    Pairs<size> sum(y);
+    for (int r = 0; r < size; ++r, X += size) {
+        const Pair factor{x[r], x[r]};
+        for (int c = 0; c < size; c += 2) sum.at[c / 2] = sum.at[c / 2] + factor * pair_at(X + c);
+    }
+    for (int c = 0; c < size; c += 2) put_pair(sum.at[c / 2], y + c);
+}
+// X -= u l'
+template <int size>
+void subtract_outer(const double* u, const double* l, double* X) {
+    const Pairs<size> row(l);
+    for (int r = 0; r < size; ++r, X += size) {
+        const Pair factor{u[r], u[r]};
+        for (int c = 0; c < size; c += 2) put_pair(pair_at(X + c) - factor * row.at[c / 2], X + c);
     }
 }
 
@@ -222,7 +243,8 @@ class ArticulatedBodies {
         detail::add_transposed_product<6>(X, own.axis, own.u);  // X being symmetric
         own.pivot = tree_->armature[link.coordinate] + detail::product<6>(own.axis, own.u);
         if (!(own.pivot > 0.0)) return false;
-        for (int r = 0; r < 6; ++r) own.answer[r] = own.u[r] / own.pivot;
+        const double inverse = 1.0 / own.pivot;
+        for (int r = 0; r < 6; ++r) own.answer[r] = own.u[r] * inverse;
         if (link.parent < 0) return true;
         detail::subtract_outer<6>(own.answer, own.u, X);
         detail::add_inertia(1.0, own.inertia, 6, X);

@@ -252,8 +252,16 @@ class VariationalStepper {
         const int stages = step_equation.stages;
         const bool smooth = state.known > 1 && mechanism.diffusion.processes == 0;
         double *change = bend.data(), *acceleration = change + n;
-        for (int c = 0; c < n; ++c) change[c] = force[c] - state.past_force[c];
-        energy_guard.solve(change, acceleration);
+        bool changed = false;
+        for (int c = 0; c < n; ++c) {
+            change[c] = force[c] - state.past_force[c];
+            changed = changed || change[c] != 0.0;
+        }
+        if (changed) {
+            energy_guard.solve(change, acceleration);
+        } else {
+            std::fill(acceleration, acceleration + n, 0.0);
+        }
         for (int i = 0; i < stages; ++i) {
             const double* ahead = &tableau.ahead[i * (stages + 1)];
             for (int c = 0; c < n; ++c) {
