@@ -80,7 +80,12 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
     out.stiffness = copied(stiffness);
     out.rest = copied(rest);
     out.controls = static_cast<int>(m);
-    out.actuation = copied(actuation);
+    for (std::size_t r = 0; r < n; ++r) {
+        for (std::size_t c = 0; c < m; ++c) {
+            if (actuation(r, c) != 0.0)
+                out.actuation.push_back({static_cast<int>(r), static_cast<int>(c), actuation(r, c)});
+        }
+    }
     out.diffusion = {static_cast<int>(processes), copied(constant), copied(control), copied(quadratic),
                      copied(centers)};
     return out;
