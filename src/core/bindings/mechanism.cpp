@@ -7,6 +7,7 @@
 #include "arrays.hpp"
 #include "bodies.hpp"
 #include "registrations.hpp"
+#include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
 
 namespace varpin::border {
@@ -79,7 +80,12 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
     out.stiffness = copied(stiffness);
     out.rest = copied(rest);
     out.controls = static_cast<int>(m);
-    out.actuation = copied(actuation);
+    for (std::size_t r = 0; r < n; ++r) {
+        for (std::size_t c = 0; c < m; ++c) {
+            if (actuation(r, c) != 0.0)
+                out.actuation.push_back({static_cast<int>(r), static_cast<int>(c), actuation(r, c)});
+        }
+    }
     out.diffusion = {static_cast<int>(processes), copied(constant), copied(control), copied(quadratic),
                      copied(centers)};
     return out;
@@ -146,6 +152,10 @@ std::tuple<Out, Out, Out> jets_along(const Mechanism& mechanism, In<2> q, In<2> 
 }  // namespace
 
 void register_mechanism(nb::module_& m) {
+    nb::enum_<Solver>(m, "Solver")
+        .value("automatic", Solver::automatic)
+        .value("dense", Solver::dense)
+        .value("elimination", Solver::elimination);
     nb::class_<Mechanism>(m, "Mechanism")
         .def_static("make", &mechanism_of, nb::kw_only(), "parent"_a, "prismatic"_a, "rotation"_a, "translation"_a,
                     "mass"_a, "center"_a, "inertia"_a, "coordinate"_a, "ratio"_a, "offset"_a, "origin"_a, "loads"_a,

@@ -42,8 +42,8 @@ Guards guards_of(bool active, double branch_margin, double energy_balance, doubl
 class VariationalRollout {
   public:
     VariationalRollout(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                       double left, std::size_t paths)
-        : stepper_(std::make_shared<VariationalStepper>(mechanism, tableau, tolerance, guards, left)),
+                       double left, std::size_t paths, Solver solver)
+        : stepper_(std::make_shared<VariationalStepper>(mechanism, tableau, tolerance, guards, left, solver)),
           states_(paths, PathState(mechanism, tableau.stages)) {}
 
     VariationalRollout fork() const { return *this; }
@@ -138,13 +138,13 @@ std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(const Me
                                                                         const Tableau& tableau, double tolerance,
                                                                         const Guards& guards, double h, In<2> q,
                                                                         In<2> p, In<3> guess, In<2> force,
-                                                                        Integers<1> substeps) {
+                                                                        Integers<1> substeps, Solver solver) {
     const auto n = static_cast<std::size_t>(mechanism.dof()), stages = static_cast<std::size_t>(tableau.stages);
     const StepsAt at{q, p, guess, force, substeps};
     const std::size_t N = at.check(n, stages);
     double *Jx = nullptr, *Jf = nullptr;
     const Out X = array_for(Jx, {N, 2 * n, 2 * n}), F = array_for(Jf, {N, 2 * n, n});
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, 1.0);
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, 1.0, solver);
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
         return work.first(h, q.data() + s * n, p.data() + s * n, guess.data() + s * stages * n, force.data() + s * n,
                           substeps(s), Jx + s * 4 * n * n, Jf + s * 2 * n * n);
@@ -156,14 +156,14 @@ std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(const Me
 std::tuple<Out, std::int64_t, std::size_t> variational_curvatures(const Mechanism& mechanism, const Tableau& tableau,
                                                                   double tolerance, const Guards& guards, double h,
                                                                   In<2> q, In<2> p, In<3> guess, In<2> force,
-                                                                  Integers<1> substeps, In<2> z) {
+                                                                  Integers<1> substeps, In<2> z, Solver solver) {
     const auto n = static_cast<std::size_t>(mechanism.dof()), stages = static_cast<std::size_t>(tableau.stages);
     const StepsAt at{q, p, guess, force, substeps};
     const std::size_t N = at.check(n, stages);
     require(z, "z", {N, 2 * n});
     double* H = nullptr;
     const Out curvatures = array_for(H, {N, 3 * n, 3 * n});
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, 1.0);
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, 1.0, solver);
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
         return work.second(h, q.data() + s * n, p.data() + s * n, guess.data() + s * stages * n, force.data() + s * n,
                            substeps(s), z.data() + s * 2 * n, H + s * 9 * n * n);
@@ -181,17 +181,19 @@ void register_rollouts(nb::module_& m) {
         .def_static("make", &guards_of, nb::kw_only(), "active"_a, "branch_margin"_a, "energy_balance"_a,
                     "energy_budget"_a, "most_halvings"_a);
     nb::class_<VariationalRollout>(m, "VariationalRollout")
-        .def(nb::init<const Mechanism&, const Tableau&, double, const Guards&, double, std::size_t>(), "mechanism"_a,
-             "tableau"_a, "tolerance"_a, "guards"_a, "left"_a, "paths"_a, nb::keep_alive<1, 2>())
+        .def(nb::init<const Mechanism&, const Tableau&, double, const Guards&, double, std::size_t, Solver>(),
+             "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "left"_a, "paths"_a, "solver"_a = Solver::automatic,
+             nb::keep_alive<1, 2>())
         .def("fork", &VariationalRollout::fork, nb::keep_alive<0, 1>())
         .def("begin", &VariationalRollout::begin, "q"_a, "v"_a)
         .def("roll", &VariationalRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a)
         .def("kick", &VariationalRollout::kick, "impulse"_a)
         .def("nodes", &VariationalRollout::nodes);
     m.def("variational_derivatives", &variational_derivatives, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
-          "dt"_a, "q"_a, "p"_a, "guess"_a, "force"_a, "substeps"_a);
+          "dt"_a, "q"_a, "p"_a, "guess"_a, "force"_a, "substeps"_a, "solver"_a = Solver::automatic);
     m.def("variational_curvatures", &variational_curvatures, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
-          "dt"_a, "q"_a, "p"_a, "guess"_a, "force"_a, "substeps"_a, nb::kw_only(), "z"_a);
+          "dt"_a, "q"_a, "p"_a, "guess"_a, "force"_a, "substeps"_a, nb::kw_only(), "z"_a,
+          "solver"_a = Solver::automatic);
 }
 
 }  // namespace varpin::border

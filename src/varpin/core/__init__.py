@@ -11,6 +11,7 @@ from varpin.core._core import Links as Links
 from varpin.core._core import Mechanism as Mechanism
 from varpin.core._core import Outcome as Outcome
 from varpin.core._core import RootPass as RootPass
+from varpin.core._core import Solver as Solver
 from varpin.core._core import Squares as Squares
 from varpin.core._core import Tableau as Tableau
 from varpin.core._core import VariationalRollout as VariationalRollout

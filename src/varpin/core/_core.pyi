@@ -55,6 +55,13 @@ class Mechanism:
     def jets_along(self, q: Floats, v: Floats, alpha: Floats, beta: Floats) -> tuple[Floats, Floats, Floats]:
         """Derivatives of M, L_vq and L_qq (N, n, n) at each row of q and v along that of alpha and beta (N, n)."""
 
+class Solver(Enum):
+    """How a variational step solves; see src/core/include/varpin/elimination.hpp."""
+
+    automatic = ...
+    dense = ...
+    elimination = ...
+
 class Tableau:
     """Collocation over a step of unit length; see src/core/include/varpin/tableau.hpp."""
 
@@ -85,7 +92,14 @@ class VariationalRollout:
     """Paths of a variational integrator, and the work arrays of a step."""
 
     def __init__(
-        self, mechanism: Mechanism, tableau: Tableau, tolerance: float, guards: Guards, left: float, paths: int
+        self,
+        mechanism: Mechanism,
+        tableau: Tableau,
+        tolerance: float,
+        guards: Guards,
+        left: float,
+        paths: int,
+        solver: Solver = Solver.automatic,
     ) -> None: ...
     def fork(self) -> VariationalRollout:
         """The paths as they stand, to move on by themselves; work arrays are shared, so one moves at a time."""
@@ -113,6 +127,7 @@ def variational_derivatives(
     guess: Floats,
     force: Floats,
     substeps: Integers,
+    solver: Solver = Solver.automatic,
 ) -> tuple[Floats, Floats, int, int]:
     """d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n); how it ended, and how many steps were done."""
 
@@ -129,6 +144,7 @@ def variational_curvatures(
     substeps: Integers,
     *,
     z: Floats,
+    solver: Solver = Solver.automatic,
 ) -> tuple[Floats, int, int]:
     """Z . d2(q1, p1)/d(q0, p0, f)2 (N, 3n, 3n) for z (N, 2n); how it ended, and how many steps were done."""
 

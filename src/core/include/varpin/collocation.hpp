@@ -4,18 +4,20 @@
 //     r_i(V) = p0 + h sum_j (abar_ij L_q + f_ij F)(Q_j, V_j) - L_v(Q_i, V_i) = 0
 //     N_im = -dr_i/dV_m = delta_im M_i + h (a_im A_i - abar_im A_m' + f_im D) - h^2 sum_j abar_ij a_jm L_qq,j
 //
-// N falls apart into one matrix for each block of the tree. On the branch of solutions that is connected to h -> 0 its
-// determinant is positive.
+// N falls apart into one matrix for each block of the tree; with one stage elimination needs none of them. On the
+// branch of solutions that is connected to h -> 0 its determinant is positive.
 #pragma once
 
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <limits>
+#include <optional>
 #include <vector>
 
 #include "varpin/compensated.hpp"
 #include "varpin/dense.hpp"
+#include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/nodes.hpp"
 #include "varpin/tableau.hpp"
@@ -46,37 +48,34 @@ struct Start {
 
 class Collocation {
   public:
-    Collocation(const Mechanism& mechanism, const Tableau& tableau)
+    Collocation(const Mechanism& mechanism, const Tableau& tableau, Solver solver)
         : mechanism(mechanism),
           tableau(tableau),
           n(mechanism.dof()),
           stages(tableau.stages),
-          stage(stages, Jet<double>(mechanism.tree)),
+          stage(stages, Jet<double>(mechanism.tree, false)),
           V(stages * n),
           Q(stages * n),
           slope(stages * n),
           residual(stages * n),
           delta(stages * n) {
-        int size = 0, largest = 0;
-        for (const Block& block : mechanism.tree.blocks) {
-            const int own = stages * (block.end - block.begin);
-            size += own * own;
-            largest = std::max(largest, own);
+        if (stages == 1 && eliminates(mechanism.tree, solver)) {
+            elimination.emplace(mechanism);
+            diagonal.resize(n);
+        } else {
+            make_room();
         }
-        lu.resize(size);
-        order.resize(stages * n);
-        change.resize(stages * largest);
-        local.resize(2 * largest);
     }
 
     const Mechanism& mechanism;
     const Tableau& tableau;
     int n;
     int stages;
-    std::vector<Jet<double>> stage;
-    std::vector<double> V;      // (s, n) stage velocities: the guess, then the root
-    std::vector<double> Q;      // (s, n)
-    std::vector<double> slope;  // (s, n) L_q + F
+    std::vector<Jet<double>> stage;          // without matrices where there is an elimination
+    std::optional<Elimination> elimination;  // at the iterate of the last factors
+    std::vector<double> V;                   // (s, n) stage velocities: the guess, then the root
+    std::vector<double> Q;                   // (s, n)
+    std::vector<double> slope;               // (s, n) L_q + F
 
     // Solve the step equation from the guess in V.
     //
@@ -122,12 +121,24 @@ class Collocation {
             before = size;
         }
         if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
+        if (jets_wanted && elimination) write_jets();
         effort.residual = std::max(effort.residual, worst);
         return Outcome::solved;
     }
 
     // Factor N from the stages' jets; false where its determinant is not positive.
     bool factor(double h) {
+        if (!elimination) return factor_blocks(h);
+        const double curvature = h * h * tableau.gradient[0] * tableau.a[0];
+        for (int c = 0; c < n; ++c) {
+            diagonal[c] = mechanism.tree.armature[c] + h * tableau.force[0] * mechanism.damping[c] +
+                          curvature * mechanism.stiffness[c];
+        }
+        return elimination->factor(h * tableau.a[0], h * tableau.gradient[0], diagonal.data());
+    }
+
+    // The same of the matrices in the stages' jets.
+    bool factor_blocks(double h) {
         double* matrix = lu.data();
         int* rows = order.data();
         for (const Block& block : mechanism.tree.blocks) {
@@ -153,7 +164,7 @@ class Collocation {
             std::fill(Jx, Jx + 4 * n * n, 0.0);
             std::fill(Jf, Jf + 2 * n * n, 0.0);
         }
-        factor(h);
+        factor_blocks(h);
         const double* matrix = lu.data();
         const int* rows = order.data();
         for (const Block& block : blocks) {
@@ -168,6 +179,7 @@ class Collocation {
 
     // x with N x = right (s, n), from what `factor` left.
     void solve_factored(const double* right, double* x) {
+        if (elimination) return elimination->solve(right, x);
         solve_blocks(right, x, [this](const double* matrix, int size, const int* rows, double* b, double* y) {
             if (stages == 1) {
                 solve_lu(matrix, size, {0, size}, b, y);
@@ -177,7 +189,7 @@ class Collocation {
         });
     }
 
-    // x with N' x = right.
+    // x with N' x = right, from what `derivatives` left.
     void solve_transposed(const double* right, double* x) {
         solve_blocks(right, x, [this](const double* matrix, int size, const int* rows, double* b, double* y) {
             solve_lu_transposed(matrix, size, stages == 1 ? nullptr : rows, b, y);
@@ -211,6 +223,28 @@ class Collocation {
     std::vector<double> lu;               // the factors of each block, one after another
     std::vector<int> order;               // of their rows
     std::vector<double> change, local, columns, shift;
+    std::vector<double> diagonal;  // (n) of N, besides what elimination takes from the bodies
+
+    // For matrices and their factors.
+    void make_room() {
+        int size = 0, largest = 0;
+        for (const Block& block : mechanism.tree.blocks) {
+            const int own = stages * (block.end - block.begin);
+            size += own * own;
+            largest = std::max(largest, own);
+        }
+        for (Jet<double>& jet : stage) jet.make_room();
+        lu.resize(size);
+        order.resize(stages * n);
+        change.resize(stages * largest);
+        local.resize(2 * largest);
+    }
+
+    // Matrices too at an iterate that elimination had no need of them for.
+    void write_jets() {
+        if (lu.empty()) make_room();
+        for (int i = 0; i < stages; ++i) lagrangian_jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
+    }
 
     void sweep(double h, const Start& start, bool second, Effort& effort) {
         for (int i = 0; i < stages; ++i) {
@@ -221,12 +255,13 @@ class Collocation {
             }
         }
         for (int i = 0; i < stages; ++i) {
-            if (second) {
+            if (second && !elimination) {
                 lagrangian_jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
             } else {
                 first_order(mechanism, &Q[i * n], &V[i * n], stage[i]);
             }
         }
+        if (second && elimination) elimination->take(stage[0]);
         (second ? effort.jets : effort.sweeps) += stages;
     }
 
@@ -294,7 +329,8 @@ class Collocation {
     }
 
     // The square of x (s, n) in the metric of the kinetic energy, averaged over the step.
-    double kinetic_size(const double* x) const {
+    double kinetic_size(const double* x) {
+        if (elimination) return elimination->kinetic_size(x);
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
             for (const Block& block : mechanism.tree.blocks)
@@ -312,6 +348,13 @@ class Collocation {
                 for (int j = 0; j < stages; ++j) total += tableau.a[i * stages + j] * delta[j * n + c];
                 moved[i * n + c] = h * total;
             }
+        }
+        if (elimination) {
+            const double ahead = h * tableau.a[0];
+            elimination->change_of_slope(delta.data(), moved.data());
+            for (int r = 0; r < n; ++r)
+                slope[r] += moved[r] - (mechanism.damping[r] + ahead * mechanism.stiffness[r]) * delta[r];
+            return;
         }
         for (int i = 0; i < stages; ++i) {
             for (const Block& block : mechanism.tree.blocks) {

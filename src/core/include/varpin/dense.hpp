@@ -139,20 +139,25 @@ inline bool factor_ldl(double* a, int n, Block block) {
     return true;
 }
 
-// The smallest ratio of a pivot of the symmetric a to the same pivot of b; 0 if one is not positive. Reads and
-// overwrites the lower triangles; both are factored at once, as neither fills a processor's pipeline.
+// The smallest ratio of a pivot of the symmetric a to the same pivot of b, the last one first; 0 if one is not
+// positive. Reads and overwrites the lower triangles; both are factored at once, as neither fills a processor's
+// pipeline.
 inline double least_pivot_ratio(double* a, double* b, int n, Block block) {
     double least = std::numeric_limits<double>::infinity();
-    for (int k = block.begin; k < block.end; ++k) {
-        const double pivot_a = a[k * n + k], pivot_b = b[k * n + k];
+    for (int k = block.end - 1; k >= block.begin; --k) {
+        const double* __restrict last_a = a + k * n;
+        const double* __restrict last_b = b + k * n;
+        const double pivot_a = last_a[k], pivot_b = last_b[k];
         if (!(pivot_a > 0.0 && pivot_b > 0.0)) return 0.0;
         least = std::min(least, pivot_a / pivot_b);
         const double inverse_a = 1.0 / pivot_a, inverse_b = 1.0 / pivot_b;
-        for (int i = k + 1; i < block.end; ++i) {
-            const double factor_a = a[i * n + k] * inverse_a, factor_b = b[i * n + k] * inverse_b;
-            for (int j = k + 1; j <= i; ++j) {
-                a[i * n + j] -= factor_a * a[j * n + k];
-                b[i * n + j] -= factor_b * b[j * n + k];
+        for (int i = block.begin; i < k; ++i) {
+            const double factor_a = last_a[i] * inverse_a, factor_b = last_b[i] * inverse_b;
+            double* __restrict row_a = a + i * n;
+            double* __restrict row_b = b + i * n;
+            for (int j = block.begin; j <= i; ++j) {
+                row_a[j] -= factor_a * last_a[j];
+                row_b[j] -= factor_b * last_b[j];
             }
         }
     }

@@ -1,7 +1,8 @@
 // When a step is accepted. docs/mathematics.md, "The principal branch".
 //
 // Branch: the step equation has other roots than the one that is connected to h -> 0. There the symmetric part of
-// N = -dr/dv is positive definite; its pivots are compared with those of M, the destabilising term exaggerated.
+// N = -dr/dv is positive definite; its pivots are compared with those of M, the destabilising term exaggerated. The
+// smallest ratio is no smaller than the least eigenvalue of one in the metric of the other, and has its sign.
 //
 // Energy: |dE - work of the forces| over a substep must be a small part of the energy turned over, for each
 // mechanically independent group. What rides on something far heavier is lost in that balance, so light parts have one
@@ -12,11 +13,13 @@
 
 #include <algorithm>
 #include <cmath>
+#include <optional>
 #include <vector>
 
 #include "varpin/collocation.hpp"
 #include "varpin/compensated.hpp"
 #include "varpin/dense.hpp"
+#include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
 
 namespace varpin {
@@ -37,7 +40,8 @@ struct Ledger {
     double most = 0.0;    // largest kinetic energy that moved in a substep
 };
 
-// What of the kinetic energy is one coordinate's own while those before it are free; its bounds of late.
+// What of the kinetic energy is one coordinate's own while those before it, or those it carries where M is not formed,
+// are free; its bounds of late.
 struct Share {
     double now = 0.0;
     double least = 0.0;
@@ -91,23 +95,43 @@ struct Trial {
 
 class EnergyGuard {
   public:
-    EnergyGuard(const Mechanism& mechanism)
+    EnergyGuard(const Mechanism& mechanism, Solver solver, bool matrices)
         : mechanism(mechanism),
           n(mechanism.dof()),
-          jet(mechanism.tree),
-          ldl(n * n),
+          jet(mechanism.tree, false),
           kinetic(mechanism.tree.groups),
           moved(mechanism.tree.groups),
           work(mechanism.tree.groups),
           lost(mechanism.tree.groups),
           share(n),
-          curved(n * n),
-          mass(n * n),
-          part(Energies(mechanism.tree).part) {}
+          diagonal(n),
+          part(Energies(mechanism.tree).part) {
+        if (eliminates(mechanism.tree, solver)) {
+            articulated.emplace(mechanism.tree);
+        } else {
+            jet.M.resize(n * n);
+            ldl.resize(n * n);
+        }
+        if (matrices) {
+            curved.resize(n * n);
+            mass.resize(n * n);
+        }
+    }
 
     // v = M(q)^-1 p at a node, and the kinetic and potential energy there; false where M is not positive definite.
     // Leaves the factors of M.
     bool node(const double* q, const double* p, double* v) {
+        if (articulated) {
+            inertias(
+                mechanism, q, jet,
+                [&](int j) {
+                    articulated->place(j, mechanism.tree.bodies[j].ratio * jet.body[j].axis, jet.body[j].inertia);
+                },
+                [](int) {});
+            if (!articulated->factor()) return false;
+            velocity(p, v);
+            return true;
+        }
         mass_matrix(mechanism, q, jet);
         for (const Block& block : mechanism.tree.blocks) {
             for (int i = block.begin; i < block.end; ++i)
@@ -122,6 +146,11 @@ class EnergyGuard {
     // none of which is negative, are the coordinates' shares.
     void velocity(const double* p, double* v) {
         std::fill(kinetic.begin(), kinetic.end(), 0.0);
+        if (articulated) {
+            articulated->solve(p, v, share.data());
+            for (int i = 0; i < n; ++i) kinetic[mechanism.tree.group[i]] += share[i];
+            return;
+        }
         for (const Block& block : mechanism.tree.blocks) {
             solve_lower(ldl.data(), n, block, p, v);
             for (int i = block.begin; i < block.end; ++i) {
@@ -135,7 +164,8 @@ class EnergyGuard {
     }
 
     // x = M^-1 b.
-    void solve(const double* b, double* x) const {
+    void solve(const double* b, double* x) {
+        if (articulated) return articulated->solve(b, x, nullptr);
         for (const Block& block : mechanism.tree.blocks) solve_ldl(ldl.data(), n, block, b, x);
     }
 
@@ -170,9 +200,16 @@ class EnergyGuard {
     // How far the root is from the fold where branches of solutions meet: 1 as h -> 0, <= 0 where refused. The smallest
     // ratio of a pivot of M + (h/2) D + h skew (A + A') - h^2 reach L_qq / (1 - margin) to the same pivot of M, all
     // averaged over the stages with b.
-    double branch_margin(double h, const Guards& guards, const Collocation& step) {
+    double branch_margin(double h, const Guards& guards, Collocation& step) {
         const Tableau& tableau = step.tableau;
         const double exaggerated = h * h * tableau.reach / (1.0 - guards.branch_margin);
+        if (step.elimination) {
+            for (int i = 0; i < n; ++i) {
+                diagonal[i] =
+                    mechanism.tree.armature[i] + 0.5 * h * mechanism.damping[i] + exaggerated * mechanism.stiffness[i];
+            }
+            return step.elimination->least_pivot_ratio(h * tableau.skew, exaggerated, diagonal.data());
+        }
         double least = infinity;
         for (const Block& block : mechanism.tree.blocks) {
             for (int i = block.begin; i < block.end; ++i) {
@@ -255,12 +292,14 @@ class EnergyGuard {
     const Mechanism& mechanism;
     int n;
     Jet<double> jet;
-    std::vector<double> ldl;             // (n, n) factors of M
+    std::optional<ArticulatedBodies> articulated;
+    std::vector<double> ldl;             // (n, n) factors of M, unless bodies are articulated
     std::vector<double> kinetic, moved;  // of each group [J]
     std::vector<double> work, lost;      // of each group over the substep, and by friction [J]
     std::vector<double> share;           // (n)
-    std::vector<double> curved, mass;    // (n, n) of the branch guard
-    std::vector<PartLedger> part;        // of the node that is tried
+    std::vector<double> diagonal;        // (n) of the branch guard
+    std::vector<double> curved, mass;  // (n, n) of the branch guard, unless the step equation is solved by elimination
+    std::vector<PartLedger> part;      // of the node that is tried
 
     // The kinetic energy that a coordinate may be said to turn over. Its share counts as far as it has varied of late:
     // a heavy wheel that turns on and on would else leave room for any error of what it carries.

@@ -47,18 +47,22 @@ struct Jet {
         Magnitudes magnitude{};
     };
 
-    explicit Jet(const Tree& tree)
+    // Without room for matrices only the functions that do not write any may be called.
+    explicit Jet(const Tree& tree, bool matrices = true)
         : body(tree.bodies.size()),
           dof(tree.dof()),
           potential(tree.groups),
           Lq(dof),
           Lv(dof),
-          M(dof * dof),
-          A(dof * dof),
-          Lqq(dof * dof),
           potential_scale(tree.groups),
           Lq_scale(dof),
-          Lv_scale(dof) {}
+          Lv_scale(dof) {
+        if (matrices) make_room();
+    }
+
+    void make_room() {
+        for (auto* matrix : {&M, &A, &Lqq}) matrix->resize(dof * dof);
+    }
 
     std::vector<BodyState> body;
     int dof;
@@ -359,26 +363,34 @@ inline void first_order(const Mechanism& mechanism, const double* q, const doubl
     detail::add_armature(tree, v, w);
 }
 
-// M and the potential energy at q alone.
-inline void mass_matrix(const Mechanism& mechanism, const double* q, Jet<double>& w) {
+// The potential energy at q alone. `enter` sees each body placed with its inertia by itself, the first one first; then
+// `project` each with the inertia of all it carries, the last one first.
+template <class Enter, class Project>
+void inertias(const Mechanism& mechanism, const double* q, Jet<double>& w, const Enter& enter, const Project& project) {
     const Tree& tree = mechanism.tree;
     std::fill(w.potential.begin(), w.potential.end(), 0.0);
     std::fill(w.potential_scale.begin(), w.potential_scale.end(), 0.0);
-    detail::clear_blocks(tree, w.M);
     for (int j = 0; j < tree.size(); ++j) {
         const Body& link = tree.bodies[j];
         auto& here = w.body[j];
         detail::place(tree, j, q, w);
         here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
+        enter(j);
     }
     for (int j = tree.size() - 1; j >= 0; --j) {
         const Body& link = tree.bodies[j];
-        detail::project_mass(tree, j, w);
+        project(j);
         if (link.parent >= 0) detail::pass_inertia(link, w.body[j].inertia, w.body[link.parent].inertia, true);
         if (link.origin) detail::add_potential(mechanism, j, q, w);
     }
     detail::add_springs(mechanism, q, w, false);
-    for (int c = 0; c < w.dof; ++c) w.M[c * w.dof + c] += tree.armature[c];
+}
+
+// M and the potential energy at q alone.
+inline void mass_matrix(const Mechanism& mechanism, const double* q, Jet<double>& w) {
+    detail::clear_blocks(mechanism.tree, w.M);
+    inertias(mechanism, q, w, [](int) {}, [&](int j) { detail::project_mass(mechanism.tree, j, w); });
+    for (int c = 0; c < w.dof; ++c) w.M[c * w.dof + c] += mechanism.tree.armature[c];
 }
 
 }  // namespace varpin

@@ -22,8 +22,8 @@ namespace varpin {
 class VariationalLinearization {
   public:
     VariationalLinearization(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                             double left)
-        : stepper(mechanism, tableau, tolerance, guards, left),
+                             double left, Solver solver)
+        : stepper(mechanism, tableau, tolerance, guards, left, solver),
           n(mechanism.dof()),
           stages(tableau.stages),
           state(mechanism, stages),

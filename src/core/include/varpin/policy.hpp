@@ -55,12 +55,8 @@ inline void apply_policy(const Commands& commands, int path, int s, int n, const
 
 // The force drift + B u that is constant over a step; drift (n) is null for none.
 inline void constant_force(const Mechanism& mechanism, const double* drift, const double* u, double* force) {
-    const int n = mechanism.dof(), m = mechanism.controls;
-    for (int r = 0; r < n; ++r) {
-        double total = drift ? drift[r] : 0.0;
-        for (int c = 0; c < m; ++c) total += mechanism.actuation[r * m + c] * u[c];
-        force[r] = total;
-    }
+    for (int r = 0; r < mechanism.dof(); ++r) force[r] = drift ? drift[r] : 0.0;
+    for (const Transmission& own : mechanism.actuation) force[own.coordinate] += own.ratio * u[own.control];
 }
 
 // The impulse part * sum_i F_i(q, u) dw_i.

@@ -58,6 +58,13 @@ struct Diffusion {
     std::vector<double> center;     // (n, k) [rad or m]
 };
 
+// Generalized force per unit of a control, one of the entries of B that are not zero.
+struct Transmission {
+    int coordinate = 0;
+    int control = 0;
+    double ratio = 0.0;
+};
+
 // A tree in its surroundings.
 struct Mechanism {
     Tree tree;
@@ -66,7 +73,7 @@ struct Mechanism {
     std::vector<double> stiffness;  // (n) of joint springs [N m/rad or N/m]
     std::vector<double> rest;       // (n) where they are slack [rad or m]
     int controls = 0;               // m
-    std::vector<double> actuation;  // (n, m) generalized force per control
+    std::vector<Transmission> actuation;
     Diffusion diffusion;
 
     int dof() const { return tree.dof(); }

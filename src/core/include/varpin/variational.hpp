@@ -54,14 +54,14 @@ struct Part {
 class VariationalStepper {
   public:
     VariationalStepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                       double left)
+                       double left, Solver solver)
         : mechanism(mechanism),
           tableau(tableau),
           tolerance(tolerance),
           guards(guards),
           left(left),
-          step_equation(mechanism, this->tableau),
-          energy_guard(mechanism),
+          step_equation(mechanism, this->tableau, solver),
+          energy_guard(mechanism, solver, !step_equation.elimination),
           n(mechanism.dof()),
           force(n),
           trial(n),
@@ -102,13 +102,8 @@ class VariationalStepper {
     // Put a path at (q, v).
     bool begin(const double* q, const double* v, PathState& state) {
         Jet<double>& jet = step_equation.stage[0];
-        mass_matrix(mechanism, q, jet);
-        for (int i = 0; i < n; ++i) {
-            double total = 0.0;
-            for (int j = 0; j < n; ++j) total += jet.M[i * n + j] * v[j];
-            bend[i] = total;
-        }
-        if (!begin_at(q, bend.data(), state)) return false;
+        first_order(mechanism, q, v, jet);
+        if (!begin_at(q, jet.Lv.data(), state)) return false;
         std::copy(v, v + n, state.v.begin());
         return true;
     }
@@ -260,8 +255,16 @@ class VariationalStepper {
         const int stages = step_equation.stages;
         const bool smooth = state.known > 1 && mechanism.diffusion.processes == 0;
         double *change = bend.data(), *acceleration = change + n;
-        for (int c = 0; c < n; ++c) change[c] = force[c] - state.past_force[c];
-        energy_guard.solve(change, acceleration);
+        bool changed = false;
+        for (int c = 0; c < n; ++c) {
+            change[c] = force[c] - state.past_force[c];
+            changed = changed || change[c] != 0.0;
+        }
+        if (changed) {
+            energy_guard.solve(change, acceleration);
+        } else {
+            std::fill(acceleration, acceleration + n, 0.0);
+        }
         for (int i = 0; i < stages; ++i) {
             const double* ahead = &tableau.ahead[i * (stages + 1)];
             for (int c = 0; c < n; ++c) {

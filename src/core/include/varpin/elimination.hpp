@@ -1,0 +1,495 @@
+// Solves with the matrix of a midpoint step by elimination from the leaves to the roots: work in proportion to the
+// number of bodies, and no matrix. docs/mathematics.md, "Linear in the number of joints". Between a joint j and one
+// above it, i,
+//
+//     N = M + ha A - hb A' - ha hb L_qq + diag(d)
+//     N_ij = row_i . (Y_j column_j) + row_i . u0_j,      u0 = ha (S x* H, g x (Y S)(linear))
+//     N_ji = (Y_j row_j) . column_i + l0_j . column_i,   l0 = -hb (S x* H, -g x (Y S)(linear))
+//
+// with nine entries each, row = (S - hb W, hb S(angular)) and column = (S + ha W, ha S(angular)), of which the inertia
+// Y of all that j carries takes the first six. Once all that j carries is eliminated, what is left of it answers a
+// motion w by X w + z, and so, x being the coordinate and w = w_parent + column x,
+//
+//     u = X column + u0,  l = X' row + l0,  D = d + row . u:      x = (r - row . z) / D - l . w_parent / D
+//     handed on to the parent: X - u l' / D,  z + u (r - row . z) / D.
+//
+// The symmetric part M + c (A + A') - k L_qq goes alike with rows and columns (S, W) of twelve entries, M alone with S:
+// that is the articulated body algorithm (Featherstone 2008).
+#pragma once
+
+#include <algorithm>
+#include <limits>
+#include <vector>
+
+#include "varpin/jet.hpp"
+#include "varpin/pair.hpp"
+#include "varpin/spatial.hpp"
+#include "varpin/tree.hpp"
+
+namespace varpin {
+
+// How to solve with M and with the matrix of a step; elimination cannot where two bodies share a coordinate.
+enum class Solver { automatic, dense, elimination };
+
+// Times of a dense step for each body, for each pair of a body and one above it, and for each cubed size of a block; in
+// units of what a body costs that is eliminated. Measured with benchmarks/joints.py.
+inline constexpr double body_cost = 0.6, pair_cost = 0.033, block_cost = 0.0004;
+
+inline bool eliminates(const Tree& tree, Solver solver) {
+    if (solver == Solver::dense || tree.size() != tree.dof()) return false;
+    if (solver == Solver::elimination) return true;
+    double dense = body_cost * tree.size();
+    std::vector<int> depth(tree.size(), 1);
+    for (int j = 0; j < tree.size(); ++j) {
+        if (tree.bodies[j].parent >= 0) depth[j] += depth[tree.bodies[j].parent];
+        dense += pair_cost * depth[j];
+    }
+    for (const Block& block : tree.blocks) {
+        const double size = block.end - block.begin;
+        dense += block_cost * size * size * size;
+    }
+    return tree.size() < dense;
+}
+
+// Where each body gathers what it carries while bodies are eliminated, the last one first. Places are used again: along
+// a chain there is one, and it stays in the cache.
+struct Gathering {
+    explicit Gathering(const Tree& tree) : place(tree.size(), -1), joins(tree.size(), 0), leaf(tree.size(), 1) {
+        std::vector<int> free;
+        for (int j = tree.size() - 1; j >= 0; --j) {
+            if (place[j] < 0) {
+                if (free.empty()) free.push_back(places++);
+                place[j] = free.back();
+                free.pop_back();
+            }
+            const int k = tree.bodies[j].parent;
+            if (k >= 0 && place[k] < 0) {
+                place[k] = place[j];
+                leaf[k] = 0;
+                continue;
+            }
+            joins[j] = k >= 0;
+            free.push_back(place[j]);
+        }
+    }
+
+    int places = 0;
+    std::vector<int> place;   // of each body; the first child's is its parent's
+    std::vector<char> joins;  // adds to what its parent has already, from a place of its own
+    std::vector<char> leaf;   // nothing is at its place before it
+};
+
+namespace detail {
+
+inline void write(const Motion<double>& a, double* x) {
+    x[0] = a.linear.x, x[1] = a.linear.y, x[2] = a.linear.z;
+    x[3] = a.angular.x, x[4] = a.angular.y, x[5] = a.angular.z;
+}
+inline void write(const Force<double>& f, double* x) {
+    x[0] = f.linear.x, x[1] = f.linear.y, x[2] = f.linear.z;
+    x[3] = f.angular.x, x[4] = f.angular.y, x[5] = f.angular.z;
+}
+inline Motion<double> motion_at(const double* x) { return {{x[0], x[1], x[2]}, {x[3], x[4], x[5]}}; }
+
+// Functions of vectors (size) and matrices (size, size), row by row, sizes being even. Sums of products have two parts,
+// of even and odd terms.
+template <int size>
+double product(const double* a, const double* b) {
+    double even = 0.0, odd = 0.0;
+    for (int c = 0; c < size; c += 2) {
+        even += a[c] * b[c];
+        odd += a[c + 1] * b[c + 1];
+    }
+    return even + odd;
+}
+template <int size>
+struct Pairs {
+    explicit Pairs(const double* x) {
+        for (int c = 0; c < size; c += 2) at[c / 2] = pair_at(x + c);
+    }
+    Pair at[size / 2];
+};
+// y += X x
+template <int size>
+void add_product(const double* X, const double* x, double* y) {
+    const Pairs<size> factor(x);
+    for (int r = 0; r < size; ++r, X += size) {
+        Pair sum = pair_at(X) * factor.at[0];
+        for (int c = 2; c < size; c += 2) sum = sum + pair_at(X + c) * factor.at[c / 2];
+        y[r] += sum[0] + sum[1];
+    }
+}
+// y += X' x
+template <int size>
+void add_transposed_product(const double* X, const double* x, double* y) {
+    Pairs<size> sum(y);
+    for (int r = 0; r < size; ++r, X += size) {
+        const Pair factor{x[r], x[r]};
+        for (int c = 0; c < size; c += 2) sum.at[c / 2] = sum.at[c / 2] + factor * pair_at(X + c);
+    }
+    for (int c = 0; c < size; c += 2) put_pair(sum.at[c / 2], y + c);
+}
+// X -= u l'
+template <int size>
+void subtract_outer(const double* u, const double* l, double* X) {
+    const Pairs<size> row(l);
+    for (int r = 0; r < size; ++r, X += size) {
+        const Pair factor{u[r], u[r]};
+        for (int c = 0; c < size; c += 2) put_pair(pair_at(X + c) - factor * row.at[c / 2], X + c);
+    }
+}
+
+// s I added to a part of a matrix whose rows have length `stride`.
+inline void add_inertia(double s, const Inertia<double>& I, int stride, double* x) {
+    const double m = s * I.mass;
+    const Vec3<double> h = s * I.moment;
+    double *linear = x, *angular = x + 3 * stride;
+    linear[0] += m, linear[4] += h.z, linear[5] -= h.y;
+    linear += stride;
+    linear[1] += m, linear[3] -= h.z, linear[5] += h.x;
+    linear += stride;
+    linear[2] += m, linear[3] += h.y, linear[4] -= h.x;
+    const double xy = s * I.second.xy, xz = s * I.second.xz, yz = s * I.second.yz;
+    angular[1] -= h.z, angular[2] += h.y, angular[3] += s * I.second.xx, angular[4] += xy, angular[5] += xz;
+    angular += stride;
+    angular[0] += h.z, angular[2] -= h.x, angular[3] += xy, angular[4] += s * I.second.yy, angular[5] += yz;
+    angular += stride;
+    angular[0] -= h.y, angular[1] += h.x, angular[3] += xz, angular[4] += yz, angular[5] += s * I.second.zz;
+}
+
+// Above an origin all slide: they see linear parts alone, which are the same about any point. `linear` says which
+// entries those are.
+template <int size>
+constexpr bool linear(int entry) {
+    return entry < 9 ? entry % 6 < 3 && (size == 12 || entry < 6) : false;
+}
+template <int size>
+void keep_linear(double* z) {
+    for (int r = 0; r < size; ++r) {
+        if (!linear<size>(r)) z[r] = 0.0;
+    }
+}
+template <int size>
+void keep_linear_rows(double* X) {
+    for (int r = 0; r < size; ++r) {
+        if (linear<size>(r)) {
+            keep_linear<size>(X + r * size);
+        } else {
+            std::fill(X + r * size, X + (r + 1) * size, 0.0);
+        }
+    }
+}
+
+// What bodies have gathered while the last of them are eliminated; `entries` numbers at each place.
+template <int entries>
+class Gathered {
+  public:
+    explicit Gathered(const Gathering& order) : order_(&order), at_(order.places * entries) {}
+
+    // What body j has of those it carries.
+    double* of(int j) {
+        double* own = at_.data() + order_->place[j] * entries;
+        if (order_->leaf[j]) std::fill(own, own + entries, 0.0);
+        return own;
+    }
+    // Body j is done with: its parent goes on with what it leaves, or adds that to its own.
+    void hand_on(int j, int parent) {
+        if (!order_->joins[j]) return;
+        const double* own = at_.data() + order_->place[j] * entries;
+        double* __restrict up = at_.data() + order_->place[parent] * entries;
+        for (int k = 0; k < entries; ++k) up[k] += own[k];
+    }
+
+  private:
+    const Gathering* order_;
+    std::vector<double> at_;
+};
+
+}  // namespace detail
+
+// M + diag(armature) as pivots and what goes with them, at one configuration after another.
+class ArticulatedBodies {
+  public:
+    explicit ArticulatedBodies(const Tree& tree)
+        : tree_(&tree),
+          order_(tree),
+          body_(tree.size()),
+          inertia_(order_),
+          force_(order_),
+          motion_(6 * (tree.size() + 1)) {}
+    ArticulatedBodies(const ArticulatedBodies&) = delete;
+    ArticulatedBodies& operator=(const ArticulatedBodies&) = delete;
+
+    // What coordinate moves body j how, and the body's inertia by itself.
+    void place(int j, const Motion<double>& axis, const Inertia<double>& inertia) {
+        detail::write(axis, body_[j].axis);
+        body_[j].inertia = inertia;
+    }
+
+    // False at a pivot that is not positive.
+    bool factor() {
+        for (int j = tree_->size() - 1; j >= 0; --j) {
+            if (!eliminate(j)) return false;
+        }
+        return true;
+    }
+
+    // One body after another, from the last to the first.
+    bool eliminate(int j) {
+        const Body& link = tree_->bodies[j];
+        State& own = body_[j];
+        double* X = inertia_.of(j);
+        detail::write(own.inertia * detail::motion_at(own.axis), own.u);
+        detail::add_transposed_product<6>(X, own.axis, own.u);  // X being symmetric
+        own.pivot = tree_->armature[link.coordinate] + detail::product<6>(own.axis, own.u);
+        if (!(own.pivot > 0.0)) return false;
+        const double inverse = 1.0 / own.pivot;
+        for (int r = 0; r < 6; ++r) own.answer[r] = own.u[r] * inverse;
+        if (link.parent < 0) return true;
+        detail::subtract_outer<6>(own.answer, own.u, X);
+        detail::add_inertia(1.0, own.inertia, 6, X);
+        if (link.origin) detail::keep_linear_rows<6>(X);
+        inertia_.hand_on(j, link.parent);
+        return true;
+    }
+
+    // The inertia of coordinate c with all it carries free [kg m^2 or kg].
+    double pivot(int body) const { return body_[body].pivot; }
+
+    // x with (M + diag(armature)) x = b; x may be b. `share`, unless null, receives the terms of 1/2 b . x, none of
+    // which is negative: that of coordinate i is what is left of b_i when all it carries is free.
+    void solve(const double* b, double* x, double* share) {
+        for (int j = tree_->size() - 1; j >= 0; --j) {
+            const Body& link = tree_->bodies[j];
+            const State& own = body_[j];
+            double* z = force_.of(j);
+            const int c = link.coordinate;
+            const double left = b[c] - detail::product<6>(own.axis, z);
+            x[c] = left / own.pivot;
+            if (share) share[c] = 0.5 * left * x[c];
+            if (link.parent < 0) continue;
+            for (int r = 0; r < 6; ++r) z[r] += own.answer[r] * left;
+            if (link.origin) detail::keep_linear<6>(z);
+            force_.hand_on(j, link.parent);
+        }
+        for (int j = 0; j < tree_->size(); ++j) {
+            const Body& link = tree_->bodies[j];
+            const State& own = body_[j];
+            const double* above = &motion_[6 * (link.parent + 1)];  // still, where there is none
+            x[link.coordinate] -= detail::product<6>(own.answer, above);
+            for (int r = 0; r < 6; ++r) motion_[6 * (j + 1) + r] = above[r] + own.axis[r] * x[link.coordinate];
+        }
+    }
+
+  private:
+    struct State {
+        double axis[6] = {};  // S
+        Inertia<double> inertia{};
+        double u[6] = {}, answer[6] = {};  // X S, and that by the pivot
+        double pivot = 0.0;
+    };
+
+    const Tree* tree_;
+    Gathering order_;
+    std::vector<State> body_;
+    detail::Gathered<36> inertia_;
+    detail::Gathered<6> force_;
+    std::vector<double> motion_;  // (b + 1, 6) of each body, after what stands still
+};
+
+// The matrix of a midpoint step and its symmetric part, at one (q, v) after another.
+class Elimination {
+  public:
+    explicit Elimination(const Mechanism& mechanism)
+        : mechanism_(&mechanism),
+          tree_(&mechanism.tree),
+          order_(mechanism.tree),
+          body_(mechanism.tree.size()),
+          factors_(mechanism.tree.size()),
+          matrix_(order_),
+          symmetric_(order_),
+          force_(order_),
+          motion_(width * (mechanism.tree.size() + 1)),
+          masses_(mechanism.tree) {}
+    Elimination(const Elimination&) = delete;
+    Elimination& operator=(const Elimination&) = delete;
+
+    // Take over from a sweep of first order what follows is about.
+    void take(const Jet<double>& jet) {
+        const Vec3<double>& g = mechanism_->gravity;
+        for (int j = 0; j < tree_->size(); ++j) {
+            const Body& link = tree_->bodies[j];
+            const auto& here = jet.body[j];
+            State& own = body_[j];
+            own.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
+            own.axis = link.ratio * here.axis;
+            own.rate = link.ratio * here.axis_rate;
+            own.turned = cross(own.axis, here.momentum);
+            own.lifted = cross(g, here.inertia.mass * own.axis.linear + cross(own.axis.angular, here.inertia.moment));
+        }
+    }
+
+    // Factor N; false at a pivot that is not positive.
+    bool factor(double ahead, double behind, const double* diagonal) {
+        ahead_ = ahead;
+        for (int j = tree_->size() - 1; j >= 0; --j) {
+            const Body& link = tree_->bodies[j];
+            const State& state = body_[j];
+            Factors& own = factors_[j];
+            const Motion<double> row = state.axis + (-behind) * state.rate, column = state.axis + ahead * state.rate;
+            write(row, behind * state.axis.angular, own.row);
+            write(column, ahead * state.axis.angular, own.column);
+            write(state.inertia * column + ahead * state.turned, ahead * state.lifted, own.u);
+            write(state.inertia * row + (-behind) * state.turned, behind * state.lifted, own.l);
+            double* X = matrix_.of(j);
+            detail::add_product<width>(X, own.column, own.u);
+            own.pivot = diagonal[link.coordinate] + detail::product<width>(own.row, own.u);
+            if (!(own.pivot > 0.0)) return false;
+            if (link.parent < 0) {
+                std::fill(own.l, own.l + width, 0.0);
+                continue;
+            }
+            detail::add_transposed_product<width>(X, own.row, own.l);
+            const double inverse = 1.0 / own.pivot;
+            for (double& entry : own.l) entry *= inverse;
+            detail::subtract_outer<width>(own.u, own.l, X);
+            detail::add_inertia(1.0, state.inertia, width, X);
+            if (link.origin) detail::keep_linear_rows<width>(X);
+            matrix_.hand_on(j, link.parent);
+        }
+        return true;
+    }
+
+    // x with N x = b.
+    void solve(const double* b, double* x) {
+        for (int j = tree_->size() - 1; j >= 0; --j) {
+            const Body& link = tree_->bodies[j];
+            const Factors& own = factors_[j];
+            double* z = force_.of(j);
+            const double t = (b[link.coordinate] - detail::product<width>(own.row, z)) / own.pivot;
+            x[link.coordinate] = t;
+            if (link.parent < 0) continue;
+            for (int r = 0; r < width; ++r) z[r] += own.u[r] * t;
+            if (link.origin) detail::keep_linear<width>(z);
+            force_.hand_on(j, link.parent);
+        }
+        for (int j = 0; j < tree_->size(); ++j) {
+            const Body& link = tree_->bodies[j];
+            const Factors& own = factors_[j];
+            const double* above = motion_above(j);
+            double* __restrict moved = motion_.data() + width * (j + 1);
+            x[link.coordinate] -= detail::product<width>(own.l, above);
+            for (int r = 0; r < width; ++r) moved[r] = above[r] + own.column[r] * x[link.coordinate];
+        }
+    }
+
+    // y = (A' + ha L_qq) x of the x that `solve` left.
+    void change_of_slope(const double* x, double* y) {
+        for (int j = tree_->size() - 1; j >= 0; --j) {
+            const Body& link = tree_->bodies[j];
+            const State& state = body_[j];
+            double* z = force_.of(j);
+            const double* above = motion_above(j);
+            const double own = ahead_ * x[link.coordinate];
+            double added[width];
+            write(state.inertia * detail::motion_at(motion_.data() + width * (j + 1)) + own * state.turned,
+                  own * state.lifted, added);
+            for (int r = 0; r < width; ++r) z[r] += added[r];
+            const Force<double> force{{z[0], z[1], z[2]}, {z[3], z[4], z[5]}};
+            const Vec3<double> lifted{z[6], z[7], z[8]}, turn{above[6], above[7], above[8]};
+            y[link.coordinate] = dot(state.rate, force) - dot(state.axis.angular, lifted) +
+                                 dot(detail::motion_at(above), state.turned) - dot(turn, state.lifted);
+            if (link.parent < 0) continue;
+            if (link.origin) detail::keep_linear<width>(z);
+            force_.hand_on(j, link.parent);
+        }
+    }
+
+    // x' M x, armature included.
+    double kinetic_size(const double* x) {
+        double total = 0.0;
+        for (int j = 0; j < tree_->size(); ++j) {
+            const Body& link = tree_->bodies[j];
+            State& own = body_[j];
+            own.moved = x[link.coordinate] * own.axis;
+            if (link.parent >= 0) own.moved += body_[link.parent].moved;
+            total += dot(own.moved, own.inertia * own.moved);
+        }
+        for (int c = 0; c < tree_->dof(); ++c) total += tree_->armature[c] * x[c] * x[c];
+        return total;
+    }
+
+    // The smallest ratio of a pivot of M + c (A + A') - k L_qq + diag(d) to the same one of M, armature included; 0 if
+    // one is not positive. What `factor` left remains.
+    double least_pivot_ratio(double c, double k, const double* diagonal) {
+        double least = std::numeric_limits<double>::infinity();
+        for (int j = tree_->size() - 1; j >= 0; --j) {
+            const Body& link = tree_->bodies[j];
+            const State& state = body_[j];
+            double row[12], u[12], answer[12];
+            detail::write(state.axis, row);
+            detail::write(state.rate, row + 6);
+            const Force<double> by_axis = state.inertia * state.axis,
+                                by_rate = state.inertia * state.rate + state.turned;
+            detail::write(by_axis + c * by_rate + Force<double>{{}, k * state.lifted}, u);
+            detail::write(c * by_axis + (-k) * by_rate, u + 6);
+            double* X = symmetric_.of(j);
+            detail::add_transposed_product<12>(X, row, u);
+            const double pivot = diagonal[link.coordinate] + detail::product<12>(row, u);
+            masses_.place(j, state.axis, state.inertia);
+            if (!(pivot > 0.0) || !masses_.eliminate(j)) return 0.0;
+            least = std::min(least, pivot / masses_.pivot(j));
+            if (link.parent < 0) continue;
+            const double inverse = 1.0 / pivot;
+            for (int r = 0; r < 12; ++r) answer[r] = u[r] * inverse;
+            detail::subtract_outer<12>(answer, u, X);
+            detail::add_inertia(1.0, state.inertia, 12, X);
+            detail::add_inertia(-k, state.inertia, 12, X + 6 * 12 + 6);
+            if (c != 0.0) {
+                detail::add_inertia(c, state.inertia, 12, X + 6);
+                detail::add_inertia(c, state.inertia, 12, X + 6 * 12);
+            }
+            if (link.origin) detail::keep_linear_rows<12>(X);
+            symmetric_.hand_on(j, link.parent);
+        }
+        return least;
+    }
+
+  private:
+    static constexpr int width = 10;  // nine entries and a zero
+
+    struct State {
+        Inertia<double> inertia{};      // of the body by itself
+        Motion<double> axis{}, rate{};  // S, W
+        Force<double> turned{};         // S x* H
+        Vec3<double> lifted{};          // g x (Y S)(linear)
+        Motion<double> moved{};         // under some x
+    };
+    struct Factors {
+        double row[width] = {}, column[width] = {};
+        double u[width] = {}, l[width] = {};  // l by the pivot
+        double pivot = 0.0;
+    };
+
+    template <class Six>
+    static void write(const Six& a, const Vec3<double>& b, double* x) {
+        detail::write(a, x);
+        x[6] = b.x, x[7] = b.y, x[8] = b.z, x[9] = 0.0;
+    }
+
+    const double* motion_above(int j) const { return motion_.data() + width * (tree_->bodies[j].parent + 1); }
+
+    const Mechanism* mechanism_;
+    const Tree* tree_;
+    Gathering order_;
+    std::vector<State> body_;
+    std::vector<Factors> factors_;
+    detail::Gathered<width * width> matrix_;
+    detail::Gathered<144> symmetric_;
+    detail::Gathered<width> force_;
+    std::vector<double> motion_;  // (b + 1, 10) of each body under the x of `solve`, after what stands still
+    double ahead_ = 0.0;
+    ArticulatedBodies masses_;
+};
+
+}  // namespace varpin
