@@ -1,7 +1,7 @@
-// Forward dynamics and its derivatives, for the integrators that work on (q, v). docs/mathematics.md, "Forward
-// dynamics". Inverse dynamics by the recursive Newton-Euler algorithm is tau = S . Phi, with Phi the force that moves
-// what a joint carries. Its derivatives follow from the rotate-along rule of the jet: for a body b below i, with V_p
-// and A_p velocity and acceleration (gravity taken off) of i's parent,
+// Forward dynamics and its derivatives, for the integrators that work on (q, v). Inverse dynamics by the recursive
+// Newton-Euler algorithm is tau = S . Phi, with Phi the force that moves what a joint carries. Its derivatives follow
+// from the rotate-along rule of the jet: for a body b below i, with V_p and A_p velocity and acceleration (gravity
+// taken off) of i's parent,
 //
 //     dV_b = W_i,    dA_b = Z_i + W_i x V_b,    Z_i = A_p x S_i + V_p x W_i,
 //

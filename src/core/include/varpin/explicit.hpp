@@ -1,4 +1,4 @@
-// Explicit integrators of q' = v, M v' = force - bias (docs/mathematics.md, "Explicit methods"), one step of length h:
+// Explicit integrators of q' = v, M v' = force - bias (docs/mathematics.md, "Noise"), one step of length h:
 //
 //     Euler                 q1 = q0 + h v0,  v1 = v0 + h a(q0, v0)
 //     semi-implicit Euler   v1 = v0 + h a(q0, v0),  q1 = q0 + h v1

@@ -44,7 +44,7 @@ struct PathState {
 };
 
 // A part of a step, to be differentiated later.
-struct Part {
+struct Substep {
     std::vector<Place> place;
     std::vector<Compensated> p;
     std::vector<double> V;  // (s, n) at its root
@@ -79,9 +79,9 @@ class VariationalStepper {
     Collocation step_equation;
     EnergyGuard energy_guard;
     int n;
-    std::vector<double> force;           // (n) constant over the step
-    Effort effort;                       // of the last step
-    std::vector<Part>* trail = nullptr;  // where the parts of steps are noted down, if anybody asks
+    std::vector<double> force;              // (n) constant over the step
+    Effort effort;                          // of the last step
+    std::vector<Substep>* trail = nullptr;  // where the parts of steps are noted down, if anybody asks
 
     // Put a path at (q, p), with nothing known of the past; false where M(q) is not positive definite.
     bool begin_at(const double* q, const double* p, PathState& state) {
