@@ -162,7 +162,7 @@ class Variational(Integrator):
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
         """See :meth:`Integrator.contract`; steps that were taken in parts are chained as in :meth:`linearize`."""
-        H, outcome, done = variational_curvatures(*self._steps(scene, trajectory), np.ascontiguousarray(z))
+        H, outcome, done = variational_curvatures(*self._steps(scene, trajectory), z=np.ascontiguousarray(z))
         if outcome in REASONS:
             raise LinearizationError(done, done * trajectory.dt, REASONS[outcome])
         return H
