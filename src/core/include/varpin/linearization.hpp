@@ -181,8 +181,8 @@ class VariationalLinearization {
 
     void join(const std::vector<double>& Jx, const std::vector<double>& Jf, std::vector<double>& both) const {
         for (int r = 0; r < 2 * n; ++r) {
-            std::copy(&Jx[r * 2 * n], &Jx[(r + 1) * 2 * n], &both[r * 3 * n]);
-            std::copy(&Jf[r * n], &Jf[(r + 1) * n], &both[r * 3 * n + 2 * n]);
+            std::copy_n(&Jx[r * 2 * n], 2 * n, &both[r * 3 * n]);
+            std::copy_n(&Jf[r * n], n, &both[r * 3 * n + 2 * n]);
         }
     }
 

@@ -186,8 +186,7 @@ class VariationalStepper {
             for (std::int64_t s = 0; s < steps; ++s) {
                 const std::int64_t row = path * steps + s;
                 const double* dw = noisy ? increments + row * k : nullptr;
-                apply_policy(commands, static_cast<int>(path), static_cast<int>(s), n, state.q.data(),
-                             state.momentum.data(), u);
+                apply_policy(commands, path, s, n, state.q.data(), state.momentum.data(), u);
                 if (noisy) noise_kick(left, u + s * m, dw, state);
                 constant_force(mechanism, drift ? drift + row * n : nullptr, u + s * m, force.data());
                 const Outcome outcome = step(h, state);
