@@ -143,7 +143,7 @@ def test_ensemble(name, value):
         assert np.isfinite(ensemble.q).all()
 
 
-class TestKernelsGetWhatFits:
+class TestTheCoreGetsWhatFits:
     @pytest.mark.parametrize(
         ("name", "value"),
         [

@@ -3,26 +3,137 @@
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import varpin as vp
+from varpin import core
+
 ROOT = Path(__file__).parents[1]
+CORE = ROOT / "src" / "core"
 COMPILER = os.environ.get("CXX", "c++")
+FLAGS = ["-std=c++20", "-O1", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", f"-I{CORE / 'include'}"]
+
+
+@pytest.fixture(autouse=True)
+def _compiler():
+    if shutil.which(COMPILER) is None:
+        pytest.skip("there is no C++ compiler")
 
 
 @pytest.fixture(params=sorted((ROOT / "tests" / "cpp").glob("*.cpp")), ids=lambda path: path.stem)
 def program(request, tmp_path):
-    if shutil.which(COMPILER) is None:
-        pytest.skip("there is no C++ compiler")
     target = tmp_path / "program"
-    flags = ["-std=c++20", "-O1", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-D_GLIBCXX_ASSERTIONS"]
-    sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-    include = ROOT / "src" / "core" / "include"
-    subprocess.run([COMPILER, *flags, *sanitizers, f"-I{include}", request.param, "-o", target], check=True)
+    sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-D_GLIBCXX_ASSERTIONS"]
+    subprocess.run([COMPILER, *FLAGS, *sanitizers, request.param, "-o", target], check=True)
     return target
 
 
 def test_it_finds_nothing_amiss(program):
     done = subprocess.run([program], check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_headers_stand_beside_each_other(tmp_path):
+    """In one program, in either order: each includes what it needs, and no name means two things."""
+    headers = sorted(path.name for path in (CORE / "include" / "varpin").glob("*.hpp"))
+    for number, order in enumerate((headers, headers[::-1])):
+        source = tmp_path / f"{number}.cpp"
+        source.write_text("".join(f'#include "varpin/{name}"\n' for name in order))
+        subprocess.run([COMPILER, *FLAGS, "-fsyntax-only", source], check=True)
+
+
+@pytest.mark.parametrize("installed", [False, True], ids=["from the tree", "installed"])
+def test_plan_of_the_example_is_what_python_finds(installed, tmp_path):
+    """To the last bit."""
+    if shutil.which("cmake") is None:
+        pytest.skip("there is no CMake")
+    build, options = tmp_path / "build", [f"-DPython_EXECUTABLE={sys.executable}"]
+    if installed:
+        subprocess.run(["cmake", "-S", CORE, "-B", tmp_path / "core"], check=True)
+        subprocess.run(["cmake", "--install", tmp_path / "core", "--prefix", tmp_path / "prefix"], check=True)
+        options.append(f"-DCMAKE_PREFIX_PATH={tmp_path / 'prefix'}")
+    subprocess.run(["cmake", "-S", ROOT / "examples" / "cpp", "-B", build, *options], check=True)
+    assert ("varpin_DIR:PATH=varpin_DIR-NOTFOUND" in (build / "CMakeCache.txt").read_text()) is not installed
+    subprocess.run(["cmake", "--build", build], check=True)
+    done = subprocess.run([build / "plan", tmp_path / "found"], check=True, capture_output=True, text=True)
+    assert "with feedback" in done.stdout
+    found, expected = np.fromfile(tmp_path / "found"), planned()
+    assert found.size == sum(array.size for array in expected)
+    for array in expected:
+        own, found = found[: array.size], found[array.size :]
+        np.testing.assert_array_equal(own.reshape(array.shape), array)
+
+
+def planned():
+    """What ``examples/cpp/plan.cpp`` writes: controls, nodes q and p, gains, nodes q of the disturbed arm."""
+    N, h, effort, at_goal, at_rest = 100, 0.01, 1e-4, 1e3, 10.0
+    start, goal = np.array([0.0, -1.5, 1.5, 0.0, 0.5, 0.0]), np.array([0.6, -1.0, 1.2, -0.4, 0.8, 0.3])
+    scene = vp.Scene(vp.load_robot("ur5"), damping=0.5)
+    n = m = 6
+    u0 = scene.holding_torque(start)
+
+    def rollout(q0, controls):
+        return vp.simulate(scene, q0, np.zeros(n), dt=h, steps=N, controls=controls, check=False)
+
+    def cost(motion):
+        total = 0.0
+        for off in (motion.u - u0).ravel().tolist():
+            total += 0.5 * h * effort * off * off
+        for off, p in zip((motion.q[-1] - goal).tolist(), motion.p[-1].tolist(), strict=True):
+            total += 0.5 * (at_goal * off * off + at_rest * p * p)
+        return total
+
+    def backward(motion):
+        gradient = np.zeros((N, 2 * n + m))
+        gradient[:, 2 * n :] = effort * (motion.u - u0)
+        hessian = np.diag([0.0] * (2 * n) + [effort] * m)
+        last = np.concatenate([at_goal * (motion.q[-1] - goal), at_rest * motion.p[-1]])
+        lin = vp.linearize(scene, motion)
+        steps = core.ExpandedSteps(
+            A=np.ascontiguousarray(lin.A),
+            B=np.ascontiguousarray(lin.B),
+            G=np.zeros((N, 2 * n, 0)),
+            Gx=np.zeros((N, 2 * n, 0, 2 * n)),
+            Gu=np.zeros((N, 2 * n, 0, m)),
+            rule=np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]]),
+            gradient=gradient,
+            hessian=hessian[None],
+            velocity=np.zeros((0, n, 2 * n)),
+            curvature=np.zeros((0, 2 * n + m, 2 * n + m)),
+            slack=np.zeros((0, 2, m)),
+            rate=np.zeros((0, m, m)),
+            pull=np.zeros((0, m)),
+        )
+        k, K = np.empty((N, m)), np.empty((N, m, 2 * n))
+        gains = core.Gains(
+            feedforward=k,
+            feedback=K,
+            previous=np.zeros((0, m, m)),
+            control_gradient=np.empty((N, m)),
+            costate=np.zeros((0, 2 * n)),
+            spread=np.zeros((0, 2 * n, 2 * n)),
+        )
+        hessian = np.diag([at_goal] * n + [at_rest] * n)
+        assert core.BackwardPass(m, last, hessian).run(h, 1, 0.0, steps, gains) < 0
+        return k, K
+
+    def policy(u, K, motion):
+        return vp.LinearPolicy(u, K, np.hstack([motion.q, motion.p])[:-1], on="momentum")
+
+    motion = rollout(start, np.tile(u0, (N, 1)))
+    for _ in range(20):
+        before, (k, K) = cost(motion), backward(motion)
+        for halvings in range(10):
+            trial = rollout(start, policy(motion.u + 0.5**halvings * k, K, motion))
+            if cost(trial) < before:
+                motion = trial
+                break
+        if before - cost(motion) < 1e-6 * before:
+            break
+    _, K = backward(motion)
+    followed = rollout(start + 0.05, policy(motion.u, K, motion))
+    return motion.u, motion.q[1:], motion.p[1:], K, followed.q[1:]

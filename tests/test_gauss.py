@@ -319,7 +319,7 @@ def test_split_steps_are_counted_and_chained():
 
 @pytest.mark.parametrize("kick", ["left", "split"])
 def test_kicks_of_one_stage_are_those_of_the_midpoint_rule(kick):
-    """With the same increments, and noise of every kind a kernel evaluates."""
+    """With the same increments, and noise of every kind the core evaluates."""
     noise = vp.AdditiveNoise(0.3) + vp.ControlNoise(0.1) + vp.StateNoise(0.5, center=0.3)
     scene = vp.Scene(vp.load_robot("ur5"), damping=0.5, noise=noise)
     u = np.random.default_rng(1).normal(size=(50, 6))
@@ -335,8 +335,8 @@ def test_kicks_of_one_stage_are_those_of_the_midpoint_rule(kick):
 
 
 @pytest.mark.parametrize("kick", ["left", "split"])
-def test_fields_in_python_and_in_kernels_do_the_same(kick):
-    """A user's field, evaluated in Python, against the same field in a kernel."""
+def test_fields_in_python_and_in_the_core_do_the_same(kick):
+    """A user's field, evaluated in Python, against the same field in the core."""
     robot = vp.load_robot("ur5")
     custom = vp.CustomNoise(
         field=lambda q, v, u: np.diag(0.3 + 0.5 * (q - 0.3) ** 2),
@@ -350,7 +350,7 @@ def test_fields_in_python_and_in_kernels_do_the_same(kick):
     in_python = vp.simulate(
         vp.Scene(robot, noise=custom), *start, dt=1e-3, steps=40, increments=dw, integrator=integrator
     )
-    in_kernel = vp.simulate(
+    in_core = vp.simulate(
         vp.Scene(robot, noise=both),
         *start,
         dt=1e-3,
@@ -358,8 +358,8 @@ def test_fields_in_python_and_in_kernels_do_the_same(kick):
         increments=np.concatenate([dw, dw], axis=1),
         integrator=integrator,
     )
-    np.testing.assert_allclose(in_python.q, in_kernel.q, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(in_python.p, in_kernel.p, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(in_python.q, in_core.q, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(in_python.p, in_core.p, rtol=0, atol=1e-12)
 
 
 def test_an_ensemble_is_its_paths():
@@ -372,7 +372,7 @@ def test_an_ensemble_is_its_paths():
 
 
 def test_a_function_and_an_array_of_controls_do_the_same():
-    """Step by step through Python or in one kernel: the past is carried from call to call."""
+    """Step by step through Python or in one call of the core: the past is carried from call to call."""
     scene = vp.Scene(vp.load_robot("finger"), gravity=False, damping=1e-5)
     u = np.random.default_rng(0).normal(size=(50, 3)) * 1e-5
     start, integrator = (np.zeros(3), np.ones(3)), vp.Gauss(3)

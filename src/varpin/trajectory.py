@@ -117,6 +117,7 @@ class Trajectory(Frozen):
 
     def __post_init__(self) -> None:
         nodes, n = np.size(self.t), len(self.joint_names)
+        # Whoever reads a record relies on its shapes.
         for name, lead in {"t": nodes, "energy": nodes, "q": nodes, "v": nodes, "p": nodes}.items():
             self._require(name, (lead, n) if name in "qvp" else (lead,))
         for name in ("u", "dw"):

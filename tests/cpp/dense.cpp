@@ -1,10 +1,10 @@
 // One block of a matrix is factored and solved, whatever stands around it: NaN here.
+#include "varpin/dense.hpp"
+
 #include <cmath>
 #include <cstdio>
 #include <limits>
 #include <vector>
-
-#include "varpin/dense.hpp"
 
 namespace {
 

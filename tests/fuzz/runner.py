@@ -52,7 +52,7 @@ def work(kind: str, seed: int, begin: int, end: int) -> None:
     own, report = module(kind), os.fdopen(os.dup(1), "w", buffering=1)
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         corpus = own.corpus()
-        # What varpin, Pinocchio and compiled kernels take themselves is no part of an input's memory.
+        # What varpin, Pinocchio and the core take themselves is no part of an input's memory.
         whole = own.whole(corpus)
         own.read(whole.write(Path(folder)), whole.form)
         _empty(Path(folder))
@@ -181,7 +181,7 @@ def _watched(kind: str, seed: int, begin: int, end: int) -> Iterator[str | None]
         os.set_blocking(worker.stdout.fileno(), False)
         waiting, rest = selectors.DefaultSelector(), b""
         waiting.register(worker.stdout, selectors.EVENT_READ)
-        patience = 40.0  # in units of TIMEOUT, until kernels are there
+        patience = 40.0  # in units of TIMEOUT, until everything is imported
         used, silent = 0.0, time.monotonic()
         while True:
             if not waiting.select(1.0):

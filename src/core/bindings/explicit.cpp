@@ -31,7 +31,8 @@ struct BoundDynamics {
 
 struct BoundRollout {
     BoundRollout(SharedMechanism of, ExplicitMethod method, const In<2>& q, const In<2>& v)
-        : mechanism(std::move(of)), own(*mechanism, method, static_cast<int>(q.shape(0)), q.data(), v.data()) {}
+        : mechanism(std::move(of)),
+          own(*mechanism, method, static_cast<std::int64_t>(q.shape(0)), q.data(), v.data()) {}
 
     SharedMechanism mechanism;
     ExplicitRollout own;

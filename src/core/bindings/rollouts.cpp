@@ -35,6 +35,7 @@ Tableau tableau_of(In<2> a, In<2> gradient, In<2> force, In<1> b, In<1> c, In<2>
 }
 
 Guards guards_of(bool active, double branch_margin, double energy_balance, double energy_budget, int most_halvings) {
+    if (most_halvings < 0 || most_halvings > 62) throw std::invalid_argument("halvings are from 0 to 62");
     return {active, branch_margin, energy_balance, energy_budget, most_halvings};
 }
 

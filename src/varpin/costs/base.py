@@ -194,7 +194,7 @@ class BoundSum(BoundCost):
         hessian = np.zeros((1, self.points.size, self.points.size))
         for part in self.parts:
             own = part.expand(q, v, u)
-            # Kernels check no shapes, and a cost of one's own may be anything.
+            # A cost of one's own may be anything, and NumPy would broadcast it.
             (N, size), found = gradient.shape, (np.shape(own.gradient), np.shape(own.hessian))
             if found not in [((N, size), (rows, size, size)) for rows in (1, N)]:
                 raise CostError(

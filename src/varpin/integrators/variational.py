@@ -186,28 +186,38 @@ class Variational(Integrator):
 
         A step that was taken in parts is taken in parts again, and their derivatives are chained.
         """
-        Jx, Jf, outcome, done = variational_derivatives(*self._steps(scene, trajectory))
+        Jx, Jf, outcome, done = variational_derivatives(**self._steps(scene, trajectory))
         if outcome in REASONS:
             raise LinearizationError(done, done * trajectory.dt, REASONS[outcome])
         return Jx, Jf, Jx[:, :, scene.robot.dof :]
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
         """See :meth:`Integrator.contract`; steps that were taken in parts are chained as in :meth:`linearize`."""
-        H, outcome, done = variational_curvatures(*self._steps(scene, trajectory), z=np.ascontiguousarray(z))
+        H, outcome, done = variational_curvatures(**self._steps(scene, trajectory), z=np.ascontiguousarray(z))
         if outcome in REASONS:
             raise LinearizationError(done, done * trajectory.dt, REASONS[outcome])
         return H
 
-    def _steps(self, scene: Scene, trajectory: Trajectory) -> tuple[Any, ...]:
-        """What the core takes the derivatives of every step at dw = 0 from."""
-        q, p = (np.ascontiguousarray(getattr(trajectory, name)[:-1]) for name in ("q", "p"))
+    def _steps(self, scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
+        """What the core takes the derivatives of every step at dw = 0 from, by the names of its arguments."""
         force = trajectory.u @ scene.actuation.T
         if scene.noise.velocity_dependent:
             force = force + self.drift_share * drifts(scene, trajectory)
-        guess = np.ascontiguousarray(self._guess(trajectory))
-        substeps = np.ascontiguousarray(trajectory.statistics.substeps)
-        map_of = scene.core, self._tableau(), float(self.tolerance), self._guards()
-        return *map_of, float(trajectory.dt), q, p, guess, np.ascontiguousarray(force), substeps
+        arrays = {
+            "q": trajectory.q[:-1],
+            "p": trajectory.p[:-1],
+            "guess": self._guess(trajectory),
+            "force": force,
+            "substeps": trajectory.statistics.substeps,
+        }
+        return {
+            "mechanism": scene.core,
+            "tableau": self._tableau(),
+            "tolerance": float(self.tolerance),
+            "guards": self._guards(),
+            "dt": float(trajectory.dt),
+            **{name: np.ascontiguousarray(array) for name, array in arrays.items()},
+        }
 
     def _guess(self, trajectory: Trajectory) -> Floats:
         """Stage velocities (N, s, n) next to the roots of every step at dw = 0: of the cubic through both nodes.

@@ -402,8 +402,7 @@ class Collocation {
         for (int k = 0; k < size; ++k) {
             double* to = line(k);
             for (int kind = 0; kind < 3; ++kind)
-                std::copy(&columns[(k * 3 + kind) * width], &columns[(k * 3 + kind + 1) * width],
-                          to + kind * n + block.begin);
+                std::copy_n(&columns[(k * 3 + kind) * width], width, to + kind * n + block.begin);
         }
     }
 

@@ -177,7 +177,8 @@ class ExplicitStepper {
 // P paths on their way, each from its own state.
 class ExplicitRollout {
   public:
-    ExplicitRollout(const Mechanism& mechanism, ExplicitMethod method, int paths, const double* q0, const double* v0)
+    ExplicitRollout(const Mechanism& mechanism, ExplicitMethod method, std::int64_t paths, const double* q0,
+                    const double* v0)
         : q(q0, q0 + paths * mechanism.dof()),
           v(v0, v0 + paths * mechanism.dof()),
           mechanism_(&mechanism),
@@ -187,17 +188,17 @@ class ExplicitRollout {
           stepper_(mechanism, method, false),
           force_(mechanism.dof()),
           jump_(mechanism.dof()) {
-        for (int i = 0; i < paths; ++i) diffusion_centers(mechanism, q0 + i * mechanism.dof(), center(i));
+        for (std::int64_t i = 0; i < paths; ++i) diffusion_centers(mechanism, q0 + i * mechanism.dof(), center(i));
     }
 
     std::vector<double> q, v;  // (P, n) where the paths stand
 
-    int paths() const { return paths_; }
+    std::int64_t paths() const { return paths_; }
     int dof() const { return mechanism_->dof(); }
 
     // The node that each path starts at; false where a mass matrix is not positive definite.
     bool first_nodes(const Nodes& nodes) {
-        for (int i = 0; i < paths_; ++i) {
+        for (std::int64_t i = 0; i < paths_; ++i) {
             load(i);
             if (enter_node(nodes, i, 0) == Outcome::singular) return false;
             nodes.done[i] = 1;
@@ -208,13 +209,12 @@ class ExplicitRollout {
     // All steps, each of length h. Increments (P, N, k) and a drift (P, N, n) on top of the controls' force are null
     // for none.
     void roll(double h, const Commands& commands, const double* increments, const double* drift, const Nodes& nodes) {
-        const auto steps = static_cast<int>(nodes.steps);
-        for (int i = 0; i < paths_; ++i) {
+        for (std::int64_t i = 0; i < paths_; ++i) {
             load(i);
             nodes.done[i] = 0;
             Outcome outcome = Outcome::solved;
             bool regular = at_state();
-            for (int s = 0; s < steps && outcome == Outcome::solved; ++s) {
+            for (std::int64_t s = 0; s < nodes.steps && outcome == Outcome::solved; ++s) {
                 const std::int64_t row = i * nodes.steps + s;
                 const double* dw = increments ? increments + row * mechanism_->diffusion.processes : nullptr;
                 outcome = step(h, commands, dw, drift ? drift + row * dof() : nullptr, regular, nodes, i, s);
@@ -226,13 +226,13 @@ class ExplicitRollout {
     }
 
   private:
-    double* center(int path) { return center_.data() + path * dof() * mechanism_->diffusion.processes; }
+    double* center(std::int64_t path) { return center_.data() + path * dof() * mechanism_->diffusion.processes; }
 
-    void load(int path) {
+    void load(std::int64_t path) {
         std::copy_n(q.data() + path * dof(), dof(), stepper_.q.data());
         std::copy_n(v.data() + path * dof(), dof(), stepper_.v.data());
     }
-    void store(int path) {
+    void store(std::int64_t path) {
         std::copy_n(stepper_.q.data(), dof(), q.data() + path * dof());
         std::copy_n(stepper_.v.data(), dof(), v.data() + path * dof());
     }
@@ -241,7 +241,7 @@ class ExplicitRollout {
 
     // One step of a path, with its node; the dynamics are at its state before and after.
     Outcome step(double h, const Commands& commands, const double* dw, const double* drift, bool regular,
-                 const Nodes& nodes, int path, int s) {
+                 const Nodes& nodes, std::int64_t path, std::int64_t s) {
         const int n = dof(), m = mechanism_->controls;
         std::vector<double>& at_q = stepper_.q;
         std::vector<double>& at_v = stepper_.v;
@@ -270,7 +270,7 @@ class ExplicitRollout {
     }
 
     // Enter the state as node s of a path; the dynamics are at it then.
-    Outcome enter_node(const Nodes& nodes, int path, int s) {
+    Outcome enter_node(const Nodes& nodes, std::int64_t path, std::int64_t s) {
         const std::int64_t row = path * nodes.steps + s;
         const bool regular = at_state();
         std::copy_n(stepper_.q.data(), dof(), nodes.q + row * dof());
@@ -282,7 +282,7 @@ class ExplicitRollout {
 
     const Mechanism* mechanism_;
     ExplicitMethod method_;
-    int paths_;
+    std::int64_t paths_;
     std::vector<double> center_;  // (P, n, k) of the diffusion fields
     ExplicitStepper stepper_;
     std::vector<double> force_, jump_;

@@ -135,7 +135,7 @@ class EnergyGuard {
         mass_matrix(mechanism, q, jet);
         for (const Block& block : mechanism.tree.blocks) {
             for (int i = block.begin; i < block.end; ++i)
-                std::copy(&jet.M[i * n + block.begin], &jet.M[i * n + i + 1], &ldl[i * n + block.begin]);
+                std::copy(&jet.M[i * n + block.begin], &jet.M[i * n + i] + 1, &ldl[i * n + block.begin]);
             if (!factor_ldl(ldl.data(), n, block)) return false;
         }
         velocity(p, v);

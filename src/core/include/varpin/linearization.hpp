@@ -1,5 +1,5 @@
 // Derivatives of the steps of a trajectory, first and second. docs/mathematics.md, "Structured linearization" and
-// "Second order".
+// "Second derivatives".
 //
 // For z = (zq, zp) the step equation is joined to phi = zq . q1 + zp . p1 with multipliers lam_i that make the sum
 // stationary in V: N' lam = dphi/dV. What is not linear in (q0, p0, f, V) there is
@@ -52,7 +52,7 @@ class VariationalLinearization {
         const Outcome outcome = parts(h, q, p, force, substeps);
         if (outcome != Outcome::solved) return outcome;
         identity(Jx, Jf);
-        for (const Part& part : trail) {
+        for (const Substep& part : trail) {
             const Outcome again = root_of(part);
             if (again != Outcome::solved) return again;
             stepper.step_equation.derivatives(part.length, dV, link.data(), link_f.data());
@@ -80,7 +80,7 @@ class VariationalLinearization {
         std::vector<double> Jx(4 * n * n), Jf(2 * n * n), back(z, z + 2 * n), before(2 * n);
         identity(Jx.data(), Jf.data());
         join(Jx, Jf, starts[0]);
-        for (const Part& part : trail) {
+        for (const Substep& part : trail) {
             const Outcome again = root_of(part);
             if (again != Outcome::solved) return again;
             stepper.step_equation.derivatives(part.length, dV, link.data(), link_f.data());
@@ -110,7 +110,7 @@ class VariationalLinearization {
     int n;
     int stages;
     PathState state;
-    std::vector<Part> trail;
+    std::vector<Substep> trail;
     std::vector<double> dV;  // (s, n, 3n)
     std::vector<double> dQ;  // (n, 3n) of one stage
     std::vector<double> link, link_f, product;
@@ -131,7 +131,7 @@ class VariationalLinearization {
                                            stepper.effort);
     }
 
-    Outcome root_of(const Part& part) {
+    Outcome root_of(const Substep& part) {
         std::copy(part.V.begin(), part.V.end(), stepper.step_equation.V.begin());
         return stepper.step_equation.solve(part.length, {part.place.data(), part.p.data(), stepper.force.data()}, loose,
                                            true, stepper.effort);
@@ -181,8 +181,8 @@ class VariationalLinearization {
 
     void join(const std::vector<double>& Jx, const std::vector<double>& Jf, std::vector<double>& both) const {
         for (int r = 0; r < 2 * n; ++r) {
-            std::copy(&Jx[r * 2 * n], &Jx[(r + 1) * 2 * n], &both[r * 3 * n]);
-            std::copy(&Jf[r * n], &Jf[(r + 1) * n], &both[r * 3 * n + 2 * n]);
+            std::copy_n(&Jx[r * 2 * n], 2 * n, &both[r * 3 * n]);
+            std::copy_n(&Jf[r * n], n, &both[r * 3 * n + 2 * n]);
         }
     }
 

@@ -4,6 +4,7 @@
 #pragma once
 
 #include <cmath>
+#include <cstddef>
 
 #include "varpin/tree.hpp"
 
@@ -23,8 +24,8 @@ struct Commands {
 };
 
 // Controls of step s of a path into row s of u (N, m). Beyond a limit a control is that limit.
-inline void apply_policy(const Commands& commands, int path, int s, int n, const double* first, const double* second,
-                         double* u) {
+inline void apply_policy(const Commands& commands, std::ptrdiff_t path, std::ptrdiff_t s, int n, const double* first,
+                         const double* second, double* u) {
     const int m = commands.controls;
     double* own = u + s * m;
     const double* last = s > 0 ? own - m : commands.before ? commands.before + path * m : nullptr;
@@ -32,7 +33,7 @@ inline void apply_policy(const Commands& commands, int path, int s, int n, const
         for (int c = 0; c < m; ++c) own[c] = last[c];
         return;
     }
-    const int r = s / commands.hold;
+    const std::ptrdiff_t r = s / commands.hold;
     for (int c = 0; c < m; ++c) {
         double total = commands.u[r * m + c];
         if (commands.gains) {

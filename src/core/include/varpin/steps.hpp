@@ -10,9 +10,9 @@ namespace varpin {
 // A sample of the running cost in a step. Its q and v are sums of those of the nodes before (0) and after (1) the step.
 struct Sample {
     struct Sum {
-        double q0, v0, q1, v1;
+        double q0 = 0.0, v0 = 0.0, q1 = 0.0, v1 = 0.0;
     };
-    double weight;
+    double weight = 1.0;
     Sum q, v;
 };
 

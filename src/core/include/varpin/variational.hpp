@@ -44,7 +44,7 @@ struct PathState {
 };
 
 // A part of a step, to be differentiated later.
-struct Part {
+struct Substep {
     std::vector<Place> place;
     std::vector<Compensated> p;
     std::vector<double> V;  // (s, n) at its root
@@ -79,9 +79,9 @@ class VariationalStepper {
     Collocation step_equation;
     EnergyGuard energy_guard;
     int n;
-    std::vector<double> force;           // (n) constant over the step
-    Effort effort;                       // of the last step
-    std::vector<Part>* trail = nullptr;  // where the parts of steps are noted down, if anybody asks
+    std::vector<double> force;              // (n) constant over the step
+    Effort effort;                          // of the last step
+    std::vector<Substep>* trail = nullptr;  // where the parts of steps are noted down, if anybody asks
 
     // Put a path at (q, p), with nothing known of the past; false where M(q) is not positive definite.
     bool begin_at(const double* q, const double* p, PathState& state) {
@@ -181,8 +181,7 @@ class VariationalStepper {
             for (std::int64_t s = 0; s < steps; ++s) {
                 const std::int64_t row = path * steps + s;
                 const double* dw = noisy ? increments + row * k : nullptr;
-                apply_policy(commands, static_cast<int>(path), static_cast<int>(s), n, state.q.data(),
-                             state.momentum.data(), u);
+                apply_policy(commands, path, s, n, state.q.data(), state.momentum.data(), u);
                 if (noisy) noise_kick(left, u + s * m, dw, state);
                 constant_force(mechanism, drift ? drift + row * n : nullptr, u + s * m, force.data());
                 const Outcome outcome = step(h, state);

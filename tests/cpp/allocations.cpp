@@ -1,0 +1,141 @@
+// Steppers and passes have all their memory once they are made, and linearizations after their first step: a controller
+// may run them at its rate.
+#include <cstdio>
+#include <cstdlib>
+#include <limits>
+#include <new>
+#include <vector>
+
+#include "varpin/backward.hpp"
+#include "varpin/explicit.hpp"
+#include "varpin/linearization.hpp"
+#include "varpin/variational.hpp"
+
+namespace {
+
+int allocations = 0;
+
+constexpr int n = 3, N = 20;
+constexpr double infinity = std::numeric_limits<double>::infinity();
+
+varpin::Mechanism chain() {
+    varpin::Mechanism out;
+    for (int j = 0; j < n; ++j) {
+        out.tree.bodies.push_back({.parent = j - 1,
+                                   .rotation = {{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}},
+                                   .translation = {j > 0 ? 1.0 : 0.0, 0.0, 0.0},
+                                   .mass = 1.0,
+                                   .center = {0.5, 0.0, 0.0},
+                                   .inertia = {0.01, 0.0, 0.1, 0.0, 0.0, 0.1},
+                                   .coordinate = j,
+                                   .origin = j == 0});
+    }
+    out.tree.armature = out.damping = out.stiffness = out.rest = std::vector<double>(n);
+    out.tree.periodic.assign(n, 0);
+    out.tree.group.assign(n, 0);
+    out.tree.groups = 1;
+    out.tree.blocks = {{0, n}};
+    out.gravity = {0.0, -9.81, 0.0};
+    out.controls = n;
+    out.actuation = {1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0};
+    return out;
+}
+
+template <class Run>
+bool without_allocation(const char* what, const Run& run) {
+    const int before = allocations;
+    const bool done = run();
+    if (!done) std::printf("%s: not done\n", what);
+    if (allocations != before) std::printf("%s: %d allocations\n", what, allocations - before);
+    return done && allocations == before;
+}
+
+}  // namespace
+
+void* operator new(std::size_t size) {
+    ++allocations;
+    if (void* memory = std::malloc(size)) return memory;
+    throw std::bad_alloc();
+}
+void operator delete(void* memory) noexcept { std::free(memory); }
+void operator delete(void* memory, std::size_t) noexcept { std::free(memory); }
+
+int main() {
+    const varpin::Mechanism mechanism = chain();
+    const varpin::Tableau midpoint{.stages = 1,
+                                   .a = {0.5},
+                                   .gradient = {0.5},
+                                   .force = {0.5},
+                                   .b = {1.0},
+                                   .c = {0.5},
+                                   .ahead = {-1.0, 2.0},
+                                   .reach = 0.25};
+    const double q0[n] = {0.3, -0.2, 0.1}, v0[n] = {}, h = 0.01;
+    std::vector<double> u(N * n, 0.5), q(N * n), p(N * n), v(N * n), energy(N), applied(N * n), quality(3 * N);
+    std::vector<double> least(n, -infinity), greatest(n, infinity);
+    std::vector<std::int64_t> tally(4 * N);
+    std::int64_t ended = 0, done = 0;
+    const varpin::Commands commands{
+        .controls = n, .u = u.data(), .width = 2 * n, .least = least.data(), .greatest = greatest.data()};
+    const varpin::Nodes nodes{.paths = 1,
+                              .steps = N,
+                              .q = q.data(),
+                              .p = p.data(),
+                              .v = v.data(),
+                              .energy = energy.data(),
+                              .u = applied.data(),
+                              .tally = tally.data(),
+                              .quality = quality.data(),
+                              .ended = &ended,
+                              .done = &done};
+    bool right = true;
+
+    varpin::ExplicitRollout runge_kutta(mechanism, varpin::ExplicitMethod::runge_kutta, 1, q0, v0);
+    right &= without_allocation("Runge and Kutta", [&] {
+        runge_kutta.roll(h, commands, nullptr, nullptr, nodes);
+        return done == N;
+    });
+
+    varpin::VariationalStepper stepper(mechanism, midpoint, 0.5, {}, 1.0);
+    std::vector<varpin::PathState> paths(1, varpin::PathState(mechanism, midpoint.stages));
+    right &= without_allocation("midpoint steps", [&] {
+        if (!stepper.begin(q0, v0, paths[0])) return false;
+        stepper.roll(h, commands, nullptr, nullptr, paths, nodes);
+        return done == N;
+    });
+
+    varpin::VariationalLinearization linearization(mechanism, midpoint, 0.5, {}, 1.0);
+    std::vector<double> A(N * 4 * n * n), B(N * 2 * n * n);
+    const auto differentiate = [&] {
+        double guess[n];
+        for (int s = 1; s < N; ++s) {
+            for (int i = 0; i < n; ++i) guess[i] = (q[s * n + i] - q[(s - 1) * n + i]) / h;
+            const varpin::Outcome outcome = linearization.first(h, &q[(s - 1) * n], &p[(s - 1) * n], guess, &u[s * n],
+                                                                1, &A[s * 4 * n * n], &B[s * 2 * n * n]);
+            if (outcome != varpin::Outcome::solved) return false;
+        }
+        return true;
+    };
+    right &= differentiate() && without_allocation("their derivatives", differentiate);
+
+    constexpr int x = 2 * n, size = 3 * n;
+    std::vector<double> gradient(N * size, 0.1), hessian(size * size), terminal(x, 1.0), terminal_hessian(x * x);
+    for (int i = 0; i < size; ++i) hessian[i * size + i] = 1.0;
+    for (int i = 0; i < x; ++i) terminal_hessian[i * x + i] = 1.0;
+    std::vector<double> k(N * n), K(N * n * x), slopes(N * n);
+    const varpin::ExpandedSteps steps{.steps = N,
+                                      .dof = n,
+                                      .controls = n,
+                                      .A = A.data(),
+                                      .B = B.data(),
+                                      .rule = {{.q = {.q0 = 1.0}, .v = {.v0 = 1.0}}},
+                                      .gradient = gradient.data(),
+                                      .hessian = hessian.data(),
+                                      .one_hessian = true};
+    varpin::BackwardPass pass(n, n, terminal.data(), terminal_hessian.data());
+    right &= without_allocation("the backward pass", [&] {
+        return pass.run(h, 1, 0.0, steps,
+                        {.feedforward = k.data(), .feedback = K.data(), .control_gradient = slopes.data()}) < 0;
+    });
+    return right ? 0 : 1;
+}

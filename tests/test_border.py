@@ -1,0 +1,189 @@
+"""The core's border to Python: an array that does not fit is refused, whichever it is and along whichever axis.
+
+Below the border nothing is checked. Run on a build with sanitizers, as ``.ci/run`` does, the calls that fit are held
+against reading and writing past an array's end, too.
+"""
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin import core
+from varpin.core.arrays import Commands, Nodes, new_nodes
+from varpin.integrators.tableau import gauss_coefficients, interpolation
+
+N, P = 4, 2
+NOISE = vp.AdditiveNoise(1e-3) + vp.ControlNoise(0.1) + vp.StateNoise(0.1)
+TREE = (
+    "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio", "offset",
+    "origin", "loads", "carried", "periodic", "armature", "group", "groups", "ends",
+)  # fmt: skip
+PLACES = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset")
+GUARDS = {"active": True, "branch_margin": 0.5, "energy_balance": 5e-3, "energy_budget": 0.02, "most_halvings": 12}
+
+
+def draw(*shape):
+    return np.random.default_rng(shape).normal(size=shape)
+
+
+def scene():
+    """Branches, a slider, a mimic joint: a hand's two fingers would do, a gripper on an arm does."""
+    return vp.Scene(vp.load_robot("panda"), damping=0.1, noise=NOISE, actuation=draw(8, 3))
+
+
+def of_mechanism(scene):
+    tree, fields = scene.robot.tree, scene.diffusion
+    return {
+        **{name: getattr(tree, name) for name in TREE},
+        **{name: getattr(scene, name) for name in ("gravity", "damping", "stiffness", "rest", "actuation")},
+        **dict(zip(("constant", "control", "quadratic", "centers"), fields, strict=True)),
+    }
+
+
+def of_tableau():
+    a, b, c = gauss_coefficients(2)
+    ahead = interpolation(np.append(c, 1.0), 1.0 + c)
+    return {"a": a, "gradient": a, "force": a, "b": b, "c": c, "ahead": ahead, "reach": 0.1, "skew": 0.0}
+
+
+def of_roll(scene, feedback):
+    n, m, k = scene.robot.dof, scene.controls, scene.processes
+    width = {"none": 2 * n, "state": 2 * n, "state and control": 2 * n + m}[feedback]
+    rows = 0 if feedback == "none" else N // 2
+    limits = np.array([[-1.0] * m, [1.0] * m])
+    commands = Commands(draw(N // 2, m), draw(rows, m, width), draw(rows, width), 2, limits, draw(P, m))
+    nodes = new_nodes(P, N, n, m)
+    return {
+        **{f"commands.{name}": value for name, value in commands._asdict().items()},
+        **{f"nodes.{name}": value for name, value in nodes._asdict().items()},
+        "dt": 1e-3,
+        "increments": 1e-2 * draw(P, N, k),
+        "drift": draw(P, N, n),
+    }
+
+
+def roll(rollout):
+    def call(dt, increments, drift, **parts):
+        commands, nodes = (
+            kind(**{name: parts[f"{prefix}.{name}"] for name in kind._fields})
+            for kind, prefix in ((Commands, "commands"), (Nodes, "nodes"))
+        )
+        path = rollout.copy() if isinstance(rollout, core.ExplicitRollout) else rollout.fork()
+        path.roll(dt, commands, increments, drift, nodes)
+        assert (nodes.done == N).all()
+        assert np.isfinite(nodes.q).all()
+
+    return call
+
+
+def variational(scene):
+    tableau, guards = core.Tableau.make(**of_tableau()), core.Guards.make(**GUARDS)
+    return core.VariationalRollout(scene.core, tableau, 0.5, guards, 0.5, P)
+
+
+def explicit(scene, method):
+    n = scene.robot.dof
+    return core.ExplicitRollout.start(scene.core, method, draw(P, n), draw(P, n))
+
+
+def begun(scene):
+    rollout, n = variational(scene), scene.robot.dof
+    assert rollout.begin(draw(P, n), draw(P, n))
+    return rollout
+
+
+def steps(scene):
+    n = scene.robot.dof
+    return {
+        "mechanism": scene.core,
+        "tableau": core.Tableau.make(**of_tableau()),
+        "tolerance": 0.5,
+        "guards": core.Guards.make(**GUARDS),
+        "dt": 1e-3,
+        **{"q": draw(N, n), "p": 0.1 * draw(N, n), "guess": np.zeros((N, 2, n)), "force": draw(N, n)},
+        "substeps": np.array([1, 1, 2, 4]),
+    }
+
+
+def calls():
+    """By name, what is called and arguments that fit."""
+    own = scene()
+    n, m = own.robot.dof, own.controls
+    state, states = {"q": draw(n), "v": draw(n)}, {"q": draw(N, n), "v": draw(N, n)}
+    tree = own.robot.tree
+    links = {name: getattr(tree, name) for name in PLACES} | {"dof": n}
+    made = core.Links.make(**links)
+    many = {**states, "force": draw(N, n)}
+    dynamics = core.ForwardDynamics(own.core)
+    rotations = np.array([np.linalg.qr(matrix)[0] for matrix in draw(N, 3, 3)])
+    rotations *= np.linalg.det(rotations)[:, None, None]
+    yield "mechanism", core.Mechanism.make, of_mechanism(own)
+    yield "jet", own.core.jet, state
+    yield "jets", own.core.jets, states
+    yield "jets along", own.core.jets_along, {**states, "alpha": draw(N, n), "beta": draw(N, n)}
+    yield "tableau", core.Tableau.make, of_tableau()
+    yield "begin", variational(own).begin, {"q": draw(P, n), "v": draw(P, n)}
+    yield "kick", begun(own).kick, {"impulse": draw(P, n)}
+    for feedback in ("none", "state", "state and control"):
+        yield f"roll, feedback of {feedback}", roll(begun(own)), of_roll(own, feedback)
+        for method in core.ExplicitMethod:
+            yield f"{method}, feedback of {feedback}", roll(explicit(own, method)), of_roll(own, feedback)
+    yield "derivatives", core.variational_derivatives, steps(own)
+    yield "curvatures", core.variational_curvatures, {**steps(own), "z": draw(N, 2 * n)}
+    yield "accelerations", core.accelerations, {"mechanism": own.core, **many}
+    for method in core.ExplicitMethod:
+        fixed = {"mechanism": own.core, "method": method, "dt": 1e-3}
+        yield f"derivatives of {method}", core.linearize_explicit, {**fixed, **many}
+    yield "rate", dynamics.rate, {"x": draw(2 * n), "force": draw(n)}
+    yield "node", dynamics.node, {"x": draw(2 * n)}
+    yield "links", core.Links.make, links
+    yield "place", made.place, {"q": draw(N, n)}
+    frame = {"turned": np.eye(3), "shifted": draw(3), "q": draw(N, n), "jacobian": True}
+    yield "place a frame", made.place_frame, frame
+    yield "logarithms", core.rotation_logarithms, {"target": rotations[:2], "R": rotations, "derivative": True}
+    box = {"H": np.eye(m), "g": draw(m), "limits": np.array([[-0.1] * m, [0.1] * m]), "guess": np.zeros(m)}
+    yield "box", core.box_minimum, box
+
+
+# Sizes that are the caller's to choose: rows of what is done one by one, targets that repeat.
+FREE = {("place", "q", 0), ("place a frame", "q", 0), ("logarithms", "target", 0), ("logarithms", "R", 0)}
+
+
+@pytest.fixture(scope="module")
+def every():
+    return list(calls())
+
+
+def test_what_fits_is_taken(every):
+    for _, call, arguments in every:
+        call(**arguments)
+
+
+def sized_otherwise(name, arguments, change):
+    """Arguments of which one array is larger or smaller along one axis; what is left out, or free, is as it is."""
+    for argument, value in arguments.items():
+        if not isinstance(value, np.ndarray) or value.size == 0:
+            continue
+        for axis in range(value.ndim):
+            shape = [size + change * (i == axis) for i, size in enumerate(value.shape)]
+            if (name, argument, axis) not in FREE:
+                yield f"{name}: {argument} of shape {shape}", {**arguments, argument: np.resize(value, shape)}
+
+
+@pytest.mark.parametrize("change", [-1, 1])
+def test_what_does_not_fit_is_refused(every, change):
+    taken = []
+    for name, call, fitting in every:
+        for what, arguments in sized_otherwise(name, fitting, change):
+            try:
+                call(**arguments)
+            except ValueError:
+                continue
+            taken.append(what)
+    assert taken == []
+
+
+@pytest.mark.parametrize("halvings", [-1, 63])
+def test_halvings_that_cannot_be_counted_are_refused(halvings):
+    with pytest.raises(ValueError, match="halvings are from 0 to 62"):
+        core.Guards.make(**{**GUARDS, "most_halvings": halvings})
