@@ -279,7 +279,7 @@ def test_no_silent_energy_jump_at_coarse_steps(stages, duration):
 
 def test_without_the_guards_there_are_silent_jumps():
     """What the guards are for: without them the same run jumps to other branches of solutions."""
-    unguarded = vp.Gauss(2, guard=None)
+    unguarded = vp.Gauss(2, vp.Guard(branch_margin=0.0, energy_balance=1e12, energy_budget=1e12))
     scene = vp.Scene(vp.planar_chain(3))
     try:
         motion = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=0.1, steps=2000, integrator=unguarded)

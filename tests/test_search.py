@@ -284,7 +284,7 @@ def test_trials_that_are_cut_to_pieces_are_given_up(monkeypatch):
     problem = tool_reach()
     sol, parts = work(monkeypatch, problem, max_iterations=12)
     with monkeypatch.context() as patch:
-        patch.setattr(search, "_HALVINGS", problem.integrator.max_halvings)
+        patch.setattr(search, "_HALVINGS", problem.integrator.guard.max_halvings)
         patch.setattr(search, "_PARTS", np.inf)
         unbounded, all_parts = work(monkeypatch, problem, max_iterations=12)
     assert parts < 0.4 * all_parts

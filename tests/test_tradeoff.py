@@ -6,7 +6,6 @@ import logging
 import math
 import subprocess
 import sys
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -558,13 +557,3 @@ def test_advice_on_a_random_set(script):
     assert len(verdicts) > 50
     assert np.mean([verdict.met for verdict in verdicts]) >= 0.95
     assert np.mean([verdict.ratio <= 2.0 for verdict in verdicts]) >= 0.8
-
-
-def test_advice_counts_no_compilation_in_its_time(monkeypatch):
-    scene = vp.Scene(vp.planar_chain(1))
-    wish = {"duration": 0.1, "tolerance": 1e-3, "integrators": [vp.RungeKutta4()]}
-    vp.advise(scene, [0.3], [0.0], **wish)
-    monkeypatch.setattr(Setting, "warm_up", lambda *_: time.sleep(1.0))
-    begin = time.perf_counter()
-    advice = vp.advise(scene, [0.3], [0.0], **wish)
-    assert advice.calibration < time.perf_counter() - begin - 1.0

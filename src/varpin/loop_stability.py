@@ -159,6 +159,8 @@ def _flipping(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding,
         return ()
     period, v, u = hold * trajectory.dt, trajectory.v[::hold], trajectory.u[::hold]
     advice = f"the law is too fast for its period of {period:g} s; take a shorter period or lower gains"
+    if not len(u):
+        return ()
     found = alternation(v)
     if found is not None:
         size = np.abs(np.diff(v[found.first : found.first + found.changes + 3, found.joint], n=2))

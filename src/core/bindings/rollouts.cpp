@@ -45,9 +45,14 @@ class VariationalRollout {
     VariationalRollout(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
                        double left, std::size_t paths, Solver solver)
         : stepper_(std::make_shared<VariationalStepper>(mechanism, tableau, tolerance, guards, left, solver)),
+          guards_(guards),
           states_(paths, PathState(mechanism, tableau.stages)) {}
 
-    VariationalRollout fork() const { return *this; }
+    VariationalRollout fork(const Guards& guards) const {
+        VariationalRollout copy = *this;
+        copy.guards_ = guards;
+        return copy;
+    }
 
     // Put each path at its row of q and v (P, n); false where an M(q) is not positive definite.
     bool begin(In<2> q, In<2> v) {
@@ -72,6 +77,7 @@ class VariationalRollout {
         const double* dw = increments_of(mechanism, increments, written);
         const double* extra = drift_of(mechanism, drift, written);
         nb::gil_scoped_release release;
+        stepper_->guards = guards_;
         stepper_->roll(h, given_commands.view(), dw, extra, states_, written.view());
     }
 
@@ -101,6 +107,7 @@ class VariationalRollout {
 
   private:
     std::shared_ptr<VariationalStepper> stepper_;
+    Guards guards_;
     std::vector<PathState> states_;
 
     std::size_t size() const { return static_cast<std::size_t>(stepper_->n); }
@@ -185,7 +192,7 @@ void register_rollouts(nb::module_& m) {
         .def(nb::init<const Mechanism&, const Tableau&, double, const Guards&, double, std::size_t, Solver>(),
              "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "left"_a, "paths"_a, "solver"_a = Solver::automatic,
              nb::keep_alive<1, 2>())
-        .def("fork", &VariationalRollout::fork, nb::keep_alive<0, 1>())
+        .def("fork", &VariationalRollout::fork, "guards"_a, nb::keep_alive<0, 1>())
         .def("begin", &VariationalRollout::begin, "q"_a, "v"_a)
         .def("roll", &VariationalRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a)
         .def("kick", &VariationalRollout::kick, "impulse"_a)

@@ -101,7 +101,7 @@ class VariationalRollout:
         paths: int,
         solver: Solver = Solver.automatic,
     ) -> None: ...
-    def fork(self) -> VariationalRollout:
+    def fork(self, guards: Guards) -> VariationalRollout:
         """The paths as they stand, to move on by themselves; work arrays are shared, so one moves at a time."""
 
     def begin(self, q: Floats, v: Floats) -> bool:

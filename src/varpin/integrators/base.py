@@ -113,7 +113,7 @@ class Integrator(ABC):
 
     @abstractmethod
     def fork(self, state: Any) -> Any:
-        """A copy of a state, which moves on by itself; work arrays are shared."""
+        """A copy of a state, which moves on by itself under this integrator's guard; work arrays are shared."""
 
     def rollout(self, scene: Scene, state: Any, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
         """The steps of length ``dt`` [s] that the commands are for; ``state`` moves along.

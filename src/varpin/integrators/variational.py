@@ -85,7 +85,8 @@ class Guard:
             raise InputError(f"max_halvings must be at most 30, got {self.max_halvings}")
 
     def __repr__(self) -> str:
-        return written(self)
+        text = written(self)
+        return text if text.endswith(")") else f"{text}()"
 
 
 class Variational(Integrator):
@@ -143,7 +144,7 @@ class Variational(Integrator):
 
     def fork(self, state: VariationalRun) -> VariationalRun:
         """See :meth:`Integrator.fork`."""
-        return replace(state, paths=state.paths.fork())
+        return replace(state, paths=state.paths.fork(self._guards()))
 
     def rollout_compiled(
         self,
