@@ -220,21 +220,23 @@ class ArticulatedBodies {
     ArticulatedBodies(const ArticulatedBodies&) = delete;
     ArticulatedBodies& operator=(const ArticulatedBodies&) = delete;
 
-    // What coordinate moves body j how, and the body's inertia by itself.
-    void place(int j, const Motion<double>& axis, const Inertia<double>& inertia) {
-        detail::write(axis, body_[j].axis);
-        body_[j].inertia = inertia;
-    }
-
-    // False at a pivot that is not positive.
-    bool factor() {
+    // Take M at q, with a jet that potential energies stay in; false at a pivot that is not positive.
+    bool at(const Mechanism& mechanism, const double* q, Jet<double>& jet) {
+        const auto enter = [&](int j) { place(j, tree_->bodies[j].ratio * jet.body[j].axis, jet.body[j].inertia); };
+        inertias(mechanism, q, jet, enter, [](int) {});
         for (int j = tree_->size() - 1; j >= 0; --j) {
             if (!eliminate(j)) return false;
         }
         return true;
     }
 
-    // One body after another, from the last to the first.
+    // What coordinate moves body j how, and the body's inertia by itself.
+    void place(int j, const Motion<double>& axis, const Inertia<double>& inertia) {
+        detail::write(axis, body_[j].axis);
+        body_[j].inertia = inertia;
+    }
+
+    // One body after another, from the last to the first; false at a pivot that is not positive.
     bool eliminate(int j) {
         const Body& link = tree_->bodies[j];
         State& own = body_[j];
