@@ -6,7 +6,7 @@ import pytest
 from mechanisms import random_inertia, random_rotation, random_tree
 
 import varpin as vp
-from varpin.core import Elimination, Solver, VariationalRollout, variational_derivatives
+from varpin.core import Elimination, ForwardDynamics, Solver, VariationalRollout, variational_derivatives
 from varpin.core.arrays import new_nodes
 from varpin.integrators.base import open_loop
 
@@ -161,7 +161,7 @@ def rolled(scene, q, v, dt, steps, solver, integrator):
 def test_motions_are_those_with_matrices(robot, alpha):
     scene, (q, v) = scene_of(robot), state_of(robot)
     # What the energy guard allows depends on whose the kinetic energy is said to be, which differs; so it allows all.
-    integrator = vp.Midpoint(alpha=alpha, energy_balance=1.0, energy_budget=1.0)
+    integrator = vp.Midpoint(alpha=alpha, guard=vp.Guard(energy_balance=1.0, energy_budget=1.0))
     dense, eliminated = (
         rolled(scene, q, 0.2 * v, 1e-3, 20, solver, integrator) for solver in (Solver.dense, Solver.elimination)
     )
@@ -186,6 +186,22 @@ def test_derivatives_are_those_with_matrices(robot):
     assert done == also == [0, 1]
     for A, B in ((Ax, Bx), (Af, Bf)):
         assert np.abs(A - B).max() <= 1e-8 * np.abs(A).max()
+
+
+def test_accelerations_are_pinocchios(robot):
+    scene, (q, v) = vp.Scene(robot), state_of(robot)
+    force = np.random.default_rng(6).normal(size=robot.dof)
+    dynamics = ForwardDynamics(scene.core, Solver.elimination)
+    rate, regular = dynamics.rate(np.r_[q, v], force)
+    assert regular
+    data, at, rates = robot.free_model.createData(), robot.free_positions(q), robot.free_velocities(v)
+    M = vp.lagrangian_jet(scene, q, v, backend="pinocchio").Lvv
+    bias = pin.nonLinearEffects(robot.free_model, data, at, rates)
+    assert np.array_equal(rate[: robot.dof], v)
+    assert solved_like(rate[robot.dof :], M, force - bias, eps=1e-11)
+    momentum, energy, _ = dynamics.node(np.r_[q, v])
+    assert np.abs(momentum - M @ v).max() <= 1e-12 * (np.abs(M) @ np.abs(v)).max()
+    assert energy == pytest.approx(ForwardDynamics(scene.core, Solver.dense).node(np.r_[q, v])[1], rel=1e-12)
 
 
 @pytest.mark.parametrize("distance", [0.0, 1e3, 1e6])

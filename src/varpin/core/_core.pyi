@@ -70,7 +70,7 @@ class Elimination:
 
     def __init__(self, mechanism: Mechanism, q: Floats, v: Floats) -> None: ...
     def step(self, ahead: float, behind: float, diagonal: Floats, b: Floats) -> tuple[Floats, Floats, float, bool]:
-        """x with N x = b, (A' + ahead L_qq) x, x' M x, and whether all pivots of N are positive.
+        """X with N x = b, (A' + ahead L_qq) x, x' M x, and whether all pivots of N are positive.
 
         N = M + ahead A - behind A' - ahead behind L_qq + diag(diagonal - armature + ahead behind stiffness), springs
         being part of L_qq.
@@ -311,7 +311,7 @@ class Outcome(IntEnum):
 class ForwardDynamics:
     """Forward dynamics at one state after another."""
 
-    def __init__(self, mechanism: Mechanism) -> None: ...
+    def __init__(self, mechanism: Mechanism, solver: Solver = Solver.automatic) -> None: ...
     def rate(self, x: Floats, force: Floats) -> tuple[Floats, bool]:
         """The rate (v, a) of x = (q, v) (2n,) under a force (n,), and whether the mass matrix is positive definite."""
 
