@@ -23,7 +23,7 @@ using SharedMechanism = std::shared_ptr<Mechanism>;
 
 // What works on a mechanism, and keeps it alive.
 struct BoundDynamics {
-    explicit BoundDynamics(SharedMechanism of) : mechanism(std::move(of)), own(*mechanism) {}
+    BoundDynamics(SharedMechanism of, Solver solver) : mechanism(std::move(of)), own(*mechanism, false, solver) {}
 
     SharedMechanism mechanism;
     ForwardDynamics own;
@@ -88,7 +88,7 @@ std::tuple<Out, Out, Out, Out, std::size_t> accelerations(const Mechanism& mecha
     std::size_t s = 0;
     {
         nb::gil_scoped_release release;
-        ForwardDynamics dynamics(mechanism);
+        ForwardDynamics dynamics(mechanism, true);
         for (; s < rows && dynamics.at(q.data() + s * n, v.data() + s * n); ++s) {
             dynamics.acceleration(force.data() + s * n, a + s * n);
             dynamics.differentiate(v.data() + s * n, a + s * n);
@@ -161,7 +161,7 @@ void register_explicit(nb::module_& m) {
         .value("semi_implicit", ExplicitMethod::semi_implicit)
         .value("runge_kutta", ExplicitMethod::runge_kutta);
     nb::class_<BoundDynamics>(m, "ForwardDynamics")
-        .def(nb::init<SharedMechanism>(), "mechanism"_a)
+        .def(nb::init<SharedMechanism, Solver>(), "mechanism"_a, "solver"_a = Solver::automatic)
         .def("rate", &rate, "x"_a, "force"_a)
         .def("node", &node, "x"_a);
     nb::class_<BoundRollout>(m, "ExplicitRollout")

@@ -7,7 +7,6 @@
 #include "arrays.hpp"
 #include "bodies.hpp"
 #include "registrations.hpp"
-#include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
 
 namespace varpin::border {
@@ -152,10 +151,6 @@ std::tuple<Out, Out, Out> jets_along(const Mechanism& mechanism, In<2> q, In<2> 
 }  // namespace
 
 void register_mechanism(nb::module_& m) {
-    nb::enum_<Solver>(m, "Solver")
-        .value("automatic", Solver::automatic)
-        .value("dense", Solver::dense)
-        .value("elimination", Solver::elimination);
     nb::class_<Mechanism>(m, "Mechanism")
         .def_static("make", &mechanism_of, nb::kw_only(), "parent"_a, "prismatic"_a, "rotation"_a, "translation"_a,
                     "mass"_a, "center"_a, "inertia"_a, "coordinate"_a, "ratio"_a, "offset"_a, "origin"_a, "loads"_a,

@@ -5,6 +5,7 @@ NB_MODULE(_core, m) {
     m.doc() = "The compiled core.";
     varpin::border::register_mechanism(m);
     varpin::border::register_kinematics(m);
+    varpin::border::register_elimination(m);
     varpin::border::register_explicit(m);
     varpin::border::register_backward(m);
     varpin::border::register_rollouts(m);

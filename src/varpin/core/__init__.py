@@ -1,6 +1,7 @@
 """The compiled core: C++ in ``src/core``, one header an idea, built when the package is."""
 
 from varpin.core._core import BackwardPass as BackwardPass
+from varpin.core._core import Elimination as Elimination
 from varpin.core._core import ExpandedSteps as ExpandedSteps
 from varpin.core._core import ExplicitMethod as ExplicitMethod
 from varpin.core._core import ExplicitRollout as ExplicitRollout

@@ -62,6 +62,29 @@ class Solver(Enum):
     dense = ...
     elimination = ...
 
+class Elimination:
+    """Solves at one (q, v) by elimination from the leaves to the roots; see src/core/include/varpin/elimination.hpp.
+
+    Raises ValueError where mimic joints share a coordinate.
+    """
+
+    def __init__(self, mechanism: Mechanism, q: Floats, v: Floats) -> None: ...
+    def step(self, ahead: float, behind: float, diagonal: Floats, b: Floats) -> tuple[Floats, Floats, float, bool]:
+        """X with N x = b, (A' + ahead L_qq) x, x' M x, and whether all pivots of N are positive.
+
+        N = M + ahead A - behind A' - ahead behind L_qq + diag(diagonal - armature + ahead behind stiffness), springs
+        being part of L_qq.
+        """
+
+    def least_pivot_ratio(self, coupling: float, curvature: float, diagonal: Floats) -> float:
+        """The smallest ratio of a pivot of M + coupling (A + A') - curvature L_qq to the same one of M; 0 if none is.
+
+        Of the diagonal as in :meth:`step`.
+        """
+
+    def mass(self, b: Floats) -> tuple[Floats, Floats, bool]:
+        """M^-1 b, the coordinates' shares of b . x / 2, and whether M is positive definite."""
+
 class Tableau:
     """Collocation over a step of unit length; see src/core/include/varpin/tableau.hpp."""
 
@@ -290,7 +313,7 @@ class Outcome(IntEnum):
 class ForwardDynamics:
     """Forward dynamics at one state after another."""
 
-    def __init__(self, mechanism: Mechanism) -> None: ...
+    def __init__(self, mechanism: Mechanism, solver: Solver = Solver.automatic) -> None: ...
     def rate(self, x: Floats, force: Floats) -> tuple[Floats, bool]:
         """The rate (v, a) of x = (q, v) (2n,) under a force (n,), and whether the mass matrix is positive definite."""
 

@@ -13,9 +13,11 @@
 #pragma once
 
 #include <algorithm>
+#include <optional>
 #include <vector>
 
 #include "varpin/dense.hpp"
+#include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/spatial.hpp"
 #include "varpin/tree.hpp"
@@ -82,17 +84,26 @@ constexpr Force<T> operator*(const Coupling& C, const Motion<T>& x) {
     return {2.0 * cross(x.angular, C.momentum), C.turn * x.angular};
 }
 
-// Forward dynamics M a = force - bias at one state after another, with work arrays.
+// Forward dynamics M a = force - bias at one state after another, with work arrays. Derivatives need a mass matrix;
+// what asks for none does without, if the tree is large.
 class ForwardDynamics {
   public:
-    explicit ForwardDynamics(const Mechanism& mechanism)
+    ForwardDynamics(const Mechanism& mechanism, bool derivatives, Solver solver = Solver::automatic)
         : mechanism_(&mechanism),
-          jet_(mechanism.tree),
+          jet_(mechanism.tree, false),
           body_(mechanism.tree.bodies.size()),
           bias_(jet_.dof),
           room_(jet_.dof),
-          ldl_(jet_.M.size()),
-          slopes_(jet_.M.size()) {}
+          momentum_(jet_.dof) {
+        const int n = jet_.dof;
+        if (!derivatives && eliminates(mechanism.tree, solver)) {
+            articulated_.emplace(mechanism.tree);
+            return;
+        }
+        jet_.M.resize(n * n);
+        ldl_.resize(n * n);
+        if (derivatives) slopes_.resize(n * n);
+    }
 
     int dof() const { return jet_.dof; }
 
@@ -102,7 +113,7 @@ class ForwardDynamics {
         const Tree& tree = mechanism_->tree;
         std::fill(jet_.potential.begin(), jet_.potential.end(), 0.0);
         std::fill(jet_.potential_scale.begin(), jet_.potential_scale.end(), 0.0);
-        detail::clear_blocks(tree, jet_.M);
+        if (!articulated_) detail::clear_blocks(tree, jet_.M);
         detail::add_springs(*mechanism_, q, jet_, false);
         for (int i = 0; i < jet_.dof; ++i) {
             bias_[i] = mechanism_->damping[i] * v[i] + mechanism_->stiffness[i] * (q[i] - mechanism_->rest[i]);
@@ -115,11 +126,20 @@ class ForwardDynamics {
             here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
             here.momentum = here.inertia * here.velocity;
             body_[j].inertia = here.inertia;
+            if (articulated_) articulated_->place(j, link.ratio * here.axis, here.inertia);
             accelerate(j, v, nullptr);
         }
+        bool regular = true;
         for (int j = tree.size() - 1; j >= 0; --j) {
             const Body& link = tree.bodies[j];
-            detail::project_mass(tree, j, jet_);
+            if (articulated_) {
+                regular = regular && articulated_->eliminate(j);
+                const int c = link.coordinate;
+                momentum_[c] = link.ratio * dot(jet_.body[j].axis, jet_.body[j].momentum) + tree.armature[c] * v[c];
+                if (link.parent >= 0) jet_.body[link.parent].momentum += jet_.body[j].momentum;
+            } else {
+                detail::project_mass(tree, j, jet_);
+            }
             bias_[link.coordinate] += link.ratio * dot(jet_.body[j].axis, body_[j].force);
             if (link.parent >= 0) {
                 detail::pass_inertia(link, jet_.body[j].inertia, jet_.body[link.parent].inertia, true);
@@ -127,13 +147,20 @@ class ForwardDynamics {
             }
             if (link.origin) detail::add_potential(*mechanism_, j, q, jet_);
         }
-        return factor();
+        return articulated_ ? regular : factor();
     }
 
     // p = M v, and the energy [J].
     double energy(const double* v, double* p) const {
         const int n = jet_.dof;
         double kinetic = 0.0;
+        if (articulated_) {
+            for (int i = 0; i < n; ++i) {
+                p[i] = momentum_[i];
+                kinetic += 0.5 * v[i] * p[i];
+            }
+            return kinetic + jet_.total_potential();
+        }
         for (const Block& block : mechanism_->tree.blocks) {
             for (int i = block.begin; i < block.end; ++i) {
                 p[i] = 0.0;
@@ -145,7 +172,8 @@ class ForwardDynamics {
     }
 
     // The x with M x = b; x may be b.
-    void solve_mass(const double* b, double* x) const {
+    void solve_mass(const double* b, double* x) {
+        if (articulated_) return articulated_->solve(b, x, nullptr);
         for (const Block& block : mechanism_->tree.blocks) solve_ldl(ldl_.data(), jet_.dof, block, b, x);
     }
 
@@ -293,8 +321,10 @@ class ForwardDynamics {
     Jet<double> jet_;  // placements, velocities, inertias of what bodies carry, M, potential
     std::vector<BodyState> body_;
     std::vector<double> bias_, room_;
-    std::vector<double> ldl_;     // (n, n) factors of M
-    std::vector<Slopes> slopes_;  // (n, n) of inverse dynamics
+    std::optional<ArticulatedBodies> articulated_;  // in place of M
+    std::vector<double> momentum_;                  // (n) where bodies are articulated
+    std::vector<double> ldl_;                       // (n, n) factors of M
+    std::vector<Slopes> slopes_;                    // (n, n) of inverse dynamics
 };
 
 }  // namespace varpin

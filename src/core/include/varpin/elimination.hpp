@@ -19,6 +19,8 @@
 
 #include <algorithm>
 #include <limits>
+#include <memory>
+#include <utility>
 #include <vector>
 
 #include "varpin/jet.hpp"
@@ -184,7 +186,8 @@ void keep_linear_rows(double* X) {
 template <int entries>
 class Gathered {
   public:
-    explicit Gathered(const Gathering& order) : order_(&order), at_(order.places * entries) {}
+    explicit Gathered(std::shared_ptr<const Gathering> order)
+        : order_(std::move(order)), at_(order_->places * entries) {}
 
     // What body j has of those it carries.
     double* of(int j) {
@@ -201,7 +204,7 @@ class Gathered {
     }
 
   private:
-    const Gathering* order_;
+    std::shared_ptr<const Gathering> order_;
     std::vector<double> at_;
 };
 
@@ -210,15 +213,19 @@ class Gathered {
 // M + diag(armature) as pivots and what goes with them, at one configuration after another.
 class ArticulatedBodies {
   public:
-    explicit ArticulatedBodies(const Tree& tree)
-        : tree_(&tree),
-          order_(tree),
-          body_(tree.size()),
-          inertia_(order_),
-          force_(order_),
-          motion_(6 * (tree.size() + 1)) {}
-    ArticulatedBodies(const ArticulatedBodies&) = delete;
-    ArticulatedBodies& operator=(const ArticulatedBodies&) = delete;
+    explicit ArticulatedBodies(const Tree& tree) : ArticulatedBodies(tree, std::make_shared<Gathering>(tree)) {}
+    ArticulatedBodies(const Tree& tree, const std::shared_ptr<const Gathering>& order)
+        : tree_(&tree), body_(tree.size()), inertia_(order), force_(order), motion_(6 * (tree.size() + 1)) {}
+
+    // Take M at q, with a jet that potential energies stay in; false at a pivot that is not positive.
+    bool at(const Mechanism& mechanism, const double* q, Jet<double>& jet) {
+        const auto enter = [&](int j) { place(j, tree_->bodies[j].ratio * jet.body[j].axis, jet.body[j].inertia); };
+        inertias(mechanism, q, jet, enter, [](int) {});
+        for (int j = tree_->size() - 1; j >= 0; --j) {
+            if (!eliminate(j)) return false;
+        }
+        return true;
+    }
 
     // What coordinate moves body j how, and the body's inertia by itself.
     void place(int j, const Motion<double>& axis, const Inertia<double>& inertia) {
@@ -226,15 +233,7 @@ class ArticulatedBodies {
         body_[j].inertia = inertia;
     }
 
-    // False at a pivot that is not positive.
-    bool factor() {
-        for (int j = tree_->size() - 1; j >= 0; --j) {
-            if (!eliminate(j)) return false;
-        }
-        return true;
-    }
-
-    // One body after another, from the last to the first.
+    // One body after another, from the last to the first; false at a pivot that is not positive.
     bool eliminate(int j) {
         const Body& link = tree_->bodies[j];
         State& own = body_[j];
@@ -290,7 +289,6 @@ class ArticulatedBodies {
     };
 
     const Tree* tree_;
-    Gathering order_;
     std::vector<State> body_;
     detail::Gathered<36> inertia_;
     detail::Gathered<6> force_;
@@ -301,18 +299,7 @@ class ArticulatedBodies {
 class Elimination {
   public:
     explicit Elimination(const Mechanism& mechanism)
-        : mechanism_(&mechanism),
-          tree_(&mechanism.tree),
-          order_(mechanism.tree),
-          body_(mechanism.tree.size()),
-          factors_(mechanism.tree.size()),
-          matrix_(order_),
-          symmetric_(order_),
-          force_(order_),
-          motion_(width * (mechanism.tree.size() + 1)),
-          masses_(mechanism.tree) {}
-    Elimination(const Elimination&) = delete;
-    Elimination& operator=(const Elimination&) = delete;
+        : Elimination(mechanism, std::make_shared<Gathering>(mechanism.tree)) {}
 
     // Take over from a sweep of first order what follows is about.
     void take(const Jet<double>& jet) {
@@ -456,6 +443,17 @@ class Elimination {
     }
 
   private:
+    Elimination(const Mechanism& mechanism, const std::shared_ptr<const Gathering>& order)
+        : mechanism_(&mechanism),
+          tree_(&mechanism.tree),
+          body_(mechanism.tree.size()),
+          factors_(mechanism.tree.size()),
+          matrix_(order),
+          symmetric_(order),
+          force_(order),
+          motion_(width * (mechanism.tree.size() + 1)),
+          masses_(mechanism.tree, order) {}
+
     static constexpr int width = 10;  // nine entries and a zero
 
     struct State {
@@ -481,7 +479,6 @@ class Elimination {
 
     const Mechanism* mechanism_;
     const Tree* tree_;
-    Gathering order_;
     std::vector<State> body_;
     std::vector<Factors> factors_;
     detail::Gathered<width * width> matrix_;

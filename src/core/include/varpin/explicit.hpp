@@ -51,10 +51,11 @@ constexpr Tableau tableau_of(ExplicitMethod method) {
 // One step after another from any state; with derivatives in (q, v, force), if asked for.
 class ExplicitStepper {
   public:
-    ExplicitStepper(const Mechanism& mechanism, ExplicitMethod method, bool derivatives)
+    ExplicitStepper(const Mechanism& mechanism, ExplicitMethod method, bool derivatives,
+                    Solver solver = Solver::automatic)
         : q(mechanism.dof()),
           v(mechanism.dof()),
-          dynamics(mechanism),
+          dynamics(mechanism, derivatives, solver),
           mechanism_(&mechanism),
           tableau_(tableau_of(method)),
           derivatives_(derivatives),

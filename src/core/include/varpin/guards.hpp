@@ -122,13 +122,7 @@ class EnergyGuard {
     // Leaves the factors of M.
     bool node(const double* q, const double* p, double* v) {
         if (articulated) {
-            inertias(
-                mechanism, q, jet,
-                [&](int j) {
-                    articulated->place(j, mechanism.tree.bodies[j].ratio * jet.body[j].axis, jet.body[j].inertia);
-                },
-                [](int) {});
-            if (!articulated->factor()) return false;
+            if (!articulated->at(mechanism, q, jet)) return false;
             velocity(p, v);
             return true;
         }
