@@ -223,6 +223,9 @@ def _fast_damping(scene: Scene, trajectory: Trajectory) -> float:
     # Rates change along the motion as the inertia does.
     at = np.unique(np.linspace(0, trajectory.steps, _INERTIAS).astype(np.int64))
     rates = np.linalg.solve(_masses(scene, trajectory.q[at]), np.diag(scene.damping))
+    # None of them is negative, and none larger than their sum.
+    if trajectory.dt * np.trace(rates, axis1=1, axis2=2).max() <= 2.0:
+        return 0.0
     fastest = float(np.abs(np.linalg.eigvals(rates)).max()) if np.isfinite(rates).all() else np.inf
     return fastest if trajectory.dt * fastest > 2.0 else 0.0
 
