@@ -62,7 +62,6 @@ def exhaustive(setting: Setting, exact: np.ndarray, tolerance: float, most: floa
     """The cheapest integrator and step that meet the tolerance, and its time [s]."""
     best, seconds = "", math.inf
     for integrator in sorted(INTEGRATORS, key=lambda own: -own.order):
-        setting.warm_up(integrator)
         steps = 2.0
         while True:
             outcome = setting.run(integrator, round(steps), repeats=2)
