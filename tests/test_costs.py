@@ -438,6 +438,6 @@ def test_types_that_users_meet_have_public_names(name):
 
 
 def test_help_of_the_problem_lists_every_cost():
-    costs = [name for name in vars(vp) if name.endswith("Cost") and name not in ("Cost", "BoundCost")]
+    costs = [name for name in dir(vp) if name.endswith("Cost") and name not in ("Cost", "BoundCost")]
     for name in (*costs, "Terminal", "Gauss(stages=4)"):
         assert f"``{name}" in vp.OptimalControlProblem.__doc__, name

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -14,10 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import JointValues, as_floats, joint_array, require_finite
 from varpin.errors import InputError
-from varpin.mpc import MpcRun
 from varpin.replay.script import Outlook, Target, Trace
 from varpin.robot import Robot
 from varpin.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from varpin.mpc import MpcRun
 
 Floats = NDArray[np.float64]
 

@@ -8,14 +8,13 @@ import reprlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import JointValues, as_floats, count, finite_array, positive, require_finite, writable
 from varpin.errors import InputError
-from varpin.mpc import MpcRun
 from varpin.replay.annotations import (
     frame_names,
     outlooks,
@@ -33,10 +32,11 @@ from varpin.trajectory import Trajectory
 if TYPE_CHECKING:
     import meshcat
 
+    from varpin.mpc import MpcRun
     from varpin.replay.page import Inline
 
 Floats = NDArray[np.float64]
-Motion: TypeAlias = Trajectory | MpcRun | ArrayLike
+Motion: TypeAlias = "Trajectory | MpcRun | ArrayLike"
 
 
 def replay(
@@ -133,8 +133,8 @@ def replay(
             "give either html=path, for a file, or open=True, for a window; or video=path, for a film; or inline=True, "
             "for a notebook"
         )
-    runs = [run if isinstance(run, MpcRun) else None for _, run in shown]
-    pairs = [(arm, moved.motion if isinstance(moved, MpcRun) else moved) for arm, moved in shown]
+    runs = [run if _is_run(run) else None for _, run in shown]
+    pairs = [(arm, moved.motion if _is_run(moved) else cast("Trajectory | ArrayLike", moved)) for arm, moved in shown]
     own = [moved.dt for _, moved in pairs if isinstance(moved, Trajectory)]
     if dt is not None and len(own) == len(pairs):
         raise InputError(f"dt belongs to an array of configurations; this trajectory has its own, {own[0]:g} s")
@@ -206,6 +206,11 @@ def _each(name: str, given: Any, robots: int) -> list[Any]:
     if not isinstance(given, list | tuple) or len(given) != robots:
         raise InputError(f"{name} of several robots must be a list with one for each of the {robots}")
     return list(given)
+
+
+def _is_run(motion: object) -> TypeGuard[MpcRun]:
+    """Whether a motion is a controller's; asked of what it can do, as few replays need controllers imported."""
+    return hasattr(motion, "planned")
 
 
 def _ahead(ahead: float | None, run: MpcRun | None) -> float:
