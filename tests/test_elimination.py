@@ -157,11 +157,20 @@ def rolled(scene, q, v, dt, steps, solver, integrator):
     return nodes
 
 
-@pytest.mark.parametrize("alpha", [0.5, 0.4])
-def test_motions_are_those_with_matrices(robot, alpha):
+# What the energy guard allows depends on whose the kinetic energy is said to be, which differs; so it allows all.
+LENIENT = vp.Guard(energy_balance=1.0, energy_budget=1.0)
+INTEGRATORS = [
+    vp.Midpoint(guard=LENIENT),
+    vp.Midpoint(alpha=0.4, guard=LENIENT),
+    vp.Gauss(2, guard=LENIENT),
+    vp.Gauss(3, guard=LENIENT),
+    vp.Radau(2, guard=LENIENT),
+]
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS, ids=["midpoint", "alpha", "gauss2", "gauss3", "radau2"])
+def test_motions_are_those_with_matrices(robot, integrator):
     scene, (q, v) = scene_of(robot), state_of(robot)
-    # What the energy guard allows depends on whose the kinetic energy is said to be, which differs; so it allows all.
-    integrator = vp.Midpoint(alpha=alpha, guard=vp.Guard(energy_balance=1.0, energy_budget=1.0))
     dense, eliminated = (
         rolled(scene, q, 0.2 * v, 1e-3, 20, solver, integrator) for solver in (Solver.dense, Solver.elimination)
     )
@@ -174,12 +183,13 @@ def test_motions_are_those_with_matrices(robot, alpha):
     assert eliminated.quality[..., 0].max() <= 100.0
 
 
-def test_derivatives_are_those_with_matrices(robot):
+@pytest.mark.parametrize(("integrator", "stages"), [(vp.Midpoint(), 1), (vp.Gauss(2), 2)], ids=["midpoint", "gauss2"])
+def test_derivatives_are_those_with_matrices(robot, integrator, stages):
     scene, (q, v) = scene_of(robot), state_of(robot)
     p = vp.lagrangian_jet(scene, q, v).Lv
-    integrator = vp.Midpoint()
     fixed = scene.core, integrator._tableau(), float(integrator.tolerance), integrator._guards(), 1e-3
-    at = q[None], p[None], v[None, None], np.zeros((1, robot.dof)), np.ones(1, dtype=np.int64)
+    guess = np.broadcast_to(v, (1, stages, robot.dof)).copy()
+    at = q[None], p[None], guess, np.zeros((1, robot.dof)), np.ones(1, dtype=np.int64)
     (Ax, Af, *done), (Bx, Bf, *also) = (
         variational_derivatives(*fixed, *at, solver) for solver in (Solver.dense, Solver.elimination)
     )

@@ -4,7 +4,7 @@
 //     r_i(V) = p0 + h sum_j (abar_ij L_q + f_ij F)(Q_j, V_j) - L_v(Q_i, V_i) = 0
 //     N_im = -dr_i/dV_m = delta_im M_i + h (a_im A_i - abar_im A_m' + f_im D) - h^2 sum_j abar_ij a_jm L_qq,j
 //
-// N falls apart into one matrix for each block of the tree; with one stage elimination needs none of them. On the
+// N falls apart into one matrix for each block of the tree; elimination needs none of them. On the
 // branch of solutions that is connected to h -> 0 its determinant is positive.
 #pragma once
 
@@ -20,6 +20,7 @@
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/nodes.hpp"
+#include "varpin/stage_elimination.hpp"
 #include "varpin/tableau.hpp"
 
 namespace varpin {
@@ -59,9 +60,13 @@ class Collocation {
           slope(stages * n),
           residual(stages * n),
           delta(stages * n) {
-        if (stages == 1 && eliminates(mechanism.tree, solver)) {
+        if (!eliminates(mechanism.tree, solver)) {
+            make_room();
+        } else if (stages == 1) {
             elimination.emplace(mechanism);
             diagonal.resize(n);
+        } else if (stages <= StageElimination::most_stages) {
+            stage_elimination.emplace(mechanism, tableau);
         } else {
             make_room();
         }
@@ -73,9 +78,10 @@ class Collocation {
     int stages;
     std::vector<Jet<double>> stage;          // without matrices where there is an elimination
     std::optional<Elimination> elimination;  // at the iterate of the last factors
-    std::vector<double> V;                   // (s, n) stage velocities: the guess, then the root
-    std::vector<double> Q;                   // (s, n)
-    std::vector<double> slope;               // (s, n) L_q + F
+    std::optional<StageElimination> stage_elimination;
+    std::vector<double> V;      // (s, n) stage velocities: the guess, then the root
+    std::vector<double> Q;      // (s, n)
+    std::vector<double> slope;  // (s, n) L_q + F
 
     // Solve the step equation from the guess in V.
     //
@@ -121,13 +127,16 @@ class Collocation {
             before = size;
         }
         if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
-        if (jets_wanted && elimination) write_jets();
+        if (jets_wanted && eliminated()) write_jets();
         effort.residual = std::max(effort.residual, worst);
         return Outcome::solved;
     }
 
+    bool eliminated() const { return elimination || stage_elimination; }
+
     // Factor N from the stages' jets; false where its determinant is not positive.
     bool factor(double h) {
+        if (stage_elimination) return stage_elimination->factor(h);
         if (!elimination) return factor_blocks(h);
         const double curvature = h * h * tableau.gradient[0] * tableau.a[0];
         for (int c = 0; c < n; ++c) {
@@ -180,6 +189,7 @@ class Collocation {
     // x with N x = right (s, n), from what `factor` left.
     void solve_factored(const double* right, double* x) {
         if (elimination) return elimination->solve(right, x);
+        if (stage_elimination) return stage_elimination->solve(right, x);
         solve_blocks(right, x, [this](const double* matrix, int size, const int* rows, double* b, double* y) {
             if (stages == 1) {
                 solve_lu(matrix, size, {0, size}, b, y);
@@ -255,13 +265,16 @@ class Collocation {
             }
         }
         for (int i = 0; i < stages; ++i) {
-            if (second && !elimination) {
+            if (second && !eliminated()) {
                 lagrangian_jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
             } else {
                 first_order(mechanism, &Q[i * n], &V[i * n], stage[i]);
             }
         }
         if (second && elimination) elimination->take(stage[0]);
+        if (second && stage_elimination) {
+            for (int i = 0; i < stages; ++i) stage_elimination->take(i, stage[i]);
+        }
         (second ? effort.jets : effort.sweeps) += stages;
     }
 
@@ -331,6 +344,7 @@ class Collocation {
     // The square of x (s, n) in the metric of the kinetic energy, averaged over the step.
     double kinetic_size(const double* x) {
         if (elimination) return elimination->kinetic_size(x);
+        if (stage_elimination) return stage_elimination->kinetic_size(x);
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
             for (const Block& block : mechanism.tree.blocks)
@@ -349,11 +363,15 @@ class Collocation {
                 moved[i * n + c] = h * total;
             }
         }
-        if (elimination) {
-            const double ahead = h * tableau.a[0];
-            elimination->change_of_slope(delta.data(), moved.data());
-            for (int r = 0; r < n; ++r)
-                slope[r] += moved[r] - (mechanism.damping[r] + ahead * mechanism.stiffness[r]) * delta[r];
+        if (eliminated()) {
+            for (int k = 0; k < stages * n; ++k)
+                slope[k] -= mechanism.damping[k % n] * delta[k] + mechanism.stiffness[k % n] * moved[k];
+            if (elimination) {
+                elimination->change_of_slope(delta.data(), moved.data());
+            } else {
+                stage_elimination->change_of_slope(delta.data(), moved.data());
+            }
+            for (int k = 0; k < stages * n; ++k) slope[k] += moved[k];
             return;
         }
         for (int i = 0; i < stages; ++i) {
