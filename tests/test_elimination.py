@@ -227,6 +227,29 @@ def test_a_floating_body_keeps_its_digits_far_away(distance):
     assert solved_like(x, N, b)
 
 
+def test_derivatives_of_long_chains_are_those_of_differences():
+    links = 60
+    scene, integrator = vp.Scene(vp.planar_chain(links), damping=0.1, stiffness=1.0), vp.Midpoint(tolerance=0.1)
+    rng = np.random.default_rng(7)
+    q, v = rng.uniform(-0.2, 0.2, links), 0.1 * rng.normal(size=links)
+    motion = vp.simulate(scene, q, v, dt=1e-2, steps=1, integrator=integrator)
+    lin = vp.linearize(scene, motion)
+    M = vp.lagrangian_jet(scene, q, v).Lvv
+    # Directions dp = M dv, as long ones would take the chain apart.
+    dq, dv, du = 0.1 * rng.normal(size=(3, links))
+    expected = lin.A[0] @ np.r_[dq, M @ dv] + lin.B[0] @ du
+    eps, ends = 1e-5, []
+    for sign in (1.0, -1.0):
+        at = q + sign * eps * dq
+        p = M @ v + sign * eps * (M @ dv)
+        rates = np.linalg.solve(vp.lagrangian_jet(scene, at, v).Lvv, p)
+        moved = vp.simulate(scene, at, rates, dt=1e-2, steps=1, controls=sign * eps * du, integrator=integrator)
+        ends.append(np.r_[moved.q[-1], moved.p[-1]])
+    difference = (ends[0] - ends[1]) / (2.0 * eps)
+    for half in (slice(0, links), slice(links, None)):
+        assert np.abs(difference[half] - expected[half]).max() <= 1e-5 * np.abs(expected[half]).max()
+
+
 @pytest.mark.parametrize("links", [200, 1000])
 def test_long_chains_move_and_keep_their_energy(links):
     scene = vp.Scene(vp.planar_chain(links))

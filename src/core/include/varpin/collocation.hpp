@@ -60,7 +60,11 @@ class Collocation {
           slope(stages * n),
           residual(stages * n),
           delta(stages * n) {
-        if (!eliminates(mechanism.tree, solver)) {
+        eliminated_columns = solver == Solver::elimination;
+        for (const Block& block : mechanism.tree.blocks)
+            eliminated_columns = eliminated_columns || block.end - block.begin >= few_columns;
+        if (!eliminates(mechanism.tree, solver, stages)) {
+            eliminated_columns = false;
             make_room();
         } else if (stages == 1) {
             elimination.emplace(mechanism);
@@ -168,6 +172,7 @@ class Collocation {
     // Derivatives at the root, from the jets of its stages: dV (s, n, 3n), and of (q1, p1), all in (q0, p0, f); Jx is
     // (2n, 2n), Jf (2n, n). Blocks alone are written into dV.
     void derivatives(double h, std::vector<double>& dV, double* Jx, double* Jf) {
+        if (eliminated_columns) return eliminate_derivatives(h, dV, Jx, Jf);
         const auto& blocks = mechanism.tree.blocks;
         if (blocks.size() > 1) {
             std::fill(Jx, Jx + 4 * n * n, 0.0);
@@ -199,8 +204,9 @@ class Collocation {
         });
     }
 
-    // x with N' x = right, from what `derivatives` left.
-    void solve_transposed(const double* right, double* x) {
+    // x with N' x = right, after `derivatives`.
+    void solve_transposed(double h, const double* right, double* x) {
+        if (eliminated_columns) factor_blocks(h);
         solve_blocks(right, x, [this](const double* matrix, int size, const int* rows, double* b, double* y) {
             solve_lu_transposed(matrix, size, stages == 1 ? nullptr : rows, b, y);
         });
@@ -224,6 +230,8 @@ class Collocation {
     }
 
     static constexpr int most_corrections = 10;
+    // Columns of a block that are solved for at once with its matrix rather than one by one by elimination. Measured.
+    static constexpr int few_columns = 45;
     // In rounding units: a residual below may stagnate; without rounding's own scatter it would be 1.
     static constexpr double stagnation = 100.0;
     // A residual that is expected this far below the tolerance need not be looked at.
@@ -233,7 +241,8 @@ class Collocation {
     std::vector<double> lu;               // the factors of each block, one after another
     std::vector<int> order;               // of their rows
     std::vector<double> change, local, columns, shift;
-    std::vector<double> diagonal;  // (n) of N, besides what elimination takes from the bodies
+    bool eliminated_columns = false;  // of derivatives
+    std::vector<double> diagonal;     // (n) of N, besides what elimination takes from the bodies
 
     // For matrices and their factors.
     void make_room() {
@@ -254,6 +263,13 @@ class Collocation {
     void write_jets() {
         if (lu.empty()) make_room();
         for (int i = 0; i < stages; ++i) lagrangian_jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
+        take_over();
+    }
+
+    void take_over() {
+        if (elimination) elimination->take(stage[0]);
+        if (!stage_elimination) return;
+        for (int i = 0; i < stages; ++i) stage_elimination->take(i, stage[i]);
     }
 
     void sweep(double h, const Start& start, bool second, Effort& effort) {
@@ -271,10 +287,7 @@ class Collocation {
                 first_order(mechanism, &Q[i * n], &V[i * n], stage[i]);
             }
         }
-        if (second && elimination) elimination->take(stage[0]);
-        if (second && stage_elimination) {
-            for (int i = 0; i < stages; ++i) stage_elimination->take(i, stage[i]);
-        }
+        if (second) take_over();
         (second ? effort.jets : effort.sweeps) += stages;
     }
 
@@ -353,6 +366,74 @@ class Collocation {
         return total;
     }
 
+    // (A_i' - D) x_i + L_qq,i h sum_j a_ij x_j into `change`, of the x in `delta` that elimination has solved for.
+    void change_of_slope(double h, std::vector<double>& change) {
+        if (elimination) {
+            elimination->change_of_slope(delta.data(), change.data());
+        } else {
+            stage_elimination->change_of_slope(delta.data(), change.data());
+        }
+        for (int i = 0; i < stages; ++i) {
+            for (int c = 0; c < n; ++c) {
+                double moved = 0.0;
+                for (int j = 0; j < stages; ++j) moved += tableau.a[i * stages + j] * delta[j * n + c];
+                change[i * n + c] -= mechanism.damping[c] * delta[i * n + c] + h * mechanism.stiffness[c] * moved;
+            }
+        }
+    }
+
+    // `derivatives` column by column.
+    void eliminate_derivatives(double h, std::vector<double>& dV, double* Jx, double* Jf) {
+        factor(h);
+        columns.resize(stages * n);
+        for (int k = 0; k < n; ++k) {
+            for (int kind = 0; kind < 3; ++kind) {
+                // With one stage the force acts in proportion to the momentum, whose column has just been solved for.
+                const double scale = stages == 1 && kind == 2 ? h * tableau.force[0] : 1.0;
+                if (stages > 1 || kind < 2) {
+                    right_side(h, kind, k);
+                    solve_factored(residual.data(), delta.data());
+                    change_of_slope(h, columns);
+                }
+                double* out = kind == 2 ? Jf + k : Jx + kind * n + k;
+                const int stride = kind == 2 ? n : 2 * n;
+                for (int r = 0; r < n; ++r) {
+                    double q = 0.0, p = 0.0;
+                    for (int i = 0; i < stages; ++i) {
+                        dV[(i * n + r) * 3 * n + kind * n + k] = scale * delta[i * n + r];
+                        q += tableau.b[i] * delta[i * n + r];
+                        p += tableau.b[i] * columns[i * n + r];
+                        if (kind == 0) p += tableau.b[i] * stage[i].Lqq[k * n + r];
+                    }
+                    out[r * stride] = h * scale * q;
+                    out[(n + r) * stride] = h * scale * p;
+                }
+                if (kind == 0) out[k * stride] += 1.0;
+                if (kind > 0) out[(n + k) * stride] += kind == 1 ? 1.0 : h;
+            }
+        }
+    }
+
+    // Into `residual` dr in one of q0, p0 or f: h sum_j abar_ij L_qq,j - A_i, 1, or h sum_j f_ij.
+    void right_side(double h, int kind, int k) {
+        std::fill(residual.begin(), residual.end(), 0.0);
+        for (int i = 0; i < stages; ++i) {
+            double* b = &residual[i * n];
+            double share = 0.0;
+            for (int j = 0; j < stages; ++j) {
+                share += tableau.force[i * stages + j];
+                if (kind > 0) continue;
+                const double* curvature = &stage[j].Lqq[k * n];
+                for (int r = 0; r < n; ++r) b[r] += h * tableau.gradient[i * stages + j] * curvature[r];
+            }
+            if (kind == 0) {
+                for (int r = 0; r < n; ++r) b[r] -= stage[i].A[r * n + k];
+            } else {
+                b[k] = kind == 1 ? 1.0 : h * share;
+            }
+        }
+    }
+
     // Bring L_q + F to where the correction in `delta` has taken the stages, to first order in it.
     void correct_slopes(double h) {
         std::vector<double>& moved = residual;
@@ -364,13 +445,7 @@ class Collocation {
             }
         }
         if (eliminated()) {
-            for (int k = 0; k < stages * n; ++k)
-                slope[k] -= mechanism.damping[k % n] * delta[k] + mechanism.stiffness[k % n] * moved[k];
-            if (elimination) {
-                elimination->change_of_slope(delta.data(), moved.data());
-            } else {
-                stage_elimination->change_of_slope(delta.data(), moved.data());
-            }
+            change_of_slope(h, moved);
             for (int k = 0; k < stages * n; ++k) slope[k] += moved[k];
             return;
         }

@@ -34,10 +34,11 @@ namespace varpin {
 enum class Solver { automatic, dense, elimination };
 
 // Times of a dense step for each body, for each pair of a body and one above it, and for each cubed size of a block; in
-// units of what a body costs that is eliminated. Measured with benchmarks/joints.py.
-inline constexpr double body_cost = 0.6, pair_cost = 0.033, block_cost = 0.0004;
+// units of what a body costs that is eliminated; and what it costs where steps have more stages. Measured with
+// benchmarks/joints.py.
+inline constexpr double body_cost = 0.6, pair_cost = 0.033, block_cost = 0.0004, stages_cost = 1.3;
 
-inline bool eliminates(const Tree& tree, Solver solver) {
+inline bool eliminates(const Tree& tree, Solver solver, int stages = 1) {
     if (solver == Solver::dense || tree.size() != tree.dof()) return false;
     if (solver == Solver::elimination) return true;
     double dense = body_cost * tree.size();
@@ -50,7 +51,7 @@ inline bool eliminates(const Tree& tree, Solver solver) {
         const double size = block.end - block.begin;
         dense += block_cost * size * size * size;
     }
-    return tree.size() < dense;
+    return (stages == 1 ? 1.0 : stages_cost) * tree.size() < dense;
 }
 
 // Where each body gathers what it carries while bodies are eliminated, the last one first. Places are used again: along
