@@ -60,20 +60,19 @@ class Collocation {
           slope(stages * n),
           residual(stages * n),
           delta(stages * n) {
+        if (stages > StageElimination::most_stages || !eliminates(mechanism.tree, solver, stages)) {
+            make_room();
+            return;
+        }
+        if (stages == 1) {
+            elimination.emplace(mechanism);
+            diagonal.resize(n);
+        } else {
+            stage_elimination.emplace(mechanism, tableau);
+        }
         eliminated_columns = solver == Solver::elimination;
         for (const Block& block : mechanism.tree.blocks)
             eliminated_columns = eliminated_columns || block.end - block.begin >= few_columns;
-        if (!eliminates(mechanism.tree, solver, stages)) {
-            eliminated_columns = false;
-            make_room();
-        } else if (stages == 1) {
-            elimination.emplace(mechanism);
-            diagonal.resize(n);
-        } else if (stages <= StageElimination::most_stages) {
-            stage_elimination.emplace(mechanism, tableau);
-        } else {
-            make_room();
-        }
     }
 
     const Mechanism& mechanism;
