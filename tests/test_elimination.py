@@ -157,11 +157,20 @@ def rolled(scene, q, v, dt, steps, solver, integrator):
     return nodes
 
 
-@pytest.mark.parametrize("alpha", [0.5, 0.4])
-def test_motions_are_those_with_matrices(robot, alpha):
+# What the energy guard allows depends on whose the kinetic energy is said to be, which differs; so it allows all.
+LENIENT = vp.Guard(energy_balance=1.0, energy_budget=1.0)
+INTEGRATORS = [
+    vp.Midpoint(guard=LENIENT),
+    vp.Midpoint(alpha=0.4, guard=LENIENT),
+    vp.Gauss(2, guard=LENIENT),
+    vp.Gauss(3, guard=LENIENT),
+    vp.Radau(2, guard=LENIENT),
+]
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS, ids=["midpoint", "alpha", "gauss2", "gauss3", "radau2"])
+def test_motions_are_those_with_matrices(robot, integrator):
     scene, (q, v) = scene_of(robot), state_of(robot)
-    # What the energy guard allows depends on whose the kinetic energy is said to be, which differs; so it allows all.
-    integrator = vp.Midpoint(alpha=alpha, guard=vp.Guard(energy_balance=1.0, energy_budget=1.0))
     dense, eliminated = (
         rolled(scene, q, 0.2 * v, 1e-3, 20, solver, integrator) for solver in (Solver.dense, Solver.elimination)
     )
@@ -174,12 +183,13 @@ def test_motions_are_those_with_matrices(robot, alpha):
     assert eliminated.quality[..., 0].max() <= 100.0
 
 
-def test_derivatives_are_those_with_matrices(robot):
+@pytest.mark.parametrize(("integrator", "stages"), [(vp.Midpoint(), 1), (vp.Gauss(2), 2)], ids=["midpoint", "gauss2"])
+def test_derivatives_are_those_with_matrices(robot, integrator, stages):
     scene, (q, v) = scene_of(robot), state_of(robot)
     p = vp.lagrangian_jet(scene, q, v).Lv
-    integrator = vp.Midpoint()
     fixed = scene.core, integrator._tableau(), float(integrator.tolerance), integrator._guards(), 1e-3
-    at = q[None], p[None], v[None, None], np.zeros((1, robot.dof)), np.ones(1, dtype=np.int64)
+    guess = np.broadcast_to(v, (1, stages, robot.dof)).copy()
+    at = q[None], p[None], guess, np.zeros((1, robot.dof)), np.ones(1, dtype=np.int64)
     (Ax, Af, *done), (Bx, Bf, *also) = (
         variational_derivatives(*fixed, *at, solver) for solver in (Solver.dense, Solver.elimination)
     )
@@ -215,6 +225,29 @@ def test_a_floating_body_keeps_its_digits_far_away(distance):
     x, *_, positive = Elimination(scene.core, q, v).step(0.01, 0.01, np.zeros(26), b)
     assert positive
     assert solved_like(x, N, b)
+
+
+def test_derivatives_of_long_chains_are_those_of_differences():
+    links = 60
+    scene, integrator = vp.Scene(vp.planar_chain(links), damping=0.1, stiffness=1.0), vp.Midpoint(tolerance=0.1)
+    rng = np.random.default_rng(7)
+    q, v = rng.uniform(-0.2, 0.2, links), 0.1 * rng.normal(size=links)
+    motion = vp.simulate(scene, q, v, dt=1e-2, steps=1, integrator=integrator)
+    lin = vp.linearize(scene, motion)
+    M = vp.lagrangian_jet(scene, q, v).Lvv
+    # Directions dp = M dv, as long ones would take the chain apart.
+    dq, dv, du = 0.1 * rng.normal(size=(3, links))
+    expected = lin.A[0] @ np.r_[dq, M @ dv] + lin.B[0] @ du
+    eps, ends = 1e-5, []
+    for sign in (1.0, -1.0):
+        at = q + sign * eps * dq
+        p = M @ v + sign * eps * (M @ dv)
+        rates = np.linalg.solve(vp.lagrangian_jet(scene, at, v).Lvv, p)
+        moved = vp.simulate(scene, at, rates, dt=1e-2, steps=1, controls=sign * eps * du, integrator=integrator)
+        ends.append(np.r_[moved.q[-1], moved.p[-1]])
+    difference = (ends[0] - ends[1]) / (2.0 * eps)
+    for half in (slice(0, links), slice(links, None)):
+        assert np.abs(difference[half] - expected[half]).max() <= 1e-5 * np.abs(expected[half]).max()
 
 
 @pytest.mark.parametrize("links", [200, 1000])

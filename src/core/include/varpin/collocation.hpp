@@ -4,7 +4,7 @@
 //     r_i(V) = p0 + h sum_j (abar_ij L_q + f_ij F)(Q_j, V_j) - L_v(Q_i, V_i) = 0
 //     N_im = -dr_i/dV_m = delta_im M_i + h (a_im A_i - abar_im A_m' + f_im D) - h^2 sum_j abar_ij a_jm L_qq,j
 //
-// N falls apart into one matrix for each block of the tree; with one stage elimination needs none of them. On the
+// N falls apart into one matrix for each block of the tree; elimination needs none of them. On the
 // branch of solutions that is connected to h -> 0 its determinant is positive.
 #pragma once
 
@@ -20,6 +20,7 @@
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/nodes.hpp"
+#include "varpin/stage_elimination.hpp"
 #include "varpin/tableau.hpp"
 
 namespace varpin {
@@ -59,12 +60,19 @@ class Collocation {
           slope(stages * n),
           residual(stages * n),
           delta(stages * n) {
-        if (stages == 1 && eliminates(mechanism.tree, solver)) {
+        if (stages > StageElimination::most_stages || !eliminates(mechanism.tree, solver, stages)) {
+            make_room();
+            return;
+        }
+        if (stages == 1) {
             elimination.emplace(mechanism);
             diagonal.resize(n);
         } else {
-            make_room();
+            stage_elimination.emplace(mechanism, tableau);
         }
+        eliminated_columns = solver == Solver::elimination;
+        for (const Block& block : mechanism.tree.blocks)
+            eliminated_columns = eliminated_columns || block.end - block.begin >= few_columns;
     }
 
     const Mechanism& mechanism;
@@ -73,9 +81,10 @@ class Collocation {
     int stages;
     std::vector<Jet<double>> stage;          // without matrices where there is an elimination
     std::optional<Elimination> elimination;  // at the iterate of the last factors
-    std::vector<double> V;                   // (s, n) stage velocities: the guess, then the root
-    std::vector<double> Q;                   // (s, n)
-    std::vector<double> slope;               // (s, n) L_q + F
+    std::optional<StageElimination> stage_elimination;
+    std::vector<double> V;      // (s, n) stage velocities: the guess, then the root
+    std::vector<double> Q;      // (s, n)
+    std::vector<double> slope;  // (s, n) L_q + F
 
     // Solve the step equation from the guess in V.
     //
@@ -121,13 +130,16 @@ class Collocation {
             before = size;
         }
         if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
-        if (jets_wanted && elimination) write_jets();
+        if (jets_wanted && eliminated()) write_jets();
         effort.residual = std::max(effort.residual, worst);
         return Outcome::solved;
     }
 
+    bool eliminated() const { return elimination || stage_elimination; }
+
     // Factor N from the stages' jets; false where its determinant is not positive.
     bool factor(double h) {
+        if (stage_elimination) return stage_elimination->factor(h);
         if (!elimination) return factor_blocks(h);
         const double curvature = h * h * tableau.gradient[0] * tableau.a[0];
         for (int c = 0; c < n; ++c) {
@@ -159,6 +171,7 @@ class Collocation {
     // Derivatives at the root, from the jets of its stages: dV (s, n, 3n), and of (q1, p1), all in (q0, p0, f); Jx is
     // (2n, 2n), Jf (2n, n). Blocks alone are written into dV.
     void derivatives(double h, std::vector<double>& dV, double* Jx, double* Jf) {
+        if (eliminated_columns) return eliminate_derivatives(h, dV, Jx, Jf);
         const auto& blocks = mechanism.tree.blocks;
         if (blocks.size() > 1) {
             std::fill(Jx, Jx + 4 * n * n, 0.0);
@@ -180,6 +193,7 @@ class Collocation {
     // x with N x = right (s, n), from what `factor` left.
     void solve_factored(const double* right, double* x) {
         if (elimination) return elimination->solve(right, x);
+        if (stage_elimination) return stage_elimination->solve(right, x);
         solve_blocks(right, x, [this](const double* matrix, int size, const int* rows, double* b, double* y) {
             if (stages == 1) {
                 solve_lu(matrix, size, {0, size}, b, y);
@@ -189,8 +203,9 @@ class Collocation {
         });
     }
 
-    // x with N' x = right, from what `derivatives` left.
-    void solve_transposed(const double* right, double* x) {
+    // x with N' x = right, after `derivatives`.
+    void solve_transposed(double h, const double* right, double* x) {
+        if (eliminated_columns) factor_blocks(h);
         solve_blocks(right, x, [this](const double* matrix, int size, const int* rows, double* b, double* y) {
             solve_lu_transposed(matrix, size, stages == 1 ? nullptr : rows, b, y);
         });
@@ -214,6 +229,8 @@ class Collocation {
     }
 
     static constexpr int most_corrections = 10;
+    // Columns of a block that are solved for at once with its matrix rather than one by one by elimination. Measured.
+    static constexpr int few_columns = 45;
     // In rounding units: a residual below may stagnate; without rounding's own scatter it would be 1.
     static constexpr double stagnation = 100.0;
     // A residual that is expected this far below the tolerance need not be looked at.
@@ -223,7 +240,8 @@ class Collocation {
     std::vector<double> lu;               // the factors of each block, one after another
     std::vector<int> order;               // of their rows
     std::vector<double> change, local, columns, shift;
-    std::vector<double> diagonal;  // (n) of N, besides what elimination takes from the bodies
+    bool eliminated_columns = false;  // of derivatives
+    std::vector<double> diagonal;     // (n) of N, besides what elimination takes from the bodies
 
     // For matrices and their factors.
     void make_room() {
@@ -244,6 +262,13 @@ class Collocation {
     void write_jets() {
         if (lu.empty()) make_room();
         for (int i = 0; i < stages; ++i) lagrangian_jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
+        take_over();
+    }
+
+    void take_over() {
+        if (elimination) elimination->take(stage[0]);
+        if (!stage_elimination) return;
+        for (int i = 0; i < stages; ++i) stage_elimination->take(i, stage[i]);
     }
 
     void sweep(double h, const Start& start, bool second, Effort& effort) {
@@ -255,13 +280,13 @@ class Collocation {
             }
         }
         for (int i = 0; i < stages; ++i) {
-            if (second && !elimination) {
+            if (second && !eliminated()) {
                 lagrangian_jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
             } else {
                 first_order(mechanism, &Q[i * n], &V[i * n], stage[i]);
             }
         }
-        if (second && elimination) elimination->take(stage[0]);
+        if (second) take_over();
         (second ? effort.jets : effort.sweeps) += stages;
     }
 
@@ -331,12 +356,81 @@ class Collocation {
     // The square of x (s, n) in the metric of the kinetic energy, averaged over the step.
     double kinetic_size(const double* x) {
         if (elimination) return elimination->kinetic_size(x);
+        if (stage_elimination) return stage_elimination->kinetic_size(x);
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
             for (const Block& block : mechanism.tree.blocks)
                 total += tableau.b[i] * quadratic_form(stage[i].M.data(), n, block, x + i * n);
         }
         return total;
+    }
+
+    // (A_i' - D) x_i + L_qq,i h sum_j a_ij x_j into `change`, of the x in `delta` that elimination has solved for.
+    void change_of_slope(double h, std::vector<double>& change) {
+        if (elimination) {
+            elimination->change_of_slope(delta.data(), change.data());
+        } else {
+            stage_elimination->change_of_slope(delta.data(), change.data());
+        }
+        for (int i = 0; i < stages; ++i) {
+            for (int c = 0; c < n; ++c) {
+                double moved = 0.0;
+                for (int j = 0; j < stages; ++j) moved += tableau.a[i * stages + j] * delta[j * n + c];
+                change[i * n + c] -= mechanism.damping[c] * delta[i * n + c] + h * mechanism.stiffness[c] * moved;
+            }
+        }
+    }
+
+    // `derivatives` column by column.
+    void eliminate_derivatives(double h, std::vector<double>& dV, double* Jx, double* Jf) {
+        factor(h);
+        columns.resize(stages * n);
+        for (int k = 0; k < n; ++k) {
+            for (int kind = 0; kind < 3; ++kind) {
+                // With one stage the force acts in proportion to the momentum, whose column has just been solved for.
+                const double scale = stages == 1 && kind == 2 ? h * tableau.force[0] : 1.0;
+                if (stages > 1 || kind < 2) {
+                    right_side(h, kind, k);
+                    solve_factored(residual.data(), delta.data());
+                    change_of_slope(h, columns);
+                }
+                double* out = kind == 2 ? Jf + k : Jx + kind * n + k;
+                const int stride = kind == 2 ? n : 2 * n;
+                for (int r = 0; r < n; ++r) {
+                    double q = 0.0, p = 0.0;
+                    for (int i = 0; i < stages; ++i) {
+                        dV[(i * n + r) * 3 * n + kind * n + k] = scale * delta[i * n + r];
+                        q += tableau.b[i] * delta[i * n + r];
+                        p += tableau.b[i] * columns[i * n + r];
+                        if (kind == 0) p += tableau.b[i] * stage[i].Lqq[k * n + r];
+                    }
+                    out[r * stride] = h * scale * q;
+                    out[(n + r) * stride] = h * scale * p;
+                }
+                if (kind == 0) out[k * stride] += 1.0;
+                if (kind > 0) out[(n + k) * stride] += kind == 1 ? 1.0 : h;
+            }
+        }
+    }
+
+    // Into `residual` dr in one of q0, p0 or f: h sum_j abar_ij L_qq,j - A_i, 1, or h sum_j f_ij.
+    void right_side(double h, int kind, int k) {
+        std::fill(residual.begin(), residual.end(), 0.0);
+        for (int i = 0; i < stages; ++i) {
+            double* b = &residual[i * n];
+            double share = 0.0;
+            for (int j = 0; j < stages; ++j) {
+                share += tableau.force[i * stages + j];
+                if (kind > 0) continue;
+                const double* curvature = &stage[j].Lqq[k * n];
+                for (int r = 0; r < n; ++r) b[r] += h * tableau.gradient[i * stages + j] * curvature[r];
+            }
+            if (kind == 0) {
+                for (int r = 0; r < n; ++r) b[r] -= stage[i].A[r * n + k];
+            } else {
+                b[k] = kind == 1 ? 1.0 : h * share;
+            }
+        }
     }
 
     // Bring L_q + F to where the correction in `delta` has taken the stages, to first order in it.
@@ -349,11 +443,9 @@ class Collocation {
                 moved[i * n + c] = h * total;
             }
         }
-        if (elimination) {
-            const double ahead = h * tableau.a[0];
-            elimination->change_of_slope(delta.data(), moved.data());
-            for (int r = 0; r < n; ++r)
-                slope[r] += moved[r] - (mechanism.damping[r] + ahead * mechanism.stiffness[r]) * delta[r];
+        if (eliminated()) {
+            change_of_slope(h, moved);
+            for (int k = 0; k < stages * n; ++k) slope[k] += moved[k];
             return;
         }
         for (int i = 0; i < stages; ++i) {

@@ -34,10 +34,11 @@ namespace varpin {
 enum class Solver { automatic, dense, elimination };
 
 // Times of a dense step for each body, for each pair of a body and one above it, and for each cubed size of a block; in
-// units of what a body costs that is eliminated. Measured with benchmarks/joints.py.
-inline constexpr double body_cost = 0.6, pair_cost = 0.033, block_cost = 0.0004;
+// units of what a body costs that is eliminated; and what it costs where steps have more stages. Measured with
+// benchmarks/joints.py.
+inline constexpr double body_cost = 0.6, pair_cost = 0.033, block_cost = 0.0004, stages_cost = 1.3;
 
-inline bool eliminates(const Tree& tree, Solver solver) {
+inline bool eliminates(const Tree& tree, Solver solver, int stages = 1) {
     if (solver == Solver::dense || tree.size() != tree.dof()) return false;
     if (solver == Solver::elimination) return true;
     double dense = body_cost * tree.size();
@@ -50,7 +51,7 @@ inline bool eliminates(const Tree& tree, Solver solver) {
         const double size = block.end - block.begin;
         dense += block_cost * size * size * size;
     }
-    return tree.size() < dense;
+    return (stages == 1 ? 1.0 : stages_cost) * tree.size() < dense;
 }
 
 // Where each body gathers what it carries while bodies are eliminated, the last one first. Places are used again: along
@@ -90,6 +91,12 @@ inline void write(const Motion<double>& a, double* x) {
 inline void write(const Force<double>& f, double* x) {
     x[0] = f.linear.x, x[1] = f.linear.y, x[2] = f.linear.z;
     x[3] = f.angular.x, x[4] = f.angular.y, x[5] = f.angular.z;
+}
+// Nine entries.
+template <class Six>
+void write(const Six& a, const Vec3<double>& b, double* x) {
+    write(a, x);
+    x[6] = b.x, x[7] = b.y, x[8] = b.z;
 }
 inline Motion<double> motion_at(const double* x) { return {{x[0], x[1], x[2]}, {x[3], x[4], x[5]}}; }
 
@@ -183,28 +190,29 @@ void keep_linear_rows(double* X) {
 }
 
 // What bodies have gathered while the last of them are eliminated; `entries` numbers at each place.
-template <int entries>
 class Gathered {
   public:
-    explicit Gathered(std::shared_ptr<const Gathering> order)
-        : order_(std::move(order)), at_(order_->places * entries) {}
+    Gathered(std::shared_ptr<const Gathering> order, int entries)
+        : order_(std::move(order)), entries_(entries), at_(order_->places * entries) {}
 
     // What body j has of those it carries.
     double* of(int j) {
-        double* own = at_.data() + order_->place[j] * entries;
-        if (order_->leaf[j]) std::fill(own, own + entries, 0.0);
+        double* own = of_again(j);
+        if (order_->leaf[j]) std::fill(own, own + entries_, 0.0);
         return own;
     }
+    double* of_again(int j) { return at_.data() + order_->place[j] * entries_; }
     // Body j is done with: its parent goes on with what it leaves, or adds that to its own.
     void hand_on(int j, int parent) {
         if (!order_->joins[j]) return;
-        const double* own = at_.data() + order_->place[j] * entries;
-        double* __restrict up = at_.data() + order_->place[parent] * entries;
-        for (int k = 0; k < entries; ++k) up[k] += own[k];
+        const double* own = of_again(j);
+        double* __restrict up = of_again(parent);
+        for (int k = 0; k < entries_; ++k) up[k] += own[k];
     }
 
   private:
     std::shared_ptr<const Gathering> order_;
+    int entries_;
     std::vector<double> at_;
 };
 
@@ -215,7 +223,7 @@ class ArticulatedBodies {
   public:
     explicit ArticulatedBodies(const Tree& tree) : ArticulatedBodies(tree, std::make_shared<Gathering>(tree)) {}
     ArticulatedBodies(const Tree& tree, const std::shared_ptr<const Gathering>& order)
-        : tree_(&tree), body_(tree.size()), inertia_(order), force_(order), motion_(6 * (tree.size() + 1)) {}
+        : tree_(&tree), body_(tree.size()), inertia_(order, 36), force_(order, 6), motion_(6 * (tree.size() + 1)) {}
 
     // Take M at q, with a jet that potential energies stay in; false at a pivot that is not positive.
     bool at(const Mechanism& mechanism, const double* q, Jet<double>& jet) {
@@ -290,9 +298,41 @@ class ArticulatedBodies {
 
     const Tree* tree_;
     std::vector<State> body_;
-    detail::Gathered<36> inertia_;
-    detail::Gathered<6> force_;
+    detail::Gathered inertia_, force_;
     std::vector<double> motion_;  // (b + 1, 6) of each body, after what stands still
+};
+
+// What elimination takes over of a body from a sweep of first order.
+struct EliminatedBody {
+    Inertia<double> inertia{};  // of the body by itself
+    Motion<double> axis{};      // S
+    Motion<double> rate{};      // W
+    Force<double> turned{};     // S x* H
+    Vec3<double> lifted{};      // g x (Y S)(linear)
+
+    static EliminatedBody of(const Mechanism& mechanism, int j, const Jet<double>& jet) {
+        const Body& link = mechanism.tree.bodies[j];
+        const auto& here = jet.body[j];
+        EliminatedBody own;
+        own.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
+        own.axis = link.ratio * here.axis;
+        own.rate = link.ratio * here.axis_rate;
+        own.turned = cross(own.axis, here.momentum);
+        own.lifted = cross(mechanism.gravity,
+                           here.inertia.mass * own.axis.linear + cross(own.axis.angular, here.inertia.moment));
+        return own;
+    }
+
+    // The body's entry of (A' + L_qq y) x where the coordinate's y x is `own`, bodies move by `moved` and `above`, nine
+    // entries each, and z is what those it carries have left; adds its own to that.
+    double change_of_slope(double own, const double* moved, const double* above, double* z) const {
+        double added[9];
+        detail::write(inertia * detail::motion_at(moved) + own * turned, own * lifted, added);
+        for (int r = 0; r < 9; ++r) z[r] += added[r];
+        const Force<double> force{{z[0], z[1], z[2]}, {z[3], z[4], z[5]}};
+        const Vec3<double> lift{z[6], z[7], z[8]}, turn{above[6], above[7], above[8]};
+        return dot(rate, force) - dot(axis.angular, lift) + dot(detail::motion_at(above), turned) - dot(turn, lifted);
+    }
 };
 
 // The matrix of a midpoint step and its symmetric part, at one (q, v) after another.
@@ -303,17 +343,7 @@ class Elimination {
 
     // Take over from a sweep of first order what follows is about.
     void take(const Jet<double>& jet) {
-        const Vec3<double>& g = mechanism_->gravity;
-        for (int j = 0; j < tree_->size(); ++j) {
-            const Body& link = tree_->bodies[j];
-            const auto& here = jet.body[j];
-            State& own = body_[j];
-            own.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
-            own.axis = link.ratio * here.axis;
-            own.rate = link.ratio * here.axis_rate;
-            own.turned = cross(own.axis, here.momentum);
-            own.lifted = cross(g, here.inertia.mass * own.axis.linear + cross(own.axis.angular, here.inertia.moment));
-        }
+        for (int j = 0; j < tree_->size(); ++j) body_[j] = EliminatedBody::of(*mechanism_, j, jet);
     }
 
     // Factor N; false at a pivot that is not positive.
@@ -321,13 +351,14 @@ class Elimination {
         ahead_ = ahead;
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
-            const State& state = body_[j];
+            const EliminatedBody& state = body_[j];
             Factors& own = factors_[j];
             const Motion<double> row = state.axis + (-behind) * state.rate, column = state.axis + ahead * state.rate;
-            write(row, behind * state.axis.angular, own.row);
-            write(column, ahead * state.axis.angular, own.column);
-            write(state.inertia * column + ahead * state.turned, ahead * state.lifted, own.u);
-            write(state.inertia * row + (-behind) * state.turned, behind * state.lifted, own.l);
+            detail::write(row, behind * state.axis.angular, own.row);
+            detail::write(column, ahead * state.axis.angular, own.column);
+            detail::write(state.inertia * column + ahead * state.turned, ahead * state.lifted, own.u);
+            detail::write(state.inertia * row + (-behind) * state.turned, behind * state.lifted, own.l);
+            own.u[9] = own.l[9] = 0.0;
             double* X = matrix_.of(j);
             detail::add_product<width>(X, own.column, own.u);
             own.pivot = diagonal[link.coordinate] + detail::product<width>(own.row, own.u);
@@ -374,18 +405,10 @@ class Elimination {
     void change_of_slope(const double* x, double* y) {
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
-            const State& state = body_[j];
             double* z = force_.of(j);
-            const double* above = motion_above(j);
+            const double* moved = motion_.data() + width * (j + 1);
             const double own = ahead_ * x[link.coordinate];
-            double added[width];
-            write(state.inertia * detail::motion_at(motion_.data() + width * (j + 1)) + own * state.turned,
-                  own * state.lifted, added);
-            for (int r = 0; r < width; ++r) z[r] += added[r];
-            const Force<double> force{{z[0], z[1], z[2]}, {z[3], z[4], z[5]}};
-            const Vec3<double> lifted{z[6], z[7], z[8]}, turn{above[6], above[7], above[8]};
-            y[link.coordinate] = dot(state.rate, force) - dot(state.axis.angular, lifted) +
-                                 dot(detail::motion_at(above), state.turned) - dot(turn, state.lifted);
+            y[link.coordinate] = body_[j].change_of_slope(own, moved, motion_above(j), z);
             if (link.parent < 0) continue;
             if (link.origin) detail::keep_linear<width>(z);
             force_.hand_on(j, link.parent);
@@ -397,10 +420,9 @@ class Elimination {
         double total = 0.0;
         for (int j = 0; j < tree_->size(); ++j) {
             const Body& link = tree_->bodies[j];
-            State& own = body_[j];
-            own.moved = x[link.coordinate] * own.axis;
-            if (link.parent >= 0) own.moved += body_[link.parent].moved;
-            total += dot(own.moved, own.inertia * own.moved);
+            moved_[j] = x[link.coordinate] * body_[j].axis;
+            if (link.parent >= 0) moved_[j] += moved_[link.parent];
+            total += dot(moved_[j], body_[j].inertia * moved_[j]);
         }
         for (int c = 0; c < tree_->dof(); ++c) total += tree_->armature[c] * x[c] * x[c];
         return total;
@@ -412,7 +434,7 @@ class Elimination {
         double least = std::numeric_limits<double>::infinity();
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
-            const State& state = body_[j];
+            const EliminatedBody& state = body_[j];
             double row[12], u[12], answer[12];
             detail::write(state.axis, row);
             detail::write(state.rate, row + 6);
@@ -447,43 +469,30 @@ class Elimination {
         : mechanism_(&mechanism),
           tree_(&mechanism.tree),
           body_(mechanism.tree.size()),
+          moved_(mechanism.tree.size()),
           factors_(mechanism.tree.size()),
-          matrix_(order),
-          symmetric_(order),
-          force_(order),
+          matrix_(order, width * width),
+          symmetric_(order, 144),
+          force_(order, width),
           motion_(width * (mechanism.tree.size() + 1)),
           masses_(mechanism.tree, order) {}
 
     static constexpr int width = 10;  // nine entries and a zero
 
-    struct State {
-        Inertia<double> inertia{};      // of the body by itself
-        Motion<double> axis{}, rate{};  // S, W
-        Force<double> turned{};         // S x* H
-        Vec3<double> lifted{};          // g x (Y S)(linear)
-        Motion<double> moved{};         // under some x
-    };
     struct Factors {
         double row[width] = {}, column[width] = {};
         double u[width] = {}, l[width] = {};  // l by the pivot
         double pivot = 0.0;
     };
 
-    template <class Six>
-    static void write(const Six& a, const Vec3<double>& b, double* x) {
-        detail::write(a, x);
-        x[6] = b.x, x[7] = b.y, x[8] = b.z, x[9] = 0.0;
-    }
-
     const double* motion_above(int j) const { return motion_.data() + width * (tree_->bodies[j].parent + 1); }
 
     const Mechanism* mechanism_;
     const Tree* tree_;
-    std::vector<State> body_;
+    std::vector<EliminatedBody> body_;
+    std::vector<Motion<double>> moved_;  // of each body, under some x
     std::vector<Factors> factors_;
-    detail::Gathered<width * width> matrix_;
-    detail::Gathered<144> symmetric_;
-    detail::Gathered<width> force_;
+    detail::Gathered matrix_, symmetric_, force_;
     std::vector<double> motion_;  // (b + 1, 10) of each body under the x of `solve`, after what stands still
     double ahead_ = 0.0;
     ArticulatedBodies masses_;

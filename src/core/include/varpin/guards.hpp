@@ -197,11 +197,12 @@ class EnergyGuard {
     double branch_margin(double h, const Guards& guards, Collocation& step) {
         const Tableau& tableau = step.tableau;
         const double exaggerated = h * h * tableau.reach / (1.0 - guards.branch_margin);
-        if (step.elimination) {
+        if (step.eliminated()) {
             for (int i = 0; i < n; ++i) {
                 diagonal[i] =
                     mechanism.tree.armature[i] + 0.5 * h * mechanism.damping[i] + exaggerated * mechanism.stiffness[i];
             }
+            if (step.stage_elimination) return step.stage_elimination->least_pivot_ratio(exaggerated, diagonal.data());
             return step.elimination->least_pivot_ratio(h * tableau.skew, exaggerated, diagonal.data());
         }
         double least = infinity;

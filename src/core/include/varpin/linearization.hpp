@@ -204,7 +204,7 @@ class VariationalLinearization {
                 slope[m * n + c] = h * total;
             }
         }
-        stepper.step_equation.solve_transposed(slope.data(), multiplier.data());
+        stepper.step_equation.solve_transposed(h, slope.data(), multiplier.data());
         if (start != nullptr) bring_to_start(start);
         for (int i = 0; i < stages; ++i) {
             for (int c = 0; c < n; ++c) {

@@ -61,7 +61,7 @@ class VariationalStepper {
           guards(guards),
           left(left),
           step_equation(mechanism, this->tableau, solver),
-          energy_guard(mechanism, solver, !step_equation.elimination),
+          energy_guard(mechanism, solver, !step_equation.eliminated()),
           n(mechanism.dof()),
           force(n),
           trial(n),
