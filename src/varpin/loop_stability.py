@@ -27,6 +27,7 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
+_ADVICE = "take a shorter period or lower gains; where neither helps, look at the signs of the law"
 KIND = "unstable loop"
 _FLIPS = "flipping controls"
 # Growth of the controls from the first quarter of a motion to its end, and over each of the last two quarters, that is
@@ -194,11 +195,13 @@ def outgrown(u: Floats, period: float) -> tuple[Finding, ...]:
     first = int(np.argmax(size > 0.0)) if size.any() else 0
     if len(u) < 2 or not size[-1] >= _OUTGROWN * size[first] > 0.0:
         return ()
+    count = len(u) - 1 - first
+    periods = "one period" if count == 1 else f"{count} periods"
     return (
         Finding(
             KIND,
             f"the control loop may be unstable at its period of {period:g} s: controls grow from {size[first]:.3g} to "
-            f"{size[-1]:.3g} within {len(u) - 1 - first} periods; take a shorter period or lower gains",
+            f"{size[-1]:.3g} within {periods}; {_ADVICE}",
         ),
     )
 
@@ -245,7 +248,7 @@ def _by_the_record(u: Floats, period: float) -> tuple[Finding, ...]:
             KIND,
             f"the control loop is unstable at its period of {period:g} s: control {worst} grows from "
             f"{quarter[worst]:.3g} in the first quarter of the motion to {largest[last, worst]:.3g} in the end; "
-            "take a shorter period or lower gains",
+            f"{_ADVICE}",
         ),
     )
 
@@ -278,7 +281,7 @@ def _by_last_changes(x: Floats, u: Floats, period: float) -> tuple[Finding, ...]
             KIND,
             f"the control loop is unstable at its period of {period:g} s: changes of control {worst} grow from "
             f"{peaks[0, worst]:.3g} to {peaks[-1, worst]:.3g} over the second half of the motion, and each period "
-            f"multiplies deviations by {growth:.4g} in the end; take a shorter period or lower gains",
+            f"multiplies deviations by {growth:.4g} in the end; {_ADVICE}",
         ),
     )
 

@@ -437,6 +437,8 @@ def control_rows(scene: Scene, controls: JointValues | None, steps: int) -> Floa
         return np.zeros(shape)
     if isinstance(controls, Mapping):
         controls = control_array("controls", controls, scene.control_joints)
+    if hasattr(controls, "policy"):
+        raise InputError("controls is a plan: give its law, plan.policy, or its controls, plan.trajectory.u")
     array = as_floats("controls", controls)
     if array.shape != shape and array.shape != shape[1:]:
         raise InputError(f"controls must have shape {shape}, one row a step, or {shape[1:]}, got {array.shape}")

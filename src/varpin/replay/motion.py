@@ -34,9 +34,10 @@ if TYPE_CHECKING:
 
     from varpin.mpc import MpcRun
     from varpin.replay.page import Inline
+    from varpin.sddp import Solution
 
 Floats = NDArray[np.float64]
-Motion: TypeAlias = "Trajectory | MpcRun | ArrayLike"
+Motion: TypeAlias = "Trajectory | MpcRun | Solution | ArrayLike"
 
 
 def replay(
@@ -69,7 +70,7 @@ def replay(
     Main args:
         robot: The arm that moved; or pairs of an arm and its motion, to be shown side by side on one clock: a plan and
             its execution, two scenes. What is over before the others is held.
-        motion: A trajectory; a run of :class:`varpin.Mpc`, which is shown with its plans; or configurations (N + 1, n)
+        motion: A trajectory or a plan; a run of :class:`varpin.Mpc`, which is shown with its plans; or configurations (N + 1, n)
             [rad or m] with ``dt``, of which a single row shows a pose.
         html: Write one self-contained HTML file here. It plays by itself, with neither server nor network.
         video: Write a film here, as ``.gif`` or ``.mp4``; with or without ``html``.
@@ -134,7 +135,7 @@ def replay(
             "for a notebook"
         )
     runs = [run if _is_run(run) else None for _, run in shown]
-    pairs = [(arm, moved.motion if _is_run(moved) else cast("Trajectory | ArrayLike", moved)) for arm, moved in shown]
+    pairs = [(arm, _moved(moved)) for arm, moved in shown]
     own = [moved.dt for _, moved in pairs if isinstance(moved, Trajectory)]
     if dt is not None and len(own) == len(pairs):
         raise InputError(f"dt belongs to an array of configurations; this trajectory has its own, {own[0]:g} s")
@@ -211,6 +212,13 @@ def _each(name: str, given: Any, robots: int) -> list[Any]:
 def _is_run(motion: object) -> TypeGuard[MpcRun]:
     """Whether a motion is a controller's; asked of what it can do, as few replays need controllers imported."""
     return hasattr(motion, "planned")
+
+
+def _moved(motion: Motion) -> Trajectory | ArrayLike:
+    """What moves: of a controller's run the plant's motion, of a plan its own."""
+    if _is_run(motion):
+        return motion.motion
+    return cast("Trajectory | ArrayLike", getattr(motion, "trajectory", motion))
 
 
 def _ahead(ahead: float | None, run: MpcRun | None) -> float:
