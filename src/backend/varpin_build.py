@@ -37,8 +37,9 @@ __all__ = [
 Settings = dict[str, Any] | None
 
 COMPILERS = ("c++", "g++", "clang++")
-# What a build asks of a tool chain, and what zig calls it. Left alone, zig compiles for the very processor it runs on.
-TOOLS = {"c++": "c++ -mcpu=baseline", "ar": "ar", "ranlib": "ranlib"}
+# What a build asks of a tool chain, and what zig calls it. Left alone, zig compiles for the very processor it runs on;
+# and it makes its C++ library anew for each level of optimization, that of CMake's own trials among them.
+TOOLS = {"c++": "c++ -mcpu=baseline -O3 -fPIC", "ar": "ar", "ranlib": "ranlib"}
 
 
 def has_compiler() -> bool:
