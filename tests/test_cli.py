@@ -647,8 +647,8 @@ def test_tradeoff_prints_a_table_and_goes_on_where_it_stopped(arm, tmp_path, cap
     options = ["--duration", "0.5", "--dt", "0.05", "0.01", "--q0", "0.3", "--repeats", "1", "--out", str(out)]
     assert main(["tradeoff", arm, *options]) == 0
     printed, err = capsys.readouterr()
-    # On a machine that is new or slow it says that it compiles, and how far it is.
-    assert all("compiling" in line or re.fullmatch(r"varpin: \d+ of \d+ runs", line) for line in err.splitlines())
+    # On a slow machine it says how far it is.
+    assert all(re.fullmatch(r"varpin: \d+ of \d+ runs", line) for line in err.splitlines())
     for words in ("arm: speed against accuracy over 0.5 s", "RungeKutta4", "Midpoint", "Pareto", "good to"):
         assert words in printed
     assert sorted(path.name for path in out.iterdir()) == [f"tradeoff.{kind}" for kind in ("csv", "html", "npz", "png")]
@@ -672,7 +672,7 @@ def test_advise_says_what_to_take(arm, tmp_path, capsys):
     options = ["--duration", "0.5", "--q0", "0.3", "--damping", "0.1"]
     assert main(["advise", arm, "--tolerance", "1e-6", *options]) == 0
     out, err = capsys.readouterr()
-    assert all("compiling" in line for line in err.splitlines())
+    assert err == ""
     assert re.match(
         r"\w+.* at dt = \S+ s: error \S+ in .*, the cheapest within an error of 1e-06 in q after 0.5 s\n", out
     )

@@ -103,19 +103,6 @@ def test_nothing_comes_back_that_was_not_asked_for():
     assert whole.returned > 8 * paths * steps * 9
 
 
-def test_workers_compile_nothing_that_was_not_compiled_before(monkeypatch):
-    """What is warmed up takes arrays of the kinds that workers meet; else each of them compiles for itself."""
-    kinds, start = set(), vp.Midpoint.start
-
-    def listening(self, scene, q0, v0):
-        kinds.add((q0.flags.writeable, v0.flags.writeable, q0.flags.c_contiguous, v0.flags.c_contiguous))
-        return start(self, scene, q0, v0)
-
-    monkeypatch.setattr(vp.Midpoint, "start", listening)
-    run(executor=Shipping())
-    assert kinds == {(True, True, True, True)}
-
-
 @pytest.fixture
 def meshed():
     """A robot of two joints, with a mesh of megabytes that came along in memory."""

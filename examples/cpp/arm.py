@@ -83,7 +83,7 @@ def header(scene: vp.Scene) -> str:
         bodies="\n".join(bodies),
         blocks=cpp(list(zip(begins, tree.ends, strict=True))),
         light_parts=cpp(list(zip(tree.loads, tree.carried, strict=True))),
-        actuation=cpp(scene.actuation.ravel()),
+        actuation=cpp([(r, c, scene.actuation[r, c]) for r, c in np.argwhere(scene.actuation)]),
         **fields,
     )
 

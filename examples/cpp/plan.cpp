@@ -110,11 +110,10 @@ bool linearize(const Motion& motion, Vector& A, Vector& B) {
                                                             motion.tally[4 * s + 3], &A[s * x * x], by_force.data());
         if (outcome != varpin::Outcome::solved) return false;
         for (int i = 0; i < x; ++i) {
-            for (int c = 0; c < m; ++c) {
-                double total = 0.0;
-                for (int j = 0; j < n; ++j) total += by_force[i * n + j] * mechanism.actuation[j * m + c];
-                B[(s * x + i) * m + c] = total;
-            }
+            double* row = &B[(s * x + i) * m];
+            std::fill(row, row + m, 0.0);
+            for (const varpin::Transmission& entry : mechanism.actuation)
+                row[entry.control] += by_force[i * n + entry.coordinate] * entry.ratio;
         }
     }
     return true;

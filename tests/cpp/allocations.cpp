@@ -37,7 +37,7 @@ varpin::Mechanism chain() {
     out.tree.blocks = {{0, n}};
     out.gravity = {0.0, -9.81, 0.0};
     out.controls = n;
-    out.actuation = {1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0};
+    out.actuation = {{0, 0, 1.0}, {1, 1, 1.0}, {2, 2, 1.0}};
     return out;
 }
 

@@ -135,7 +135,7 @@ class Report:
 def run(kind: str, seed: int, begin: int, end: int, folder: Path | None = None) -> Report:
     """Inputs begin .. end of a kind, each in a worker that may die of it; findings are kept in ``folder``."""
     report = Report()
-    # Whoever comes first compiles, and what that takes is no part of an input's memory.
+    # What imports take is no part of an input's memory.
     for line in _watched(kind, seed, begin, begin):
         raise RuntimeError(f"a worker does not get to its first input: {line}")
     while begin < end:

@@ -126,6 +126,10 @@ struct StepsAt {
             require(*array, name, {N, n});
         require(guess, "guess", {N, stages, n});
         require(substeps, "substeps", {N});
+        for (std::size_t s = 0; s < N; ++s) {
+            if (substeps(s) < 1 || substeps(s) > (std::int64_t{1} << 30))
+                throw std::invalid_argument("a step has one part or more, and at most 2^30");
+        }
         return N;
     }
 };

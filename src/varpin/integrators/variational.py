@@ -201,6 +201,9 @@ class Variational(Integrator):
 
     def _steps(self, scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
         """What the core takes the derivatives of every step at dw = 0 from, by the names of its arguments."""
+        substeps = trajectory.statistics.substeps
+        if substeps.size and not 1 <= substeps.min() <= substeps.max() <= 1 << 30:
+            raise InputError("the trajectory is damaged: statistics.substeps holds numbers of parts that no step has")
         force = trajectory.u @ scene.actuation.T
         if scene.noise.velocity_dependent:
             force = force + self.drift_share * drifts(scene, trajectory)

@@ -70,8 +70,8 @@ def replay(
     Main args:
         robot: The arm that moved; or pairs of an arm and its motion, to be shown side by side on one clock: a plan and
             its execution, two scenes. What is over before the others is held.
-        motion: A trajectory or a plan; a run of :class:`varpin.Mpc`, which is shown with its plans; or configurations (N + 1, n)
-            [rad or m] with ``dt``, of which a single row shows a pose.
+        motion: A trajectory or a plan; a run of :class:`varpin.Mpc`, which is shown with its plans; or configurations
+            (N + 1, n) [rad or m] with ``dt``, of which a single row shows a pose.
         html: Write one self-contained HTML file here. It plays by itself, with neither server nor network.
         video: Write a film here, as ``.gif`` or ``.mp4``; with or without ``html``.
         open: Open a live window instead.

@@ -22,15 +22,15 @@ namespace varpin {
 
 enum class ExplicitMethod { euler, semi_implicit, runge_kutta };
 
-struct Tableau {
+struct Nystroem {
     int stages = 1;
     double reach[4] = {};                           // c
     double stage_q[4][4] = {}, stage_v[4][4] = {};  // k, l
     double end_q[4] = {}, end_v[4] = {1.0};         // x, y
 };
 
-constexpr Tableau tableau_of(ExplicitMethod method) {
-    Tableau of;
+constexpr Nystroem nystroem_of(ExplicitMethod method) {
+    Nystroem of;
     if (method == ExplicitMethod::semi_implicit) of.end_q[0] = 1.0;
     if (method == ExplicitMethod::runge_kutta) {
         // The classical method of fourth order.
@@ -57,7 +57,7 @@ class ExplicitStepper {
           v(mechanism.dof()),
           dynamics(mechanism, derivatives, solver),
           mechanism_(&mechanism),
-          tableau_(tableau_of(method)),
+          coefficients_(nystroem_of(method)),
           derivatives_(derivatives),
           stage_q_(mechanism.dof()),
           stage_v_(mechanism.dof()),
@@ -72,25 +72,26 @@ class ExplicitStepper {
     std::vector<double> q, v;  // the state
     ForwardDynamics dynamics;  // at the state, when a step begins
 
-    int stages() const { return tableau_.stages; }
+    int stages() const { return coefficients_.stages; }
 
     // From the state that `dynamics` is at; false where a mass matrix on the way is not positive definite.
     bool step(double h, const double* force) {
         for (int i = 0; i < stages(); ++i) {
-            move(h, tableau_.reach[i], tableau_.stage_q[i], tableau_.stage_v[i], i, stage_q_.data(), stage_v_.data());
+            move(h, coefficients_.reach[i], coefficients_.stage_q[i], coefficients_.stage_v[i], i, stage_q_.data(),
+                 stage_v_.data());
             if (i > 0 && !dynamics.at(stage_q_.data(), stage_v_.data())) return false;
             dynamics.acceleration(force, a_[i].data());
             if (derivatives_) differentiate(h, i);
         }
-        move(h, 1.0, tableau_.end_q, tableau_.end_v, stages(), q.data(), v.data());
+        move(h, 1.0, coefficients_.end_q, coefficients_.end_v, stages(), q.data(), v.data());
         return true;
     }
 
     // The derivatives of the last step in (q, v) and in the force into Jx (2n, 2n) and Jf (2n, n), of which everything
     // outside of blocks is zero already.
     void write_derivatives(double h, double* Jx, double* Jf) {
-        add_up(h * h, tableau_.end_q, sum_q_);
-        add_up(h, tableau_.end_v, sum_v_);
+        add_up(h * h, coefficients_.end_q, sum_q_);
+        add_up(h, coefficients_.end_v, sum_v_);
         const int n = mechanism_->dof();
         const double *in_q = sum_q_.data(), *in_v = sum_v_.data();
         for (const Block& block : mechanism_->tree.blocks) {
@@ -138,15 +139,15 @@ class ExplicitStepper {
         dynamics.differentiate(stage_v_.data(), a_[i].data());
         double in_q[4], in_v[4];
         for (int k = 0; k < i; ++k) {
-            in_q[k] = h * h * tableau_.stage_q[i][k];
-            in_v[k] = h * tableau_.stage_v[i][k];
+            in_q[k] = h * h * coefficients_.stage_q[i][k];
+            in_v[k] = h * coefficients_.stage_v[i][k];
         }
         int first = 0;
         for (const Block& block : mechanism_->tree.blocks) {
             const int size = block.end - block.begin;
             const double* before[4] = {};
             for (int k = 0; k < i; ++k) before[k] = slope_[k].data() + first;
-            dynamics.slope(block, slope_[i].data() + first, h * tableau_.reach[i], i, before, in_q, in_v);
+            dynamics.slope(block, slope_[i].data() + first, h * coefficients_.reach[i], i, before, in_q, in_v);
             first += 3 * size * size;
         }
     }
@@ -167,7 +168,7 @@ class ExplicitStepper {
     }
 
     const Mechanism* mechanism_;
-    Tableau tableau_;
+    Nystroem coefficients_;
     bool derivatives_;
     std::vector<double> stage_q_, stage_v_;
     std::vector<double> a_[4];           // (n) of each stage

@@ -22,7 +22,7 @@ namespace varpin {
 class VariationalLinearization {
   public:
     VariationalLinearization(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                             double left, Solver solver)
+                             double left, Solver solver = Solver::automatic)
         : stepper(mechanism, tableau, tolerance, guards, left, solver),
           n(mechanism.dof()),
           stages(tableau.stages),

@@ -54,7 +54,7 @@ struct Substep {
 class VariationalStepper {
   public:
     VariationalStepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                       double left, Solver solver)
+                       double left, Solver solver = Solver::automatic)
         : mechanism(mechanism),
           tableau(tableau),
           tolerance(tolerance),
@@ -148,7 +148,7 @@ class VariationalStepper {
                     place /= 2;
                 }
             } else if (!(extrapolated && outcome != Outcome::energy)) {
-                if (level == guards.most_halvings) return outcome;
+                if (level >= guards.most_halvings) return outcome;
                 ++level;
                 place *= 2;
             }
