@@ -43,7 +43,7 @@ def of_mechanism(scene):
 def of_tableau():
     a, b, c = gauss_coefficients(2)
     ahead = interpolation(np.append(c, 1.0), 1.0 + c)
-    return {"a": a, "gradient": a, "force": a, "b": b, "c": c, "ahead": ahead, "reach": 0.1, "skew": 0.0}
+    return {"a": a, "gradient": a, "force": a, "b": b, "c": c, "ahead": ahead, "reach": 0.1, "skew": 0.0, "stiffly_accurate": False}
 
 
 def of_roll(scene, feedback):
