@@ -43,7 +43,9 @@ def of_mechanism(scene):
 def of_tableau():
     a, b, c = gauss_coefficients(2)
     ahead = interpolation(np.append(c, 1.0), 1.0 + c)
-    return {"a": a, "gradient": a, "force": a, "b": b, "c": c, "ahead": ahead, "reach": 0.1, "skew": 0.0, "stiffly_accurate": False}
+    return {"a": a, "gradient": a, "force": a, "b": b, "c": c, "ahead": ahead, "reach": 0.1, "skew": 0.0} | {
+        "stiffly_accurate": False
+    }
 
 
 def of_roll(scene, feedback):
@@ -68,7 +70,7 @@ def roll(rollout):
             kind(**{name: parts[f"{prefix}.{name}"] for name in kind._fields})
             for kind, prefix in ((Commands, "commands"), (Nodes, "nodes"))
         )
-        path = rollout.copy() if isinstance(rollout, core.ExplicitRollout) else rollout.fork()
+        path = rollout.copy() if isinstance(rollout, core.ExplicitRollout) else rollout.fork(core.Guards.make(**GUARDS))
         path.roll(dt, commands, increments, drift, nodes)
         assert (nodes.done == N).all()
         assert np.isfinite(nodes.q).all()

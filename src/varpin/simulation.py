@@ -172,7 +172,6 @@ def _trajectory(
     u: Floats,
     dw: Floats,
     statistics: StepStatistics,
-    stages: Floats | None = None,
 ) -> Trajectory:
     return Trajectory(
         t=np.arange(len(u) + 1, dtype=np.float64) * dt,
@@ -188,7 +187,6 @@ def _trajectory(
         robot=scene.robot.name,
         joint_names=scene.robot.joint_names,
         statistics=statistics,
-        stages=stages,
     )
 
 
@@ -236,7 +234,7 @@ class Motions:
         steps = join(parts) if len(parts) > 1 else parts[0]
         nodes = {name: np.concatenate([getattr(self._first, name), getattr(steps, name)]) for name in _NODES}
         dw = np.zeros((len(steps.u), self.scene.processes)) if increments is None else increments[: len(steps.u)]
-        made = _trajectory(self.scene, self.integrator, self.dt, nodes, steps.u, dw, steps.statistics, steps.stages)
+        made = _trajectory(self.scene, self.integrator, self.dt, nodes, steps.u, dw, steps.statistics)
         return made, failure
 
 

@@ -94,8 +94,6 @@ class Trajectory(Frozen):
         statistics: What each step took.
         version: The varpin that made it.
         warnings: What varpin said of the motion, a sentence each: dt too coarse, energy off, steps taken in parts.
-        stages: Velocities at the stages of each step (N, s, n), where a plan's motion keeps them: the first guess of
-            its linearization. They are not saved.
     """
 
     t: Floats
@@ -113,7 +111,6 @@ class Trajectory(Frozen):
     statistics: StepStatistics
     version: str = __version__
     warnings: tuple[str, ...] = ()
-    stages: Floats | None = None
 
     def __post_init__(self) -> None:
         nodes, n = np.size(self.t), len(self.joint_names)
@@ -155,7 +152,6 @@ class Trajectory(Frozen):
             **{name: getattr(self, name)[nodes] for name in ("t", "q", "v", "p", "energy")},
             u=self.u[steps],
             dw=self.dw[steps],
-            stages=None if self.stages is None else self.stages[steps],
             statistics=StepStatistics(**{item.name: getattr(own, item.name)[steps] for item in fields(own)}),
         )
 

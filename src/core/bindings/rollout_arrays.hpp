@@ -32,7 +32,6 @@ class NodeArrays {
           v(field<InOut<3>>(nodes, "v")),
           energy(field<InOut<2>>(nodes, "energy")),
           u(field<InOut<3>>(nodes, "u")),
-          stages(field<InOut<4>>(nodes, "stages")),
           tally(field<IntegersInOut<3>>(nodes, "tally")),
           quality(field<InOut<3>>(nodes, "quality")),
           ended(field<IntegersInOut<1>>(nodes, "ended")),
@@ -44,13 +43,10 @@ class NodeArrays {
         require(u, "u", {P, N, m});
         require(tally, "tally", {P, N, 4});
         require(quality, "quality", {P, N, 3});
-        if (stages.shape(0) != 0) require(stages, "stages", {P, N, stages.shape(2), n});
         for (const auto& [array, name] : {std::pair{&ended, "ended"}, {&done, "done"}}) require(*array, name, {P});
     }
 
     std::size_t paths() const { return q.shape(0); }
-    // How many stages a step has, 0 where they are not wanted.
-    std::size_t stage_count() const { return stages.shape(0) == 0 ? 0 : stages.shape(2); }
     std::size_t steps() const { return q.shape(1); }
     Nodes view() const {
         return {static_cast<std::int64_t>(paths()),
@@ -60,7 +56,6 @@ class NodeArrays {
                 v.data(),
                 energy.data(),
                 u.data(),
-                stages.shape(0) == 0 ? nullptr : stages.data(),
                 tally.data(),
                 quality.data(),
                 ended.data(),
@@ -71,7 +66,6 @@ class NodeArrays {
     InOut<3> q, p, v;
     InOut<2> energy;
     InOut<3> u;
-    InOut<4> stages;
     IntegersInOut<3> tally;
     InOut<3> quality;
     IntegersInOut<1> ended, done;

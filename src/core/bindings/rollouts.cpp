@@ -71,8 +71,6 @@ class VariationalRollout {
         const NodeArrays written(mechanism, nodes);
         if (written.paths() != states_.size())
             throw std::invalid_argument("there is not one row of nodes for each path");
-        if (written.stage_count() != 0 && written.stage_count() != static_cast<std::size_t>(stepper_->tableau.stages))
-            throw std::invalid_argument("there is no room for as many stages as a step has");
         const CommandArrays given_commands(mechanism, commands, written.paths(), written.steps());
         const double* dw = increments_of(mechanism, increments, written);
         const double* extra = drift_of(mechanism, drift, written);

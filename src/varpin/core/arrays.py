@@ -72,22 +72,20 @@ class Nodes(NamedTuple):
     v: Floats  # (P, N, n)
     energy: Floats  # (P, N)
     u: Floats  # (P, N, m) controls applied
-    stages: Floats  # (P, N, s, n) stage velocities of steps taken whole, or (0, N, s, n) where nobody asks for them
     tally: Integers  # (P, N, 4) Newton iterations, jets, first-order sweeps, substeps
     quality: Floats  # (P, N, 3) worst scaled residual, smallest branch margin, energy error so far [J]
     ended: Integers  # (P,) how
     done: Integers  # (P,) steps
 
 
-def new_nodes(paths: int, steps: int, dof: int, controls: int, stages: int = 0) -> Nodes:
-    """Room for the nodes of a rollout, and for the velocities at so many stages of each step."""
+def new_nodes(paths: int, steps: int, dof: int, controls: int) -> Nodes:
+    """Room for the nodes of a rollout."""
     return Nodes(
         q=np.empty((paths, steps, dof)),
         p=np.empty((paths, steps, dof)),
         v=np.empty((paths, steps, dof)),
         energy=np.empty((paths, steps)),
         u=np.empty((paths, steps, controls)),
-        stages=np.empty((paths if stages else 0, steps, stages, dof)),
         tally=np.zeros((paths, steps, 4), dtype=np.int64),
         quality=np.zeros((paths, steps, 3)),
         ended=np.zeros(paths, dtype=np.int64),

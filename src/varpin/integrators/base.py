@@ -44,7 +44,6 @@ class Segment:
         energy: (k,) [J].
         statistics: Of the k steps.
         failure: Why the step after them failed, or None.
-        stages: Velocities at the stages of each step (k, s, n), of variational integrators and one path.
     """
 
     q: Floats
@@ -54,7 +53,6 @@ class Segment:
     energy: Floats
     statistics: StepStatistics
     failure: Failure | None = None
-    stages: Floats | None = None
 
 
 class Integrator(ABC):
@@ -199,9 +197,7 @@ def join(segments: Sequence[Segment]) -> Segment:
         }
     )
     nodes = {name: np.concatenate([getattr(s, name) for s in segments]) for name in ("q", "p", "v", "u", "energy")}
-    kept = [s.stages for s in segments if s.stages is not None]
-    stages = np.concatenate(kept) if len(kept) == len(segments) else None
-    return Segment(**nodes, statistics=statistics, failure=segments[-1].failure, stages=stages)
+    return Segment(**nodes, statistics=statistics, failure=segments[-1].failure)
 
 
 def diffusion_and_drift(scene: Scene, q: Floats, v: Floats, u: Floats, start: Floats) -> tuple[Floats, Floats]:
@@ -251,7 +247,6 @@ def segments_of(nodes: Nodes, reasons: Mapping[int, str]) -> list[Segment]:
                 energy=nodes.energy[i, :done],
                 statistics=statistics,
                 failure=failure,
-                stages=nodes.stages[i, :done] if len(nodes.stages) else None,
             )
         )
     return segments

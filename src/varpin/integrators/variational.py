@@ -156,10 +156,7 @@ class Variational(Integrator):
         dt: float,
     ) -> list[Segment]:
         """See :meth:`Integrator.rollout_compiled`."""
-        paths = len(state.start)
-        # Of one path, which may be linearized.
-        stages = len(self._times()) if paths == 1 else 0
-        nodes = new_nodes(paths, steps_of(commands), scene.robot.dof, scene.controls, stages)
+        nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
         state.paths.roll(dt, commands, increments, drift, nodes)
         return segments_of(nodes, REASONS)
 
@@ -229,10 +226,7 @@ class Variational(Integrator):
         With noise that step starts from another momentum, and its velocity is all there is to go by.
         """
         q, v, c = trajectory.q, trajectory.v, self._times()[None, :, None]
-        noisy = trajectory.dw.any()
-        if trajectory.stages is not None and not noisy and trajectory.stages.shape[1] == c.size:
-            return trajectory.stages
-        if noisy:
+        if trajectory.dw.any():
             return v[:-1, None] + np.zeros_like(c)
         mean = (np.diff(q, axis=0) / trajectory.dt)[:, None]
         if c.size == 1:

@@ -24,7 +24,6 @@ struct Nodes {
     double* v = nullptr;            // (P, N, n)
     double* energy = nullptr;       // (P, N) [J]
     double* u = nullptr;            // (P, N, m) controls applied
-    double* stages = nullptr;       // (P, N, s, n) stage velocities of steps taken whole, or null
     std::int64_t* tally = nullptr;  // (P, N, 4) Newton iterations, jets, first-order sweeps, substeps
     double* quality = nullptr;      // (P, N, 3) worst scaled residual, smallest branch margin, energy error so far [J]
     std::int64_t* ended = nullptr;  // (P) an Outcome

@@ -190,10 +190,6 @@ class VariationalStepper {
                 if (outcome != Outcome::solved) break;
                 if (noisy && left < 1.0) noise_kick(1.0 - left, u + s * m, dw, state);
                 record_node(nodes, row, state);
-                if (nodes.stages) {
-                    std::copy(step_equation.V.begin(), step_equation.V.end(),
-                              nodes.stages + row * step_equation.stages * n);
-                }
                 nodes.done[path] = s + 1;
             }
         }
