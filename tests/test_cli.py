@@ -613,6 +613,9 @@ def test_interruption_while_python_imports_is_no_traceback():
     code = """
 import importlib.abc, os, signal, sys, varpin_command
 
+# Whoever runs the tests may ignore it, and children inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 class Interrupt(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path, target=None):
         if name == "pinocchio":
