@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.checks import count
-from varpin.core import Guards, Tableau
-from varpin.errors import InputError
+from varpin.core import Tableau
+from varpin.integrators.collocation import Collocation
 from varpin.integrators.tableau import gauss, gauss_coefficients
-from varpin.integrators.variational import Guard, Variational
+from varpin.integrators.variational import Guard
 
 Floats = NDArray[np.float64]
 
-MOST_STAGES = 6
 # Of the energy errors that one stage is allowed, what is enough for more: steps of high order seldom need it.
 BALANCE_SHARE, BUDGET_SHARE = 1 / 25, 1 / 100
 
 
 @dataclass(frozen=True)
-class Gauss(Variational):
+class Gauss(Collocation):
     """Variational Gauss-Legendre collocation with s stages, in position-momentum form.
 
     Solves L_v(Q_i, V_i) = p0 + dt sum_j a_ij (L_q + F)(Q_j, V_j) with Q_i = q0 + dt sum_j a_ij V_j for the stage
@@ -47,18 +44,6 @@ class Gauss(Variational):
         kick: When noise kicks the momentum, ``"left"`` or ``"split"``.
     """
 
-    stages: int = 2
-    guard: Guard | None = Guard()  # noqa: RUF009
-    tolerance: float = 0.5
-    kick: Literal["left", "split"] = "left"
-
-    named = ("stages",)
-
-    def __post_init__(self) -> None:
-        if count("stages", self.stages, 1) > MOST_STAGES:
-            raise InputError(f"stages must be at most {MOST_STAGES}, got {self.stages}")
-        super().__post_init__()
-
     @property
     def order(self) -> int:
         """See :meth:`Integrator.order`; 2 s."""
@@ -70,12 +55,11 @@ class Gauss(Variational):
     def _times(self) -> Floats:
         return gauss_coefficients(int(self.stages))[2]
 
-    def _guards(self) -> Guards:
+    def _asked(self) -> Guard | None:
         if self.stages == 1 or self.guard is None:
-            return super()._guards()
-        strict = replace(
+            return self.guard
+        return replace(
             self.guard,
             energy_balance=BALANCE_SHARE * self.guard.energy_balance,
             energy_budget=BUDGET_SHARE * self.guard.energy_budget,
         )
-        return replace(self, stages=1, guard=strict)._guards()

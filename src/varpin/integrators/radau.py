@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.checks import count
 from varpin.core import Tableau
-from varpin.errors import InputError
+from varpin.integrators.collocation import Collocation
 from varpin.integrators.tableau import radau, radau_coefficients
-from varpin.integrators.variational import Guard, Variational
 
 Floats = NDArray[np.float64]
 
-MOST_STAGES = 6
-
 
 @dataclass(frozen=True)
-class Radau(Variational):
+class Radau(Collocation):
     """Radau IIA collocation with s stages, in position-momentum form, for damping and springs faster than the step.
 
     The stage equations of :class:`Gauss` with other points, the last of them the end of the step. Of order 2 s - 1 and
@@ -38,17 +33,7 @@ class Radau(Variational):
         kick: When noise kicks the momentum, ``"left"`` or ``"split"``.
     """
 
-    stages: int = 2
-    guard: Guard | None = Guard()  # noqa: RUF009
-    tolerance: float = 0.5
-    kick: Literal["left", "split"] = "left"
-
-    named = ("stages",)
-
-    def __post_init__(self) -> None:
-        if count("stages", self.stages, 2) > MOST_STAGES:
-            raise InputError(f"stages must be at most {MOST_STAGES}, got {self.stages}")
-        super().__post_init__()
+    least = 2
 
     @property
     def order(self) -> int:

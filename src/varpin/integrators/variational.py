@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.checks import count, fraction, is_one_of, positive
-from varpin.core import Guards, Tableau, VariationalRollout, variational_curvatures, variational_derivatives
+from varpin.core import (
+    Guards,
+    Outcome,
+    Tableau,
+    VariationalRollout,
+    variational_curvatures,
+    variational_derivatives,
+)
 from varpin.core.arrays import Commands, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
@@ -29,13 +36,12 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-# By the numbers of nodes.hpp.
-REASONS = {
-    1: "Newton's iteration does not contract, however small the substep",
-    2: "the step equation gives values that are not finite",
-    3: "the step is at a fold of the step equation's solutions (its branch margin is not positive)",
-    4: "the energy balance of the step does not close",
-    5: "the mass matrix at the end of the step is not positive definite",
+REASONS: dict[int, str] = {
+    Outcome.diverged: "Newton's iteration does not contract, however small the substep",
+    Outcome.not_finite: "the step equation gives values that are not finite",
+    Outcome.fold: "the step is at a fold of the step equation's solutions (its branch margin is not positive)",
+    Outcome.energy: "the energy balance of the step does not close",
+    Outcome.singular: "the mass matrix at the end of the step is not positive definite",
 }
 
 
@@ -119,10 +125,15 @@ class Variational(Integrator):
     def _tableau(self) -> Tableau:
         """Its coefficients."""
 
+    def _asked(self) -> Guard | None:
+        """What of its guard is asked of its steps."""
+        return self.guard
+
     def _guards(self) -> Guards:
-        own = self.guard or Guard(max_halvings=0)
+        asked = self._asked()
+        own = asked or Guard(max_halvings=0)
         return Guards.make(
-            active=self.guard is not None,
+            active=asked is not None,
             branch_margin=float(own.branch_margin),
             energy_balance=float(own.energy_balance),
             energy_budget=float(own.energy_budget),

@@ -1,0 +1,30 @@
+"""What collocation methods of several stages share: their options."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from varpin.checks import count
+from varpin.errors import InputError
+from varpin.integrators.variational import Guard, Variational
+
+MOST_STAGES = 6
+
+
+@dataclass(frozen=True)
+class Collocation(Variational):
+    """A variational integrator with ``stages`` stages, from ``least`` on."""
+
+    stages: int = 2
+    guard: Guard | None = Guard()  # noqa: RUF009
+    tolerance: float = 0.5
+    kick: Literal["left", "split"] = "left"
+
+    named = ("stages",)
+    least: ClassVar[int] = 1
+
+    def __post_init__(self) -> None:
+        if count("stages", self.stages, self.least) > MOST_STAGES:
+            raise InputError(f"stages must be at most {MOST_STAGES}, got {self.stages}")
+        super().__post_init__()
