@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from varpin.chatter import RUN, Alternation, alternation
 from varpin.errors import SingularMassMatrix
-from varpin.integrators import ExplicitEuler, Integrator, Radau, Reference
+from varpin.integrators import ExplicitEuler, Integrator, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.lagrangian import lagrangian_jet
@@ -175,7 +175,7 @@ def evident(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tup
     found = []
     rate = _fast_damping(scene, trajectory)
     # With more stages what dampers are faster than a step leaves is less.
-    if not isinstance(integrator, Radau) and trajectory.dt * rate > 2.0 * getattr(integrator, "stages", 1):
+    if not integrator.l_stable and trajectory.dt * rate > 2.0 * getattr(integrator, "stages", 1):
         found.append(Finding("fast damping", _ringing(rate, trajectory.dt)))
     if split := _in_parts(trajectory):
         found.append(Finding("split steps", f"{split}: dt = {trajectory.dt:g} s is coarse here"))
@@ -278,7 +278,7 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
             f"smaller steps from t = {start:.4g} s on move joint {trajectory.joint_names[error.joint]!r} by "
             f"{100 * error.position:.3g}% of its way over a period, and its velocity by {100 * error.velocity:.3g}%"
         )
-        rate = 0.0 if isinstance(integrator, Radau) else _fast_damping(scene, trajectory)
+        rate = 0.0 if integrator.l_stable else _fast_damping(scene, trajectory)
         if rate:
             found.append(Finding("fast damping", f"{_ringing(rate, dt)}; {off}", error.joint))
         else:

@@ -69,6 +69,8 @@ class Integrator(ABC):
     """
 
     variational: bool
+    # Whether what dampers stop within a step is at rest after it.
+    l_stable: ClassVar[bool] = False
     # Options that its text names even where they are the default.
     named: ClassVar[tuple[str, ...]] = ()
 

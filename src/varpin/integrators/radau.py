@@ -34,6 +34,7 @@ class Radau(Collocation):
     """
 
     least = 2
+    l_stable = True
 
     @property
     def order(self) -> int:
