@@ -1,4 +1,4 @@
-"""The same mechanism in other simulators: MuJoCo, Drake, trep, and SciPy on Pinocchio's forward dynamics.
+"""The same mechanism in other simulators: MuJoCo, Drake, trep, and DOP853, SciPy's or compiled, on Pinocchio's ``aba``.
 
 Each takes part where it is installed (``pip install "varpin[peers]"``; trep has no release for Python 3 and has to be
 ported by hand). :func:`require_same` holds every model against Pinocchio's before anybody races: mass matrix, energy
@@ -7,17 +7,24 @@ and acceleration, with gravity, dampers, springs and torques. Robots of revolute
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import importlib.metadata
+import shutil
+import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 from scipy.integrate import solve_ivp
+from scipy.integrate._ivp import dop853_coefficients as dop853
 
 import varpin as vp
 
@@ -127,6 +134,63 @@ def scipy_run(case: Case, rtol: float, method: str = "DOP853") -> Callable[[], n
         if not solution.success:
             raise PeerBlewUp(solution.message)
         return solution.y[:n, -1]
+
+    return run
+
+
+# Compiled DOP853 ----------------------------------------------------------------------------------------------------
+
+
+@cache
+def _dop853_library() -> ctypes.CDLL | None:
+    """dop853.cpp, compiled against the headers of the ``pin`` wheel; None without a compiler or Eigen's headers.
+
+    It takes two minutes, once a process.
+    """
+    headers = Path(pin.__file__).parents[4] / "include"
+    eigen, compiler = headers / "eigen3", shutil.which("c++")
+    if compiler is None or not eigen.is_dir():
+        return None
+    # As Pinocchio's own pkg-config file has them.
+    defines = ("-DBOOST_MPL_LIMIT_LIST_SIZE=30", "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS")
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / "dop853.so"
+        source = Path(__file__).with_name("dop853.cpp")
+        options = ("-w", "-std=c++17", "-O3", "-DNDEBUG", *defines, f"-I{headers}", f"-I{eigen}", "-shared", "-fPIC")
+        subprocess.run([compiler, *options, str(source), "-o", str(library)], check=True)
+        loaded = ctypes.CDLL(str(library))
+    loaded.varpin_problem.restype = ctypes.c_void_p
+    loaded.varpin_integrate.restype = ctypes.c_long
+    return loaded
+
+
+def _pointer(values: np.ndarray) -> ctypes.c_void_p:
+    return ctypes.c_void_p(values.ctypes.data)
+
+
+def compiled_run(case: Case, tolerance: float) -> Callable[[], np.ndarray] | None:
+    """A run of DOP853 in C++ on Pinocchio's ``aba`` that gives the last q; None where it cannot be compiled."""
+    library = _dop853_library()
+    if library is None:
+        return None
+    scene, own = case.scene, bodies(case.scene.robot)
+    parents = np.array([body.parent for body in own], dtype=np.intc)
+    placements = np.array([np.append(body.placement.rotation.ravel(), body.placement.translation) for body in own])
+    axes = np.array([body.axis for body in own], dtype=float)
+    inertias = np.array([body.inertia.toDynamicParameters() for body in own])
+    forces = np.array([scene.actuation @ case.u, scene.damping, scene.stiffness, scene.rest])
+    arrays = [np.ascontiguousarray(a) for a in (parents, placements, axes, inertias, scene.gravity, forces)]
+    # Never freed: it lives as long as the process.
+    problem = ctypes.c_void_p(library.varpin_problem(len(own), *map(_pointer, arrays)))
+    coefficients = [np.ascontiguousarray(a) for a in (dop853.A[:12, :12], dop853.B, dop853.E3, dop853.E5)]
+    start = np.concatenate([case.q0, case.v0])
+
+    def run() -> np.ndarray:
+        x = start.copy()
+        duration, asked = ctypes.c_double(case.duration), ctypes.c_double(tolerance)
+        if library.varpin_integrate(problem, _pointer(x), duration, asked, *map(_pointer, coefficients)) < 0:
+            raise PeerBlewUp("the step of DOP853 vanishes")
+        return x[: len(own)]
 
     return run
 

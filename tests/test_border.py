@@ -35,7 +35,8 @@ def of_mechanism(scene):
     tree, fields = scene.robot.tree, scene.diffusion
     return {
         **{name: getattr(tree, name) for name in TREE},
-        **{name: getattr(scene, name) for name in ("gravity", "damping", "stiffness", "rest", "actuation")},
+        **{name: getattr(scene, name) for name in ("gravity", "actuation")},
+        "forces": scene.elements,
         **dict(zip(("constant", "control", "quadratic", "centers"), fields, strict=True)),
     }
 
@@ -102,8 +103,9 @@ def steps(scene):
         "tolerance": 0.5,
         "guards": core.Guards.make(**GUARDS),
         "dt": 1e-3,
-        **{"q": draw(N, n), "p": 0.1 * draw(N, n), "guess": np.zeros((N, 2, n)), "force": draw(N, n)},
+        **{"q": draw(N, n), "p": 0.1 * draw(N, n), "force": draw(N, n)},
         "substeps": np.array([1, 1, 2, 4]),
+        "halvings": np.array([1, 1, 2, 2, 2, 2], dtype=np.uint8),
     }
 
 
@@ -130,8 +132,10 @@ def calls():
         yield f"roll, feedback of {feedback}", roll(begun(own)), of_roll(own, feedback)
         for method in core.ExplicitMethod:
             yield f"{method}, feedback of {feedback}", roll(explicit(own, method)), of_roll(own, feedback)
-    yield "derivatives", core.variational_derivatives, steps(own)
-    yield "curvatures", core.variational_curvatures, {**steps(own), "z": draw(N, 2 * n)}
+    guess = np.zeros((N, 2, n))
+    yield "derivatives", core.variational_derivatives, {**steps(own), "guess": guess}
+    yield "curvatures", core.variational_curvatures, {**steps(own), "guess": guess, "z": draw(N, 2 * n)}
+    yield "ends", core.variational_ends, steps(own)
     yield "accelerations", core.accelerations, {"mechanism": own.core, **many}
     for method in core.ExplicitMethod:
         fixed = {"mechanism": own.core, "method": method, "dt": 1e-3}
@@ -189,3 +193,16 @@ def test_what_does_not_fit_is_refused(every, change):
 def test_halvings_that_cannot_be_counted_are_refused(halvings):
     with pytest.raises(ValueError, match="halvings are from 0 to 62"):
         core.Guards.make(**{**GUARDS, "most_halvings": halvings})
+
+
+@pytest.mark.parametrize("level", [0, 63])
+def test_parts_that_no_step_has_are_refused(level):
+    given = {**steps(scene()), "halvings": np.array([1, 1, 2, 2, 2, level], dtype=np.uint8)}
+    with pytest.raises(ValueError, match="parts are halved 1 to 62 times"):
+        core.variational_ends(**given)
+
+
+@pytest.mark.parametrize("path", [-1, P])
+def test_parts_of_a_path_that_is_not_there_are_refused(path):
+    with pytest.raises((ValueError, TypeError), match=r"no such path|incompatible"):
+        begun(scene()).halvings(path)

@@ -11,7 +11,18 @@ from mechanisms import joint, link, mimic, random_tree, write_urdf
 from test_linearization import difference
 
 import varpin as vp
-from varpin.core import ExplicitMethod, ExplicitRollout, Links, Mechanism, Outcome, accelerations, linearize_explicit
+from varpin.core import (
+    ExplicitMethod,
+    ExplicitRollout,
+    ForwardDynamics,
+    Links,
+    Mechanism,
+    Outcome,
+    Solver,
+    VariationalRollout,
+    accelerations,
+    linearize_explicit,
+)
 from varpin.core.arrays import new_nodes
 from varpin.integrators.base import open_loop
 from varpin.robot.kinematics import links
@@ -81,8 +92,7 @@ def test_what_is_no_tree_is_refused(field, value, match):
     own = {name: getattr(tree, name) for name in names}
     own["ends"] = np.array(tree.ends)
     own[field] = np.array(value, dtype=own[field].dtype)
-    own |= {name: np.zeros(2) for name in ("damping", "stiffness", "rest")}
-    own |= {"actuation": np.eye(2), "constant": np.zeros((2, 0)), "control": np.zeros((2, 0, 2))}
+    own |= {"forces": (), "actuation": np.eye(2), "constant": np.zeros((2, 0)), "control": np.zeros((2, 0, 2))}
     own |= {"quadratic": np.zeros((2, 0)), "centers": np.zeros((2, 0))}
     with pytest.raises(ValueError, match=match):
         Mechanism.make(**own, groups=tree.groups, gravity=np.zeros(3))
@@ -230,3 +240,29 @@ def test_what_are_no_links_is_refused(change, match):
     names = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset")
     with pytest.raises(ValueError, match=match):
         Links.make(**({name: getattr(own, name) for name in names} | change), dof=2)
+
+
+def test_matrices_beyond_the_range_of_indices_are_refused_before_there_is_room_for_them():
+    """A chain of 50 000 joints has mass matrices of more than 2^31 numbers; what needs none of them runs."""
+    n, link = 50_000, vp.planar_chain(1).tree
+    own = {name: np.repeat(getattr(link, name), n, axis=0) for name in (
+        "prismatic", "rotation", "translation", "mass", "center", "inertia", "ratio", "offset", "periodic", "armature",
+        "group",
+    )}  # fmt: skip
+    own |= {"parent": np.arange(-1, n - 1), "coordinate": np.arange(n), "origin": np.repeat([1, 0], [1, n - 1])}
+    own |= {"loads": np.zeros(0, dtype=np.int64), "carried": np.zeros((0, n), dtype=np.int64), "ends": np.array([n])}
+    own |= {"actuation": np.zeros((n, 0)), "constant": np.zeros((n, 0)), "control": np.zeros((n, 0, 0))}
+    own |= {"quadratic": np.zeros((n, 0)), "centers": np.zeros((n, 0))}
+    chain = Mechanism.make(**own, groups=1, gravity=np.zeros(3), forces=[])
+    still = np.zeros((1, n))
+    step = (vp.Midpoint()._tableau(), 0.5, vp.Midpoint()._guards())
+    assert VariationalRollout(chain, *step, 1.0, 1, Solver.elimination).begin(still, still)
+    quick = VariationalRollout(chain, vp.Gauss(2)._tableau(), *step[1:], 1.0, 1)
+    assert quick.begin(still, still)
+    for dense in (
+        lambda: VariationalRollout(chain, *step, 1.0, 1, Solver.dense),
+        lambda: ForwardDynamics(chain, Solver.dense),
+        lambda: chain.jet(still[0], still[0]),
+    ):
+        with pytest.raises(ValueError, match=r"a matrix of \d+ by \d+ numbers is more than varpin can index"):
+            dense()

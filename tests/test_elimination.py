@@ -189,9 +189,10 @@ def test_derivatives_are_those_with_matrices(robot, integrator, stages):
     p = vp.lagrangian_jet(scene, q, v).Lv
     fixed = scene.core, integrator._tableau(), float(integrator.tolerance), integrator._guards(), 1e-3
     guess = np.broadcast_to(v, (1, stages, robot.dof)).copy()
-    at = q[None], p[None], guess, np.zeros((1, robot.dof)), np.ones(1, dtype=np.int64)
+    at = q[None], p[None], np.zeros((1, robot.dof)), np.ones(1, dtype=np.int64), np.zeros(0, dtype=np.uint8)
     (Ax, Af, *done), (Bx, Bf, *also) = (
-        variational_derivatives(*fixed, *at, solver) for solver in (Solver.dense, Solver.elimination)
+        variational_derivatives(*fixed, *at, guess=guess, solver=solver)
+        for solver in (Solver.dense, Solver.elimination)
     )
     assert done == also == [0, 1]
     for A, B in ((Ax, Bx), (Af, Bf)):

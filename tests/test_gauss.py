@@ -71,7 +71,7 @@ def test_one_step_solves_the_stage_equations(stages):
 
     solution = root(equations, (q0 + dt * c[:, None] * v0).ravel(), tol=1e-13)
     V, _, slope = at(solution.x)
-    end = vp.simulate(scene, q0, v0, dt=dt, steps=1, controls=u, integrator=vp.Gauss(stages))
+    end = vp.simulate(scene, q0, v0, dt=dt, steps=1, controls=u, integrator=vp.Gauss(stages), check=False)
     np.testing.assert_allclose(end.q[1], q0 + dt * b @ V, rtol=0, atol=1e-10)
     np.testing.assert_allclose(end.p[1], p0 + dt * b @ slope, rtol=0, atol=1e-9)
 
@@ -114,7 +114,9 @@ def test_order_twice_the_stages(stages, name, forced):
     scene, start, u, duration, exact = problem(name, forced)
     errors = []
     for steps in STEPS[name][stages]:
-        end = vp.simulate(scene, *start, dt=duration / steps, steps=steps, controls=u, integrator=vp.Gauss(stages))
+        end = vp.simulate(
+            scene, *start, dt=duration / steps, steps=steps, controls=u, integrator=vp.Gauss(stages), check=False
+        )
         assert end.statistics.split_steps == 0
         errors.append(np.linalg.norm(end.q[-1] - exact))
     slopes = -np.diff(np.log(errors)) / np.diff(np.log(STEPS[name][stages]))
@@ -212,7 +214,9 @@ def oscillator(stiffness):
 def test_a_spring_is_turned_by_the_pade_approximant(stages):
     """One step of the oscillator is the diagonal Pade approximant of exp(h [[0, 1], [-k, 0]]), stiff or not."""
     for product in (0.3, 5.0, 400.0):  # h sqrt(k)
-        motion = vp.simulate(oscillator(product**2), [1.0], [0.7], dt=1.0, steps=1, integrator=vp.Gauss(stages))
+        motion = vp.simulate(
+            oscillator(product**2), [1.0], [0.7], dt=1.0, steps=1, integrator=vp.Gauss(stages), check=False
+        )
         assert motion.statistics.split_steps == 0
         Z = np.array([[0.0, 1.0], [-(product**2), 0.0]])
         factors = [1.0]
@@ -232,7 +236,9 @@ def test_a_spring_is_turned_by_the_pade_approximant(stages):
 @pytest.mark.parametrize("stages", [2, 3])
 def test_energy_round_off_walks_at_random(stages):
     """A mass on a spring: Gauss collocation conserves quadratic energies exactly, so what is left is rounding."""
-    motion = vp.simulate(oscillator(3.0), [1.0], [0.3], dt=2e-2, steps=200_000, integrator=vp.Gauss(stages))
+    motion = vp.simulate(
+        oscillator(3.0), [1.0], [0.3], dt=2e-2, steps=200_000, integrator=vp.Gauss(stages), check=False
+    )
     assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 50 * np.finfo(float).eps
 
 
@@ -304,7 +310,7 @@ def test_split_steps_are_counted_and_chained():
 
     def step(x):
         v = np.linalg.solve(vp.lagrangian_jet(scene, x[:3], np.zeros(3)).Lvv, x[3:])
-        end = vp.simulate(scene, x[:3], v, dt=dt, steps=1, integrator=integrator)
+        end = vp.simulate(scene, x[:3], v, dt=dt, steps=1, integrator=integrator, check=False)
         assert end.statistics.substeps[0] == parts
         return np.concatenate([end.q[1], end.p[1]])
 
@@ -427,7 +433,9 @@ def test_failure_keeps_what_was_done(stages):
 def test_stiff_springs_and_dampers(stages, stiffness, damping):
     """Springs and dampers far faster than the step: finite, bounded, and dissipating what they should."""
     scene = vp.Scene(vp.load_robot("finger"), gravity=False, stiffness=stiffness, damping=damping)
-    motion = vp.simulate(scene, [0.1, 0.1, 0.1], np.zeros(3), dt=1e-2, steps=500, integrator=vp.Gauss(stages))
+    motion = vp.simulate(
+        scene, [0.1, 0.1, 0.1], np.zeros(3), dt=1e-2, steps=500, integrator=vp.Gauss(stages), check=False
+    )
     assert np.isfinite(motion.q).all()
     if damping == 0.0:
         assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 0.1

@@ -174,7 +174,7 @@ def test_strong_order_one(name, kick):
         steps = len(dw)
         end = vp.simulate(
             scene, [1.0, 0.5], [0.0, 0.0], dt=duration / steps, steps=steps, increments=dw, integrator=integrator,
-            controls=np.repeat(u, steps // coarse, axis=0),
+            controls=np.repeat(u, steps // coarse, axis=0), check=False,
         )  # fmt: skip
         nodes = slice(None, None, steps // coarse)
         return np.hstack([end.q[nodes], end.p[nodes]])

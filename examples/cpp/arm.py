@@ -14,6 +14,8 @@ import varpin as vp
 HEADER = """// Written by arm.py: {robot}.
 #pragma once
 
+#include <cmath>
+
 #include "varpin/tree.hpp"
 
 inline varpin::Mechanism arm() {{
@@ -28,9 +30,7 @@ inline varpin::Mechanism arm() {{
     out.tree.blocks = {blocks};
     out.tree.light_parts = {light_parts};
     out.gravity = {gravity};
-    out.damping = {damping};
-    out.stiffness = {stiffness};
-    out.rest = {rest};
+    out.forces = varpin::Forces({forces});
     out.controls = {controls};
     out.actuation = {actuation};
     return out;
@@ -58,7 +58,14 @@ def cpp(value: object) -> str:
     """A number or an array, as C++ has it."""
     if isinstance(value, list | tuple | np.ndarray):
         return "{" + ", ".join(cpp(item) for item in value) + "}"
-    return float(value).hex() if isinstance(value, float) else str(int(value))
+    if isinstance(value, float):
+        return value.hex() if np.isfinite(value) else f"{'-' if value < 0.0 else ''}HUGE_VAL"
+    return str(int(value))
+
+
+def elements(scene: vp.Scene) -> str:
+    """The forces on single joints."""
+    return "{" + ", ".join(f"varpin::{own.kind}{cpp((own.coordinate, *own.values))}" for own in scene.elements) + "}"
 
 
 def header(scene: vp.Scene) -> str:
@@ -76,12 +83,13 @@ def header(scene: vp.Scene) -> str:
         for j in range(len(tree.parent))
     ]
     begins = [0, *tree.ends[:-1]]
-    fields = {name: cpp(getattr(tree, name)) for name in ("armature", "periodic", "group", "groups")}
-    fields |= {name: cpp(getattr(scene, name)) for name in ("gravity", "damping", "stiffness", "rest", "controls")}
+    fields = {name: cpp(getattr(tree, name)) for name in ("periodic", "group", "groups")}
+    fields |= {name: cpp(getattr(scene, name)) for name in ("armature", "gravity", "controls")}
     return HEADER.format(
         robot=scene.robot.name,
         bodies="\n".join(bodies),
         blocks=cpp(list(zip(begins, tree.ends, strict=True))),
+        forces=elements(scene),
         light_parts=cpp(list(zip(tree.loads, tree.carried, strict=True))),
         actuation=cpp([(r, c, scene.actuation[r, c]) for r, c in np.argwhere(scene.actuation)]),
         **fields,

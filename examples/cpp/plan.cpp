@@ -9,6 +9,7 @@
 #include <cstdio>
 #include <fstream>
 #include <limits>
+#include <span>
 #include <vector>
 
 #include "arm.hpp"
@@ -43,6 +44,7 @@ struct Motion {
     Vector u = Vector(N * m), q = Vector(N * n), p = Vector(N * n), v = Vector(N * n), energy = Vector(N),
            quality = Vector(3 * N);
     std::vector<std::int64_t> tally = std::vector<std::int64_t>(4 * N);
+    std::vector<std::uint8_t> halvings;  // of the parts of steps that were not taken whole
     std::int64_t ended = 0, done = 0;
 
     bool whole() const { return done == N; }
@@ -82,6 +84,7 @@ Motion rollout(const Vector& q0, const Vector& u, const Vector* gains = nullptr,
                   .quality = motion.quality.data(),
                   .ended = &motion.ended,
                   .done = &motion.done});
+    motion.halvings = paths[0].halvings;
     return motion;
 }
 
@@ -100,14 +103,18 @@ double cost(const Motion& motion, const Vector& u0) {
 
 // A (N, 2n, 2n) and B (N, 2n, m) of every step; false where a step has no derivative.
 bool linearize(const Motion& motion, Vector& A, Vector& B) {
-    varpin::VariationalLinearization linearization(mechanism, midpoint, tolerance, {}, 1.0);
+    varpin::VariationalLinearization linearization(mechanism, midpoint, tolerance, {.active = false});
     Vector guess(n), force(n), by_force(x * n);
+    auto next = motion.halvings.begin();
     for (int s = 0; s < N; ++s) {
         const double* q = motion.q_before(s);
         for (int i = 0; i < n; ++i) guess[i] = (motion.q_before(s + 1)[i] - q[i]) / h;
         varpin::constant_force(mechanism, nullptr, &motion.u[s * m], force.data());
+        const std::int64_t parts = motion.tally[4 * s + 3];
+        const std::span halvings(next, parts > 1 ? parts : 0);
+        next += halvings.size();
         const varpin::Outcome outcome = linearization.first(h, q, motion.p_before(s), guess.data(), force.data(),
-                                                            motion.tally[4 * s + 3], &A[s * x * x], by_force.data());
+                                                            halvings, &A[s * x * x], by_force.data());
         if (outcome != varpin::Outcome::solved) return false;
         for (int i = 0; i < x; ++i) {
             double* row = &B[(s * x + i) * m];

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from varpin.checks import JointValues, fraction, joint_array, positive
 from varpin.errors import InputError
+from varpin.forces import of_kind
 from varpin.scene import Scene, require_scene
 from varpin.textbook import rigid_body_Lqq
 
@@ -88,13 +89,37 @@ def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
     C = pin.computeCoriolisMatrix(model, data, full_q, full_v).copy()
     gravity = pin.computeGeneralizedGravity(model, data, full_q).copy()
     M += np.diag(own_armature)
+    added = np.diag(scene.armature - robot.tree.armature)
+    energy, force, curvature = _stops(scene, q)
 
     deflection = q - scene.rest
-    Lvv = G.T @ M @ G
-    Lq = G.T @ (C.T @ full_v - gravity) - scene.stiffness * deflection
-    Lqq = G.T @ rigid_body_Lqq(model, full_q, full_v) @ G - np.diag(scene.stiffness)
-    potential = pin.computePotentialEnergy(model, data, full_q) + 0.5 * scene.stiffness @ deflection**2
+    Lvv = G.T @ M @ G + added
+    Lq = G.T @ (C.T @ full_v - gravity) - scene.stiffness * deflection + force
+    Lqq = G.T @ rigid_body_Lqq(model, full_q, full_v) @ G - np.diag(scene.stiffness) + np.diag(curvature)
+    potential = pin.computePotentialEnergy(model, data, full_q) + energy
+    springs = of_kind(scene.elements, "JointSpring")
+    potential += sum(0.5 * own.values[0] * (q[own.coordinate] - own.values[1]) ** 2 for own in springs)
     return LagrangianJet(float(0.5 * v @ Lvv @ v - potential), Lq, Lvv @ v, Lqq, G.T @ A @ G, Lvv)
+
+
+def _stops(scene: Scene, q: Floats) -> tuple[float, Floats, Floats]:
+    """The energy V of all joint stops, with -dV/dq and -d2V/dq2 (n,)."""
+    energy, force, curvature = 0.0, np.zeros_like(q), np.zeros_like(q)
+    # The integrals of s(y) = 3 y^2 - 2 y^3 over the first width, and the first and second of them at its end.
+    rise = np.polynomial.Polynomial([0.0, 0.0, 3.0, -2.0])
+    once, twice = rise.integ(), rise.integ(2)
+    for own in scene.elements:
+        if own.kind != "JointStop":
+            continue
+        lower, upper, stiffness, _, width = own.values
+        c = own.coordinate
+        side = 1.0 if q[c] > upper else -1.0
+        y = max(q[c] - upper, lower - q[c], 0.0) / width
+        past, y = max(y - 1.0, 0.0), min(y, 1.0)
+        energy += stiffness * width**2 * float(twice(y) + once(y) * past + 0.5 * past**2)
+        force[c] -= side * stiffness * width * float(once(y) + past)
+        curvature[c] -= stiffness * float(rise(y))
+    return energy, force, curvature
 
 
 @dataclass(frozen=True, eq=False)

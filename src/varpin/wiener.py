@@ -32,7 +32,7 @@ def wiener_increments(
         dt: Time step [s].
         steps: N.
         rng: Generator or seed; each increment is drawn from N(0, dt).
-        increments: The increments themselves, (N, k) [s^0.5], to be checked only.
+        increments: The increments themselves, (N, k) [s^0.5], to be checked only; 0 for none.
 
     Returns:
         (N, k) [s^0.5], or (0, k) with neither ``rng`` nor ``increments``, or without processes: none.
@@ -43,6 +43,8 @@ def wiener_increments(
     if increments is not None:
         if rng is not None:
             raise InputError("give rng, to draw the Wiener increments, or increments, to use yours; not both")
+        if np.ndim(increments) == 0 and as_floats("increments", increments) == 0.0:
+            return np.zeros((0, processes))
         return finite_array("increments", increments, (steps, processes))
     if rng is None or processes == 0:
         return np.zeros((0, processes))

@@ -4,6 +4,7 @@
 #include <cstdlib>
 #include <limits>
 #include <new>
+#include <span>
 #include <vector>
 
 #include "varpin/backward.hpp"
@@ -30,7 +31,7 @@ varpin::Mechanism chain() {
                                    .coordinate = j,
                                    .origin = j == 0});
     }
-    out.tree.armature = out.damping = out.stiffness = out.rest = std::vector<double>(n);
+    out.tree.armature = std::vector<double>(n);
     out.tree.periodic.assign(n, 0);
     out.tree.group.assign(n, 0);
     out.tree.groups = 1;
@@ -104,19 +105,23 @@ int main() {
         return done == N;
     });
 
-    varpin::VariationalLinearization linearization(mechanism, midpoint, 0.5, {}, 1.0);
+    varpin::VariationalLinearization linearization(mechanism, midpoint, 0.5, {.active = false});
     std::vector<double> A(N * 4 * n * n), B(N * 2 * n * n);
+    std::span<const std::uint8_t> halvings;
     const auto differentiate = [&] {
         double guess[n];
         for (int s = 1; s < N; ++s) {
             for (int i = 0; i < n; ++i) guess[i] = (q[s * n + i] - q[(s - 1) * n + i]) / h;
             const varpin::Outcome outcome = linearization.first(h, &q[(s - 1) * n], &p[(s - 1) * n], guess, &u[s * n],
-                                                                1, &A[s * 4 * n * n], &B[s * 2 * n * n]);
+                                                                halvings, &A[s * 4 * n * n], &B[s * 2 * n * n]);
             if (outcome != varpin::Outcome::solved) return false;
         }
         return true;
     };
     right &= differentiate() && without_allocation("their derivatives", differentiate);
+    const std::uint8_t parts[] = {1, 2, 2};
+    halvings = parts;
+    right &= without_allocation("those of steps in parts", differentiate);
 
     constexpr int x = 2 * n, size = 3 * n;
     std::vector<double> gradient(N * size, 0.1), hessian(size * size), terminal(x, 1.0), terminal_hessian(x * x);

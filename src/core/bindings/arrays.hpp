@@ -9,6 +9,7 @@
 #include <initializer_list>
 #include <stdexcept>
 #include <string>
+#include <vector>
 
 namespace varpin::border {
 
@@ -22,7 +23,9 @@ template <int dimensions>
 using Integers = nb::ndarray<const std::int64_t, nb::ndim<dimensions>, nb::c_contig, nb::device::cpu>;
 template <int dimensions>
 using IntegersInOut = nb::ndarray<std::int64_t, nb::ndim<dimensions>, nb::c_contig, nb::device::cpu>;
+using Bytes = nb::ndarray<const std::uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Out = nb::ndarray<nb::numpy, double>;
+using BytesOut = nb::ndarray<nb::numpy, std::uint8_t>;
 
 // std::invalid_argument becomes ValueError.
 template <class Array>
@@ -52,6 +55,13 @@ inline Out array_for(double*& values, std::initializer_list<std::size_t> shape) 
     values = new double[size]();
     nb::capsule owner(values, [](void* held) noexcept { delete[] static_cast<double*>(held); });
     return Out(values, shape, owner);
+}
+
+// A NumPy array that owns a copy of some bytes.
+inline BytesOut array_of(const std::vector<std::uint8_t>& bytes) {
+    auto* copy = new std::vector<std::uint8_t>(bytes);
+    nb::capsule owner(copy, [](void* held) noexcept { delete static_cast<std::vector<std::uint8_t>*>(held); });
+    return BytesOut(copy->data(), {copy->size()}, owner);
 }
 
 // A NumPy array that owns a copy of some numbers.

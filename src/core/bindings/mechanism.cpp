@@ -1,12 +1,18 @@
 // The mechanism and its Lagrangian jet.
+#include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
+#include <array>
+#include <limits>
+#include <string>
 #include <tuple>
 #include <utility>
 
 #include "arrays.hpp"
 #include "bodies.hpp"
 #include "registrations.hpp"
+#include "varpin/dense.hpp"
 #include "varpin/jet.hpp"
 
 namespace varpin::border {
@@ -20,11 +26,42 @@ std::vector<double> copied(const Array& array) {
     return {array.data(), array.data() + array.size()};
 }
 
+// Elements by the name of their kind, with their coordinate and their numbers in order.
+using Named = std::vector<std::tuple<std::string, int, std::vector<double>>>;
+
+template <class Kind, class... Numbers>
+Element made(int coordinate, const std::vector<double>& values, Numbers Kind::*... members) {
+    if (values.size() != sizeof...(members))
+        throw std::invalid_argument("an element has " + std::to_string(sizeof...(members)) + " numbers, not " +
+                                    std::to_string(values.size()));
+    Kind own;
+    own.coordinate = coordinate;
+    auto value = values.begin();
+    ((own.*members = *value++), ...);
+    return own;
+}
+
+Element element_of(const std::string& kind, int coordinate, const std::vector<double>& values) {
+    using S = JointSpring;
+    using D = JointDamper;
+    using F = CoulombFriction;
+    using E = JointStop;
+    using P = PositionServo;
+    if (kind == "JointSpring") return made(coordinate, values, &S::stiffness, &S::rest);
+    if (kind == "JointDamper") return made(coordinate, values, &D::damping);
+    if (kind == "CoulombFriction")
+        return made(coordinate, values, &F::level, &F::width, &F::breakaway, &F::stribeck_velocity);
+    if (kind == "JointStop")
+        return made(coordinate, values, &E::lower, &E::upper, &E::stiffness, &E::damping, &E::width);
+    if (kind == "PositionServo") return made(coordinate, values, &P::stiffness, &P::damping, &P::effort);
+    throw std::invalid_argument("there is no element of kind " + kind);
+}
+
 Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation, In<2> translation, In<1> mass,
                        In<2> center, In<2> inertia, Integers<1> coordinate, In<1> ratio, In<1> offset,
                        Integers<1> origin, Integers<1> loads, Integers<2> carried, Integers<1> periodic, In<1> armature,
-                       Integers<1> group, int groups, Integers<1> ends, In<1> gravity, In<1> damping, In<1> stiffness,
-                       In<1> rest, In<2> actuation, In<2> constant, In<3> control, In<2> quadratic, In<2> centers) {
+                       Integers<1> group, int groups, Integers<1> ends, In<1> gravity, const Named& forces,
+                       In<2> actuation, In<2> constant, In<3> control, In<2> quadratic, In<2> centers) {
     const std::size_t bodies = parent.shape(0), n = armature.shape(0), m = actuation.shape(1);
     const std::size_t processes = constant.shape(1);
     require(origin, "origin", {bodies});
@@ -34,8 +71,6 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
     require(carried, "carried", {loads.shape(0), n});
     for (const auto& [array, name] : {std::pair{&group, "group"}, {&periodic, "periodic"}}) require(*array, name, {n});
     require(gravity, "gravity", {3});
-    for (const auto& [array, name] : {std::pair{&damping, "damping"}, {&stiffness, "stiffness"}, {&rest, "rest"}})
-        require(*array, name, {n});
     require(actuation, "actuation", {n, m});
     require(constant, "constant", {n, processes});
     require(control, "control", {n, processes, m});
@@ -75,9 +110,13 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
     }
     out.tree.armature = copied(armature);
     out.gravity = {gravity(0), gravity(1), gravity(2)};
-    out.damping = copied(damping);
-    out.stiffness = copied(stiffness);
-    out.rest = copied(rest);
+    std::vector<Element> elements;
+    for (const auto& [kind, coordinate, values] : forces) {
+        if (coordinate < 0 || coordinate >= static_cast<int>(n))
+            throw std::invalid_argument("an element's coordinate is out of range");
+        elements.push_back(element_of(kind, coordinate, values));
+    }
+    out.forces = Forces(elements);
     out.controls = static_cast<int>(m);
     for (std::size_t r = 0; r < n; ++r) {
         for (std::size_t c = 0; c < m; ++c) {
@@ -120,6 +159,58 @@ std::tuple<Out, Out> jets(const Mechanism& mechanism, In<2> q, In<2> v) {
     return {Ms, As};
 }
 
+// The derivative of v in (q, p) (N, n, 2n) at each row of q and v (N, n): at fixed q dv = M^-1 dp, at fixed p
+// dv = -M^-1 L_vq dq. Not a number where M is not positive definite.
+Out velocity_slopes(const Mechanism& mechanism, In<2> q, In<2> v) {
+    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
+    require(q, "q", {rows, n});
+    require(v, "v", {rows, n});
+    double* slopes = nullptr;
+    const Out out = array_for(slopes, {rows, n, 2 * n});
+    nb::gil_scoped_release release;
+    Jet<double> w(mechanism.tree);
+    const int size = mechanism.dof();
+    for (std::size_t s = 0; s < rows; ++s) {
+        lagrangian_jet(mechanism, q.data() + s * n, v.data() + s * n, w);
+        double* own = slopes + s * 2 * n * n;
+        for (std::size_t i = 0; i < n; ++i) {
+            for (std::size_t j = 0; j < n; ++j) own[i * 2 * n + j] = -w.A[i * n + j];
+            own[i * 2 * n + n + i] = 1.0;
+        }
+        for (const Block& block : mechanism.tree.blocks) {
+            double* first = own + static_cast<std::size_t>(block.begin) * 2 * n;
+            if (factor_ldl(w.M.data(), size, block)) {
+                solve_ldl_rows(w.M.data(), size, block, first, 2 * size, 2 * size);
+            } else {
+                std::fill_n(first, static_cast<std::size_t>(block.end - block.begin) * 2 * n,
+                            std::numeric_limits<double>::quiet_NaN());
+            }
+        }
+    }
+    return out;
+}
+
+// At each row of q, v and the constant force f (N, n) the forces that the elements have beside L_q, dF/dq, dF/dv and
+// the power they turn into heat.
+std::tuple<Out, Out, Out, Out> forces(const Mechanism& mechanism, In<2> q, In<2> v, In<2> f) {
+    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
+    require(q, "q", {rows, n});
+    require(v, "v", {rows, n});
+    require(f, "f", {rows, n});
+    double* of[4] = {};
+    const Out value = array_for(of[0], {rows, n}), by_q = array_for(of[1], {rows, n}),
+              by_v = array_for(of[2], {rows, n}), lost = array_for(of[3], {rows, n});
+    std::vector<JointForce<double>> sum(n);
+    for (std::size_t s = 0; s < rows; ++s) {
+        mechanism.forces.sum(mechanism.dof(), q.data() + s * n, v.data() + s * n, f.data() + s * n, sum.data());
+        for (std::size_t c = 0; c < n; ++c) {
+            const JointForce<double>& own = sum[c];
+            for (int i = 0; i < 4; ++i) of[i][s * n + c] = std::array{own.value, own.by_q, own.by_v, own.lost}[i];
+        }
+    }
+    return {value, by_q, by_v, lost};
+}
+
 // Derivatives of M, L_vq and L_qq along (alpha, beta) at each row of q, v, alpha and beta (N, n).
 std::tuple<Out, Out, Out> jets_along(const Mechanism& mechanism, In<2> q, In<2> v, In<2> alpha, In<2> beta) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
@@ -154,10 +245,12 @@ void register_mechanism(nb::module_& m) {
     nb::class_<Mechanism>(m, "Mechanism")
         .def_static("make", &mechanism_of, nb::kw_only(), "parent"_a, "prismatic"_a, "rotation"_a, "translation"_a,
                     "mass"_a, "center"_a, "inertia"_a, "coordinate"_a, "ratio"_a, "offset"_a, "origin"_a, "loads"_a,
-                    "carried"_a, "periodic"_a, "armature"_a, "group"_a, "groups"_a, "ends"_a, "gravity"_a, "damping"_a,
-                    "stiffness"_a, "rest"_a, "actuation"_a, "constant"_a, "control"_a, "quadratic"_a, "centers"_a)
+                    "carried"_a, "periodic"_a, "armature"_a, "group"_a, "groups"_a, "ends"_a, "gravity"_a, "forces"_a,
+                    "actuation"_a, "constant"_a, "control"_a, "quadratic"_a, "centers"_a)
         .def("jet", &jet, "q"_a, "v"_a)
         .def("jets", &jets, "q"_a, "v"_a)
+        .def("velocity_slopes", &velocity_slopes, "q"_a, "v"_a)
+        .def("forces", &forces, "q"_a, "v"_a, "f"_a)
         .def("jets_along", &jets_along, "q"_a, "v"_a, "alpha"_a, "beta"_a);
 }
 

@@ -2,6 +2,7 @@
 #include <nanobind/stl/tuple.h>
 
 #include <memory>
+#include <span>
 #include <tuple>
 #include <vector>
 
@@ -103,6 +104,12 @@ class VariationalRollout {
         return {Q, MV, V, E};
     }
 
+    // Of each part of every step of a path in its last roll that was not taken whole.
+    BytesOut halvings(std::size_t path) const {
+        if (path >= states_.size()) throw std::invalid_argument("there is no such path");
+        return array_of(states_[path].halvings);
+    }
+
   private:
     std::shared_ptr<VariationalStepper> stepper_;
     Guards guards_;
@@ -111,25 +118,51 @@ class VariationalRollout {
     std::size_t size() const { return static_cast<std::size_t>(stepper_->n); }
 };
 
-// The arrays that derivatives of N steps are taken at.
-struct StepsAt {
-    In<2> q, p;
-    In<3> guess;
-    In<2> force;
-    Integers<1> substeps;
-
-    std::size_t check(std::size_t n, std::size_t stages) const {
-        const std::size_t N = q.shape(0);
+// The arrays that N steps are taken again from.
+class StepsAt {
+  public:
+    StepsAt(const Mechanism& mechanism, In<2> q, In<2> p, In<2> force, Integers<1> substeps, Bytes halvings)
+        : n(static_cast<std::size_t>(mechanism.dof())),
+          N(q.shape(0)),
+          q_(q),
+          p_(p),
+          force_(force),
+          halvings_(halvings),
+          place_(N + 1, 0) {
         for (const auto& [array, name] : {std::pair{&q, "q"}, {&p, "p"}, {&force, "force"}})
             require(*array, name, {N, n});
-        require(guess, "guess", {N, stages, n});
         require(substeps, "substeps", {N});
         for (std::size_t s = 0; s < N; ++s) {
-            if (substeps(s) < 1 || substeps(s) > (std::int64_t{1} << 30))
+            const std::int64_t parts = substeps(s);
+            if (parts < 1 || parts > (std::int64_t{1} << 30))
                 throw std::invalid_argument("a step has one part or more, and at most 2^30");
+            place_[s + 1] = place_[s] + (parts > 1 ? static_cast<std::size_t>(parts) : 0);
         }
-        return N;
+        require(halvings, "halvings", {place_[N]});
+        for (std::size_t k = 0; k < halvings.size(); ++k) {
+            if (halvings(k) < 1 || halvings(k) > 62) throw std::invalid_argument("parts are halved 1 to 62 times");
+        }
     }
+
+    const std::size_t n, N;
+    const double* q(std::size_t s) const { return q_.data() + s * n; }
+    const double* p(std::size_t s) const { return p_.data() + s * n; }
+    const double* force(std::size_t s) const { return force_.data() + s * n; }
+    // Of the parts of a step; none if it was taken whole.
+    std::span<const std::uint8_t> halvings(std::size_t s) const {
+        return {halvings_.data() + place_[s], place_[s + 1] - place_[s]};
+    }
+    // How many steps right before a step were taken whole, as far as they bear on its guess.
+    int past(std::size_t s) const {
+        int found = 0;
+        while (found < 8 && s > static_cast<std::size_t>(found) && place_[s - found - 1] == place_[s]) ++found;
+        return found;
+    }
+
+  private:
+    In<2> q_, p_, force_;
+    Bytes halvings_;
+    std::vector<std::size_t> place_;  // (N + 1) where the parts of a step begin
 };
 
 // How the first step that was not solved ended, and how many were done before it.
@@ -147,17 +180,17 @@ std::pair<Outcome, std::size_t> each_step(std::size_t N, const Step& step) {
 std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(const Mechanism& mechanism,
                                                                         const Tableau& tableau, double tolerance,
                                                                         const Guards& guards, double h, In<2> q,
-                                                                        In<2> p, In<3> guess, In<2> force,
-                                                                        Integers<1> substeps, Solver solver) {
-    const auto n = static_cast<std::size_t>(mechanism.dof()), stages = static_cast<std::size_t>(tableau.stages);
-    const StepsAt at{q, p, guess, force, substeps};
-    const std::size_t N = at.check(n, stages);
+                                                                        In<2> p, In<2> force, Integers<1> substeps,
+                                                                        Bytes halvings, In<3> guess, Solver solver) {
+    const StepsAt at(mechanism, q, p, force, substeps, halvings);
+    const std::size_t N = at.N, n = at.n, stages = static_cast<std::size_t>(tableau.stages);
+    require(guess, "guess", {N, stages, n});
     double *Jx = nullptr, *Jf = nullptr;
     const Out X = array_for(Jx, {N, 2 * n, 2 * n}), F = array_for(Jf, {N, 2 * n, n});
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, 1.0, solver);
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver);
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
-        return work.first(h, q.data() + s * n, p.data() + s * n, guess.data() + s * stages * n, force.data() + s * n,
-                          substeps(s), Jx + s * 4 * n * n, Jf + s * 2 * n * n);
+        return work.first(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
+                          Jx + s * 4 * n * n, Jf + s * 2 * n * n, at.past(s));
     });
     return {X, F, static_cast<std::int64_t>(outcome), done};
 }
@@ -165,20 +198,36 @@ std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(const Me
 // z . d2(q1, p1)/d(q0, p0, f)2 of each step (N, 3n, 3n), for the rows of z (N, 2n).
 std::tuple<Out, std::int64_t, std::size_t> variational_curvatures(const Mechanism& mechanism, const Tableau& tableau,
                                                                   double tolerance, const Guards& guards, double h,
-                                                                  In<2> q, In<2> p, In<3> guess, In<2> force,
-                                                                  Integers<1> substeps, In<2> z, Solver solver) {
-    const auto n = static_cast<std::size_t>(mechanism.dof()), stages = static_cast<std::size_t>(tableau.stages);
-    const StepsAt at{q, p, guess, force, substeps};
-    const std::size_t N = at.check(n, stages);
+                                                                  In<2> q, In<2> p, In<2> force, Integers<1> substeps,
+                                                                  Bytes halvings, In<3> guess, In<2> z, Solver solver) {
+    const StepsAt at(mechanism, q, p, force, substeps, halvings);
+    const std::size_t N = at.N, n = at.n, stages = static_cast<std::size_t>(tableau.stages);
+    require(guess, "guess", {N, stages, n});
     require(z, "z", {N, 2 * n});
     double* H = nullptr;
     const Out curvatures = array_for(H, {N, 3 * n, 3 * n});
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, 1.0, solver);
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver);
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
-        return work.second(h, q.data() + s * n, p.data() + s * n, guess.data() + s * stages * n, force.data() + s * n,
-                           substeps(s), z.data() + s * 2 * n, H + s * 9 * n * n);
+        return work.second(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
+                           z.data() + s * 2 * n, H + s * 9 * n * n, at.past(s));
     });
     return {curvatures, static_cast<std::int64_t>(outcome), done};
+}
+
+// Configurations and velocities (N, n) at the end of each step.
+std::tuple<Out, Out, std::int64_t, std::size_t> variational_ends(const Mechanism& mechanism, const Tableau& tableau,
+                                                                 double tolerance, const Guards& guards, double h,
+                                                                 In<2> q, In<2> p, In<2> force, Integers<1> substeps,
+                                                                 Bytes halvings, Solver solver) {
+    const StepsAt at(mechanism, q, p, force, substeps, halvings);
+    const std::size_t N = at.N, n = at.n;
+    double *q1 = nullptr, *v1 = nullptr;
+    const Out Q = array_for(q1, {N, n}), V = array_for(v1, {N, n});
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver);
+    const auto [outcome, done] = each_step(N, [&](std::size_t s) {
+        return work.end(h, at.q(s), at.p(s), at.force(s), at.halvings(s), q1 + s * n, v1 + s * n);
+    });
+    return {Q, V, static_cast<std::int64_t>(outcome), done};
 }
 
 }  // namespace
@@ -198,12 +247,16 @@ void register_rollouts(nb::module_& m) {
         .def("begin", &VariationalRollout::begin, "q"_a, "v"_a)
         .def("roll", &VariationalRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a)
         .def("kick", &VariationalRollout::kick, "impulse"_a)
-        .def("nodes", &VariationalRollout::nodes);
+        .def("nodes", &VariationalRollout::nodes)
+        .def("halvings", &VariationalRollout::halvings, "path"_a);
     m.def("variational_derivatives", &variational_derivatives, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
-          "dt"_a, "q"_a, "p"_a, "guess"_a, "force"_a, "substeps"_a, "solver"_a = Solver::automatic);
-    m.def("variational_curvatures", &variational_curvatures, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
-          "dt"_a, "q"_a, "p"_a, "guess"_a, "force"_a, "substeps"_a, nb::kw_only(), "z"_a,
+          "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a,
           "solver"_a = Solver::automatic);
+    m.def("variational_curvatures", &variational_curvatures, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
+          "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "z"_a,
+          "solver"_a = Solver::automatic);
+    m.def("variational_ends", &variational_ends, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "dt"_a, "q"_a,
+          "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "solver"_a = Solver::automatic);
 }
 
 }  // namespace varpin::border

@@ -1,6 +1,7 @@
 """The compiled core: C++ in ``src/core``, one header an idea, built when the package is."""
 
 from varpin.core._core import BackwardPass as BackwardPass
+from varpin.core._core import CostTerms as CostTerms
 from varpin.core._core import Elimination as Elimination
 from varpin.core._core import ExpandedSteps as ExpandedSteps
 from varpin.core._core import ExplicitMethod as ExplicitMethod
@@ -14,11 +15,19 @@ from varpin.core._core import Outcome as Outcome
 from varpin.core._core import RootPass as RootPass
 from varpin.core._core import Solver as Solver
 from varpin.core._core import Squares as Squares
+from varpin.core._core import Subject as Subject
 from varpin.core._core import Tableau as Tableau
 from varpin.core._core import VariationalRollout as VariationalRollout
 from varpin.core._core import accelerations as accelerations
 from varpin.core._core import box_minimum as box_minimum
+from varpin.core._core import doubled_steps_agree as doubled_steps_agree
+from varpin.core._core import energy_turnover as energy_turnover
+from varpin.core._core import fastest_damping as fastest_damping
 from varpin.core._core import linearize_explicit as linearize_explicit
+from varpin.core._core import longest_alternation as longest_alternation
+from varpin.core._core import pulls_fast as pulls_fast
 from varpin.core._core import rotation_logarithms as rotation_logarithms
+from varpin.core._core import sample_steps as sample_steps
 from varpin.core._core import variational_curvatures as variational_curvatures
 from varpin.core._core import variational_derivatives as variational_derivatives
+from varpin.core._core import variational_ends as variational_ends

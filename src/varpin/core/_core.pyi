@@ -1,5 +1,6 @@
 """The compiled core: src/core, bound by nanobind."""
 
+from collections.abc import Sequence
 from enum import Enum, IntEnum
 
 import numpy as np
@@ -9,6 +10,7 @@ from varpin.core.arrays import Commands, Nodes
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
 
 class Mechanism:
     """A tree of bodies in its surroundings; see src/core/include/varpin/tree.hpp for the fields."""
@@ -35,9 +37,7 @@ class Mechanism:
         groups: int,
         ends: Integers,
         gravity: Floats,
-        damping: Floats,
-        stiffness: Floats,
-        rest: Floats,
+        forces: Sequence[tuple[str, int, tuple[float, ...]]],
         actuation: Floats,
         constant: Floats,
         control: Floats,
@@ -51,6 +51,15 @@ class Mechanism:
 
     def jets(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
         """M and L_vq (N, n, n) at each row of q and v (N, n)."""
+
+    def velocity_slopes(self, q: Floats, v: Floats) -> Floats:
+        """The derivative of v in (q, p) (N, n, 2n) at each row of q and v; NaN where M is not positive definite."""
+
+    def forces(self, q: Floats, v: Floats, f: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Forces F of the elements beside L_q, dF/dq, dF/dv and the power turned into heat (N, n).
+
+        They are at rows of q, v and f (N, n), f being the constant force of the controls, to which F adds.
+        """
 
     def jets_along(self, q: Floats, v: Floats, alpha: Floats, beta: Floats) -> tuple[Floats, Floats, Floats]:
         """Derivatives of M, L_vq and L_qq (N, n, n) at each row of q and v along that of alpha and beta (N, n)."""
@@ -139,6 +148,9 @@ class VariationalRollout:
     def nodes(self) -> tuple[Floats, Floats, Floats, Floats]:
         """Configurations, momenta and velocities (P, n), and energies (P,)."""
 
+    def halvings(self, path: int) -> Bytes:
+        """Of each part of every step of a path in its last roll that was not taken whole, step after step."""
+
 def variational_derivatives(
     mechanism: Mechanism,
     tableau: Tableau,
@@ -147,12 +159,18 @@ def variational_derivatives(
     dt: float,
     q: Floats,
     p: Floats,
-    guess: Floats,
     force: Floats,
     substeps: Integers,
+    halvings: Bytes,
+    *,
+    guess: Floats,
     solver: Solver = Solver.automatic,
 ) -> tuple[Floats, Floats, int, int]:
-    """d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n); how it ended, and how many steps were done."""
+    """d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n); how it ended, and how many steps were done.
+
+    ``halvings`` are those of the parts of all steps with more ``substeps`` than one. The same parts are taken again;
+    one that ``guards`` refuse, where they are active, in halves.
+    """
 
 def variational_curvatures(
     mechanism: Mechanism,
@@ -162,14 +180,31 @@ def variational_curvatures(
     dt: float,
     q: Floats,
     p: Floats,
-    guess: Floats,
     force: Floats,
     substeps: Integers,
+    halvings: Bytes,
     *,
+    guess: Floats,
     z: Floats,
     solver: Solver = Solver.automatic,
 ) -> tuple[Floats, int, int]:
     """Z . d2(q1, p1)/d(q0, p0, f)2 (N, 3n, 3n) for z (N, 2n); how it ended, and how many steps were done."""
+
+def variational_ends(
+    mechanism: Mechanism,
+    tableau: Tableau,
+    tolerance: float,
+    guards: Guards,
+    dt: float,
+    q: Floats,
+    p: Floats,
+    force: Floats,
+    substeps: Integers,
+    halvings: Bytes,
+    *,
+    solver: Solver = Solver.automatic,
+) -> tuple[Floats, Floats, int, int]:
+    """Configurations and velocities (N, n) at the end of each step; how it ended, and how many steps were done."""
 
 class ExpandedSteps:
     """The linearized dynamics and the expanded costs of N steps; what may be left out is empty then.
@@ -370,3 +405,78 @@ def linearize_explicit(
 
     With them, how many rows there are before the first with a mass matrix that is not positive definite.
     """
+
+def fastest_damping(mechanism: Mechanism, q: Floats, v: Floats, f: Floats, least: float) -> float:
+    """The fastest rate of what damps [1/s] over rows of q, v and the controls' forces f (K, n); 0 below ``least``."""
+
+def pulls_fast(mechanism: Mechanism, q: Floats, v: Floats, f: Floats, dt: float) -> bool:
+    """Whether springs, servos or gravity turn a mode by more than a radian over dt [s], at a row of q, v, f (K, n)."""
+
+def energy_turnover(
+    mechanism: Mechanism, q: Floats, v: Floats, p: Floats, u: Floats, *, even: float, looks: int
+) -> tuple[float, float, Floats, Floats]:
+    """The energy that a motion turns over [J]; of its nodes (N + 1, n) and controls (N, m).
+
+    The largest kinetic energy; the largest work so far of all controls. For each coordinate (n,): the kinetic energy of
+    the largest change of its velocity, at least by the part ``even`` of its largest; the largest work so far.
+    """
+
+def doubled_steps_agree(
+    mechanism: Mechanism,
+    q: Floats,
+    v: Floats,
+    begins: Integers,
+    length: int,
+    dt: float,
+    again_q: Floats,
+    again_v: Floats,
+    *,
+    way: float,
+    velocity: float,
+    little: float,
+    light: float,
+    even: float,
+) -> bool:
+    """Whether windows of a motion (N + 1, n) are what steps of twice the length make of them (K, length / 2, n).
+
+    Up to ``way`` of each coordinate's way over the window, and ``velocity`` of its largest velocity.
+    """
+
+def longest_alternation(
+    v: Floats, u: Floats | None, *, counts: float, idle: float, even: float
+) -> tuple[int, int, int]:
+    """The coordinate, the number and the first node of the longest stretch of turns of v (N + 1, n), one after another.
+
+    Turns are those of its second differences. Nodes at which one of the controls u (N, m) turns do not count.
+    """
+
+class Subject(Enum):
+    """What the residual of a cost is of: entries of z = (q, v, u), or a frame's position, orientation or twist."""
+
+    entries = 0
+    position = 1
+    orientation = 2
+    twist = 3
+
+class CostTerms:
+    """Costs weight . r^2 at samples (q, v, u); see src/core/include/varpin/costs.hpp."""
+
+    @staticmethod
+    def make(dof: int, controls: int) -> CostTerms: ...
+    def add_frame(self, links: Links, turned: Floats, shifted: Floats) -> int:
+        """A frame that stands at (turned, shifted) in the last of some bodies; its index."""
+
+    def add_term(self, subject: Subject, place: int, weight: Floats, target: Floats) -> None:
+        """A term with weight (r, r) and targets (T, r), (T, 9) of an orientation, that repeat after T samples.
+
+        ``place`` is the first of the entries of z, or the index of the frame.
+        """
+
+    def values(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """The value of each term (N, terms) at rows of q (N, n), v (N, n) and u (N, m)."""
+
+    def expand(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats]:
+        """Gradient (N, 2n + m) and Hessian (N or 1, 2n + m, 2n + m) of all terms, of Gauss and Newton."""
+
+def sample_steps(rule: Floats, q: Floats, v: Floats) -> tuple[Floats, Floats]:
+    """Samples (P, N s, n) of q and v from their nodes (P, N + 1, n), by a rule (s, 9)."""

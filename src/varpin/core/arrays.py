@@ -37,6 +37,14 @@ class Tree(NamedTuple):
     ends: Integers  # (c,) one past the last coordinate of each block outside of which M, L_vq and L_qq vanish
 
 
+class Element(NamedTuple):
+    """What acts on one coordinate besides inertia and gravity; src/core/include/varpin/forces.hpp has the kinds."""
+
+    kind: str
+    coordinate: int
+    values: tuple[float, ...]  # its numbers, in order
+
+
 class Diffusion(NamedTuple):
     """Fields F_i of k Wiener processes that the core can evaluate.
 

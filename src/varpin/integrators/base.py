@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, ClassVar
 
@@ -11,12 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.core.arrays import Commands, Nodes
-from varpin.errors import InputError
+from varpin.errors import InputError, SingularMassMatrix
 from varpin.lagrangian import lagrangian_jet
 from varpin.scene import Scene
-from varpin.trajectory import StepStatistics, Trajectory
+from varpin.trajectory import Bytes, StepStatistics, Trajectory, joined
 
 Floats = NDArray[np.float64]
+
+# Of a segment.
+_ARRAYS = ("q", "p", "v", "u", "energy")
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,12 @@ class Segment:
     statistics: StepStatistics
     failure: Failure | None = None
 
+    def part(self, steps: int) -> Segment:
+        """The first steps, as views."""
+        values = {name: getattr(self, name)[:steps] for name in _ARRAYS}
+        own = {item.name: getattr(self.statistics, item.name)[:steps] for item in fields(StepStatistics)}
+        return Segment(**values, statistics=StepStatistics(**own), failure=None)
+
 
 class Integrator(ABC):
     """A one-step method.
@@ -64,7 +74,7 @@ class Integrator(ABC):
        copies it;
     2. ``rollout_compiled`` and ``step_in_python``, which move a state on: many steps of many paths in the core, and one
        step of one path with noise that only Python can evaluate;
-    3. ``linearize``, the derivatives of its steps;
+    3. ``linearize``, the derivatives of its steps, and ``quiet_ends`` if it kicks after a step too;
     4. ``variational``, which says whether it maps (q, p) or (q, v), and ``order``.
     """
 
@@ -140,9 +150,33 @@ class Integrator(ABC):
     ) -> list[Segment]:
         """:meth:`rollout` with fields that the core evaluates; ``drift`` is a force (P, N, n), or (0, 0, n)."""
 
+    def motions(
+        self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, drift: Floats, dt: float
+    ) -> tuple[Floats, Floats] | None:
+        """Configurations and velocities (P, N, n) after each step of P motions from (q0, v0) (P, n), without noise.
+
+        ``commands`` and ``drift`` are as for :meth:`rollout_compiled`. None where one of the motions stops.
+        """
+        try:
+            state, _ = self.start(scene, q0, v0)
+        except SingularMassMatrix:
+            return None
+        parts = self.rollout_compiled(scene, state, commands, scene.silence, drift, dt)
+        if any(part.failure is not None for part in parts):
+            return None
+        return np.array([part.q for part in parts]), np.array([part.v for part in parts])
+
     @abstractmethod
     def step_in_python(self, scene: Scene, state: Any, command: Commands, increment: Floats, dt: float) -> Segment:
         """One step of one path with diffusion fields that are evaluated in Python."""
+
+    def quiet_ends(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
+        """Where each step ends at dw = 0, q and v (N, n): for integrators that kick there too.
+
+        Raises:
+            LinearizationError: A step has no solution at dw = 0.
+        """
+        raise NotImplementedError(f"{self} does not kick after the step")
 
     @abstractmethod
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
@@ -192,13 +226,8 @@ def _text(value: object) -> str:
 
 def join(segments: Sequence[Segment]) -> Segment:
     """Segments that follow each other as one."""
-    statistics = StepStatistics(
-        **{
-            item.name: np.concatenate([getattr(s.statistics, item.name) for s in segments])
-            for item in fields(StepStatistics)
-        }
-    )
-    nodes = {name: np.concatenate([getattr(s, name) for s in segments]) for name in ("q", "p", "v", "u", "energy")}
+    statistics = joined([segment.statistics for segment in segments])
+    nodes = {name: np.concatenate([getattr(s, name) for s in segments]) for name in _ARRAYS}
     return Segment(**nodes, statistics=statistics, failure=segments[-1].failure)
 
 
@@ -223,9 +252,15 @@ def drifts(scene: Scene, trajectory: Trajectory) -> Floats:
     return np.array([diffusion_and_drift(scene, q, v, u, trajectory.q[0])[1] for q, v, u in nodes])
 
 
-def segments_of(nodes: Nodes, reasons: Mapping[int, str]) -> list[Segment]:
-    """What the core wrote, path by path, without copies."""
+def segments_of(
+    nodes: Nodes, reasons: Mapping[int, str], halvings: Callable[[int], Bytes] | None = None
+) -> list[Segment]:
+    """What the core wrote, path by path, without copies.
+
+    ``halvings`` gives those of the parts of a path's steps; it is asked where steps were not taken whole.
+    """
     segments = []
+    split = np.any(nodes.tally[:, :, 3] > 1, axis=1)
     for i, done in enumerate(nodes.done):
         tally, quality = nodes.tally[i], nodes.quality[i]
         statistics = StepStatistics(
@@ -233,6 +268,7 @@ def segments_of(nodes: Nodes, reasons: Mapping[int, str]) -> list[Segment]:
             jets=tally[:done, 1],
             sweeps=tally[:done, 2],
             substeps=tally[:done, 3],
+            halvings=np.zeros(0, dtype=np.uint8) if halvings is None or not split[i] else halvings(i),
             residual=quality[:done, 0],
             branch_margin=quality[:done, 1],
             energy_defect=quality[:done, 2],
@@ -257,12 +293,16 @@ def segments_of(nodes: Nodes, reasons: Mapping[int, str]) -> list[Segment]:
 def open_loop(u: Floats) -> Commands:
     """Controls (N, m) without feedback."""
     m = u.shape[1]
-    return contiguous(Commands(u, np.zeros((0, m, 0)), np.zeros((0, 0)), 1, no_limits(m), np.zeros((0, m))))
+    u = np.ascontiguousarray(u)
+    return Commands(u, np.zeros((0, m, 0)), np.zeros((0, 0)), 1, no_limits(m), np.zeros((0, m)))
 
 
+@functools.cache
 def no_limits(controls: int) -> Floats:
-    """The limits (2, m) of controls that have none."""
-    return np.outer([-np.inf, np.inf], np.ones(controls))
+    """The limits (2, m) of controls that have none; not to be written to."""
+    limits = np.outer([-np.inf, np.inf], np.ones(controls))
+    limits.setflags(write=False)
+    return limits
 
 
 def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from varpin.core import Tableau
 from varpin.integrators.collocation import Collocation
 from varpin.integrators.tableau import gauss, gauss_coefficients
-from varpin.integrators.variational import Guard
 
 Floats = NDArray[np.float64]
 
@@ -55,11 +54,5 @@ class Gauss(Collocation):
     def _times(self) -> Floats:
         return gauss_coefficients(int(self.stages))[2]
 
-    def _asked(self) -> Guard | None:
-        if self.stages == 1 or self.guard is None:
-            return self.guard
-        return replace(
-            self.guard,
-            energy_balance=BALANCE_SHARE * self.guard.energy_balance,
-            energy_budget=BUDGET_SHARE * self.guard.energy_budget,
-        )
+    def _shares(self) -> tuple[float, float]:
+        return (BALANCE_SHARE, BUDGET_SHARE) if self.stages > 1 else (1.0, 1.0)

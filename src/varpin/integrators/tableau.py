@@ -21,29 +21,40 @@ def interpolation(nodes: Floats, at: Floats) -> Floats:
     return values
 
 
+@functools.cache
 def gauss_coefficients(stages: int) -> tuple[Floats, Floats, Floats]:
-    """A (s, s), b (s,) and c (s,) of the Gauss-Legendre method with s stages, of order 2 s, over a unit step."""
+    """A (s, s), b (s,) and c (s,) of the Gauss-Legendre method with s stages, of order 2 s, over a unit step.
+
+    They are not to be written to.
+    """
     x, w = np.polynomial.legendre.leggauss(stages)
     c, b = 0.5 * (1.0 + x), 0.5 * w
     # The rule itself integrates the Lagrange polynomials from 0 to each node, exactly.
     a = np.array([c[i] * (b @ interpolation(c, c[i] * c)) for i in range(stages)])
     # Symplectic, b_i a_ij + b_j a_ji = b_i b_j, to the last digit.
     half = b[:, None] * a
-    return 0.5 * b + 0.5 * (half - half.T) / b[:, None], b, c
+    return _held(0.5 * b + 0.5 * (half - half.T) / b[:, None], b, c)
 
 
+@functools.cache
 def radau_coefficients(stages: int) -> tuple[Floats, Floats, Floats]:
     """A (s, s), b (s,) and c (s,) of the Radau IIA method with s stages, of order 2 s - 1, over a unit step.
 
     Its points are the end of the step and the roots of a Jacobi polynomial (Hairer and Wanner, Solving Ordinary
-    Differential Equations II, IV.5).
+    Differential Equations II, IV.5). They are not to be written to.
     """
     inner, _ = scipy.special.roots_jacobi(stages - 1, 1.0, 0.0) if stages > 1 else (np.zeros(0), None)
     c = np.append(0.5 * (1.0 + inner), 1.0)
     # Gauss's rule of as many points integrates the Lagrange polynomials exactly.
     _, weights, points = gauss_coefficients(stages)
     a = np.array([c[i] * (weights @ interpolation(c, c[i] * points)) for i in range(stages)])
-    return a, a[-1].copy(), c
+    return _held(a, a[-1].copy(), c)
+
+
+def _held(a: Floats, b: Floats, c: Floats) -> tuple[Floats, Floats, Floats]:
+    for array in (a, b, c):
+        array.setflags(write=False)
+    return a, b, c
 
 
 def _reach(a: Floats, b: Floats) -> float:

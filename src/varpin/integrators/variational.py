@@ -17,8 +17,9 @@ from varpin.core import (
     VariationalRollout,
     variational_curvatures,
     variational_derivatives,
+    variational_ends,
 )
-from varpin.core.arrays import Commands, new_nodes
+from varpin.core.arrays import Commands, Nodes, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
     Integrator,
@@ -32,9 +33,12 @@ from varpin.integrators.base import (
     written,
 )
 from varpin.scene import Scene
-from varpin.trajectory import Trajectory
+from varpin.trajectory import MOST_HALVINGS, Trajectory
 
 Floats = NDArray[np.float64]
+
+# A balance of energies that always closes.
+_ANY_ENERGY = 1e300
 
 REASONS: dict[int, str] = {
     Outcome.diverged: "Newton's iteration does not contract, however small the substep",
@@ -87,8 +91,8 @@ class Guard:
             raise InputError("branch_margin must be in [0, 1), got 1")
         positive("energy_balance", self.energy_balance, "1")
         positive("energy_budget", self.energy_budget, "1")
-        if count("max_halvings", self.max_halvings) > 30:
-            raise InputError(f"max_halvings must be at most 30, got {self.max_halvings}")
+        if count("max_halvings", self.max_halvings) > MOST_HALVINGS:
+            raise InputError(f"max_halvings must be at most {MOST_HALVINGS}, got {self.max_halvings}")
 
     def __repr__(self) -> str:
         text = written(self)
@@ -125,33 +129,38 @@ class Variational(Integrator):
     def _tableau(self) -> Tableau:
         """Its coefficients."""
 
-    def _asked(self) -> Guard | None:
-        """What of its guard is asked of its steps."""
-        return self.guard
+    def _shares(self) -> tuple[float, float]:
+        """What of the guard's energy balance and budget is asked of its steps."""
+        return 1.0, 1.0
 
     def _guards(self) -> Guards:
-        asked = self._asked()
-        own = asked or Guard(max_halvings=0)
-        return Guards.make(
-            active=asked is not None,
-            branch_margin=float(own.branch_margin),
-            energy_balance=float(own.energy_balance),
-            energy_budget=float(own.energy_budget),
-            most_halvings=int(own.max_halvings),
-        )
+        return _of_core(self.guard, *self._shares())
+
+    def _guards_again(self, trajectory: Trajectory) -> Guards:
+        """When the parts of a motion's steps are accepted that are taken again at dw = 0.
+
+        The guards have passed them once, and where nothing is noisy no more is asked. Without the kick that noise gave
+        it, a step is another one: its parts must have roots on the branch that is connected to dt -> 0.
+        """
+        if self.guard is None or not trajectory.dw.any():
+            return _of_core(None)
+        return _of_core(replace(self.guard, energy_balance=_ANY_ENERGY, energy_budget=_ANY_ENERGY))
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[VariationalRun, list[Segment]]:
         """See :meth:`Integrator.start`; p0 = M(q0) v0."""
-        paths, n = q0.shape
-        rollout = VariationalRollout(
-            scene.core, self._tableau(), float(self.tolerance), self._guards(), self.left, paths
-        )
-        if not rollout.begin(np.ascontiguousarray(q0), np.ascontiguousarray(v0)):
-            raise SingularMassMatrix(scene.robot.joint_names, q0)
-        nodes = new_nodes(paths, 1, n, scene.controls)
-        nodes.q[:, 0], nodes.p[:, 0], nodes.v[:, 0], nodes.energy[:, 0] = rollout.nodes()
+        run = self._begun(scene, q0, v0)
+        nodes = new_nodes(len(q0), 1, scene.robot.dof, scene.controls)
+        nodes.q[:, 0], nodes.p[:, 0], nodes.v[:, 0], nodes.energy[:, 0] = run.paths.nodes()
         nodes.done[:] = 1
-        return VariationalRun(rollout, q0.copy()), segments_of(nodes, REASONS)
+        return run, segments_of(nodes, REASONS)
+
+    def _begun(self, scene: Scene, q0: Floats, v0: Floats) -> VariationalRun:
+        rollout = VariationalRollout(
+            scene.core, self._tableau(), float(self.tolerance), self._guards(), self.left, len(q0)
+        )
+        if not rollout.begin(q0, v0):
+            raise SingularMassMatrix(scene.robot.joint_names, q0)
+        return VariationalRun(rollout, q0.copy())
 
     def fork(self, state: VariationalRun) -> VariationalRun:
         """See :meth:`Integrator.fork`."""
@@ -167,9 +176,18 @@ class Variational(Integrator):
         dt: float,
     ) -> list[Segment]:
         """See :meth:`Integrator.rollout_compiled`."""
-        nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
-        state.paths.roll(dt, commands, increments, drift, nodes)
-        return segments_of(nodes, REASONS)
+        return segments_of(_rolled(scene, state, commands, increments, drift, dt), REASONS, state.paths.halvings)
+
+    def motions(
+        self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, drift: Floats, dt: float
+    ) -> tuple[Floats, Floats] | None:
+        """See :meth:`Integrator.motions`."""
+        try:
+            run = self._begun(scene, q0, v0)
+        except SingularMassMatrix:
+            return None
+        nodes = _rolled(scene, run, commands, scene.silence, drift, dt)
+        return None if nodes.ended.any() else (nodes.q, nodes.v)
 
     def step_in_python(
         self, scene: Scene, state: VariationalRun, command: Commands, increment: Floats, dt: float
@@ -193,40 +211,51 @@ class Variational(Integrator):
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, p).
 
-        A step that was taken in parts is taken in parts again, and their derivatives are chained.
+        A step that was taken in parts is taken again in the same parts, and their derivatives are chained.
         """
-        Jx, Jf, outcome, done = variational_derivatives(**self._steps(scene, trajectory))
-        if outcome in REASONS:
-            raise LinearizationError(done, done * trajectory.dt, REASONS[outcome])
+        steps = self._steps(scene, trajectory)
+        Jx, Jf, outcome, done = variational_derivatives(**steps, guess=np.ascontiguousarray(self._guess(trajectory)))
+        _require_solved(trajectory, outcome, done)
         return Jx, Jf, Jx[:, :, scene.robot.dof :]
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
         """See :meth:`Integrator.contract`; steps that were taken in parts are chained as in :meth:`linearize`."""
-        H, outcome, done = variational_curvatures(**self._steps(scene, trajectory), z=np.ascontiguousarray(z))
-        if outcome in REASONS:
-            raise LinearizationError(done, done * trajectory.dt, REASONS[outcome])
+        steps = self._steps(scene, trajectory)
+        H, outcome, done = variational_curvatures(
+            **steps, guess=np.ascontiguousarray(self._guess(trajectory)), z=np.ascontiguousarray(z)
+        )
+        _require_solved(trajectory, outcome, done)
         return H
 
+    def quiet_ends(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
+        """See :meth:`Integrator.quiet_ends`; of the steps that :meth:`linearize` differentiates."""
+        q, v, outcome, done = variational_ends(**self._steps(scene, trajectory))
+        _require_solved(trajectory, outcome, done)
+        return q, v
+
     def _steps(self, scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
-        """What the core takes the derivatives of every step at dw = 0 from, by the names of its arguments."""
-        substeps = trajectory.statistics.substeps
-        if substeps.size and not 1 <= substeps.min() <= substeps.max() <= 1 << 30:
-            raise InputError("the trajectory is damaged: statistics.substeps holds numbers of parts that no step has")
+        """What the core takes every step at dw = 0 again from, by the names of its arguments."""
+        own = trajectory.statistics
+        damage = own.damage()
+        if damage is None and (own.substeps < 1).any():
+            damage = "statistics.substeps holds numbers of parts that no step has"
+        if damage is not None:
+            raise InputError(f"the trajectory is damaged: {damage}")
         force = trajectory.u @ scene.actuation.T
         if scene.noise.velocity_dependent:
             force = force + self.drift_share * drifts(scene, trajectory)
         arrays = {
             "q": trajectory.q[:-1],
             "p": trajectory.p[:-1],
-            "guess": self._guess(trajectory),
             "force": force,
-            "substeps": trajectory.statistics.substeps,
+            "substeps": own.substeps,
+            "halvings": own.halvings,
         }
         return {
             "mechanism": scene.core,
             "tableau": self._tableau(),
             "tolerance": float(self.tolerance),
-            "guards": self._guards(),
+            "guards": self._guards_again(trajectory),
             "dt": float(trajectory.dt),
             **{name: np.ascontiguousarray(array) for name, array in arrays.items()},
         }
@@ -250,3 +279,28 @@ class Variational(Integrator):
     @abstractmethod
     def _times(self) -> Floats:
         """Where its stages stand in a step of unit length (s,)."""
+
+
+def _of_core(asked: Guard | None, balance: float = 1.0, budget: float = 1.0) -> Guards:
+    own = asked or Guard(max_halvings=0)
+    return Guards.make(
+        active=asked is not None,
+        branch_margin=float(own.branch_margin),
+        energy_balance=balance * float(own.energy_balance),
+        energy_budget=budget * float(own.energy_budget),
+        most_halvings=int(own.max_halvings),
+    )
+
+
+def _require_solved(trajectory: Trajectory, outcome: int, done: int) -> None:
+    if outcome in REASONS:
+        raise LinearizationError(done, done * trajectory.dt, REASONS[outcome])
+
+
+def _rolled(
+    scene: Scene, state: VariationalRun, commands: Commands, increments: Floats, drift: Floats, dt: float
+) -> Nodes:
+    """The nodes of some steps, by which the state moves on."""
+    nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
+    state.paths.roll(dt, commands, increments, drift, nodes)
+    return nodes

@@ -1,8 +1,10 @@
 // The equation of a collocation step, its Newton iteration and its derivatives. docs/mathematics.md, "Higher order" and
-// "Structured linearization". The unknowns are the stage velocities V_i (tableau.hpp); with F = f - D V
+// "Structured linearization". The unknowns are the stage velocities V_i (tableau.hpp); with F = f + the forces of the
+// elements (forces.hpp), whose derivatives F_q, F_v and F_f - 1 are diagonal,
 //
 //     r_i(V) = p0 + h sum_j (abar_ij L_q + f_ij F)(Q_j, V_j) - L_v(Q_i, V_i) = 0
-//     N_im = -dr_i/dV_m = delta_im M_i + h (a_im A_i - abar_im A_m' + f_im D) - h^2 sum_j abar_ij a_jm L_qq,j
+//     N_im = -dr_i/dV_m = delta_im M_i + h (a_im A_i - abar_im A_m' - f_im F_v,m)
+//                         - h^2 sum_j a_jm (abar_ij L_qq,j + f_ij F_q,j)
 //
 // N falls apart into one matrix for each block of the tree; elimination needs none of them. On the
 // branch of solutions that is connected to h -> 0 its determinant is positive.
@@ -58,15 +60,17 @@ class Collocation {
           V(stages * n),
           Q(stages * n),
           slope(stages * n),
+          acting(stages * n),
           residual(stages * n),
           delta(stages * n) {
         if (stages > StageElimination::most_stages || !eliminates(mechanism.tree, solver, stages)) {
             make_room();
             return;
         }
+        element_curvature.resize(stages * n);
+        diagonal.resize(stages * stages * n);
         if (stages == 1) {
             elimination.emplace(mechanism);
-            diagonal.resize(n);
         } else {
             stage_elimination.emplace(mechanism, tableau);
         }
@@ -82,9 +86,10 @@ class Collocation {
     std::vector<Jet<double>> stage;          // without matrices where there is an elimination
     std::optional<Elimination> elimination;  // at the iterate of the last factors
     std::optional<StageElimination> stage_elimination;
-    std::vector<double> V;      // (s, n) stage velocities: the guess, then the root
-    std::vector<double> Q;      // (s, n)
-    std::vector<double> slope;  // (s, n) L_q + F
+    std::vector<double> V;                   // (s, n) stage velocities: the guess, then the root
+    std::vector<double> Q;                   // (s, n)
+    std::vector<double> slope;               // (s, n) L_q + F
+    std::vector<JointForce<double>> acting;  // (s, n) of the elements
 
     // Solve the step equation from the guess in V.
     //
@@ -139,14 +144,23 @@ class Collocation {
 
     // Factor N from the stages' jets; false where its determinant is not positive.
     bool factor(double h) {
-        if (stage_elimination) return stage_elimination->factor(h);
-        if (!elimination) return factor_blocks(h);
-        const double curvature = h * h * tableau.gradient[0] * tableau.a[0];
-        for (int c = 0; c < n; ++c) {
-            diagonal[c] = mechanism.tree.armature[c] + h * tableau.force[0] * mechanism.damping[c] +
-                          curvature * mechanism.stiffness[c];
-        }
+        if (!eliminated()) return factor_blocks(h);
+        write_diagonal(h);
+        if (stage_elimination) return stage_elimination->factor(h, diagonal.data());
         return elimination->factor(h * tableau.a[0], h * tableau.gradient[0], diagonal.data());
+    }
+
+    // What the elements add to the pivot of coordinate c: -(by_rate F_v + by_place F_q) averaged over the step, and
+    // where no jet has the curvature of their potentials, that with F_q.
+    double stiffening(int c, double by_rate, double by_place) const {
+        if (!mechanism.forces.any()) return 0.0;
+        double total = 0.0;
+        for (int i = 0; i < stages; ++i) {
+            const JointForce<double>& own = acting[i * n + c];
+            const double in_place = own.by_q + (eliminated() ? element_curvature[i * n + c] : 0.0);
+            total -= tableau.b[i] * (by_rate * own.by_v + by_place * in_place);
+        }
+        return total;
     }
 
     // The same of the matrices in the stages' jets.
@@ -240,15 +254,16 @@ class Collocation {
     std::vector<double> lu;               // the factors of each block, one after another
     std::vector<int> order;               // of their rows
     std::vector<double> change, local, columns, shift;
-    bool eliminated_columns = false;  // of derivatives
-    std::vector<double> diagonal;     // (n) of N, besides what elimination takes from the bodies
+    bool eliminated_columns = false;        // of derivatives
+    std::vector<double> element_curvature;  // (s, n) of the elements' potentials, where there is an elimination
+    std::vector<double> diagonal;           // (s, s, n) of N, besides what elimination takes from the bodies
 
     // For matrices and their factors.
     void make_room() {
         int size = 0, largest = 0;
         for (const Block& block : mechanism.tree.blocks) {
             const int own = stages * (block.end - block.begin);
-            size += own * own;
+            size = entries(1, std::int64_t{size} + entries(own, own));
             largest = std::max(largest, own);
         }
         for (Jet<double>& jet : stage) jet.make_room();
@@ -287,15 +302,50 @@ class Collocation {
             }
         }
         if (second) take_over();
+        if (mechanism.forces.any()) look_at_elements(start.force);
         (second ? effort.jets : effort.sweeps) += stages;
+    }
+
+    void look_at_elements(const double* force) {
+        for (int i = 0; i < stages; ++i) mechanism.forces.sum(n, &Q[i * n], &V[i * n], force, &acting[i * n]);
+        if (!eliminated()) return;
+        std::fill(element_curvature.begin(), element_curvature.end(), 0.0);
+        for (int i = 0; i < stages; ++i) {
+            double* own = &element_curvature[i * n];
+            mechanism.forces.potentials(
+                &Q[i * n], [own](int c, const Potential<double>& element) { own[c] += element.curvature; });
+        }
+    }
+
+    // What the elements add to N_im of coordinate c: by F, and where `potentials` are not in jets, by those too.
+    double element_entry(double h, int i, int m, int c, bool potentials) const {
+        double by_place = 0.0;
+        for (int j = 0; j < stages; ++j) {
+            double share = tableau.force[i * stages + j] * acting[j * n + c].by_q;
+            if (potentials) share += tableau.gradient[i * stages + j] * element_curvature[j * n + c];
+            by_place += tableau.a[j * stages + m] * share;
+        }
+        return -h * tableau.force[i * stages + m] * acting[m * n + c].by_v - h * h * by_place;
+    }
+
+    void write_diagonal(double h) {
+        const bool elements = mechanism.forces.any();
+        for (int i = 0; i < stages; ++i) {
+            for (int m = 0; m < stages; ++m) {
+                for (int c = 0; c < n; ++c) {
+                    double entry = i == m ? mechanism.tree.armature[c] : 0.0;
+                    if (elements) entry += element_entry(h, i, m, c, true);
+                    diagonal[(i * stages + m) * n + c] = entry;
+                }
+            }
+        }
     }
 
     // r(V); returns its largest entry in rounding units of its terms.
     double residuals(double h, const Start& start) {
         double worst = 0.0;
         for (int i = 0; i < stages; ++i) {
-            for (int c = 0; c < n; ++c)
-                slope[i * n + c] = stage[i].Lq[c] + (start.force[c] - mechanism.damping[c] * V[i * n + c]);
+            for (int c = 0; c < n; ++c) slope[i * n + c] = stage[i].Lq[c] + (start.force[c] + acting[i * n + c].value);
         }
         for (int i = 0; i < stages; ++i) {
             const double* abar = &tableau.gradient[i * stages];
@@ -303,10 +353,10 @@ class Collocation {
             for (int c = 0; c < n; ++c) {
                 double total = 0.0, scale = 0.0;
                 for (int j = 0; j < stages; ++j) {
-                    const double drag = mechanism.damping[c] * V[j * n + c];
-                    total += abar[j] * stage[j].Lq[c] + f[j] * (start.force[c] - drag);
+                    const JointForce<double>& element = acting[j * n + c];
+                    total += abar[j] * stage[j].Lq[c] + f[j] * (start.force[c] + element.value);
                     scale += std::abs(abar[j]) * stage[j].Lq_scale[c] +
-                             std::abs(f[j]) * (std::abs(start.force[c]) + std::abs(drag));
+                             std::abs(f[j]) * (std::abs(start.force[c]) + element.scale);
                 }
                 double error = (start.p[c].high - stage[i].Lv[c]) + (start.p[c].low + h * total);
                 residual[i * n + c] = error;
@@ -345,7 +395,7 @@ class Collocation {
                     const double factor = h * tableau.a[i * stages + j];
                     const double* A = &stage[i].A[row * n + block.begin];
                     for (int c = 0; c < width; ++c) line[j * width + c] += factor * A[c];
-                    line[j * width + r] += h * tableau.force[i * stages + j] * mechanism.damping[row];
+                    if (mechanism.forces.any()) line[j * width + r] += element_entry(h, i, j, row, false);
                 }
                 const double* M = &stage[i].M[row * n + block.begin];
                 for (int c = 0; c < width; ++c) line[i * width + c] += M[c];
@@ -365,18 +415,21 @@ class Collocation {
         return total;
     }
 
-    // (A_i' - D) x_i + L_qq,i h sum_j a_ij x_j into `change`, of the x in `delta` that elimination has solved for.
+    // (A_i' + F_v,i) x_i + (L_qq,i + F_q,i) h sum_j a_ij x_j into `change`, of the x in `delta` that elimination has
+    // solved for.
     void change_of_slope(double h, std::vector<double>& change) {
         if (elimination) {
             elimination->change_of_slope(delta.data(), change.data());
         } else {
             stage_elimination->change_of_slope(delta.data(), change.data());
         }
+        if (!mechanism.forces.any()) return;
         for (int i = 0; i < stages; ++i) {
             for (int c = 0; c < n; ++c) {
                 double moved = 0.0;
                 for (int j = 0; j < stages; ++j) moved += tableau.a[i * stages + j] * delta[j * n + c];
-                change[i * n + c] -= mechanism.damping[c] * delta[i * n + c] + h * mechanism.stiffness[c] * moved;
+                const int k = i * n + c;
+                change[k] += acting[k].by_v * delta[k] + h * (element_curvature[k] + acting[k].by_q) * moved;
             }
         }
     }
@@ -388,7 +441,7 @@ class Collocation {
         for (int k = 0; k < n; ++k) {
             for (int kind = 0; kind < 3; ++kind) {
                 // With one stage the force acts in proportion to the momentum, whose column has just been solved for.
-                const double scale = stages == 1 && kind == 2 ? h * tableau.force[0] : 1.0;
+                const double scale = stages == 1 && kind == 2 ? h * tableau.force[0] * (1.0 + acting[k].by_f) : 1.0;
                 if (stages > 1 || kind < 2) {
                     right_side(h, kind, k);
                     solve_factored(residual.data(), delta.data());
@@ -403,17 +456,18 @@ class Collocation {
                         q += tableau.b[i] * delta[i * n + r];
                         p += tableau.b[i] * columns[i * n + r];
                         if (kind == 0) p += tableau.b[i] * stage[i].Lqq[k * n + r];
+                        if (kind == 0 && r == k) p += tableau.b[i] * acting[i * n + k].by_q;
                     }
                     out[r * stride] = h * scale * q;
                     out[(n + r) * stride] = h * scale * p;
                 }
                 if (kind == 0) out[k * stride] += 1.0;
-                if (kind > 0) out[(n + k) * stride] += kind == 1 ? 1.0 : h;
+                if (kind > 0) out[(n + k) * stride] += kind == 1 ? 1.0 : h * passed(k);
             }
         }
     }
 
-    // Into `residual` dr in one of q0, p0 or f: h sum_j abar_ij L_qq,j - A_i, 1, or h sum_j f_ij.
+    // Into `residual` dr in one of q0, p0 or f: h sum_j (abar_ij L_qq,j + f_ij F_q,j) - A_i, 1, or h sum_j f_ij F_f,j.
     void right_side(double h, int kind, int k) {
         std::fill(residual.begin(), residual.end(), 0.0);
         for (int i = 0; i < stages; ++i) {
@@ -424,13 +478,28 @@ class Collocation {
                 if (kind > 0) continue;
                 const double* curvature = &stage[j].Lqq[k * n];
                 for (int r = 0; r < n; ++r) b[r] += h * tableau.gradient[i * stages + j] * curvature[r];
+                b[k] += h * tableau.force[i * stages + j] * acting[j * n + k].by_q;
             }
             if (kind == 0) {
                 for (int r = 0; r < n; ++r) b[r] -= stage[i].A[r * n + k];
             } else {
                 b[k] = kind == 1 ? 1.0 : h * share;
+                if (kind == 2) b[k] += h * changed(i, k);
             }
         }
+    }
+
+    // sum_j f_ij (F_f,j - 1): what elements make of a constant force in r_i.
+    double changed(int i, int c) const {
+        double total = 0.0;
+        for (int j = 0; j < stages; ++j) total += tableau.force[i * stages + j] * acting[j * n + c].by_f;
+        return total;
+    }
+    // sum_j b_j F_f,j: what of it arrives at the end.
+    double passed(int c) const {
+        double total = 1.0;
+        for (int j = 0; j < stages; ++j) total += tableau.b[j] * acting[j * n + c].by_f;
+        return total;
     }
 
     // Bring L_q + F to where the correction in `delta` has taken the stages, to first order in it.
@@ -443,6 +512,10 @@ class Collocation {
                 moved[i * n + c] = h * total;
             }
         }
+        if (mechanism.forces.any()) {
+            for (int k = 0; k < stages * n; ++k)
+                acting[k].value += acting[k].by_v * delta[k] + acting[k].by_q * moved[k];
+        }
         if (eliminated()) {
             change_of_slope(h, moved);
             for (int k = 0; k < stages * n; ++k) slope[k] += moved[k];
@@ -451,7 +524,8 @@ class Collocation {
         for (int i = 0; i < stages; ++i) {
             for (const Block& block : mechanism.tree.blocks) {
                 for (int r = block.begin; r < block.end; ++r) {
-                    double total = -mechanism.damping[r] * delta[i * n + r];
+                    const JointForce<double>& element = acting[i * n + r];
+                    double total = element.by_v * delta[i * n + r] + element.by_q * moved[i * n + r];
                     for (int c = block.begin; c < block.end; ++c)
                         total += stage[i].Lqq[r * n + c] * moved[i * n + c] + stage[i].A[c * n + r] * delta[i * n + c];
                     slope[i * n + r] += total;
@@ -460,7 +534,7 @@ class Collocation {
         }
     }
 
-    // dr_i in (q0, p0, f): h sum_j abar_ij L_qq,j - A_i, 1, and h sum_j f_ij.
+    // dr_i in (q0, p0, f): h sum_j (abar_ij L_qq,j + f_ij F_q,j) - A_i, 1, and h sum_j f_ij F_f,j.
     void right_sides(double h, Block block, std::vector<double>& dV) const {
         for (int i = 0; i < stages; ++i) {
             double share = 0.0;
@@ -471,9 +545,11 @@ class Collocation {
                     double total = 0.0;
                     for (int j = 0; j < stages; ++j)
                         total += tableau.gradient[i * stages + j] * stage[j].Lqq[r * n + c];
+                    for (int j = 0; j < stages && r == c; ++j)
+                        total += tableau.force[i * stages + j] * acting[j * n + r].by_q;
                     row[c] = h * total - stage[i].A[r * n + c];
                     row[n + c] = r == c ? 1.0 : 0.0;
-                    row[2 * n + c] = r == c ? h * share : 0.0;
+                    row[2 * n + c] = r == c ? h * (share + changed(i, r)) : 0.0;
                 }
             }
         }
@@ -482,7 +558,7 @@ class Collocation {
     // N dV = dr in place, whole rows at a time.
     void solve_columns(const double* matrix, const int* rows, Block block, std::vector<double>& dV) {
         const int width = block.end - block.begin, size = stages * width;
-        columns.resize(size * 3 * width);
+        columns.resize(entries(size, 3 * width));
         // Row k of the block's own system, which stands at (stage, coordinate) in dV.
         const auto line = [&](int k) { return &dV[((k / width) * n + block.begin + k % width) * 3 * n]; };
         for (int k = 0; k < size; ++k) {
@@ -498,10 +574,10 @@ class Collocation {
         }
     }
 
-    // dq1 = dq0 + h sum_i b_i dV_i,  dp1 = dp0 + h sum_i b_i (L_qq,i dQ_i + A_i' dV_i - D dV_i + df).
+    // dq1 = dq0 + h sum_i b_i dV_i,  dp1 = dp0 + h sum_i b_i ((L_qq,i + F_q,i) dQ_i + (A_i' + F_v,i) dV_i + F_f,i df).
     void end_derivatives(double h, Block block, const std::vector<double>& dV, double* Jx, double* Jf) {
         const int width = block.end - block.begin;
-        shift.resize(width * 3 * width);
+        shift.resize(entries(width, 3 * width));
         const auto entry = [&](int r, int kind, int c) -> double& {
             return kind == 2 ? Jf[r * n + c] : Jx[r * 2 * n + kind * n + c];
         };
@@ -511,7 +587,7 @@ class Collocation {
                     double total = 0.0;
                     for (int i = 0; i < stages; ++i) total += tableau.b[i] * dV[(i * n + r) * 3 * n + kind * n + c];
                     entry(r, kind, c) = h * total + (kind == 0 && r == c ? 1.0 : 0.0);
-                    entry(n + r, kind, c) = r != c ? 0.0 : kind == 1 ? 1.0 : kind == 2 ? h : 0.0;
+                    entry(n + r, kind, c) = r != c ? 0.0 : kind == 1 ? 1.0 : kind == 2 ? h * passed(r) : 0.0;
                 }
             }
         }
@@ -530,8 +606,9 @@ class Collocation {
             const double weight = h * tableau.b[i];
             for (int r = block.begin; r < block.end; ++r) {
                 for (int m = block.begin; m < block.end; ++m) {
-                    const double curvature = weight * stage[i].Lqq[r * n + m];
-                    const double coupling = weight * (stage[i].A[m * n + r] - (m == r ? mechanism.damping[r] : 0.0));
+                    const JointForce<double> own = m == r ? acting[i * n + r] : JointForce<double>{};
+                    const double curvature = weight * (stage[i].Lqq[r * n + m] + own.by_q);
+                    const double coupling = weight * (stage[i].A[m * n + r] + own.by_v);
                     for (int kind = 0; kind < 3; ++kind) {
                         const double* __restrict dQ = &shift[((m - block.begin) * 3 + kind) * width];
                         const double* __restrict dv = &dV[(i * n + m) * 3 * n + kind * n + block.begin];

@@ -21,7 +21,17 @@ constexpr Dual operator*(double a, Dual b) { return {a * b.value, a * b.slope}; 
 constexpr Dual operator*(Dual a, double b) { return b * a; }
 constexpr Dual& operator+=(Dual& a, Dual b) { return a = a + b; }
 constexpr Dual& operator-=(Dual& a, Dual b) { return a = a - b; }
+constexpr double value_of(double a) { return a; }
+constexpr double value_of(Dual a) { return a.value; }
 inline Dual sin(Dual a) { return {std::sin(a.value), a.slope * std::cos(a.value)}; }
+inline Dual tanh(Dual a) {
+    const double t = std::tanh(a.value);
+    return {t, a.slope * (1.0 - t * t)};
+}
+inline Dual exp(Dual a) {
+    const double e = std::exp(a.value);
+    return {e, a.slope * e};
+}
 inline Dual cos(Dual a) { return {std::cos(a.value), -a.slope * std::sin(a.value)}; }
 
 }  // namespace varpin

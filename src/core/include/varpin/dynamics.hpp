@@ -92,6 +92,10 @@ class ForwardDynamics {
         : mechanism_(&mechanism),
           jet_(mechanism.tree, false),
           body_(mechanism.tree.bodies.size()),
+          q_(jet_.dof),
+          v_(jet_.dof),
+          acting_(jet_.dof),
+          curvature_(jet_.dof),
           bias_(jet_.dof),
           room_(jet_.dof),
           momentum_(jet_.dof) {
@@ -100,7 +104,7 @@ class ForwardDynamics {
             articulated_.emplace(mechanism.tree);
             return;
         }
-        jet_.M.resize(n * n);
+        jet_.M.resize(entries(n, n));
         ldl_.resize(n * n);
         if (derivatives) slopes_.resize(n * n);
     }
@@ -114,10 +118,9 @@ class ForwardDynamics {
         std::fill(jet_.potential.begin(), jet_.potential.end(), 0.0);
         std::fill(jet_.potential_scale.begin(), jet_.potential_scale.end(), 0.0);
         if (!articulated_) detail::clear_blocks(tree, jet_.M);
-        detail::add_springs(*mechanism_, q, jet_, false);
-        for (int i = 0; i < jet_.dof; ++i) {
-            bias_[i] = mechanism_->damping[i] * v[i] + mechanism_->stiffness[i] * (q[i] - mechanism_->rest[i]);
-        }
+        add_potentials(q);
+        std::copy_n(q, jet_.dof, q_.data());
+        std::copy_n(v, jet_.dof, v_.data());
         for (int j = 0; j < tree.size(); ++j) {
             const Body& link = tree.bodies[j];
             auto& here = jet_.body[j];
@@ -177,9 +180,10 @@ class ForwardDynamics {
         for (const Block& block : mechanism_->tree.blocks) solve_ldl(ldl_.data(), jet_.dof, block, b, x);
     }
 
-    // The accelerations a under a force.
+    // The accelerations a under a force, which the derivatives that follow are about too.
     void acceleration(const double* force, double* a) {
-        for (int i = 0; i < jet_.dof; ++i) room_[i] = force[i] - bias_[i];
+        mechanism_->forces.sum(jet_.dof, q_.data(), v_.data(), force, acting_.data());
+        for (int i = 0; i < jet_.dof; ++i) room_[i] = force[i] + acting_[i].value - bias_[i];
         solve_mass(room_.data(), a);
     }
 
@@ -189,7 +193,7 @@ class ForwardDynamics {
         const Tree& tree = mechanism_->tree;
         const int n = jet_.dof;
         detail::clear_blocks(tree, slopes_);
-        for (int i = 0; i < n; ++i) slopes_[i * n + i] = {mechanism_->stiffness[i], mechanism_->damping[i]};
+        for (int i = 0; i < n; ++i) slopes_[i * n + i] = {-acting_[i].by_q - curvature_[i], -acting_[i].by_v};
         for (int j = 0; j < tree.size(); ++j) {
             const auto& here = jet_.body[j];
             accelerate(j, v, a);
@@ -221,7 +225,7 @@ class ForwardDynamics {
                     in_q[at + j] = -slopes_[at + j].q;
                     in_v[at + j] = -slopes_[at + j].v;
                 }
-                in_force[at + at / n - block.begin] = 1.0;
+                in_force[at + at / n - block.begin] = 1.0 + acting_[at / n].by_f;
             }
             for (double* x : {in_q, in_v, in_force}) {
                 solve_ldl_rows(ldl_.data(), n, block, x + corner, size, n);
@@ -241,7 +245,7 @@ class ForwardDynamics {
             for (int j = 0; j < size; ++j) {
                 row[j] = -by[j].q;
                 row[size + j] = -by[j].v - reach * by[j].q;
-                row[2 * size + j] = i == j ? 1.0 : 0.0;
+                row[2 * size + j] = i == j ? 1.0 + acting_[block.begin + i].by_f : 0.0;
             }
             for (int k = 0; k < others; ++k) {
                 if (in_q[k] == 0.0 && in_v[k] == 0.0) continue;
@@ -262,6 +266,17 @@ class ForwardDynamics {
         Force<double> force{};                 // Phi
         Coupling coupling{};
     };
+
+    // The elements' potential energy, whose force is part of the bias.
+    void add_potentials(const double* q) {
+        std::fill(bias_.begin(), bias_.end(), 0.0);
+        std::fill(curvature_.begin(), curvature_.end(), 0.0);
+        mechanism_->forces.potentials(q, [&](int c, const Potential<double>& own) {
+            jet_.potential[mechanism_->tree.group[c]] += own.energy;
+            bias_[c] -= own.force;
+            curvature_[c] += own.curvature;
+        });
+    }
 
     bool factor() {
         const Tree& tree = mechanism_->tree;
@@ -320,6 +335,9 @@ class ForwardDynamics {
     const Mechanism* mechanism_;
     Jet<double> jet_;  // placements, velocities, inertias of what bodies carry, M, potential
     std::vector<BodyState> body_;
+    std::vector<double> q_, v_;               // (n)
+    std::vector<JointForce<double>> acting_;  // (n) of the elements, under the last force
+    std::vector<double> curvature_;           // (n) of their potentials
     std::vector<double> bias_, room_;
     std::optional<ArticulatedBodies> articulated_;  // in place of M
     std::vector<double> momentum_;                  // (n) where bodies are articulated

@@ -84,19 +84,27 @@ struct Gathering {
 
 namespace detail {
 
-inline void write(const Motion<double>& a, double* x) {
-    x[0] = a.linear.x, x[1] = a.linear.y, x[2] = a.linear.z;
-    x[3] = a.angular.x, x[4] = a.angular.y, x[5] = a.angular.z;
-}
-inline void write(const Force<double>& f, double* x) {
-    x[0] = f.linear.x, x[1] = f.linear.y, x[2] = f.linear.z;
-    x[3] = f.angular.x, x[4] = f.angular.y, x[5] = f.angular.z;
+// Numbers are written in pairs where they are read in pairs next: a processor waits for single ones that it has just
+// written.
+template <class Six>
+void write(const Six& a, double* x) {
+    put_pair(Pair{a.linear.x, a.linear.y}, x);
+    put_pair(Pair{a.linear.z, a.angular.x}, x + 2);
+    put_pair(Pair{a.angular.y, a.angular.z}, x + 4);
 }
 // Nine entries.
 template <class Six>
 void write(const Six& a, const Vec3<double>& b, double* x) {
     write(a, x);
-    x[6] = b.x, x[7] = b.y, x[8] = b.z;
+    put_pair(Pair{b.x, b.y}, x + 6);
+    x[8] = b.z;
+}
+// The same and a zero.
+template <class Six>
+void write_padded(const Six& a, const Vec3<double>& b, double* x) {
+    write(a, x);
+    put_pair(Pair{b.x, b.y}, x + 6);
+    put_pair(Pair{b.z, 0.0}, x + 8);
 }
 inline Motion<double> motion_at(const double* x) { return {{x[0], x[1], x[2]}, {x[3], x[4], x[5]}}; }
 
@@ -104,12 +112,9 @@ inline Motion<double> motion_at(const double* x) { return {{x[0], x[1], x[2]}, {
 // of even and odd terms.
 template <int size>
 double product(const double* a, const double* b) {
-    double even = 0.0, odd = 0.0;
-    for (int c = 0; c < size; c += 2) {
-        even += a[c] * b[c];
-        odd += a[c + 1] * b[c + 1];
-    }
-    return even + odd;
+    Pair sum = pair_at(a) * pair_at(b);
+    for (int c = 2; c < size; c += 2) sum = sum + pair_at(a + c) * pair_at(b + c);
+    return sum[0] + sum[1];
 }
 template <int size>
 struct Pairs {
@@ -118,14 +123,23 @@ struct Pairs {
     }
     Pair at[size / 2];
 };
+// y = a + s b
+template <int size>
+void put_sum(const double* a, double s, const double* b, double* y) {
+    const Pair factor{s, s};
+    for (int c = 0; c < size; c += 2) put_pair(pair_at(a + c) + factor * pair_at(b + c), y + c);
+}
 // y += X x
 template <int size>
 void add_product(const double* X, const double* x, double* y) {
     const Pairs<size> factor(x);
-    for (int r = 0; r < size; ++r, X += size) {
-        Pair sum = pair_at(X) * factor.at[0];
-        for (int c = 2; c < size; c += 2) sum = sum + pair_at(X + c) * factor.at[c / 2];
-        y[r] += sum[0] + sum[1];
+    for (int r = 0; r < size; r += 2, X += 2 * size) {
+        Pair first = pair_at(X) * factor.at[0], second = pair_at(X + size) * factor.at[0];
+        for (int c = 2; c < size; c += 2) {
+            first = first + pair_at(X + c) * factor.at[c / 2];
+            second = second + pair_at(X + size + c) * factor.at[c / 2];
+        }
+        put_pair(pair_at(y + r) + (Pair{first[0], second[0]} + Pair{first[1], second[1]}), y + r);
     }
 }
 // y += X' x
@@ -138,32 +152,61 @@ void add_transposed_product(const double* X, const double* x, double* y) {
     }
     for (int c = 0; c < size; c += 2) put_pair(sum.at[c / 2], y + c);
 }
-// X -= u l'
+// y += X x with a symmetric X, of which a row holds pairs from that on in which the diagonal lies.
 template <int size>
-void subtract_outer(const double* u, const double* l, double* X) {
-    const Pairs<size> row(l);
-    for (int r = 0; r < size; ++r, X += size) {
+void add_symmetric_product(const double* X, const double* x, double* y) {
+    const Pairs<size> factor(x);
+    Pairs<size> sum(y);
+    for (int r = 0; r < size; r += 2) {
+        const double *above = X + r * size, *below = above + size;
+        const Pair first{x[r], x[r]}, second{x[r + 1], x[r + 1]};
+        Pair along = first * pair_at(above + r), beside = second * pair_at(below + r);
+        sum.at[r / 2] = sum.at[r / 2] + (along + beside);
+        if (r + 2 == size) break;
+        along = beside = Pair{0.0, 0.0};
+        for (int c = r + 2; c < size; c += 2) {
+            const Pair upper = pair_at(above + c), lower = pair_at(below + c);
+            sum.at[c / 2] = sum.at[c / 2] + (first * upper + second * lower);
+            along = along + upper * factor.at[c / 2];
+            beside = beside + lower * factor.at[c / 2];
+        }
+        sum.at[r / 2] = sum.at[r / 2] + (Pair{along[0], beside[0]} + Pair{along[1], beside[1]});
+    }
+    for (int c = 0; c < size; c += 2) put_pair(sum.at[c / 2], y + c);
+}
+
+// The matrix of an inertia, in pairs along its rows.
+struct InertiaRows {
+    explicit InertiaRows(const Inertia<double>& I)
+        : at{{{I.mass, 0.0}, {0.0, 0.0}, {I.moment.z, -I.moment.y}},
+             {{0.0, I.mass}, {0.0, -I.moment.z}, {0.0, I.moment.x}},
+             {{0.0, 0.0}, {I.mass, I.moment.y}, {-I.moment.x, 0.0}},
+             {{0.0, -I.moment.z}, {I.moment.y, I.second.xx}, {I.second.xy, I.second.xz}},
+             {{I.moment.z, 0.0}, {-I.moment.x, I.second.xy}, {I.second.yy, I.second.yz}},
+             {{-I.moment.y, I.moment.x}, {0.0, I.second.xz}, {I.second.yz, I.second.zz}}} {}
+    Pair at[6][3];
+};
+
+// Whether a matrix holds all its pairs, or is symmetric and holds those from the diagonal on.
+enum class Kept { all, upper };
+
+// X - u l' in place of X, each pair (r, c) as `finished` leaves it. All in one go: what comes next waits for it.
+template <int size, Kept kept, int r = 0, class Finished>
+void replace(const double* u, const Pairs<size>& l, const Finished& finished, double* X) {
+    if constexpr (r < size) {
         const Pair factor{u[r], u[r]};
-        for (int c = 0; c < size; c += 2) put_pair(pair_at(X + c) - factor * row.at[c / 2], X + c);
+        for (int c = kept == Kept::upper ? r & ~1 : 0; c < size; c += 2)
+            put_pair(finished(pair_at(X + c) - factor * l.at[c / 2], r, c), X + c);
+        replace<size, kept, r + 1>(u, l, finished, X + size);
     }
 }
 
 // s I added to a part of a matrix whose rows have length `stride`.
-inline void add_inertia(double s, const Inertia<double>& I, int stride, double* x) {
-    const double m = s * I.mass;
-    const Vec3<double> h = s * I.moment;
-    double *linear = x, *angular = x + 3 * stride;
-    linear[0] += m, linear[4] += h.z, linear[5] -= h.y;
-    linear += stride;
-    linear[1] += m, linear[3] -= h.z, linear[5] += h.x;
-    linear += stride;
-    linear[2] += m, linear[3] += h.y, linear[4] -= h.x;
-    const double xy = s * I.second.xy, xz = s * I.second.xz, yz = s * I.second.yz;
-    angular[1] -= h.z, angular[2] += h.y, angular[3] += s * I.second.xx, angular[4] += xy, angular[5] += xz;
-    angular += stride;
-    angular[0] += h.z, angular[2] -= h.x, angular[3] += xy, angular[4] += s * I.second.yy, angular[5] += yz;
-    angular += stride;
-    angular[0] -= h.y, angular[1] += h.x, angular[3] += xz, angular[4] += yz, angular[5] += s * I.second.zz;
+inline void add_inertia(double s, const InertiaRows& I, int stride, double* x) {
+    const Pair scale{s, s};
+    for (int r = 0; r < 6; ++r, x += stride) {
+        for (int c = 0; c < 3; ++c) put_pair(pair_at(x + 2 * c) + scale * I.at[r][c], x + 2 * c);
+    }
 }
 
 // Above an origin all slide: they see linear parts alone, which are the same about any point. `linear` says which
@@ -241,20 +284,23 @@ class ArticulatedBodies {
         body_[j].inertia = inertia;
     }
 
-    // One body after another, from the last to the first; false at a pivot that is not positive.
-    bool eliminate(int j) {
+    // One body after another, from the last to the first; false at a pivot that is not positive. Here and below, that
+    // nothing in the loop over bodies is a call takes a tenth off a step.
+    [[gnu::flatten]] bool eliminate(int j) {
         const Body& link = tree_->bodies[j];
         State& own = body_[j];
         double* X = inertia_.of(j);
         detail::write(own.inertia * detail::motion_at(own.axis), own.u);
-        detail::add_transposed_product<6>(X, own.axis, own.u);  // X being symmetric
+        detail::add_symmetric_product<6>(X, own.axis, own.u);
         own.pivot = tree_->armature[link.coordinate] + detail::product<6>(own.axis, own.u);
         if (!(own.pivot > 0.0)) return false;
         const double inverse = 1.0 / own.pivot;
         for (int r = 0; r < 6; ++r) own.answer[r] = own.u[r] * inverse;
         if (link.parent < 0) return true;
-        detail::subtract_outer<6>(own.answer, own.u, X);
-        detail::add_inertia(1.0, own.inertia, 6, X);
+        const detail::InertiaRows inertia(own.inertia);
+        detail::replace<6, detail::Kept::upper>(
+            own.answer, detail::Pairs<6>(own.u), [&](Pair rest, int r, int c) { return rest + inertia.at[r][c / 2]; },
+            X);
         if (link.origin) detail::keep_linear_rows<6>(X);
         inertia_.hand_on(j, link.parent);
         return true;
@@ -275,7 +321,7 @@ class ArticulatedBodies {
             x[c] = left / own.pivot;
             if (share) share[c] = 0.5 * left * x[c];
             if (link.parent < 0) continue;
-            for (int r = 0; r < 6; ++r) z[r] += own.answer[r] * left;
+            detail::put_sum<6>(z, left, own.answer, z);
             if (link.origin) detail::keep_linear<6>(z);
             force_.hand_on(j, link.parent);
         }
@@ -284,7 +330,7 @@ class ArticulatedBodies {
             const State& own = body_[j];
             const double* above = &motion_[6 * (link.parent + 1)];  // still, where there is none
             x[link.coordinate] -= detail::product<6>(own.answer, above);
-            for (int r = 0; r < 6; ++r) motion_[6 * (j + 1) + r] = above[r] + own.axis[r] * x[link.coordinate];
+            detail::put_sum<6>(above, x[link.coordinate], own.axis, &motion_[6 * (j + 1)]);
         }
     }
 
@@ -326,8 +372,8 @@ struct EliminatedBody {
     // The body's entry of (A' + L_qq y) x where the coordinate's y x is `own`, bodies move by `moved` and `above`, nine
     // entries each, and z is what those it carries have left; adds its own to that.
     double change_of_slope(double own, const double* moved, const double* above, double* z) const {
-        double added[9];
-        detail::write(inertia * detail::motion_at(moved) + own * turned, own * lifted, added);
+        double added[10];
+        detail::write_padded(inertia * detail::motion_at(moved) + own * turned, own * lifted, added);
         for (int r = 0; r < 9; ++r) z[r] += added[r];
         const Force<double> force{{z[0], z[1], z[2]}, {z[3], z[4], z[5]}};
         const Vec3<double> lift{z[6], z[7], z[8]}, turn{above[6], above[7], above[8]};
@@ -347,18 +393,17 @@ class Elimination {
     }
 
     // Factor N; false at a pivot that is not positive.
-    bool factor(double ahead, double behind, const double* diagonal) {
+    [[gnu::flatten]] bool factor(double ahead, double behind, const double* diagonal) {
         ahead_ = ahead;
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
             const EliminatedBody& state = body_[j];
             Factors& own = factors_[j];
             const Motion<double> row = state.axis + (-behind) * state.rate, column = state.axis + ahead * state.rate;
-            detail::write(row, behind * state.axis.angular, own.row);
-            detail::write(column, ahead * state.axis.angular, own.column);
-            detail::write(state.inertia * column + ahead * state.turned, ahead * state.lifted, own.u);
-            detail::write(state.inertia * row + (-behind) * state.turned, behind * state.lifted, own.l);
-            own.u[9] = own.l[9] = 0.0;
+            detail::write_padded(row, behind * state.axis.angular, own.row);
+            detail::write_padded(column, ahead * state.axis.angular, own.column);
+            detail::write_padded(state.inertia * column + ahead * state.turned, ahead * state.lifted, own.u);
+            detail::write_padded(state.inertia * row + (-behind) * state.turned, behind * state.lifted, own.l);
             double* X = matrix_.of(j);
             detail::add_product<width>(X, own.column, own.u);
             own.pivot = diagonal[link.coordinate] + detail::product<width>(own.row, own.u);
@@ -370,8 +415,10 @@ class Elimination {
             detail::add_transposed_product<width>(X, own.row, own.l);
             const double inverse = 1.0 / own.pivot;
             for (double& entry : own.l) entry *= inverse;
-            detail::subtract_outer<width>(own.u, own.l, X);
-            detail::add_inertia(1.0, state.inertia, width, X);
+            const detail::InertiaRows inertia(state.inertia);
+            detail::replace<width, detail::Kept::all>(
+                own.u, detail::Pairs<width>(own.l),
+                [&](Pair rest, int r, int c) { return r < 6 && c < 6 ? rest + inertia.at[r][c / 2] : rest; }, X);
             if (link.origin) detail::keep_linear_rows<width>(X);
             matrix_.hand_on(j, link.parent);
         }
@@ -387,7 +434,7 @@ class Elimination {
             const double t = (b[link.coordinate] - detail::product<width>(own.row, z)) / own.pivot;
             x[link.coordinate] = t;
             if (link.parent < 0) continue;
-            for (int r = 0; r < width; ++r) z[r] += own.u[r] * t;
+            detail::put_sum<width>(z, t, own.u, z);
             if (link.origin) detail::keep_linear<width>(z);
             force_.hand_on(j, link.parent);
         }
@@ -395,9 +442,8 @@ class Elimination {
             const Body& link = tree_->bodies[j];
             const Factors& own = factors_[j];
             const double* above = motion_above(j);
-            double* __restrict moved = motion_.data() + width * (j + 1);
             x[link.coordinate] -= detail::product<width>(own.l, above);
-            for (int r = 0; r < width; ++r) moved[r] = above[r] + own.column[r] * x[link.coordinate];
+            detail::put_sum<width>(above, x[link.coordinate], own.column, &motion_[width * (j + 1)]);
         }
     }
 
@@ -430,7 +476,7 @@ class Elimination {
 
     // The smallest ratio of a pivot of M + c (A + A') - k L_qq + diag(d) to the same one of M, armature included; 0 if
     // one is not positive. What `factor` left remains.
-    double least_pivot_ratio(double c, double k, const double* diagonal) {
+    [[gnu::flatten]] double least_pivot_ratio(double c, double k, const double* diagonal) {
         double least = std::numeric_limits<double>::infinity();
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
@@ -443,7 +489,7 @@ class Elimination {
             detail::write(by_axis + c * by_rate + Force<double>{{}, k * state.lifted}, u);
             detail::write(c * by_axis + (-k) * by_rate, u + 6);
             double* X = symmetric_.of(j);
-            detail::add_transposed_product<12>(X, row, u);
+            detail::add_symmetric_product<12>(X, row, u);
             const double pivot = diagonal[link.coordinate] + detail::product<12>(row, u);
             masses_.place(j, state.axis, state.inertia);
             if (!(pivot > 0.0) || !masses_.eliminate(j)) return 0.0;
@@ -451,13 +497,11 @@ class Elimination {
             if (link.parent < 0) continue;
             const double inverse = 1.0 / pivot;
             for (int r = 0; r < 12; ++r) answer[r] = u[r] * inverse;
-            detail::subtract_outer<12>(answer, u, X);
-            detail::add_inertia(1.0, state.inertia, 12, X);
-            detail::add_inertia(-k, state.inertia, 12, X + 6 * 12 + 6);
-            if (c != 0.0) {
-                detail::add_inertia(c, state.inertia, 12, X + 6);
-                detail::add_inertia(c, state.inertia, 12, X + 6 * 12);
-            }
+            const detail::InertiaRows inertia(state.inertia);
+            const Pair scale[2][2] = {{{1.0, 1.0}, {c, c}}, {{c, c}, {-k, -k}}};
+            detail::replace<12, detail::Kept::upper>(
+                answer, detail::Pairs<12>(u),
+                [&](Pair rest, int r, int e) { return rest + scale[r / 6][e / 6] * inertia.at[r % 6][e % 6 / 2]; }, X);
             if (link.origin) detail::keep_linear_rows<12>(X);
             symmetric_.hand_on(j, link.parent);
         }

@@ -84,13 +84,14 @@ struct Energies {
 
 // A node that a substep has reached.
 struct Trial {
-    explicit Trial(int n) : place(n), p(n), at(n), momentum(n), v(n), work(n), dissipated(n) {}
+    explicit Trial(int n) : place(n), p(n), at(n), momentum(n), v(n), work(n), dissipated(n), magnitude(n) {}
     std::vector<Place> place;
     std::vector<Compensated> p;
     std::vector<double> at, momentum;  // (n) the same as plain numbers, for sweeps
     std::vector<double> v;             // (n) M^-1 p
     std::vector<double> work;          // (n) of the forces on each coordinate over the substep [J]
     std::vector<double> dissipated;    // (n) by friction [J]
+    std::vector<double> magnitude;     // (n) of the work of all terms of the force on each coordinate [J]
 };
 
 class EnergyGuard {
@@ -103,17 +104,18 @@ class EnergyGuard {
           moved(mechanism.tree.groups),
           work(mechanism.tree.groups),
           lost(mechanism.tree.groups),
+          magnitude(mechanism.tree.groups),
           share(n),
           diagonal(n),
           part(Energies(mechanism.tree).part) {
         if (eliminates(mechanism.tree, solver)) {
             articulated.emplace(mechanism.tree);
         } else {
-            jet.M.resize(n * n);
+            jet.M.resize(entries(n, n));
             ldl.resize(n * n);
         }
         if (matrices) {
-            curved.resize(n * n);
+            curved.resize(entries(n, n));
             mass.resize(n * n);
         }
     }
@@ -192,16 +194,14 @@ class EnergyGuard {
     }
 
     // How far the root is from the fold where branches of solutions meet: 1 as h -> 0, <= 0 where refused. The smallest
-    // ratio of a pivot of M + (h/2) D + h skew (A + A') - h^2 reach L_qq / (1 - margin) to the same pivot of M, all
-    // averaged over the stages with b.
+    // ratio of a pivot of M - (h/2) dF/dv + h skew (A + A') - h^2 reach (L_qq + dF/dq) / (1 - margin) to the same pivot
+    // of M, all averaged over the stages with b.
     double branch_margin(double h, const Guards& guards, Collocation& step) {
         const Tableau& tableau = step.tableau;
         const double exaggerated = h * h * tableau.reach / (1.0 - guards.branch_margin);
         if (step.eliminated()) {
-            for (int i = 0; i < n; ++i) {
-                diagonal[i] =
-                    mechanism.tree.armature[i] + 0.5 * h * mechanism.damping[i] + exaggerated * mechanism.stiffness[i];
-            }
+            for (int i = 0; i < n; ++i)
+                diagonal[i] = mechanism.tree.armature[i] + step.stiffening(i, 0.5 * h, exaggerated);
             if (step.stage_elimination) return step.stage_elimination->least_pivot_ratio(exaggerated, diagonal.data());
             return step.elimination->least_pivot_ratio(h * tableau.skew, exaggerated, diagonal.data());
         }
@@ -219,7 +219,7 @@ class EnergyGuard {
                     curved[i * n + j] = inertia - exaggerated * curvature + h * tableau.skew * coupling;
                     mass[i * n + j] = inertia;
                 }
-                curved[i * n + i] += 0.5 * h * mechanism.damping[i];
+                curved[i * n + i] += step.stiffening(i, 0.5 * h, exaggerated);
             }
             least = std::min(least, least_pivot_ratio(curved.data(), mass.data(), n, block));
         }
@@ -239,7 +239,9 @@ class EnergyGuard {
         const Tree& tree = mechanism.tree;
         std::fill(work.begin(), work.end(), 0.0);
         std::fill(lost.begin(), lost.end(), 0.0);
+        std::fill(magnitude.begin(), magnitude.end(), 0.0);
         for (int i = 0; i < n; ++i) {
+            magnitude[tree.group[i]] += trial.magnitude[i];
             work[tree.group[i]] += trial.work[i];
             lost[tree.group[i]] += trial.dissipated[i];
         }
@@ -265,7 +267,7 @@ class EnergyGuard {
 
   private:
     static constexpr double fade = 1.0 / 256.0;  // by which a substep forgets how far kinetic energies have varied
-    static constexpr double rounding = 1e-12;    // of the magnitudes that make up an energy
+    static constexpr double rounding = 1e-12;    // of the magnitudes that make up an energy or a work
     static constexpr double part_room = 4.0;     // times the limits of whole groups: the trapezoidal rule errs too
     static constexpr double least_room = 0.02;   // is always left, or a full ledger could never be worked off
 
@@ -291,6 +293,7 @@ class EnergyGuard {
     std::vector<double> ldl;             // (n, n) factors of M, unless bodies are articulated
     std::vector<double> kinetic, moved;  // of each group [J]
     std::vector<double> work, lost;      // of each group over the substep, and by friction [J]
+    std::vector<double> magnitude;       // of each group, as of Trial
     std::vector<double> share;           // (n)
     std::vector<double> diagonal;        // (n) of the branch guard
     std::vector<double> curved, mass;  // (n, n) of the branch guard, unless the step equation is solved by elimination
@@ -332,7 +335,7 @@ class EnergyGuard {
         if (stiffly_accurate && std::abs(error) <= lost[r]) return true;
         const double exchanged = std::abs(jet.potential[r] - ledger.potential) + std::abs(work[r]);
         const double scale = jet.potential_scale[r];
-        const double room = rounding * (scale + kinetic[r]) + 1e-3 * off_middle * scale + nothing;
+        const double room = rounding * (scale + kinetic[r] + magnitude[r]) + 1e-3 * off_middle * scale + nothing;
         return std::abs(error) <= limit.of(error, ledger.defect, moved[r], exchanged, ledger.most) + room;
     }
 
@@ -385,11 +388,14 @@ class EnergyGuard {
             std::fill(own.Lv.begin(), own.Lv.end(), 0.0);
             for (int c = 0; c < n; ++c) {
                 if (!light.carried[c]) continue;
-                const double stretch = q[c] - mechanism.rest[c];
-                own.potential += 0.5 * mechanism.stiffness[c] * stretch * stretch;
                 own.jacobi += 0.5 * p[c] * v[c];
                 own.scale += std::abs(p[c] * v[c]);
             }
+            mechanism.forces.potentials(q, [&](int c, const Potential<double>& element) {
+                if (!light.carried[c]) return;
+                own.potential += element.energy;
+                own.scale += element.magnitude(q[c]);
+            });
             const Force<double> weight{top.inertia.mass * g, cross(top.inertia.moment, g)};
             for (int a = carrier; a >= 0; a = tree.bodies[a].parent) {
                 const Body& link = tree.bodies[a];
@@ -408,10 +414,11 @@ class EnergyGuard {
                        const std::vector<double>& from_v, const Trial& trial, std::size_t r) {
         const PartLedger& old = energies.part[r];
         PartLedger& own = part[r];
-        double work = 0.0, drive = 0.0, exchanged = 0.0, turned = 0.0;
+        double work = 0.0, drive = 0.0, exchanged = 0.0, turned = 0.0, magnitude = 0.0;
         for (int c = 0; c < n; ++c) {
             if (mechanism.tree.light_parts[r].carried[c]) {
                 work += trial.work[c];
+                magnitude += trial.magnitude[c];
                 turned += varied(energies, c);
                 continue;
             }
@@ -426,7 +433,8 @@ class EnergyGuard {
         const double most = limit.of(error, old.defect, turned, exchanged, part_room * old.most);
         own.defect = old.defect + error;
         own.most = std::max(old.most, turned);
-        return std::abs(error) <= part_room * most + rounding * (old.scale + own.scale + exchanged) + nothing;
+        return std::abs(error) <=
+               part_room * most + rounding * (old.scale + own.scale + exchanged + magnitude) + nothing;
     }
 };
 

@@ -61,7 +61,7 @@ struct Jet {
     }
 
     void make_room() {
-        for (auto* matrix : {&M, &A, &Lqq}) matrix->resize(dof * dof);
+        for (auto* matrix : {&M, &A, &Lqq}) matrix->resize(entries(dof, dof));
     }
 
     std::vector<BodyState> body;
@@ -268,22 +268,19 @@ void clear_blocks(const Tree& tree, std::vector<T>& matrix) {
     }
 }
 
-// The springs' potential energy; where `sloped`, their forces too.
+// The elements' potential energy, and its derivatives up to an order.
 template <class T>
-void add_springs(const Mechanism& mechanism, const T* q, Jet<T>& w, bool sloped) {
-    for (int c = 0; c < w.dof; ++c) {
-        const T stretch = q[c] - T(mechanism.rest[c]);
-        const T force = -mechanism.stiffness[c] * stretch;
-        const T energy = -0.5 * force * stretch;
+void add_elements(const Mechanism& mechanism, const T* q, Jet<T>& w, int order) {
+    mechanism.forces.potentials(q, [&](int c, const Potential<T>& own) {
         const int group = mechanism.tree.group[c];
-        w.potential[group] += energy;
-        if (sloped) w.Lq[c] += force;
+        w.potential[group] += own.energy;
+        if (order > 0) w.Lq[c] += own.force;
+        if (order > 1) w.Lqq[c * w.dof + c] += own.curvature;
         if constexpr (Jet<T>::scaled) {
-            w.potential_scale[group] += energy;
-            if (sloped)
-                w.Lq_scale[c] += std::abs(mechanism.stiffness[c]) * (std::abs(q[c]) + std::abs(mechanism.rest[c]));
+            w.potential_scale[group] += std::abs(own.energy);
+            if (order > 0) w.Lq_scale[c] += own.scale;
         }
-    }
+    });
 }
 
 // Armature's momentum, and the kinetic energy.
@@ -325,11 +322,8 @@ void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T>& 
         }
         if (link.origin) detail::add_potential(mechanism, j, q, w);
     }
-    detail::add_springs(mechanism, q, w, true);
-    for (int c = 0; c < w.dof; ++c) {
-        w.M[c * w.dof + c] += T(tree.armature[c]);
-        w.Lqq[c * w.dof + c] -= T(mechanism.stiffness[c]);
-    }
+    detail::add_elements(mechanism, q, w, 2);
+    for (int c = 0; c < w.dof; ++c) w.M[c * w.dof + c] += T(tree.armature[c]);
     detail::add_armature(tree, v, w);
 }
 
@@ -360,7 +354,7 @@ inline void first_order(const Mechanism& mechanism, const double* q, const doubl
         }
         if (link.origin) detail::add_potential(mechanism, j, q, w);
     }
-    detail::add_springs(mechanism, q, w, true);
+    detail::add_elements(mechanism, q, w, 1);
     detail::add_armature(tree, v, w);
 }
 
@@ -384,7 +378,7 @@ void inertias(const Mechanism& mechanism, const double* q, Jet<double>& w, const
         if (link.parent >= 0) detail::pass_inertia(link, w.body[j].inertia, w.body[link.parent].inertia, true);
         if (link.origin) detail::add_potential(mechanism, j, q, w);
     }
-    detail::add_springs(mechanism, q, w, false);
+    detail::add_elements(mechanism, q, w, 0);
 }
 
 // M and the potential energy at q alone.

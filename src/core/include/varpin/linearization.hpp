@@ -4,15 +4,15 @@
 // For z = (zq, zp) the step equation is joined to phi = zq . q1 + zp . p1 with multipliers lam_i that make the sum
 // stationary in V: N' lam = dphi/dV. What is not linear in (q0, p0, f, V) there is
 //
-//     psi = sum_i alpha_i . L_q(Q_i, V_i) + beta_i . L_v(Q_i, V_i),
-//     alpha_i = h (b_i zp + sum_j abar_ji lam_j),    beta_i = -lam_i,
+//     psi = sum_i alpha_i . L_q(Q_i, V_i) + beta_i . L_v(Q_i, V_i) + gamma_i . F(Q_i, V_i, f),
+//     alpha_i = h (b_i zp + sum_j abar_ji lam_j),    beta_i = -lam_i,    gamma_i = h (b_i zp + sum_j f_ji lam_j),
 //
-// and at a root first derivatives of V are enough: d2 phi = sum_i (dQ_i, dV_i)' d2 psi_i (dQ_i, dV_i).
+// and at a root first derivatives of V are enough: d2 phi = sum_i (dQ_i, dV_i, df)' d2 psi_i (dQ_i, dV_i, df).
 #pragma once
 
 #include <algorithm>
-#include <bit>
 #include <cstdint>
+#include <span>
 #include <vector>
 
 #include "varpin/variational.hpp"
@@ -21,78 +21,86 @@ namespace varpin {
 
 class VariationalLinearization {
   public:
+    // Where guards are active, a part that they refuse is taken in halves: a step that noise kicked may need other
+    // parts without it. Where they are not, the parts are those given and no others.
     VariationalLinearization(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                             double left, Solver solver = Solver::automatic)
-        : stepper(mechanism, tableau, tolerance, guards, left, solver),
+                             Solver solver = Solver::automatic)
+        : stepper(mechanism, tableau, tolerance, guards, 1.0, solver),
           n(mechanism.dof()),
           stages(tableau.stages),
           state(mechanism, stages),
-          dV(stages * n * 3 * n),
-          dQ(n * 3 * n),
-          link(4 * n * n),
-          link_f(2 * n * n),
-          product(4 * n * n),
+          from(n),
+          from_p(n),
+          dV(entries(stages * n, 3 * n)),
+          dQ(entries(n, 3 * n)),
+          link(entries(2 * n, 2 * n)),
+          link_f(entries(2 * n, n)),
+          product(entries(2 * n, 2 * n)),
           multiplier(stages * n),
           slope(stages * n),
           direction(mechanism.tree),
           at_q(n),
           at_v(n),
-          inner(2 * n * 3 * n) {}
+          inner(entries(2 * n, 3 * n)),
+          at_f(n),
+          along_q(n),
+          along_v(n),
+          along_f(n) {}
 
     // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a constant force f. A step
-    // that was taken whole is solved once more from a guess (s, n) next to its root; another is taken again, guards and
-    // all, and the derivatives of its parts are chained.
+    // that was taken whole is solved once more from a guess (s, n) next to its root; in the rows before q, p and force
+    // there are `past` others. Of another `halvings` are those of its parts: these are taken again, and their
+    // derivatives are chained.
     Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                  std::int64_t substeps, double* Jx, double* Jf) {
-        if (substeps == 1) {
-            const Outcome outcome = root(h, q, p, guess, force);
+                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past = 0) {
+        if (halvings.empty() && !stepper.guards.active) {
+            const Outcome outcome = root(h, q, p, guess, force, past);
             if (outcome == Outcome::solved) stepper.step_equation.derivatives(h, dV, Jx, Jf);
             return outcome;
         }
-        const Outcome outcome = parts(h, q, p, force, substeps);
-        if (outcome != Outcome::solved) return outcome;
         identity(Jx, Jf);
-        for (const Substep& part : trail) {
-            const Outcome again = root_of(part);
-            if (again != Outcome::solved) return again;
-            stepper.step_equation.derivatives(part.length, dV, link.data(), link_f.data());
+        return parts(h, q, p, force, halvings, [&](double length) {
+            stepper.step_equation.derivatives(length, dV, link.data(), link_f.data());
             chain(Jx, Jf);
-        }
+        });
+    }
+
+    // q1 and M(q1)^-1 p1 (n) of the step of which `first` gives the derivatives.
+    Outcome end(double h, const double* q, const double* p, const double* force, std::span<const std::uint8_t> halvings,
+                double* q1, double* v1) {
+        const Outcome outcome = parts(h, q, p, force, halvings, [](double) {});
+        if (outcome != Outcome::solved) return outcome;
+        std::copy(state.q.begin(), state.q.end(), q1);
+        std::copy(state.v.begin(), state.v.end(), v1);
         return Outcome::solved;
     }
 
     // z . d2(q1, p1)/d(q0, p0, f)2 of one step, into H (3n, 3n). A step taken in parts: z goes back by each part's
     // derivative, and the curvature of each part to the start of the step.
     Outcome second(double h, const double* q, const double* p, const double* guess, const double* force,
-                   std::int64_t substeps, const double* z, double* H) {
-        std::fill(H, H + 9 * n * n, 0.0);
-        if (substeps == 1) {
-            const Outcome outcome = root(h, q, p, guess, force);
+                   std::span<const std::uint8_t> halvings, const double* z, double* H, int past = 0) {
+        std::fill(H, H + entries(3 * n, 3 * n), 0.0);
+        if (halvings.empty() && !stepper.guards.active) {
+            const Outcome outcome = root(h, q, p, guess, force, past);
             if (outcome != Outcome::solved) return outcome;
             stepper.step_equation.derivatives(h, dV, link.data(), link_f.data());
             add_curvature(h, z, nullptr, H);
             return Outcome::solved;
         }
-        const Outcome outcome = parts(h, q, p, force, substeps);
-        if (outcome != Outcome::solved) return outcome;
-        // Derivatives (2n, 3n) from the start of the step to the start of each part.
-        std::vector<std::vector<double>> starts(1, std::vector<double>(6 * n * n));
+        std::vector<Substep> trail;
         std::vector<double> Jx(4 * n * n), Jf(2 * n * n), back(z, z + 2 * n), before(2 * n);
         identity(Jx.data(), Jf.data());
-        join(Jx, Jf, starts[0]);
-        for (const Substep& part : trail) {
-            const Outcome again = root_of(part);
-            if (again != Outcome::solved) return again;
-            stepper.step_equation.derivatives(part.length, dV, link.data(), link_f.data());
+        const Outcome outcome = parts(h, q, p, force, halvings, [&](double length) {
+            trail.push_back({from, from_p, stepper.step_equation.V, length, joined(Jx, Jf)});
+            stepper.step_equation.derivatives(length, dV, link.data(), link_f.data());
             chain(Jx.data(), Jf.data());
-            starts.emplace_back(6 * n * n);
-            join(Jx, Jf, starts.back());
-        }
+        });
+        if (outcome != Outcome::solved) return outcome;
         for (std::size_t k = trail.size(); k-- > 0;) {
             const Outcome again = root_of(trail[k]);
             if (again != Outcome::solved) return again;
             stepper.step_equation.derivatives(trail[k].length, dV, link.data(), link_f.data());
-            add_curvature(trail[k].length, back.data(), starts[k].data(), H);
+            add_curvature(trail[k].length, back.data(), trail[k].start.data(), H);
             for (int c = 0; c < 2 * n; ++c) {
                 before[c] = 0.0;
                 for (int r = 0; r < 2 * n; ++r) before[c] += link[r * 2 * n + c] * back[r];
@@ -106,11 +114,21 @@ class VariationalLinearization {
     // A root that is known to 1e-10 is good enough for derivatives.
     static constexpr double loose = 1e6;
 
+    // A part of a step that has been solved.
+    struct Substep {
+        std::vector<Place> place;
+        std::vector<Compensated> p;
+        std::vector<double> V;      // (s, n) at its root
+        double length = 0.0;        // [s]
+        std::vector<double> start;  // (2n, 3n) derivatives from the start of the step to its own
+    };
+
     VariationalStepper stepper;
     int n;
     int stages;
     PathState state;
-    std::vector<Substep> trail;
+    std::vector<Place> from;  // where the last part began
+    std::vector<Compensated> from_p;
     std::vector<double> dV;  // (s, n, 3n)
     std::vector<double> dQ;  // (n, 3n) of one stage
     std::vector<double> link, link_f, product;
@@ -118,15 +136,35 @@ class VariationalLinearization {
     Jet<Dual> direction;
     std::vector<Dual> at_q, at_v;
     std::vector<double> inner;  // (2n, 3n)
+    std::vector<Dual> at_f;
+    std::vector<JointForce<Dual>> along_q, along_v, along_f;  // (n) of the elements, with derivatives in q, in v, in f
 
-    Outcome root(double h, const double* q, const double* p, const double* guess, const double* force) {
+    // The root of a step that was taken whole: from a guess (s, n); where that is too far away, as where friction turns
+    // round within the step, from its first velocity, and from the steps before as the motion had it.
+    Outcome root(double h, const double* q, const double* p, const double* guess, const double* force, int past) {
+        std::copy(guess, guess + stages * n, stepper.step_equation.V.begin());
+        Outcome outcome = root_at(h, q, p, force);
+        if (outcome == Outcome::solved) return outcome;
+        if (!stepper.begin_at(q, p, state)) return Outcome::singular;
+        outcome = stepper.part(h, 0, state);
+        if (outcome == Outcome::solved || past == 0) return outcome;
+        const Outcome alone = outcome;
+        if (!stepper.begin_at(q - past * n, p - past * n, state)) return alone;
+        for (int k = past; k >= 0; --k) {
+            std::copy(force - k * n, force - k * n + n, stepper.force.begin());
+            if (stepper.step(h, state) != Outcome::solved) return alone;
+        }
+        return root_at(h, q, p, force);
+    }
+
+    // From the guess in the step equation.
+    Outcome root_at(double h, const double* q, const double* p, const double* force) {
         for (int i = 0; i < n; ++i) {
             state.place[i] = {{q[i], 0.0}, 0.0};
             stepper.unwind(i, state);
             state.p[i] = {p[i], 0.0};
         }
         std::copy(force, force + n, stepper.force.begin());
-        std::copy(guess, guess + stages * n, stepper.step_equation.V.begin());
         return stepper.step_equation.solve(h, {state.place.data(), state.p.data(), stepper.force.data()}, loose, true,
                                            stepper.effort);
     }
@@ -137,21 +175,32 @@ class VariationalLinearization {
                                            true, stepper.effort);
     }
 
-    // Take the step again, with its parts noted down. The motion's own step may have begun with shorter parts than a
-    // fresh start does: then it is taken once more, beginning with those.
-    Outcome parts(double h, const double* q, const double* p, const double* force, std::int64_t substeps) {
+    // Take the parts of a step again; of each that is solved `visit` is told the length, its root in the stepper.
+    template <class Visit>
+    Outcome parts(double h, const double* q, const double* p, const double* force,
+                  std::span<const std::uint8_t> halvings, const Visit& visit) {
         std::copy(force, force + n, stepper.force.begin());
-        Outcome outcome = Outcome::solved;
-        for (const bool again : {false, true}) {
-            if (!stepper.begin_at(q, p, state)) return Outcome::singular;
-            if (again) state.level = std::bit_width(static_cast<std::uint64_t>(substeps - 1)) + 1;
-            trail.clear();
-            stepper.trail = &trail;
-            outcome = stepper.step(h, state);
-            stepper.trail = nullptr;
-            if (stepper.effort.substeps == substeps) break;
+        if (!stepper.begin_at(q, p, state)) return Outcome::singular;
+        if (halvings.empty()) return part(h, 0, visit);
+        for (const std::uint8_t level : halvings) {
+            const Outcome outcome = part(h, level, visit);
+            if (outcome != Outcome::solved) return outcome;
         }
-        return outcome;
+        return Outcome::solved;
+    }
+
+    template <class Visit>
+    Outcome part(double h, int level, const Visit& visit) {
+        from = state.place;
+        from_p = state.p;
+        const Outcome outcome = stepper.part(h, level, state);
+        if (outcome == Outcome::solved) {
+            visit(VariationalStepper::length_of(h, level));
+            return outcome;
+        }
+        if (!stepper.guards.active || level >= stepper.guards.most_halvings) return outcome;
+        const Outcome half = part(h, level + 1, visit);
+        return half == Outcome::solved ? part(h, level + 1, visit) : half;
     }
 
     void identity(double* Jx, double* Jf) const {
@@ -179,11 +228,13 @@ class VariationalLinearization {
         for (int i = 0; i < x * n; ++i) Jf[i] = product[i] + link_f[i];
     }
 
-    void join(const std::vector<double>& Jx, const std::vector<double>& Jf, std::vector<double>& both) const {
+    std::vector<double> joined(const std::vector<double>& Jx, const std::vector<double>& Jf) const {
+        std::vector<double> both(6 * n * n);
         for (int r = 0; r < 2 * n; ++r) {
             std::copy_n(&Jx[r * 2 * n], 2 * n, &both[r * 3 * n]);
             std::copy_n(&Jf[r * n], n, &both[r * 3 * n + 2 * n]);
         }
+        return both;
     }
 
     // Add start' (z . d2(q1, p1)) start at the root in the stepper, its dV at hand; `start` (2n, 3n) may be null.
@@ -192,13 +243,14 @@ class VariationalLinearization {
         const Tableau& tableau = equation.tableau;
         const Mechanism& mechanism = stepper.mechanism;
         const int w = 3 * n;
-        // dphi/dV_m = h b_m (zq + A_m zp - D zp) + h^2 sum_i b_i a_im L_qq,i zp
+        // dphi/dV_m = h b_m (zq + (A_m + F_v,m) zp) + h^2 sum_i b_i a_im (L_qq,i + F_q,i) zp
         for (int m = 0; m < stages; ++m) {
             for (int c = 0; c < n; ++c) {
-                double total = tableau.b[m] * (z[c] - mechanism.damping[c] * z[n + c]);
+                double total = tableau.b[m] * (z[c] + equation.acting[m * n + c].by_v * z[n + c]);
                 for (int j = 0; j < n; ++j) total += tableau.b[m] * equation.stage[m].A[c * n + j] * z[n + j];
                 for (int i = 0; i < stages; ++i) {
                     const double factor = h * tableau.b[i] * tableau.a[i * stages + m];
+                    total += factor * equation.acting[i * n + c].by_q * z[n + c];
                     for (int j = 0; j < n; ++j) total += factor * equation.stage[i].Lqq[c * n + j] * z[n + j];
                 }
                 slope[m * n + c] = h * total;
@@ -235,6 +287,7 @@ class VariationalLinearization {
                     }
                 }
             }
+            if (mechanism.forces.any()) add_elements(h, i, z, H);
             for (int c = 0; c < n; ++c) {
                 const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w];
                 const double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w];
@@ -246,6 +299,39 @@ class VariationalLinearization {
         }
         for (int r = 0; r < w; ++r) {
             for (int k = 0; k < r; ++k) H[r * w + k] = H[k * w + r] = 0.5 * (H[r * w + k] + H[k * w + r]);
+        }
+    }
+
+    // Add to `inner`, and in f to H, what stage i's gamma . F has of second derivatives, all on diagonals.
+    void add_elements(double h, int i, const double* z, double* H) {
+        const Collocation& equation = stepper.step_equation;
+        const int w = 3 * n;
+        for (auto* along : {&along_q, &along_v, &along_f}) {
+            for (int c = 0; c < n; ++c) {
+                at_q[c] = {equation.Q[i * n + c], along == &along_q ? 1.0 : 0.0};
+                at_v[c] = {equation.V[i * n + c], along == &along_v ? 1.0 : 0.0};
+                at_f[c] = {stepper.force[c], along == &along_f ? 1.0 : 0.0};
+            }
+            stepper.mechanism.forces.sum(n, at_q.data(), at_v.data(), at_f.data(), along->data());
+        }
+        for (int c = 0; c < n; ++c) {
+            double gamma = equation.tableau.b[i] * z[n + c];
+            for (int j = 0; j < stages; ++j) gamma += equation.tableau.force[j * stages + i] * multiplier[j * n + c];
+            gamma *= h;
+            const double qq = gamma * along_q[c].by_q.slope, qv = gamma * along_q[c].by_v.slope;
+            const double vv = gamma * along_v[c].by_v.slope;
+            const double qf = gamma * along_f[c].by_q.slope, vf = gamma * along_f[c].by_v.slope;
+            const int f = 2 * n + c;
+            const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w];
+            double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w], *in_f = H + f * w;
+            for (int k = 0; k < w; ++k) {
+                in_q[k] += qq * dq[k] + qv * dv[k];
+                in_v[k] += qv * dq[k] + vv * dv[k];
+                in_f[k] += qf * dq[k] + vf * dv[k];
+            }
+            in_q[f] += qf;
+            in_v[f] += vf;
+            in_f[f] += gamma * along_f[c].by_f.slope;
         }
     }
 

@@ -99,9 +99,10 @@ class StageElimination {
         for (int j = 0; j < tree_->size(); ++j) state_[j * stages_ + c] = EliminatedBody::of(*mechanism_, j, jet);
     }
 
-    // Factor N; false where its determinant is not positive.
-    bool factor(double h) {
+    // Factor N with diagonals d (s, s, n), armature included; false where its determinant is not positive.
+    bool factor(double h, const double* diagonal) {
         h_ = h;
+        diagonal_ = diagonal;
         int sign = 1;
         for (int j = tree_->size() - 1; j >= 0 && sign != 0; --j) sign *= eliminate(j);
         return sign > 0;
@@ -202,7 +203,7 @@ class StageElimination {
             if (link.parent < 0) continue;
             double *M = masses_.rest(j, mass), *C = curved_.rest(j, pivot);
             for (int c = 0; c < stages_; ++c) {
-                const Inertia<double>& inertia = state_[j * stages_ + c].inertia;
+                const detail::InertiaRows inertia(state_[j * stages_ + c].inertia);
                 const double b = tableau_->b[c];
                 const int m = 6 * stages_, w = 12 * stages_;
                 detail::add_inertia(b, inertia, m, M + 6 * c * (m + 1));
@@ -227,7 +228,6 @@ class StageElimination {
           tableau_(&tableau),
           stages_(tableau.stages),
           width_(9 * stages_ + stages_ % 2),
-          reach_(stages_ * stages_),
           state_(tree_->size() * stages_),
           factors_(tree_->size() * factor_size()),
           matrix_(order, width_ * width_),
@@ -238,14 +238,7 @@ class StageElimination {
           lu_(stages_ * stages_),
           rows_(stages_),
           curved_(12 * stages_, order),
-          masses_(6 * stages_, order) {
-        for (int i = 0; i < stages_; ++i) {
-            for (int m = 0; m < stages_; ++m) {
-                for (int c = 0; c < stages_; ++c)
-                    reach_[i * stages_ + m] += tableau.gradient[i * stages_ + c] * tableau.a[c * stages_ + m];
-            }
-        }
-    }
+          masses_(6 * stages_, order) {}
 
     int factor_size() const { return 4 * stages_ * width_ + stages_ * stages_; }
     Factors factors(int j) {
@@ -271,10 +264,8 @@ class StageElimination {
         const int c = link.coordinate;
         for (int i = 0; i < stages_; ++i) {
             for (int m = 0; m < stages_; ++m) {
-                double D = detail::product(width_, own.row + i * width_, own.u + m * width_);
-                D += h_ * tableau_->force[i * stages_ + m] * mechanism_->damping[c];
-                D += h_ * h_ * reach_[i * stages_ + m] * mechanism_->stiffness[c];
-                lu_[i * stages_ + m] = i == m ? D + tree_->armature[c] : D;
+                const double D = detail::product(width_, own.row + i * width_, own.u + m * width_);
+                lu_[i * stages_ + m] = D + diagonal_[(i * stages_ + m) * tree_->dof() + c];
             }
         }
         const int sign = factor_lu_pivoting(lu_.data(), stages_, rows_.data());
@@ -297,7 +288,8 @@ class StageElimination {
                 detail::add_scaled(width_, -own.u[m * width_ + r], own.l + m * width_, X + r * width_);
         }
         for (int k = 0; k < stages_; ++k)
-            detail::add_inertia(1.0, state_[j * stages_ + k].inertia, width_, X + 9 * k * (width_ + 1));
+            detail::add_inertia(1.0, detail::InertiaRows(state_[j * stages_ + k].inertia), width_,
+                                X + 9 * k * (width_ + 1));
         if (link.origin) detail::keep_linear_rows(width_, 9, X);
         matrix_.hand_on(j, link.parent);
         return sign;
@@ -340,7 +332,6 @@ class StageElimination {
     const Tableau* tableau_;
     int stages_;
     int width_;                          // nine entries for each stage, and a zero where that is odd
-    std::vector<double> reach_;          // (s, s) abar a
     std::vector<EliminatedBody> state_;  // (b, s)
     std::vector<double> factors_;
     detail::Gathered matrix_, force_;
@@ -350,6 +341,7 @@ class StageElimination {
     std::vector<int> rows_;
     detail::Pivots curved_, masses_;
     double h_ = 0.0;
+    const double* diagonal_ = nullptr;
 };
 
 }  // namespace varpin

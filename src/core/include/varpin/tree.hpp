@@ -2,11 +2,25 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
+#include <limits>
+#include <stdexcept>
+#include <string>
 #include <vector>
 
+#include "varpin/forces.hpp"
 #include "varpin/spatial.hpp"
 
 namespace varpin {
+
+// How many entries a matrix has. Indices into matrices are ints: a larger one is refused before there is room for it.
+inline int entries(std::int64_t rows, std::int64_t columns) {
+    if (columns > 0 && rows > std::numeric_limits<int>::max() / columns)
+        throw std::length_error("a matrix of " + std::to_string(rows) + " by " + std::to_string(columns) +
+                                " numbers is more than varpin can index, 2^31: the robot has too many joints, or the "
+                                "integrator too many stages for so many");
+    return static_cast<int>(rows * columns);
+}
 
 // Body and joint. The joint stands at ratio * q[coordinate] + offset; mimic joints have ratios other than 1.
 struct Body {
@@ -38,7 +52,7 @@ struct LightPart {
 struct Tree {
     std::vector<Body> bodies;
     std::vector<double> armature;  // (n) [kg m^2 or kg]
-    std::vector<char> periodic;    // (n) the Lagrangian without springs is the same after a whole turn
+    std::vector<char> periodic;    // (n) the Lagrangian without elements is the same after a whole turn
     std::vector<int> group;        // (n) mechanically independent group of a coordinate
     int groups = 0;
     std::vector<Block> blocks;  // in order; together they hold all coordinates
@@ -68,11 +82,9 @@ struct Transmission {
 // A tree in its surroundings.
 struct Mechanism {
     Tree tree;
-    Vec3<double> gravity{};         // [m/s^2]
-    std::vector<double> damping;    // (n) [N m s/rad or N s/m]
-    std::vector<double> stiffness;  // (n) of joint springs [N m/rad or N/m]
-    std::vector<double> rest;       // (n) where they are slack [rad or m]
-    int controls = 0;               // m
+    Vec3<double> gravity{};  // [m/s^2]
+    Forces forces;           // of single joints
+    int controls = 0;        // m
     std::vector<Transmission> actuation;
     Diffusion diffusion;
 

@@ -4,6 +4,7 @@
 #pragma once
 
 #include <algorithm>
+#include <cstdint>
 #include <vector>
 
 #include "varpin/collocation.hpp"
@@ -34,21 +35,14 @@ struct PathState {
     std::vector<double> momentum;  // (n) p, rounded
     std::vector<double> v;         // (n) M(q)^-1 p
     Energies energies;
-    std::vector<double> center;      // (n, k) of the diffusion fields, for this rollout
-    std::vector<double> past;        // (s, n) stage velocities of the last whole step
-    std::vector<double> miss;        // (s, n) by how much its guess had missed them
-    std::vector<double> past_end;    // (n) velocity at its end
-    std::vector<double> past_force;  // (n)
-    int known = 0;                   // of the past: 0, 1, or 2 with `miss`
-    int level = 0;                   // halvings of the last step
-};
-
-// A part of a step, to be differentiated later.
-struct Substep {
-    std::vector<Place> place;
-    std::vector<Compensated> p;
-    std::vector<double> V;  // (s, n) at its root
-    double length = 0.0;    // [s]
+    std::vector<double> center;          // (n, k) of the diffusion fields, for this rollout
+    std::vector<double> past;            // (s, n) stage velocities of the last whole step
+    std::vector<double> miss;            // (s, n) by how much its guess had missed them
+    std::vector<double> past_end;        // (n) velocity at its end
+    std::vector<double> past_force;      // (n)
+    int known = 0;                       // of the past: 0, 1, or 2 with `miss`
+    int level = 0;                       // halvings of the last step
+    std::vector<std::uint8_t> halvings;  // of each part of every step of the last `roll` that was not taken whole
 };
 
 class VariationalStepper {
@@ -79,9 +73,9 @@ class VariationalStepper {
     Collocation step_equation;
     EnergyGuard energy_guard;
     int n;
-    std::vector<double> force;              // (n) constant over the step
-    Effort effort;                          // of the last step
-    std::vector<Substep>* trail = nullptr;  // where the parts of steps are noted down, if anybody asks
+    std::vector<double> force;           // (n) constant over the step
+    Effort effort;                       // of the last step
+    std::vector<std::uint8_t> halvings;  // of each part of the last step; none if it was taken whole
 
     // Put a path at (q, p), with nothing known of the past; false where M(q) is not positive definite.
     bool begin_at(const double* q, const double* p, PathState& state) {
@@ -130,6 +124,7 @@ class VariationalStepper {
     // halves the substep, unless only the guess may be to blame; after a success at an even place it is doubled again.
     Outcome step(double h, PathState& state) {
         effort = {};
+        halvings.clear();
         int level = std::max(state.level - 1, 0), deepest = level;
         bool extrapolated = level == 0 && state.known > 0;
         std::int64_t place = 0;  // in units of h / 2^level
@@ -137,11 +132,11 @@ class VariationalStepper {
             if (extrapolated) {
                 extrapolate(h, state);
             } else {
-                for (int i = 0; i < step_equation.stages; ++i)
-                    std::copy(state.v.begin(), state.v.end(), step_equation.V.begin() + i * n);
+                guess_velocity(state);
             }
-            const Outcome outcome = attempt(h / static_cast<double>(std::int64_t{1} << level), state);
+            const Outcome outcome = attempt(length_of(h, level), state, false);
             if (outcome == Outcome::solved) {
+                if (level > 0) halvings.push_back(static_cast<std::uint8_t>(level));
                 ++place;
                 if (level > 0 && place % 2 == 0) {
                     --level;
@@ -164,6 +159,15 @@ class VariationalStepper {
         return Outcome::solved;
     }
 
+    // The part of a step of length h that was halved `level` times, begun as a part always is, from the current
+    // velocity. Leaves the jets of its root in step_equation.
+    Outcome part(double h, int level, PathState& state) {
+        guess_velocity(state);
+        return attempt(length_of(h, level), state, true);
+    }
+
+    static double length_of(double h, int level) { return h / static_cast<double>(std::int64_t{1} << level); }
+
     // Steps of every path from where it stands. Writes into `nodes` the node after each step, what was applied in it
     // and what it took. A path that fails stops there; nodes.ended and nodes.done say how and where. `increments` of
     // the Wiener processes (P, N, k) and `drift`, a force besides the controls' (P, N, n), may be null.
@@ -176,6 +180,7 @@ class VariationalStepper {
             PathState& state = states[path];
             double* u = nodes.u + path * steps * m;
             look_at(state);
+            state.halvings.clear();
             nodes.ended[path] = static_cast<std::int64_t>(Outcome::solved);
             nodes.done[path] = 0;
             for (std::int64_t s = 0; s < steps; ++s) {
@@ -188,6 +193,7 @@ class VariationalStepper {
                 record_effort(nodes, row);
                 nodes.ended[path] = static_cast<std::int64_t>(outcome);
                 if (outcome != Outcome::solved) break;
+                state.halvings.insert(state.halvings.end(), halvings.begin(), halvings.end());
                 if (noisy && left < 1.0) noise_kick(1.0 - left, u + s * m, dw, state);
                 record_node(nodes, row, state);
                 nodes.done[path] = s + 1;
@@ -195,8 +201,11 @@ class VariationalStepper {
         }
     }
 
+    // Whether the Lagrangian does not know how often coordinate i went round.
+    bool unwinds(int i) const { return mechanism.tree.periodic[i] && !mechanism.forces.anchors(i); }
+
     void unwind(int i, PathState& state) const {
-        if (mechanism.tree.periodic[i] && mechanism.stiffness[i] == 0.0) state.place[i].unwind();
+        if (unwinds(i)) state.place[i].unwind();
     }
 
   private:
@@ -205,31 +214,41 @@ class VariationalStepper {
     std::vector<double> bend;   // (2, n)
     std::vector<double> at;     // (n)
 
+    void guess_velocity(const PathState& state) {
+        for (int i = 0; i < step_equation.stages; ++i)
+            std::copy(state.v.begin(), state.v.end(), step_equation.V.begin() + i * n);
+    }
+
     // One substep from where the path stands and the guess in step_equation.V; moves the path only if it is accepted.
-    Outcome attempt(double h, PathState& state) {
+    Outcome attempt(double h, PathState& state, bool jets_wanted) {
         Collocation& equation = step_equation;
         const Outcome solved =
-            equation.solve(h, {state.place.data(), state.p.data(), force.data()}, tolerance, false, effort);
+            equation.solve(h, {state.place.data(), state.p.data(), force.data()}, tolerance, jets_wanted, effort);
         if (solved != Outcome::solved) return solved;
         const double margin = guards.active ? energy_guard.branch_margin(h, guards, equation) : infinity;
         if (!(margin > 0.0)) return Outcome::fold;
         for (int c = 0; c < n; ++c) {
             double move = 0.0, impulse = 0.0;
-            trial.work[c] = trial.dissipated[c] = 0.0;
+            trial.work[c] = trial.dissipated[c] = trial.magnitude[c] = 0.0;
+            // Whole turns are no distance.
+            const double distance = std::min(std::abs(state.place[c].place.high), unwinds(c) ? Place::turn : infinity);
             for (int i = 0; i < equation.stages; ++i) {
                 const double share = h * tableau.b[i], velocity = equation.V[i * n + c];
-                const double drag = mechanism.damping[c] * velocity;
+                const JointForce<double>& element = equation.acting[i * n + c];
                 move += tableau.b[i] * velocity;
                 impulse += tableau.b[i] * equation.slope[i * n + c];
-                trial.work[c] += share * (force[c] - drag) * velocity;
-                trial.dissipated[c] += share * drag * velocity;
+                trial.work[c] += share * (force[c] + element.value) * velocity;
+                trial.dissipated[c] += share * element.lost;
+                const double scale = equation.stage[i].Lq_scale[c] + std::abs(force[c]) + element.scale;
+                // Beside what cancels, rounding of q moves the potential.
+                trial.magnitude[c] +=
+                    share * scale * std::abs(velocity) + tableau.b[i] * std::abs(equation.stage[i].Lq[c]) * distance;
             }
             trial.place[c] = {state.place[c].place.plus(h * move), state.place[c].turns};
             trial.p[c] = state.p[c].plus(h * impulse);
         }
         const Outcome outcome = energy_guard.settle(guards, tableau, state.energies, state.place, state.v, trial);
         if (outcome != Outcome::solved) return outcome;
-        if (trail != nullptr) trail->push_back({state.place, state.p, equation.V, h});
         effort.branch_margin = std::min(effort.branch_margin, margin);
         ++effort.substeps;
         std::swap(state.place, trial.place);

@@ -1,0 +1,96 @@
+// The look at a finished motion.
+#include "varpin/look.hpp"
+
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include <optional>
+#include <tuple>
+#include <utility>
+
+#include "arrays.hpp"
+#include "registrations.hpp"
+
+namespace varpin::border {
+
+namespace {
+
+using namespace nanobind::literals;
+
+// Look at rows of q, v and f (K, n).
+template <class Look>
+auto at_rows(const Mechanism& mechanism, const In<2>& q, const In<2>& v, const In<2>& f, const Look& look) {
+    const auto n = static_cast<std::size_t>(mechanism.dof());
+    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}, {&f, "f"}}) require(*array, name, {q.shape(0), n});
+    nb::gil_scoped_release release;
+    Inertias inertias(mechanism);
+    return look(inertias, States{q.data(), v.data(), f.data(), q.shape(0)});
+}
+
+double fastest_damping_at(const Mechanism& mechanism, In<2> q, In<2> v, In<2> f, double least) {
+    if (!(least > 0.0)) throw std::invalid_argument("least is a positive rate");
+    return at_rows(mechanism, q, v, f,
+                   [&](Inertias& inertias, const States& states) { return fastest_damping(inertias, states, least); });
+}
+
+bool pulls_fast_at(const Mechanism& mechanism, In<2> q, In<2> v, In<2> f, double dt) {
+    return at_rows(mechanism, q, v, f,
+                   [&](Inertias& inertias, const States& states) { return pulls_fast(inertias, states, dt); });
+}
+
+std::tuple<double, double, Out, Out> energy_turnover(const Mechanism& mechanism, In<2> q, In<2> v, In<2> p, In<2> u,
+                                                     double even, int looks) {
+    const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
+    const std::size_t steps = u.shape(0);
+    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}, {&p, "p"}}) require(*array, name, {steps + 1, n});
+    require(u, "u", {steps, m});
+    if (looks < 2) throw std::invalid_argument("inertias are looked at at both ends at least");
+    Turnover found;
+    {
+        nb::gil_scoped_release release;
+        found = turnover(mechanism, {static_cast<std::int64_t>(steps), q.data(), v.data(), p.data(), u.data()}, even,
+                         looks);
+    }
+    return {found.kinetic, found.work, array_of(found.kinetic_of.data(), {n}), array_of(found.work_of.data(), {n})};
+}
+
+bool doubled_steps_agree(const Mechanism& mechanism, In<2> q, In<2> v, Integers<1> begins, std::size_t length,
+                         double dt, In<3> again_q, In<3> again_v, double way, double velocity, double little,
+                         double light, double even) {
+    const auto n = static_cast<std::size_t>(mechanism.dof());
+    const std::size_t nodes = q.shape(0), windows = begins.shape(0);
+    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {nodes, n});
+    for (const auto& [array, name] : {std::pair{&again_q, "again_q"}, {&again_v, "again_v"}})
+        require(*array, name, {windows, length / 2, n});
+    for (std::size_t w = 0; w < windows; ++w) {
+        if (begins(w) < 0 || static_cast<std::size_t>(begins(w)) + length >= nodes)
+            throw std::invalid_argument("a window is beyond the motion");
+    }
+    nb::gil_scoped_release release;
+    return agree_in_doubled_steps(mechanism, q.data(), v.data(), begins.data(), windows, length, dt, again_q.data(),
+                                  again_v.data(), {way, velocity, little, light, even});
+}
+
+std::tuple<std::int64_t, std::int64_t, std::int64_t> alternation(In<2> v, std::optional<In<2>> u, double counts,
+                                                                 double idle, double even) {
+    if (v.shape(0) == 0) throw std::invalid_argument("a motion has a node");
+    if (u && u->shape(0) != v.shape(0) - 1) throw std::invalid_argument("there is not one control for each step");
+    const Alternation found =
+        longest_alternation(v.data(), static_cast<std::int64_t>(v.shape(0)) - 1, static_cast<int>(v.shape(1)),
+                            u ? u->data() : nullptr, u ? static_cast<int>(u->shape(1)) : 0, {counts, idle, even});
+    return {found.joint, found.changes, found.first};
+}
+
+}  // namespace
+
+void register_look(nb::module_& m) {
+    m.def("longest_alternation", &alternation, "v"_a, "u"_a.none(), nb::kw_only(), "counts"_a, "idle"_a, "even"_a);
+    m.def("fastest_damping", &fastest_damping_at, "mechanism"_a, "q"_a, "v"_a, "f"_a, "least"_a);
+    m.def("pulls_fast", &pulls_fast_at, "mechanism"_a, "q"_a, "v"_a, "f"_a, "dt"_a);
+    m.def("energy_turnover", &energy_turnover, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, nb::kw_only(), "even"_a,
+          "looks"_a);
+    m.def("doubled_steps_agree", &doubled_steps_agree, "mechanism"_a, "q"_a, "v"_a, "begins"_a, "length"_a, "dt"_a,
+          "again_q"_a, "again_v"_a, nb::kw_only(), "way"_a, "velocity"_a, "little"_a, "light"_a, "even"_a);
+}
+
+}  // namespace varpin::border

@@ -1,0 +1,492 @@
+"""Forces on joints: each against its formula, steps with all of them against differences, motions against SciPy."""
+
+import pickle
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from naive import gradient
+from scipy.integrate import solve_ivp
+from test_elimination import rolled
+
+import varpin as vp
+from varpin.core import Solver, variational_derivatives
+from varpin.core.arrays import Element
+from varpin.tradeoff.setting import digest
+
+WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}  # of eighth-order central differences
+INTEGRATORS = [vp.Midpoint(), vp.Midpoint(0.3), vp.Gauss(2), vp.Radau(2), vp.RungeKutta4(), vp.SemiImplicitEuler()]
+
+
+def rise(y):
+    """How much of a stop acts: a smooth step from 0 to 1."""
+    y = np.where(np.real(y) < 0.0, 0.0, np.where(np.real(y) > 1.0, 1.0, y))
+    return 3.0 * y**2 - 2.0 * y**3
+
+
+def depths(lower, upper, q):
+    return [*([q - upper] if np.isfinite(upper) else []), *([lower - q] if np.isfinite(lower) else [])]
+
+
+def stop_energy(depth, stiffness, width):
+    """The energy of a stop of unit width, from the integrals of its rise."""
+    y = depth / width
+    within = y**4 / 4.0 - y**5 / 10.0
+    beyond = 0.15 + 0.5 * (y - 1.0) + 0.5 * (y - 1.0) ** 2
+    return stiffness * width**2 * np.where(np.real(y) <= 0.0, 0.0, np.where(np.real(y) < 1.0, within, beyond))
+
+
+def energy(element, q):
+    """The potential energy of one element at complex q of its joint."""
+    values = element.values
+    if element.kind == "JointSpring":
+        return 0.5 * values[0] * (q - values[1]) ** 2
+    if element.kind == "JointStop":
+        lower, upper, stiffness, _, width = values
+        return sum(stop_energy(depth, stiffness, width) for depth in depths(lower, upper, q))
+    return 0.0 * q
+
+
+def force(element, q, v, f=0.0):
+    """The force of one element besides that of its energy, at complex q and v of its joint."""
+    values = element.values
+    if element.kind == "JointDamper":
+        return -values[0] * v
+    if element.kind == "CoulombFriction":
+        level, width, breakaway, fading = values
+        return -(level + (breakaway - level) * np.exp(-((v / fading) ** 2))) * np.tanh(v / width)
+    if element.kind == "JointStop":
+        lower, upper, _, damping, width = values
+        return -damping * sum(rise(depth / width) for depth in depths(lower, upper, q)) * v
+    if element.kind == "PositionServo":
+        stiffness, damping, effort = values
+        wanted = f - stiffness * q - damping * v
+        side, y = np.sign(np.real(wanted)), wanted * np.sign(np.real(wanted)) / effort
+        bent = np.where(np.real(y) < 1.1, y - 2.5 * (y - 0.9) ** 2, 1.0)
+        return np.where(np.real(y) < 0.9, wanted, side * effort * bent) - f
+    return 0.0 * q
+
+
+def total(scene, q, v, f):
+    """Forces of all elements (n,), those of their energies too, in plain NumPy, under constant forces f (n,)."""
+    out = np.zeros(scene.robot.dof)
+    for own in scene.elements:
+        c = own.coordinate
+        out[c] += force(own, q[c], v[c], f[c]) - gradient(lambda x, own=own: energy(own, x[..., 0]), q[[c]])[0]
+    return out
+
+
+def everything(robot, q, scale=1.0):
+    """A scene with every kind of force, its stops such that some are touched at q, one of them all through."""
+    n = robot.dof
+    touched = np.arange(n) % 3
+    upper = np.where(touched == 0, q - 0.2, q + 1.0)
+    lower = np.where(touched == 1, q + 0.7, q - 9.0)
+    lower = np.where(lower < upper, lower, upper - 9.0)
+    return vp.Scene(
+        robot,
+        damping=0.05 * scale,
+        stiffness=0.7 * scale,
+        rest=0.2,
+        forces=[
+            vp.CoulombFriction(0.3 * scale, width=0.8),
+            vp.CoulombFriction({robot.joint_names[0]: 0.2 * scale}, 1.0, {robot.joint_names[0]: 0.5 * scale}, 1.5),
+            vp.JointStop(4.0 * scale, 0.6 * scale, lower=lower, upper=upper, width=0.5),
+            vp.JointSpring({robot.joint_names[-1]: 0.4 * scale}, 1.0),
+            vp.Armature(0.02 * scale),
+            vp.PositionServo({robot.joint_names[1]: 2.0 * scale}, 0.1 * scale),
+            # Its limit is met 1.5 rad away.
+            vp.PositionServo({robot.joint_names[-1]: 1.5 * scale}, 0.05 * scale, 2.25 * scale),
+        ],
+    )
+
+
+ELEMENTS = [
+    Element("JointSpring", 0, (3.0, 0.4)),
+    Element("JointDamper", 0, (0.7,)),
+    Element("CoulombFriction", 0, (0.5, 0.1, 0.5, 1.0)),
+    Element("CoulombFriction", 0, (0.5, 0.1, 0.9, 0.3)),
+    Element("JointStop", 0, (-1.0, 1.0, 50.0, 3.0, 0.2)),
+    Element("JointStop", 0, (-np.inf, 0.5, 50.0, 0.0, 0.2)),
+    Element("PositionServo", 0, (2.0, 0.3, 2.0)),
+]
+FORCES = [
+    vp.JointSpring(3.0, 0.4),
+    vp.JointDamper(0.7),
+    vp.CoulombFriction(0.5, 0.1),
+    vp.CoulombFriction(0.5, 0.1, 0.9, 0.3),
+    vp.JointStop(50.0, 3.0, -1.0, 1.0, 0.2),
+    vp.JointStop(50.0, 0.0, -np.inf, 0.5, 0.2),
+    vp.PositionServo(2.0, 0.3, 2.0),
+]
+
+
+@pytest.mark.parametrize(("given", "element"), list(zip(FORCES, ELEMENTS, strict=True)), ids=lambda own: repr(own)[:40])
+def test_each_against_its_formula(given, element):
+    """Energy, forces and their derivatives at places before, in and beyond the rise of a stop, by the complex step."""
+    robot = vp.planar_chain(1)
+    scene, bare = vp.Scene(robot, forces=given), vp.Scene(robot)
+    assert scene.elements == (element,)
+    for q, v in [(-1.35, 0.4), (-1.05, -0.2), (0.1, 0.03), (0.6, -0.3), (1.15, 0.9), (1.6, -0.05), (3.0, 0.0)]:
+        at, rate = np.array([q]), np.array([v])
+        own, other = vp.lagrangian_jet(scene, at, rate), vp.lagrangian_jet(bare, at, rate)
+
+        def potential(x):
+            return energy(element, x[..., 0])
+
+        slope = gradient(potential, at)
+        assert pytest.approx(energy(element, q), rel=1e-12, abs=1e-13) == other.L - own.L
+        assert own.Lq - other.Lq == pytest.approx(-slope, rel=1e-12, abs=1e-13)
+        h = 1e-4
+        curvature = sum(
+            w * (gradient(potential, at + i * h) - gradient(potential, at - i * h)) for i, w in WEIGHTS.items()
+        )
+        assert own.Lqq[0] - other.Lqq[0] == pytest.approx(-curvature / h, rel=1e-9, abs=1e-9)
+        value, by_q, by_v, lost = (array[0] for array in scene.core.forces(at[None], rate[None], np.array([[0.7]])))
+        assert value == pytest.approx([force(element, q, v, 0.7)], rel=1e-13, abs=1e-15)
+        assert by_q == pytest.approx(
+            gradient(lambda x, v=v: force(element, x[..., 0], v, 0.7), at), rel=1e-12, abs=1e-14
+        )
+        assert by_v == pytest.approx(
+            gradient(lambda x, q=q: force(element, q, x[..., 0], 0.7), rate), rel=1e-12, abs=1e-14
+        )
+        if element.kind != "PositionServo":
+            assert lost == pytest.approx([-force(element, q, v) * v], rel=1e-13, abs=1e-15)
+        assert lost[0] >= 0.0
+
+
+@pytest.mark.parametrize("robot", ["finger", "ur5", "panda"])
+def test_the_lagrangian_against_pinocchio(robot):
+    arm = vp.load_robot(robot)
+    rng = np.random.default_rng(4)
+    q, v = rng.normal(size=(2, arm.dof))
+    scene = everything(arm, q)
+    one, other = (vp.lagrangian_jet(scene, q, v, backend=backend) for backend in ("compiled", "pinocchio"))
+    for name in ("L", "Lq", "Lv", "Lqq", "Lvq", "Lvv"):
+        a, b = getattr(one, name), getattr(other, name)
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11 * (1.0 + np.abs(b).max()), err_msg=name)
+
+
+def one_step(scene, x, u, dt, integrator):
+    """The state after a step from x, (q, p) or (q, v)."""
+    n = scene.robot.dof
+    v = x[n:]
+    if integrator.variational:
+        v = np.linalg.solve(vp.lagrangian_jet(scene, x[:n], np.zeros(n)).Lvv, v)
+    end = vp.simulate(scene, x[:n], v, dt=dt, steps=1, controls=u, integrator=integrator)
+    return np.concatenate([end.q[1], end.p[1] if integrator.variational else end.v[1]])
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS, ids=str)
+@pytest.mark.parametrize("name", ["finger", "ur5", "chain"])
+def test_linearization_of_a_step_with_all_of_them(name, integrator):
+    robot = vp.planar_chain(3) if name == "chain" else vp.load_robot(name)
+    n, scale = robot.dof, 1e-4 if name == "finger" else 1.0
+    rng = np.random.default_rng(7)
+    q, v = rng.normal(size=n), rng.normal(size=n)
+    scene, dt = everything(robot, q, scale), 2e-3
+    u = scale * rng.normal(size=n)
+    u[[1, -1]] = q[1] + 0.4, q[-1] + 1.5
+    motion = vp.simulate(scene, q, v, dt=dt, steps=1, controls=u, integrator=integrator)
+    assert motion.statistics.split_steps == 0
+    lin = vp.linearize(scene, motion, integrator=integrator)
+    x = np.concatenate([q, motion.p[0] if integrator.variational else v])
+    light = 1.0 / np.diag(np.linalg.inv(vp.lagrangian_jet(scene, q, v).Lvv)) if integrator.variational else np.ones(n)
+    rows = np.concatenate([np.ones(n), light])
+    units = np.concatenate([rows, np.full(n, scale)])
+    units[[2 * n + 1, -1]] = 1.0
+    point, given = np.concatenate([x, u]), np.hstack([lin.A[0], lin.B[0]])
+    for c in range(3 * n):
+        size = 1e-2 * units[c]
+        found = sum(
+            w * (one_step(scene, *np.split(point + i * size * np.eye(3 * n)[c], [2 * n]), dt, integrator)
+                 - one_step(scene, *np.split(point - i * size * np.eye(3 * n)[c], [2 * n]), dt, integrator))
+            for i, w in WEIGHTS.items()
+        ) / size  # fmt: skip
+        expected = found * units[c] / rows
+        assert np.abs(given[:, c] * units[c] / rows - expected).max() <= 1e-8 * max(1.0, np.abs(expected).max())
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS[:4], ids=str)
+@pytest.mark.parametrize("name", ["finger", "ur5"])
+def test_second_derivatives_of_a_step_with_all_of_them(name, integrator):
+    """Against differences of the first, of eighth order, along some directions."""
+    robot, scale = vp.load_robot(name), 1e-4 if name == "finger" else 1.0
+    n, dt = robot.dof, 2e-3
+    rng = np.random.default_rng(11)
+    q, v = rng.normal(size=n), rng.normal(size=n)
+    scene, u = everything(robot, q, scale), scale * rng.normal(size=n)
+    u[[1, -1]] = q[1] + 0.4, q[-1] + 1.5
+    motion = vp.simulate(scene, q, v, dt=dt, steps=1, controls=u, integrator=integrator)
+    light = 1.0 / np.diag(np.linalg.inv(vp.lagrangian_jet(scene, q, v).Lvv))
+    z = rng.normal(size=2 * n) / np.concatenate([np.ones(n), light])
+    units = np.concatenate([np.ones(n), light, np.full(n, scale)])
+    units[[2 * n + 1, -1]] = 1.0
+    own = vp.second_order(scene, motion, z, integrator=integrator)
+    given = np.block([[own.xx[0], own.ux[0].T], [own.ux[0], own.uu[0]]])
+
+    def slope(y):
+        rate = np.linalg.solve(vp.lagrangian_jet(scene, y[:n], np.zeros(n)).Lvv, y[n : 2 * n])
+        end = vp.simulate(scene, y[:n], rate, dt=dt, steps=1, controls=y[2 * n :], integrator=integrator)
+        lin = vp.linearize(scene, end, integrator=integrator)
+        return z @ np.hstack([lin.A[0], lin.B[0]])
+
+    point, size = np.concatenate([q, motion.p[0], u]), 1e-2
+    for c in (0, 1, n - 1, n, 2 * n - 1, 2 * n, 3 * n - 1):
+        e = np.zeros(3 * n)
+        e[c] = size * units[c]
+        found = sum(w * (slope(point + i * e) - slope(point - i * e)) for i, w in WEIGHTS.items()) / size
+        expected = found * units
+        error = given[:, c] * units[c] * units - expected
+        assert np.abs(error).max() <= 1e-9 * max(1.0, np.abs(expected).max())
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Midpoint(0.4), vp.Gauss(2), vp.Radau(2)], ids=str)
+def test_elimination_takes_the_steps_of_the_dense_solver(integrator):
+    robot = vp.planar_chain(5)
+    q, v = np.array([0.3, -0.4, 0.9, 0.1, -0.8]), np.array([1.0, -0.5, 0.3, 0.8, -1.2])
+    scene = everything(robot, q)
+    dense, eliminated = (rolled(scene, q, v, 1e-3, 20, way, integrator) for way in (Solver.dense, Solver.elimination))
+    assert dense.done == eliminated.done == 20
+    for name in ("q", "v", "p", "energy"):
+        np.testing.assert_allclose(getattr(eliminated, name), getattr(dense, name), rtol=1e-9, atol=1e-9)
+    assert eliminated.quality[..., 1] == pytest.approx(dense.quality[..., 1], rel=1e-5)
+    stages = getattr(integrator, "stages", 1)
+    fixed = scene.core, integrator._tableau(), float(integrator.tolerance), integrator._guards(), 1e-3
+    at = q[None], vp.lagrangian_jet(scene, q, v).Lv[None], np.zeros((1, 5))
+    whole = np.ones(1, dtype=np.int64), np.zeros(0, dtype=np.uint8)
+    guess = np.broadcast_to(v, (1, stages, 5)).copy()
+    (Ax, Af, *_), (Bx, Bf, *_) = (
+        variational_derivatives(*fixed, *at, *whole, guess=guess, solver=way)
+        for way in (Solver.dense, Solver.elimination)
+    )
+    for A, B in ((Ax, Bx), (Af, Bf)):
+        assert np.abs(A - B).max() <= 1e-10 * np.abs(A).max()
+
+
+def test_conservative_ones_keep_the_step_symplectic():
+    robot = vp.planar_chain(3)
+    q, v = np.array([0.9, -0.4, 0.6]), np.array([0.5, 1.0, -2.0])
+    forces = [vp.JointSpring(4.0, 0.3), vp.JointStop(80.0, lower=-0.3, upper=0.5, width=0.2), vp.Armature(0.3)]
+    scene = vp.Scene(robot, forces=forces)
+    for integrator in (vp.Midpoint(), vp.Gauss(2)):
+        motion = vp.simulate(scene, q, v, dt=5e-3, steps=40, integrator=integrator)
+        assert (motion.q > 0.5).any()
+        A = vp.linearize(scene, motion, integrator=integrator).A
+        J = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.eye(3), np.zeros((3, 3))]])
+        assert np.abs(A.transpose(0, 2, 1) @ J @ A - J).max() <= 1e-12 * np.abs(A).max() ** 2
+
+
+@pytest.mark.parametrize("integrator", [vp.Gauss(3), vp.RungeKutta4()], ids=str)
+def test_what_is_lost_is_what_the_energy_lacks(integrator):
+    """The energy, that of stops included, falls by the integral of the power that the forces turn into heat."""
+    robot = vp.planar_chain(2)
+    scene = vp.Scene(
+        robot,
+        forces=[
+            vp.CoulombFriction(0.4, 0.5, 0.7, 1.0),
+            vp.JointStop(60.0, 4.0, lower=-0.4, upper=0.5, width=0.3),
+            vp.JointDamper(0.2),
+            vp.Armature(0.1),
+        ],
+    )
+    motion = vp.simulate(scene, [0.2, 0.1], [2.0, -3.0], dt=5e-4, steps=2000, integrator=integrator)
+    assert np.abs(motion.q).max() > 0.6
+    lost = scene.core.forces(motion.q, motion.v, np.zeros_like(motion.q))[3].sum(axis=1)
+    # Simpson's rule.
+    heat = (lost[:-1:2] + 4.0 * lost[1::2] + lost[2::2]).cumsum() * motion.dt / 3.0
+    taken = motion.energy[0] - motion.energy[2::2]
+    assert taken[-1] > 5.0
+    np.testing.assert_allclose(taken, heat, atol=2e-6 * taken[-1])
+    assert np.abs(motion.statistics.energy_defect).max() <= 1e-3 * taken[-1]
+    assert not motion.warnings
+
+
+def by_scipy(scene, q, v, times, u=0.0):
+    """The same motion by SciPy's Radau on Pinocchio's dynamics and the plain forces, the controls being constant."""
+    model = scene.robot.model.copy()
+    model.armature = scene.armature
+    data, n = model.createData(), scene.robot.dof
+    f = scene.actuation @ np.full(n, u)
+
+    def slope(_, y):
+        return np.concatenate([y[n:], pin.aba(model, data, y[:n], y[n:], f + total(scene, y[:n], y[n:], f))])
+
+    return solve_ivp(
+        slope, (0.0, times[-1]), np.concatenate([q, v]), "Radau", t_eval=times, rtol=1e-9, atol=1e-11, max_step=0.02
+    ).y.T
+
+
+def test_friction_brings_a_pendulum_to_rest():
+    """A motion with friction that falls with the velocity, against SciPy."""
+    scene = vp.Scene(vp.planar_chain(1), forces=vp.CoulombFriction(1.5, 0.05, 2.5, 0.5))
+    exact = by_scipy(scene, [1.2], [0.0], np.linspace(0.0, 2.0, 21))
+    for integrator, steps, error in ((vp.Gauss(3), 2000, 1e-7), (vp.Radau(3), 2000, 1e-7), (vp.Midpoint(), 2000, 1e-4)):
+        motion = vp.simulate(scene, [1.2], [0.0], dt=2.0 / steps, steps=steps, integrator=integrator)
+        np.testing.assert_allclose(motion.q[:: steps // 20, 0], exact[:, 0], atol=error)
+
+
+def test_a_stop_throws_back():
+    """An arm that falls onto its stops and bounces, against SciPy; what it comes back with is less."""
+    forces = [vp.JointStop(2e3, 10.0, lower=-0.2, upper={"joint1": 1.0, "joint2": 0.4}, width=0.02), vp.Armature(0.05)]
+    scene = vp.Scene(vp.planar_chain(2), forces=forces)
+    q, v = np.array([0.4, -0.1]), np.array([1.0, 0.5])
+    exact = by_scipy(scene, q, v, np.linspace(0.0, 0.8, 17))
+    assert exact[:, 0].max() > 1.0
+    for integrator, error in ((vp.Gauss(3), 1e-6), (vp.Midpoint(), 1e-3), (vp.RungeKutta4(), 1e-4)):
+        motion = vp.simulate(scene, q, v, dt=5e-4, steps=1600, integrator=integrator)
+        np.testing.assert_allclose(motion.q[::100], exact[:, :2], atol=error)
+
+
+def test_servos_go_where_they_are_told():
+    """Against SciPy, from the effort limit on; and a servo far faster than the step."""
+    robot = vp.planar_chain(2)
+    scene = vp.Scene(robot, forces=vp.PositionServo(400.0, 40.0, 60.0))
+    assert scene.control_joints == robot.joint_names
+    exact = by_scipy(scene, [0.0, 0.0], [0.0, 0.0], np.linspace(0.0, 1.0, 11), 0.7)
+    for integrator, error in ((vp.Gauss(3), 1e-6), (vp.Midpoint(), 1e-3), (vp.RungeKutta4(), 1e-4)):
+        motion = vp.simulate(
+            scene, [0.0, 0.0], [0.0, 0.0], dt=1e-3, steps=1000, controls=[0.7, 0.7], integrator=integrator
+        )
+        np.testing.assert_allclose(motion.q[::100], exact[:, :2], atol=error)
+        assert not [words for words in motion.warnings if "energy" in words]
+    stiff = vp.Scene(robot, forces=vp.PositionServo(1e7, 1e5))
+    motion = vp.simulate(
+        stiff, [0.0, 0.0], [0.0, 0.0], dt=1e-2, steps=100, controls=[0.1, -0.1], integrator=vp.Radau(2)
+    )
+    np.testing.assert_allclose(motion.q[-1], [0.1, -0.1], atol=1e-4)
+
+
+def test_what_holds_an_arm_on_servos_is_a_position():
+    robot = vp.load_robot("ur5")
+    q = np.array([0.1, -0.8, 1.1, 0.2, -0.4, 0.3])
+    scene = vp.Scene(robot, forces=vp.PositionServo({"elbow_joint": 900.0, "shoulder_lift_joint": 700.0}, 1.0, 1000.0))
+    u = scene.holding_controls(q)
+    motion = vp.simulate(scene, q, np.zeros(6), dt=1e-2, steps=20, controls=u)
+    np.testing.assert_allclose(motion.q, np.tile(q, (21, 1)), atol=1e-9)
+    torque = scene.holding_torque(q)
+    assert u[2] == pytest.approx(q[2] + torque[2] / 900.0, rel=1e-12)
+    assert u[3] == pytest.approx(torque[3], rel=1e-12)
+    weak = vp.Scene(robot, forces=vp.PositionServo({"shoulder_lift_joint": 900.0}, effort=1.0))
+    with pytest.raises(vp.InputError, match="shoulder_lift_joint"):
+        weak.holding_controls(q)
+
+
+def test_a_servo_has_a_control_of_its_own():
+    robot = vp.planar_chain(2)
+    for forces, actuation in (
+        (vp.PositionServo(1.0), ["joint1"]),
+        (vp.PositionServo({"joint1": 1.0}), [[1.0], [1.0]]),
+        (vp.PositionServo({"joint1": 1.0}), [[2.0, 0.0], [0.0, 1.0]]),
+        ([vp.PositionServo(1.0), vp.PositionServo({"joint2": 1.0})], None),
+    ):
+        with pytest.raises(vp.InputError, match="servo"):
+            vp.Scene(robot, forces=forces, actuation=actuation)
+    scene = vp.Scene(robot, forces=vp.PositionServo({"joint2": 50.0}), actuation=["joint2"])
+    np.testing.assert_array_equal(scene.actuation, [[0.0], [50.0]])
+
+
+def test_short_forms_are_the_same_elements():
+    robot = vp.load_robot("ur5")
+    short = vp.Scene(robot, damping=0.3, stiffness={"elbow_joint": 2.0}, rest=0.1)
+    long = vp.Scene(robot, forces=[vp.JointSpring({"elbow_joint": 2.0}, 0.1), vp.JointDamper(np.full(6, 0.3))])
+    assert short.elements == long.elements
+    for name in ("damping", "stiffness"):
+        assert getattr(short, name).tobytes() == getattr(long, name).tobytes()
+    assert long.rest[2] == 0.1
+    several = vp.Scene(robot, damping=0.3, forces=[vp.JointDamper(0.2), vp.JointSpring(1.0, 1.0), vp.JointSpring(3.0)])
+    np.testing.assert_allclose([several.damping[0], several.stiffness[0], several.rest[0]], [0.5, 4.0, 0.25])
+
+
+def test_stops_are_where_the_description_has_limits():
+    robot = vp.load_robot("panda")
+    stops = vp.Scene(robot, forces=vp.JointStop(100.0)).elements
+    assert [own.coordinate for own in stops] == list(range(robot.dof))
+    np.testing.assert_array_equal(np.array([own.values[:2] for own in stops]).T, robot.position_limits)
+    one = vp.Scene(robot, forces=vp.JointStop(100.0, lower={"panda_joint2": 0.1}, upper={})).elements
+    assert [(own.coordinate, own.values[:2]) for own in one] == [(1, (0.1, np.inf))]
+
+
+def test_scenes_with_forces_travel_and_tell_themselves():
+    robot = vp.load_robot("ur5")
+    forces = [vp.CoulombFriction({"elbow_joint": 0.5}), vp.JointStop(1e3, np.full(6, 2.0)), vp.Armature(0.1)]
+    scene = vp.Scene(robot, forces=forces)
+    back = pickle.loads(pickle.dumps(scene))
+    assert back.elements == scene.elements
+    assert repr(back.forces) == repr(scene.forces)
+    assert digest(back.elements) == digest(scene.elements)
+    assert digest(scene.elements) != digest(vp.Scene(robot, forces=forces[:1]).elements)
+    assert "CoulombFriction, JointStop, Armature" in repr(scene)
+    assert "CoulombFriction(level={'elbow_joint': 0.5}, width=0.01)" in repr(scene.forces)
+    assert "CoulombFriction on" in scene._repr_html_()
+    motions = [vp.simulate(own, np.zeros(6), np.ones(6), dt=1e-3, steps=20) for own in (scene, back)]
+    assert motions[0].q.tobytes() == motions[1].q.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("force", "match"),
+    [
+        (vp.JointDamper(-1.0), r"damping\[0\] is -1.0; it must be >= 0"),
+        (vp.Armature([1.0, 2.0]), r"inertia must be one number or have shape \(6,\)"),
+        (vp.CoulombFriction(1.0, width=0.0), r"width\[0\] is 0.0; it must be > 0"),
+        (vp.CoulombFriction(1.0, breakaway=2.0), "belong together"),
+        (vp.CoulombFriction(1.0, 0.1, 0.5, 1.0), r"breakaway\[0\] is 0.5; it must be at least the level"),
+        (
+            vp.JointStop(1.0, lower=1.0, upper=-1.0),
+            "lower end of joint 'shoulder_pan_joint', 1, is not below its upper end, -1",
+        ),
+        (vp.JointStop(1.0, lower=np.inf), r"lower\[0\] is inf"),
+        (vp.JointSpring({"knee": 1.0}), "knee"),
+        ("friction", "must be a list of varpin's forces"),
+        ([vp.JointDamper(1.0), 3.0], "got 3.0 in it"),
+    ],
+    ids=lambda own: repr(own)[:40],
+)
+def test_what_is_no_force_is_refused(force, match):
+    with pytest.raises(vp.VarpinError, match=match):
+        vp.Scene(vp.load_robot("ur5"), forces=force)
+
+
+def test_what_friction_lets_a_motion_do_is_linearized():
+    """Friction that turns round within a step: a motion's root is far from what its nodes say of it."""
+    robot = vp.load_robot("z1")
+    scene = vp.Scene(robot, damping="robot", forces=[vp.CoulombFriction(robot.friction, width=0.1)])
+    rng, n, t = np.random.default_rng(0), robot.dof, 0.02 * np.arange(50)[:, None]
+    for _ in range(3):
+        q0 = rng.uniform(-0.5, 0.5, n)
+        waves = np.sin(2.0 * np.pi * rng.uniform(0.5, 3.0, n) * t + rng.uniform(0.0, 6.0, n))
+        u = scene.holding_torque(q0) + rng.uniform(0.5, 3.0, n) * waves
+        motion = vp.simulate(scene, q0, np.zeros(n), dt=0.02, steps=50, controls=u, check=False)
+        assert np.isfinite(vp.linearize(scene, motion).A).all()
+
+
+def test_stops_ends_and_servos_are_said():
+    chain = vp.planar_chain(2)
+    with pytest.raises(vp.InputError, match="no position limits for 'joint1', 'joint2': give lower= and upper="):
+        vp.Scene(chain, forces=[vp.JointStop(1e3)])
+    servos = [vp.PositionServo(100.0, 5.0, effort=50.0)]
+    with pytest.raises(vp.InputError, match="the control of joint 'joint1' is the position of its servo"):
+        vp.Scene(chain, forces=servos, noise=vp.AdditiveNoise(0.1) + vp.ControlNoise(0.1))
+    cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost([1.0, 0.5], 50.0))
+    plan = vp.solve(vp.OptimalControlProblem(vp.Scene(chain, damping=0.1), cost, [0, 0], [0, 0], dt=0.02, steps=30))
+    served = vp.Scene(chain, damping=0.1, forces=servos)
+    with pytest.raises(vp.InputError, match="positions of no joints and forces of all others"):
+        vp.simulate(served, [0, 0], [0, 0], dt=0.02, steps=30, controls=plan.policy, integrator=vp.Gauss(4))
+    with pytest.raises(vp.InputError, match="the plant has servos on joint1, joint2; the problem on no joints"):
+        vp.Mpc(plan.problem).run(vp.Plant(served), duration=0.1)
+
+
+def test_limits_are_held_against_what_drives_and_stops_do():
+    robot = vp.load_robot("ur5")
+    servo = vp.PositionServo({"elbow_joint": 1e4}, {"elbow_joint": 100.0})
+    scene, q = vp.Scene(robot, gravity=False, forces=[servo]), [0, 0, 0.5, 0, 0, 0]
+
+    def said(scene, q, v, steps, **options):
+        return " ".join(vp.simulate(scene, q, v, dt=1e-3, steps=steps, check=False, **options).warnings)
+
+    assert "effort" not in said(scene, q, np.zeros(6), 20, controls={"elbow_joint": 0.5})
+    assert "4.85e+03 N m below -150" in said(scene, q, np.zeros(6), 20, controls={"elbow_joint": 0.0})
+    loose = vp.Scene(robot, gravity=False, forces=[vp.JointStop(1e3, lower=-50, upper=50)])
+    assert "leave their limits" in said(loose, [0, 0, 2.9, 0, 0, 0], [0, 0, 6.0, 0, 0, 0], 400)
+    stiff = vp.Scene(robot, gravity=False, forces=[vp.JointStop(1e5, 1e3)])
+    assert "leave their limits" not in said(stiff, [0, 0, 3.0, 0, 0, 0], [0, 0, 1.0, 0, 0, 0], 400)
