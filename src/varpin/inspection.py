@@ -17,7 +17,7 @@ from varpin.frozen import Frozen
 from varpin.inspection_tables import parts_of
 from varpin.integrators import Guard, largest_step
 from varpin.lagrangian import lagrangian_jet
-from varpin.markup import facts, folded, table
+from varpin.markup import facts, folded, said, table
 from varpin.robot import Robot, build_robot, check_inertia
 from varpin.robot.inertia import fault, principal_moments
 from varpin.robot.mimic import joint_index
@@ -147,8 +147,7 @@ class RobotReport(Frozen):
 
     def __repr__(self) -> str:
         return (
-            f"RobotReport({self.robot.name}: {len(self.joints)} joints, {len(self.links)} links, "
-            f"{len(self.warnings)} warnings)"
+            f"RobotReport({self.robot.name}: {len(self.joints)} joints, {len(self.links)} links{said(self.warnings)})"
         )
 
     def __str__(self) -> str:
@@ -224,7 +223,7 @@ def inspect_robot(
         robot = source
     else:
         robot = build_robot(source, package_dirs=package_dirs, lock=lock, mimic=mimic)
-    scene = Scene(robot, gravity=gravity)
+    scene = Scene(robot, gravity=gravity, damping=0.0)
     configuration = joint_array("q", 0.0 if q is None else q, robot.joint_names, uniform=True)
     velocity = joint_array("v", 0.0 if v is None else v, robot.joint_names, uniform=True)
     with np.errstate(all="ignore"):
@@ -235,7 +234,7 @@ def inspect_robot(
         )
     margin = Guard().branch_margin
     condition, scaled = _condition_numbers(jet.Lvv)
-    urdf = None if robot.urdf is None else read_urdf(robot.urdf)
+    urdf = None if robot.urdf is None else read_urdf(robot.urdf, robot.expanded)
     joints, links = _joints(robot), _links(robot, urdf)
     warnings = [
         *(() if urdf is None else urdf.remarks),
@@ -509,15 +508,18 @@ def _mimic_warnings(robot: Robot, urdf: Urdf | None, joints: Sequence[JointRepor
 
 
 def _damping_warnings(robot: Robot) -> Iterator[str]:
-    index = joint_index(robot.free_model)
-    damping = np.asarray(robot.free_model.damping)
-    values = [(name, damping[robot.free_model.joints[index[name]].idx_v]) for name in robot.joint_names]
-    damped = ", ".join(f"{name!r} {value:g}" for name, value in values if value)
-    if damped:
-        yield (
-            "the description gives joint damping, which a scene takes only as damping=... "
-            f"[N m s/rad or N s/m]: {damped}"
-        )
+    for what, values, unit, means in (
+        ("damping", robot.damping, "N m s/rad or N s/m", "which a scene takes as damping='robot', or as numbers"),
+        (
+            "dry friction",
+            robot.friction,
+            "N m or N",
+            "which a scene takes as forces=[varpin.CoulombFriction(robot.friction)]",
+        ),
+    ):
+        given = ", ".join(f"{name!r} {value:g}" for name, value in zip(robot.joint_names, values, strict=True) if value)
+        if given:
+            yield f"the description gives joint {what} [{unit}], {means}: {given}"
 
 
 def _position(value: float | tuple[float, ...]) -> str:

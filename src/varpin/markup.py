@@ -51,3 +51,8 @@ def listed(names: Iterable[object]) -> str:
 def _text(value: object) -> str:
     """A value as markup: a number to four digits, anything else as its own text."""
     return html.escape(f"{value:.4g}" if isinstance(value, float) else str(value))
+
+
+def said(warnings: Sequence[str]) -> str:
+    """How many warnings there are, for one line; nothing if there are none."""
+    return f", {len(warnings)} warning{'s' * (len(warnings) > 1)}" if warnings else ""

@@ -142,6 +142,13 @@ class FrameKinematics(Frozen):
     rotation: Floats
     translation: Floats
 
+    @cached_property
+    def key(self) -> bytes:
+        """The same for frames that are the same."""
+        own = self.links
+        arrays = *(getattr(own, name) for name in _JOINT), self.rotation, self.translation
+        return b"".join(array.tobytes() for array in arrays)
+
     def placements(self, q: Floats) -> tuple[Floats, Floats]:
         """World rotations (N, 3, 3) and positions (N, 3) [m] at q (N, n)."""
         return self._placed(q, jacobian=False)[:2]

@@ -4,6 +4,7 @@ import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
@@ -12,15 +13,17 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, is_one_of, require_finite
+from varpin.checks import JointValues, as_floats, is_one_of, joint_array, require_finite
 from varpin.core.arrays import Tree
-from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint
+from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint, UnknownPosture
 from varpin.frozen import Frozen
 from varpin.markup import facts, listed, table
 from varpin.robot.inertia import faults
 from varpin.robot.mimic import Tie, joint_index, rebuild, tied_model
+from varpin.robot.mjcf import build_mjcf_model, build_mjcf_shapes
 from varpin.robot.payload import Payload, carry
 from varpin.robot.sources import Description, describe, hang_shapes
+from varpin.robot.srdf import Posture, of_joints
 from varpin.robot.tree import (
     flatten,
     frame_index,
@@ -31,7 +34,7 @@ from varpin.robot.tree import (
     to_pinocchio,
     tree_mass_matrix,
 )
-from varpin.robot.urdf import build_model, build_shapes, read_urdf
+from varpin.robot.urdf import build_model, build_shapes, missing_meshes, read_urdf, tell_missing
 
 Floats = NDArray[np.float64]
 
@@ -54,9 +57,12 @@ class Robot(Frozen):
         ties: The mimic joints, by index in ``free_model``.
         tree: Flat arrays for the core.
         locked: Joints that were locked, and where.
-        urdf: The file the robot was read from, or None.
+        urdf: The URDF or xacro file the robot was read from, or None.
+        expanded: The URDF that a xacro file stands for, or what the shapes of an MJCF file are made of.
+        mjcf: The MJCF file the robot was read from, or None.
         package_dirs: Where its meshes are looked up.
         visuals: Geometry that came with a RobotWrapper, locked like the model, or None.
+        group_states: What :meth:`posture` reads.
     """
 
     name: str
@@ -67,8 +73,11 @@ class Robot(Frozen):
     tree: Tree = field(repr=False)
     locked: Mapping[str, float | tuple[float, ...]] = field(default_factory=lambda: MappingProxyType({}))
     urdf: Path | None = None
+    expanded: str | None = field(default=None, repr=False)
+    mjcf: Path | None = None
     package_dirs: tuple[str, ...] = field(default=(), repr=False)
     visuals: pin.GeometryModel | None = field(default=None, repr=False)
+    group_states: tuple[Posture, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
         held = f", {len(self.locked)} locked" if self.locked else ""
@@ -103,6 +112,51 @@ class Robot(Frozen):
         if joint not in self.joint_names:
             raise UnknownJoint(joint, self.joint_names, f"robot {self.name!r}")
         return self.joint_names.index(joint)
+
+    @property
+    def postures(self) -> tuple[str, ...]:
+        """Names of the postures that :meth:`posture` knows."""
+        return tuple(dict.fromkeys(state.name for state in self.group_states))
+
+    def posture(self, name: str, *, group: str | None = None, others: JointValues = 0.0) -> Floats:
+        """A posture of the robot's SRDF file (its ``group_state``), or a reference configuration of its model.
+
+        Joints of the posture that are no coordinates here (locked, mimicking, or of a part that the robot has not) are
+        passed over.
+
+        Main args:
+            name: Of the posture: ``"home"``.
+
+        Other Args:
+            group: The group of joints whose posture is meant, where several have one of that name; left out, the
+                postures of all of them together.
+            others: Positions of the joints of which the posture says nothing: a number, (n,), or by joint name
+                [rad or m].
+
+        Returns:
+            Configuration (n,) [rad or m].
+
+        Raises:
+            UnknownPosture: There is none of that name; the message lists the names.
+            InputError: There is none of that group, or groups put a joint in two places.
+            UnknownJoint: ``others`` names a joint that is not there.
+        """
+        q = joint_array("others", others, self.joint_names, uniform=True)
+        found = [state for state in self.group_states if state.name == name]
+        if not found:
+            raise UnknownPosture(name, self.postures, self.name)
+        groups = ", ".join(state.group for state in found)
+        if group is not None and not (found := [state for state in found if state.group == group]):
+            raise InputError(f"posture {name!r} is one of the groups {groups}; there is none of group {group!r}")
+        placed: dict[str, float] = {}
+        for joint, position in (entry for state in found for entry in state.positions):
+            if joint in self.joint_names:
+                if placed.setdefault(joint, position) != position:
+                    raise InputError(
+                        f"the postures {name!r} put joint {joint!r} in two places: give group=, of {groups}"
+                    )
+                q[self.coordinate(joint)] = position
+        return q
 
     def configuration(self, q: ArrayLike) -> Floats:
         """``q`` (..., n) as Pinocchio configurations (..., model.nq) of ``model``.
@@ -156,7 +210,7 @@ class Robot(Frozen):
         lower, upper = self.position_limits
         return ~slides & np.isinf(lower) & np.isinf(upper)
 
-    @property
+    @cached_property
     def position_limits(self) -> tuple[Floats, Floats]:
         """Lower and upper bounds (n,), (n,) [rad or m]; infinite where there are none.
 
@@ -171,24 +225,52 @@ class Robot(Frozen):
         # Pinocchio writes the absence of a limit as the largest double, a URDF as 0 and 0.
         none = (lower == 0.0) & (upper == 0.0)
         lower[none | (lower <= -1e300)], upper[none | (upper >= 1e300)] = -np.inf, np.inf
+        for limit in (lower, upper):
+            limit.setflags(write=False)
         return lower, upper
 
     @property
     def velocity_limit(self) -> Floats:
         """Bound (n,) [rad/s or m/s]; infinite where there is none, or one of 0."""
-        limit = self._limit("velocityLimit")
-        return np.where(limit == 0.0, np.inf, limit)
+        return self._limit("velocityLimit")
 
     @property
     def effort_limit(self) -> Floats:
-        """Bound (n,) [N m or N]; infinite where there is none."""
+        """Bound (n,) [N m or N]; infinite where there is none, or one of 0."""
         return self._limit("effortLimit")
+
+    @property
+    def damping(self) -> Floats:
+        """Viscous damping that the description gives (n,) [N m s/rad or N s/m]; ``Scene(damping="robot")`` takes it.
+
+        With that of mimic joints, which their leaders move.
+        """
+        return self._felt(self.free_model.damping, self.tree.ratio**2)
+
+    @cached_property
+    def slides(self) -> NDArray[np.bool_]:
+        """Which coordinates make a body slide (n,), the follower of a mimic joint too."""
+        sliding = np.zeros(self.dof, dtype=bool)
+        sliding[self.tree.coordinate[self.tree.prismatic > 0]] = True
+        sliding.setflags(write=False)
+        return sliding
+
+    @property
+    def friction(self) -> Floats:
+        """Dry friction that the description gives (n,) [N m or N]; ``CoulombFriction(robot.friction)`` takes it."""
+        return self._felt(self.free_model.friction, np.abs(self.tree.ratio))
+
+    def _felt(self, values: ArrayLike, weights: Floats) -> Floats:
+        """What the coordinates (n,) feel of what the joints of ``free_model`` have, each with its weight."""
+        felt = np.bincount(self.tree.coordinate, np.asarray(values, dtype=float) * weights, minlength=self.dof)
+        return np.asarray(felt, dtype=np.float64)
 
     def _limit(self, attribute: str) -> Floats:
         index = joint_index(self.model)
         values = np.asarray(getattr(self.model, attribute), dtype=float)
         limit = np.array([values[self.model.joints[index[name]].idx_v] for name in self.joint_names])
-        return np.where(limit >= 1e300, np.inf, limit)
+        # Pinocchio writes the absence of a limit as the largest double or as infinity, a URDF as 0.
+        return np.where((limit >= 1e300) | ~(limit > 0.0), np.inf, limit)
 
     def _spread(self, model: pin.Model, q: Floats) -> Floats:
         configuration = np.empty((*q.shape[:-1], model.nq))
@@ -212,6 +294,8 @@ def load_robot(
     lock: Mapping[str, ArrayLike] | None = None,
     mimic: Literal["tied", "free"] = "tied",
     payload: Payload | Sequence[Payload] = (),
+    xacro_args: Mapping[str, object] | None = None,
+    srdf: str | os.PathLike[str] | None = None,
 ) -> Robot:
     """Load an arm.
 
@@ -219,17 +303,23 @@ def load_robot(
     log with the link and its numbers.
 
     Main args:
-        source: Path of a URDF file; name of a bundled robot (``"finger"``); name of a fixed-base robot of
-            example-robot-data (``"ur5"``); a ``pin.Model``; or a ``RobotWrapper``. :func:`varpin.robot_names` lists
-            the names.
+        source: Path of a URDF file, of a xacro file (``arm.urdf.xacro``) that stands for one, or of an MJCF file
+            (``arm.xml``); name of a bundled robot (``"finger"``); name of a fixed-base robot of example-robot-data
+            (``"ur5"``); name of a robot of the package robot_descriptions (``"iiwa14_description"``), which downloads
+            it on first use; a ``pin.Model``; or a ``RobotWrapper``. :func:`varpin.robot_names` lists the names that
+            need no download.
         lock: Joints to hold still, by name, and where: ``{"panda_finger_joint1": 0.02}`` [rad or m]. They are
             removed before anything is computed. A joint that is not one-axis (a free-flyer, say) takes its
             Pinocchio configuration.
 
     Other Args:
-        package_dirs: Where ``package://`` mesh paths are looked up; the URDF's own folder is always searched.
+        package_dirs: Where ``package://`` mesh paths, and ``$(find package)`` in xacro files, are looked up. The
+            file's own folder, and those beside the ROS packages that it lies in, are always searched.
         mimic: ``"tied"`` moves a mimic joint with its leader; ``"free"`` makes it a coordinate of its own.
         payload: What the robot carries; it becomes part of the links that it hangs on.
+        xacro_args: Arguments of a xacro file by name: ``{"prefix": "left_"}``.
+        srdf: The SRDF file, or the xacro file of one, that :meth:`Robot.posture` reads; left out, the one of the file's
+            name in its folder or in a folder ``srdf`` beside that, if there is one.
 
     Returns:
         The robot, its geometry not yet read.
@@ -242,9 +332,12 @@ def load_robot(
         UnsupportedJoint: A joint has no single axis (free-flyer, spherical, planar, screw).
         UnknownJoint: ``lock`` names a joint that is not there.
         UnknownFrame: A payload hangs on a frame that is not there.
+        MissingDependency: A xacro file needs the package xacro (extra ``xacro``); a name needs robot_descriptions
+            (extra ``descriptions``).
+        InputError: A xacro file has no argument of that name.
         SingularMassMatrix: A joint moves no inertia, or a negative one.
     """
-    robot, description = _built(source, package_dirs, lock, mimic, payload)
+    robot, description = _built(source, package_dirs, lock, mimic, payload, xacro_args, srdf)
     for remark in (*description.remarks, *faults(robot.free_model, description.inertials)):
         logger.warning("robot %r: %s", robot.name, remark)
     check_inertia(robot)
@@ -258,9 +351,11 @@ def build_robot(
     lock: Mapping[str, ArrayLike] | None = None,
     mimic: Literal["tied", "free"] = "tied",
     payload: Payload | Sequence[Payload] = (),
+    xacro_args: Mapping[str, object] | None = None,
+    srdf: str | os.PathLike[str] | None = None,
 ) -> Robot:
     """:func:`load_robot` without its checks of inertia, for looking into faulty models."""
-    return _built(source, package_dirs, lock, mimic, payload)[0]
+    return _built(source, package_dirs, lock, mimic, payload, xacro_args, srdf)[0]
 
 
 def _built(
@@ -269,11 +364,13 @@ def _built(
     lock: Mapping[str, ArrayLike] | None,
     mimic: Literal["tied", "free"],
     payload: Payload | Sequence[Payload],
+    xacro_args: Mapping[str, object] | None,
+    srdf: str | os.PathLike[str] | None,
 ) -> tuple[Robot, Description]:
     """The robot, and what its source says."""
     if not is_one_of(mimic, ("tied", "free")):
         raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
-    description = describe(source, package_dirs, mimic=mimic == "tied")
+    description = describe(source, package_dirs, mimic=mimic == "tied", xacro_args=xacro_args, srdf=srdf)
     carry(description.model, (payload,) if isinstance(payload, Payload) else payload, description.name)
     names = list(description.model.names)
     if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -299,8 +396,11 @@ def _built(
         tree=tree,
         locked=MappingProxyType(locked),
         urdf=description.urdf,
+        expanded=description.expanded,
+        mjcf=description.mjcf,
         package_dirs=description.package_dirs,
         visuals=visuals,
+        group_states=of_joints(description.postures, description.model.names),
     )
     return robot, description
 
@@ -399,9 +499,12 @@ def geometry(robot: Robot) -> pin.GeometryModel:
     """
     if robot.visuals is not None:
         return robot.visuals
+    if robot.mjcf is not None and robot.expanded is not None:
+        full = build_mjcf_model(robot.mjcf, robot.expanded)
+        return _on_joints(robot, full, build_mjcf_shapes(robot.mjcf, robot.expanded, full))
     if robot.urdf is None:
         return pin.GeometryModel()
-    urdf = read_urdf(robot.urdf)
+    urdf = read_urdf(robot.urdf, robot.expanded)
     full = build_model(urdf)
     return _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, pin.coal.MeshLoader()))
 
@@ -411,11 +514,17 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
 
     Returns:
         The shapes of the links that can be read; and by name of each other link, its joint in ``free_model`` and what
-        is wrong with it.
+        is wrong with it: of meshes that are not there, all of them together.
     """
+    if robot.mjcf is not None:
+        try:
+            return geometry(robot), {}
+        except RobotError as error:
+            faulty = str(error)
+        return pin.GeometryModel(), {frame.name: (frame.parentJoint, faulty) for frame in _links(robot.free_model)}
     if robot.visuals is not None or robot.urdf is None:
         return geometry(robot), {}
-    urdf = read_urdf(robot.urdf)
+    urdf = read_urdf(robot.urdf, robot.expanded)
     full = build_model(urdf)
     # Reads no mesh twice.
     loader = pin.coal.CachedMeshLoader()
@@ -424,6 +533,8 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
     except RobotError as error:
         problem = str(error)
     found, missing = pin.GeometryModel(), {}
+    absent = missing_meshes(urdf, robot.package_dirs)
+    told = tell_missing(urdf, absent, robot.package_dirs)
     for link in urdf.elements("link"):
         name = link.get("name", "")
         if link.find("visual") is None:
@@ -432,7 +543,7 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
             part = _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, loader, name))
         except RobotError as error:
             frame = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.BODY)]
-            missing[name] = frame.parentJoint, str(error)
+            missing[name] = frame.parentJoint, told if name in absent else str(error)
         else:
             for shape in part.geometryObjects:
                 found.addGeometryObject(shape)

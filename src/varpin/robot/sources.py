@@ -2,15 +2,15 @@
 
 import logging
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
 from varpin.errors import FileError, InputError, RobotError, RobotNotFound
-from varpin.robot import example_robot_data
+from varpin.robot import example_robot_data, robot_descriptions
 from varpin.robot.mimic import (
     JOINT_PARAMETERS,
     Tie,
@@ -21,7 +21,10 @@ from varpin.robot.mimic import (
     ties_of,
     untied_model,
 )
+from varpin.robot.mjcf import build_mjcf_model, is_mjcf, read_mjcf, root_tag
+from varpin.robot.srdf import Posture, beside, read_postures, reference_postures
 from varpin.robot.urdf import Inertial, Mimic, build_model, read_urdf
+from varpin.robot.xacro import enclosing_packages, expand, is_xacro, plain_name
 
 logger = logging.getLogger(__name__)
 
@@ -34,21 +37,27 @@ class Description:
         name: Of the file, the bundled robot or the model.
         model: Every joint on its own.
         ties: Mimic joints.
-        urdf: The file, if there is one.
+        urdf: The URDF or xacro file, if there is one.
+        expanded: The URDF that a xacro file stands for, or what the shapes of an MJCF file are made of.
+        mjcf: The MJCF file, if there is one.
         package_dirs: Where ``package://`` paths are looked up.
         visuals: Geometry handed over with a RobotWrapper.
         inertials: Of the links in a URDF, which the model has merged into bodies.
         remarks: What the source leaves out, in words.
+        postures: Of the joints of ``model``.
     """
 
     name: str
     model: pin.Model
     ties: tuple[Tie, ...] = ()
     urdf: Path | None = None
+    expanded: str | None = field(default=None, repr=False)
+    mjcf: Path | None = None
     package_dirs: tuple[str, ...] = ()
     visuals: pin.GeometryModel | None = None
     inertials: tuple[Inertial, ...] = ()
     remarks: tuple[str, ...] = ()
+    postures: tuple[Posture, ...] = ()
 
 
 def models_dir() -> Path:
@@ -73,9 +82,29 @@ def robot_names() -> tuple[str, ...]:
     return (*bundled_robots(), *example_robot_data.installed())
 
 
-def describe(source: object, package_dirs: Sequence[str | os.PathLike[str]] | None, *, mimic: bool) -> Description:
+def describe(
+    source: object,
+    package_dirs: Sequence[str | os.PathLike[str]] | None,
+    *,
+    mimic: bool,
+    xacro_args: Mapping[str, object] | None = None,
+    srdf: str | os.PathLike[str] | None = None,
+) -> Description:
     """Find and parse ``source``; see :func:`varpin.load_robot`."""
     folders = _folders(package_dirs)
+    if xacro_args is not None and not isinstance(xacro_args, Mapping):
+        raise InputError(f"xacro_args must be a mapping of names to values, got {xacro_args!r}")
+    description = _found(source, folders, xacro_args or {}, mimic=mimic)
+    if xacro_args and (description.urdf is None or description.expanded is None):
+        raise InputError(f"xacro_args are given, but {description.name!r} is read from no xacro file")
+    if srdf is None:
+        return description
+    if not isinstance(srdf, str | os.PathLike):
+        raise InputError(f"srdf must be the path of a file, got {type(srdf).__name__}")
+    return replace(description, postures=_postures(Path(srdf).expanduser(), folders, xacro_args or {}))
+
+
+def _found(source: object, folders: tuple[str, ...], xacro_args: Mapping[str, object], *, mimic: bool) -> Description:
     if isinstance(source, pin.Model):
         return _of_model(source, source.name or "model", None)
     if isinstance(source, pin.RobotWrapper):
@@ -89,7 +118,7 @@ def describe(source: object, package_dirs: Sequence[str | os.PathLike[str]] | No
     path = Path(text).expanduser()
     is_path = isinstance(source, os.PathLike) or path.suffix or os.sep in text
     if is_path and _is_file(path):
-        return _of_urdf(path.resolve(), path.stem, folders, mimic=mimic)
+        return _of_file(path.resolve(), plain_name(path), folders, xacro_args, mimic=mimic)
     bundled = bundled_robots()
     if text in bundled:
         return _of_urdf(bundled[text], text, folders, mimic=mimic)
@@ -100,18 +129,21 @@ def describe(source: object, package_dirs: Sequence[str | os.PathLike[str]] | No
             f"{text!r} stands on a free-flyer in example-robot-data, and varpin models fixed bases; "
             "to pin its base to the world, load its URDF file by path"
         )
+    downloadable = robot_descriptions.names()
+    if text in downloadable or (not downloadable and not is_path and text.endswith(robot_descriptions.SUFFIX)):
+        return _of_downloaded(text, folders, xacro_args, mimic=mimic)
     if is_path and path.is_dir():
         raise RobotError(f"{path} is a folder, not a URDF file; it holds {_urdf_files(path)}")
-    note = "" if path.suffix != ".urdf" else f" (looked in {path.absolute().parent})"
-    raise RobotNotFound(text, [*bundled, *example_robot_data.installed()], note)
+    note = "" if path.suffix not in (".urdf", ".xacro") else f" (looked in {path.absolute().parent})"
+    raise RobotNotFound(text, [*bundled, *example_robot_data.installed(), *downloadable], note)
 
 
 def _folders(package_dirs: Sequence[str | os.PathLike[str]] | str | os.PathLike[str] | None) -> tuple[str, ...]:
     if isinstance(package_dirs, str | os.PathLike):
         package_dirs = [package_dirs]
     try:
-        return tuple(os.fspath(folder) for folder in package_dirs or ())
-    except TypeError:
+        return tuple(str(Path(folder).expanduser()) for folder in package_dirs or ())
+    except (TypeError, RuntimeError):
         raise InputError(f"package_dirs must be a list of folders, got {package_dirs!r}") from None
 
 
@@ -150,7 +182,7 @@ def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) ->
     repair_velocity_limits(free)
     if shapes is not None:
         hang_shapes(shapes, model, free)
-    return Description(name, free, ties, visuals=shapes)
+    return Description(name, free, ties, visuals=shapes, postures=reference_postures(model))
 
 
 def _check_model(model: pin.Model, name: str) -> None:
@@ -216,8 +248,54 @@ def _of_example(name: str, folders: tuple[str, ...], *, mimic: bool) -> Descript
     return description
 
 
-def _of_urdf(path: Path, name: str, folders: tuple[str, ...], *, mimic: bool) -> Description:
-    urdf = read_urdf(path)
+def _of_downloaded(name: str, folders: tuple[str, ...], arguments: Mapping[str, object], *, mimic: bool) -> Description:
+    found = robot_descriptions.download(name)
+    folders = (*folders, *found.package_dirs)
+    own = {**found.xacro_args, **arguments}
+    description = _of_file(found.path, name, folders, own, found.packages, mimic=mimic)
+    if found.srdf is None:
+        return description
+    postures = _postures(found.srdf, folders, {**found.srdf_args, **arguments}, found.packages)
+    return replace(description, postures=postures)
+
+
+def _of_file(
+    path: Path,
+    name: str,
+    folders: tuple[str, ...],
+    arguments: Mapping[str, object],
+    packages: Mapping[str, str] | None = None,
+    *,
+    mimic: bool,
+) -> Description:
+    if is_xacro(path):
+        text = expand(path, arguments, _places(path, folders), packages)
+        return _of_urdf(path, name, folders, mimic=mimic, expanded=text)
+    if is_mjcf(path):
+        return _of_mjcf(path, name)
+    if path.suffix == ".sdf" or (path.suffix in (".xml", ".world") and root_tag(path) == "sdf"):
+        raise RobotError(
+            f"{path} is an SDF file, which Pinocchio's package on PyPI cannot read; convert it to a URDF or an MJCF"
+        )
+    return _of_urdf(path, name, folders, mimic=mimic)
+
+
+def _of_mjcf(path: Path, name: str) -> Description:
+    mjcf = read_mjcf(path)
+    description = _of_model(build_mjcf_model(path, mjcf.dynamics), name, None)
+    return replace(description, mjcf=path, expanded=mjcf.looks, remarks=mjcf.remarks)
+
+
+def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:
+    """Where the packages of a file are looked up: where the user says, beside the packages it lies in, beside it."""
+    around = (str(package.parent) for package in enclosing_packages(path).values())
+    return tuple(dict.fromkeys((*folders, *around, str(path.parent))))
+
+
+def _of_urdf(
+    path: Path, name: str, folders: tuple[str, ...], *, mimic: bool, expanded: str | None = None
+) -> Description:
+    urdf = read_urdf(path, expanded)
     model, mimics, remarks = build_model(urdf), urdf.mimics, urdf.remarks
     if urdf.root is None:
         remarks = (*remarks, f"{urdf.fault}; varpin has it as Pinocchio's parser, which is more lenient, reads it")
@@ -228,7 +306,32 @@ def _of_urdf(path: Path, name: str, folders: tuple[str, ...], *, mimic: bool) ->
         order = depth_first(model, ties)
         if order != sorted(order):
             model, ties = reordered(model, ties, order)
-    return Description(name, model, ties, path, (*folders, str(path.parent)), inertials=urdf.inertials, remarks=remarks)
+    postures: tuple[Posture, ...] = ()
+    if srdf := beside(path, "" if urdf.root is None else urdf.root.get("name", "")):
+        try:
+            postures = read_postures(srdf)
+        except (RobotError, FileError) as error:
+            # Nobody has asked for it.
+            remarks = (*remarks, f"{error}; the robot has no postures")
+    return Description(
+        name=name,
+        model=model,
+        ties=ties,
+        urdf=path,
+        expanded=expanded,
+        package_dirs=_places(path, folders),
+        inertials=urdf.inertials,
+        remarks=remarks,
+        postures=postures,
+    )
+
+
+def _postures(
+    path: Path, folders: tuple[str, ...], arguments: Mapping[str, object], packages: Mapping[str, str] | None = None
+) -> tuple[Posture, ...]:
+    """The postures in an SRDF file, or in the xacro file of one; the robot's arguments need not be the file's."""
+    text = expand(path, arguments, _places(path, folders), packages, strict=False) if is_xacro(path) else None
+    return read_postures(path, text)
 
 
 def _mimics_of(model: pin.Model) -> dict[str, Mimic]:

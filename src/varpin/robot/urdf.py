@@ -7,6 +7,7 @@ refuses some mimic elements that are of use.
 
 import codecs
 import contextlib
+import copy
 import logging
 import math
 import os
@@ -110,20 +111,24 @@ class Urdf:
         return [] if self.root is None else self.root.findall(tag)
 
 
-def read_urdf(path: Path) -> Urdf:
+def read_urdf(path: Path, text: str | None = None) -> Urdf:
     """Read a URDF file.
 
     XML is read leniently: prefixes need no namespace, and comments may hold ``--``.
+
+    Args:
+        path: Of the file.
+        text: What it stands for, if that is not its content.
 
     Raises:
         FileError: The file cannot be read.
         RobotError: It is no URDF, or not one of a tree of bodies, or a number of a mimic element is none.
     """
-    text, remarks = _decoded(path)
+    text, remarks = decoded(path) if text is None else (text, [])
     if not text.strip("\0 \t\r\n"):
         raise RobotError(f"{path} is not a URDF: it is empty")
     try:
-        root = _parsed(text)
+        root = parsed(text)
     except expat.ExpatError as error:
         if text[:200].lower().startswith(("<!doctype html", "<html")):
             raise RobotError(f"{path} is a web page, not a URDF") from None
@@ -144,7 +149,7 @@ def build_model(urdf: Urdf, *, mimic: bool = False) -> pin.Model:
     massive = {inertial.link for inertial in urdf.inertials}
     text = urdf.text if urdf.root is None else _written(urdf, _dynamics(urdf.root, massive))
     options = {"mimic": True} if mimic else {}
-    with _captured_stderr() as complaints:
+    with captured_stderr() as complaints:
         try:
             model = _on_a_stack(urdf, lambda: pin.buildModelFromXML(text, **options))
         except (ValueError, RuntimeError, IndexError) as error:
@@ -180,13 +185,16 @@ def build_shapes(
     """
     text, textures = urdf.text, dict[str, str]()
     if urdf.root is not None:
-        looks, textures = _looks(urdf.root, link)
+        absent = missing_meshes(urdf, package_dirs)
+        if absent := {name: files for name, files in absent.items() if link in (None, name)}:
+            raise RobotError(tell_missing(urdf, absent, package_dirs))
+        looks, textures = _looks(urdf, urdf.root, package_dirs, link)
         text = _written(urdf, looks)
 
     def read() -> pin.GeometryModel:
         return pin.buildGeomFromUrdfString(model, text, pin.GeometryType.VISUAL, None, list(package_dirs), loader)
 
-    with _captured_stderr() as complaints:
+    with captured_stderr() as complaints:
         try:
             shapes = _on_a_stack(urdf, read)
         except (ValueError, RuntimeError, IndexError) as error:
@@ -196,12 +204,39 @@ def build_shapes(
             logger.warning("%s: %s", urdf.path, line)
     for shape in shapes.geometryObjects:
         if shape.name in textures:
-            shape.meshTexturePath = _texture(textures[shape.name], urdf.path, package_dirs)
+            texture = _located(textures[shape.name], urdf.path, package_dirs)
+            if texture is None:
+                logger.warning("%s: texture %r is not there", urdf.path, textures[shape.name])
+            shape.meshTexturePath = "" if texture is None else str(texture)
     return shapes
 
 
-def _decoded(path: Path) -> tuple[str, list[str]]:
-    """A file's text in the encoding that it declares, and what is to be said of it."""
+def missing_meshes(urdf: Urdf, package_dirs: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """The visual meshes that are not there, as the file names them, by link."""
+    missing = {}
+    for element in urdf.elements("link"):
+        files = [mesh.get("filename", "") for mesh in element.iterfind("visual/geometry/mesh")]
+        if absent := tuple(file for file in files if _located(file, urdf.path, package_dirs) is None):
+            missing[element.get("name", "")] = absent
+    return missing
+
+
+def tell_missing(urdf: Urdf, missing: Mapping[str, Sequence[str]], package_dirs: Sequence[str]) -> str:
+    """What there is to be said of meshes from :func:`missing_meshes`."""
+    links = "; ".join(f"link {link!r}: {', '.join(files)}" for link, files in missing.items())
+    places = ", ".join(_places(package_dirs)) or "no folder"
+    return (
+        f"meshes of {urdf.path} are not there: {links}; package:// was looked up in {places}, other paths beside the "
+        "file; package_dirs=[...] adds folders that hold packages"
+    )
+
+
+def decoded(path: Path) -> tuple[str, list[str]]:
+    """A file's text in the encoding that it declares, and what is to be said of it.
+
+    Raises:
+        FileError: The file cannot be read.
+    """
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -227,7 +262,7 @@ def _decoded(path: Path) -> tuple[str, list[str]]:
     return text.lstrip("\ufeff \t\r\n"), remarks
 
 
-def _parsed(text: str) -> ET.Element:
+def parsed(text: str) -> ET.Element:
     """The root element of an XML text, prefixes kept as they are written.
 
     Raises:
@@ -251,7 +286,8 @@ def _require_robot(root: ET.Element, path: Path) -> None:
     if leftover := _xacro(root):
         name = path.name.removesuffix(".xacro").removesuffix(".urdf")
         raise RobotError(
-            f"{path} is a xacro file: expand it first, with xacro {path.name} > {name}.expanded.urdf; it has {leftover}"
+            f"{path} is a xacro file: expand it first, with xacro {path.name} > {name}.expanded.urdf, "
+            f"or name it {name}.xacro; it has {leftover}"
         )
     if not root.get("name"):
         raise RobotError(f"{path}: its <robot> has no name, which a URDF must have")
@@ -360,8 +396,8 @@ def _mimic(joint: ET.Element, path: Path) -> Mimic:
         raise RobotError(f"{where} element names no joint")
     return Mimic(
         element.get("joint", ""),
-        _number(element.get("multiplier", "1"), f"{where} multiplier"),
-        _number(element.get("offset", "0"), f"{where} offset"),
+        finite_number(element.get("multiplier", "1"), f"{where} multiplier"),
+        finite_number(element.get("offset", "0"), f"{where} offset"),
     )
 
 
@@ -371,10 +407,15 @@ def _finite(word: str | None) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _number(word: str, what: str) -> float:
-    if (number := _finite(word)) is None:
+def finite_number(word: str, what: str) -> float:
+    """The finite number that a word is.
+
+    Raises:
+        RobotError: It is none; the message calls it ``what``.
+    """
+    if (value := _finite(word)) is None:
         raise RobotError(f"{what} is {reprlib.repr(word)}, where a finite number belongs")
-    return number
+    return value
 
 
 def _dynamics(root: ET.Element, massive: Collection[str]) -> ET.Element:
@@ -388,8 +429,12 @@ def _dynamics(root: ET.Element, massive: Collection[str]) -> ET.Element:
     return small
 
 
-def _looks(root: ET.Element, only: str | None) -> tuple[ET.Element, dict[str, str]]:
+def _looks(
+    urdf: Urdf, root: ET.Element, package_dirs: Sequence[str], only: str | None
+) -> tuple[ET.Element, dict[str, str]]:
     """What Pinocchio makes shapes of: links with their visuals, of all or of one, and joints; and shapes' textures.
+
+    Meshes go by their absolute paths: Pinocchio takes a relative one for one from the working folder.
 
     Pinocchio knows no textures, and takes a material without a colour for black. Such a material is left out, as is
     black beside a texture, where a converter had no colour: the mesh then keeps the colours of its file.
@@ -409,10 +454,23 @@ def _looks(root: ET.Element, only: str | None) -> tuple[ET.Element, dict[str, st
                 textures[f"{link.get('name')}_{k}"] = texture.get("filename", "")
             plain = ET.SubElement(part, "visual", visual.attrib)
             plain.extend(
-                child for child in visual if child is not own or (material is not None and _has_color(material))
+                _with_places(child, urdf, package_dirs)
+                for child in visual
+                if child is not own or (material is not None and _has_color(material))
             )
     small.extend(root.findall("joint"))
     return small, textures
+
+
+def _with_places(part: ET.Element, urdf: Urdf, package_dirs: Sequence[str]) -> ET.Element:
+    """A part of a visual, a mesh in it by its absolute path."""
+    if part.find("mesh") is None:
+        return part
+    placed = copy.deepcopy(part)
+    for mesh in placed.iterfind("mesh"):
+        file = mesh.get("filename", "")
+        mesh.set("filename", str(_located(file, urdf.path, package_dirs) or file))
+    return placed
 
 
 def _has_color(material: ET.Element) -> bool:
@@ -422,16 +480,24 @@ def _has_color(material: ET.Element) -> bool:
     return material.find("texture") is None or any(word.strip("0.") for word in color.get("rgba", "").split()[:3])
 
 
-def _texture(name: str, urdf: Path, package_dirs: Sequence[str]) -> str:
-    """The file of a texture; empty, with a warning in the log, if it is not there."""
+def _located(name: str, urdf: Path, package_dirs: Sequence[str]) -> Path | None:
+    """The file that a URDF names; None if it is not there."""
     scheme, separator, rest = name.partition("://")
-    places = [Path(folder, rest) for folder in package_dirs] if scheme == "package" else [urdf.parent / name]
-    places = [Path(rest)] if separator and scheme == "file" else places
-    for place in places:
-        if place.is_file():
-            return str(place)
-    logger.warning("%s: texture %r is not there", urdf, name)
-    return ""
+    if not separator:
+        places = [urdf.parent / name, Path(name)]
+    elif scheme == "file":
+        places = [Path(rest)]
+    else:
+        # Gazebo writes model:// for package://.
+        places = [Path(folder, rest) for folder in _places(package_dirs)] if scheme in ("package", "model") else []
+    return next((place.absolute() for place in places if place.is_file()), None)
+
+
+def _places(package_dirs: Sequence[str]) -> list[str]:
+    """Where packages are looked up: as told, and where a ROS that is sourced has them."""
+    ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
+    ament = [folder for folder in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if folder]
+    return [*package_dirs, *ros, *(f"{folder}/share" for folder in ament)]
 
 
 def _named(link: ET.Element) -> dict[str, str]:
@@ -472,7 +538,7 @@ def _on_a_stack(urdf: Urdf, read: Callable[[], T]) -> T:
 
 
 @contextlib.contextmanager
-def _captured_stderr() -> Iterator[Callable[[], list[str]]]:
+def captured_stderr() -> Iterator[Callable[[], list[str]]]:
     """Catch what Pinocchio's C++ parser writes to the process's stderr; yields a function that returns its messages."""
     with _STDERR, tempfile.TemporaryFile() as sink:
         sys.stderr.flush()

@@ -1,0 +1,84 @@
+"""Robots that go by a name of the package robot_descriptions, which downloads their git repositories on first use."""
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from varpin.errors import MissingDependency, RobotError
+
+SUFFIX = "_description"
+
+# Tags of robots that walk or fly, unless they are arms as well.
+_FLOATING, _FIXED = {"biped", "drone", "humanoid", "quadruped"}, {"arm", "dual_arm", "end_effector"}
+
+
+@dataclass(frozen=True)
+class Downloaded:
+    """The files of a robot.
+
+    Attributes:
+        path: Of the URDF, xacro or MJCF file.
+        package_dirs: Where its meshes are looked up.
+        xacro_args: What the package gives to the xacro file.
+        packages: Folders of ROS packages by name.
+        srdf: The SRDF or xacro file of its postures, if it has one.
+        srdf_args: What the package gives to that xacro file.
+    """
+
+    path: Path
+    package_dirs: tuple[str, ...]
+    xacro_args: Mapping[str, str] = field(default_factory=dict)
+    packages: Mapping[str, str] = field(default_factory=dict)
+    srdf: Path | None = None
+    srdf_args: Mapping[str, str] = field(default_factory=dict)
+
+
+def names() -> tuple[str, ...]:
+    """Names of the installed package; none without it."""
+    try:
+        return tuple(importlib.import_module("robot_descriptions").DESCRIPTIONS)
+    except ImportError:
+        return ()
+
+
+def download(name: str) -> Downloaded:
+    """The files of one of the robots, from the package's cache or from the network.
+
+    Raises:
+        MissingDependency: The package is not installed.
+        RobotError: The download fails; or the robot walks or flies, or comes as no URDF, xacro or MJCF file.
+    """
+    try:
+        package = importlib.import_module("robot_descriptions")
+    except ImportError as error:
+        missing = error.name or "robot_descriptions"
+        raise MissingDependency(f"robot {name!r}", [missing], 'pip install "varpin[descriptions]"') from None
+    try:
+        module = importlib.import_module(f"robot_descriptions.{name}")
+    except Exception as error:  # The module downloads while it is imported, by git.
+        what = " ".join(str(error).split())
+        raise RobotError(
+            f"robot {name!r} cannot be downloaded by robot_descriptions, which keeps what it has in "
+            f"$ROBOT_DESCRIPTIONS_CACHE or ~/.cache/robot_descriptions: {type(error).__name__}: {what}"
+        ) from None
+    found = next((value for key in ("URDF_PATH", "XACRO_PATH", "MJCF_PATH") if (value := getattr(module, key, ""))), "")
+    if not found:
+        raise RobotError(f"robot {name!r} of robot_descriptions comes as no URDF, xacro or MJCF file")
+    tags = set(package.DESCRIPTIONS[name].tags)
+    if tags & _FLOATING and not tags & _FIXED:
+        raise RobotError(
+            f"{name!r} is a {' and '.join(sorted(tags & _FLOATING))}, whose base moves, and varpin models fixed bases; "
+            f"to pin its base to the world, load its file by path: {found}"
+        )
+    roots = [Path(value) for key in ("PACKAGE_PATH", "REPOSITORY_PATH") if (value := getattr(module, key, ""))]
+    folders = dict.fromkeys(str(folder) for root in roots for folder in (root, root.parent))
+    srdf = getattr(module, "SRDF_PATH", "") or getattr(module, "SRDF_XACRO_PATH", "")
+    return Downloaded(
+        path=Path(found),
+        package_dirs=tuple(folders),
+        xacro_args=getattr(module, "XACRO_ARGS", {}),
+        packages=getattr(module, "XACRO_PACKAGE_PATHS", {}),
+        srdf=Path(srdf) if srdf else None,
+        srdf_args=getattr(module, "SRDF_XACRO_ARGS", {}),
+    )

@@ -1,0 +1,127 @@
+"""Damping and dry friction of a robot's description: told of where a scene leaves them out, taken on request."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from mechanisms import joint, link, mimic, write_urdf
+
+import varpin as vp
+
+TOLD = "the scene leaves out what the description gives"
+
+
+@pytest.fixture
+def arm(tmp_path):
+    """Two joints and one that follows the second at twice its speed, with dampers and dry friction."""
+
+    def make(damping=("0.3", "0.5", "0.25"), friction=("0", "0.1", "0.2")):
+        inside = [f'<dynamics damping="{d}" friction="{f}"/>' for d, f in zip(damping, friction, strict=True)]
+        inside[2] += mimic("j2", ratio=-2)
+        parts = [link(f"l{i}") for i in (1, 2, 3)]
+        bodies = zip(("j1", "j2", "j3"), ("base", "l1", "l2"), ("l1", "l2", "l3"), inside, strict=True)
+        parts += [joint(name, parent, child, inside=text) for name, parent, child, text in bodies]
+        return vp.load_robot(write_urdf(tmp_path, *parts))
+
+    return make
+
+
+def said(caplog):
+    return [record.getMessage() for record in caplog.records if TOLD in record.getMessage()]
+
+
+def test_a_scene_that_leaves_dampers_out_says_so_once(arm, caplog):
+    robot = arm()
+    with caplog.at_level(logging.WARNING):
+        scene = vp.Scene(robot)
+        for _ in range(2):
+            vp.simulate(scene, [0, 0], [0, 0], dt=1e-3, steps=3)
+    (sentence,) = said(caplog)
+    # What the follower's dampers take from its leader: the square of the ratio times their own.
+    for words in ("'j1' 0.3, 'j2' 1.5", "dry friction [N m or N] of 'j2' 0.5", "damping='robot'", "damping=0 says"):
+        assert words in sentence
+    assert not scene.damping.any()
+
+
+@pytest.mark.parametrize("damping", [0, 0.0, [0.0, 0.0], {"j1": 0.2}, 0.1], ids=str)
+def test_damping_that_is_given_is_what_is_meant(arm, caplog, damping):
+    with caplog.at_level(logging.WARNING):
+        vp.Scene(arm(), damping=damping)
+    assert said(caplog) == []
+
+
+def test_nothing_is_said_where_the_description_has_none(arm, caplog):
+    with caplog.at_level(logging.WARNING):
+        vp.Scene(arm(("0", "0", "0"), ("0", "0", "0")))
+        vp.Scene(vp.load_robot("ur5"))
+        vp.Scene(vp.planar_chain(2))
+    assert said(caplog) == []
+
+
+def test_the_description_s_dampers_take_what_pinocchio_s_model_says(arm, caplog):
+    """Power of the dampers of all joints of the free model, followers too, at a velocity of the coordinates."""
+    robot = arm()
+    with caplog.at_level(logging.WARNING):
+        scene = vp.Scene(robot, damping="robot")
+    (sentence,) = said(caplog)
+    assert "CoulombFriction(robot.friction)" in sentence
+    assert "N m s/rad" not in sentence
+    v = np.array([0.7, -1.3])
+    free = robot.free_velocities(v)
+    assert scene.damping @ v**2 == pytest.approx(np.asarray(robot.free_model.damping) @ free**2, rel=1e-14)
+    assert robot.friction @ np.abs(v) == pytest.approx(np.asarray(robot.free_model.friction) @ np.abs(free), rel=1e-14)
+    # And it is what forces of that size do in the equations of motion.
+    given = vp.Scene(robot, damping=[0.3, 0.5 + 4 * 0.25])
+    ends = [vp.simulate(s, [0.1, 0.2], v, dt=1e-3, steps=20).q for s in (scene, given)]
+    np.testing.assert_array_equal(*ends)
+
+
+def test_models_in_memory_and_locked_joints():
+    model = pin.buildSampleModelManipulator()
+    model.damping = np.arange(1.0, 1.0 + model.nv)
+    held = vp.load_robot(model, lock={model.names[2]: 0.0})
+    np.testing.assert_array_equal(held.damping, np.delete(model.damping, 1))
+
+
+def test_other_words_are_refused(arm):
+    with pytest.raises(vp.InputError, match="damping must be numbers, or 'robot'"):
+        vp.Scene(arm(), damping="urdf")
+
+
+def test_scene_files_take_it(tmp_path, caplog):
+    text = '{}\n[robot]\nsource = "xarm7"\n[horizon]\ndt = 1e-2\nsteps = 3\n'
+    path = tmp_path / "arm.toml"
+    found = {}
+    for line in ("", 'damping = "robot"', "damping = 0.0"):
+        path.write_text(text.format(line))
+        caplog.clear()
+        with caplog.at_level(logging.WARNING):
+            scene = vp.load_scene(path, required_only=False).scene
+        found[line] = scene.damping.tolist(), len(said(caplog))
+    own = vp.load_robot("xarm7").damping.tolist()
+    assert own == [10.0, 10.0, 5.0, 5.0, 5.0, 2.0, 2.0]
+    # Its file gives dry friction, too, which is told of wherever the rest is taken.
+    assert found == {"": ([0.0] * 7, 1), 'damping = "robot"': (own, 1), "damping = 0.0": ([0.0] * 7, 0)}
+    path.write_text(text.format('damping = "urdf"'))
+    with pytest.raises(vp.VarpinError, match="damping: there is no 'urdf'"):
+        vp.load_scene(path)
+
+
+def test_the_command_line_takes_it(tmp_path, capsys):
+    from varpin.cli import main  # noqa: PLC0415
+
+    saved = tmp_path / "motion.npz"
+    command = ["simulate", "xarm7", "--dt", "1e-3", "--steps", "3", "--save", str(saved)]
+    for words, damping, told in (
+        ([], 0.0, True),
+        (["--damping", "robot"], 10.0, False),
+        (["--damping", "0"], 0, False),
+    ):
+        assert main([*command, *words]) == 0
+        assert ("damping [N m s/rad or N s/m] of 'joint1' 10" in capsys.readouterr().err) == told
+        assert vp.Trajectory.load(saved).scene_values["damping"][0] == damping
+    assert main([*command, "--damping", "robot", "1"]) != 0
+    assert "either numbers or the word robot" in capsys.readouterr().err

@@ -1,0 +1,217 @@
+"""MJCF files load as MuJoCo reads them: mass matrix, gravity torques, damping, limits, places of bodies."""
+
+from __future__ import annotations
+
+import pickle
+import re
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import varpin as vp
+from varpin.robot import geometry, readable_geometry
+
+MASS = '<inertial pos="0.02 0.05 0.1" mass="1.3" diaginertia="0.02 0.03 0.025" quat="0.9 0.2 0.1 0"/>'
+BOX = '<geom type="box" size="0.1 0.05 0.02" pos="0.1 0.02 0"/>'
+BALL = '<geom type="sphere" size="0.1"'
+PLACE = 'pos="0.1 0.02 0.2" quat="0.9 0.1 0.2 0.3"'
+
+
+def body(name, inside=MASS, place=PLACE, joint=None):
+    joint = f'<joint name="j{name}" axis="0 1 0"/>' if joint is None else joint
+    return f'<body name="{name}" {place}>{joint}{inside}</body>'
+
+
+TIP = body("tip")
+
+
+def document(world, *sections, compiler='angle="radian"'):
+    return f"<mujoco><compiler {compiler}/>{''.join(sections)}<worldbody>{world}</worldbody></mujoco>"
+
+
+def one(inside=MASS + TIP, *sections, joint=None, place=PLACE, compiler='angle="radian"'):
+    return document(body("a", inside, place, joint), *sections, compiler=compiler)
+
+
+def default(inside):
+    return f"<default>{inside}</default>"
+
+
+HINGE = '<joint name="ja" {}/>'
+MESH = '<asset><mesh name="tet" file="tet.obj"/></asset>'
+STANDS = body("s", BOX, 'pos="1 0 0" quat="0.8 0.3 0 0"', "")
+LEANING = 'pos="0 0 0.3" euler="0.4 -0.2 0.3"'
+FRAME = '<frame pos="0 0 1" euler="0.1 0.2 0.3">{}</frame>'
+FILES = {
+    "plain": one(),
+    "on a body that stands still": document(body("base", body("a", MASS + TIP), LEANING, "")),
+    "two on the world": document(body("a", MASS + TIP) + body("b", MASS, 'pos="1 0 0"')),
+    "beside a body that stands still": document(STANDS + body("a", MASS + TIP)),
+    "a body that stands still between": one(MASS + body("s", BOX + TIP, 'pos="1 0 0"', "")),
+    "degrees": one(place='euler="10 20 30"', joint=HINGE.format('range="-10 20"'), compiler=""),
+    "turns about turned axes": one(place=LEANING, compiler='angle="radian" eulerseq="zyx"'),
+    "turns about fixed axes": one(place=LEANING, compiler='angle="radian" eulerseq="XZY"'),
+    "axis and angle": one(place='axisangle="1 2 3 0.4"'),
+    "two axes": one(place='xyaxes="1 0.1 0 0 1 0.3"'),
+    "joint off the origin": one(joint=HINGE.format('axis="0 1 2" pos="0.1 0.2 0.3" ref="0.3"')),
+    "position of reference": one(joint=HINGE.format('range="-10 20" ref="5"'), compiler=""),
+    "slide in a file of degrees": one(joint=HINGE.format('type="slide" range="-1 2" ref="0.5"'), compiler=""),
+    "slide with one": one(joint=HINGE.format('type="slide" range="-1 2" ref="0.5"')),
+    "slide": one(joint=HINGE.format('type="slide" axis="0 3 4" pos="0.1 0 0" armature="1"')),
+    "three joints on a body": one(
+        joint='<joint name="x" axis="1 0 0" pos="0.1 0 0" range="-1 2"/><joint name="y" damping="3" pos="0 0.2 0.3"/>'
+        '<joint name="z" type="slide" armature="0.2" axis="0 1 1"/>'
+    ),
+    "classes": one(
+        MASS + TIP,
+        default('<joint damping="1"/><default class="k"><joint axis="1 0 0"/><default class="l">'
+                '<joint armature="0.4" frictionloss="0.3"/></default></default>'),
+        joint=HINGE.format('class="l" damping="2"'),
+    ),
+    "class of the children": one(
+        MASS + TIP,
+        default('<default class="k"><joint axis="1 0 0" range="-1 2"/></default>'),
+        place='childclass="k"',
+        joint=HINGE.format(""),
+    ),
+    "class of shapes": one(
+        f'<geom class="k" size="0.1"/>{BOX}{TIP}',
+        default('<default class="k"><geom type="sphere" mass="0.4"/></default>')
+    ),
+    "range that does not hold": one(joint=HINGE.format('range="-1 2" limited="false"')),
+    "defaults at the end": one().replace("</mujoco>", default('<joint type="slide"/>') + "</mujoco>"),
+    "two compilers": one(place='euler="10 20 30"').replace("<worldbody>", '<compiler angle="degree"/><worldbody>'),
+    "full inertia": one('<inertial pos="0 0 1" mass="1" fullinertia="0.02 0.03 0.025 0.001 0.002 0.003"/>' + TIP),
+    "shapes": one(f'{BOX}<geom type="capsule" size="0.05" fromto="0 0 0 0.1 0.2 0.3"/>{BALL} density="9"/>{TIP}'),
+    "shapes without mass": one(f'{BALL} mass="0"/><geom type="mesh" mesh="tet" density="0"/>{BOX}{TIP}', MESH),
+    "shapes beside an inertia": one(MASS + BOX + '<geom type="mesh" mesh="tet"/>' + TIP, MESH),
+    "shapes instead of an inertia": one(MASS + BOX + TIP, compiler='angle="radian" inertiafromgeom="true"'),
+    "shapes of no group": one(
+        MASS + BOX + TIP, compiler='angle="radian" inertiafromgeom="true" inertiagrouprange="1 2"'
+    ),
+    "shapes of a group": one(f'{BALL} group="2"/>{BOX}{TIP}', compiler='angle="radian" inertiagrouprange="0 1"'),
+    "frames": document(FRAME.format(FRAME.format(body("a", MASS + FRAME.format(TIP))))),
+    "an included file": one(MASS + '<include file="tip.xml"/>'),
+}  # fmt: skip
+
+
+def written(folder, text):
+    (folder / "tip.xml").write_text(f"<mujocoinclude>{TIP}</mujocoinclude>")
+    (folder / "tet.obj").write_text("v 0 0 0\nv 0.3 0 0\nv 0 0.2 0\nv 0 0 0.4\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    path = folder / "arm.xml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_robot_is_mujoco_s(tmp_path, kind, caplog):
+    mujoco = pytest.importorskip("mujoco")
+    path = written(tmp_path, FILES[kind])
+    robot, model = vp.load_robot(path), mujoco.MjModel.from_xml_path(str(path))
+    assert not caplog.records
+    assert list(robot.joint_names) == [model.joint(k).name for k in range(model.njnt)]
+    data, M = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    for q in np.random.default_rng(0).uniform(-0.9, 0.9, (2, robot.dof)):
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, M)
+        jet = vp.lagrangian_jet(vp.Scene(robot), q, np.zeros(robot.dof))
+        np.testing.assert_allclose(jet.Lvv, M, rtol=0, atol=1e-12 * np.abs(M).max())
+        # Two roundings: MuJoCo turns inertias to their principal axes and back.
+        np.testing.assert_allclose(-jet.Lq, data.qfrc_bias, rtol=0, atol=1e-12 * max(1.0, np.abs(data.qfrc_bias).max()))
+        np.testing.assert_allclose(robot.frame_positions(q[None], "tip")[0], data.body("tip").xpos, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(robot.damping, model.dof_damping)
+    np.testing.assert_array_equal(robot.friction, model.dof_frictionloss)
+    limited, limits = model.jnt_limited.astype(bool), robot.position_limits
+    np.testing.assert_allclose(limits[0], np.where(limited, model.jnt_range[:, 0], -np.inf))
+    np.testing.assert_allclose(limits[1], np.where(limited, model.jnt_range[:, 1], np.inf))
+
+
+def test_keyframes_are_postures(tmp_path):
+    keys = '<keyframe><key name="home" qpos="0.1 -0.2"/><key time="1"/></keyframe>'
+    robot = vp.load_robot(written(tmp_path, one(MASS + TIP, keys)))
+    assert robot.posture("home").tolist() == [0.1, -0.2]
+
+
+def test_shapes_and_locked_joints(tmp_path):
+    path = written(tmp_path, one(f'{BALL} name="b"/><geom type="mesh" mesh="tet" density="0"/>{TIP}', MESH))
+    robot = pickle.loads(pickle.dumps(vp.load_robot(path)))
+    assert (robot.name, robot.urdf, robot.mjcf) == ("arm", None, path)
+    assert [shape.parentJoint for shape in geometry(robot).geometryObjects] == [1, 1]
+    locked = vp.load_robot(path, lock={"ja": 0.5})
+    assert [shape.parentJoint for shape in geometry(locked).geometryObjects] == [0, 0]
+    assert len(vp.inspect_robot(path).joints) == 2
+    (tmp_path / "tet.obj").unlink()
+    with pytest.raises(vp.RobotError, match=r"meshes of .*arm.xml are not there: link 'a': .*tet.obj$"):
+        geometry(robot)
+    shapes, missing = readable_geometry(robot)
+    assert (shapes.ngeoms, missing["a"][0]) == (0, 1)
+    # Its dynamics do without.
+    assert vp.load_robot(path).dof == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (one(joint=HINGE.format('stiffness="2"')), r"joint springs \(1\)"),
+        (one(joint=HINGE.format('damping="2 0.5"')), r"nonlinear joint dampers \(1\)"),
+        (one(compiler='boundmass="0.1"'), r"least masses and inertias \(1\)"),
+        (one(place='gravcomp="1"'), r"gravity compensation \(1\)"),
+        (one(MASS + TIP, '<equality><joint joint1="ja" joint2="jtip"/></equality>'), r"equality constraints \(1\)"),
+        (one(MASS + TIP, '<tendon><fixed name="f"><joint joint="ja" coef="1"/></fixed></tendon>'), r"tendons \(1\)"),
+    ],
+)
+def test_what_is_left_out_is_told(tmp_path, caplog, text, words):
+    vp.load_robot(written(tmp_path, text))
+    (record,) = caplog.records
+    assert "which the model leaves out" in record.getMessage()
+    assert re.search(words, record.getMessage())
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            one(f'<geom type="mesh" mesh="tet"/>{TIP}', MESH),
+            "body 'a' has no <inertial>, and its mass follows from a mesh",
+        ),
+        (one(MASS + f'<replicate count="2">{TIP}</replicate>'), "has <replicate>, which Pinocchio does not read"),
+        (one(FRAME.format(BOX) + TIP), "a <geom> in a <frame>"),
+        (one(compiler='settotalmass="10"'), "scaled by settotalmass"),
+        (one(compiler='eulerseq="xy"', place=LEANING), "eulerseq is 'xy', where three of x, y and z belong"),
+        (one(joint='<freejoint name="f"/>'), "joint 'f' is a JointModelFreeFlyer"),
+        (one(joint='<joint name="b" type="ball"/>'), "joint 'b' is a JointModelSpherical"),
+        (one(joint='<joint name="b" type="screw"/>'), "is no MJCF that Pinocchio can read: Unknown joint type"),
+        (one(joint=HINGE.format('class="k"')), "<joint> 'ja': there is no default class 'k'"),
+        (one(joint=HINGE.format('damping="much"')), "<joint> 'ja': its damping is 'much', no 1 or 2 or 3 finite"),
+        (one(MASS + body("b", place='pos="1 0 x"')), "<body> 'b': its pos is '1 0 x', no 3 finite number"),
+        (one(place='pos="1 0 x"'), "<body> 'a': its pos is '1 0 x', no 3 finite number"),
+        (one(place='axisangle="0 0 0 1"'), "<body> 'a': the axis of its axisangle is 0"),
+        (one(MASS.replace("1.3", "nan") + TIP), "its mass is 'nan'"),
+        (one('<inertial pos="0 0 0" mass="1"/>' + TIP), "body 'a': its <inertial> has no mass, or neither"),
+        (one(MASS + body("b", joint=HINGE.format(""))), "several joints named 'ja'"),
+        (one(MASS + '<include file="arm.xml"/>'), "arm.xml includes itself"),
+        (one()[:-10] + "</mujoco>", "is not a URDF: it is not well-formed XML"),
+        ("<mujoco/>", "has no joint that moves"),
+    ],
+)
+def test_bad_files_give_one_error(tmp_path, text, words):
+    with pytest.raises(vp.RobotError, match=words):
+        vp.load_robot(written(tmp_path, text))
+
+
+def test_file_that_is_not_there(tmp_path):
+    with pytest.raises(vp.FileError, match=r"cannot read .*lost.xml"):
+        vp.load_robot(written(tmp_path, one(MASS + '<include file="lost.xml"/>')))
+
+
+def test_urdf_of_another_suffix_and_sdf(tmp_path, load):
+    path = tmp_path / "ur5.xml"
+    path.write_text(load("ur5").urdf.read_text())
+    expected = pin.buildModelFromUrdf(str(path))
+    assert [inertia.mass for inertia in vp.load_robot(path).model.inertias] == [i.mass for i in expected.inertias]
+    for name in ("arm.sdf", "arm.xml"):
+        (tmp_path / name).write_text('<sdf version="1.6"><model name="a"/></sdf>')
+        with pytest.raises(vp.RobotError, match="is an SDF file, which Pinocchio's package on PyPI cannot read"):
+            vp.load_robot(tmp_path / name)

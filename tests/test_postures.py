@@ -1,0 +1,192 @@
+"""Postures of SRDF files are the configurations that Pinocchio reads from them."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from mechanisms import joint, link, mimic, write_urdf
+
+import varpin as vp
+
+# Robots of example-robot-data and the postures in their SRDF files, under srdf/ of each.
+PUBLISHED = {
+    "alex_nub_hands": ("alex_nub_hands", ("default",)),
+    "alex_psyonic_hands": ("alex_psyonic_hands", ("default",)),
+    "alex_sake_hands": ("alex_sake_hands", ("default",)),
+    "finger_edu": ("finger_edu", ("hanging",)),
+    "kinova": ("kinova", ("arm_up",)),
+    "panda": ("panda", ("default",)),
+    "panda_collision": ("panda", ("default",)),
+    "talos_arm": ("talos", ("half_sitting",)),
+    "xarm7": ("xarm7", ("home", "hold-up")),
+    "z1": ("z1", ("home", "arm_up")),
+}
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_published_postures_are_pinocchio_s(load, name):
+    robot, (file, names) = load(name), PUBLISHED[name]
+    assert robot.postures == names
+    model = pin.buildModelFromUrdf(str(robot.urdf))
+    path = robot.urdf.parent.parent / "srdf" / f"{file}.srdf"
+    pin.loadReferenceConfigurations(model, str(path))
+    for posture in names:
+        q, expected = robot.configuration(robot.posture(posture)), model.referenceConfigurations[posture]
+        for joint_name in robot.joint_names:
+            one, other = (
+                robot.model.joints[robot.model.getJointId(joint_name)],
+                model.joints[model.getJointId(joint_name)],
+            )
+            np.testing.assert_allclose(
+                q[one.idx_q : one.idx_q + one.nq], expected[other.idx_q : other.idx_q + other.nq], atol=1e-12
+            )
+
+
+def test_no_other_robot_has_postures(load):
+    """Also not Baxter, whose file gives its joints names that they do not have."""
+    for name in vp.robot_names():
+        if name not in PUBLISHED:
+            assert load(name).postures == (), name
+
+
+SRDF = """<robot name="made_up">
+<group_state name="home" group="arm"><joint name="j1" value="0.5"/><joint name="j2" value="9"/></group_state>
+<group_state name="home" group="hand"><joint name="j3" value="-0.25"/>
+<joint name="root" value="0 0 0 0 0 0 1"/></group_state>
+<group_state name="there" group="arm"><joint name="j3" value="0.6 0.8"/></group_state>
+<group_state name="there" group="hand"><joint name="j3" value="0.1"/></group_state>
+<group_state name="none" group="other"><joint name="k1" value="1"/></group_state></robot>"""
+
+
+@pytest.fixture
+def urdf(tmp_path):
+    parts = [link(f"l{k}") for k in (1, 2, 3, 4)]
+    joints = [joint("j1", "base", "l1"), joint("j2", "l1", "l2", inside=mimic("j1", 2, 0.1))]
+    joints += [joint("j3", "l2", "l3", "continuous"), joint("j4", "l3", "l4", "prismatic")]
+    return write_urdf(tmp_path, *parts, *joints)
+
+
+def test_coordinates_of_a_posture(urdf):
+    (urdf.parent / "made_up.srdf").write_text(SRDF)
+    robot = vp.load_robot(urdf)
+    assert robot.joint_names == ("j1", "j3", "j4")
+    assert robot.postures == ("home", "there")
+    np.testing.assert_array_equal(robot.posture("home"), [0.5, -0.25, 0.0])
+    np.testing.assert_array_equal(robot.posture("home", others={"j4": 0.3, "j1": 7.0}), [0.5, -0.25, 0.3])
+    np.testing.assert_array_equal(robot.posture("home", group="hand", others=[1.0, 2.0, 3.0]), [1.0, -0.25, 3.0])
+    assert robot.posture("there", group="arm")[1] == pytest.approx(np.arctan2(0.8, 0.6))
+    assert vp.load_robot(urdf, lock={"j3": 1.0}).posture("home").tolist() == [0.5, 0.0]
+    assert pickle.loads(pickle.dumps(robot)).posture("home").tolist() == [0.5, -0.25, 0.0]
+
+
+def test_errors_of_a_call(urdf):
+    (urdf.parent / "made_up.srdf").write_text(SRDF)
+    robot = vp.load_robot(urdf)
+    with pytest.raises(
+        vp.UnknownPosture, match=r"'hme'; did you mean 'home' or 'there'\? postures: home, there$"
+    ) as caught:
+        robot.posture("hme")
+    assert caught.value.postures == ("home", "there")
+    with pytest.raises(vp.InputError, match="put joint 'j3' in two places: give group=, of arm, hand"):
+        robot.posture("there")
+    with pytest.raises(vp.InputError, match="one of the groups arm, hand; there is none of group 'leg'"):
+        robot.posture("home", group="leg")
+    with pytest.raises(vp.UnknownJoint, match="j9"):
+        robot.posture("home", others={"j9": 1.0})
+    with pytest.raises(vp.UnknownPosture, match="it has none: give the SRDF file"):
+        vp.load_robot("ur5").posture("home")
+
+
+@pytest.mark.parametrize(
+    ("place", "name", "found"),
+    [
+        ("{}/made_up.srdf", "another", True),
+        ("srdf/made_up.srdf", "another", True),
+        ("srdf/any.srdf", "made_up", True),
+        ("srdf/any.srdf", "another", False),
+        ("deep/srdf/made_up.srdf", "made_up", False),
+    ],
+)
+def test_where_the_file_is_looked_for(urdf, tmp_path, place, name, found):
+    folder = tmp_path / "urdf"
+    folder.mkdir()
+    urdf = urdf.rename(folder / urdf.name)
+    file = tmp_path / place.format("urdf")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(SRDF.replace("made_up", name))
+    assert bool(vp.load_robot(urdf).postures) == found
+    assert vp.load_robot(urdf, srdf=str(file)).postures == ("home", "there")
+
+
+def test_two_files_for_a_robot_of_its_name_are_none(urdf):
+    for name in ("a", "b"):
+        (urdf.parent / f"{name}.srdf").write_text(SRDF)
+    assert vp.load_robot(urdf).postures == ()
+
+
+BAD = {
+    "no number": (SRDF.replace('"0.5"', '"half"'), "posture 'home': the position of joint 'j1' is 'half', where"),
+    "no value": (SRDF.replace('value="0.5"', ""), "the position of joint 'j1' is '', where a finite number belongs"),
+    "infinite": (SRDF.replace('"0.5"', '"inf"'), "the position of joint 'j1' is 'inf'"),
+    "broken": (SRDF[:-5], "made_up.srdf is not an SRDF: it is not well-formed XML"),
+    "empty": ("", "made_up.srdf is not an SRDF"),
+    "another format": (SRDF.replace("robot", "sdf"), "is not an SRDF: its root element is <sdf>"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_files(urdf, caplog, kind):
+    text, words = BAD[kind]
+    path = urdf.parent / "made_up.srdf"
+    path.write_text(text)
+    with pytest.raises(vp.RobotError, match=words):
+        vp.load_robot(urdf, srdf=path)
+    # One that nobody asks for is told of.
+    assert vp.load_robot(urdf).postures == ()
+    assert words in caplog.text
+
+
+def test_files_that_are_none(urdf):
+    with pytest.raises(vp.FileError, match=r"cannot read .*lost.srdf"):
+        vp.load_robot(urdf, srdf="lost.srdf")
+    with pytest.raises(vp.InputError, match="srdf must be the path of a file, got int"):
+        vp.load_robot(urdf, srdf=3)
+
+
+def test_xacro_file(urdf, tmp_path):
+    pytest.importorskip("xacro")
+    path = tmp_path / "any.srdf.xacro"
+    path.write_text(
+        '<robot name="made_up" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arg name="at" default="0.5"/>'
+        '<group_state name="home"><joint name="j1" value="${2 * 0.3}"/></group_state></robot>'
+    )
+    assert vp.load_robot(urdf, srdf=path).posture("home")[0] == 0.6
+
+
+def test_reference_configurations_of_a_model(urdf):
+    model = pin.buildModelFromUrdf(str(urdf))
+    q = pin.randomConfiguration(model, -np.ones(model.nq), np.ones(model.nq))
+    model.referenceConfigurations["here"] = q
+    robot = vp.load_robot(model)
+    np.testing.assert_allclose(robot.configuration(robot.posture("here")), q, atol=1e-15)
+
+
+def test_of_robot_descriptions(urdf, tmp_path, monkeypatch):
+    srdf = tmp_path / "elsewhere" / "any.srdf"
+    srdf.parent.mkdir()
+    srdf.write_text(SRDF)
+
+    module = SimpleNamespace(
+        DESCRIPTIONS={"one_description": SimpleNamespace(tags={"arm"})},
+        PACKAGE_PATH=str(tmp_path),
+        URDF_PATH=str(urdf),
+        SRDF_PATH=str(srdf),
+    )
+    for name in ("robot_descriptions", "robot_descriptions.one_description"):
+        monkeypatch.setitem(sys.modules, name, module)
+    assert vp.load_robot("one_description").postures == ("home", "there")

@@ -1,0 +1,146 @@
+"""Xacro files load as the URDF that they stand for."""
+
+from __future__ import annotations
+
+import logging
+import pickle
+import sys
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from mechanisms import INERTIAL, arm, joint, link
+
+import varpin as vp
+from varpin.robot import geometry
+
+HEAD = '<?xml version="1.0"?>\n<robot name="made_up" xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
+BALL = '<visual><geometry><sphere radius="0.1"/></geometry></visual>'
+
+# A macro in a package beside it, one found by a relative path, an argument, a property and a condition.
+ARM = (
+    HEAD
+    + """<xacro:arg name="prefix" default=""/>
+<xacro:arg name="tool" default="false"/>
+<xacro:property name="mass" value="${0.65 * 2}"/>
+<xacro:include filename="$(find parts)/macros.xacro"/>
+<xacro:include filename="base.xacro"/>
+<xacro:segment name="$(arg prefix)1" parent="base" mass="${mass}"/>
+<xacro:if value="$(arg tool)"><xacro:segment name="$(arg prefix)2" parent="l$(arg prefix)1" mass="0.5"/></xacro:if>
+</robot>
+"""
+)
+MACROS = (
+    HEAD
+    + '<xacro:macro name="segment" params="name parent mass">'
+    + link("l${name}", INERTIAL.replace('"1.3"', '"${mass}"'), BALL)
+    + joint("j${name}", "${parent}", "l${name}")
+    + "</xacro:macro></robot>"
+)
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    """A folder of two ROS packages; returns the file of the robot."""
+    pytest.importorskip("xacro")
+    for name in ("my_arm", "parts"):
+        folder = tmp_path / name
+        (folder / "urdf").mkdir(parents=True)
+        (folder / "package.xml").write_text(f"<package><name>{name}</name></package>")
+    (tmp_path / "parts" / "macros.xacro").write_text(MACROS)
+    (tmp_path / "my_arm" / "urdf" / "base.xacro").write_text(HEAD + '<link name="base"/></robot>')
+    path = tmp_path / "my_arm" / "urdf" / "arm.urdf.xacro"
+    path.write_text(ARM)
+    return path
+
+
+def test_robot_is_that_of_the_urdf_written_by_hand(workspace, tmp_path, monkeypatch):
+    monkeypatch.chdir("/")
+    robot = vp.load_robot(workspace)
+    assert (robot.name, robot.urdf, robot.joint_names) == ("arm", workspace, ("j1",))
+    expected = pin.buildModelFromUrdf(str(arm(tmp_path)))
+    q = np.array([0.7])
+    np.testing.assert_allclose(
+        vp.Scene(robot).holding_torque(q),
+        pin.computeGeneralizedGravity(expected, expected.createData(), q),
+        rtol=1e-12,
+    )
+    jet = vp.lagrangian_jet(vp.Scene(robot), q, q)
+    np.testing.assert_allclose(jet.Lvv, pin.crba(expected, expected.createData(), q), rtol=1e-12)
+
+
+def test_arguments(workspace):
+    robot = vp.load_robot(workspace, xacro_args={"prefix": "left_", "tool": True})
+    assert robot.joint_names == ("jleft_1", "jleft_2")
+    assert robot.model.inertias[2].mass == 0.5
+    with pytest.raises(vp.InputError, match=r"arm.urdf.xacro has no xacro argument 'prefx'; it takes: prefix, tool"):
+        vp.load_robot(workspace, xacro_args={"prefx": "left_"})
+
+
+def test_geometry_and_report_of_a_robot_that_travelled(workspace, monkeypatch):
+    robot = pickle.loads(pickle.dumps(vp.load_robot(workspace, xacro_args={"tool": True})))
+    monkeypatch.setitem(sys.modules, "xacro", None)
+    assert geometry(robot).ngeoms == 2
+    assert len(vp.inspect_robot(robot).joints) == 2
+
+
+def test_packages_are_those_around_the_file_each_time(workspace, tmp_path):
+    """Two workspaces hold packages of the same name."""
+    assert vp.load_robot(workspace).model.inertias[1].mass == 1.3
+    other = tmp_path / "other"
+    for name in ("my_arm", "parts"):
+        (tmp_path / name).rename(other.mkdir(exist_ok=True) or other / name)
+    (other / "parts" / "macros.xacro").write_text(MACROS.replace("${mass}", "${2 * mass}"))
+    assert vp.load_robot(other / "my_arm" / "urdf" / "arm.urdf.xacro").model.inertias[1].mass == 2.6
+
+
+def test_package_dirs(workspace, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "parts").rename(tmp_path / "elsewhere" / "parts")
+    with pytest.raises(vp.RobotError, match=r"cannot be expanded: .*no package 'parts' above the file nor in .*dirs"):
+        vp.load_robot(workspace)
+    assert vp.load_robot(workspace, package_dirs=[tmp_path / "elsewhere"]).dof == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda text: text.replace("${0.65 * 2}", "${lost * 2}"), r"name 'lost' is not defined .*arm.urdf.xacro"),
+        (lambda text: text.replace("</robot>", ""), r"cannot be expanded: ExpatError: no element found"),
+        (lambda text: text.replace("$(arg tool)", "$(arg tol)"), r"cannot be expanded: .*tol"),
+        (lambda text: text.replace("base.xacro", "case.xacro"), r"case.xacro"),
+        (lambda text: text.replace('parent="base"', 'perent="base"'), r"perent"),
+    ],
+)
+def test_bad_files_give_one_error(workspace, change, words):
+    workspace.write_text(change(workspace.read_text()))
+    with pytest.raises(vp.RobotError, match=words):
+        vp.load_robot(workspace)
+
+
+def test_warnings_of_xacro_are_logged(workspace, caplog, capfd):
+    workspace.write_text(workspace.read_text().replace("</robot>", '<xacro:include filename="more_*.xacro"/></robot>'))
+    with caplog.at_level(logging.WARNING):
+        vp.load_robot(workspace)
+    assert "more_*.xacro" in caplog.text
+    assert "more_" not in capfd.readouterr().err
+
+
+def test_without_the_package(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xacro", None)
+    (tmp_path / "arm.urdf.xacro").write_text(ARM)
+    with pytest.raises(vp.MissingDependency, match=r"arm.urdf.xacro needs xacro: pip install \"varpin\[xacro\]\""):
+        vp.load_robot(tmp_path / "arm.urdf.xacro")
+
+
+def test_arguments_of_what_is_no_xacro_file(tmp_path):
+    for source in (arm(tmp_path), "ur5"):
+        with pytest.raises(vp.InputError, match="is read from no xacro file"):
+            vp.load_robot(source, xacro_args={"prefix": "left_"})
+    with pytest.raises(vp.InputError, match="xacro_args must be a mapping"):
+        vp.load_robot("ur5", xacro_args=["prefix"])
+
+
+def test_no_such_file(tmp_path):
+    with pytest.raises(vp.RobotNotFound, match=r"arm.urdf.xacro' \(looked in "):
+        vp.load_robot("arm.urdf.xacro")
