@@ -9,6 +9,7 @@ from mechanisms import slider
 import varpin as vp
 import varpin.mpc
 from varpin.mpc import _decision
+from varpin.sddp import backward
 
 
 def cart(steps=40, **options):
@@ -171,6 +172,31 @@ def test_interruption_keeps_the_motion():
     assert caught.value.trajectory.steps == 70
 
 
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_a_tick_takes_a_backward_pass_for_each_iteration(iterations, monkeypatch):
+    """And no more: its gains are those that its last step followed, and near those made anew for its motion."""
+    mpc = vp.Mpc(tracking(), iterations=iterations, tolerance=1e-15)
+    first = mpc.plan(0.0, mpc.problem.q0, mpc.problem.v0)
+    passes, real = [], backward._one_pass
+
+    def counted(*given, **options):
+        passes.append(given)
+        return real(*given, **options)
+
+    q, v = first.trajectory.q[1] + 1e-3, first.trajectory.v[1]
+    monkeypatch.setattr(backward, "_one_pass", counted)
+    plan = mpc.plan(mpc.period, q, v, first)
+    assert len(passes) == plan.iterations == iterations
+    whole = vp.solve(plan.problem, first.shifted(1), tolerance=1e-15, max_iterations=iterations, check=False)
+    assert len(passes) == 2 * iterations + 1
+    np.testing.assert_array_equal(plan.trajectory.u, whole.trajectory.u)
+    assert plan.cost == whole.cost
+    assert 0.0 < np.abs(plan.gains - whole.gains).max() < 0.05 * np.abs(whole.gains).max()
+    # The whole step was taken, so nothing is left of it.
+    assert plan.history[-1].step == 1.0
+    assert not plan.feedforward.any()
+
+
 def test_a_plant_that_fails_keeps_the_motion():
     mpc = vp.Mpc(tracking(), iterations=1)
     plant = vp.Plant(
@@ -181,7 +207,7 @@ def test_a_plant_that_fails_keeps_the_motion():
     assert caught.value.trajectory.dt == pytest.approx(0.02)
 
 
-@pytest.mark.parametrize("whose", ["simulate", "solve"])
+@pytest.mark.parametrize("whose", ["simulate", "replan"])
 def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whose, monkeypatch):
     """In the third tick's simulation, or in the search of the fourth."""
     mpc, calls, real = vp.Mpc(tracking(), iterations=1), [], getattr(varpin.mpc, whose)
@@ -189,7 +215,7 @@ def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whos
 
     def failing(*given, **options):
         calls.append(given)
-        if len(calls) < (3 if whose == "simulate" else 4):
+        if len(calls) < 3:
             return real(*given, **options)
         return vp.simulate(
             harsh, np.zeros(3), np.zeros(3), dt=0.1, steps=5, integrator=vp.Midpoint(guard=vp.Guard(max_halvings=0))
@@ -207,6 +233,79 @@ def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whos
         assert part.steps == 10 * ticks
         assert "no plan can be made from here" in str(caught.value)
         assert isinstance(caught.value.__cause__, vp.StepFailure)
+
+
+@pytest.mark.parametrize("whose", ["cost", "reference"])
+def test_a_cost_that_fails_keeps_the_motion_of_all_ticks_before(whose):
+    """In the plan of the tick whose horizon first reaches beyond 0.5 s."""
+
+    def goal(t):
+        return [0.0 if t <= 0.51 else np.nan]
+
+    def far(t, q, v, u):
+        return np.where(t <= 0.51, q[:, 0] ** 2, np.nan)
+
+    broken = vp.TrackingCost(goal) if whose == "reference" else vp.CustomCost(far)
+    usual = cart(steps=8)
+    whole = vp.Mpc(usual.at(t0=0.0), iterations=1).run(duration=0.2)
+    problem = vp.OptimalControlProblem(
+        usual.scene, usual.cost + broken, usual.q0, usual.v0, dt=usual.dt, steps=usual.steps
+    )
+    with pytest.raises(vp.CostError) as caught:
+        vp.Mpc(problem, iterations=1).run(duration=0.5)
+    motion = caught.value.trajectory
+    assert motion.steps == 30
+    assert motion.q[0] == whole.motion.q[0]
+    assert "motion so far is in error.trajectory" in str(caught.value)
+    assert isinstance(caught.value.__cause__, vp.CostError)
+    assert caught.value.__cause__.trajectory is None
+    assert caught.value.cost == caught.value.__cause__.cost
+
+
+@pytest.mark.parametrize(("slow", "told"), [(20, True), (3, True), (1, False), (0, False)])
+def test_a_controller_that_cannot_keep_up_says_so(slow, told, monkeypatch):
+    """A clock that runs on by 80 ms in some of twenty ticks of 50 ms, by 10 ms in the others."""
+    spans = iter([0.08] * slow + [0.01] * (20 - slow))
+    now = [0.0, False]
+
+    def clock():
+        # Asked before a plan and after it.
+        now[0] += next(spans) if now[1] else 0.0
+        now[1] = not now[1]
+        return now[0]
+
+    class Clock:
+        perf_counter = staticmethod(clock)
+
+    monkeypatch.setattr(varpin.mpc, "time", Clock)
+    run = vp.Mpc(cart(steps=8), iterations=1).run(duration=1.05)
+    said = [sentence for sentence in run.warnings if "longer than the period of 50 ms" in sentence]
+    assert bool(said) == told
+    assert not told or f"in {slow} of 20 ticks ({1e3 * run.seconds[1:].mean():.3g} ms in the mean)" in said[0]
+
+
+def test_what_is_told_of_an_early_end_is_in_the_time_of_the_run():
+    """Of joints beyond their limits, at the time from the run's start and not from the tick's."""
+    calls = []
+
+    def stop(done, _):
+        calls.append(done)
+        if done == 6:
+            raise KeyboardInterrupt
+
+    robot = vp.load_robot("ur5")
+    cost = vp.VelocityCost(1e-3) + vp.ControlCost(1e-5) + vp.TrackingCost(lambda t: np.full(6, 5.0 * t), 10.0)
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, gravity=False), cost, np.zeros(6), np.zeros(6), dt=0.02, steps=10
+    )
+    with pytest.raises(vp.Interrupted) as caught:
+        vp.Mpc(problem, iterations=1).run(duration=0.3, progress=stop)
+    motion = caught.value.trajectory
+    (sentence,) = [sentence for sentence in motion.warnings if "velocity limits" in sentence]
+    excess = np.abs(motion.v) - robot.velocity_limit
+    worst = int(np.argmax(excess.max(axis=0)))
+    assert motion.steps == 60
+    assert f"at t = {motion.t[np.argmax(excess[:, worst])]:.4g} s" in sentence.partition(";")[0]
 
 
 def test_mistakes_are_named():

@@ -122,6 +122,39 @@ def test_everything_in_a_scene_arrives(tmp_path):
     assert file.spec.outputs.save == Path.cwd() / "plan.npz"
 
 
+FORCES = """
+[[force]]
+type = "friction"
+level = { mcp = 1e-4 }
+width = 0.05
+
+[[force]]
+type = "stop"
+stiffness = 0.1
+damping = [1e-4, 0.0]
+upper = { pip = 1.0 }
+
+[[force]]
+type = "armature"
+inertia = 1e-6
+"""
+
+
+def test_forces_of_a_scene_are_those_written_in_python(tmp_path):
+    file = vp.load_scene(write(tmp_path, GOOD + FORCES))
+    forces = [
+        vp.CoulombFriction([1e-4, 0.0], 0.05),
+        vp.JointStop(0.1, [1e-4, 0.0], upper=[np.inf, 1.0]),
+        vp.Armature(1e-6),
+    ]
+    scene = vp.Scene(file.robot, damping=[1e-5, 2e-5], stiffness=1e-3, rest=[0.1, 0.2], forces=forces)
+    assert file.scene.elements == scene.elements
+    np.testing.assert_array_equal(file.scene.armature, scene.armature)
+    assert file.required.terms["other forces"] == "armature, friction, stop"
+    assert file.required.terms["not modelled"].startswith("contact;")
+    assert vp.load_scene(write(tmp_path, GOOD)).required.terms["not modelled"].startswith("stops at joint limits, dry")
+
+
 def test_cost_of_a_scene_is_that_written_in_python(tmp_path):
     file = vp.load_scene(write(tmp_path, GOOD))
 
@@ -234,6 +267,14 @@ MISTAKES = {
         changed("controls = [0.0, 0.0]", "controls = [0.0, 0.6]"),
         "simulate.controls",
         "torque_limit is 0.5",
+    ),
+    "unknown force": (GOOD + '[[force]]\ntype = "glue"', "force[0].type", "friction, spring, stop"),
+    "force without a number": (GOOD + '[[force]]\ntype = "armature"', "force[0].inertia", "by name"),
+    "negative friction": (GOOD + '[[force]]\ntype = "friction"\nlevel = -1', "force[0]", "must be >= 0"),
+    "force on no joint": (
+        GOOD + '[[force]]\ntype = "damper"\ndamping = {x = 1}',
+        "force[0].damping.x",
+        "no such joint",
     ),
     "unknown noise": (changed('type = "state"', '"type" = "white"'), "noise[0].type", "additive, control, state"),
     "center of additive noise": (
@@ -515,8 +556,8 @@ def test_the_documented_scene_is_one(tmp_path):
     # It has every key that there is.
     data = tomllib.loads(whole)
     assert set(data) == {
-        *("title", "gravity", "damping", "robot", "springs", "actuation", "noise", "initial", "horizon"),
-        *("integrator", "cost", "simulate", "solve", "outputs"),
+        *("title", "gravity", "damping", "robot", "springs", "force", "actuation", "noise", "initial"),
+        *("horizon", "integrator", "cost", "simulate", "solve", "outputs"),
     }
     for text in parts:
         tomllib.loads(text)
@@ -557,7 +598,7 @@ def test_a_replay_is_told_which_motion_is_followed():
         assert marks.keys() == {"trace", "ghost"}
         assert marks["trace"] is True
         t = np.linspace(0.0, duration, len(marks["ghost"]))
-        wanted = [1.0 + 0.25 * np.sin(4.0 * np.pi * t), 0.1 * np.sin(2.0 * np.pi * t), np.zeros_like(t)]
+        wanted = [1.0 + 0.25 * np.sin(4.0 * np.pi * t), 0.3 + 0.1 * np.sin(2.0 * np.pi * t), np.full_like(t, 0.2)]
         np.testing.assert_allclose(marks["ghost"].T, wanted, atol=1e-12)
     assert scene.marks(0.0)["ghost"].shape == (1, 3)
 

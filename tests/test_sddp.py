@@ -239,6 +239,7 @@ def run(problem, controls):
         steps=problem.steps,
         controls=np.repeat(controls, problem.hold, axis=0),
         integrator=problem.integrator,
+        check=False,
     )
 
 
@@ -723,7 +724,7 @@ def test_hold_is_the_optimum_over_shared_controls(integrator, sampling):
     np.testing.assert_allclose(sol.gains[0], gains, rtol=0, atol=1e-9 * np.abs(gains).max())
 
 
-@pytest.mark.parametrize("name", ["finger", "ur5"])
+@pytest.mark.parametrize("name", ["finger", pytest.param("ur5", marks=pytest.mark.slow)])
 def test_hold_on_an_arm(name):
     """The nonlinear optimum over shared controls, by a quasi-Newton method on the cost alone."""
     problem = arm_problem(name, vp.Midpoint(), hold=4, steps=12)

@@ -171,7 +171,16 @@ def test_monte_carlo_against_paths_one_by_one():
         costs = np.array(
             [
                 problem.cost_of(
-                    vp.simulate(problem.scene, problem.q0, problem.v0, dt=0.03, steps=40, controls=controls, rng=rng)
+                    vp.simulate(
+                        problem.scene,
+                        problem.q0,
+                        problem.v0,
+                        dt=0.03,
+                        steps=40,
+                        controls=controls,
+                        rng=rng,
+                        check=False,
+                    )
                 )
                 for _ in range(1000)
             ]
@@ -285,11 +294,11 @@ def test_where_noise_matters(name, intensity):
     aware, plain = vp.solve(problem), vp.solve(problem_without_noise(problem))
     assert aware.status is plain.status is vp.Status.CONVERGED
     assert aware.expected_cost > 1.2 * plain.cost
-    ours = path_costs(problem, aware.policy, 2000, 1)
-    theirs = np.minimum(path_costs(problem, plain.policy, 2000, 1), 20 * aware.expected_cost)
+    ours = path_costs(problem, aware.policy, 1000, 1)
+    theirs = np.minimum(path_costs(problem, plain.policy, 1000, 1), 20 * aware.expected_cost)
     assert np.isfinite(ours).all()
     assert np.isfinite(theirs).all()
-    error = np.hypot(ours.std(ddof=1), theirs.std(ddof=1)) / np.sqrt(2000)
+    error = np.hypot(ours.std(ddof=1), theirs.std(ddof=1)) / np.sqrt(1000)
     assert theirs.mean() - ours.mean() > 4 * error
     assert aware.expected_cost == pytest.approx(ours.mean(), rel=0.05)
 
@@ -313,9 +322,9 @@ def test_paths_that_fail_are_counted():
     """Plain DDP's gains on the light finger, in noise they were not made for."""
     problem = noisy_reach("finger", 0.3)
     plain = dataclasses.replace(vp.solve(problem_without_noise(problem)), problem=problem)
-    found = plain.monte_carlo(256, 1)
+    found = plain.monte_carlo(64, 1)
     assert found.failures > 0
-    assert found.paths + found.failures == 256
+    assert found.paths + found.failures == 64
     assert np.isfinite(found.cost)
 
 

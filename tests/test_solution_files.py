@@ -8,9 +8,9 @@ import pytest
 import varpin as vp
 
 
-def problem_of(*, noise=None, damping=0.2, dt=0.02, weight=0.1, integrator=None, q0=(0.4, -0.3), robot=None):
+def problem_of(*, noise=None, damping=0.2, dt=0.02, weight=0.1, integrator=None, q0=(0.4, -0.3), robot=None, forces=()):
     robot = vp.planar_chain(2) if robot is None else robot
-    scene = vp.Scene(robot, damping=damping, noise=noise)
+    scene = vp.Scene(robot, damping=damping, noise=noise, forces=forces)
     cost = vp.TrackingCost([0.8, 0.1], 10.0) + vp.ControlCost(weight) + vp.Terminal(vp.VelocityCost(1.0))
     return vp.OptimalControlProblem(scene, cost, q0, [0.0, 0.0], dt=dt, steps=round(0.6 / dt), integrator=integrator)
 
@@ -93,6 +93,20 @@ def test_solution_of_another_problem_is_refused(other, words, tmp_path):
     path = vp.solve(problem_of(), max_iterations=1).save(tmp_path / "plan.npz")
     with pytest.raises(vp.FileError, match=words):
         vp.Solution.load(path, problem_of(**other))
+
+
+@pytest.mark.parametrize("force", [vp.CoulombFriction(0.1), vp.JointStop(9.0, lower=-1.0, upper=1.0), vp.Armature(0.1)])
+def test_forces_belong_to_the_problem(force, tmp_path):
+    problem = problem_of(forces=force)
+    plan = vp.solve(problem, max_iterations=2, second_order=True)
+    path = plan.save(tmp_path / "with.npz")
+    same(vp.Solution.load(path, problem), plan)
+    other = vp.solve(problem_of(), max_iterations=1).save(tmp_path / "without.npz")
+    for file, wrong in ((path, problem_of()), (other, problem)):
+        with pytest.raises(vp.FileError, match="another scene"):
+            vp.Solution.load(file, wrong)
+    with pytest.raises(vp.InputError, match=r"another armature|other forces"):
+        vp.solve(problem_of(), resume=plan)
 
 
 def test_files_that_are_no_solutions(tmp_path):

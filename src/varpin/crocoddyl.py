@@ -188,6 +188,8 @@ def policy_of(problem: OptimalControlProblem, solver: Any) -> LinearPolicy:
         -np.array(gains.tolist() if hasattr(gains, "tolist") else gains),
         np.array(solver.xs.tolist())[:-1],
         on="momentum" if problem.integrator.variational else "velocity",
+        period=problem.period,
+        joints=problem.scene.control_joints,
     )
 
 

@@ -6,27 +6,32 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from varpin.chatter import alternation
-from varpin.checks import JointValues, count, positive, real
+from varpin.checks import JointValues, control_values, count, positive, real
+from varpin.costs import CostError
 from varpin.errors import InputError
 from varpin.frozen import Frozen
 from varpin.integrators import Gauss, Integrator
 from varpin.integrators.base import Failure
 from varpin.loop_stability import examined_in_loop
-from varpin.markup import facts
+from varpin.markup import facts, said
 from varpin.scene import Scene, require_scene
-from varpin.sddp import OptimalControlProblem, Solution, solve
-from varpin.simulation import Interrupted, StepFailure, simulate
-from varpin.soundness import Finding, announce
+from varpin.sddp import OptimalControlProblem, Solution, replan, solve
+from varpin.simulation import Interrupted, StepFailure, noise_forgotten, simulate
+from varpin.soundness import Finding, announce, evident, with_warnings
 from varpin.trajectory import Trajectory, chained
 
 Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
+
+# Part of the ticks that may take longer than the period without a word: other programs get in the way.
+_FEW = 0.05
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,8 @@ class MpcRun(Frozen):
         period: Of the ticks [s].
         budget: For planning in a tick [s]; infinite for any.
         warnings: What looks wrong with the plant's motion, as in :attr:`Trajectory.warnings`, with its velocities from
-            tick to tick, and with the first plan.
+            tick to tick, and with the first plan; and whether planning took longer than the period in more than one
+            tick of twenty, which depends on the machine.
     """
 
     motion: Trajectory
@@ -105,7 +111,7 @@ class MpcRun(Frozen):
         return int(self.late.sum())
 
     def __repr__(self) -> str:
-        return f"MpcRun({str(self).splitlines()[0]})"
+        return f"MpcRun({str(self).splitlines()[0]}{said(self.warnings)})"
 
     @property
     def _planning(self) -> str:
@@ -194,9 +200,12 @@ class Mpc:
         v: JointValues,
         previous: Solution | None = None,
         decisions: int = 1,
-        before: ArrayLike | None = None,
+        before: JointValues | None = None,
     ) -> Solution:
         """The plan at time ``t`` [s] from configuration ``q`` (n,) and velocity ``v`` (n,).
+
+        Where it starts from another, each iteration takes one backward pass, and its gains are those that the last
+        iteration followed.
 
         Args:
             t: Now.
@@ -204,14 +213,17 @@ class Mpc:
             v: (n,) or by joint name [rad/s or m/s].
             previous: The plan to start from; None in the first tick.
             decisions: How many decisions ago it was made.
-            before: The control applied last (m,), where changes of controls cost something. Left out, what ``previous``
-                meant to apply, and in the first tick what the problem says.
+            before: The control applied last, (m,) or by joint name, where changes of controls cost something. Left out,
+                what ``previous`` meant to apply, and in the first tick what the problem says.
 
         Raises:
             InputError: q or v of a wrong shape, or not finite.
             StepFailure, CostError: The motion to start from cannot be integrated, or has no cost.
         """
-        if before is None and self.problem.rate and previous is not None and previous.problem.rate:
+        scene = self.problem.scene
+        if before is not None:
+            before = control_values("before", before, scene.control_joints, scene.controls)
+        elif self.problem.rate and previous is not None and previous.problem.rate:
             before = previous.problem.rate.before
             if decisions > 0:
                 before = previous.controls[min(decisions, len(previous.controls)) - 1]
@@ -220,14 +232,7 @@ class Mpc:
             return solve(problem, tolerance=self.tolerance, max_iterations=self.first_iterations)
         start = previous.shifted(min(decisions, problem.decisions - 1), before)
         # A tick has no time for a second look at its plan; the run takes one at what came of them all.
-        return solve(
-            problem,
-            start,
-            tolerance=self.tolerance,
-            max_iterations=self.iterations,
-            time_limit=self.budget,
-            check=False,
-        )
+        return replan(problem, start, tolerance=self.tolerance, max_iterations=self.iterations, time_limit=self.budget)
 
     def run(
         self,
@@ -245,7 +250,7 @@ class Mpc:
         Main args:
             plant: None for the problem's own scene, integrated more finely.
             duration: Of the run [s], rounded to whole ticks.
-            rng: Generator or seed of the plant's noise; without it there is none.
+            rng: Generator or seed of the plant's noise; without it there is none, of which a noisy plant has a warning.
 
         Other Args:
             progress: Called with (ticks done, ticks in all).
@@ -254,6 +259,7 @@ class Mpc:
             InputError: A plant with other controls or joints.
             StepFailure: The plant's motion, or the first motion of a search, cannot be integrated; it holds the plant's
                 motion so far. Of a search its cause is the search's own.
+            CostError: A cost of the user's fails; from the second tick on it holds the plant's motion so far.
             Interrupted: Ctrl-C; holds the plant's motion so far.
         """
         problem = self.problem
@@ -263,6 +269,11 @@ class Mpc:
             raise InputError(
                 f"the plant has joints {', '.join(joints)} and {controls} controls; the problem "
                 f"{', '.join(problem.scene.robot.joint_names)} and {problem.scene.controls}"
+            )
+        if plant.scene.servo_joints != problem.scene.servo_joints:
+            raise InputError(
+                f"the plant has servos on {', '.join(plant.scene.servo_joints) or 'no joints'}; the problem on "
+                f"{', '.join(problem.scene.servo_joints) or 'no joints'}"
             )
         ticks = max(1, round(positive("duration", duration, "s") / self.period))
         dt = self.period / plant.substeps
@@ -279,7 +290,9 @@ class Mpc:
                     try:
                         fresh = self.plan(problem.t0 + tick * self.period, q, v, active, age + 1, before)
                     except StepFailure as failure:
-                        raise _unplanned(failure, chained(parts)) from failure
+                        raise _unplanned(failure, _so_far(plant, parts)) from failure
+                    except CostError as error:
+                        raise CostError(error.cost, error.problem, _so_far(plant, parts)) from error
                     seconds[tick] = time.perf_counter() - begin
                     iterations[tick] = fresh.iterations
                     late[tick] = seconds[tick] > self.budget
@@ -294,9 +307,10 @@ class Mpc:
         except KeyboardInterrupt:
             if not parts:
                 raise
-            raise Interrupted(chained(parts)) from None
+            raise Interrupted(_so_far(plant, parts)) from None
         motion, found = examined_in_loop(plant.scene, plant.integrator, chained(parts), plant.substeps)
-        found = (*found, *_alternating(motion, plant.substeps))
+        found = (*noise_forgotten(plant.scene, rng), *found, *_alternating(motion, plant.substeps))
+        found = (*found, *_behind(seconds, self.period))
         announce(logger, plant.scene, dt, found)
         return MpcRun(
             motion,
@@ -308,6 +322,26 @@ class Mpc:
             self.budget,
             warnings=(*plans[0].warnings, *(finding.sentence for finding in found)),
         )
+
+
+def _so_far(plant: Plant, parts: Sequence[Trajectory]) -> Trajectory:
+    """The plant's motion of the ticks that there are, with what is evident of it."""
+    motion = chained(parts)
+    return with_warnings(motion, evident(plant.scene, plant.integrator, motion))
+
+
+def _behind(seconds: Floats, period: float) -> tuple[Finding, ...]:
+    """Says if planning took longer than the period in more than a few ticks: on a robot that plan would be late."""
+    planned = seconds[1:]
+    slow = int((planned > period).sum())
+    if not slow > _FEW * len(planned):
+        return ()
+    sentence = (
+        f"planning took longer than the period of {1e3 * period:.3g} ms in {slow} of {len(planned)} ticks "
+        f"({1e3 * planned.mean():.3g} ms in the mean): a controller this slow cannot keep up with a robot; fewer steps "
+        "ahead, fewer iterations or a longer period (hold=) make it faster"
+    )
+    return (Finding("slow planning", sentence),)
 
 
 def _alternating(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:
@@ -348,9 +382,10 @@ def _simulated(
     before: Sequence[Trajectory],
 ) -> Trajectory:
     """The plant's motion of one tick; what came before is in its failure."""
-    steps, integrator = plant.substeps, plant.integrator
+    options: dict[str, Any] = {"dt": dt, "steps": plant.substeps, "controls": u, "integrator": plant.integrator}
+    options |= {"increments": 0.0} if rng is None or not plant.scene.processes else {"rng": rng}
     try:
-        return simulate(plant.scene, q, v, dt=dt, steps=steps, controls=u, integrator=integrator, rng=rng, check=False)
+        return simulate(plant.scene, q, v, **options, check=False)
     except StepFailure as failure:
-        whole = chained([*before, failure.trajectory])
+        whole = _so_far(plant, [*before, failure.trajectory])
         raise StepFailure(whole.steps, whole.t[-1], Failure(failure.reason, failure.residual), whole) from None

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import inspect
 import reprlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, checked_limits, count, finite_array, is_one_of
+from varpin.checks import (
+    JointValues,
+    as_floats,
+    control_values,
+    count,
+    finite_array,
+    is_one_of,
+    named_limits,
+    positive,
+)
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
 from varpin.frozen import Frozen
@@ -27,13 +36,14 @@ class OpenLoop:
     order, whatever the integrator. What depends on the state is a control law, a function of (t, q, v).
 
     Attributes:
-        f: Of the time [s]; returns the controls (m,).
+        f: Of the time [s]; returns the controls, (m,) or by joint name where each is the force of a joint, 0 for joints
+            that are not named.
 
     Raises:
         InputError: It is no function, or not one of one argument.
     """
 
-    f: Callable[[float], ArrayLike]
+    f: Callable[[float], JointValues]
 
     def __post_init__(self) -> None:
         if not callable(self.f):
@@ -74,6 +84,10 @@ class LinearPolicy(Frozen):
         previous_gains: On the control of the interval before (N, m, m), or None for none.
         previous: What those gains expect it to be (N, m), or None.
         before: The control before the first interval (m,); None where nobody said, and it counts as expected.
+        period: Of an interval [s], or None where nobody said. Then the policy acts at any dt that goes into it, held
+            over as many steps as that takes.
+        joints: The joint whose force, or servo's position, each control is, or None where nobody said.
+        servos: The joints whose controls are positions, or None where nobody said.
     """
 
     u: Floats
@@ -85,6 +99,9 @@ class LinearPolicy(Frozen):
     previous_gains: Floats | None
     previous: Floats | None
     before: Floats | None
+    period: float | None
+    joints: tuple[str, ...] | None
+    servos: tuple[str, ...] | None
 
     def __init__(
         self,
@@ -93,11 +110,14 @@ class LinearPolicy(Frozen):
         reference: ArrayLike,
         hold: int = 1,
         on: Literal["momentum", "velocity"] | None = None,
-        limits: tuple[ArrayLike, ArrayLike] | None = None,
+        limits: tuple[JointValues, JointValues] | None = None,
         *,
         previous_gains: ArrayLike | None = None,
         previous: ArrayLike | None = None,
-        before: ArrayLike | None = None,
+        before: JointValues | None = None,
+        period: float | None = None,
+        joints: Sequence[str] | None = None,
+        servos: Sequence[str] | None = None,
     ) -> None:
         """Make a policy.
 
@@ -107,14 +127,22 @@ class LinearPolicy(Frozen):
             reference: (N, 2n), or (N + 1, 2n), of which the last row is not used.
             hold: Steps of a simulation that each control is held over: the rate of a digital controller.
             on: Say what x is, and an integrator on the other x refuses the policy.
-            limits: (lower, upper), each one number or (m,), of the whole control: feedback saturates there.
+            limits: (lower, upper), each one number, (m,) or by joint name, of the whole control: feedback saturates
+                there.
             previous_gains: (N, m, m), on the control of the interval before.
             previous: (N, m), what they expect it to be; left out, u of the interval before, and ``before`` for the
                 first.
-            before: The control before the first interval (m,).
+            before: The control before the first interval, (m,) or by joint name.
+            period: Of an interval [s]: with it ``hold`` follows from the dt of a simulation, and a dt that does not go
+                into it is refused.
+            joints: The joint whose force each control is, :attr:`varpin.Scene.control_joints`: they give names to
+                ``limits`` and ``before``, and a scene with other controls refuses the policy.
+            servos: The joints whose controls are positions, :attr:`varpin.Scene.servo_joints`: a scene with other
+                servos refuses the policy.
 
         Raises:
-            InputError: Shapes that do not fit each other, or values that are not finite.
+            InputError: Shapes that do not fit each other, values that are not finite, or names without ``joints``.
+            UnknownJoint: A name that is not in ``joints``.
         """
         rows, gains = as_floats("reference", reference), as_floats("gains", gains)
         shape = gains.shape
@@ -135,8 +163,19 @@ class LinearPolicy(Frozen):
         if on is not None and not is_one_of(on, ("momentum", "velocity")):
             raise InputError(f"on must be 'momentum', 'velocity' or None, got {on!r}")
         object.__setattr__(self, "on", on)
-        object.__setattr__(self, "limits", checked_limits("limits", limits, m))
-        start = None if before is None else finite_array("before", before, (m,))
+        names = None if joints is None else tuple(joints)
+        if names is not None and len(names) != m:
+            raise InputError(f"joints must name the joint of each of the {m} controls, got {names}")
+        object.__setattr__(self, "joints", names)
+        object.__setattr__(self, "servos", None if servos is None else tuple(servos))
+        object.__setattr__(self, "period", None if period is None else positive("period", period, "s"))
+        by_name = isinstance(before, Mapping) or any(isinstance(side, Mapping) for side in limits or ())
+        if by_name and names is None:
+            raise InputError(
+                "limits and before by joint name take the names of the controls, joints=scene.control_joints"
+            )
+        object.__setattr__(self, "limits", named_limits("limits", limits, names, m))
+        start = None if before is None else control_values("before", before, names, m)
         own: Floats | None = None
         expected: Floats | None = None
         if previous_gains is not None:
@@ -159,7 +198,33 @@ class LinearPolicy(Frozen):
     def without_feedback(self) -> LinearPolicy:
         """The controls alone."""
         limits = (self.limits[0], self.limits[1])
-        return LinearPolicy(self.u, np.zeros_like(self.gains), self.reference, self.hold, self.on, limits)
+        return LinearPolicy(
+            self.u,
+            np.zeros_like(self.gains),
+            self.reference,
+            self.hold,
+            self.on,
+            limits,
+            period=self.period,
+            joints=self.joints,
+            servos=self.servos,
+        )
+
+    def hold_at(self, dt: float) -> int:
+        """Steps of ``dt`` [s] that an interval has.
+
+        Raises:
+            InputError: The intervals have a period, and ``dt`` does not go into it.
+        """
+        if self.period is None:
+            return self.hold
+        hold = max(1, round(self.period / dt))
+        if abs(hold * dt - self.period) > 1e-9 * self.period:
+            raise InputError(
+                f"the policy decides every {self.period:g} s, and dt = {dt:g} s does not go into that: "
+                f"dt = {self.period / hold:g} s does"
+            )
+        return hold
 
     def control(self, interval: int, x: ArrayLike, before: ArrayLike | None = None) -> Floats:
         """The control (m,) of an interval at the state x (2n,), after the control ``before`` (m,).
@@ -177,21 +242,30 @@ class LinearPolicy(Frozen):
             u = u + self.previous_gains[interval] @ (finite_array("before", before, (m,)) - self.previous[interval])
         return np.asarray(np.clip(u, *self.limits), dtype=np.float64)
 
-    def commands(self, steps: int, controls: int, dof: int, variational: bool) -> Commands:
+    def commands(self, steps: int, controls: int, dof: int, variational: bool, dt: float | None = None) -> Commands:
         """The policy as the core takes it, for an integrator on (q, p) if it is ``variational``, else on (q, v).
 
+        Its intervals have :meth:`hold_at` steps, or ``hold`` where ``dt`` [s] is left out.
+
         Raises:
-            InputError: It is for another number of steps, controls or coordinates, or for the other x.
+            InputError: It is for another number of steps, controls or coordinates, for another dt, or for the other x.
         """
         if self.on is not None and variational != (self.on == "momentum"):
             raise InputError(
                 f"the policy acts on (q, {'p' if self.on == 'momentum' else 'v'}), the integrator's state is "
                 f"(q, {'p' if variational else 'v'}); Solution.policy_on(...) gives the policy on either"
             )
-        if len(self.gains) * self.hold != steps:
+        hold, intervals = self.hold if dt is None else self.hold_at(dt), len(self.gains)
+        if intervals * hold != steps:
+            finer = ""
+            if self.period is None and intervals and steps % intervals == 0 and steps > intervals * hold:
+                finer = (
+                    f". Where dt is finer than the policy's own, hold={steps // intervals} holds each control as long, "
+                    "or give LinearPolicy the period of its intervals, period= [s]"
+                )
             raise InputError(
-                f"the policy has {len(self.gains)} controls, each held over {self.hold} steps: "
-                f"for {len(self.gains) * self.hold} steps, not {steps}"
+                f"the policy has {intervals} controls, each held over {hold} steps: "
+                f"for {intervals * hold} steps, not {steps}{finer}"
             )
         if self.gains.shape[1:] != (controls, 2 * dof):
             raise InputError(f"the policy's gains must have shape (N, {controls}, {2 * dof}), got {self.gains.shape}")
@@ -200,4 +274,4 @@ class LinearPolicy(Frozen):
             gains = np.concatenate([gains, self.previous_gains], axis=2)
             reference = np.concatenate([reference, self.previous], axis=1)
         before = np.zeros((0, controls)) if self.before is None else self.before[None].copy()
-        return Commands(self.u, gains, reference, self.hold, self.limits, before)
+        return Commands(self.u, gains, reference, hold, self.limits, before)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import JointValues, checked_limits, joint_array
 from varpin.costs.base import Cost, Points, Scaled, Terminal
-from varpin.costs.residual import Residual, TaskCost
+from varpin.costs.residual import Residual, ResidualCost
 from varpin.errors import InputError
 from varpin.robot import Robot
 
@@ -35,7 +35,7 @@ class _Excess(Residual):
         return self.value(q, v), outside[:, :, None] * np.eye(y.shape[1])
 
 
-class _Barrier(TaskCost):
+class _Barrier(ResidualCost):
     limits: Floats
     in_velocity: bool
 

@@ -1,25 +1,28 @@
 """Costs: integrals over time and terms at the end, which add up.
 
 A running cost l(t, q, v, u) stands for its integral over the motion, whatever the time step; ``Terminal`` makes it a
-term at the final time. All of them are evaluated and expanded over many points at once, with NumPy, so that a cost of
-one's own needs no compiled code.
+term at the final time. All of them are evaluated and expanded over many points at once: those of joints, controls and
+frames in the core, others with NumPy, so that a cost of one's own needs no compiled code.
 """
 
 from __future__ import annotations
 
 import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, finite_array, require_finite
+from varpin.costs.terms import Terms
 from varpin.errors import InputError, VarpinError
 from varpin.frozen import Frozen
 from varpin.markup import facts
+from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 Reference = ArrayLike | Callable[[float], ArrayLike]
@@ -30,11 +33,16 @@ class CostError(VarpinError, ValueError):
 
     Attributes:
         cost: Which one, as text.
+        problem: What is wrong with it.
+        trajectory: The plant's motion so far where a controller was at work (:meth:`varpin.Mpc.run`), else None.
     """
 
-    def __init__(self, cost: str, problem: str) -> None:
+    def __init__(self, cost: str, problem: str, trajectory: Trajectory | None = None) -> None:
         self.cost = cost
-        super().__init__(f"{cost}: {problem}")
+        self.problem = problem
+        self.trajectory = trajectory
+        so_far = "" if trajectory is None else "; the plant's motion so far is in error.trajectory"
+        super().__init__(f"{cost}: {problem}{so_far}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +103,31 @@ class BoundCost(Frozen, ABC):
     @abstractmethod
     def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
         """Its expansion at q (N, n), v (N, n) and u (N, m)."""
+
+    def add_to(self, terms: Terms, factor: float) -> bool:  # noqa: ARG002
+        """Put ``factor`` times the cost among terms that the core evaluates; False if it is none of them."""
+        return False
+
+
+class CompiledCost(BoundCost):
+    """A cost that the core evaluates; whoever adds one provides ``add_to``."""
+
+    points: Points
+
+    @cached_property
+    def _alone(self) -> Terms:
+        terms = Terms(self.points.dof, self.points.controls)
+        self.add_to(terms, 1.0)
+        return terms
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """See :meth:`BoundCost.value`."""
+        total: Floats = self._alone.values(q, v, u).sum(axis=-1)
+        return total
+
+    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
+        """See :meth:`BoundCost.expand`."""
+        return Expansion(*self._alone.expand(q, v, u))
 
 
 class Cost(Frozen, ABC):
@@ -161,7 +194,7 @@ class CostSum(Cost):
         """See :attr:`Cost.terms`."""
         return self.parts
 
-    @property
+    @cached_property
     def nonnegative(self) -> bool:
         """See :attr:`Cost.nonnegative`."""
         return all(part.nonnegative for part in self.parts)
@@ -181,18 +214,37 @@ class BoundSum(BoundCost):
     parts: tuple[BoundCost, ...]
     points: Points
 
+    @cached_property
+    def _sorted(self) -> tuple[Terms, tuple[BoundCost, ...]]:
+        """The parts that the core evaluates, and the others."""
+        terms = Terms(self.points.dof, self.points.controls)
+        return terms, tuple(part for part in self._flat() if not part.add_to(terms, 1.0))
+
+    def _flat(self) -> Iterator[BoundCost]:
+        for part in self.parts:
+            if isinstance(part, BoundSum):
+                yield from part._flat()
+            else:
+                yield part
+
+    def shares(self, q: Floats, v: Floats, u: Floats) -> list[Floats]:
+        """The values of all terms, which add up: arrays (..., N, terms) and (..., N)."""
+        terms, others = self._sorted
+        return [terms.values(q, v, u), *(part.value(q, v, u) for part in others)]
+
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """See :meth:`BoundCost.value`."""
-        total = np.zeros(q.shape[:-1])
-        for part in self.parts:
-            total += part.value(q, v, u)
+        compiled, *others = self.shares(q, v, u)
+        total: Floats = compiled.sum(axis=-1)
+        for own in others:
+            total += own
         return total
 
     def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
         """See :meth:`BoundCost.expand`."""
-        gradient = np.zeros((len(q), self.points.size))
-        hessian = np.zeros((1, self.points.size, self.points.size))
-        for part in self.parts:
+        terms, others = self._sorted
+        gradient, hessian = terms.expand(q, v, u)
+        for part in others:
             own = part.expand(q, v, u)
             # A cost of one's own may be anything, and NumPy would broadcast it.
             (N, size), found = gradient.shape, (np.shape(own.gradient), np.shape(own.hessian))
@@ -242,6 +294,9 @@ class _BoundScaled(BoundCost):
     def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
         own = self.cost.expand(q, v, u)
         return Expansion(self.factor * own.gradient, self.factor * own.hessian)
+
+    def add_to(self, terms: Terms, factor: float) -> bool:
+        return self.cost.add_to(terms, self.factor * factor)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.checks import JointValues, as_floats, control_array, joint_array
-from varpin.costs.base import BoundCost, Cost, Expansion, Points, Reference, checked_weight, sample, weight_matrix
+from varpin.costs.base import (
+    BoundCost,
+    CompiledCost,
+    Cost,
+    Points,
+    Reference,
+    checked_weight,
+    sample,
+    weight_matrix,
+)
+from varpin.costs.terms import Terms
 
 Floats = NDArray[np.float64]
 
@@ -51,31 +61,20 @@ class _Quadratic(Cost):
             weight = checked_weight(name, self._named("weight", weight, points))
         if isinstance(values, Mapping):
             values = self._named("reference", values, points)
-        W = weight_matrix(name, weight, size)
-        hessian = np.zeros((1, points.size, points.size))
-        hessian[0, begin : begin + size, begin : begin + size] = 2.0 * W
         reference = sample(name, values, points, size, held=self.block == "u")
-        return _BoundQuadratic(self.block, begin, reference, W, hessian)
+        return _BoundQuadratic(begin, weight_matrix(name, weight, size), reference, points)
 
 
 @dataclass(frozen=True, eq=False)
-class _BoundQuadratic(BoundCost):
-    block: str
+class _BoundQuadratic(CompiledCost):
     begin: int
-    reference: Floats  # (N, size) or (1, size)
     weight: Floats  # (size, size)
-    hessian: Floats
+    reference: Floats  # (N, size) or (1, size)
+    points: Points
 
-    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        error = {"q": q, "v": v, "u": u}[self.block] - self.reference
-        total: Floats = np.einsum("...i,...i->...", error @ self.weight, error)
-        return total
-
-    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
-        error = {"q": q, "v": v, "u": u}[self.block] - self.reference
-        gradient = np.zeros((len(q), self.hessian.shape[1]))
-        gradient[:, self.begin : self.begin + len(self.weight)] = 2.0 * (error @ self.weight)
-        return Expansion(gradient, self.hessian)
+    def add_to(self, terms: Terms, factor: float) -> bool:
+        terms.add_entries(self.begin, factor * self.weight, self.reference)
+        return True
 
 
 class TrackingCost(_Quadratic):

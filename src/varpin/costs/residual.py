@@ -88,7 +88,18 @@ class TaskCost(Cost):
                 f"{name} is for robot {self.robot.name!r} with {self.robot.dof} coordinates; "
                 f"the problem has {points.dof}"
             )
-        return _BoundTask(self._at(points), weight_matrix(name, self.weight, self.size), points.size)
+        return self._bound(points, weight_matrix(name, self.weight, self.size))
+
+    @abstractmethod
+    def _bound(self, points: Points, weight: Floats) -> BoundCost:
+        """The cost at given points, with its weight as a matrix (r, r)."""
+
+
+class ResidualCost(TaskCost):
+    """A task cost whose residual is evaluated with NumPy."""
+
+    def _bound(self, points: Points, weight: Floats) -> BoundCost:
+        return _BoundTask(self._at(points), weight, points.size)
 
     @abstractmethod
     def _at(self, points: Points) -> Residual:

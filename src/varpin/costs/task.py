@@ -10,8 +10,10 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, positive, require_finite
-from varpin.costs.base import CostError, Points, Reference, sample
-from varpin.costs.residual import Residual, TaskCost
+from varpin.core import Subject
+from varpin.costs.base import BoundCost, CompiledCost, CostError, Points, Reference, sample
+from varpin.costs.residual import Residual, ResidualCost, TaskCost
+from varpin.costs.terms import Terms
 from varpin.errors import InputError
 from varpin.robot import Robot
 from varpin.robot.kinematics import (
@@ -19,7 +21,6 @@ from varpin.robot.kinematics import (
     FrameKinematics,
     center_of_mass,
     frame_kinematics,
-    rotation_errors,
 )
 
 Floats = NDArray[np.float64]
@@ -45,17 +46,16 @@ def _rows(x: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class _Position(Residual):
+class _BoundFrame(CompiledCost):
+    subject: Subject
     of: FrameKinematics
-    target: Floats  # (N, 3) or (1, 3)
-    columns: slice
+    weight: Floats  # (r, r)
+    target: Floats  # (N, r) or (1, r); of orientations (N, 9) or (1, 9)
+    points: Points
 
-    def value(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
-        return self.of.placements(_rows(q))[1].reshape(*q.shape[:-1], 3) - self.target
-
-    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:  # noqa: ARG002
-        _, position, J = self.of.jacobians(q)
-        return position - self.target, J[:, :3]
+    def add_to(self, terms: Terms, factor: float) -> bool:
+        terms.add_frame(self.subject, self.of, factor * self.weight, self.target)
+        return True
 
 
 class FramePositionCost(_FrameCost):
@@ -80,25 +80,9 @@ class FramePositionCost(_FrameCost):
         super().__init__(robot, frame, weight)
         self.target = target if callable(target) else as_floats("FramePositionCost target", target)
 
-    def _at(self, points: Points) -> Residual:
+    def _bound(self, points: Points, weight: Floats) -> BoundCost:
         target = sample("FramePositionCost", self.target, points, 3)
-        return _Position(self._kinematics, target, slice(0, points.dof))
-
-
-@dataclass(frozen=True, eq=False)
-class _Orientation(Residual):
-    of: FrameKinematics
-    target: Floats  # (N, 3, 3) or (1, 3, 3)
-    columns: slice
-
-    def value(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
-        R = self.of.placements(_rows(q))[0].reshape(*q.shape[:-1], 3, 3)
-        return rotation_errors(self.target, R)[0]
-
-    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:  # noqa: ARG002
-        R, _, J = self.of.jacobians(q)
-        error, turn = rotation_errors(self.target, R, derivative=True)
-        return error, turn @ np.swapaxes(R, 1, 2) @ J[:, 3:]
+        return _BoundFrame(Subject.position, self._kinematics, weight, target, points)
 
 
 class FrameOrientationCost(_FrameCost):
@@ -130,8 +114,9 @@ class FrameOrientationCost(_FrameCost):
         super().__init__(robot, frame, weight)
         self.target = target if callable(target) else as_floats("FrameOrientationCost target", target)
 
-    def _at(self, points: Points) -> Residual:
-        return _Orientation(self._kinematics, _sample_rotations(self.target, points), slice(0, points.dof))
+    def _bound(self, points: Points, weight: Floats) -> BoundCost:
+        target = _sample_rotations(self.target, points).reshape(-1, 9)
+        return _BoundFrame(Subject.orientation, self._kinematics, weight, target, points)
 
 
 def _sample_rotations(target: Floats | Callable[[float], ArrayLike], points: Points) -> Floats:
@@ -172,21 +157,6 @@ def _require_rotations(name: str, R: Floats) -> Floats:
     return R
 
 
-@dataclass(frozen=True, eq=False)
-class _Twist(Residual):
-    of: FrameKinematics
-    target: Floats  # (N, 6) or (1, 6)
-    columns: slice
-
-    def value(self, q: Floats, v: Floats) -> Floats:
-        J = self.of.jacobians(_rows(q))[2]
-        return (J @ _rows(v)[:, :, None]).reshape(*q.shape[:-1], 6) - self.target
-
-    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
-        J = self.of.jacobians(q)[2]
-        return (J @ v[:, :, None])[..., 0] - self.target, np.concatenate([self.of.motion(q).twist_in_q(v), J], axis=2)
-
-
 class FrameVelocityCost(_FrameCost):
     """weight . (J(q) v - V_r(t))^2: the velocity of a frame's origin, and its angular velocity, in world axes."""
 
@@ -208,9 +178,9 @@ class FrameVelocityCost(_FrameCost):
         super().__init__(robot, frame, weight)
         self.target = target if callable(target) else as_floats("FrameVelocityCost target", target)
 
-    def _at(self, points: Points) -> Residual:
+    def _bound(self, points: Points, weight: Floats) -> BoundCost:
         target = sample("FrameVelocityCost", self.target, points, 6)
-        return _Twist(self._kinematics, target, slice(0, 2 * points.dof))
+        return _BoundFrame(Subject.twist, self._kinematics, weight, target, points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +197,7 @@ class _Center(Residual):
         return position - self.target, J
 
 
-class CenterOfMassCost(TaskCost):
+class CenterOfMassCost(ResidualCost):
     """weight . (c(q) - c_r(t))^2 with c the centre of mass of the links that joints move."""
 
     size = 3
@@ -273,7 +243,7 @@ class _Dexterity(Residual):
         return np.maximum(0.0, lack)[:, None], np.where(lack > 0.0, -1.0, 0.0)[:, None, None] * slope[:, None, :]
 
 
-class ManipulabilityCost(_FrameCost):
+class ManipulabilityCost(_FrameCost, ResidualCost):
     """weight (least - w(q))^2 where w < least: keep away from singular configurations.
 
     w = sqrt(det(J J')) of the frame's Jacobian (Yoshikawa, "Manipulability of robotic mechanisms", 1985), zero where

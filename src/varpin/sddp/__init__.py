@@ -6,6 +6,7 @@ from varpin.sddp.history import Status as Status
 from varpin.sddp.monte_carlo import MonteCarlo as MonteCarlo
 from varpin.sddp.monte_carlo import MonteCarloInterrupted as MonteCarloInterrupted
 from varpin.sddp.problem import OptimalControlProblem as OptimalControlProblem
+from varpin.sddp.search import replan as replan
 from varpin.sddp.search import solve as solve
 from varpin.sddp.solution import Solution as Solution
 from varpin.sddp.solution import Violations as Violations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -54,6 +54,11 @@ class Plan:
         """Decrease of the expected cost with a full step, by the model."""
         # Without limits the step is the model's minimum, where the curvature takes back half of what the slope gives.
         return -self.slope - 0.5 * self.curvature if self.limited else -0.5 * self.slope
+
+    def followed(self, length: float) -> Plan:
+        """What is left of it after a step of some length, by the model: its gains, and the rest of the way."""
+        left = 1.0 - length
+        return replace(self, feedforward=left * self.feedforward, gradient=left * self.gradient)
 
     def free_gradient(self, problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
         """The gradient (R, m) without what pushes controls against limits they are at: zero at an optimum."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.costs import BoundCost, BoundSum, Expansion
+from varpin.costs import Expansion
 from varpin.integrators import Segment
 from varpin.sddp.problem import OptimalControlProblem
 from varpin.trajectory import Trajectory
@@ -18,32 +18,6 @@ Floats = NDArray[np.float64]
 _EPS = float(np.finfo(np.float64).eps)
 # Rounding errors of costs and states, in units of the last digit: functions are evaluated and steps solved with some.
 _ROUNDED = 16.0
-
-
-def shares(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
-    """What the cost of a motion is the sum of: one entry for each term at each sample.
-
-    Differences of two costs are sums of differences of shares. A constant in a cost leaves them as they are, however
-    large it is.
-    """
-    q, v, u = trajectory.q, trajectory.v, trajectory.u
-    at = problem.samples(q, v, u)
-    weight = problem.dt * problem.rule[0, 0]
-    found = [weight * part.value(*at) for part in _parts(problem.running)]
-    end = q[-1:], v[-1:], np.zeros((1, u.shape[1]))
-    found += [part.value(*end) for part in _parts(problem.terminal)]
-    if problem.rate is not None:
-        change = problem.rate.changes(u[:: problem.hold])
-        found.append(((change @ problem.rate.weight) * change).sum(axis=1) / problem.period)
-    return np.concatenate([np.zeros(0), *found])
-
-
-def _parts(cost: BoundCost) -> Iterator[BoundCost]:
-    if isinstance(cost, BoundSum):
-        for part in cost.parts:
-            yield from _parts(part)
-    else:
-        yield cost
 
 
 def spent(problem: OptimalControlProblem, parts: Sequence[Segment], whole: Trajectory) -> float:

@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from varpin.chatter import alternation
+from varpin.chatter import alternation, restlessness
 from varpin.errors import VarpinError
 from varpin.integrators.base import open_loop
+from varpin.sddp.history import Status
 from varpin.sddp.problem import OptimalControlProblem, default_integrator
 from varpin.sddp.solution import Solution
 from varpin.sddp.verification import accurate_cost, percent
-from varpin.soundness import Finding, announce, examined
+from varpin.soundness import Finding, announce, evident, examined
 
 logger = logging.getLogger(__name__)
 
@@ -23,7 +24,9 @@ PARTS = 4
 LOSS, GAIN = 1e-3, 1e-2
 # Findings about single steps; what they come to over a whole plan, playing it again tells.
 _OF_STEPS = ("coarse steps", "fast damping", "split steps")
-_ALTERNATION = "alternating velocities"
+# Of its cost, what a search that stalls may still promise without a word.
+_LITTLE = 1e-3
+_ALTERNATION, _RESTLESS = "alternating velocities", "restless velocities"
 
 
 @dataclass(frozen=True)
@@ -61,11 +64,11 @@ def looked_at(solution: Solution) -> Solution:
 
 
 def findings(solution: Solution) -> tuple[Finding, ...]:
-    """What is to be said of a plan: its energy, alternating velocities, and what the robot makes of it."""
+    """What is to be said of a plan: its energy, its velocities if they are restless, and what the robot makes of it."""
     problem, motion = solution.problem, solution.trajectory
     _, found = examined(problem.scene, problem.integrator, motion)
     told = [finding for finding in found if finding.kind not in (*_OF_STEPS, _ALTERNATION)]
-    told += _alternating(solution)
+    told += _unfinished(solution) + (_alternating(solution) or _restless(solution))
     try:
         replay = replayed(solution)
     except VarpinError as error:
@@ -74,7 +77,10 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
     if replay.holds:
         return tuple(told)
     told.append(Finding("replay", _sentence(problem, replay)))
-    return *told, *(finding for finding in found if finding.kind in _OF_STEPS)
+    reasons = [finding for finding in found if finding.kind in _OF_STEPS]
+    # What is no fault of the motion may be one of the plan.
+    record = evident(problem.scene, problem.integrator, motion)
+    return *told, *(reasons or [finding for finding in record if finding.kind in _OF_STEPS])
 
 
 def replayed(solution: Solution) -> Replay:
@@ -119,6 +125,38 @@ def _alternating(solution: Solution) -> list[Finding]:
             _ALTERNATION,
             f"the velocity of {name} alternates from step to step, {found.changes} times in a row from "
             f"t = {motion.t[found.first]:.4g} s on: {why}",
+        )
+    ]
+
+
+def _unfinished(solution: Solution) -> list[Finding]:
+    """Says if the search ended without a plan that it could call the best."""
+    history = solution.history
+    if solution.status not in (Status.STALLED, Status.INDEFINITE, Status.NOT_DIFFERENTIABLE) or not history:
+        return []
+    promised = history[-1].promised_decrease
+    # What promises next to nothing is as good as the best.
+    if solution.status is Status.STALLED and promised <= _LITTLE * abs(solution.cost):
+        return []
+    return [Finding("not converged", solution.reason)]
+
+
+def _restless(solution: Solution) -> list[Finding]:
+    """Says if a velocity goes up and down all the time: what costs hardly weigh, an optimum makes use of."""
+    problem = solution.problem
+    # Between decisions a velocity does what held controls leave it to.
+    decided = solution.trajectory.v[:: problem.hold]
+    found = restlessness(decided)
+    if found is None:
+        return []
+    name = problem.scene.robot.joint_names[found.joint]
+    return [
+        Finding(
+            _RESTLESS,
+            f"the velocity of {name} goes up and down {found.changes} times in {len(decided) - 1} decisions: where "
+            "the task does not ask for it, the cost hardly weighs it; a running VelocityCost, even a small one, calms "
+            "it",
+            found.joint,
         )
     ]
 

@@ -22,7 +22,6 @@ from varpin.ensemble import (
     greater,
     looked_at,
     looked_at_here,
-    said,
     simulate_paths,
     without_geometry,
 )
@@ -30,7 +29,7 @@ from varpin.errors import VarpinError
 from varpin.executors import executing, in_order
 from varpin.frozen import Frozen
 from varpin.loop_stability import examined_in_loop
-from varpin.markup import facts
+from varpin.markup import facts, said
 from varpin.policy import LinearPolicy
 from varpin.sddp.problem import OptimalControlProblem
 from varpin.sddp.verification import excess, percent
@@ -229,7 +228,9 @@ def _look_alone(given: _Alone) -> tuple[Finding, ...]:
     """What is to be said of the first path."""
     (child,) = given.seeds.generators(given.path, given.path + 1)
     motion = given.problem.simulate(given.policy, rng=child)
-    _, found = examined_in_loop(given.problem.scene, given.problem.integrator, motion, given.policy.hold)
+    _, found = examined_in_loop(
+        given.problem.scene, given.problem.integrator, motion, given.policy.hold_at(given.problem.dt)
+    )
     return tuple(Finding(finding.kind, f"path {given.path}: {finding.sentence}") for finding in found)
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.checks import JointValues, checked_limits, control_array, count, is_one_of, joint_array, positive, real
+from varpin.checks import JointValues, count, is_one_of, joint_array, named_limits, positive, real
+from varpin.core import sample_steps
 from varpin.costs import (
     BoundSum,
     ControlRate,
@@ -149,7 +149,7 @@ class OptimalControlProblem(Frozen):
             "sampling": sampling,
             "hold": hold,
             "t0": t0,
-            "control_limits": _limits(scene, control_limits),
+            "control_limits": named_limits("control_limits", control_limits, scene.control_joints, scene.controls),
             "running": running,
             "terminal": terminal,
             "rule": rule,
@@ -244,9 +244,11 @@ class OptimalControlProblem(Frozen):
             mine, theirs = getattr(self, name), getattr(other, name)
             if not np.array_equal(mine, theirs):
                 return f"{name} = {theirs}, not {mine}"
-        for name in ("gravity", "damping", "stiffness", "rest", "actuation"):
+        for name in ("gravity", "damping", "stiffness", "rest", "armature", "actuation"):
             if not np.array_equal(getattr(self.scene, name), getattr(other.scene, name)):
                 return f"another {name}"
+        if sorted(self.scene.elements) != sorted(other.scene.elements):
+            return "other forces"
         return ""
 
     @property
@@ -256,7 +258,7 @@ class OptimalControlProblem(Frozen):
 
     def holding_controls(self) -> Floats:
         """The constant control (m,) that comes closest to holding the robot at q0 at rest, within its limits."""
-        u = closest_controls(self.scene, self.scene.holding_torque(self.q0))
+        u = closest_controls(self.scene, self.q0)
         return np.asarray(np.clip(u, *self.control_limits), dtype=np.float64)
 
     def holding_policy(self) -> LinearPolicy:
@@ -281,6 +283,9 @@ class OptimalControlProblem(Frozen):
             hold=self.hold,
             on="momentum" if self.integrator.variational else "velocity",
             limits=(self.control_limits[0], self.control_limits[1]),
+            period=self.period,
+            joints=self.scene.control_joints,
+            servos=self.scene.servo_joints,
         )
 
     def samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
@@ -288,14 +293,9 @@ class OptimalControlProblem(Frozen):
 
         q and v (..., N s, n) and u (..., N s, m), from q and v at the nodes (..., N + 1, n) and u (..., N, m).
         """
-        nodes = q[..., :-1, :], v[..., :-1, :], q[..., 1:, :], v[..., 1:, :]
-        at = []
-        for begin in (1, 5):
-            rows = [
-                sum(row[begin + c] * node for c, node in enumerate(nodes) if row[begin + c] != 0.0) for row in self.rule
-            ]
-            at.append(rows[0] if len(rows) == 1 else np.stack(rows, axis=-2).reshape(*u.shape[:-2], -1, q.shape[-1]))
-        return at[0], at[1], u if len(self.rule) == 1 else np.repeat(u, len(self.rule), axis=-2)
+        motions = (x.reshape(-1, *x.shape[-2:]) for x in (q, v))
+        at_q, at_v = (x.reshape(*q.shape[:-2], *x.shape[-2:]) for x in sample_steps(self.rule, *motions))
+        return at_q, at_v, u if len(self.rule) == 1 else np.repeat(u, len(self.rule), axis=-2)
 
     def costs(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """The cost (...) of motions without their noise terms: q and v (..., N + 1, n), u (..., N, m)."""
@@ -319,7 +319,23 @@ class OptimalControlProblem(Frozen):
                 f"the motion has {trajectory.steps} steps of {trajectory.dt:g} s; "
                 f"the problem {self.steps} of {self.dt:g} s"
             )
-        return float(self.costs(trajectory.q, trajectory.v, trajectory.u))
+        return float(self.shares(trajectory).sum())
+
+    def shares(self, trajectory: Trajectory) -> Floats:
+        """What the cost of a motion is the sum of: one entry for each term at each sample.
+
+        Differences of two costs are sums of differences of shares. A constant in a cost leaves them as they are,
+        however large it is.
+        """
+        q, v, u = trajectory.q, trajectory.v, trajectory.u
+        weight = self.dt * self.rule[0, 0]
+        end = q[-1:], v[-1:], np.zeros((1, u.shape[1]))
+        found = [weight * values.ravel() for values in self.running.shares(*self.samples(q, v, u))]
+        found += [values.ravel() for values in self.terminal.shares(*end)]
+        if self.rate is not None:
+            change = self.rate.changes(u[:: self.hold])
+            found.append(((change @ self.rate.weight) * change).sum(axis=1) / self.period)
+        return np.concatenate(found)
 
     def simulate(
         self, controls: JointValues | LinearPolicy | OpenLoop, *, rng: np.random.Generator | int | None = None
@@ -338,7 +354,8 @@ class OptimalControlProblem(Frozen):
             steps=self.steps,
             controls=controls,
             integrator=self.integrator,
-            rng=rng,
+            rng=rng if self.scene.processes else None,
+            increments=0.0 if rng is None else None,
             check=False,
         )
 
@@ -349,19 +366,6 @@ class OptimalControlProblem(Frozen):
     def expand_terminal(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""
         return self.terminal.expand(trajectory.q[-1:], trajectory.v[-1:], np.zeros((1, self.scene.controls)))
-
-
-def _limits(scene: Scene, limits: tuple[JointValues, JointValues] | None) -> Floats:
-    """Limits of controls (2, m), of which a side may be by joint name."""
-    sides: Any = limits
-    if isinstance(limits, tuple | list) and len(limits) == 2:
-        sides = tuple(
-            control_array(f"control_limits: {side}", value, scene.control_joints, absent=none, read=real)
-            if isinstance(value, Mapping)
-            else value
-            for side, value, none in zip(("lower", "upper"), limits, (-np.inf, np.inf), strict=True)
-        )
-    return checked_limits("control_limits", sides, scene.controls)
 
 
 def default_integrator() -> Gauss:

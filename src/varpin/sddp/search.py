@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, is_dataclass, replace
 from typing import Literal
 
@@ -32,7 +32,7 @@ from varpin.integrators.variational import Variational
 from varpin.noise import NoiseFieldError
 from varpin.policy import LinearPolicy
 from varpin.sddp.backward import Plan, backward, noise_shares
-from varpin.sddp.descent import Stake, at_stake, rounding, shares, spent
+from varpin.sddp.descent import Stake, at_stake, rounding, spent
 from varpin.sddp.examination import looked_at
 from varpin.sddp.history import Iteration, SearchState, Status
 from varpin.sddp.problem import OptimalControlProblem
@@ -46,6 +46,8 @@ Progress = Callable[[int, int], None]
 
 logger = logging.getLogger(__name__)
 
+# What a step must keep of the promised slope, and the factor between trials.
+ARMIJO, BACKTRACKING = 1e-5, 0.25
 # The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it shrinks after
 # long steps and grows after short ones.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
@@ -78,8 +80,8 @@ def solve(
     max_iterations: int = 100,
     second_order: bool = False,
     forward: Literal["closed", "open"] = "closed",
-    armijo: float = 1e-5,
-    backtracking: float = 0.25,
+    armijo: float = ARMIJO,
+    backtracking: float = BACKTRACKING,
     regularization: float = 0.0,
     time_limit: float = np.inf,
     callback: Callback | None = None,
@@ -134,8 +136,9 @@ def solve(
         resume: A solution of this very problem, as solve returned it or as read from a file: the search goes on where
             it stopped, for at most ``max_iterations`` more, as if it had not been interrupted. Give the other options
             as before; ``regularization`` goes on by itself.
-        check: Look at the finished plan, whether it costs in finer steps what it promises and its velocities do not
-            alternate, for ``Solution.warnings`` and the log. It takes as long as some motions of the search.
+        check: Look at the finished plan, whether it costs in finer steps what it promises and its velocities neither
+            alternate nor go up and down all the time, for ``Solution.warnings`` and the log. It takes as long as some
+            motions of the search.
 
     Returns:
         The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers, and
@@ -185,6 +188,23 @@ def solve(
     return looked_at(solution) if check else solution
 
 
+def replan(
+    problem: OptimalControlProblem, start: LinearPolicy, *, tolerance: float, max_iterations: int, time_limit: float
+) -> Solution:
+    """A plan from the policy of the one before, with one backward pass for each iteration: a controller's tick.
+
+    Where iterations or time end the search, gains are those that its last step followed, and are not made anew for the
+    motion that came of it. Nobody looks at the finished plan. Arguments and errors are those of :func:`solve`.
+    """
+    search = _Search(problem, second_order=False, anew=False)
+    search.begin(_first_commands(problem, start))
+    try:
+        status = search.run(tolerance, max_iterations, time.perf_counter() + time_limit, lambda _: None)
+    except KeyboardInterrupt:
+        status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
+    return search.solution(status)
+
+
 def _first_commands(problem: OptimalControlProblem, controls: JointValues | LinearPolicy | Solution | None) -> Commands:
     R, m = problem.decisions, problem.scene.controls
     variational = problem.integrator.variational
@@ -193,9 +213,9 @@ def _first_commands(problem: OptimalControlProblem, controls: JointValues | Line
     if controls is None:
         controls = problem.holding_policy()
     if isinstance(controls, LinearPolicy):
-        if controls.hold != problem.hold:
-            raise InputError(f"the policy holds its controls over {controls.hold} steps, the problem {problem.hold}")
-        commands = controls.commands(problem.steps, m, problem.scene.robot.dof, variational)
+        if (hold := controls.hold_at(problem.dt)) != problem.hold:
+            raise InputError(f"the policy holds its controls over {hold} steps, the problem {problem.hold}")
+        commands = controls.commands(problem.steps, m, problem.scene.robot.dof, variational, problem.dt)
         narrowed = np.clip(commands.limits, *problem.control_limits)
         narrowed.setflags(write=False)
         if problem.rate is not None and problem.rate.before is not None:
@@ -303,10 +323,12 @@ class _Search:
         self,
         problem: OptimalControlProblem,
         second_order: bool,
-        forward: str,
-        armijo: float,
-        backtracking: float,
-        regularization: float,
+        forward: str = "closed",
+        armijo: float = ARMIJO,
+        backtracking: float = BACKTRACKING,
+        regularization: float = 0.0,
+        *,
+        anew: bool = True,
     ) -> None:
         self.problem, self.second_order, self.forward = problem, second_order, forward
         self.armijo, self.backtracking, self.regularization = armijo, backtracking, regularization
@@ -326,8 +348,11 @@ class _Search:
         self.above = 0.0  # what the trajectory costs more than the best one, without noise
         self.bounded = True  # whether trials are given up for their parts
         self.cut = False  # whether one was
+        self.cutting: dict[int, Integrator] = {}  # the integrator with fewer halvings
         self.gains: list[float] = []  # by how much each iteration lowered the least expected cost
         self.reason = ""
+        self.anew = anew  # whether a plan is made for the last motion, too
+        self.followed = 0.0  # the length of the last step, if none was
         self.steered = _steered(problem)
 
     def begin(self, commands: Commands) -> None:
@@ -335,15 +360,15 @@ class _Search:
         if failure is not None:
             raise StepFailure(trajectory.steps, trajectory.t[-1], failure, trajectory)
         self.trajectory = trajectory
-        self.cost = self.problem.cost_of(trajectory)
+        self.shares = self.problem.shares(trajectory)
+        self.cost = float(self.shares.sum())
         if not np.isfinite(self.cost):
             raise CostError(repr(self.problem.cost), f"the cost of the first motion is {self.cost}")
-        self.shares = shares(self.problem, trajectory)
 
     def resume(self, state: SearchState) -> None:
         """Stand where ``state`` was taken."""
         self.trajectory, self.cost, self.above, self.first = state.trajectory, state.cost, state.above, state.first
-        self.shares = shares(self.problem, state.trajectory)
+        self.shares = self.problem.shares(state.trajectory)
         self.gains, self.history = list(state.gains), list(state.history)
         self.best, self.best_cost, self.best_noise = state.best, state.best_cost, state.best_noise
         self.regularization, self.growth = state.regularization, state.growth
@@ -406,6 +431,11 @@ class _Search:
             if step.length == 0.0 and self._keeps_no_promise_above(step.hidden):
                 self.reason = f"{self._promised()}, and rounding hides {step.hidden:.1e} of the cost"
                 return Status.CONVERGED
+            ended = self._out_of(last, deadline)
+            if not self.anew and step.length > 0.0 and ended is not None:
+                self.followed = step.length
+                self.reason = f"{self._promised()} before the last step"
+                return ended
             if step.length >= _LONG:
                 self._relax()
             elif step.length <= _SHORT and not self._stiffen() and not self._lift():
@@ -451,12 +481,18 @@ class _Search:
     def _ended(self, plan: Plan, tolerance: float, last: int, deadline: float) -> tuple[Status | None, str]:
         """How a search ends that has not converged, if it does, and the reason."""
         if len(self.history) >= last:
-            return Status.MAX_ITERATIONS, ""
+            return self._out_of(last, deadline), ""
         if len(self.gains) > _PATIENCE:
             recent = sum(self.gains[-_PATIENCE:])
             if recent <= self._share(plan, tolerance):
                 return Status.STALLED, f"{_PATIENCE} iterations have lowered the expected cost by {recent:.1e}; "
-        return (Status.OUT_OF_TIME if time.perf_counter() > deadline else None), ""
+        return self._out_of(last, deadline), ""
+
+    def _out_of(self, last: int, deadline: float) -> Status | None:
+        """Whether iterations or time end the search."""
+        if len(self.history) >= last:
+            return Status.MAX_ITERATIONS
+        return Status.OUT_OF_TIME if time.perf_counter() > deadline else None
 
     def _keeps_no_promise_above(self, bound: float) -> bool:
         """Whether the model promises no more than ``bound``; the plan is then one that can be trusted with that.
@@ -581,29 +617,27 @@ class _Search:
         hidden = 0.0
         if taken.motion is not None and taken.shares is not None:
             self.trajectory, self.shares = taken.motion, taken.shares
-            self.cost = self.problem.cost_of(taken.motion)
+            self.cost = float(taken.shares.sum())
             self.above += taken.cost
         elif tried is not None:
             hidden = rounding(self.problem, self.trajectory, self.shares, tried, self.plan.model)
         return _Step(length, trials, -taken.expected if length > 0.0 else 0.0, hidden)
 
-    def _bounds(self) -> list[_Bounds]:
+    def _bounds(self) -> Iterator[_Bounds]:
         """What trials may take, one after another while nothing else helps."""
         integrator = self.problem.integrator
         guard = integrator.guard if isinstance(integrator, Variational) else None
         if not (self.bounded and guard is not None and is_dataclass(integrator)):
-            return [_Bounds(integrator, np.inf, watched=False)]
+            yield _Bounds(integrator, np.inf, watched=False)
+            return
         # As many parts as a step of the motion so far has take fewer halvings of halves.
         few = max(_HALVINGS, int(self.trajectory.statistics.substeps.max()) - 1)
-        first, second = (
-            replace(integrator, guard=replace(guard, max_halvings=min(halvings, guard.max_halvings)))
-            for halvings in (few, few + _MORE_HALVINGS)
-        )
-        return [
-            _Bounds(first, _PARTS, watched=few > _HALVINGS),
-            _Bounds(second, _PARTS**2, watched=True),
-            _Bounds(integrator, np.inf, watched=True),
-        ]
+        for halvings, parts in ((few, _PARTS), (few + _MORE_HALVINGS, _PARTS**2)):
+            if halvings not in self.cutting:
+                own = replace(guard, max_halvings=min(halvings, guard.max_halvings))
+                self.cutting[halvings] = replace(integrator, guard=own)
+            yield _Bounds(self.cutting[halvings], parts, watched=halvings > _HALVINGS)
+        yield _Bounds(integrator, np.inf, watched=True)
 
     def _try(self, step: float, added: Floats, bounds: _Bounds) -> _Trial:
         """A motion so far along the plan, given up where it is cut to pieces or too dear already."""
@@ -630,7 +664,7 @@ class _Search:
                 # Whatever makes a step of few halvings fail, more may mend.
                 few = bounds.integrator != problem.integrator
                 return _Trial(cut=failure.reason == _CUT or (few and failure.reason != _DEAR))
-            there, noise = shares(problem, moved), noise_shares(problem, moved, plan)
+            there, noise = problem.shares(moved), noise_shares(problem, moved, plan)
         except _LOST as error:
             logger.info("trial of length %g: %s", step, error)
             return _Trial()
@@ -665,7 +699,9 @@ class _Search:
 
     def solution(self, status: Status) -> Solution:
         problem, plan = self.problem, self.plan
-        if status is not Status.CONVERGED:
+        if plan is not None and self.followed > 0.0:
+            plan = plan.followed(self.followed)
+        elif status is not Status.CONVERGED:
             # With noise the fixed point of the search is not the minimum of the expected cost, and the last motion not
             # always the best; nor does the last plan belong to it, or hold without its regularization.
             plan = self._last_plan()

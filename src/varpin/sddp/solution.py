@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from varpin.checks import count, is_one_of, positive
+from varpin.checks import JointValues, count, is_one_of, positive
 from varpin.costs import barriers_of
 from varpin.errors import InputError
 from varpin.frozen import Frozen
 from varpin.linearization import velocity_at_nodes
-from varpin.markup import facts, folded, listed, table
+from varpin.markup import facts, folded, listed, said, table
 from varpin.policy import LinearPolicy
 from varpin.sddp.history import Iteration, SearchState, Status
 from varpin.sddp.monte_carlo import MonteCarlo, monte_carlo
@@ -92,7 +92,8 @@ class Solution(Frozen):
         history: One entry for each iteration.
         search: From where :func:`varpin.solve` can go on, with ``resume``.
         warnings: What looks wrong with the plan, in sentences that say what to change: it costs more than planned when
-            its steps are taken in quarters, its velocities alternate, its energy balance does not close.
+            its steps are taken in quarters, its velocities alternate or go up and down all the time, its energy balance
+            does not close.
     """
 
     problem: OptimalControlProblem
@@ -147,8 +148,8 @@ class Solution(Frozen):
 
     def __repr__(self) -> str:
         noise = f" + {self.noise_cost:.4g} by noise" if self.noise_cost else ""
-        warned = f", {len(self.warnings)} warnings" if self.warnings else ""
-        return f"Solution(cost {self.cost:.6g}{noise}, {self.iterations} iterations, {self.status.value}{warned})"
+        ended = f"{self.iterations} iterations, {self.status.value}{said(self.warnings)}"
+        return f"Solution(cost {self.cost:.6g}{noise}, {ended})"
 
     def __str__(self) -> str:
         return "\n".join([repr(self), *(f"warning: {sentence}" for sentence in self.warnings)])
@@ -209,10 +210,10 @@ class Solution(Frozen):
             raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
         return cls(**read(path, problem))
 
-    def shifted(self, decisions: int, before: ArrayLike | None = None) -> LinearPolicy:
+    def shifted(self, decisions: int, before: JointValues | None = None) -> LinearPolicy:
         """The policy from a later decision on, its last row repeated: what to start the next horizon with.
 
-        ``before`` is the control (m,) that has acted before that decision; left out, the plan's own.
+        ``before`` is the control, (m,) or by joint name, that has acted before that decision; left out, the plan's own.
 
         Raises:
             InputError: Not from 0 to R - 1, or a control of a wrong shape.
@@ -235,10 +236,15 @@ class Solution(Frozen):
             previous_gains=previous_gains,
             previous=previous,
             before=before,
+            period=own.period,
+            joints=own.joints,
+            servos=own.servos,
         )
 
     def policy_on(self, x: Literal["momentum", "velocity"], substeps: int = 1) -> LinearPolicy:
         """The policy on (q, p) or on (q, v), each control held over ``substeps`` times as many steps.
+
+        A simulation finds out itself over how many steps of its dt a control is held.
 
         Where x is not that of the problem's integrator, dp = L_vq dq + M dv turns the gains around, to first order.
 
@@ -270,6 +276,9 @@ class Solution(Frozen):
             (limits[0], limits[1]),
             previous_gains=self.previous_gains,
             before=None if rate is None else rate.before,
+            period=self.problem.period,
+            joints=self.problem.scene.control_joints,
+            servos=self.problem.scene.servo_joints,
         )
 
     def verify(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +13,19 @@ from numpy.typing import NDArray
 
 from varpin.checks import path_like
 from varpin.errors import FileError
+from varpin.integrators.variational import Variational
 from varpin.robot import Robot
+from varpin.scene import same
 from varpin.sddp.history import Iteration, SearchState, Status
 from varpin.sddp.problem import OptimalControlProblem
-from varpin.trajectory import MEMBERS, Trajectory, atomic_file, read_members, require_layout
+from varpin.trajectory import MEMBERS, OPTIONAL, Trajectory, atomic_file, read_members, require_layout
 
 Floats = NDArray[np.float64]
 
-_FORMAT = "varpin.solution/1"
+_FORMAT = "varpin.solution/2"
 _PLAN = ("gains", "feedforward", "gradient")
 _NUMBERS = ("cost", "noise_cost")
 _PROBLEM = ("q0", "v0", "t0", "steps", "hold", "sampling", "control_limits")
-_SURROUNDINGS = ("gravity", "damping", "stiffness", "rest", "actuation")
 _SEARCH = ("cost", "above", "first", "best_cost", "best_noise", "regularization", "growth")
 _FLAGS = ("bounded", "cut")
 _COLUMNS = tuple(item.name for item in fields(Iteration))
@@ -48,7 +49,9 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
     for prefix, motion in motions.items():
         members[f"{prefix}motion"] = kept.setdefault(id(motion), prefix)
         if kept[id(motion)] == prefix:
-            members |= {f"{prefix}{name}": value for name, value in motion.members().items()}
+            # The problem's scene is all of theirs, and is there once.
+            own = replace(motion, scene_values={}).members()
+            members |= {f"{prefix}{name}": value for name, value in own.items()}
     members |= {name: solution[name] for name in (*_PLAN, *_NUMBERS)}
     if solution["previous_gains"] is not None:
         members["previous_gains"] = solution["previous_gains"]
@@ -82,21 +85,29 @@ def solution_trajectory(path: str | os.PathLike[str], robot: Robot | None = None
         FileError: As :meth:`Trajectory.load`.
     """
     source = path_like("path", path)
-    members = read_members(source, _FORMAT, MEMBERS, check=lambda headers: require_layout(source, headers))
+    members = read_members(
+        source, _FORMAT, MEMBERS, optional=OPTIONAL, check=lambda headers: require_layout(source, headers)
+    )
     return Trajectory.of_members(source, members, robot)
 
 
 def _most_bytes(problem: OptimalControlProblem) -> int:
-    """More than the file of any solution unpacks to: three motions, the plan, and some megabytes for all else."""
+    """More than the file of any solution unpacks to: three motions, the plan, and some megabytes for all else.
+
+    A byte for each part of a step comes to no more than the guard's halvings allow.
+    """
     n, m, k = problem.scene.robot.dof, problem.scene.controls, problem.scene.processes
     own = sum(array.nbytes for array in _surroundings(problem).values())
     numbers = 3 * (problem.steps + 1) * (3 * n + m + k + 16) + problem.decisions * m * (2 * n + m + 2)
-    return 8 * numbers + own + 16_000_000
+    guard = problem.integrator.guard if isinstance(problem.integrator, Variational) else None
+    parts = 0 if guard is None else 3 * problem.steps << guard.max_halvings
+    return 8 * numbers + parts + own + 16_000_000
 
 
 def _surroundings(problem: OptimalControlProblem) -> dict[str, Floats]:
     """What of a problem's scene tells it from others; of a noise that only Python can evaluate nothing but its size."""
-    arrays = {f"scene.{name}": getattr(problem.scene, name) for name in _SURROUNDINGS}
+    values = problem.scene.values
+    arrays = {f"scene.{name}": array for name, array in values.items() if not name.startswith("noise.")}
     fields_of_noise = problem.scene.diffusion._asdict()
     return arrays | {f"noise.{name}": array for name, array in fields_of_noise.items()}
 
@@ -126,9 +137,14 @@ class _Reader:
                 f"{self.source} is of a problem with integrator {members.get('problem.integrator')}, not {own}"
             )
 
-        for name, array in _surroundings(problem).items():
-            found = members.get(name)
-            if found is None or found.dtype != array.dtype or not np.array_equal(found, array, equal_nan=True):
+        self._check_arrays("noise.")
+
+    def _check_arrays(self, kind: str) -> None:
+        for name, array in _surroundings(self.problem).items():
+            if not name.startswith(kind):
+                continue
+            found = self.members.get(name)
+            if found is None or found.dtype != array.dtype or not same(found, array):
                 raise FileError(f"{self.source} is of a problem with another {name.replace('.', ' ')}")
 
     def array(self, name: str, shape: tuple[int, ...], *, finite: bool = True) -> Floats:
@@ -155,7 +171,7 @@ class _Reader:
                 f"{self.source}: its motion has {found[0]} steps, {found[1]} controls and {found[2]} noise processes; "
                 f"the problem has {self.problem.steps}, {scene.controls} and {scene.processes}"
             )
-        return motion
+        return replace(motion, scene_values=scene.values)
 
     def count(self, name: str, most: int) -> int:
         """A member that is a whole number from 0 to ``most``."""
@@ -183,6 +199,8 @@ class _Reader:
         if status not in Status.__members__:
             raise FileError(f"{self.source}: there is no status {status!r}")
         motions = {"": self.motion("")}
+        # Motions of another robot say so by its weight.
+        self._check_arrays("scene.")
         history = self.history()
         cost = float(self.array("cost", ()))
         found = problem.cost_of(motions[""])

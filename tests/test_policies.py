@@ -1,0 +1,119 @@
+"""Policies at steps of their own and at finer ones, and what of controls goes by joint name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import varpin as vp
+
+CHAIN = vp.planar_chain(2)
+SCENE = vp.Scene(CHAIN, damping=0.1)
+Q0 = [0.3, -0.2]
+REST = [0.0, 0.0]
+INTERVALS, PERIOD = 10, 0.02
+
+
+def policy(**options):
+    rng = np.random.default_rng(0)
+    gains = -np.tile(np.hstack([2.0 * np.eye(2), 0.5 * np.eye(2)]), (INTERVALS, 1, 1))
+    return vp.LinearPolicy(
+        rng.normal(size=(INTERVALS, 2)), gains, np.zeros((INTERVALS, 4)), on="velocity", **{"period": PERIOD} | options
+    )
+
+
+def run(given, dt, steps, **options):
+    return vp.simulate(SCENE, Q0, REST, dt=dt, steps=steps, controls=given, integrator=vp.RungeKutta4(), **options)
+
+
+@pytest.mark.parametrize("finer", [1, 2, 7])
+def test_a_policy_with_a_period_is_held_over_finer_steps(finer):
+    """By hand: each control from the state that its period begins with, in an open loop."""
+    given, dt = policy(), PERIOD / finer
+    motion = run(given, dt, INTERVALS * finer)
+    np.testing.assert_array_equal(np.ptp(motion.u.reshape(INTERVALS, finer, 2), axis=1), 0.0)
+    for k in range(INTERVALS):
+        x = np.concatenate([motion.q[finer * k], motion.v[finer * k]])
+        np.testing.assert_allclose(motion.u[finer * k], given.control(k, x), rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(motion.q, run(policy(hold=finer, period=None), dt, INTERVALS * finer).q)
+    np.testing.assert_allclose(run(motion.u, dt, INTERVALS * finer).q, motion.q, rtol=0.0, atol=1e-13)
+
+
+def test_ensembles_hold_it_alike():
+    motion = run(policy(), PERIOD / 4, 4 * INTERVALS)
+    paths = vp.simulate_ensemble(
+        SCENE, [Q0, Q0], REST, dt=PERIOD / 4, steps=4 * INTERVALS, paths=2, rng=0, controls=policy(),
+        integrator=vp.RungeKutta4(),
+    )  # fmt: skip
+    np.testing.assert_array_equal(paths.u[1], motion.u)
+
+
+def test_a_plan_runs_at_finer_steps_as_it_is():
+    cost = vp.VelocityCost(0.1) + vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost([0.5, 0.2], 10.0))
+    problem = vp.OptimalControlProblem(SCENE, cost, Q0, REST, dt=0.01, steps=20, hold=2)
+    plan = vp.solve(problem)
+    assert plan.policy.period == 0.02
+    finer = vp.simulate(SCENE, Q0, REST, dt=0.0025, steps=80, controls=plan.policy, integrator=vp.Gauss(4))
+    np.testing.assert_allclose(finer.q[::4], plan.trajectory.q, atol=1e-7)
+    for same in (plan.policy.without_feedback(), plan.shifted(1), problem.holding_policy(), plan.policy_on("velocity")):
+        assert (same.period, same.joints) == (0.02, CHAIN.joint_names)
+
+
+def test_steps_that_do_not_fit_are_refused_with_what_does():
+    with pytest.raises(vp.InputError, match=r"decides every 0\.02 s, and dt = 0\.003 s does not .* 0\.00285714 s does"):
+        run(policy(), 0.003, 70)
+    # As many steps as it has intervals, but longer ones: nothing told of it before.
+    with pytest.raises(vp.InputError, match=r"dt = 0\.04 s does not go into that: dt = 0\.02 s does"):
+        run(policy(), 0.04, INTERVALS)
+    with pytest.raises(vp.InputError, match="each held over 2 steps: for 20 steps, not 10"):
+        run(policy(), 0.01, 10)
+    with pytest.raises(vp.InputError, match=r"hold=3 holds each control as long, .* period= \[s\]"):
+        run(policy(period=None), 0.01, 3 * INTERVALS)
+    with pytest.raises(vp.InputError, match="period must be positive"):
+        policy(period=0.0)
+
+
+def test_laws_and_functions_of_time_may_answer_by_joint_name():
+    def pull(t):
+        return {"joint2": 2.0 * np.cos(t)}
+
+    rows = np.array([[0.0, 2.0 * np.cos((k + 0.5) * 0.01)] for k in range(8)])
+    options = {"dt": 0.01, "steps": 8}
+    np.testing.assert_array_equal(vp.simulate(SCENE, Q0, REST, controls=vp.OpenLoop(pull), **options).u, rows)
+    law = vp.simulate(SCENE, Q0, REST, controls=lambda t, q, v: {"joint1": -q[0]}, **options)
+    np.testing.assert_array_equal(law.u, np.column_stack([-law.q[:-1, 0], np.zeros(8)]))
+    paths = vp.simulate_ensemble(SCENE, Q0, REST, controls=vp.OpenLoop(pull), paths=1, rng=0, **options)
+    np.testing.assert_array_equal(paths.u[0], rows)
+    with pytest.raises(vp.ControlError, match=r"no control is the force of a joint 'join2'; did you mean 'joint2'"):
+        vp.simulate(SCENE, Q0, REST, controls=vp.OpenLoop(lambda t: {"join2": t}), **options)
+    geared = vp.Scene(CHAIN, actuation=2.0 * np.eye(2))
+    with pytest.raises(vp.ControlError, match="given by joint name, but not every control"):
+        vp.simulate(geared, Q0, REST, controls=vp.OpenLoop(pull), **options)
+
+
+def test_limits_of_policies_by_name():
+    named = policy(limits=({"joint2": -0.5}, {"joint2": 0.5, "joint1": 1.0}), joints=SCENE.control_joints)
+    np.testing.assert_array_equal(named.limits, [[-np.inf, -0.5], [1.0, 0.5]])
+    given = policy(limits=([-np.inf, -0.5], [1.0, 0.5]))
+    np.testing.assert_array_equal(run(named, PERIOD, INTERVALS).q, run(given, PERIOD, INTERVALS).q)
+    with pytest.raises(vp.InputError, match=r"joints=scene\.control_joints"):
+        policy(limits=({"joint2": -0.5}, 1.0))
+    with pytest.raises(vp.UnknownJoint, match="did you mean 'joint2'"):
+        policy(limits=({"join2": -0.5}, 1.0), joints=SCENE.control_joints)
+    with pytest.raises(vp.InputError, match="joints must name the joint of each of the 2 controls"):
+        policy(joints=["joint1"])
+    swapped = policy(joints=["joint2", "joint1"])
+    with pytest.raises(vp.InputError, match="controls are of joints joint2, joint1; the scene's of joint1"):
+        run(swapped, PERIOD, INTERVALS)
+
+
+def test_the_control_before_a_plan_by_name():
+    cost = vp.ControlCost(0.1) + vp.ControlRateCost(1e-2) + vp.Terminal(vp.TrackingCost([0.5, 0.2], 10.0))
+    mpc = vp.Mpc(vp.OptimalControlProblem(SCENE, cost, Q0, REST, dt=0.02, steps=8))
+    for previous in (None, mpc.plan(0.0, Q0, REST)):
+        named = mpc.plan(0.0, Q0, REST, previous, before={"joint2": 3.0})
+        given = mpc.plan(0.0, Q0, REST, previous, before=[0.0, 3.0])
+        np.testing.assert_array_equal(named.controls, given.controls)
+        assert np.abs(named.controls - mpc.plan(0.0, Q0, REST, previous).controls).max() > 1e-3
+    plan = mpc.plan(0.0, Q0, REST)
+    np.testing.assert_array_equal(plan.shifted(2, {"joint1": 1.0}).before, [1.0, 0.0])

@@ -1,0 +1,152 @@
+"""A motion is linearized in the scene that made it: any other is told from it, by name."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mechanisms import random_tree
+
+import varpin as vp
+from varpin.sddp.solution_file import solution_trajectory
+
+UR5 = {"damping": 0.1, "stiffness": 2.0, "rest": 0.3, "noise": vp.AdditiveNoise(1e-3)}
+OTHERS = {
+    "damping was 0.1 at joint 'elbow_joint', and is 0.4 in the scene": {
+        "damping": [0.1, 0.1, 0.4, 0.1, 0.1, 0.1],
+    },
+    "stiffness was 2 at joint 'shoulder_pan_joint', and is 0 in the scene": {"stiffness": 0.0},
+    "rest was 0.3 at joint 'shoulder_pan_joint', and is 0.2 in the scene": {"rest": 0.2},
+    "gravity was (0, 0, -9.81) m/s^2, and is (0, 0, 0) in the scene": {"gravity": False},
+    "actuation is another in the scene": {"actuation": 2.0 * np.eye(6)},
+}
+
+
+def motion_of(scene, **options):
+    n = scene.robot.dof
+    return vp.simulate(scene, np.full(n, 0.2), np.full(n, 0.5), dt=1e-3, steps=5, **options)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4()], ids=str)
+@pytest.mark.parametrize("words", OTHERS)
+def test_another_scene_is_refused_by_what_differs(load, words, integrator):
+    robot = load("ur5")
+    motion = motion_of(vp.Scene(robot, **UR5), integrator=integrator)
+    with pytest.raises(vp.InputError) as caught:
+        vp.linearize(vp.Scene(robot, **UR5 | OTHERS[words]), motion)
+    assert words in str(caught.value)
+    assert str(caught.value).count(" in the scene") == 1
+
+
+def test_second_order_refuses_too(load):
+    robot = load("ur5")
+    motion = motion_of(vp.Scene(robot))
+    with pytest.raises(vp.InputError, match="damping was 0 at joint"):
+        vp.second_order(vp.Scene(robot, damping=1.0), motion, np.ones(12))
+
+
+def test_robots_of_the_same_joints_are_told_apart():
+    model = random_tree(3, bodies=3)
+    motion = motion_of(vp.Scene(vp.load_robot(model)))
+
+    def other(change):
+        changed = model.copy()
+        change(changed)
+        return vp.Scene(vp.load_robot(changed))
+
+    def heavier(m):
+        m.inertias[2].mass *= 1.5
+
+    def longer(m):
+        m.jointPlacements[2].translation = 1.1 * m.jointPlacements[2].translation
+
+    def turned(m):
+        m.inertias[2].inertia = 1.2 * m.inertias[2].inertia
+
+    def geared(m):
+        m.armature = m.armature + np.array([0.0, 0.0, 0.5])
+
+    for change, words in (
+        (heavier, "the robot's masses are others"),
+        (longer, "the robot's joints are in other places"),
+        (turned, "the robot's inertias are others"),
+        (geared, "armature was .* at joint 'joint2'"),
+    ):
+        with pytest.raises(vp.InputError, match=words):
+            vp.linearize(other(change), motion)
+    assert vp.linearize(other(lambda _: None), motion).steps == 5
+
+
+def test_scenes_that_are_alike_are_the_same(load, tmp_path):
+    """Other objects of the same numbers, rounding apart, a motion that has been away, noise of which none was drawn."""
+    motion = motion_of(vp.Scene(load("ur5"), **UR5))
+    back = vp.Trajectory.load(motion.save(tmp_path / "motion.npz"))
+    for name, values in motion.scene_values.items():
+        np.testing.assert_array_equal(back.scene_values[name], values)
+    again = vp.Scene(vp.load_robot("ur5"), **UR5 | {"damping": 0.1 * (1.0 + 1e-13)})
+    stronger = vp.Scene(load("ur5"), **UR5 | {"noise": vp.AdditiveNoise(0.1)})
+    exact = vp.linearize(vp.Scene(load("ur5"), **UR5), motion)
+    for given in (motion, back, motion.part(1, 4)):
+        assert vp.linearize(again, given).steps == given.steps
+    np.testing.assert_array_equal(vp.linearize(stronger, motion).A, exact.A)
+    kicked = motion_of(vp.Scene(load("ur5"), **UR5), rng=0)
+    with pytest.raises(vp.InputError, match="the noise has another strength"):
+        vp.linearize(stronger, kicked)
+
+
+def without_values(path):
+    """The file as varpin wrote it before it kept the scene's values."""
+    older = path.with_name("older.npz")
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(older, "w") as target:
+        for name in source.namelist():
+            if not name.startswith("scene."):
+                target.writestr(name, source.read(name))
+    return vp.Trajectory.load(older)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(3), vp.Radau(2), vp.ExplicitEuler()], ids=str)
+def test_files_without_the_values_are_held_against_their_steps(load, tmp_path, integrator):
+    robot = load("ur5")
+    scene = vp.Scene(robot, **UR5)
+    for options in ({}, {"rng": 1} if integrator.left == 1.0 else {}):
+        motion = motion_of(scene, integrator=integrator, **options)
+        older = without_values(motion.save(tmp_path / "motion.npz"))
+        assert not older.scene_values
+        np.testing.assert_array_equal(vp.linearize(scene, older).A, vp.linearize(scene, motion).A)
+        for change in OTHERS.values():
+            if "actuation" not in change:
+                with pytest.raises(vp.InputError, match=r"step \d+ \(t = .* s\) ends at velocities that are off by"):
+                    vp.linearize(vp.Scene(robot, **UR5 | change), older)
+
+
+def test_coarse_motions_of_old_files_are_those_of_their_scene():
+    """Steps in parts, which depend on the ledger of the guards, are no reason to refuse."""
+    scene = vp.Scene(vp.planar_chain(5), damping=0.01)
+    motion = vp.simulate(scene, np.zeros(5), np.zeros(5), dt=0.05, steps=200, check=False)
+    assert motion.statistics.split_steps > 10
+    assert vp.linearize(scene, replace(motion, scene_values={})).steps == 200
+
+
+@pytest.mark.parametrize("name", ["gravity", "damping", "inertia", "actuation"])
+def test_damaged_values_are_refused(load, tmp_path, name):
+    motion = motion_of(vp.Scene(load("ur5")))
+    for wrong in (motion.scene_values[name][:-1], np.full_like(motion.scene_values[name], np.nan)):
+        if name in ("inertia", "actuation") and np.isfinite(wrong).all():
+            wrong = wrong[..., :-1, None]  # noqa: PLW2901
+        damaged = replace(motion, scene_values={**motion.scene_values, name: wrong})
+        with pytest.raises(vp.FileError, match=f"scene.{name}"):
+            vp.Trajectory.load(damaged.save(tmp_path / "damaged.npz"))
+
+
+def test_plans_in_files_keep_their_scene(tmp_path):
+    scene = vp.Scene(vp.planar_chain(2), damping=0.3)
+    cost = vp.ControlCost(1.0) + vp.Terminal(vp.TrackingCost([0.1, 0.1]))
+    problem = vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=0.02, steps=5)
+    plan = vp.solve(problem, max_iterations=2)
+    path = plan.save(tmp_path / "plan.npz")
+    for motion in (vp.Solution.load(path, problem).trajectory, solution_trajectory(path)):
+        assert vp.linearize(scene, motion).steps == 5
+        with pytest.raises(vp.InputError, match=r"damping was 0\.3 at joint 'joint1', and is 0 in the scene"):
+            vp.linearize(vp.Scene(vp.planar_chain(2)), motion)
