@@ -345,6 +345,8 @@ class TestScene:
         ],
     )
     def test_joint_properties(self, robot, name, value, words):
+        if name == "damping" and isinstance(value, str):
+            words = " must be numbers, or 'robot' for those of the robot's description, got 'text'"
         with refused(vp.InputError, name + words):
             vp.Scene(robot, **{name: value})
 

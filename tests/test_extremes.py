@@ -16,13 +16,14 @@ from varpin import extremes
 from varpin.cli import main
 from varpin.extremes import Kind, Setup, Trial, checks
 from varpin.extremes.battery import INTEGRATORS
-from varpin.extremes.plans import Task, attempt, cost_error, part_left
+from varpin.extremes.periods import period_error
+from varpin.extremes.plans import Task, attempt, changes, cost_error, part_left
 from varpin.robot.chain import rod_chain
 from varpin.soundness import Finding
 from varpin.wiener import wiener_increments
 
 BY_NAME = {trial.name: trial for trial in (*extremes.TRIALS, *extremes.PLANS)}
-MEASURES = ("error", "joint", "velocity", "energy", "momentum", "reversal", "symplecticity", "record")
+MEASURES = ("error", "joint", "velocity", "period", "energy", "momentum", "reversal", "symplecticity", "record")
 
 
 def falling(integrator=None, *, dt=1e-2, steps=100, **scene):
@@ -146,6 +147,40 @@ def test_the_exact_motion_ends_where_it_cannot_be_told():
     assert checks.exact_motion(chaotic, 1e-2, 2000, 20.0).nodes[-1] < 1000
 
 
+def test_the_error_of_a_period_is_that_of_its_closed_form():
+    """An oscillator: what the explicit Euler method's amplitude gains over a period, in units of what is wrong."""
+    scene, z = vp.Scene(rod_chain([1.0], [1.0]), gravity=False, stiffness=1.0 / 3.0), 0.03
+    for integrator in (vp.ExplicitEuler(), vp.Midpoint()):
+        motion = vp.simulate(scene, [0.5], [0.0], dt=z, steps=round(math.tau / z), integrator=integrator)
+        off = np.abs(motion.q[:, 0] - 0.5 * np.cos(motion.t)).max() / np.ptp(motion.q)
+        assert period_error(scene, integrator, motion) == pytest.approx(off / checks.LEVELS["error"], rel=1e-3)
+
+
+def test_what_goes_wrong_late_is_found():
+    """A fifth of its way is added to what is left of a motion from a node on, of which every record is consistent."""
+    setup, motion = falling(dt=1e-2, steps=400)
+    before = checks.measures(setup, vp.Midpoint(), motion, checks.exact_motion(setup, 1e-2, 400, 0.3))
+    later = vp.simulate(setup.scene, motion.q[250] + 0.3, motion.v[250], dt=1e-2, steps=150)
+    arrays = {name: np.append(getattr(motion, name)[:250], getattr(later, name), axis=0) for name in "qvp"}
+    energy = np.append(motion.energy[:250], later.energy)
+    found = checks.measures(
+        setup,
+        vp.Midpoint(),
+        tampered(motion, **arrays, energy=energy),
+        checks.exact_motion(setup, 1e-2, 400, 0.3),
+    )
+    assert before["period"] < 1.0 < found["period"]
+    assert found["error"] == before["error"]
+
+
+def test_dampers_far_faster_than_the_step_have_an_exact_motion():
+    scene = vp.Scene(rod_chain([1.0] * 2, [1.0] * 2), damping=1e6)
+    ringing = vp.simulate(scene, [0.3, 0.3], [1.0, 1.0], dt=1e-2, steps=50)
+    calm = vp.simulate(scene, [0.3, 0.3], [1.0, 1.0], dt=1e-2, steps=50, integrator=vp.Radau(3))
+    assert period_error(scene, vp.Midpoint(), ringing) > 1.0
+    assert period_error(scene, vp.Radau(3), calm) < 0.1
+
+
 def test_kicks_of_noise_are_in_the_reference():
     trial = BY_NAME["noise of 1 N m s^0.5"]
     setup = trial.build()
@@ -155,6 +190,9 @@ def test_kicks_of_noise_are_in_the_reference():
     quiet = vp.simulate(setup.scene, setup.q0, setup.v0, dt=trial.dt, steps=trial.steps)
     assert checks.reference_error(exact, motion) < 1e-2
     assert checks.reference_error(exact, quiet) > checks.LEVELS["error"]
+    assert period_error(setup.scene, vp.Midpoint(), motion) < 1.0
+    unkicked = tampered(quiet, dw=motion.dw)
+    assert period_error(setup.scene, vp.Midpoint(), unkicked) > 1.0
 
 
 def test_kicks_come_before_or_after_their_steps():
@@ -275,6 +313,22 @@ def test_a_plan_of_nan_is_silent_wrong(monkeypatch, small_plan):
     assert "cost off by" in outcome["found"][0]
 
 
+def test_a_plan_that_whirls_with_nothing_said_is_silent_wrong(monkeypatch, small_plan):
+    """Ten steps of a motion that goes to and fro in each, whose cost is its own."""
+    task, solution = small_plan
+    v = solution.trajectory.v + np.abs(solution.trajectory.v).max() * (-1.0) ** np.arange(11)[:, None]
+    motion = dataclasses.replace(solution.trajectory, v=v)
+    assert changes(solution.trajectory) <= 2
+    assert changes(motion) >= 7
+    whirling = dataclasses.replace(solution, trajectory=motion, cost=task.cost(motion))
+    monkeypatch.setattr("varpin.extremes.plans.solve", lambda *_, **__: whirling)
+    # Ten steps have no more than nine changes.
+    monkeypatch.setattr("varpin.extremes.plans._FEW", 4)
+    outcome = attempt(BY_NAME["10 nodes"], vp.Midpoint())
+    assert outcome["kind"] is Kind.WRONG
+    assert any("goes up and down" in text for text in outcome["found"])
+
+
 def test_added_noise_of_any_strength_hides_nothing():
     quiet, loud = (attempt(BY_NAME[f"added noise of {strength}"], vp.Midpoint()) for strength in ("1e-09", "1e+06"))
     assert quiet["kind"] is Kind.ACCURATE
@@ -337,6 +391,7 @@ def test_a_record_survives_the_disk(tmp_path):
         math.nan,
         0.2,
         0.3,
+        0.4,
         math.inf,
         1e-300,
         0.1,

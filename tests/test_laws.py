@@ -181,6 +181,127 @@ def test_a_law_is_read_off_where_it_does_not_saturate():
     assert "each multiplies deviations by" in motion.warnings[0]
 
 
+def clipped_loops():
+    """Loops without end: scene, gains, limit, step, period, start, spectral radius of the loop without limits."""
+    rng = np.random.default_rng(3)
+    while True:
+        n, period = int(rng.integers(1, 3)), int(rng.integers(1, 4))
+        scene, goal = vp.Scene(vp.planar_chain(n), gravity=False, damping=0.01), np.full(n, 0.3)
+        kp, kd, dt, limit = (10 ** rng.uniform(*ends) for ends in ((1, 4.5), (0, 2.5), (-3, -2), (0.5, 2)))
+        start = goal + 10 ** rng.uniform(-4, 0) * rng.normal(size=n)
+        K = np.hstack([-kp * np.eye(n), -kd * np.eye(n)])
+        radius = Plant(scene).spectral_radius(spring_and_damper(kp, kd, goal), K, period * dt, goal)
+        yield scene, kp, kd, limit, dt, period, start, radius
+
+
+def speaks_of_the_loop(motion):
+    return any("control loop" in text or "too fast for its period" in text for text in motion.warnings)
+
+
+def test_random_clipped_loops():
+    """Limits keep what is unstable from growing: it cycles, over any number of periods."""
+    counts = {True: 0, False: 0}
+    told = {True: 0, False: 0}
+    for scene, kp, kd, limit, dt, period, start, radius in clipped_loops():
+        if min(counts.values()) >= 20:
+            break
+        unstable = radius > 1.05
+        if 1.0 <= radius <= 1.05 or counts[unstable] >= 20:
+            continue
+        what = f"kp {kp:.6g}, kd {kd:.6g}, limit {limit:.4g}, dt {dt:.5g}, period {period}, start {start}, {radius:.5g}"
+        counts[unstable] += 1
+
+        def law(t, q, v, kp=kp, kd=kd, limit=limit):
+            return np.clip(-kp * (q - 0.3) - kd * v, -limit, limit)
+
+        try:
+            motion = vp.simulate(scene, start, 0 * start, dt=dt, steps=600, period=period, controls=law)
+        except vp.StepFailure:
+            assert unstable, what
+            continue
+        off = np.abs(motion.q - 0.3).max(axis=1)
+        if unstable and (off.max() > 10.0 * off[0] or (np.abs(motion.u[400:]) == limit).any()):
+            assert speaks_of_the_loop(motion), what
+            told[any("goes from one of its limits" in text for text in motion.warnings)] += 1
+        if not unstable:
+            assert not speaks_of_the_loop(motion), (what, motion.warnings)
+    # Laws that can be told from the nodes inside their limits, and laws that cannot.
+    assert told[False] > 5
+    assert told[True] > 1
+
+
+def test_a_clipped_loop_is_judged_by_its_few_nodes_inside_its_limits():
+    """A cycle of 20 periods, 2900 times its start; 4 of 300 periods are inside the limits."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=0.01)
+    kp, kd = 22161.0, 6.8
+    law = saturated(kp, kd, 20.0)
+    motion = vp.simulate(scene, [1.0003], [0.0], dt=5.33e-3, steps=600, period=2, controls=law)
+    assert np.abs(motion.q - 1.0).max() > 1e3 * 3e-4
+    plant = Plant(scene)
+    radius = plant.spectral_radius(spring_and_damper(kp, kd), np.array([[-kp, -kd]]), 2 * 5.33e-3, np.ones(1))
+    assert f"each multiplies deviations by {radius:.4g}" in motion.warnings[0]
+
+
+@pytest.mark.parametrize("steps", [600, 1200])
+def test_a_law_that_is_never_inside_its_limits_is_told_of(steps):
+    """Nothing can be fitted; a goal that moves the same way, or a law that pumps on purpose, is no alarm."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=0.01)
+
+    def late(law, q0=0.0):
+        motion = vp.simulate(scene, [q0], [0.0], dt=5e-3, steps=steps, controls=law)
+        half = motion.u[steps // 2 :]
+        assert (half == motion.u.max()).any()
+        assert (half == motion.u.min()).any()
+        return motion
+
+    cycling = late(saturated(1e6, 10.0, 20.0), 1.2)
+    assert (np.abs(cycling.u) == 20.0).all()
+    assert "goes from one of its limits, -20 and 20, to the other" in cycling.warnings[0]
+    assert "shorter period or lower gains" in cycling.warnings[0]
+    for law in (
+        lambda t, q, v: np.clip(-1e3 * (q - 3.0 * np.sin(6.0 * t)) - 50.0 * v, -10.0, 10.0),
+        lambda t, q, v: np.clip(-3e3 * (q - np.sin(8.0 * t)) - 60.0 * (v - 8.0 * np.cos(8.0 * t)), -10.0, 10.0),
+        lambda t, q, v: np.clip(-300.0 * (q - 0.5 * np.sign(np.sin(9.0 * t))) - 20.0 * v, -5.0, 5.0),
+        lambda t, q, v: 10.0 * np.sign(np.sin(9.0 * t)) * np.ones(1),
+    ):
+        motion = late(law)
+        assert not speaks_of_the_loop(motion), motion.warnings
+
+
+def test_a_swing_up_from_limit_to_limit_is_no_alarm():
+    """It pumps on purpose, catches the pendulum upright and holds it."""
+    scene = vp.Scene(vp.planar_chain(1), damping=0.01)
+
+    def law(t, q, v):
+        if np.sin(q[0]) < -0.8:
+            off = np.arctan2(np.cos(q), -np.sin(q))
+            return np.clip(-60.0 * off - 10.0 * v, -6.0, 6.0)
+        return -2.0 * np.sign(v * (v**2 / 6.0 - 0.5 * 9.81 * (np.sin(q) + 1.0)) + 1e-12)
+
+    motion = vp.simulate(scene, [0.1 + np.pi / 2], [0.0], dt=5e-3, steps=1600, controls=law)
+    assert (motion.u == 2.0).any()
+    assert (motion.u == -2.0).any()
+    assert abs(motion.v[-1, 0]) < 1e-6
+    assert not speaks_of_the_loop(motion), motion.warnings
+    pumped = vp.simulate(
+        scene, [0.1 + np.pi / 2], [0.0], dt=5e-3, steps=1600, controls=lambda t, q, v: 0.3 * np.sign(v - 1e-12)
+    )
+    assert (np.diff(pumped.u[:, 0]) != 0.0).sum() > 6
+    assert not speaks_of_the_loop(pumped), pumped.warnings
+
+
+def test_torque_limits_of_an_arm_with_a_far_goal_are_no_alarm():
+    scene = vp.Scene(vp.load_robot("ur5"), damping=1.0)
+    goal, limit = np.array([1.0, -1.0, 1.2, -0.8, 0.5, 0.7]), 0.4 * np.array([150.0, 150.0, 150.0, 28.0, 28.0, 28.0])
+    M = np.diag(vp.lagrangian_jet(scene, goal, np.zeros(6)).Lvv)
+    motion = vp.simulate(
+        scene, np.zeros(6), np.zeros(6), dt=2e-3, steps=600,
+        controls=lambda t, q, v: np.clip(-M * (400.0 * (q - goal) + 10.0 * v), -limit, limit),
+    )  # fmt: skip
+    assert (np.abs(motion.u) == limit).any()
+    assert not speaks_of_the_loop(motion), motion.warnings
+
+
 @pytest.mark.parametrize("kd", [1e3, 1e5, 1e6])
 def test_a_loop_that_ends_within_a_few_periods_is_named(kd):
     with pytest.raises(vp.StepFailure, match="control loop may be unstable") as caught:

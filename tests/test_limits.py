@@ -246,3 +246,36 @@ def test_what_dies_out_ends_at_rest(integrator, rate):
     motion = vp.simulate(scene, [0.0], [100.0], dt=1e-2, steps=2000, integrator=integrator)
     assert abs(motion.v[-1, 0]) < 1e-280
     assert motion.q[-1, 0] == pytest.approx(1.0 / rate, rel=1e-9)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Radau(2)], ids=str)
+@pytest.mark.parametrize(
+    ("options", "controls", "end"),
+    [
+        ({"stiffness": 100.0, "damping": 10.0, "rest": 0.25}, None, 0.25),
+        ({"forces": [vp.PositionServo(500.0, 30.0)]}, [1.0], 1.0),
+    ],
+    ids=["spring", "servo"],
+)
+def test_what_dies_out_away_from_zero_ends_at_rest(integrator, options, controls, end):
+    """Where rounding of q and of the forces that cancel moves more than there is left."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, **options)
+    motion = vp.simulate(scene, [0.0], [0.0], dt=5e-3, steps=4000, controls=controls, integrator=integrator)
+    assert motion.q[-1, 0] == pytest.approx(end, abs=1e-14)
+    assert abs(motion.v[-1, 0]) < 1e-13
+    assert motion.statistics.split_steps == 0
+
+
+def test_chains_come_to_rest_on_springs_and_dampers():
+    rng = np.random.default_rng(5)
+    for _ in range(12):
+        n = int(rng.integers(1, 4))
+        scene = vp.Scene(
+            vp.planar_chain(n),
+            gravity=False,
+            stiffness=10.0 ** rng.uniform(0.0, 3.0, n),
+            damping=10.0 ** rng.uniform(0.5, 1.5, n),
+            rest=rng.uniform(-1.0, 1.0, n),
+        )
+        motion = vp.simulate(scene, np.zeros(n), np.zeros(n), dt=5e-3, steps=4000, check=False)
+        assert motion.statistics.substeps[3000:].max() == 1

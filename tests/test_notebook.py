@@ -71,7 +71,7 @@ def robot(tmp_path_factory):
 @pytest.fixture(scope="module")
 def objects(robot):
     scene = vp.Scene(robot, damping=0.2, noise=vp.AdditiveNoise(0.01))
-    motion = vp.simulate(scene, [0.1, 0.2, 0.3], np.zeros(3), dt=5e-3, steps=40)
+    motion = vp.simulate(scene, [0.1, 0.2, 0.3], np.zeros(3), dt=5e-3, steps=40, increments=0)
     lin = vp.linearize(scene, motion)
     cost = vp.TrackingCost(np.zeros(3), 1.0) + vp.ControlCost(1e-2) + vp.Terminal(vp.VelocityCost(2.0))
     problem = vp.OptimalControlProblem(scene, cost, [0.1, 0.2, 0.3], np.zeros(3), dt=5e-3, steps=40)

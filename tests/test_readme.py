@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from varpin import limits
+
 ROOT = Path(__file__).resolve().parents[1]
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", (ROOT / "README.md").read_text(encoding="utf-8"), re.M | re.S)
 
@@ -27,6 +29,8 @@ def test_python_block(number, tmp_path):
         [sys.executable, "-c", blocks("python")[number]], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+    # What is shown first asks nothing of a robot that its description forbids.
+    assert not [kind for kind in limits.KINDS if kind in done.stderr], done.stderr
     if "replay" in blocks("python")[number]:
         assert list(tmp_path.glob("*.html"))
     if "verify" in blocks("python")[number]:

@@ -517,8 +517,14 @@ def test_advice_says_when_a_wish_is_out_of_reach():
     advice = vp.advise(scene, rest, rest, duration=1.0, tolerance=1e-20)
     assert not advice.reached
     assert "not within reach" in str(advice)
-    chaotic = vp.advise(scene, rest, rest, duration=60.0, tolerance=1e-9, patience=1.0)
+    chaotic = vp.advise(scene, rest, rest, duration=60.0, tolerance=1e-9, patience=2.0)
     assert not chaotic.reached
+
+
+def test_advice_says_when_its_patience_was_too_short():
+    scene, rest = vp.Scene(vp.planar_chain(2)), np.zeros(2)
+    with pytest.raises(vp.VarpinError, match=r"in whole steps yet, with up to \d+ of them: give more patience"):
+        vp.advise(scene, rest, rest, duration=60.0, tolerance=1e-9, patience=1e-9, integrators=[vp.Midpoint()])
 
 
 def test_steps_that_a_guard_splits_are_not_taken_for_agreement():

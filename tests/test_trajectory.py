@@ -264,7 +264,7 @@ class TestLoading:
         with pytest.raises(vp.FileError, match="is not an npz file"):
             vp.Trajectory.load(path)
 
-    @pytest.mark.parametrize("other", ["varpin.trajectory/2", "varpin.trajectory/0", "something"])
+    @pytest.mark.parametrize("other", ["varpin.trajectory/3", "varpin.trajectory/0", "something"])
     def test_another_format(self, saved, other):
         with pytest.raises(vp.FileError, match=f"its format is {other}, not '{FORMAT}'"):
             vp.Trajectory.load(tampered(saved, format=other))

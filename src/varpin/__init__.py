@@ -22,8 +22,16 @@ from varpin.errors import RobotNotFound as RobotNotFound
 from varpin.errors import SingularMassMatrix as SingularMassMatrix
 from varpin.errors import UnknownFrame as UnknownFrame
 from varpin.errors import UnknownJoint as UnknownJoint
+from varpin.errors import UnknownPosture as UnknownPosture
 from varpin.errors import UnsupportedJoint as UnsupportedJoint
 from varpin.errors import VarpinError as VarpinError
+from varpin.forces import Armature as Armature
+from varpin.forces import CoulombFriction as CoulombFriction
+from varpin.forces import Force as Force
+from varpin.forces import JointDamper as JointDamper
+from varpin.forces import JointSpring as JointSpring
+from varpin.forces import JointStop as JointStop
+from varpin.forces import PositionServo as PositionServo
 from varpin.integrators import ExplicitEuler as ExplicitEuler
 from varpin.integrators import Gauss as Gauss
 from varpin.integrators import Guard as Guard

@@ -75,8 +75,9 @@ def read_npz(
 ) -> dict[str, NDArray[Any]]:
     """The arrays of an npz file; without those in ``names`` it is not ``what`` it should be.
 
-    Of others than ``wanted``, if given, nothing is read. ``most`` is how many bytes it may unpack to, if that is known.
-    ``check`` is given the headers of what is to be read, and raises a FileError where they do not fit.
+    Of others than ``wanted``, if given, nothing is read; of these, what is there. ``most`` is how many bytes it may
+    unpack to, if that is known. ``check`` is given the headers of what is to be read, and raises a FileError where they
+    do not fit.
 
     Arrays are C-contiguous and cannot be written to.
 
@@ -97,7 +98,7 @@ def read_npz(
             if missing := sorted(set(names) - set(members)):
                 raise FileError(f"{source} is not a {what}: it has no {', '.join(missing)}")
             if wanted is not None:
-                members = {name: members[name] for name in wanted}
+                members = {name: members[name] for name in wanted if name in members}
             _require_size(source, what, sum(info.file_size for info in members.values()), most)
             headers = {}
             for name, info in members.items():

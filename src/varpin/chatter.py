@@ -1,4 +1,4 @@
-"""Velocities that alternate from step to step: what a method leaves that neither the robot nor its controls ask for."""
+"""Velocities that alternate from step to step, which neither the robot nor its controls ask for; and restless ones."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from varpin.core import longest_alternation
 
 Floats = NDArray[np.float64]
 
@@ -18,6 +20,12 @@ RUN = 8
 # From a node to the next they change by less than this factor: what a jump at an end of an optimal motion leaves falls
 # to a quarter or two fifths from step to step under held controls, and is gone after a few.
 _EVEN = 2.0
+
+# Differences of a velocity from node to node that count for restlessness, in units of the joint's largest velocity.
+_SHOWS = 1e-3
+# Changes of their sign that are spoken of: more than so many in a hundred steps, and no fewer than these, for the ends
+# of a motion under held controls have five or six each, however many steps it has.
+RESTLESS, _FEW = 12, 13
 
 
 @dataclass(frozen=True)
@@ -43,24 +51,37 @@ def alternation(v: Floats, u: Floats | None = None) -> Alternation | None:
         u: Controls of the steps (N, m). Where one of them alternates, the motion has a reason to, and does not count.
             Left out, everything does.
     """
-    fastest = np.abs(v).max(axis=0)
     if len(v) < RUN + 3:
         return None
-    bend = np.diff(v, n=2, axis=0)
-    if not (np.count_nonzero(bend[1:] * bend[:-1] < 0.0, axis=0) >= RUN).any():
+    joint, changes, first = longest_alternation(v, u, counts=_COUNTS, idle=_IDLE, even=_EVEN)
+    return Alternation(joint, changes, first) if changes >= RUN else None
+
+
+@dataclass(frozen=True)
+class Restlessness:
+    """How often the joint that does so most goes from speeding up to slowing down, or back.
+
+    Attributes:
+        joint: Its coordinate.
+        changes: Changes of sign of the differences of its velocity from node to node.
+    """
+
+    joint: int
+    changes: int
+
+
+def restlessness(v: Floats) -> Restlessness | None:
+    """The joint whose velocity goes up and down most often, if that is often enough to speak of.
+
+    Args:
+        v: Velocities at the nodes (N + 1, n) [rad/s or m/s].
+    """
+    fastest = np.abs(v).max(axis=0, initial=0.0)
+    change = np.diff(v, axis=0)
+    shows = np.abs(change) > np.maximum(_SHOWS * fastest, _IDLE * fastest.max(initial=0.0))
+    changes = ((change[1:] * change[:-1] < 0.0) & shows[1:] & shows[:-1]).sum(axis=0)
+    if not changes.size:
         return None
-    counts = (np.abs(bend) > _COUNTS * fastest) & (np.abs(bend) > _IDLE * fastest.max())
-    size = np.abs(bend)
-    even = (size[1:] < _EVEN * size[:-1]) & (size[:-1] < _EVEN * size[1:])
-    turns = (bend[1:] * bend[:-1] < 0.0) & counts[1:] & counts[:-1] & even
-    if u is not None:
-        # The bend at a node is driven by the jump of the controls there.
-        jump = np.diff(u, axis=0)
-        driven = (jump[1:] * jump[:-1] < 0.0) & (np.abs(jump[1:]) > _COUNTS * np.abs(u).max(axis=0))
-        turns &= ~driven.any(axis=1, keepdims=True)
-    # How many turns in a row end at each node: those since the last node without one.
-    nodes = np.arange(1, len(turns) + 1)[:, None]
-    rows = nodes - np.maximum.accumulate(np.where(turns, 0, nodes), axis=0)
-    last, joint = np.unravel_index(int(rows.argmax()), rows.shape)
-    longest = int(rows[last, joint])
-    return Alternation(int(joint), longest, int(last) + 1 - longest) if longest >= RUN else None
+    joint = int(changes.argmax())
+    most = int(changes[joint])
+    return Restlessness(joint, most) if most >= _FEW and 100 * most > RESTLESS * len(change) else None

@@ -101,6 +101,13 @@ def control_array(
     return array
 
 
+def control_values(name: str, value: JointValues, joints: Sequence[str] | None, size: int) -> Floats:
+    """``value``, (m,) or by joint name, as a new float array (m,); errors as :func:`control_array`."""
+    if isinstance(value, Mapping):
+        return control_array(name, value, joints)
+    return finite_array(name, value, (size,))
+
+
 def checked_limits(name: str, limits: tuple[ArrayLike, ArrayLike] | None, size: int) -> Floats:
     """(lower, upper), each one number or (size,), as an array (2, size); infinite where there is no limit.
 
@@ -124,6 +131,21 @@ def checked_limits(name: str, limits: tuple[ArrayLike, ArrayLike] | None, size: 
         raise InputError(f"{name}: nothing is within {both[0, c]:g} and {both[1, c]:g}, the limits of entry {c}")
     both.setflags(write=False)
     return both
+
+
+def named_limits(
+    name: str, limits: tuple[JointValues, JointValues] | None, joints: Sequence[str] | None, size: int
+) -> Floats:
+    """:func:`checked_limits` of controls, of which a side may be by the names of their ``joints``."""
+    sides: Any = limits
+    if isinstance(limits, tuple | list) and len(limits) == 2:
+        sides = tuple(
+            control_array(f"{name}: {side}", value, joints, absent=none, read=real)
+            if isinstance(value, Mapping)
+            else value
+            for side, value, none in zip(("lower", "upper"), limits, (-np.inf, np.inf), strict=True)
+        )
+    return checked_limits(name, sides, size)
 
 
 def as_floats(name: str, value: object) -> Floats:

@@ -24,7 +24,7 @@ from varpin.frozen import Frozen
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, rows
 from varpin.loop_stability import examined_in_loop
-from varpin.markup import facts, table
+from varpin.markup import facts, said, table
 from varpin.policy import LinearPolicy, OpenLoop
 from varpin.scene import Scene, require_scene
 from varpin.simulation import Motions, commands_of
@@ -148,11 +148,6 @@ class Ensemble(Frozen):
         return f"{counted} paths{kept} over {len(self.t) - 1} steps, {self.t[-1] - self.t[0]:g} s{lost}"
 
 
-def said(warnings: Sequence[str]) -> str:
-    """How many warnings there are, for one line; nothing if there are none."""
-    return f", {len(warnings)} warning{'s' * (len(warnings) > 1)}" if warnings else ""
-
-
 class EnsembleInterrupted(KeyboardInterrupt):
     """Ctrl-C during an ensemble.
 
@@ -248,9 +243,20 @@ def simulate_ensemble(
             raise EnsembleInterrupted(sums.ensemble((*sums.lost(), *seen))) from None
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
-    found = (*sums.lost(), *found)
+    found = (*_alike(scene, start), *sums.lost(), *found)
     announce(logger, scene, dt, found)
     return sums.ensemble(found)
+
+
+def _alike(scene: Scene, start: Sequence[Floats]) -> tuple[Finding, ...]:
+    """Says if nothing tells the paths apart."""
+    if scene.processes or len(start[0]) < 2 or any((x != x[0]).any() for x in start):
+        return ()
+    sentence = (
+        "the scene has no noise and all paths begin alike, so that they are one and the same motion: "
+        "varpin.Scene(robot, noise=...) tells them apart"
+    )
+    return (Finding("paths alike", sentence),)
 
 
 def _parts(pool: Executor, sums: _Sums, q0: Floats, v0: Floats) -> Generator[Part, None, None]:

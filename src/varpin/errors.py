@@ -115,6 +115,24 @@ class UnknownFrame(InputError):
         super().__init__(f"robot {robot!r} has no frame {frame!r}; {hint}frames: {', '.join(self.frames)}")
 
 
+class UnknownPosture(InputError):
+    """A posture that the robot does not have.
+
+    Attributes:
+        posture: The name given.
+        postures: The names there are.
+        matches: Those that come close.
+    """
+
+    def __init__(self, posture: str, postures: Iterable[str], robot: str) -> None:
+        self.posture = posture
+        self.postures = tuple(postures)
+        self.matches, hint = _meant(posture, self.postures)
+        known = f"{hint}postures: {', '.join(self.postures)}"
+        none = "it has none: give the SRDF file that has them, load_robot(..., srdf=path)"
+        super().__init__(f"robot {robot!r} has no posture {posture!r}; {known if self.postures else none}")
+
+
 class FileError(VarpinError, OSError):
     """A file cannot be read, or not be written."""
 

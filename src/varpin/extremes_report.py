@@ -47,7 +47,7 @@ dt { padding: 0 0.5rem; } dd { margin: 0; }
 def false_alarms(record: Record) -> str:
     """How many warnings were needless, in words."""
     warned, needless = record.counts()[Kind.DEGRADED], len(record.needless())
-    return f"Of {warned} cells that varpin warns of, {needless} are far from failing any check: false alarms."
+    return f"Of {warned} cells that varpin warns of, {needless} fail no check: false alarms."
 
 
 def entry(cell: Cell) -> str:
@@ -131,7 +131,7 @@ def _box(cell: Cell) -> str:
 
 def details(cell: Cell) -> str:
     """All there is to say of a cell."""
-    names = ("error", "joint", "velocity", "energy", "momentum", "reversal", "symplecticity", "record")
+    names = ("error", "joint", "velocity", "period", "energy", "momentum", "reversal", "symplecticity", "record")
     values = [f"{name} {getattr(cell, name):.2g}" for name in names if not math.isnan(getattr(cell, name))]
     kind = f"{cell.kind.value}, needlessly" if cell.needless else cell.kind.value
     lines = [f"{kind}; {cell.done} of {cell.steps} steps, {cell.seconds:.2g} s", ", ".join(values)]

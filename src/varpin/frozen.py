@@ -35,9 +35,11 @@ class Frozen:
 
 
 def _writable(value: Any) -> Any:
-    """Of an array whether it can be written to; of a tuple the same of its items."""
+    """Of an array whether it can be written to; of a tuple or a view of a mapping the same of its items."""
     if isinstance(value, np.ndarray):
         return bool(value.flags.writeable)
+    if isinstance(value, MappingProxyType):
+        return {name: _writable(item) for name, item in value.items()}
     return tuple(map(_writable, value)) if isinstance(value, tuple) else None
 
 
@@ -47,6 +49,8 @@ def _restored(value: Any, writable: Any) -> Any:
         array = value if value.flags.owndata and value.flags.aligned else value.copy(order="K")
         array.setflags(write=writable)
         return array
+    if isinstance(writable, dict):
+        return {name: _restored(item, writable[name]) for name, item in value.items()}
     if isinstance(value, tuple):
         items = [_restored(*pair) for pair in zip(value, writable, strict=True)]
         return type(value)(*items) if hasattr(value, "_fields") else tuple(items)

@@ -9,15 +9,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import as_floats, finite_array
-from varpin.errors import InputError, LinearizationError
+from varpin.errors import InputError
 from varpin.integrators import Integrator, integrator_of
 from varpin.integrators.base import diffusion_and_drift, open_loop
 from varpin.markup import facts, table
 from varpin.noise import Fields
 from varpin.scene import Scene, require_scene
-from varpin.trajectory import Trajectory, require_motion
+from varpin.trajectory import Trajectory, require_motion, require_scene_of
 
 Floats = NDArray[np.float64]
+
+# Steps of a motion that does not say what scene it was made in which are taken again, and what they may be off by: as
+# shares of the largest change of velocity in the step, and of the largest velocity.
+_RETAKEN, _OF_CHANGE, _OF_SPEED = 8, 1e-5, 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,12 +101,12 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
             integrator of varpin's own; other guards than those of the simulation may be given too.
 
     Raises:
-        InputError: The trajectory is of another robot, another number of controls or processes, or another integrator;
-            or nobody knows the integrator that made it.
+        InputError: The trajectory is of another robot, another number of controls or processes, another integrator or
+            a scene of other gravity, damping, springs, inertias or actuation; or nobody knows the integrator that made
+            it.
         LinearizationError: A step has no solution at dw = 0.
     """
-    require_scene(scene)
-    integrator = _matching(scene, trajectory, integrator)
+    integrator = _matching(require_scene(scene), trajectory, integrator)
     return linearize_steps(scene, trajectory, integrator, trajectory.q[0])
 
 
@@ -139,7 +143,10 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
     Gx = left * _chain(Jk, jump_x)
     Gu = left * _chain(Jk, jump_u)
     if left < 1.0:
-        end_q, end_v = _quiet_ends(scene, trajectory, integrator, first)
+        # There the part of a kick that comes after the step is evaluated.
+        end_q, end_v = trajectory.q[1:], trajectory.v[1:]
+        if trajectory.dw.any():
+            end_q, end_v = integrator.quiet_ends(scene, trajectory)
         end = scene.noise.fields(end_q, end_v, trajectory.u, first)
         end_x = _in_momentum(scene, end_q, end_v, end)
         G[:, n:] += (1.0 - left) * end.F
@@ -202,8 +209,7 @@ def second_order(
             the velocity.
         LinearizationError: A step has no solution at dw = 0.
     """
-    require_scene(scene)
-    integrator = _matching(scene, trajectory, integrator)
+    integrator = _matching(require_scene(scene), trajectory, integrator)
     n, steps = scene.robot.dof, trajectory.steps
     rows = as_floats("z", z)
     if rows.shape == (2 * n,):
@@ -238,10 +244,7 @@ def node_jets(scene: Scene, q: Floats, v: Floats) -> tuple[Floats, Floats]:
 
 def velocity_at_nodes(scene: Scene, q: Floats, v: Floats) -> Floats:
     """Derivative of v in (q, p) at many nodes (N, n, 2n): at fixed q dv = M^-1 dp, at fixed p dv = -M^-1 L_vq dq."""
-    M, A = node_jets(scene, q, v)
-    inverse = np.linalg.inv(M)
-    rates: Floats = np.concatenate([-inverse @ A, inverse], axis=2)
-    return rates
+    return scene.core.velocity_slopes(np.ascontiguousarray(q), np.ascontiguousarray(v))
 
 
 def velocity_curvature(scene: Scene, q: Floats, v: Floats, c: Floats) -> Floats:
@@ -324,30 +327,48 @@ def _drift_derivatives(
     return in_state, in_control
 
 
-def _quiet_ends(scene: Scene, trajectory: Trajectory, integrator: Integrator, first: Floats) -> tuple[Floats, Floats]:
-    """Where each step ends at dw = 0 (N, n), q and v: there the part of a kick that comes after it is evaluated."""
-    if not trajectory.dw.any():
-        return trajectory.q[1:], trajectory.v[1:]
-    q, v = (np.ascontiguousarray(nodes[:-1]) for nodes in (trajectory.q, trajectory.v))
-    force = trajectory.u @ scene.actuation.T
-    if scene.noise.velocity_dependent:
-        nodes = zip(q, v, trajectory.u, strict=True)
-        force += integrator.drift_share * np.array([diffusion_and_drift(scene, *node, first)[1] for node in nodes])
-    # Every step is a path of its own, whose controls come with the drift: commands are the same for all paths.
-    state, _ = integrator.start(scene, q, v)
-    commands = open_loop(np.zeros((1, scene.controls)))
-    ends = integrator.rollout_compiled(
-        scene, state, commands, scene.silence, np.ascontiguousarray(force[:, None]), trajectory.dt
-    )
-    for j, end in enumerate(ends):
-        if end.failure is not None:
-            raise LinearizationError(j, j * trajectory.dt, end.failure.reason)
-    return np.concatenate([end.q for end in ends]), np.concatenate([end.v for end in ends])
-
-
 def _matching(scene: Scene, trajectory: Trajectory, given: Integrator | None) -> Integrator:
     """The integrator that made the trajectory, which has to be one of the scene."""
     require_motion(scene, trajectory)
+    integrator = _integrator_of(scene, trajectory, given)
+    require_scene_of(scene, trajectory)
+    if not trajectory.scene_values:
+        _require_steps_of(scene, trajectory, integrator)
+    return integrator
+
+
+def _require_steps_of(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> None:
+    """Refuse a motion some steps of which are others in this scene: what a file without the scene's values tells.
+
+    Steps that were taken in parts, and kicks after the first step, depend on more than a node, and are left out.
+
+    Raises:
+        InputError: Naming the step, and by how much it is off.
+    """
+    whole = np.flatnonzero(trajectory.statistics.substeps <= 1)
+    if trajectory.dw.any():
+        whole = whole[whole == 0]
+    if not whole.size:
+        return
+    change, speed = np.abs(np.diff(trajectory.v, axis=0)).max(axis=1), float(np.abs(trajectory.v).max())
+    spread = np.linspace(0, whole.size - 1, _RETAKEN - 1).astype(np.int64)
+    for k in np.unique([*whole[spread], whole[np.argmax(change[whole])]]).tolist():
+        state, _ = integrator.start(scene, trajectory.q[k : k + 1].copy(), trajectory.v[k : k + 1].copy())
+        drawn = trajectory.dw[None, k : k + 1] if trajectory.dw.any() else np.zeros((0, 0, scene.processes))
+        (again,) = integrator.rollout(scene, state, open_loop(trajectory.u[k : k + 1]), drawn, trajectory.dt)
+        if again.failure is not None or again.statistics.substeps[0] > 1:
+            continue
+        off = float(np.abs(again.v[0] - trajectory.v[k + 1]).max())
+        if not off <= _OF_CHANGE * change[k] + _OF_SPEED * speed:
+            raise InputError(
+                f"the trajectory was made in another scene than the one given: taken again in this one, step {k} "
+                f"(t = {trajectory.t[k]:.6g} s) ends at velocities that are off by {off:.3g} rad/s or m/s. Give the "
+                "scene that made it, with its damping, gravity, springs and inertias, or simulate again in this one"
+            )
+
+
+def _integrator_of(scene: Scene, trajectory: Trajectory, given: Integrator | None) -> Integrator:
+    """The integrator that made the trajectory."""
     if trajectory.dw.shape[1] != scene.processes:
         raise InputError(f"the trajectory has {trajectory.dw.shape[1]} processes, the scene {scene.processes}")
     made: Integrator | None = None

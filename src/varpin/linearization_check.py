@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -76,7 +77,8 @@ def check_linearization(
     u = np.zeros(m) if u is None else finite_array("u", u, (m,))
     dt, step = positive("dt", dt, "s"), positive("step", step, "1")
     method = Midpoint() if integrator is None else integrator
-    motion = simulate(scene, q, v, dt=dt, steps=1, controls=u, integrator=method)
+    options: dict[str, Any] = {"dt": dt, "steps": 1, "integrator": method, "check": False}
+    motion = simulate(scene, q, v, controls=u, increments=0.0, **options)
     lin = linearize(scene, motion, integrator=method)
     second = motion.p[0] if method.variational else v
     mass = lagrangian_jet(scene, q, np.zeros(n)).Lvv
@@ -88,7 +90,7 @@ def check_linearization(
         if method.variational:
             M = lagrangian_jet(scene, x[:n], np.zeros(n)).Lvv
             velocity = np.asarray(np.linalg.solve(M, x[n:]), dtype=np.float64)
-        end = simulate(scene, x[:n], velocity, dt=dt, steps=1, controls=control, increments=dw[None], integrator=method)
+        end = simulate(scene, x[:n], velocity, controls=control, increments=dw[None], **options)
         return np.concatenate([end.q[1], end.p[1] if method.variational else end.v[1]])
 
     x, zero = np.concatenate([q, second]), np.zeros(k)

@@ -50,7 +50,14 @@ _CALMS = 0.5
 # Growth of the controls up to a step that fails that is spoken of.
 _OUTGROWN = 10.0
 # Nodes at one extreme value from which on a control saturates there.
-_SATURATED = 3
+_SATURATED = 2
+# Ways from one limit to the other that are a cycle, and those of them within the last half of a motion. The last
+# stretches between them are compared: of a motion that calms down they are shorter and shorter.
+_CYCLES, _LATE, _STRETCHES, _KEEPS = 6, 2, 8, 0.9
+# Part of what a control does with its joint that is pushing it on: a law that only pushes pumps it up on purpose.
+_PUMPS = 0.7
+# Nodes that a clipped law is sought from where it cannot be fitted.
+_SOUGHT = 400
 # Beyond this nothing can be squared.
 _HUGE = 1e120
 # Newton's iterations from one start, and halvings of one of its steps.
@@ -147,7 +154,8 @@ def examined_in_loop(
     """:func:`varpin.soundness.examined`, and the loop too; ``hold`` is its period in steps, None without feedback."""
     trajectory, found = examined(scene, integrator, trajectory)
     if hold is not None:
-        found = (*(unstable_loop(scene, trajectory, hold) or _flipping(scene, trajectory, hold)), *found)
+        loop = unstable_loop(scene, trajectory, hold) or _flipping(scene, trajectory, hold)
+        found = (*(loop or _cycling(scene, trajectory, hold)), *found)
     return with_warnings(trajectory, found), found
 
 
@@ -184,6 +192,98 @@ def _flipping(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding,
         f"{advice}"
     )
     return (Finding(_FLIPS, sentence),)
+
+
+def _cycling(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding, ...]:
+    """Says if a law whose goal stands still sends a control from limit to limit again and again.
+
+    It is not to calm down. Only of laws that leave too few nodes inside their limits to be told from them.
+    """
+    if trajectory.dw.any():
+        return ()
+    at = np.arange(0, trajectory.steps, hold)
+    x, u = np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1), trajectory.u[at]
+    if len(u) <= _CYCLES or np.abs(x).max() >= _HUGE:
+        return ()
+    side = _at_limit(u, u.max(axis=0)).astype(np.int64) - _at_limit(u, u.min(axis=0))
+    half, v = len(u) // 2, trajectory.v[at] @ scene.actuation
+    ways = {}
+    for k in range(u.shape[1]):
+        arrivals = _arrivals(side[:, k])
+        late = int((arrivals >= half).sum())
+        if len(arrivals) < _CYCLES or late < _LATE:
+            continue
+        before, after = np.array_split(np.diff(arrivals)[-_STRETCHES:], 2)
+        work = side[half:, k] * v[half:, k]
+        calms = after.mean() < _KEEPS * before.mean()
+        if not calms and work.sum() <= _PUMPS * np.abs(work).sum() and _clips(scene, x, u, side, k, len(arrivals)):
+            ways[k] = late
+    if not ways:
+        return ()
+    with np.errstate(all="ignore"):
+        try:
+            known = _law_inside_limits(scene, x, u) is not None
+        except (np.linalg.LinAlgError, LinearizationError):
+            known = False
+    if known:
+        return ()
+    worst = max(ways, key=lambda k: ways[k])
+    low, high = u[:, worst].min(), u[:, worst].max()
+    return (
+        Finding(
+            KIND,
+            f"the control loop seems unstable at its period of {hold * trajectory.dt:g} s: control {worst} goes from "
+            f"one of its limits, {low:.4g} and {high:.4g}, to the other {ways[worst]} times in the last "
+            f"{len(u) - half} periods and does not calm down; {_ADVICE}",
+        ),
+    )
+
+
+def _arrivals(side: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Nodes at which a control comes to a limit from the other one; ``side`` (P,) is 1, -1 at the limits, 0 inside."""
+    visits = np.flatnonzero(side)
+    arrivals: NDArray[np.int64] = visits[1:][side[visits[1:]] != side[visits[:-1]]]
+    return arrivals
+
+
+def _clips(scene: Scene, x: Floats, u: Floats, side: NDArray[np.int64], k: int, ways: int) -> bool:
+    """Whether control k of u (P, m) is a clipped law of its own joints' state or, failing that, of the whole one.
+
+    Fewer ways than twice the unknowns of a law say nothing: some law would give them by chance (Cover 1965).
+    """
+    own = np.tile(scene.actuation[:, k] != 0.0, 2)
+    return any(
+        ways >= 2 * (columns.sum() + 1) and _clipped_law(x[:, columns], u[:, k], side[:, k])
+        for columns in (own, np.ones_like(own))
+    )
+
+
+def _clipped_law(x: Floats, u: Floats, side: NDArray[np.int64]) -> bool:
+    """Whether some k x + c, clipped to its limits, gives u (P,) at x (P, 2n); ``side`` (P,) is 1, -1 at the limits.
+
+    A goal that moves sends a control to its limits at other states each time.
+    """
+    turns = np.flatnonzero(side[1:] != side[:-1])
+    tight = np.unique(np.concatenate([turns, turns + 1]))
+    spread = np.linspace(0, len(x) - 1, _SOUGHT).astype(np.int64)
+    rows = np.unique(np.concatenate([tight[:: 1 + len(tight) // _SOUGHT], spread]))
+    x, u, side = x[rows], u[rows], side[rows]
+    weight = np.ones(len(x))
+    unit = _spread(x, weight)
+    moving = unit > 0.0
+    columns = np.concatenate([_centered(x[:, moving], weight) / unit[moving], np.ones((len(x), 1))], axis=1)
+    target = 2.0 * (u - u.min()) / np.ptp(u) - 1.0
+    above, below, free = side > 0, side < 0, side == 0
+    result = scipy.optimize.linprog(
+        np.zeros(columns.shape[1]),
+        A_ub=np.concatenate([-columns[above], columns[below]]),
+        b_ub=np.concatenate([-target[above], target[below]]),
+        A_eq=columns[free],
+        b_eq=target[free],
+        bounds=(None, None),
+        method="highs",
+    )
+    return bool(result.status == 0)
 
 
 def outgrown(u: Floats, period: float) -> tuple[Finding, ...]:
@@ -288,10 +388,7 @@ def _by_last_changes(x: Floats, u: Floats, period: float) -> tuple[Finding, ...]
 
 def _by_theory(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Finding, ...]:
     """The spectral radius of the loop, where the record determines the law."""
-    law = fitted_law(scene, x, u)
-    free = _unsaturated(u)
-    if law is None and not free.all():
-        law = fitted_law(scene, x[free], u[free])
+    law = _law_inside_limits(scene, x, u)
     if law is None:
         return ()
     loop = loop_at_rest(scene, law)
@@ -317,19 +414,43 @@ def _by_theory(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Findi
     )
 
 
+def _law_inside_limits(scene: Scene, x: Floats, u: Floats) -> Law | None:
+    """The law from all nodes or, where it saturates, from those at which a control is inside its limits."""
+    law = fitted_law(scene, x, u)
+    if law is not None:
+        return law
+    free = _unsaturated(u)
+    if free.all():
+        return None
+    law = fitted_law(scene, x[free.all(axis=1)], u[free.all(axis=1)], spare=2)
+    if law is not None or u.shape[1] == 1:
+        return law
+    # Each control by itself: where one is at its limit another is not.
+    laws = [fitted_law(scene, x[rows], u[rows, k : k + 1], spare=2) for k, rows in enumerate(free.T)]
+    known = [law for law in laws if law is not None]
+    # Of directions that only some of them know nothing can be said of the loop.
+    if len(known) < len(laws) or any(law.span.directions.shape[1] < x.shape[1] for law in known):
+        return None
+    Kq, Kv, S, c = (np.concatenate([getattr(law, name) for law in known]) for name in ("Kq", "Kv", "S", "c"))
+    return Law(Kq=Kq, Kv=Kv, S=S, c=c, span=known[0].span, near=known[0].near)
+
+
 def _unsaturated(u: Floats) -> NDArray[np.bool_]:
-    """Rows of u (P, m) in which no control is at its largest or smallest value (P,), where it stays there at times."""
-    free = np.ones(len(u), dtype=bool)
-    for column in u.T[np.ptp(u, axis=0) > 0.0]:
-        for extreme in (column.min(), column.max()):
-            at = column == extreme
-            if at.sum() >= _SATURATED:
-                free &= ~at
-    return free
+    """Where controls u (P, m) are not at their largest or smallest value, if they are there more than once (P, m)."""
+    return ~(_at_limit(u, u.max(axis=0)) | _at_limit(u, u.min(axis=0)))
 
 
-def fitted_law(scene: Scene, x: Floats, u: Floats) -> Law | None:
-    """The law that gives u (P, m) at (q, v) = x (P, 2n), if one that is linear but for gravity does, to rounding."""
+def _at_limit(u: Floats, limit: Floats) -> NDArray[np.bool_]:
+    """Where controls u (P, m) saturate at a value (m,), if they change at all (P, m)."""
+    at = u == limit
+    return np.asarray(at & (at.sum(axis=0) >= _SATURATED) & (np.ptp(u, axis=0) > 0.0), dtype=np.bool_)
+
+
+def fitted_law(scene: Scene, x: Floats, u: Floats, spare: int = 4) -> Law | None:
+    """The law that gives u (P, m) at (q, v) = x (P, 2n), if one that is linear but for gravity does, to rounding.
+
+    There are to be ``spare`` more nodes than directions in which the state moves.
+    """
     n = scene.robot.dof
     sound = (np.abs(x).max(axis=1) < _HUGE) & (np.abs(u).max(axis=1) < _HUGE)
     x, u = x[sound], u[sound]
@@ -346,9 +467,9 @@ def fitted_law(scene: Scene, x: Floats, u: Floats) -> Law | None:
         chosen = np.unique(np.concatenate([moved, np.linspace(0, len(x) - 1, nodes).astype(np.int64)]))
         x, u, weight = x[chosen], u[chosen], weight[chosen]
     unit = _spread(x, weight)
-    gains = _affine(x, u, weight)
+    gains = _affine(x, u, weight, spare)
     if gains is None:
-        gains = _affine(np.concatenate([x, _pull(scene, x[:, :n])], axis=1), u, weight)
+        gains = _affine(np.concatenate([x, _pull(scene, x[:, :n])], axis=1), u, weight, spare)
     if gains is None:
         return None
     K, c = gains
@@ -381,7 +502,7 @@ def _spread(columns: Floats, weight: Floats) -> Floats:
     return np.where(size > 1e-13 * np.abs(columns * weight[:, None]).max(axis=0), size, 0.0)
 
 
-def _affine(x: Floats, u: Floats, weight: Floats) -> tuple[Floats, Floats] | None:
+def _affine(x: Floats, u: Floats, weight: Floats, spare: int) -> tuple[Floats, Floats] | None:
     """K (m, k) and c (m,) of u = K x + c, if that holds to rounding; K is the least of those that give the same."""
     unit = _spread(x, weight)
     moving = np.flatnonzero(unit > 0.0)
@@ -391,7 +512,7 @@ def _affine(x: Floats, u: Floats, weight: Floats) -> tuple[Floats, Floats] | Non
     left, sizes, right = np.linalg.svd(state, full_matrices=False)
     known = sizes > _EXCITED * sizes[0]
     left = left[:, known]
-    if len(x) < known.sum() + 4:
+    if len(x) < known.sum() + spare:
         return None
     target = _centered(u, weight)
     scaled = (right[known].T / sizes[known]) @ (left.T @ target)

@@ -4,43 +4,43 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from varpin import limits
 from varpin.checks import (
     JointValues,
     as_floats,
     control_array,
+    control_values,
     count,
-    finite_array,
     joint_array,
     positive,
     require_finite,
 )
 from varpin.core.arrays import Commands
-from varpin.errors import InputError, VarpinError
+from varpin.errors import InputError, UnknownJoint, VarpinError
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
 from varpin.loop_stability import examined_in_loop, outgrown, unstable_loop
 from varpin.policy import LinearPolicy, OpenLoop, takes
 from varpin.scene import Scene, require_scene
 from varpin.soundness import Finding, announce, evident, with_warnings
-from varpin.trajectory import StepStatistics, Trajectory
+from varpin.trajectory import STEP_NUMBERS, Trajectory
 from varpin.wiener import wiener_increments
 
 Floats = NDArray[np.float64]
-ControlLaw = Callable[[float, Floats, Floats], ArrayLike]
+ControlLaw = Callable[[float, Floats, Floats], JointValues]
 Progress = Callable[[int, int], None]
 Futile = Callable[[list[Segment]], str | None]
 
 logger = logging.getLogger(__name__)
 
-# What a node has.
-_NODES = ("q", "v", "p", "energy")
 # Work between two looks at the progress callback and at Ctrl-C, in steps of one joint: some tens of milliseconds.
 _CHUNK = 30_000
+# Parts of a motion that are kept one by one.
+_PARTS = 256
 
 
 class Interrupted(KeyboardInterrupt):
@@ -113,7 +113,8 @@ class StepFailure(VarpinError, RuntimeError):
         self.reason = failure.reason
         self.q, self.v, self.p = trajectory.q[-1], trajectory.v[-1], trajectory.p[-1]
         self.trajectory = trajectory
-        advice = trajectory.warnings[0] if trajectory.warnings else "a smaller dt may go further"
+        told = [sentence for sentence in trajectory.warnings if not sentence.startswith(limits.KINDS)]
+        advice = told[0] if told else "a smaller dt may go further"
         super().__init__(
             f"step {step} (t = {time:.6g} s) cannot be trusted: {failure.reason}; last residual {failure.residual:.3g} "
             f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}. What came before is in error.trajectory; "
@@ -127,66 +128,57 @@ def _row(values: Floats) -> str:
 
 
 class _Record:
-    """Nodes, controls and statistics of the steps done so far; a trajectory can be made of it at any time."""
+    """The steps done so far; a trajectory can be made of them at any time.
 
-    def __init__(self, scene: Scene, integrator: Integrator, dt: float, steps: int, dw: Floats, first: Segment) -> None:
-        self.scene, self.integrator, self.dt = scene, integrator, dt
-        self.steps = 0
-        self.dw = dw if len(dw) else np.zeros((steps, scene.processes))
-        n = scene.robot.dof
-        self.nodes = {name: np.empty((steps + 1, n)) for name in ("q", "v", "p")} | {"energy": np.empty(steps + 1)}
-        self.u = np.empty((steps, scene.controls))
-        self.statistics = {
-            item.name: np.empty(steps, dtype=getattr(first.statistics, item.name).dtype)
-            for item in fields(StepStatistics)
-        }
-        for name, array in self.nodes.items():
-            array[0] = getattr(first, name)[0]
+    Attributes:
+        steps: How many.
+        last: The part that was added last, or the first node.
+    """
+
+    def __init__(self, scene: Scene, integrator: Integrator, dt: float, dw: Floats, first: Segment) -> None:
+        self.scene, self.integrator, self.dt, self.dw = scene, integrator, dt, dw
+        self.steps, self.last = 0, first
+        self._first = first
+        self._joined: list[Segment] = []
+        self._parts: list[Segment] = []
 
     def add(self, segment: Segment) -> None:
-        now = slice(self.steps, self.steps + len(segment.q))
-        for name, array in self.nodes.items():
-            array[now.start + 1 : now.stop + 1] = getattr(segment, name)
-        for name, array in self.statistics.items():
-            array[now] = getattr(segment.statistics, name)
-        self.u[now] = segment.u
-        self.steps = now.stop
+        if not len(segment.q):
+            return
+        self.steps += len(segment.q)
+        self.last = segment
+        self._parts.append(segment)
+        # Single steps take many times the room of their numbers.
+        if len(self._parts) == _PARTS:
+            self._joined.append(join(self._parts))
+            self._parts = []
 
     def trajectory(self) -> Trajectory:
-        return _trajectory(
-            self.scene,
-            self.integrator,
-            self.dt,
-            {name: array[: self.steps + 1] for name, array in self.nodes.items()},
-            self.u[: self.steps],
-            self.dw[: self.steps],
-            StepStatistics(**{name: array[: self.steps] for name, array in self.statistics.items()}),
-        )
+        dw = self.dw[: self.steps] if len(self.dw) else None
+        return _trajectory(self.scene, self.integrator, self.dt, self._first, [*self._joined, *self._parts], dw)
 
 
 def _trajectory(
-    scene: Scene,
-    integrator: Integrator,
-    dt: float,
-    nodes: dict[str, Floats],
-    u: Floats,
-    dw: Floats,
-    statistics: StepStatistics,
+    scene: Scene, integrator: Integrator, dt: float, first: Segment, parts: list[Segment], dw: Floats | None
 ) -> Trajectory:
+    """The motion from a first node on over parts that follow each other; no increments stand for zeros."""
+    steps = join(parts) if len(parts) > 1 else parts[0] if parts else first.part(0)
+    N = len(steps.u)
     return Trajectory(
-        t=np.arange(len(u) + 1, dtype=np.float64) * dt,
-        q=nodes["q"],
-        v=nodes["v"],
-        p=nodes["p"],
-        energy=nodes["energy"],
-        u=u,
-        dw=dw,
+        t=np.arange(N + 1, dtype=np.float64) * dt,
+        q=np.concatenate([first.q, steps.q]),
+        v=np.concatenate([first.v, steps.v]),
+        p=np.concatenate([first.p, steps.p]),
+        energy=np.concatenate([first.energy, steps.energy]),
+        u=steps.u,
+        dw=np.zeros((N, scene.processes)) if dw is None else dw,
         masses=scene.robot.tree.mass.copy(),
         dt=dt,
         integrator=str(integrator),
         robot=scene.robot.name,
         joint_names=scene.robot.joint_names,
-        statistics=statistics,
+        statistics=steps.statistics,
+        scene_values=scene.values,
     )
 
 
@@ -231,11 +223,8 @@ class Motions:
                 failure = None if reason is None else Failure(reason, 0.0)
             if failure is not None:
                 break
-        steps = join(parts) if len(parts) > 1 else parts[0]
-        nodes = {name: np.concatenate([getattr(self._first, name), getattr(steps, name)]) for name in _NODES}
-        dw = np.zeros((len(steps.u), self.scene.processes)) if increments is None else increments[: len(steps.u)]
-        made = _trajectory(self.scene, self.integrator, self.dt, nodes, steps.u, dw, steps.statistics)
-        return made, failure
+        dw = None if increments is None else increments[: sum(len(part.u) for part in parts)]
+        return _trajectory(self.scene, self.integrator, self.dt, self._first, parts, dw), failure
 
 
 def _last_control(parts: list[Segment]) -> Floats | None:
@@ -274,16 +263,18 @@ def simulate(
         steps: N, their number.
         controls: None for none; an array (N, m), one row a step; one row (m,) for all steps, by joint name too where
             each control is the force of a joint, with 0 for joints that are not named; a
-            :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that returns (m,); or
-            :class:`varpin.OpenLoop`, a function of time alone. Controls are constant over each step. A law is a digital
-            controller: it is called once where each of its periods begins, with the time and the state of that node,
-            and what it returns is held over the period.
+            :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that returns (m,), or
+            numbers by joint name; or :class:`varpin.OpenLoop`, a function of time alone. Controls are constant over
+            each step. A law is a digital controller: it is called once where each of its periods begins, with the time
+            and the state of that node, and what it returns is held over the period.
         period: Of a control law, in steps.
         integrator: :class:`Midpoint` with alpha = 1/2 if left out.
 
     Other Args:
-        rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero.
-        increments: The increments themselves, (N, k) [s^0.5], to replay or refine a path; see :mod:`varpin.wiener`.
+        rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero, and a
+            noisy scene has a warning of it; so has an ``rng`` where nothing is random.
+        increments: The increments themselves, (N, k) [s^0.5], to replay or refine a path; see :mod:`varpin.wiener`. 0
+            says that the motion without noise is meant.
         check: Look at the finished motion, whether the balance of its energy closes, its steps resolve it and its
             control loop is stable, for ``Trajectory.warnings`` and the log. It takes about as long as the motion, and
             at most as some thousands of steps where these are in doubt.
@@ -324,10 +315,10 @@ def simulate(
         commands = open_loop(np.zeros((0, scene.controls)))
     else:
         commands = commands_of(scene, integrator, controls, steps, dt)
-    hold = period if law is not None else controls.hold if isinstance(controls, LinearPolicy) else None
+    hold = period if law is not None else commands.hold if isinstance(controls, LinearPolicy) else None
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
     state, (start,) = integrator.start(scene, q0[None], v0[None])
-    record = _Record(scene, integrator, dt, steps, dw, start)
+    record = _Record(scene, integrator, dt, dw, start)
     # A sweep takes as long as the robot has joints, an elimination as their cube.
     chunk = max(1, _CHUNK // (n + n**3 // 100))
     # One step at a time where noise calls Python functions, so that what came before one that fails is recorded.
@@ -338,7 +329,7 @@ def simulate(
             done = record.steps
             if law is not None:
                 held = min(1 if stepwise else period, steps - done)
-                u = record.u[done - 1 : done] if done % period else _decision(law, record)
+                u = record.last.u[-1:] if done % period else _decision(law, record)
                 block = open_loop(u)._replace(hold=held)
             elif isinstance(controls, OpenLoop):
                 block = open_loop(_sampled(controls, record, 1 if stepwise else min(chunk, steps - done)))
@@ -346,7 +337,7 @@ def simulate(
                 block = _next(commands, record)
             else:
                 first = record.steps // commands.hold
-                before = record.u[None, record.steps - 1] if record.steps else None
+                before = record.last.u[None, -1] if record.steps else None
                 block = rows(commands, first, first + max(1, chunk // commands.hold), before)
             drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
             try:
@@ -370,6 +361,8 @@ def simulate(
         interrupted = True
     try:
         trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
+        found = (*noise_forgotten(scene, rng, increments), *found)
+        trajectory = with_warnings(trajectory, found)
     except KeyboardInterrupt:
         raise Interrupted(record.trajectory()) from None
     if interrupted:
@@ -388,9 +381,25 @@ def _told(
     return with_warnings(trajectory, found), found
 
 
+def noise_forgotten(
+    scene: Scene, rng: np.random.Generator | int | None, increments: ArrayLike | None = None
+) -> tuple[Finding, ...]:
+    """Says if a noisy scene is given nothing to draw its noise from, or a seed is given to a scene without noise."""
+    if scene.processes and rng is None and increments is None:
+        sentence = (
+            "the scene has noise, and none was drawn: this is the motion without it. rng=0, or any other seed, draws "
+            "it (in a scene file, seed = 0 under [simulate]); increments=0 says that none is meant"
+        )
+        return (Finding("noise not drawn", sentence),)
+    if rng is not None and not scene.processes:
+        sentence = "rng was given, but the scene has no noise, so nothing is random: varpin.Scene(robot, noise=...) has"
+        return (Finding("nothing random", sentence),)
+    return ()
+
+
 def _require_memory(scene: Scene, steps: int) -> None:
     """Refuse a number of steps whose record cannot be held, before anything runs."""
-    columns = 3 * scene.robot.dof + 2 * scene.controls + len(fields(StepStatistics)) + 2
+    columns = 3 * scene.robot.dof + 2 * scene.controls + len(STEP_NUMBERS) + 2
     try:
         np.empty((steps + 1, columns))
     except (MemoryError, ValueError, OverflowError):
@@ -410,7 +419,17 @@ def commands_of(
         ControlError: The function of an OpenLoop failed; it holds no trajectory.
     """
     if isinstance(controls, LinearPolicy):
-        return controls.commands(steps, scene.controls, scene.robot.dof, integrator.variational)
+        if controls.joints is not None and controls.joints != scene.control_joints:
+            raise InputError(
+                f"the policy's controls are of joints {', '.join(controls.joints)}; "
+                f"the scene's of {', '.join(scene.control_joints or ('no single joints',))}"
+            )
+        if controls.servos is not None and controls.servos != scene.servo_joints:
+            raise InputError(
+                f"the policy's controls are positions of {', '.join(controls.servos) or 'no joints'} and forces of all "
+                f"others; the scene has servos on {', '.join(scene.servo_joints) or 'no joints'}"
+            )
+        return controls.commands(steps, scene.controls, scene.robot.dof, integrator.variational, dt)
     if isinstance(controls, OpenLoop):
         u = np.empty((steps, scene.controls))
         for k in range(steps):
@@ -447,8 +466,8 @@ def _next(commands: Commands, record: _Record) -> Commands:
     """The command of the next step alone: a decision, or the control of the last one while it is held."""
     decision, held = divmod(record.steps, commands.hold)
     if held:
-        return open_loop(record.u[record.steps - 1 : record.steps])
-    before = record.u[None, record.steps - 1] if record.steps else None
+        return open_loop(record.last.u[-1:])
+    before = record.last.u[None, -1] if record.steps else None
     return rows(commands, decision, decision + 1, before)._replace(hold=1)
 
 
@@ -468,7 +487,7 @@ def _decision(law: ControlLaw, record: _Record) -> Floats:
     """The control (1, m) of the period that begins at the last node."""
     k = record.steps
     time = k * record.dt
-    state = record.nodes["q"][k].copy(), record.nodes["v"][k].copy()
+    state = record.last.q[-1].copy(), record.last.v[-1].copy()
     return _called("controls(t, q, v)", lambda: law(time, *state), record.scene, k, time, record)[None]
 
 
@@ -492,7 +511,7 @@ def _row_at(controls: OpenLoop, scene: Scene, dt: float, step: int, record: _Rec
 
 
 def _called(
-    name: str, call: Callable[[], ArrayLike], scene: Scene, step: int, time: float, record: _Record | None
+    name: str, call: Callable[[], JointValues], scene: Scene, step: int, time: float, record: _Record | None
 ) -> Floats:
     """What a function of the user's returns as a control (m,).
 
@@ -505,6 +524,6 @@ def _called(
         before = None if record is None else record.trajectory()
         raise ControlError(step, time, f"{name} raised {error!r}", before) from error
     try:
-        return finite_array(name, value, (scene.controls,))
-    except InputError as error:
+        return control_values(name, value, scene.control_joints, scene.controls)
+    except (InputError, UnknownJoint) as error:
         raise ControlError(step, time, str(error), None if record is None else record.trajectory()) from None

@@ -14,57 +14,57 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.accuracy import (
+    CLOSE,
+    EVEN,
+    FIRST,
+    LIGHT,
+    LITTLE,
+    WINDOW,
+    WRONG_ENERGY,
+    WRONG_MOTION,
+    WRONG_VELOCITY,
+    MotionError,
+    Place,
+    between,
+    blows,
+    disturbance,
+    grown,
+    inertias,
+    places,
+)
 from varpin.chatter import RUN, Alternation, alternation
+from varpin.core import doubled_steps_agree, energy_turnover, fastest_damping, pulls_fast
 from varpin.errors import SingularMassMatrix
-from varpin.integrators import ExplicitEuler, Integrator, Reference
+from varpin.integrators import ExplicitEuler, Integrator, Radau, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.lagrangian import lagrangian_jet
+from varpin.limits import left
 from varpin.scene import Scene
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# What is spoken of: error of the energy balance, in units of the energy that was turned over; of a joint's position, in
-# units of its way over a period, and of the way of the joint that goes furthest; of its velocity, in units of its
-# largest one: velocities have peaks, which a small shift in time moves by much. All are half of what is wrong by
-# :mod:`varpin.extremes`, for an estimate is good to about a factor of two.
-ENERGY_BUDGET = 0.05
-COARSE, COARSE_WAY, COARSE_VELOCITY = 0.05, 0.025, 0.125
-# Steps taken again at the start, and at each other place looked at.
-_FIRST, _WINDOW = 384, 64
-# Later on, errors in units of what is spoken of at the start: by then a motion has gone further than from there.
-_LATER = 0.5
-# Other places looked at: where velocities change most, and as many spread over the motion.
-_VIOLENT, _SPREAD = 4, 3
-# And where single steps have most of the energy's error.
-_JUMPS = 2
-# Steps after which a start is judged by its way so far; before that a method of first order is behind by half a step.
-_SOON = (80, 160)
+# What is spoken of, as part of what is wrong: estimates are made good to some percent.
+CAUTION = 0.95
+# Estimates up to this factor from what is wrong are made good; others are beyond doubt. Those that do not settle are
+# spoken of from this part of what is wrong on. Those of a part of a period are in doubt from here on.
+_DOUBT, _UNSETTLED, _DOUBT_OF_PART = 3.0, 0.7, 0.03
+# Where estimates settle: from one halving to the next they change by less than this part; after so many at most.
+_SETTLED, _HALVINGS = 0.1, 3
+# Steps taken for that at most: so many of one joint, or so many times the motion's own.
+_LEAST_WORK, _WORK = 200_000, 2
 # Windows that are taken again in steps of twice the length, beside those where velocities change most; and how many
 # times the error of a window counts, for over a period it grows.
-_WINDOWS, _MARGIN = 16, 4.0
-# Nodes on either side of a place within which a joint's period is looked for.
-_HORIZON = 1024
-# A small disturbance that grows by this is the motion's own doing: from there on no single motion can be told.
-_PREDICTABLE, _DISTURBANCE = 10.0, 1e-7
-# What a joint does that moves this much less than others of its kind, and with this much less speed than would have
-# their energy, is measured in these parts of theirs.
-_LITTLE, _LIGHT = 1e-2, 1e-2
-# Part of a joint's motion so far below which what it does at one place is rest.
-_REST = 1e-3
-# Part of a speed that counts as changed if nothing changes it: a wheel that turns evenly turns over next to nothing.
-_EVEN = 1e-3
+_WINDOWS, _MARGIN = 16, 8.0
+# What they are taken again with where dampers are faster than the step.
+_STOPPING = Radau(3)
 # Nodes at which mass matrices, and energies of single groups, are looked at; and rates of dampers.
 _NODES, _INERTIAS = 16, 4
 # Velocities below this count as none [rad/s or m/s]: what rounding leaves of a robot in equilibrium.
 _STILL = 1e-9
-
-# The kind of finding that says nothing against the motion as a solution of its equations, and how its sentence begins.
-JOINT_LIMITS = "joints leave their limits"
-# Beyond its limit by more than this a joint is spoken of [rad or m]; and so many of them with numbers.
-_OUTSIDE, _NAMED = 1e-6, 6
 
 
 @dataclass(frozen=True)
@@ -81,30 +81,6 @@ class Finding:
     kind: str
     sentence: str
     joint: int | None = None
-
-
-@dataclass(frozen=True)
-class MotionError:
-    """How far a motion is from that of smaller steps, at its worst over the joints and the places looked at.
-
-    Attributes:
-        step: Where the place begins.
-        joint: Which coordinate.
-        position: Error of q there over a period, in units of the joint's way over it.
-        velocity: Error of v, in units of the joint's largest.
-        motion: Error of q, in units of the way of the joint that goes furthest.
-    """
-
-    step: int
-    joint: int
-    position: float
-    velocity: float
-    motion: float
-
-    @property
-    def worst(self) -> float:
-        """The larger error, in units of what is spoken of."""
-        return max(self.position / COARSE, self.velocity / COARSE_VELOCITY, self.motion / COARSE_WAY)
 
 
 def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Trajectory, tuple[Finding, ...]]:
@@ -140,12 +116,9 @@ def _does_so_in_smaller_steps(scene: Scene, integrator: Integrator, trajectory: 
     """Whether a stretch of alternating velocities alternates alike when its first steps are halved."""
     place, count = found.first, RUN + 1
     parts = 2 * int(np.maximum(trajectory.statistics.substeps[place : place + count], 1).max())
-    if isinstance(integrator, Reference) or count * parts > max(4 * _FIRST, int(trajectory.statistics.substeps.sum())):
+    if isinstance(integrator, Reference) or count * parts > max(4 * FIRST, int(trajectory.statistics.substeps.sum())):
         return False
-    try:
-        again = _taken_again(scene, integrator, trajectory, place, count, parts)
-    except SingularMassMatrix:
-        return False
+    again = _taken_again(scene, integrator, trajectory, place, count, parts)
     if again is None:
         return False
     own = np.diff(trajectory.v[place : place + count + 1, found.joint], n=2)
@@ -183,28 +156,8 @@ def evident(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tup
 
 
 def _beyond_limits(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Says which joints leave their limits, which no motion is stopped by; the motion itself may be right."""
-    lower, upper = scene.robot.position_limits
-    # Limits that leave no room are a fault of the description, which inspect_robot tells of.
-    sound = lower < upper
-    with np.errstate(invalid="ignore"):
-        excess = np.where(sound, np.maximum(lower - trajectory.q, trajectory.q - upper), -np.inf)
-    most = excess.max(axis=0)
-    joints = [int(c) for c in np.argsort(-most, kind="stable") if most[c] > _OUTSIDE]
-    if not joints:
-        return ()
-    tree = scene.robot.tree
-    slides = np.isin(np.arange(len(most)), tree.coordinate[tree.prismatic > 0])
-    parts = []
-    for c in joints[:_NAMED]:
-        first, peak = int(np.argmax(excess[:, c] > _OUTSIDE)), int(np.argmax(excess[:, c]))
-        since = "from the start" if first == 0 else f"from t = {trajectory.t[first]:.4g} s"
-        unit, t = "m" if slides[c] else "rad", trajectory.t[peak]
-        name, side = scene.robot.joint_names[c], "above" if trajectory.q[peak, c] > upper[c] else "below"
-        limit = upper[c] if side == "above" else lower[c]
-        parts.append(f"{name!r} {since}, at most {most[c]:.3g} {unit} {side} {limit:.4g} at t = {t:.4g} s")
-    more = f"; and {len(joints) - _NAMED} more" if len(joints) > _NAMED else ""
-    return (Finding(JOINT_LIMITS, f"{JOINT_LIMITS}, which nothing stops: {'; '.join(parts)}{more}"),)
+    """Says which limits of the robot's description the motion leaves; the motion itself may be right."""
+    return tuple(Finding(kind, sentence) for kind, sentence in left(scene, trajectory))
 
 
 def _in_parts(trajectory: Trajectory) -> str:
@@ -218,30 +171,22 @@ def _in_parts(trajectory: Trajectory) -> str:
 
 def _fast_damping(scene: Scene, trajectory: Trajectory) -> float:
     """The fastest rate of the dampers [1/s] if a step cannot resolve it, else 0."""
-    if not scene.damping.any():
+    if not scene.dissipates or not trajectory.steps:
         return 0.0
     # Rates change along the motion as the inertia does.
-    at = np.unique(np.linspace(0, trajectory.steps, _INERTIAS).astype(np.int64))
-    rates = np.linalg.solve(_masses(scene, trajectory.q[at]), np.diag(scene.damping))
-    # None of them is negative, and none larger than their sum.
-    if trajectory.dt * np.trace(rates, axis1=1, axis2=2).max() <= 2.0:
-        return 0.0
-    fastest = float(np.abs(np.linalg.eigvals(rates)).max()) if np.isfinite(rates).all() else np.inf
-    return fastest if trajectory.dt * fastest > 2.0 else 0.0
+    at = [i * trajectory.steps // (_INERTIAS - 1) for i in range(_INERTIAS)]
+    return fastest_damping(scene.core, *_nodes_of(scene, trajectory, at), 2.0 / trajectory.dt)
 
 
-def _fast_pull(scene: Scene, trajectory: Trajectory) -> bool:
-    """Whether springs or gravity turn a mode by more than a radian a step, at the first node or the last."""
-    still = np.zeros(scene.robot.dof)
-    for q in trajectory.q[[0, -1]]:
-        _, _, _, Lqq, _, M = scene.core.jet(np.ascontiguousarray(q), still)
-        turns = trajectory.dt**2 * np.linalg.solve(M, Lqq)
-        # A matrix is no larger than its rows.
-        if np.abs(turns).sum(axis=1).max() <= 1.0:
-            continue
-        if not np.isfinite(turns).all() or np.abs(np.linalg.eigvals(turns)).max() > 1.0:
-            return True
-    return False
+def _nodes_of(scene: Scene, trajectory: Trajectory, at: list[int]) -> tuple[Floats, Floats, Floats]:
+    """q, v and the constant forces of the controls (K, n) at some nodes."""
+    controls = trajectory.u[np.minimum(at, trajectory.steps - 1)]
+    return trajectory.q[at], trajectory.v[at], np.ascontiguousarray(controls @ scene.actuation.T)
+
+
+def _applied(scene: Scene, trajectory: Trajectory) -> Floats:
+    """Constant forces of the controls in each step (N, n)."""
+    return np.ascontiguousarray(trajectory.u @ scene.actuation.T)
 
 
 def _ringing(rate: float, dt: float) -> str:
@@ -252,18 +197,6 @@ def _ringing(rate: float, dt: float) -> str:
     )
 
 
-def _masses(scene: Scene, q: Floats) -> Floats:
-    """M at some configurations (K, n, n)."""
-    q = np.ascontiguousarray(q)
-    return scene.core.jets(q, np.zeros_like(q))[0]
-
-
-def _inertias(scene: Scene, q: Floats) -> Floats:
-    """What each joint has to move, its entry on the diagonal of M, at most at some configurations: (n,) of (K, n)."""
-    largest: Floats = np.diagonal(_masses(scene, q), axis1=1, axis2=2).max(axis=0)
-    return largest
-
-
 def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
     """What the balance of the energy and steps taken again tell."""
     if not trajectory.steps:
@@ -272,7 +205,7 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     if resolved(scene, integrator, trajectory):
         return tuple(found)
     error = motion_error(scene, integrator, trajectory)
-    if error is not None and not error.worst <= 1.0:
+    if error is not None and spoken_of(error):
         dt, start = trajectory.dt, trajectory.t[error.step]
         off = (
             f"smaller steps from t = {start:.4g} s on move joint {trajectory.joint_names[error.joint]!r} by "
@@ -293,11 +226,11 @@ def _energy(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tup
     worst: tuple[float, int, float, float] | None = None
     for at, defect, scale in _balances(scene, integrator, trajectory):
         # Dampers take what a coarse step leaves too much of: what is lost to them is no error of the motion.
-        off = np.maximum(defect, 0.0) if scene.damping.any() else np.abs(defect)
+        off = np.maximum(defect, 0.0) if scene.dissipates else np.abs(defect)
         last = int(np.argmax(off))
         rounding = 1e-12 * float(np.abs(trajectory.energy).max())
         # Written such that what is not finite is spoken of.
-        if not off[last] <= ENERGY_BUDGET * scale + rounding:
+        if not off[last] <= CAUTION * WRONG_ENERGY * scale + rounding:
             share = float(off[last] / scale) if scale > 0.0 else np.inf
             if worst is None or not share <= worst[0]:
                 worst = share, int(at[last]), float(off[last]), scale
@@ -324,9 +257,7 @@ def _balances(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> l
     tree = scene.robot.tree
     if integrator.variational or tree.groups < 2 or scene.noise.diffusion is None:
         return found
-    turned = _turned_over(scene, trajectory)
-    work, _ = _works(scene, trajectory)
-    worked = np.abs(np.cumsum(work, axis=0)).max(axis=0, initial=0.0)
+    _, turned, worked = _turnover(scene, trajectory)
     some = np.unique(np.linspace(1, trajectory.steps, _NODES).astype(np.int64))
     for group in range(tree.groups):
         own = tree.group == group
@@ -355,26 +286,18 @@ def energy_scale(scene: Scene, trajectory: Trajectory) -> float:
 
     What turns evenly all the time, however fast, turns nothing over.
     """
-    kinetic = 0.5 * np.einsum("ki,ki->k", trajectory.p, trajectory.v)
-    work, _ = _works(scene, trajectory)
-    turned = min(float(kinetic.max()), float(_turned_over(scene, trajectory).sum()))
-    return turned + float(np.abs(np.cumsum(work.sum(axis=1))).max(initial=0.0))
+    return _turnover(scene, trajectory)[0]
 
 
-def _turned_over(scene: Scene, trajectory: Trajectory) -> Floats:
-    """Of each joint, the kinetic energy of the largest change of its velocity (n,) [J], for all it has to move."""
-    at = np.unique(np.linspace(0, trajectory.steps, _NODES).astype(np.int64))
-    inertia = _inertias(scene, trajectory.q[at])
-    with np.errstate(over="ignore", invalid="ignore"):
-        turned: Floats = 0.5 * inertia * _changed(trajectory.v) ** 2
-    return turned
+def _turnover(scene: Scene, trajectory: Trajectory) -> tuple[float, Floats, Floats]:
+    """:func:`energy_scale`; and of each joint (n,) [J] the energies that it is made of.
 
-
-def _changed(v: Floats) -> Floats:
-    """By how much each joint's velocity changes over some nodes (n,), at most the largest; of v (K, n)."""
-    fastest = np.abs(v).max(axis=0)
-    changed: Floats = np.clip(np.ptp(v, axis=0), _EVEN * fastest, fastest)
-    return changed
+    The kinetic energy of the largest change of its velocity, for all it has to move; and the controls' work.
+    """
+    kinetic, work, turned, worked = energy_turnover(
+        scene.core, trajectory.q, trajectory.v, trajectory.p, trajectory.u, even=EVEN, looks=_NODES
+    )
+    return min(kinetic, float(turned.sum())) + work, turned, worked
 
 
 def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
@@ -395,15 +318,21 @@ def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
 def _works(scene: Scene, trajectory: Trajectory, kicked: Floats | float = 0.0) -> tuple[Floats, Floats]:
     """Work of the controls, and the least that the dampers can take, at each joint in each step (N, n) [J].
 
+    What servos make of their controls counts among what is taken.
+
     Controls are constant over a step, and do the work of its way. A kick of v (N, n) begins each step. Dampers take
-    least where the velocity is even, and q knows its mean.
+    least where the velocity is even, and q knows its mean: so does all other friction there.
     """
     h, before, after = trajectory.dt, trajectory.v[:-1] + kicked, trajectory.v[1:]
     with np.errstate(over="ignore", invalid="ignore"):
         way = np.diff(trajectory.q, axis=0)
-        work = (trajectory.u @ scene.actuation.T) * way
+        force = _applied(scene, trajectory)
+        work = force * way
         even = (way / h) ** 2
         heat = h * np.minimum((before**2 + before * after + after**2) / 3.0, even) * scene.damping
+        if scene.dissipates:
+            middle = 0.5 * (trajectory.q[1:] + trajectory.q[:-1])
+            heat -= scene.core.forces(middle, way / h, force)[0] * way + h * even * scene.damping
     return work, heat
 
 
@@ -422,275 +351,217 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
     """Whether even steps of twice the length make the same motion, so that there is nothing more to look for.
 
     Windows all over the motion, or some of them, are taken again from their first nodes, all at once. That takes half
-    as long as the motion, or less; a motion of whole steps without noise or fast dampers can pass.
+    as long as the motion, or less; a motion of whole steps without noise can pass.
     """
-    steps, n = trajectory.steps, scene.robot.dof
+    steps, q, v, u = trajectory.steps, trajectory.q, trajectory.v, trajectory.u
     # Windows of like lengths, which are even.
-    pieces = min(-(-steps // _WINDOW), _WINDOWS)
-    length = min(_WINDOW, 2 * -(-steps // (2 * pieces)), steps - steps % 2) if pieces else 0
+    pieces = min(-(-steps // WINDOW), _WINDOWS)
+    length = min(WINDOW, 2 * -(-steps // (2 * pieces)), steps - steps % 2) if pieces else 0
     if isinstance(integrator, Reference) or not length or trajectory.dw.any() or scene.noise.diffusion is None:
         return False
-    if not np.abs(trajectory.v).max() > _STILL:
+    if not np.abs(v).max() > _STILL:
         return True
-    # Dampers and springs far faster than the step do as little in two.
-    if (trajectory.statistics.substeps > 1).any() or _fast_damping(scene, trajectory) or _fast_pull(scene, trajectory):
+    # Springs far faster than the step do as little in two.
+    if trajectory.statistics.split_steps or pulls_fast(
+        scene.core, *_nodes_of(scene, trajectory, [0, trajectory.steps]), trajectory.dt
+    ):
         return False
-    begins = np.unique(np.linspace(0, steps - length, max(pieces, 1 + steps % 2)).astype(np.int64))
+    # So do dampers, but not where what they stop is at rest after a step, whatever its length. Other methods are held
+    # against that in steps as long as theirs.
+    damped = bool(_fast_damping(scene, trajectory))
+    other, times = _STOPPING if damped else integrator, 1 if damped and not integrator.l_stable else 2
+    apart = max(pieces, 1 + steps % 2) - 1
+    begins = np.array(sorted({i * (steps - length) // max(apart, 1) for i in range(apart + 1)}))
     if pieces == _WINDOWS:
-        begins = np.union1d(begins, _blows(trajectory.v, length))
-    nodes = begins[:, None] + np.arange(length + 1)
-    q, v, u = trajectory.q[nodes], trajectory.v[nodes], trajectory.u
-    commands, drift = open_loop(u[:length:2]), np.zeros((0, 0, n))
-    if np.ptp(u, axis=0).any():
+        begins = np.union1d(begins, blows(v, length))
+    commands, drift = open_loop(u[:length:times]), np.zeros((0, 0, scene.robot.dof))
+    if (u != u[0]).any():
         # Commands are the same for all paths; their forces need not be.
-        force = u[nodes[:, :-1]].reshape(len(begins), length // 2, 2, -1).mean(axis=2) @ scene.actuation.T
-        commands, drift = open_loop(np.zeros_like(u[:length:2])), np.ascontiguousarray(force)
-    try:
-        state, _ = integrator.start(scene, np.ascontiguousarray(q[:, 0]), np.ascontiguousarray(v[:, 0]))
-    except SingularMassMatrix:
-        return False
-    again = integrator.rollout_compiled(scene, state, commands, scene.silence, drift, 2.0 * trajectory.dt)
-    if any(len(part.q) < length // 2 for part in again):
-        return False
-    with np.errstate(over="ignore", invalid="ignore"):
-        off = np.array(
-            [
-                np.abs(np.array([part.q for part in again]) - q[:, 2::2]).max(axis=1),
-                np.abs(np.array([part.v for part in again]) - v[:, 2::2]).max(axis=1),
-            ]
-        )
-        way, speed = np.ptp(q, axis=1), np.abs(v).max(axis=1)
-        root = np.sqrt(_inertias(scene, q[:, 0]))
-        light = _LIGHT * (root * np.clip(np.ptp(v, axis=1), _EVEN * speed, speed)).max(axis=1)[:, None] / root
-        for values, least in ((way, light * length * trajectory.dt), (speed, light)):
-            for kind in (slides := _slides(scene), ~slides):
-                others = _LITTLE * values[:, kind].max(axis=1, initial=0.0)
-                values[:, kind] = np.maximum(values[:, kind], np.minimum(others[:, None], least[:, kind]))
-        rounding = 1e3 * np.finfo(np.float64).eps * (1.0 + np.abs(q[:, 0]).max(axis=1))[:, None]
-        off[0] = np.where(off[0] <= rounding, 0.0, off[0])
-        allowed = np.array([COARSE_WAY * way, COARSE_VELOCITY * speed])
-        return bool((_MARGIN * off <= (2.0**integrator.order - 1.0) * allowed).all())
+        held = u[begins[:, None] + np.arange(length)].reshape(len(begins), length // times, times, -1)
+        commands, drift = open_loop(np.zeros_like(u[:length:times])), held.mean(axis=2) @ scene.actuation.T
+    again = other.motions(scene, q[begins], v[begins], commands, drift, times * trajectory.dt)
+    if times == 1 and again is not None:
+        again = np.ascontiguousarray(again[0][:, 1::2]), np.ascontiguousarray(again[1][:, 1::2])
+    # How much less the error is in steps of half the length; of another method nothing is known.
+    gain = (1.0 if damped else 2.0**integrator.order - 1.0) / _MARGIN
+    return again is not None and doubled_steps_agree(
+        scene.core,
+        q,
+        v,
+        begins,
+        length,
+        trajectory.dt,
+        *again,
+        way=gain * WRONG_MOTION,
+        velocity=gain * WRONG_VELOCITY,
+        little=LITTLE,
+        light=LIGHT,
+        even=EVEN,
+    )
 
 
 def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> MotionError | None:
     """The error of a motion, by taking parts of it again from their first nodes, in steps of half the length.
 
     The start, the places where velocities change most and some spread over the motion are looked at, over a period of
-    each joint or what can be had of it. Each joint is judged in units of its own motion. It says nothing of how errors
-    grow over many periods. None where nothing moves, and for an integrator that chooses its own steps.
+    each joint or what can be had of it; more places where errors come close to what is wrong. Each joint is judged in
+    units of its own motion. Where that leaves doubt whether it is wrong, steps are halved again until the estimate
+    settles. It says nothing of how errors grow over many
+    periods. None where nothing moves, and for an integrator that chooses its own steps.
     """
     moved = np.abs(trajectory.v).max(initial=0.0)
     if isinstance(integrator, Reference) or not trajectory.steps or not moved > _STILL:
         return None
-    worst = None
-    # Where a joint goes to and fro within the first steps, what comes after is to be looked at, too.
-    first = _judged(*_periods(scene, trajectory.q[: _HORIZON + 1], trajectory.v[: _HORIZON + 1])).min()
-    places = _places(trajectory.v, trajectory.statistics.energy_defect, min(_FIRST, int(first)))
-    inertia = _inertias(scene, trajectory.q[places])
+    steps = places(scene, trajectory)
+    inertia = inertias(scene, trajectory.q[steps])
     # Half a step is as little as a whole one to dampers that are far faster.
     fast = trajectory.dt * _fast_damping(scene, trajectory)
     finer = int(2 ** np.clip(np.ceil(np.log2(max(1.0, fast))), 0, 3))
-    for place in places:
-        try:
-            found = _error_at(scene, integrator, trajectory, int(place), inertia, finer)
-        except SingularMassMatrix:
-            continue
-        if found is not None and (worst is None or not found.worst <= worst.worst):
-            worst = found
+    left = max(_LEAST_WORK // scene.robot.dof, _WORK * int(trajectory.statistics.substeps.sum()))
+    worst = None
+    for chosen in (steps, between(trajectory.steps, steps)):
+        looks = []
+        for step in chosen:
+            place = Place.at(scene, trajectory, int(step))
+            look = _look(scene, integrator, trajectory, place, inertia, finer)
+            if look is not None and look.doubtful and not look.whole:
+                whole = _look(scene, integrator, trajectory, place, inertia, finer, left)
+                look = whole or look
+                left -= 0 if whole is None else whole.work
+            if look is not None:
+                looks.append((place, look))
+        looks.sort(key=lambda pair: -pair[1].error.worst)
+        for place, look in looks:
+            error = look.error
+            if look.doubtful:
+                error, work = _settled(scene, integrator, trajectory, place, inertia, finer, look, left)
+                left -= work
+            if worst is None or error.worst > worst.worst:
+                worst = error
+            if spoken_of(error):
+                return error
+        if worst is None or worst.worst < CLOSE:
+            break
     return worst
 
 
-def _places(v: Floats, defect: Floats, first: int) -> Integers:
-    """Where a motion is looked at: the first steps of its windows (K,); of v (N + 1, n) and of the energy defect (N,).
+def spoken_of(error: MotionError) -> bool:
+    """Whether an error is worth a word."""
+    return not error.worst <= (CAUTION if error.settled else _UNSETTLED)
 
-    One window has the ``first`` steps.
+
+@dataclass(frozen=True)
+class _Look:
+    """An estimate of the error at one place.
+
+    Attributes:
+        error: The error.
+        whole: Whether it is of a period, or of all that can be told of it, and not of a part that stands for it.
+        known: How many steps can be told.
+        work: Steps taken for it.
     """
-    steps = len(v) - 1
-    seen = np.zeros(steps, dtype=bool)
-    seen[:first] = True
-    found = [0, *_blows(v, _WINDOW, seen)]
-    for place in np.linspace(0, max(0, steps - _WINDOW), _SPREAD + 1)[1:].astype(np.int64):
-        if not seen[place : place + _WINDOW].all():
-            found.append(int(place))
-    # Single steps that are worse than others, as a whole one is among steps in parts.
-    jumps = np.abs(np.diff(defect, prepend=0.0))
-    found += np.argsort(-np.nan_to_num(jumps, nan=np.inf), kind="stable")[:_JUMPS].tolist()
-    return np.unique(found)
+
+    error: MotionError
+    whole: bool
+    known: int
+    work: int
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the error itself may be on the other side of what is wrong."""
+        low, high = (1.0 / _DOUBT, _DOUBT) if self.whole else (_DOUBT_OF_PART, np.inf)
+        return low < self.error.worst < high
 
 
-def _blows(v: Floats, length: int, seen: NDArray[np.bool_] | None = None) -> list[int]:
-    """The first steps of windows of some length about the largest changes of v (N + 1, n); they are marked as seen."""
-    steps = len(v) - 1
-    seen = np.zeros(steps, dtype=bool) if seen is None else seen
-    change = np.abs(np.diff(v, axis=0))
-    most = change.max(axis=0)
-    # A joint's changes in units of its own largest.
-    change = ((change / np.where(most > 0.0, most, np.inf)) ** 2).sum(axis=1)
-    found: list[int] = []
-    for _ in range(_VIOLENT):
-        if seen.all():
+def _settled(
+    scene: Scene,
+    integrator: Integrator,
+    trajectory: Trajectory,
+    place: Place,
+    inertia: Floats,
+    finer: int,
+    look: _Look,
+    most: int,
+) -> tuple[MotionError, int]:
+    """The error at a place by ever smaller steps, over a period, and how many steps that took."""
+    spent = 0
+    for halving in range(1, _HALVINGS + 1):
+        known = look.known if look.whole else None
+        again = _look(scene, integrator, trajectory, place, inertia, finer * 2**halving, most - spent, known)
+        if again is None:
             break
-        peak = int(np.argmax(np.where(seen, -1.0, change)))
-        found.append(min(max(0, peak - length // 4), max(0, steps - length)))
-        seen[found[-1] : found[-1] + length] = True
-    return found
+        spent += again.work
+        change = abs(again.error.worst - look.error.worst)
+        if not again.doubtful or (look.whole and again.whole and change <= _SETTLED * again.error.worst):
+            return again.error, spent
+        look = again
+    return replace(look.error, settled=False), spent
 
 
-def _error_at(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, place: int, inertia: Floats, finer: int
-) -> MotionError | None:
-    """The error at one place; None where steps cannot be taken again."""
-    ahead = slice(place, place + _HORIZON + 1)
-    span, whole = _periods(scene, trajectory.q[ahead], trajectory.v[ahead])
-    variation = np.abs(np.diff(trajectory.v[ahead], axis=0)).cumsum(axis=0)
-    judged = _judged(span, whole)
-    count, parts = _affordable(trajectory, place, int(judged.max()), finer)
+def _look(
+    scene: Scene,
+    integrator: Integrator,
+    trajectory: Trajectory,
+    place: Place,
+    inertia: Floats,
+    finer: int,
+    most: int | None = None,
+    known: int | None = None,
+) -> _Look | None:
+    """The error at one place, with at most so many steps; None where steps cannot be taken again.
+
+    How many steps of the motion can be told need not be found out twice.
+    """
+    count, parts = _affordable(trajectory, place, finer, most)
     if not parts:
         return None
-    again = _taken_again(scene, integrator, trajectory, place, count, parts)
+    again = _taken_again(scene, integrator, trajectory, place.step, count, parts)
     if again is None:
         return None
-    recorded = trajectory.q[place : place + count + 1], trajectory.v[place : place + count + 1]
+    steps = slice(place.step, place.step + count + 1)
+    recorded = trajectory.q[steps], trajectory.v[steps]
     if scene.noise.diffusion is None and trajectory.dw.any():
         # Kicks that only Python knows are left out of both.
-        plain = _taken_again(scene, integrator, trajectory, place, count, parts // (2 * finer))
+        plain = _taken_again(scene, integrator, trajectory, place.step, count, parts // (2 * finer))
         if plain is None:
             return None
         recorded = plain
     # The part of the error that is left with the smaller steps.
-    taken = np.maximum(trajectory.statistics.substeps[place : place + count], 1)
+    taken = np.maximum(trajectory.statistics.substeps[steps][:count], 1)
     left = float(parts) ** -integrator.order / np.mean(1.0 / taken.astype(float) ** integrator.order)
-
-    def error(until: int) -> MotionError:
-        here = np.minimum(judged, until)
-        # What cannot be told any more is no part of the way.
-        end = span if until == count else np.minimum(span, until)
-        units = _units(scene, trajectory, place, end, whole | (end < span), inertia)
-        joints = np.arange(len(span))
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            off = [
-                np.maximum.accumulate(np.abs(a - b), axis=0)[here, joints] / (1.0 - left)
-                for a, b in zip(recorded, again, strict=True)
-            ]
-            # Errors grow in the course of a period as the motion goes on.
-            so_far = variation[here - 1, joints]
-            growth = np.where(so_far > 0.0, variation[judged - 1, joints] / so_far, np.inf)
-            growth = np.minimum(growth, judged / here)
-            growth = np.where(until == count, np.maximum(growth, 1.0), 1.0)
-            rounding = 1e3 * np.finfo(np.float64).eps * (1.0 + np.abs(trajectory.q[place]).max())
-            position = np.where(off[0] <= rounding, 0.0, off[0] * growth / units[0])
-            velocity = np.where(off[1] <= 1e-9 * units[1], 0.0, off[1] / units[1])
-            motion = position * units[0] / units[0].max()
-            errors = np.array([position, velocity, motion]) * (_LATER if place else 1.0)
-            shares = errors / np.array([[COARSE], [COARSE_VELOCITY], [COARSE_WAY]])
-        joint = int(np.argmax(np.nan_to_num(shares, nan=np.inf).max(axis=0)))
-        return MotionError(place, joint, *errors[:, joint].tolist())
-
-    known = _predictable(scene, integrator, trajectory, place, count)
-    # What dies out soon is judged by the way that it takes, too.
-    untils = [until for until in _SOON if until < known] if place == 0 else []
-    return max((error(until) for until in (*untils, known)), key=lambda found: np.nan_to_num(found.worst, nan=np.inf))
+    work = count * parts
+    if known is None:
+        moved = disturbance(trajectory, place.step, count)
+        # In small steps as well: guards may take the large ones of the two in different parts.
+        other = _taken_again(scene, integrator, trajectory, place.step, count, parts, moved)
+        known = 1 if other is None else grown(again[0], other[0], moved[0])
+        work *= 2
+    known = min(known, count)
+    with np.errstate(over="ignore", invalid="ignore"):
+        q, v = (np.abs(a - b)[: known + 1] / (1.0 - left) for a, b in zip(recorded, again, strict=True))
+    error = place.error(scene, trajectory, inertia, (q, v), cut=known < count)
+    return _Look(error, known < count or count >= int(place.judged.max()), known, work)
 
 
-def _periods(scene: Scene, q: Floats, v: Floats) -> tuple[Integers, NDArray[np.bool_]]:
-    """Over how many steps each joint goes to and fro, or right round (n,), for q and v (K + 1, n).
-
-    All of them where it does not, which the second value says. Where a joint turns back the way is as long as there and
-    back, and the velocity small; one and a half ways to and fro, with all that the velocity does, are no such place.
-    """
-    gone = np.abs(np.diff(q, axis=0)).cumsum(axis=0)
-    wide = (np.maximum.accumulate(q, axis=0) - np.minimum.accumulate(q, axis=0))[1:]
-    varied = np.abs(np.diff(v, axis=0)).cumsum(axis=0)
-    fastest = np.maximum.accumulate(np.abs(v), axis=0)[1:]
-    round_once = ~_slides(scene) & (wide >= 2.0 * np.pi)
-    over = ((gone >= 3.0 * wide) | round_once) & (varied >= 4.0 * fastest) & (wide > 0.0)
-    whole = np.asarray(over.any(axis=0))
-    span: Integers = np.where(whole, over.argmax(axis=0) + 1, len(q) - 1)
-    return span, whole
-
-
-def _judged(span: Integers, whole: NDArray[np.bool_]) -> Integers:
-    """Over how many steps errors count (n,), of what :func:`_periods` gives: a period is two thirds of it."""
-    judged: Integers = np.where(whole, (2 * span + 2) // 3, span)
-    return judged
-
-
-def _affordable(trajectory: Trajectory, place: int, span: int, finer: int) -> tuple[int, int]:
+def _affordable(trajectory: Trajectory, place: Place, finer: int, most: int | None) -> tuple[int, int]:
     """How many steps are taken again, each in how many parts; (0, 0) for none.
 
     These are half of what they were taken in, or that part of it again where dampers are faster.
 
-    The work is at most that of some tens of steps, or an eighth of the motion's own.
+    The work is at most ``most``; if that is left out, that of some hundreds of steps or an eighth of the motion's own,
+    and then a part has to do for a period.
     """
-    length = _FIRST if place == 0 else _WINDOW
     substeps = np.maximum(trajectory.statistics.substeps, 1)
-    most = max(4 * length, int(substeps.sum()) // 8)
-    parts = 2 * finer * np.maximum.accumulate(substeps[place : place + min(length, span)])
+    count = int(place.judged.max())
+    if most is None:
+        length = FIRST if place.step == 0 else WINDOW
+        count, most = min(length, count), max(4 * length, int(substeps.sum()) // 8)
+    parts = 2 * finer * np.maximum.accumulate(substeps[place.step : place.step + count])
     affordable = parts * np.arange(1, len(parts) + 1) <= most
     if not affordable[0]:
         return 0, 0
     count = len(parts) if affordable.all() else int(affordable.argmin())
     return count, int(parts[count - 1])
-
-
-def _units(
-    scene: Scene, trajectory: Trajectory, place: int, span: Integers, whole: NDArray[np.bool_], inertia: Floats
-) -> tuple[Floats, Floats]:
-    """In what each joint's errors of q and v are measured (n,): its way over a period, and its largest velocity.
-
-    A joint that hardly moves and has little energy is measured by the others.
-    """
-    n = len(span)
-    behind = slice(max(0, place - _HORIZON), place + 1)
-    before = np.zeros(n, dtype=np.int64)
-    if place:
-        before = _periods(scene, trajectory.q[behind][::-1], trajectory.v[behind][::-1])[0]
-    # Where the motion ends within a period, what came before completes it.
-    begin = place - np.where(whole, 0, before)
-    way, speed, change = np.empty(n), np.empty(n), np.empty(n)
-    for i in range(n):
-        nodes = slice(begin[i], place + span[i] + 1)
-        way[i], speed[i] = np.ptp(trajectory.q[nodes, i]), np.abs(trajectory.v[nodes, i]).max()
-        change[i] = _changed(trajectory.v[nodes, i : i + 1])[0]
-        so_far = slice(0, place + span[i] + 1)
-        way[i] = max(way[i], _REST * np.ptp(trajectory.q[so_far, i]))
-        speed[i] = max(speed[i], _REST * np.abs(trajectory.v[so_far, i]).max())
-    root = np.sqrt(inertia)
-    light = _LIGHT * (root * change).max() / root
-    least = np.minimum(_LITTLE * _of_its_kind(scene, speed), light)
-    least_way = np.minimum(_LITTLE * _of_its_kind(scene, way), light * span * trajectory.dt)
-    tiny = np.finfo(np.float64).tiny
-    return np.maximum(way, np.maximum(least_way, tiny)), np.maximum(speed, np.maximum(least, tiny))
-
-
-def _predictable(scene: Scene, integrator: Integrator, trajectory: Trajectory, place: int, count: int) -> int:
-    """Steps, one at least, until a small disturbance of q has grown out of hand."""
-    nodes = trajectory.q[place : place + count + 1]
-    moved = _DISTURBANCE * max(1.0, float(np.abs(trajectory.q[place]).max()))
-    # In v, by what the same part of the motion has.
-    way = max(float(np.ptp(nodes, axis=0).max()), moved)
-    faster = _DISTURBANCE * float(np.abs(trajectory.v[place : place + count + 1]).max()) / max(1.0, way)
-    other = _taken_again(scene, integrator, trajectory, place, count, 1, (moved, faster))
-    if other is None:
-        return 1
-    with np.errstate(over="ignore", invalid="ignore"):
-        grown = ~(np.abs(other[0] - nodes).max(axis=1) <= _PREDICTABLE * moved)
-    return max(1, int(grown.argmax())) if grown.any() else count
-
-
-def _slides(scene: Scene) -> NDArray[np.bool_]:
-    """Which coordinates slide (n,)."""
-    tree = scene.robot.tree
-    slides = np.zeros(scene.robot.dof, dtype=bool)
-    slides[tree.coordinate[tree.prismatic > 0]] = True
-    return slides
-
-
-def _of_its_kind(scene: Scene, values: Floats) -> Floats:
-    """For each coordinate (n,), the largest value of all that turn, or of all that slide: units do not compare."""
-    slides = _slides(scene)
-    largest: Floats = np.where(slides, values[slides].max(initial=0.0), values[~slides].max(initial=0.0))
-    return largest
 
 
 def _taken_again(
@@ -717,7 +588,10 @@ def _taken_again(
         else:
             drawn[0, ::parts] += integrator.left * trajectory.dw[steps]
             drawn[0, parts - 1 :: parts] += (1.0 - integrator.left) * trajectory.dw[steps]
-    state, _ = integrator.start(scene, q, v)
+    try:
+        state, _ = integrator.start(scene, q, v)
+    except SingularMassMatrix:
+        return None
     # Impulses of noise depend on the controls, too.
     commands = open_loop(np.repeat(trajectory.u[steps], parts, axis=0))
     no_drift = np.zeros((0, 0, scene.robot.dof))

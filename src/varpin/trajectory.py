@@ -6,9 +6,10 @@ import contextlib
 import os
 import reprlib
 import secrets
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -19,19 +20,24 @@ from varpin.archive import Check, Header, read_npz
 from varpin.checks import path_like, writable
 from varpin.errors import FileError, InputError
 from varpin.frozen import Frozen
-from varpin.markup import facts, table
+from varpin.markup import facts, said, table
 from varpin.robot import Robot
-from varpin.scene import Scene
+from varpin.scene import OF_FORCES, VALUES, Scene, differences, same
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
 
-FORMAT = "varpin.trajectory/1"
+FORMAT = "varpin.trajectory/2"
 
 _ARRAYS = ("t", "q", "v", "p", "u", "dw", "energy", "masses")
 _TEXTS = ("version", "integrator", "robot", "joint_names", "warnings")
+_AT_A_TIME = 1_000_000  # parts of steps
+# Before the names of the scene's values in a file.
+_SCENE = "scene."
 _MOST_WORDS = 1_000_000  # bytes of what does not grow with the steps
-_COUNTS = {f"statistics.{name}" for name in ("newton_iterations", "jets", "sweeps", "substeps")}
+_KINDS = {f"statistics.{name}": "int64" for name in ("newton_iterations", "jets", "sweeps", "substeps")}
+_KINDS["statistics.halvings"] = "uint8"
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +50,8 @@ class StepStatistics(Frozen):
         sweeps: Evaluations of its first derivatives alone, or of forward dynamics (N,).
         substeps: Parts the step was taken in (N,); more than 1 where a guard refused the whole step, and there the
             map is not the integrator's own.
+        halvings: Of dt in each part of the steps taken in more than one (K,), step after step: a part is
+            dt / 2**halvings long. Nothing is kept of the other steps.
         residual: Residual of the step equation (N,), in units of the rounding error of its terms.
         energy_defect: Errors of the energy balances so far (N,) [J], added up over the mechanically independent groups
             of joints: what the energy is off by, of what no force accounts for.
@@ -54,6 +62,7 @@ class StepStatistics(Frozen):
     jets: Integers
     sweeps: Integers
     substeps: Integers
+    halvings: Bytes
     residual: Floats
     branch_margin: Floats
     energy_defect: Floats
@@ -71,6 +80,52 @@ class StepStatistics(Frozen):
     def split_steps(self) -> int:
         """How many steps were taken in more than one part."""
         return int((self.substeps > 1).sum())
+
+    def part(self, begin: int, end: int) -> StepStatistics:
+        """Of the steps begin .. end, as views."""
+        first, last = (_parts_in(self.substeps[:place]) for place in (begin, end))
+        own = {name: getattr(self, name)[begin:end] for name in STEP_NUMBERS}
+        return StepStatistics(**own, halvings=self.halvings[first:last])
+
+    def damage(self) -> str | None:
+        """What is wrong with a record of parts that no motion has, in words."""
+        counts, halvings = self.substeps[self.substeps > 1], self.halvings
+        if counts.size and counts.max() > 1 << MOST_HALVINGS:
+            return "statistics.substeps holds numbers of parts that no step has"
+        fits = counts.sum() == halvings.size and (
+            not halvings.size or (halvings.min() >= 1 and halvings.max() <= MOST_HALVINGS and _add_up(counts, halvings))
+        )
+        return None if fits else "statistics.halvings does not hold the parts that statistics.substeps counts"
+
+
+# What statistics hold one number of for each step.
+STEP_NUMBERS = tuple(item.name for item in fields(StepStatistics) if item.name != "halvings")
+# A step is never halved more often.
+MOST_HALVINGS = 30
+
+
+def _parts_in(substeps: Integers) -> int:
+    """How many parts the steps have together that were not taken whole."""
+    return int(substeps[substeps > 1].sum())
+
+
+def _add_up(counts: Integers, halvings: Bytes) -> bool:
+    """Whether the parts of every step make a whole one; takes little memory, whatever a file holds."""
+    units = 1 << (MOST_HALVINGS - np.arange(MOST_HALVINGS + 1))
+    ends, done = np.cumsum(counts), 0
+    for begin in range(0, halvings.size, _AT_A_TIME):
+        sums = done + np.cumsum(units[halvings[begin : begin + _AT_A_TIME]])
+        first, last = np.searchsorted(ends, [begin, begin + len(sums)], side="right")
+        if not np.array_equal(sums[ends[first:last] - 1 - begin], np.arange(first + 1, last + 1) << MOST_HALVINGS):
+            return False
+        done = int(sums[-1])
+    return True
+
+
+def joined(statistics: Sequence[StepStatistics]) -> StepStatistics:
+    """Of steps that follow each other."""
+    names = (item.name for item in fields(StepStatistics))
+    return StepStatistics(**{name: np.concatenate([getattr(own, name) for own in statistics]) for name in names})
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +149,8 @@ class Trajectory(Frozen):
         statistics: What each step took.
         version: The varpin that made it.
         warnings: What varpin said of the motion, a sentence each: dt too coarse, energy off, steps taken in parts.
+        scene_values: Numbers of the scene it was made in, :attr:`varpin.Scene.values`; empty in files that varpin wrote
+            before it kept them.
     """
 
     t: Floats
@@ -111,6 +168,7 @@ class Trajectory(Frozen):
     statistics: StepStatistics
     version: str = __version__
     warnings: tuple[str, ...] = ()
+    scene_values: Mapping[str, Floats] = field(default_factory=lambda: MappingProxyType({}), repr=False)
 
     def __post_init__(self) -> None:
         nodes, n = np.size(self.t), len(self.joint_names)
@@ -146,13 +204,12 @@ class Trajectory(Frozen):
         if begin == 0 and end == self.steps:
             return self
         nodes, steps = slice(begin, end + 1), slice(begin, end)
-        own = self.statistics
         return replace(
             self,
             **{name: getattr(self, name)[nodes] for name in ("t", "q", "v", "p", "energy")},
             u=self.u[steps],
             dw=self.dw[steps],
-            statistics=StepStatistics(**{item.name: getattr(own, item.name)[steps] for item in fields(own)}),
+            statistics=self.statistics.part(begin, end),
         )
 
     def __repr__(self) -> str:
@@ -160,7 +217,7 @@ class Trajectory(Frozen):
         flag = f", {split} steps split by the guards" if split else ""
         return (
             f"Trajectory({self.robot}: {len(self.joint_names)} joints, {self.steps} steps of {self.dt:g} s, "
-            f"{self.integrator}{flag})"
+            f"{self.integrator}{flag}{said(self.warnings)})"
         )
 
     def _repr_html_(self) -> str:
@@ -202,6 +259,7 @@ class Trajectory(Frozen):
         members |= {f"statistics.{item.name}": getattr(self.statistics, item.name) for item in fields(StepStatistics)}
         members |= {"version": self.version, "integrator": self.integrator, "robot": self.robot}
         members |= {"warnings": np.array(self.warnings, dtype=str)}
+        members |= {f"{_SCENE}{name}": values for name, values in self.scene_values.items()}
         return members | {"dt": self.dt, "joint_names": np.array(self.joint_names, dtype=str)}
 
     @classmethod
@@ -220,7 +278,9 @@ class Trajectory(Frozen):
         source = path_like("path", path)
         if robot is not None and not isinstance(robot, Robot):
             raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
-        members = read_members(source, FORMAT, MEMBERS, check=lambda headers: require_layout(source, headers))
+        members = read_members(
+            source, FORMAT, MEMBERS, optional=OPTIONAL, check=lambda headers: require_layout(source, headers)
+        )
         return cls.of_members(source, members, robot)
 
     @classmethod
@@ -235,6 +295,10 @@ class Trajectory(Frozen):
         # Energies, momenta with them, and what is said of steps overflow before q and v do, and are saved as they are.
         held = np.isfinite(members["energy"])
         given = {name: members[name] for name in ("t", "q", "v", "u", "dw", "masses", "dt")} | {"p": members["p"][held]}
+        kept = {name: members[_SCENE + name] for name in VALUES if _SCENE + name in members}
+        # A noise without a center of its own has NaN there, a stop of one end an infinite other one.
+        endless = {"noise.center", *OF_FORCES}
+        given |= {_SCENE + name: values for name, values in kept.items() if name not in endless}
         for name, values in given.items():
             if not np.isfinite(values).all():
                 raise FileError(f"{source}: {name} holds values that are not finite numbers")
@@ -258,6 +322,8 @@ class Trajectory(Frozen):
                 f"{robot.name!r} has joints of the same names, but its links weigh {robot.tree.mass.sum():.6g} kg"
             )
         statistics = StepStatistics(**{x.name: members[f"statistics.{x.name}"] for x in fields(StepStatistics)})
+        if damage := statistics.damage():
+            raise FileError(f"{source}: {damage}")
         return cls(
             **{name: members[name] for name in _ARRAYS},
             dt=float(members["dt"]),
@@ -267,6 +333,7 @@ class Trajectory(Frozen):
             statistics=statistics,
             version=str(members["version"]),
             warnings=tuple(str(sentence) for sentence in members["warnings"]),
+            scene_values=MappingProxyType(kept),
         )
 
 
@@ -280,8 +347,12 @@ def require_layout(source: Path, members: Mapping[str, NDArray[Any] | Header]) -
     nodes: tuple[int, ...] = (steps + 1,)
     shapes = dict.fromkeys("qvp", (*nodes, n)) | dict.fromkeys(("t", "energy"), nodes) | {"masses": (-1,), "dt": ()}
     shapes |= {"u": (steps, -1), "dw": (steps, -1), "joint_names": (-1,), "warnings": (-1,)}
-    shapes |= {f"statistics.{item.name}": (steps,) for item in fields(StepStatistics)}
+    shapes |= {f"statistics.{name}": (steps,) for name in STEP_NUMBERS} | {"statistics.halvings": (-1,)}
     shapes |= dict.fromkeys(_TEXTS[:3], ())
+    ends = {"gravity": (3,), "actuation": (n, -1)} | dict.fromkeys(("damping", "stiffness", "rest", "armature"), (n,))
+    ends |= dict.fromkeys(("ratio", "offset"), (-1,)) | dict.fromkeys(("center", "translation"), (-1, 3))
+    ends |= {"inertia": (-1, 6), "rotation": (-1, 3, 3)} | dict.fromkeys(OF_FORCES, (-1, -1))
+    shapes |= {_SCENE + name: ends.get(name, (n, -1)) for name in VALUES if _SCENE + name in members}
     for name, shape in shapes.items():
         found, kind = members[name].shape, members[name].dtype
         if len(found) != len(shape) or any(b not in (-1, a) for a, b in zip(found, shape, strict=True)):
@@ -289,14 +360,17 @@ def require_layout(source: Path, members: Mapping[str, NDArray[Any] | Header]) -
         if name in _TEXTS:
             if kind.kind != "U":
                 raise FileError(f"{source}: {name} holds {kind}, where text belongs")
-        elif kind != (np.int64 if name in _COUNTS else np.float64):
-            raise FileError(f"{source}: {name} holds {kind}, where {'int64' if name in _COUNTS else 'float64'} belongs")
+        elif kind != _KINDS.get(name, "float64"):
+            raise FileError(f"{source}: {name} holds {kind}, where {_KINDS.get(name, 'float64')} belongs")
         if name in (*_TEXTS, "masses") and members[name].size * kind.itemsize > _MOST_WORDS:
             raise FileError(f"{source}: {name} is longer than any: {found} of {kind}")
 
 
 def chained(parts: Sequence[Trajectory]) -> Trajectory:
-    """Motions at one dt, each of which begins where the one before ended, as one that begins when the first does."""
+    """Motions at one dt, each of which begins where the one before ended, as one that begins when the first does.
+
+    Their warnings, each in the times of its own part, are left out.
+    """
     first = parts[0]
     steps = sum(part.steps for part in parts)
     arrays: dict[str, Any] = {
@@ -304,16 +378,12 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
         for name in ("q", "v", "p", "energy")
     }
     arrays |= {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("u", "dw")}
-    statistics = {
-        item.name: np.concatenate([getattr(part.statistics, item.name) for part in parts])
-        for item in fields(StepStatistics)
-    }
     return replace(
         first,
         t=first.t[0] + np.arange(steps + 1) * first.dt,
         **arrays,
-        statistics=StepStatistics(**statistics),
-        warnings=tuple(dict.fromkeys(sentence for part in parts for sentence in part.warnings)),
+        statistics=joined([part.statistics for part in parts]),
+        warnings=(),
     )
 
 
@@ -334,9 +404,28 @@ def require_motion(scene: Scene, trajectory: Trajectory) -> None:
         raise InputError(f"the trajectory has {trajectory.u.shape[1]} controls, the scene {scene.controls}")
 
 
-# What a file of a trajectory holds beside its format.
+def require_scene_of(scene: Scene, trajectory: Trajectory) -> None:
+    """Refuse a motion that was made in a scene of other numbers, as far as it keeps them.
+
+    Noise counts where there was some: without, the motion is that of any noise.
+
+    Raises:
+        InputError: It says what differs.
+    """
+    found = differences(scene, trajectory.scene_values, noise=bool(trajectory.dw.any()))
+    if not same(trajectory.masses, scene.robot.tree.mass):
+        found.insert(0, "the robot's masses are others in the scene")
+    if found:
+        raise InputError(
+            f"the trajectory was made in another scene than the one given: {'; '.join(found)}. Give the scene that "
+            "made it, or simulate again in this one"
+        )
+
+
+# What a file of a trajectory holds beside its format, and what it may hold.
 MEMBERS = frozenset(_ARRAYS) | {"dt", "version", "integrator", "robot", "joint_names", "warnings"}
 MEMBERS |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
+OPTIONAL = frozenset(_SCENE + name for name in VALUES)
 
 
 def read_members(
@@ -344,11 +433,12 @@ def read_members(
     kind: str,
     expected: Iterable[str],
     *,
+    optional: Collection[str] = (),
     others: bool = False,
     most: int | None = None,
     check: Check | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """The ``expected`` arrays of an npz file of format ``kind``, with ``others`` all of them.
+    """The ``expected`` arrays of an npz file of format ``kind``, the ``optional`` that it has, with ``others`` all.
 
     ``most`` and ``check`` as for :func:`varpin.archive.read_npz`.
 
@@ -360,7 +450,8 @@ def read_members(
     found = read_npz(source, names, what, wanted={"format"}, most=_MOST_WORDS)["format"]
     if found.shape != () or str(found) != kind:
         raise FileError(f"{source} is not a {what}: its format is {reprlib.repr(str(found))[1:-1]}, not {kind!r}")
-    return read_npz(source, names, what, wanted=None if others else names, most=most, check=check)
+    wanted = None if others else {*names, *optional}
+    return read_npz(source, names, what, wanted=wanted, most=most, check=check)
 
 
 @contextlib.contextmanager

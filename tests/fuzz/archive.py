@@ -47,7 +47,7 @@ def _strange_array(array: np.ndarray, rng: random.Random) -> np.ndarray:
         return np.zeros(rng.choice([(), (0,), (0, 0), (3, 0), (0, 3), (1,) * 32, (7,), (7, 3)]))
     if change == 6:
         return np.array(
-            rng.choice(["", "x" * 3000, "varpin.trajectory/2", "\0", "é", "{", "[]", "{}", "null", "1" * 5000])
+            rng.choice(["", "x" * 3000, "varpin.trajectory/3", "\0", "é", "{", "[]", "{}", "null", "1" * 5000])
         )
     if change == 7:
         return np.zeros(3, dtype=[("a", "f8"), ("b", "U3")])

@@ -28,6 +28,7 @@ def corpus() -> Corpus:
             error=1e-3 * k,
             joint=2e-3 * k,
             velocity=3e-3 * k,
+            period=4e-3 * k,
             energy=math.inf,
             said=("dt is coarse",) * (k % 2),
             found=("energy",) * (k % 3),

@@ -6,9 +6,10 @@ import argparse
 import difflib
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,15 +61,18 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
     add_vector(start, "v0", "initial velocity [rad/s or m/s]; default: 0")
     surroundings = parser.add_argument_group("surroundings")
     add_gravity(surroundings)
-    add_vector(surroundings, "damping", "viscous damping [N m s/rad or N s/m]; default: 0")
+    text = "viscous damping [N m s/rad or N s/m], or 'robot' for that of the robot's description; default: 0"
+    add_vector(surroundings, "damping", text, _damping)
     add_vector(surroundings, "stiffness", "joint springs [N m/rad or N/m]; default: 0")
     add_vector(surroundings, "rest", "where the springs are slack [rad or m]; default: 0")
     add_vector(surroundings, "torque", "constant generalized forces [N m or N]; default: 0")
 
 
-def add_vector(group: argparse._ActionsContainer, name: str, text: str) -> None:
-    """An option of one number for all joints, one for each, or some by name."""
-    group.add_argument(f"--{name}", type=_number, nargs="+", metavar="X", help=text)
+def add_vector(
+    group: argparse._ActionsContainer, name: str, text: str, read: Callable[[str], object] | None = None
+) -> None:
+    """An option of one number for all joints, one for each, or some by name; ``read`` takes one if it takes others."""
+    group.add_argument(f"--{name}", type=read or _number, nargs="+", metavar="X", help=text)
 
 
 def add_integrator(parser: argparse.ArgumentParser) -> None:
@@ -139,7 +143,7 @@ def _text(value: object) -> str:
         return f"{value[0]}={_text(value[1])}"
     if isinstance(value, list):
         return ",".join(map(_text, value))
-    return repr(value)
+    return value if isinstance(value, str) else repr(value)
 
 
 def add_gravity(group: argparse._ActionsContainer) -> None:
@@ -179,6 +183,11 @@ def _number(word: str) -> float | tuple[str, float]:
     return (name, number) if equals else number
 
 
+def _damping(word: str) -> float | tuple[str, float] | str:
+    """As :func:`_number`, or the word for what the robot's description gives."""
+    return "robot" if word.strip() == "robot" else _number(word)
+
+
 def values_of(option: str, given: Sequence[float | tuple[str, float]] | None) -> JointValues | None:
     """What an option of :func:`add_vector` says: None if it was not given, one number, several, or some by name.
 
@@ -211,13 +220,22 @@ def _vector(option: str, given: Sequence[float | tuple[str, float]] | None, robo
     return joint_array(option, 0.0 if values is None else values, robot.joint_names, uniform=True)
 
 
+def _damping_of(request: argparse.Namespace, robot: Robot) -> NDArray[np.float64] | Literal["robot"] | None:
+    given = request.damping
+    if given is None or "robot" not in given:
+        return None if given is None else _vector("damping", given, robot)
+    if len(given) > 1:
+        raise InputError("--damping takes either numbers or the word robot, not both at once")
+    return "robot"
+
+
 def motion_of(request: argparse.Namespace) -> tuple[Scene, ArrayLike, ArrayLike, NDArray[np.float64] | None]:
     """The scene, q0, v0, and the torque unless it is zero."""
     robot = load_robot(request.robot, package_dirs=request.package_dir, lock=dict(request.lock))
     scene = Scene(
         robot,
         gravity=request.gravity,
-        damping=_vector("damping", request.damping, robot),
+        damping=_damping_of(request, robot),
         stiffness=_vector("stiffness", request.stiffness, robot),
         rest=_vector("rest", request.rest, robot),
     )

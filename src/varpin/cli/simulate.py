@@ -67,7 +67,7 @@ def add_simulate(parser: argparse.ArgumentParser) -> None:
 def _simulate(request: argparse.Namespace, errors: Console) -> int:
     if names_scene(request.robot):
         file = scene_file(request, request.robot, "simulate", *_OF_MOTIONS)
-        driven = bool(file.scene.damping.any() or file.controls() is not None or file.spec.seed is not None)
+        driven = bool(file.scene.dissipates or file.controls() is not None or file.spec.seed is not None)
         outputs = outputs_of(request, file.marks)
         return _run(request, errors, file.scene, driven, file.spec.steps, lambda p: file.simulate(progress=p), outputs)
     outputs = outputs_of(request)
@@ -80,7 +80,7 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
             scene, q0, v0, dt=request.dt, steps=steps, controls=torque, integrator=integrator, progress=progress
         )
 
-    return _run(request, errors, scene, bool(scene.damping.any() or torque is not None), steps, run, outputs)
+    return _run(request, errors, scene, bool(scene.dissipates or torque is not None), steps, run, outputs)
 
 
 def _run(

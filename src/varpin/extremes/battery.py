@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import varpin
+from varpin import limits
 from varpin._version import __version__
 from varpin.checks import is_file, path_like, positive, writable
 from varpin.errors import FileError, VarpinError
@@ -26,10 +27,9 @@ from varpin.extremes.trial import Cell, Kind, Setup, Trial
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
 from varpin.robot import Robot
 from varpin.simulation import Interrupted, simulate
-from varpin.soundness import JOINT_LIMITS
 from varpin.trajectory import Trajectory, atomic_file
 
-FORMAT = "varpin.extremes/2"
+FORMAT = "varpin.extremes/3"
 
 INTEGRATORS: tuple[Integrator, ...] = (
     *(Midpoint(alpha=alpha) for alpha in (0.0, 0.5, 1.0)),
@@ -47,7 +47,7 @@ _SAVED_EVERY = 2.0
 Progress = Callable[[int, int, str], None]
 # What no coarse step excuses: a record that contradicts itself, and derivatives without their structure.
 _STRUCTURE = ("record", "symplecticity")
-_MEASURES = ("error", "joint", "velocity", "energy", "momentum", "reversal", "symplecticity", "record")
+_MEASURES = ("error", "joint", "velocity", "period", "energy", "momentum", "reversal", "symplecticity", "record")
 
 
 class _OutOfTime(KeyboardInterrupt):
@@ -303,7 +303,7 @@ class Bench:
             text = (f"unnamed error: {type(error).__name__}: {error}",)
             return nothing | {"kind": Kind.WRONG, "said": (), "found": text, "done": 0}
         wrong = findings(found, integrator, condition(self._setup))  # type: ignore[arg-type]
-        said = tuple(sentence for sentence in trajectory.warnings if not sentence.startswith(JOINT_LIMITS))
+        said = tuple(sentence for sentence in trajectory.warnings if not sentence.startswith(limits.KINDS))
         if not finite(trajectory):
             kind, wrong = Kind.WRONG, ("the record is not finite", *wrong)
         elif any(sentence.startswith(_STRUCTURE) for sentence in wrong):

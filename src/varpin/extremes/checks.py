@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.errors import LinearizationError, VarpinError
+from varpin.extremes.periods import period_error
 from varpin.extremes.trial import LEVELS, Setup
 from varpin.integrators import Gauss, Integrator, Midpoint, Reference
 from varpin.integrators.base import open_loop
@@ -106,8 +107,7 @@ def _units(setup: Setup, dt: float, nodes: NDArray[np.int64], q: Floats, v: Floa
     way = np.abs(q - setup.q0).max(axis=0)
     known = np.vstack([setup.v0, np.diff(q, axis=0, prepend=setup.q0[None]) / dt if v is None else v])
     speed, duration = np.abs(known).max(axis=0), float(nodes[-1]) * dt
-    tree = setup.scene.robot.tree
-    slides = np.isin(np.arange(q.shape[1]), tree.coordinate[tree.prismatic > 0])
+    slides = setup.scene.robot.slides
     inertia = np.sqrt(np.diag(lagrangian_jet(setup.scene, setup.q0, np.zeros_like(setup.q0), backend="pinocchio").Lvv))
     # What turns evenly, however fast, has next to no part in what the others do.
     change = np.clip(np.ptp(known, axis=0), _EVEN * speed, speed)
@@ -199,7 +199,7 @@ def velocity_error(exact: Exact, trajectory: Trajectory) -> float:
 
 def unforced(scene: Scene, trajectory: Trajectory) -> bool:
     """Whether nothing but gravity and springs acts."""
-    return not (scene.damping.any() or (trajectory.u @ scene.actuation.T).any() or trajectory.dw.any())
+    return not (scene.dissipates or (trajectory.u @ scene.actuation.T).any() or trajectory.dw.any())
 
 
 def energy_error(scene: Scene, trajectory: Trajectory) -> float:
@@ -214,7 +214,7 @@ def energy_error(scene: Scene, trajectory: Trajectory) -> float:
     force = trajectory.u @ scene.actuation.T
     work = np.append(0.0, np.cumsum(np.einsum("ki,ki->k", force, np.diff(trajectory.q, axis=0))))
     off = trajectory.energy - trajectory.energy[0] - work
-    off = np.maximum(off, 0.0) if scene.damping.any() else np.abs(off)
+    off = np.maximum(off, 0.0) if scene.dissipates else np.abs(off)
     fastest = np.abs(trajectory.v).max(axis=0)
     change = np.clip(np.ptp(trajectory.v, axis=0), _EVEN * fastest, fastest)
     some = trajectory.q[np.unique(np.linspace(0, trajectory.steps, _DYING).astype(np.int64))]
@@ -285,7 +285,7 @@ def linearized(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
     """A of some steps that were not taken in parts (K, 2n, 2n); of variational methods, where nothing damps."""
     n = scene.robot.dof
     nothing = np.zeros((0, 2 * n, 2 * n))
-    if not integrator.variational or scene.damping.any() or trajectory.dw.any():
+    if not integrator.variational or scene.dissipates or trajectory.dw.any():
         return nothing
     whole = np.flatnonzero(trajectory.statistics.substeps == 1)
     if not len(whole):
@@ -359,6 +359,7 @@ def measures(setup: Setup, integrator: Integrator, trajectory: Trajectory, exact
             "error": math.nan if exact is None else reference_error(exact, trajectory),
             "joint": math.nan if exact is None else joint_error(exact, trajectory),
             "velocity": math.nan if exact is None else velocity_error(exact, trajectory),
+            "period": period_error(scene, integrator, trajectory),
             "energy": energy_error(scene, trajectory),
             "momentum": momentum_error(scene, trajectory),
             "reversal": reversal_error(scene, integrator, trajectory),

@@ -15,19 +15,28 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.costs import ControlCost, Cost, Terminal, TrackingCost
 from varpin.errors import VarpinError
-from varpin.extremes.trial import Kind
-from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint
+from varpin.extremes.checks import energy_error
+from varpin.extremes.trial import LEVELS, Kind
+from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, Reference
 from varpin.noise import AdditiveNoise, ControlNoise, Noise
 from varpin.robot import Robot
 from varpin.robot.chain import rod_chain
 from varpin.scene import Scene
 from varpin.sddp import OptimalControlProblem, Solution, Status, solve
+from varpin.simulation import simulate
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
 # Part of a plan's cost that single controls may still take off it, and relative error of the cost itself.
 LEFT_LEVEL, COST_LEVEL = 1e-2, 1e-6
+# Part of a plan's cost that a robot may pay beyond it without a word.
+PAID_LEVEL = 1e-3
+# Parts of a step over which that is summed up.
+_FINER = 16
+# Changes between speeding up and slowing down in a hundred steps that a plan may have without a word, and how many need
+# no word in any; of those that a thousandth of a joint's largest velocity shows.
+_RESTLESS, _FEW, _SHOWN = 12.0, 12, 1e-3
 _PLANNERS = (Midpoint(), Gauss(stages=4), ExplicitEuler())
 # Part of a cost up to which noise does not move its optimum to speak of.
 _QUIET = 1e-4
@@ -68,7 +77,10 @@ class Task:
     def cost(self, motion: Trajectory) -> float:
         """The cost of a motion, summed by hand at two Gauss points of each step, on the cubic through its nodes."""
         t, q, u, dt = motion.t, motion.q, motion.u, motion.dt
-        rows = np.broadcast_to(np.atleast_2d(self.reference), q.shape)
+        given = np.atleast_2d(self.reference)
+        # Between its rows a reference is straight.
+        places = np.linspace(0.0, len(given) - 1.0, len(q))
+        rows = np.stack([np.interp(places, np.arange(len(given)), column) for column in given.T], axis=1)
         path, tracking = scipy.interpolate.CubicHermiteSpline(t, q, motion.v), 0.0
         for place in (0.5 - math.sqrt(3.0) / 6.0, 0.5 + math.sqrt(3.0) / 6.0):
             off = path(t[:-1] + place * dt) - ((1.0 - place) * rows[:-1] + place * rows[1:])
@@ -97,7 +109,7 @@ class Plan:
 def attempt(plan: Plan, integrator: Integrator, patience: float = math.inf) -> dict[str, Any]:
     """Solve it, within about this time [s], and judge the solution: what a cell holds."""
     outcome: dict[str, Any] = dict.fromkeys(
-        ("error", "joint", "velocity", "energy", "momentum", "reversal", "symplecticity", "record"), math.nan
+        ("error", "joint", "velocity", "period", "energy", "momentum", "reversal", "symplecticity", "record"), math.nan
     ) | {"said": (), "found": (), "done": 0}
     try:
         task = plan.build()
@@ -125,12 +137,24 @@ def attempt(plan: Plan, integrator: Integrator, patience: float = math.inf) -> d
         wrong = wrong or solution.status.converged
         found.append(f"single controls take {left:.2g} off the cost (wrong from {LEFT_LEVEL:g})")
     said = (*(() if solution.status.converged else (solution.status.value,)), *warnings)
+    energy = energy_error(problem.scene, solution.trajectory)
+    if energy > LEVELS["energy"]:
+        wrong = wrong or not said
+        found.append(f"energy {energy:.2g} (wrong from {LEVELS['energy']:g})")
+    # What is said of a plan is mostly of what the robot pays, which takes a while to find out.
+    if said and not abs(paid := paid_by_robot(task, solution)) <= PAID_LEVEL:
+        found.append(f"the robot pays {paid:+.2g} of the cost more for its controls (worth a word from {PAID_LEVEL:g})")
+    restless = changes(solution.trajectory)
+    if restless > max(_RESTLESS * plan.steps / 100.0, _FEW):
+        wrong = wrong or not said
+        found.append(f"a velocity goes up and down {restless} times in {plan.steps} steps")
     # Plans have a number of iterations here; one that it cuts short is no better and no worse than that.
     cut = solution.status is Status.MAX_ITERATIONS
     kind = Kind.WRONG if wrong else Kind.STOPPED if cut else Kind.DEGRADED if said else Kind.ACCURATE
     return outcome | {
         "kind": kind,
         "error": left,
+        "energy": energy,
         "record": record,
         "said": said,
         "found": tuple(found),
@@ -160,6 +184,33 @@ def cost_error(task: Task, solution: Solution) -> float:
     motion = solution.trajectory
     cost = task.cost(motion)
     return abs(cost - solution.cost) / max(abs(cost), np.finfo(np.float64).tiny) if cost != solution.cost else 0.0
+
+
+def paid_by_robot(task: Task, solution: Solution) -> float:
+    """What the plan's controls cost on the continuous robot beyond what the plan has them cost, relative to that.
+
+    Without noise. Infinite where there is no such motion.
+    """
+    problem, motion = solution.problem, solution.trajectory
+    try:
+        exact = simulate(
+            problem.scene, problem.q0, problem.v0, dt=motion.dt / _FINER, steps=_FINER * motion.steps,
+            controls=np.repeat(motion.u, _FINER, axis=0), increments=0 if problem.scene.processes else None,
+            integrator=Reference(), check=False,
+        )  # fmt: skip
+    except VarpinError:
+        return math.inf
+    return (task.cost(exact) - solution.cost) / max(abs(solution.cost), np.finfo(np.float64).tiny)
+
+
+def changes(motion: Trajectory) -> int:
+    """How often the velocity of the most restless joint goes from rising to falling, or back, as far as it shows."""
+    most = 0
+    for v in motion.v.T:
+        step = np.diff(v)
+        step = np.where(np.abs(step) > _SHOWN * np.abs(v).max(), np.sign(step), 0.0)
+        most = max(most, int((step[1:] * step[:-1] < 0.0).sum()))
+    return most
 
 
 def part_left(task: Task, solution: Solution) -> float:
@@ -262,7 +313,7 @@ def plans_on(robot: Robot) -> list[Plan]:
 
     def task(**options: Any) -> Callable[[], Task]:
         def build() -> Task:
-            scene = Scene(robot, noise=options.pop("noise", None)) if "noise" in options else Scene(robot)
+            scene = Scene(robot, damping=0.0, noise=options.pop("noise", None))
             return Task(scene, np.full(robot.dof, 0.3), np.zeros(robot.dof), **options)
 
         return build

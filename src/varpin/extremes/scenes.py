@@ -281,24 +281,24 @@ def trials_on(robot: Robot) -> list[Trial | Plan]:
     """What of the battery makes sense for any robot: scaled by what it weighs and how fast it falls from q = 0.3."""
     n = robot.dof
     start = np.full(n, 0.3)
-    M = lagrangian_jet(Scene(robot), start, np.zeros(n)).Lvv
+    bare = Scene(robot, damping=0.0)
+    M = lagrangian_jet(bare, start, np.zeros(n)).Lvv
     # The inertia that each joint has to move, and the heaviest of the forces that gravity takes it to.
     inertia = np.diag(M)
-    weight = np.maximum(np.abs(lagrangian_jet(Scene(robot), start, np.zeros(n)).Lq), 1e-3 * inertia)
+    weight = np.maximum(np.abs(lagrangian_jet(bare, start, np.zeros(n)).Lq), 1e-3 * inertia)
 
     def still(controls: Floats | None = None, v: ArrayLike = 0.0, **scene: Any) -> Callable[[], Setup]:
         def build() -> Setup:
             speed = np.broadcast_to(np.asarray(v, dtype=np.float64), (n,)).copy()
-            return Setup(Scene(robot, **scene), start.copy(), speed, controls=controls)
+            return Setup(Scene(robot, **{"damping": 0.0} | scene), start.copy(), speed, controls=controls)
 
         return build
 
     def turned(turns: float) -> Callable[[], Setup]:
         def build() -> Setup:
-            scene = Scene(robot)
+            scene = Scene(robot, damping=0.0)
             # A mimic joint that follows turns by a part of it, and no motion is the same then.
-            revolute = np.full(n, not robot.ties)
-            revolute[robot.tree.coordinate[robot.tree.prismatic > 0]] = False
+            revolute = np.full(n, not robot.ties) & ~robot.slides
             shift = np.where(revolute, _TURN * turns, 0.0)
             return Setup(scene, start + shift, np.zeros(n), twin=scene, shift=shift)
 
@@ -306,7 +306,7 @@ def trials_on(robot: Robot) -> list[Trial | Plan]:
 
     def noisy(strength: float, dt: float, steps: int) -> Callable[[], Setup]:
         def build() -> Setup:
-            scene = Scene(robot, noise=AdditiveNoise(strength * weight))
+            scene = Scene(robot, damping=0.0, noise=AdditiveNoise(strength * weight))
             return Setup(scene, start.copy(), np.zeros(n), increments=wiener_increments(n, dt, steps, 0))
 
         return build

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -10,6 +9,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.accuracy import WRONG_ENERGY, WRONG_MOTION, WRONG_POSITION, WRONG_VELOCITY
 from varpin.integrators import Integrator
 from varpin.scene import Scene
 
@@ -19,21 +19,17 @@ Floats = NDArray[np.float64]
 # From here on a result is wrong. Accuracy in units of the motion itself, structure in units of rounding with room for
 # ill-conditioned mass matrices.
 LEVELS = {
-    "error": 0.05,
-    "joint": 0.1,
-    "velocity": 0.25,
-    "energy": 0.1,
+    "error": WRONG_MOTION,
+    "joint": WRONG_POSITION,
+    "velocity": WRONG_VELOCITY,
+    "period": 1.0,
+    "energy": WRONG_ENERGY,
     "momentum": 0.1,
     "kept momentum": 1e-6,
     "reversal": 1e-4,
     "symplecticity": 1e-7,
     "record": 1e-6,
 }
-
-# varpin warns from about half of these levels on, for its own estimates are good to a factor of two; by as much below
-# that, a warning is needless.
-NEEDLESS = 0.25
-_ACCURACY = ("error", "joint", "velocity", "energy")
 
 
 class Kind(Enum):
@@ -113,6 +109,7 @@ class Cell:
             the part of its cost that single controls would take off.
         joint: The same distance, each joint in units of its own way.
         velocity: The same of v, in units of each joint's largest velocity.
+        period: Largest error over a period from any of many nodes of the whole motion, in units of what is wrong.
         energy: Largest error of the energy balance, in units of the energy there is to turn over.
         momentum: Largest change of the momentum that is to be conserved, in units of the largest one.
         reversal: Distance in q from where the reversed motion is to end, in units of the way.
@@ -133,6 +130,7 @@ class Cell:
     error: float
     joint: float
     velocity: float
+    period: float
     energy: float
     momentum: float
     reversal: float
@@ -152,10 +150,5 @@ class Cell:
 
     @property
     def needless(self) -> bool:
-        """Whether it says so of what is far better than wrong; where there is no exact motion, nobody knows."""
-        if not self.warned or self.found:
-            return False
-        if self.family.startswith("plans"):
-            return True
-        shares = [getattr(self, name) / LEVELS[name] for name in _ACCURACY]
-        return not math.isnan(self.error) and not any(share >= NEEDLESS for share in shares)
+        """Whether it says so although no check finds anything."""
+        return self.warned and not self.found

@@ -248,7 +248,7 @@ def torque_shares(
     size = np.abs(values)
     largest = size.max(axis=0, initial=0.0)
     own = robot.effort_limit
-    bound = np.where(np.isfinite(own) & (own > 0.0), own, largest)
+    bound = np.where(np.isfinite(own), own, largest)
     if limit is not None:
         given = joint_array("torque_limit", limit, robot.joint_names, uniform=True)
         # Of joints that are not named the limit stays their own.

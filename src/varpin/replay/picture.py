@@ -44,7 +44,8 @@ class Picture:
         """The picture of a robot, made of the meshes that can be read."""
         visuals, missing = readable_geometry(robot)
         shapes = list(visuals.geometryObjects)
-        problem = next((error for _, error in missing.values()), f"robot {robot.name!r} comes without visual geometry")
+        problem = "; ".join(dict.fromkeys(error for _, error in missing.values()))
+        problem = problem or f"robot {robot.name!r} comes without visual geometry"
         if not shapes:
             logger.warning("%s; drawing a skeleton of its joints and centres of mass instead", problem)
             shapes = _skeleton(robot)

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from varpin.costs import Cost, CostSum, Terminal
 from varpin.errors import InputError, RobotError, RobotNotFound, UnknownFrame, UnknownJoint, VarpinError
+from varpin.forces import Force
 from varpin.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
 from varpin.robot import Robot, load_robot
-from varpin.scene import Scene, closest_controls
+from varpin.scene import Scene, closest_controls, damping_of
 from varpin.scenefile.references import Timeline, constant
-from varpin.scenefile.spec import CostSpec, SceneSpec, degrees_for_radians
+from varpin.scenefile.spec import CostSpec, ForceSpec, SceneSpec, degrees_for_radians
 from varpin.scenefile.table import Floats, SceneFileError, Table, suggestion
 from varpin.scenefile.terms import Given
 
@@ -29,6 +30,18 @@ class Noises:
     kind: str
     intensity: Floats
     center: Floats | None
+
+
+@dataclass(frozen=True, eq=False)
+class JointForces:
+    """A force on joints, its attributes by joint (n,)."""
+
+    kind: type[Force]
+    values: Mapping[str, Floats]
+
+    def force(self) -> Force:
+        """As a scene takes it."""
+        return self.kind(**self.values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +62,7 @@ class Layout:
         spec: The file.
         robot: The robot.
         damping: (n,), like stiffness, rest, q0 and v0.
+        forces: Others on joints.
         actuated: Indices of the driven joints (m,).
         gear: Generalized force per control (m,).
         torque_limit: (m,) [N m or N], infinite where there is none.
@@ -63,6 +77,7 @@ class Layout:
     damping: Floats
     stiffness: Floats
     rest: Floats
+    forces: tuple[JointForces, ...]
     q0: Floats
     v0: Floats
     actuated: NDArray[np.int64]
@@ -104,6 +119,10 @@ class Layout:
             damping=self.damping[keep],
             stiffness=self.stiffness[keep],
             rest=self.rest[keep],
+            forces=tuple(
+                JointForces(own.kind, {name: values[keep] for name, values in own.values.items()})
+                for own in self.forces
+            ),
             q0=self.q0[keep],
             v0=self.v0[keep],
             actuated=np.array([position[int(joint)] for joint in self.actuated[driven]], dtype=np.int64),
@@ -135,6 +154,7 @@ class Layout:
             damping=self.damping,
             stiffness=self.stiffness,
             rest=self.rest,
+            forces=[own.force() for own in self.forces],
             actuation=self.actuation,
             noise=[model for model in map(self._noise, self.noise) if model is not None] or None,
         )
@@ -180,7 +200,7 @@ def _part(term: CostTerm, index: NDArray[np.int64]) -> CostTerm:
 
 def holding_controls(scene: Scene, q: Floats) -> Floats:
     """The controls (m,) that come closest to holding the robot at q at rest."""
-    return closest_controls(scene, scene.holding_torque(q))
+    return closest_controls(scene, q)
 
 
 def joints_of_frame(robot: Robot, frame: str) -> NDArray[np.bool_]:
@@ -251,6 +271,10 @@ def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
                 raise actuation.error(
                     f"joints[{index}]", f"there is no joint {joint!r}; {suggestion(joint, names, 'joints')}"
                 )
+    if spec.damping is None or isinstance(spec.damping, str):
+        damping = damping_of(robot, spec.damping)
+    else:
+        damping = root.spread("damping", spec.damping, names)
     driven = names if spec.actuated is None else spec.actuated
     gear = actuation.spread("gear", spec.gear, driven, "driven joint")
     if not gear.all():
@@ -273,9 +297,10 @@ def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
     return Layout(
         spec=spec,
         robot=robot,
-        damping=root.spread("damping", spec.damping, names),
+        damping=damping,
         stiffness=springs.spread("stiffness", spec.stiffness, names),
         rest=rest,
+        forces=tuple(_force(force, robot) for force in spec.forces),
         q0=q0,
         v0=initial.spread("v", spec.v0, names),
         actuated=actuated,
@@ -306,8 +331,8 @@ def _torque_limit(spec: SceneSpec, robot: Robot, actuated: NDArray[np.int64], dr
         return np.full(len(driven), np.inf)
     if isinstance(spec.torque_limit, str):
         limit = robot.effort_limit[actuated]
-        if not (limit > 0.0).all():
-            joint = driven[int(np.argmax(~(limit > 0.0)))]
+        if not np.isfinite(limit).all():
+            joint = driven[int(np.argmax(~np.isfinite(limit)))]
             raise table.error("torque_limit", f"the robot description gives {joint!r} none: write numbers [N m or N]")
         return limit
     limit = table.spread("torque_limit", spec.torque_limit, driven, "driven joint")
@@ -317,6 +342,20 @@ def _torque_limit(spec: SceneSpec, robot: Robot, actuated: NDArray[np.int64], dr
             "torque_limit", f"must be > 0 [N m or N], and is {limit[driven.index(joint)]:g} for {joint!r}"
         )
     return limit
+
+
+def _force(spec: ForceSpec, robot: Robot) -> JointForces:
+    absent = {"lower": -np.inf, "upper": np.inf}
+    values = {
+        name: spec.table.spread(name, value, robot.joint_names, absent=absent.get(name, 0.0))
+        for name, value in spec.values.items()
+    }
+    found = JointForces(spec.kind, values)
+    try:
+        found.force().bind(robot)
+    except InputError as error:
+        raise spec.table.error("", str(error)) from None
+    return found
 
 
 def _noises(spec: SceneSpec, names: Sequence[str], driven: Sequence[str]) -> list[Noises]:

@@ -8,14 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.forces import CoulombFriction, Force, JointStop
 from varpin.lagrangian import lagrangian_jet
 from varpin.markup import facts, listed
 from varpin.scene import Scene
 from varpin.scenefile.layout import CostTerm, Layout, holding_controls, joints_of_frame
 from varpin.scenefile.references import Timeline
+from varpin.scenefile.spec import FORCES
 from varpin.scenefile.table import Floats
 
 Mask = NDArray[np.bool_]
+# What a scene has if it asks for it.
+_ABSENT: Mapping[str, type[Force]] = {"stops at joint limits": JointStop, "dry friction": CoulombFriction}
 # Times at which it is looked whether a reference ever leaves a place.
 _LOOKS = 2000
 
@@ -84,7 +88,7 @@ def idle_joints(layout: Layout, scene: Scene) -> Mask:
     group and what is left out with it. Noise in proportion to controls does nothing to controls that are zero.
     """
     touched = layout.v0 != 0.0
-    touched |= layout.stiffness * (layout.q0 - layout.rest) != 0.0
+    touched |= _pushed(layout, scene)
     touched |= _weighed(layout)
     t = np.linspace(0.0, layout.spec.duration, min(layout.spec.steps, _LOOKS) + 1)
     for model in layout.noise:
@@ -102,12 +106,18 @@ def idle_joints(layout: Layout, scene: Scene) -> Mask:
     return ~busy if busy.any() else np.zeros_like(busy)
 
 
+def _pushed(layout: Layout, scene: Scene) -> Mask:
+    """Which joints springs and stops push at where they start."""
+    floating = Scene(layout.robot, gravity=False, forces=scene.forces)
+    return np.asarray(lagrangian_jet(floating, layout.q0, np.zeros(layout.robot.dof)).Lq != 0.0)
+
+
 def _weighed(layout: Layout) -> Mask:
     """Which joints gravity pulls at, in some configuration."""
     robot = layout.robot
     if layout.spec.gravity is False:
         return np.zeros(robot.dof, dtype=np.bool_)
-    bare = Scene(robot, gravity=layout.spec.gravity)
+    bare = Scene(robot, gravity=layout.spec.gravity, damping=0.0)
     rng = np.random.default_rng(0)
     places = [layout.q0, *rng.uniform(-2.0, 2.0, (3, robot.dof))]
     pull = np.abs([lagrangian_jet(bare, q, np.zeros(robot.dof), backend="pinocchio").Lq for q in places]).max(axis=0)
@@ -173,6 +183,8 @@ def _terms(layout: Layout) -> dict[str, str]:
     noise = [f"{model.kind} ({np.count_nonzero(model.intensity)} processes)" for model in layout.noise]
     limited = np.isfinite(layout.torque_limit)
     costs = [term.spec.table.data["type"] + (" at the end" if term.spec.terminal else "") for term in layout.costs]
+    kinds = {force.kind for force in layout.forces}
+    absent = [words for words, kind in _ABSENT.items() if kind not in kinds] + ["contact"]
     loads = [f"{load.mass:g} kg at {load.frame}" for load in spec.robot.payload]
     return {
         "gravity": f"{', '.join(f'{g:g}' for g in gravity)} m/s^2" if any(gravity) else "none",
@@ -183,5 +195,6 @@ def _terms(layout: Layout) -> dict[str, str]:
         "driven": ", ".join(layout.driven) or "none",
         "torque limits": of(limited.astype(float), layout.driven),
         "cost": ", ".join(costs) or "none",
-        "not modelled": "stops at joint limits, contact, dry friction; shapes are read only for a replay",
+        "other forces": ", ".join(word for word, kind in FORCES.items() if kind in kinds) or "none",
+        "not modelled": f"{', '.join(absent)}; shapes are read only for a replay",
     }

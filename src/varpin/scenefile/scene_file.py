@@ -194,7 +194,7 @@ class SceneFile:
             x = np.concatenate([own, n + own])
             u[:, rows], reference[:, x] = plan.u, plan.reference
             gains[:, rows[:, None], x] = plan.gains
-        return LinearPolicy(u, gains, reference, hold=plan.hold, on=plan.on)
+        return LinearPolicy(u, gains, reference, hold=plan.hold, on=plan.on, period=plan.period)
 
     def saving(self, *, steps: int = 200, repeats: int = 5) -> float:
         """How many times as long a step takes with all joints that the file does not lock, measured.

@@ -7,12 +7,13 @@ import os
 import re
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from varpin.checks import is_file
 from varpin.errors import FileError, InputError
+from varpin.forces import Armature, CoulombFriction, Force, JointDamper, JointSpring, JointStop
 from varpin.integrators import BY_NAME, Integrator, options_of
 from varpin.robot import Payload, models_dir
 from varpin.scenefile.references import Reference, read_reference
@@ -31,6 +32,14 @@ _NESTED = 20
 _LONGEST_WORD = 1000
 _MOST_TABLES = 300
 _FLOAT = re.compile(r"(?<![\w.+-])[+-]?[0-9][0-9_]*\.[0-9][0-9_]*(?:[eE][+-]?[0-9]+)?(?![\w.-])", re.ASCII)
+# Of a [[force]], by the word for it.
+FORCES: Mapping[str, type[Force]] = {
+    "armature": Armature,
+    "damper": JointDamper,
+    "friction": CoulombFriction,
+    "spring": JointSpring,
+    "stop": JointStop,
+}
 FIGURES = (".png", ".pdf", ".svg")
 
 
@@ -66,6 +75,21 @@ class NoiseSpec:
     kind: str
     intensity: ByName
     center: ByName | None
+
+
+@dataclass(frozen=True, eq=False)
+class ForceSpec:
+    """A force on joints.
+
+    Attributes:
+        kind: Which one.
+        values: Its attributes by joint, those that the file gives.
+        table: Where it stands, for messages.
+    """
+
+    kind: type[Force]
+    values: Mapping[str, ByName]
+    table: Table
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +147,10 @@ class SceneSpec:
         root: Its tables, for messages.
         robot: See :class:`RobotSpec`.
         gravity: [m/s^2], or whether there is any.
-        damping: By joint [N m s/rad or N s/m].
+        damping: By joint [N m s/rad or N s/m], or "robot" for the description's own; None where nothing is said.
         stiffness: Of joint springs, by joint [N m/rad or N/m].
         rest: Where springs are slack, by joint [rad or m].
+        forces: Others on joints.
         actuated: Joints that are driven; None for all.
         gear: Generalized force per control, by driven joint.
         torque_limit: By driven joint [N m or N]; ``"robot"`` for the robot description's; None for none.
@@ -150,9 +175,10 @@ class SceneSpec:
     root: Table
     robot: RobotSpec
     gravity: bool | tuple[float, ...]
-    damping: ByName
+    damping: ByName | Literal["robot"] | None
     stiffness: ByName
     rest: ByName
+    forces: tuple[ForceSpec, ...]
     actuated: tuple[str, ...] | None
     gear: ByName
     torque_limit: ByName | str | None
@@ -266,10 +292,17 @@ def _is_plain(word: str) -> bool:
     return word.isprintable() and len(word) <= _LONGEST_WORD
 
 
+def _damping(root: Table) -> ByName | Literal["robot"] | None:
+    if isinstance(root.data.get("damping"), str):
+        root.choice("damping", ("robot",))
+        return "robot"
+    return root.by_name("damping", least=0.0, unit="N m s/rad or N s/m") if "damping" in root else None
+
+
 def _scene(root: Table, path: Path, name: str) -> SceneSpec:
     root.allow(
-        *("title", "gravity", "damping", "robot", "springs", "actuation", "noise", "initial", "horizon", "integrator"),
-        *("cost", "simulate", "solve", "outputs"),
+        *("title", "gravity", "damping", "robot", "springs", "force", "actuation", "noise", "initial", "horizon"),
+        *("integrator", "cost", "simulate", "solve", "outputs"),
     )
     for required in ("robot", "horizon"):
         root.require(required, f"the table [{required}]")
@@ -305,9 +338,10 @@ def _scene(root: Table, path: Path, name: str) -> SceneSpec:
         root=root,
         robot=_robot(root.table("robot"), folder),
         gravity=_gravity(root),
-        damping=root.by_name("damping", 0.0, least=0.0, unit="N m s/rad or N s/m"),
+        damping=_damping(root),
         stiffness=springs.by_name("stiffness", 0.0, least=0.0, unit="N m/rad or N/m"),
         rest=springs.by_name("rest", 0.0, unit="rad or m"),
+        forces=tuple(_force(table) for table in root.tables("force")),
         actuated=joints or None,
         gear=actuation.by_name("gear", 1.0),
         torque_limit=limit,
@@ -375,6 +409,14 @@ def _gravity(root: Table) -> bool | tuple[float, ...]:
     if not isinstance(root.data["gravity"], list):
         raise root.error("gravity", "must be true, false or three numbers [m/s^2]")
     return root.numbers("gravity", 3)
+
+
+def _force(table: Table) -> ForceSpec:
+    kind = FORCES[table.choice("type", tuple(FORCES))]
+    own = fields(kind)
+    table.allow("type", *(item.name for item in own))
+    values = {item.name: table.by_name(item.name) for item in own if item.name in table or item.default is MISSING}
+    return ForceSpec(kind, values, table)
 
 
 def _noise(table: Table) -> NoiseSpec:

@@ -227,15 +227,17 @@ class Table:
                 raise self.error(f"{name}[{index}]", f"{entry!r} is there twice")
         return tuple(value)
 
-    def spread(self, name: str, value: ByName, names: Sequence[str], what: str = "joint") -> Floats:
-        """``value``, read under ``name``, as one number for each of ``names``."""
+    def spread(
+        self, name: str, value: ByName, names: Sequence[str], what: str = "joint", *, absent: float = 0.0
+    ) -> Floats:
+        """``value``, read under ``name``, as one number for each of ``names``; ``absent`` for those left out."""
         if isinstance(value, Mapping):
             for entry in value:
                 if entry not in names:
                     raise self.error(
                         f"{name}.{entry}", f"there is no such {what}; {suggestion(entry, names, what + 's')}"
                     )
-            return np.array([value.get(entry, 0.0) for entry in names], dtype=np.float64)
+            return np.array([value.get(entry, absent) for entry in names], dtype=np.float64)
         if isinstance(value, tuple):
             if len(value) != len(names):
                 raise self.error(

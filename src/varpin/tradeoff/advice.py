@@ -490,6 +490,12 @@ class _Search:
             VarpinError: There is none.
         """
         done = [m for m in self.methods if m.whole]
+        if not done and self.late:
+            finest = max(method.last.steps for method in self.methods)
+            raise VarpinError(
+                f"no integrator has taken this motion in whole steps yet, with up to {finest} of them: "
+                "give more patience [s], or a shorter duration"
+            )
         if not done:
             raise VarpinError("no integrator gets to the end of this motion, however small its steps were made")
         choices = [m.choice(m.last.steps, self.floor) for m in done]

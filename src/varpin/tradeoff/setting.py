@@ -119,7 +119,7 @@ class Setting(Frozen):
     @property
     def conservative(self) -> bool:
         """Whether the energy is to stay."""
-        return not (self.scene.damping.any() or (self.controls @ self.scene.actuation.T).any())
+        return not (self.scene.dissipates or (self.controls @ self.scene.actuation.T).any())
 
     @property
     def fingerprint(self) -> str:
@@ -128,6 +128,7 @@ class Setting(Frozen):
         surroundings = (
             *(scene.robot.tree, scene.gravity, scene.damping, scene.stiffness, scene.rest, scene.actuation),
             scene.diffusion,
+            *([scene.elements, scene.armature] if scene.forces else []),
         )
         parts = surroundings, (self.q0, self.v0), self.controls, self.duration
         return " ".join(digest(part) for part in parts)

@@ -1,0 +1,98 @@
+"""Noise that is not drawn, and seeds of nothing, are told of; where either is meant, nothing is."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+
+import varpin as vp
+
+CHAIN = vp.planar_chain(2)
+QUIET = vp.Scene(CHAIN)
+NOISES = {
+    "additive": vp.AdditiveNoise(1e-3),
+    "control": vp.ControlNoise(1e-3),
+    "custom": vp.CustomNoise(lambda q, v, u: 1e-3 * np.eye(2), processes=2),
+}
+NOT_DRAWN, NOTHING_RANDOM = "the scene has noise, and none was drawn", "rng was given, but the scene has no noise"
+SHORT = {"dt": 1e-3, "steps": 20}
+
+
+def noisy(noise="additive"):
+    return vp.Scene(CHAIN, noise=NOISES[noise])
+
+
+@pytest.mark.parametrize("check", [True, False])
+@pytest.mark.parametrize("noise", NOISES)
+def test_noise_that_is_not_drawn_is_told_of_once(noise, check, caplog):
+    scene = noisy(noise)
+    with caplog.at_level(logging.WARNING):
+        motions = [vp.simulate(scene, [0, 0], [0, 0], **SHORT, check=check) for _ in range(3)]
+    for motion in motions:
+        (sentence,) = motion.warnings
+        assert sentence.startswith(NOT_DRAWN)
+        assert not motion.dw.any()
+    assert sum(record.getMessage().startswith(NOT_DRAWN) for record in caplog.records) == 1
+
+
+@pytest.mark.parametrize("meant", [{"rng": 0}, {"increments": 0}, {"increments": np.zeros((20, 2))}], ids=str)
+def test_what_is_meant_is_not_told_of(meant):
+    assert vp.simulate(noisy(), [0, 0], [0, 0], **SHORT, **meant).warnings == ()
+
+
+def test_no_increments_are_the_motion_without_noise():
+    quiet = vp.simulate(QUIET, [0.1, 0.2], [0, 0], **SHORT)
+    told = vp.simulate(noisy(), [0.1, 0.2], [0, 0], **SHORT, increments=0)
+    np.testing.assert_allclose(told.q, quiet.q, rtol=0.0, atol=1e-14)
+    with pytest.raises(vp.InputError, match=r"increments must have shape \(20, 2\)"):
+        vp.simulate(noisy(), [0.1, 0.2], [0, 0], **SHORT, increments=1.0)
+
+
+def test_a_seed_of_nothing_is_told_of():
+    (sentence,) = vp.simulate(QUIET, [0, 0], [0, 0], **SHORT, rng=0).warnings
+    assert sentence.startswith(NOTHING_RANDOM)
+
+
+def test_paths_that_are_all_one_are_told_of():
+    same = vp.simulate_ensemble(QUIET, [0, 0], [0, 0], **SHORT, paths=3, rng=0)
+    assert any("one and the same motion" in sentence for sentence in same.warnings)
+    starts = [[0.0, 0.0], [0.1, 0.0], [0.2, 0.0]]
+    for apart in (
+        vp.simulate_ensemble(QUIET, starts, [0, 0], **SHORT, paths=3, rng=0),
+        vp.simulate_ensemble(noisy(), [0, 0], [0, 0], **SHORT, paths=3, rng=0),
+        vp.simulate_ensemble(QUIET, [0, 0], [0, 0], **SHORT, paths=1, rng=0),
+    ):
+        assert apart.warnings == ()
+
+
+def problem(scene):
+    cost = vp.ControlCost(1.0) + vp.Terminal(vp.TrackingCost([0.1, 0.1]))
+    return vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=0.02, steps=5)
+
+
+def test_a_controller_tells_of_its_plant():
+    mpc = vp.Mpc(problem(noisy()))
+    for plant, rng, said in (
+        (None, None, NOT_DRAWN),
+        (None, 0, None),
+        (vp.Plant(noisy()), None, NOT_DRAWN),
+        (vp.Plant(QUIET), 0, NOTHING_RANDOM),
+        (vp.Plant(QUIET), None, None),
+    ):
+        run = mpc.run(plant, duration=0.06, rng=rng)
+        told = [sentence for sentence in run.warnings if sentence.startswith((NOT_DRAWN, NOTHING_RANDOM))]
+        assert len(told) == (said is not None)
+        assert not told or told[0].startswith(said)
+        assert not any(sentence.startswith((NOT_DRAWN, NOTHING_RANDOM)) for sentence in run.motion.warnings[1:])
+
+
+def test_plans_and_their_checks_draw_nothing_and_say_nothing(caplog):
+    """Motions without noise are what plans and derivatives are about."""
+    with caplog.at_level(logging.WARNING):
+        plan = vp.solve(problem(noisy()), max_iterations=2)
+        plan.problem.simulate(plan.policy)
+        plan.verify(tolerance=1e-3)
+        vp.check_linearization(noisy(), [0.1, 0.2], [0.0, 0.0], dt=1e-2)
+    assert not [record for record in caplog.records if NOT_DRAWN in record.getMessage()]
