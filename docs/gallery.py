@@ -146,10 +146,10 @@ SHOTS = {
     "finger_noise": Shot(0.5, paths),
     "ur5_reach": Shot(0.6, torques, (20.0, 25.0, 1.1)),
     "panda_payload": Shot(0.5, distance, (-50.0, 21.0, 1.15)),
-    "kinova_circle": Shot(1.4, circle, (245.0, 40.0, 1.0)),
+    "kinova_circle": Shot(2.8, circle, (245.0, 40.0, 1.0)),
     "allegro_finger": Shot(0.55, joints, (-50.0, 21.0, 1.1)),
     "double_pendulum_swing_up": Shot(0.95, swing),
-    "talos_wave": Shot(0.8, joints, (-50.0, 21.0, 1.1)),
+    "talos_wave": Shot(1.2, joints, (-50.0, 21.0, 1.1)),
 }
 
 _VIEW = """

@@ -1,8 +1,9 @@
 """The measurements behind docs/which-integrator.md: its tables and figures.
 
 Short horizon, long horizon, optimal control, noise and stiffness, for varpin's integrators and, where they are
-installed (``pip install "varpin[peers]"``), for MuJoCo and Drake; SciPy's DOP853 on Pinocchio's forward dynamics always
-takes part. Times are the best of several rounds in which the methods take turns, after a round that does not count.
+installed (``pip install "varpin[peers]"``), for MuJoCo, Drake and a DOP853 in C++; SciPy's DOP853 on Pinocchio's
+forward dynamics always takes part. A time of varpin's is that of a plain ``simulate`` call, its look at the motion
+included. Times are the best of several rounds in which the methods take turns, after a round that does not count.
 
     python docs/which_integrator.py                   # rewrites the page and its figures
     python docs/which_integrator.py --quick FOLDER    # shorter, into a folder: the page, its figures, and which.csv
@@ -58,6 +59,7 @@ STYLES = {
     "MuJoCo implicitfast": ("#8b2500", "1", ":"),
     "MuJoCo RK4": ("#cc79a7", "v", "--"),
     "Drake RK3": ("#7b3294", "p", "--"),
+    "DOP853 in C++": ("#00573d", "8", "--"),
     "SciPy DOP853": ("#009e73", "s", "--"),
     "trep midpoint": ("#999933", "d", "--"),
     "Midpoint, split kick": ("#009e73", "s", "--"),
@@ -87,7 +89,7 @@ class Point:
     @property
     def ours(self) -> bool:
         """Whether the method is varpin's."""
-        return not self.method.startswith(("MuJoCo", "Drake", "SciPy", "trep"))
+        return not self.method.startswith(("MuJoCo", "Drake", "DOP853", "SciPy", "trep"))
 
 
 @dataclass(frozen=True)
@@ -153,14 +155,14 @@ def varpin_run(case: peers.Case, integrator: vp.Integrator, steps: int) -> Run:
     scene, q0, v0, u, dt = case.scene, case.q0, case.v0, case.u, case.duration / steps
 
     def run() -> np.ndarray:
-        return vp.simulate(scene, q0, v0, dt=dt, steps=steps, controls=u, integrator=integrator, check=False).q[-1]
+        return vp.simulate(scene, q0, v0, dt=dt, steps=steps, controls=u, integrator=integrator).q[-1]
 
     return run
 
 
 # Short horizon ------------------------------------------------------------------------------------------------------
 
-LEVELS = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
+LEVELS = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 STEPS: dict[vp.Integrator, tuple[float, ...]] = {
     vp.ExplicitEuler(): (1e-2, 3e-3, 1e-3, 3e-4, 1e-4),
     vp.SemiImplicitEuler(): (1e-2, 3e-3, 1e-3, 3e-4, 1e-4),
@@ -172,7 +174,7 @@ STEPS: dict[vp.Integrator, tuple[float, ...]] = {
 
 
 def short_cases() -> list[peers.Case]:
-    """The falling chains, and an arm under torques and friction."""
+    """The falling chains, and two arms: under torques and friction, and falling with friction."""
     own = []
     for links in (3, 7):
         rest = np.zeros(links)
@@ -180,7 +182,10 @@ def short_cases() -> list[peers.Case]:
     q0 = np.array([0.3, -1.2, 1.4, -0.5, 0.8, 0.1])
     arm = vp.Scene(vp.load_robot("ur5"), damping=[4.0, 4.0, 2.0, 0.3, 0.2, 0.05])
     torque = np.array([10.0, -30.0, -8.0, 0.5, 0.3, 0.1])
-    return [*own, peers.Case("ur5, torques and friction", arm, q0, np.zeros(6), torque)]
+    own.append(peers.Case("ur5, torques and friction", arm, q0, np.zeros(6), torque))
+    light = vp.Scene(vp.load_robot("ur10"), damping=[4.0, 4.0, 2.0, 0.5, 0.5, 0.2])
+    start = np.array([0.2, 1.0, -1.2, 0.4, 0.3, 0.1])
+    return [*own, peers.Case("ur10, friction", light, start, np.zeros(6), np.zeros(6))]
 
 
 def short_entries(case: peers.Case, scale: Scale) -> list[Entry]:
@@ -193,7 +198,7 @@ def short_entries(case: peers.Case, scale: Scale) -> list[Entry]:
                 Entry(name_of(integrator), f"{case.duration / steps:.3g} s", varpin_run(case, integrator, steps))
             )
     for scheme in ("Euler", "implicitfast", "RK4"):
-        for dt in (2e-2, 1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4)[:: scale.thin]:
+        for dt in (2e-2, 1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 5e-5)[:: scale.thin]:
             run = peers.mujoco_run(case, dt, scheme)
             entries += [] if run is None else [Entry(f"MuJoCo {scheme}", f"{dt:g} s", run)]
     for accuracy in (10.0 ** -np.arange(2.0, 9.0))[:: scale.thin]:
@@ -204,17 +209,19 @@ def short_entries(case: peers.Case, scale: Scale) -> list[Entry]:
             run = peers.trep_run(case, dt)
             entries += [] if run is None else [Entry("trep midpoint", f"{dt:g} s", run)]
     for rtol in (10.0 ** -np.arange(3.0, 13.0))[:: scale.thin]:
+        compiled = peers.compiled_run(case, rtol)
+        entries += [] if compiled is None else [Entry("DOP853 in C++", f"rtol {rtol:.0e}", compiled)]
         entries.append(Entry("SciPy DOP853", f"rtol {rtol:.0e}", peers.scipy_run(case, rtol)))
     return entries
 
 
 def short(scale: Scale) -> tuple[str, Figure, list[tuple[str, Point]]]:
     """The race over one second."""
-    figure = Figure(figsize=(12, 4.9), layout="constrained")
-    panels = figure.subplots(1, 3, sharey=True)
+    figure = Figure(figsize=(15, 4.9), layout="constrained")
+    panels = figure.subplots(1, 4, sharey=True)
     lines = [
-        "| motion | error [rad] | varpin [us] | MuJoCo [us] | Drake [us] | SciPy [us] |",
-        "|---|---|---|---|---|---|",
+        "| motion | error [rad] | varpin [us] | MuJoCo [us] | DOP853 in C++ [us] | Drake [us] | SciPy [us] |",
+        "|---|---|---|---|---|---|---|",
     ]
     rows = []
     handles: dict[str, object] = {}
@@ -233,7 +240,7 @@ def short(scale: Scale) -> tuple[str, Figure, list[tuple[str, Point]]]:
         for level in LEVELS:
             good = [p for p in points if p.error <= level]
             sides = [[p for p in good if p.ours]]
-            sides += [[p for p in good if p.method.startswith(peer)] for peer in ("MuJoCo", "Drake", "SciPy")]
+            sides += [[p for p in good if p.method.startswith(peer)] for peer in ("MuJoCo", "DOP853", "Drake", "SciPy")]
             best = [min(side, key=lambda p: p.microseconds, default=None) for side in sides]
             fastest = min((p.microseconds for p in best if p is not None), default=0.0)
             cells = []

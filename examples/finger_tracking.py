@@ -14,7 +14,7 @@ out.mkdir(exist_ok=True)
 
 def reference(t: float) -> list[float]:
     """Joint angles to follow [rad]."""
-    return [1.0 + 0.25 * np.sin(4 * np.pi * t), 0.1 * np.sin(2 * np.pi * t), 0.0]
+    return [1.0 + 0.25 * np.sin(4 * np.pi * t), 0.3 + 0.1 * np.sin(2 * np.pi * t), 0.2]
 
 
 finger = vp.load_robot("finger")
@@ -22,7 +22,7 @@ hanging = [9.81, 0.0, 0.0]  # gravity pulls along the stretched finger
 quiet = vp.Scene(finger, gravity=hanging)
 noisy = vp.Scene(finger, gravity=hanging, noise=vp.ControlNoise(2e-3))  # the more torque, the more noise
 cost = vp.TrackingCost(reference, 10.0) + vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost(reference, 1.0))
-start = {"q0": [1.0, 0.0, 0.0], "v0": [0.0, 0.0, 0.0], "dt": 2e-3, "steps": 750}
+start = {"q0": [1.0, 0.3, 0.2], "v0": [0.0, 0.0, 0.0], "dt": 2e-3, "steps": 750}
 
 problem = vp.OptimalControlProblem(noisy, cost, **start)
 plan = vp.solve(problem)

@@ -11,7 +11,9 @@ out.mkdir(exist_ok=True)
 
 robot = vp.load_robot("ur5")
 heavier = vp.load_robot("ur5", payload=vp.Payload("tool0", mass=0.3))  # what the controller does not know
-begin = np.array([0.0, -1.5, 1.2, -1.2, -1.5, 0.0])
+begin = np.array([0.37, -1.38, 1.37, -1.16, -1.45, 0.0])  # at the target [rad]
+
+limits = (-robot.effort_limit, robot.effort_limit)  # [N m]
 
 
 def target(t):
@@ -26,7 +28,7 @@ def controller(integrator):
     cost = vp.FramePositionCost(robot, "tool0", target, 1e3) + vp.VelocityCost(0.05) + vp.ControlCost(1e-4, hold)
     cost += vp.Terminal(vp.FramePositionCost(robot, "tool0", target, 1e2) + vp.VelocityCost(0.5))
     problem = vp.OptimalControlProblem(
-        scene, cost, begin, np.zeros(robot.dof), dt=1e-2, steps=50, integrator=integrator
+        scene, cost, begin, np.zeros(robot.dof), dt=1e-2, steps=50, integrator=integrator, control_limits=limits
     )
     return vp.Mpc(problem, iterations=1)
 

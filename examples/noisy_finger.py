@@ -14,12 +14,12 @@ out = Path("out")
 out.mkdir(exist_ok=True)
 
 finger = vp.load_robot("finger")
-noise = vp.AdditiveNoise(2e-3) + vp.StateNoise(5e-3)  # forces on every joint, stronger away from the start
+noise = vp.AdditiveNoise(1e-3) + vp.StateNoise(2e-3)  # forces on every joint, stronger away from the start
 surroundings = {"gravity": False, "stiffness": STIFFNESS, "damping": DAMPING, "rest": [0.5, 0.7, 0.3]}
 scene = vp.Scene(finger, noise=noise, **surroundings)
 start = {"q0": [1.2, 1.1, 0.6], "v0": [0.0, 0.0, 0.0], "dt": 5e-4, "steps": 400}
 
-mean_path = vp.simulate(scene, **start)  # no seed: the Wiener increments are zero
+mean_path = vp.simulate(scene, **start, increments=0)  # the motion without noise
 moments = vp.propagate_moments(vp.linearize(scene, mean_path))
 ensemble = vp.simulate_ensemble(scene, **start, paths=1000, rng=0)
 
