@@ -120,7 +120,7 @@ def test_robot_is_mujoco_s(tmp_path, kind, caplog):
         np.testing.assert_allclose(jet.Lvv, M, rtol=0, atol=1e-12 * np.abs(M).max())
         # Two roundings: MuJoCo turns inertias to their principal axes and back.
         np.testing.assert_allclose(-jet.Lq, data.qfrc_bias, rtol=0, atol=1e-12 * max(1.0, np.abs(data.qfrc_bias).max()))
-        np.testing.assert_allclose(robot.frame_positions(q[None], "tip")[0], data.body("tip").xpos, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(robot.frame_positions(q, "tip"), data.body("tip").xpos, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(robot.damping, model.dof_damping)
     np.testing.assert_array_equal(robot.friction, model.dof_frictionloss)
     limited, limits = model.jnt_limited.astype(bool), robot.position_limits

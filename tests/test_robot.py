@@ -635,5 +635,6 @@ def test_end_effector_is_where_pinocchio_says(load):
         np.testing.assert_allclose(position, data.oMf[panda.model.getFrameId("panda_hand")].translation, atol=1e-14)
     with pytest.raises(vp.InputError, match="has no frame 'hand'"):
         panda.frame_positions(q, "hand")
-    with pytest.raises(vp.InputError, match=r"q must have shape \(N, 3\)"):
-        chain.frame_positions(np.zeros(3))
+    np.testing.assert_array_equal(panda.frame_positions(q[0], "panda_hand"), panda.frame_positions(q, "panda_hand")[0])
+    with pytest.raises(vp.InputError, match=r"q must have shape \(N, 3\) or \(3,\), got \(2,\)"):
+        chain.frame_positions(np.zeros(2))

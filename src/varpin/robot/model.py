@@ -187,20 +187,23 @@ class Robot(Frozen):
         return str([frame.name for frame in self.free_model.frames if frame.parentJoint == last][-1])
 
     def frame_positions(self, q: ArrayLike, frame: str | None = None) -> Floats:
-        """Positions (N, 3) [m] in the world of a frame, or of :attr:`end_effector`, at configurations ``q`` (N, n).
+        """Positions [m] in the world of a frame, or of :attr:`end_effector`: (N, 3) at ``q`` (N, n), (3,) at one (n,).
 
         Raises:
-            InputError: ``q`` is not (N, n), or there is no such frame.
+            InputError: ``q`` is neither (N, n) nor (n,), or there is no such frame.
         """
         q = as_floats("q", q)
-        if q.ndim != 2 or q.shape[1] != self.dof:
-            raise InputError(f"q must have shape (N, {self.dof}), got {q.shape}")
+        if q.ndim not in (1, 2) or q.shape[-1] != self.dof:
+            raise InputError(f"q must have shape (N, {self.dof}) or ({self.dof},), got {q.shape}")
         name = self.end_effector if frame is None else frame
         found = self.free_model.frames[frame_index(self.free_model, name, self.name)]
+        rows = np.atleast_2d(q)
         if found.parentJoint == 0:
-            return np.tile(found.placement.translation, (len(q), 1))
-        body, _, place = frame_on_body(self.free_model, name, self.name)
-        return place_on_body(self.tree, q, body, place)
+            positions = np.tile(found.placement.translation, (len(rows), 1))
+        else:
+            body, _, place = frame_on_body(self.free_model, name, self.name)
+            positions = place_on_body(self.tree, rows, body, place)
+        return np.asarray(positions.reshape(*q.shape[:-1], 3), dtype=np.float64)
 
     @property
     def unbounded(self) -> NDArray[np.bool_]:
