@@ -1,7 +1,8 @@
 """Time of a Midpoint step against the number of joints, with matrices and by elimination from the leaves.
 
 Where the two cross is what ``body_cost``, ``pair_cost`` and ``block_cost`` in src/core/include/varpin/elimination.hpp
-are about: they are fitted to the dense times here, in units of the time of elimination for a joint. MuJoCo's mj_step
+are about: they are fitted to the dense times here, in units of the time of elimination for a joint. Chains with mimic
+joints are what ``tied_cost`` and ``slot_cost`` are fitted to, against chains without. MuJoCo's mj_step
 (Euler) takes part where it is installed (``pip install "varpin[peers]"``).
 
     python benchmarks/joints.py
@@ -11,6 +12,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+import pinocchio as pin
 from peers import mujoco_model
 
 import varpin as vp
@@ -19,10 +21,21 @@ from varpin.core.arrays import new_nodes
 from varpin.integrators.base import open_loop
 
 LINKS = (3, 6, 10, 15, 20, 30, 60, 100, 200, 1000)
+# Joints that follow, in chains of so many links; how many.
+TIED_LINKS = (20, 30, 45, 60, 100)
+TIES = (1, 2, 4)
 ROBOTS = ("ur5", "talos_arm", "allegro_left_hand")
 MOST_DENSE = 200
 ROUNDS = 10
 DT = 1e-3
+
+
+def tied_chain(links: int, ties: int) -> vp.Robot:
+    """A chain with mimic joints whose spans overlap."""
+    model = vp.planar_chain(links).model
+    for leader in range(3, 3 + ties):
+        model = pin.transformJointIntoMimic(model, leader, leader + ties, -0.7, 0.1)
+    return vp.load_robot(model)
 
 
 def steps_for(dof: int) -> int:
@@ -74,12 +87,13 @@ def main() -> None:
     header = f"{'robot':20} {'n':>4} {'matrices [us]':>14} {'elimination [us]':>17} {'a joint':>8} {'ratio':>6}"
     print(f"{header} {'mj_step [us]':>13} {'ratio':>6}")
     chains = [(f"chain of {links}", vp.planar_chain(links)) for links in LINKS]
+    chains += [(f"chain of {links}, {k} ties", tied_chain(links, k)) for k in TIES for links in TIED_LINKS]
     for name, robot in [*chains, *((name, vp.load_robot(name)) for name in ROBOTS)]:
         scene = vp.Scene(robot)
         runs = {"elimination": step(scene, Solver.elimination)}
         if robot.dof <= MOST_DENSE:
             runs["matrices"] = step(scene, Solver.dense)
-        peer = mujoco_step(scene) if name.startswith("chain") else None
+        peer = mujoco_step(scene) if name.startswith("chain") and "ties" not in name else None
         if peer is not None:
             runs["mujoco"] = peer
         best = dict.fromkeys(("matrices", "elimination", "mujoco"), np.nan)

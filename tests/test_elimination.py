@@ -9,6 +9,7 @@ import varpin as vp
 from varpin.core import Elimination, ForwardDynamics, Solver, VariationalRollout, variational_derivatives
 from varpin.core.arrays import new_nodes
 from varpin.integrators.base import open_loop
+from varpin.robot import example_robot_data
 
 
 def star(branches, links, seed=0):
@@ -53,6 +54,57 @@ def floating(seed=0):
     return vp.load_robot(model)
 
 
+def tied(model, ties):
+    """Joints that follow others, by (leader, follower, ratio, offset)."""
+    for leader, follower, ratio, offset in ties:
+        model = pin.transformJointIntoMimic(model, leader, follower, ratio, offset)
+    return vp.load_robot(model)
+
+
+def tied_chain(links, ties=((3, 5), (4, 12))):
+    return tied(vp.planar_chain(links).model, [(leader, follower, -0.7, 0.1) for leader, follower in ties])
+
+
+def tied_tree(count, seed=1):
+    """Ties between any joints: leaders with several followers, spans that overlap."""
+    rng = np.random.default_rng(seed)
+    model = random_tree(seed, bodies=9 + 2 * count)
+    single = [joint for joint in range(1, model.njoints) if model.joints[joint].nq == 1]
+    ties, followers = [], set()
+    for _ in range(count):
+        while True:
+            leader, follower = sorted(rng.choice(single, 2, replace=False))
+            if not {leader, follower} & followers and follower not in {tie[0] for tie in ties}:
+                break
+        followers.add(follower)
+        ties.append((int(leader), int(follower), rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 2.0), rng.normal()))
+    return tied(model, ties)
+
+
+def example(path):
+    return vp.load_robot(example_robot_data.locate(path))
+
+
+def grippers():
+    """Two fingers on the ground and two on an arm that slides, of which the follower has no mass."""
+    model = pin.Model()
+    model.name = "grippers"
+    rng = np.random.default_rng(8)
+
+    def add(parent, kind, name):
+        joint = model.addJoint(parent, kind, pin.SE3(random_rotation(rng), rng.normal(0.0, 0.2, 3)), name)
+        model.appendBodyToJoint(joint, random_inertia(rng), pin.SE3.Identity())
+        return joint
+
+    first, second = add(0, pin.JointModelRX(), "first"), add(0, pin.JointModelPY(), "second")
+    slide = add(0, pin.JointModelPZ(), "slide")
+    turn = add(slide, pin.JointModelRY(), "turn")
+    third = add(turn, pin.JointModelRX(), "third")
+    fourth = model.addJoint(slide, pin.JointModelRX(), pin.SE3.Identity(), "fourth")
+    add(second, pin.JointModelRZ(), "tip")
+    return tied(model, [(first, second, 0.5, 0.2), (third, fourth, -1.0, 0.0)])
+
+
 ROBOTS = {
     **{f"chain{n}": lambda n=n: vp.planar_chain(n) for n in (1, 2, 15, 30)},
     **{f"tree{seed}": lambda seed=seed: vp.load_robot(random_tree(seed, bodies=4 + 4 * seed)) for seed in range(6)},
@@ -61,6 +113,13 @@ ROBOTS = {
     "floating": floating,
     "ur5": lambda: vp.load_robot("ur5"),
     "allegro": lambda: vp.load_robot("allegro_left_hand"),
+    **{f"{k} ties": lambda k=k: tied_tree(k) for k in range(1, 6)},
+    "tied chain": lambda: tied_chain(30),
+    "leader and followers": lambda: tied_chain(12, ((2, 3), (2, 8), (4, 6), (5, 12))),
+    "grippers": grippers,
+    "panda": lambda: vp.load_robot("panda"),
+    "talos": lambda: example("talos_data/robots/talos_full_v2.urdf"),
+    "pr2": lambda: example("pr2_description/urdf/pr2.urdf"),
 }
 
 
@@ -78,6 +137,22 @@ def scene_of(robot, seed=1):
 def state_of(robot, seed=2):
     rng = np.random.default_rng(seed)
     return rng.uniform(-2.0, 2.0, robot.dof), rng.normal(size=robot.dof)
+
+
+def eliminated_order(robot):
+    """Coordinates in the order of elimination: with the last body that all their bodies hang on, from the last on."""
+    parent, coordinate = robot.tree.parent, robot.tree.coordinate
+
+    def hung_on(body):
+        return [] if body < 0 else [*hung_on(parent[body]), body]
+
+    # A body's own coordinate comes before others that end with it.
+    keys = []
+    for c in range(robot.dof):
+        own = np.flatnonzero(coordinate == c)
+        shared = set.intersection(*(set(hung_on(body)) for body in own))
+        keys.append((-max(shared, default=-1), len(own) > 1, c))
+    return [key[-1] for key in sorted(keys)]
 
 
 def solved_like(x, matrix, b, eps=1e-12):
@@ -113,10 +188,10 @@ def test_velocities_and_shares_of_the_energy_are_those_of_the_mass_matrix(robot)
     x, share, positive = Elimination(scene.core, q, v).mass(p)
     assert positive
     assert solved_like(x, M, p)
-    # M = U D U' with ones on the diagonal of U: the last coordinate is eliminated first.
-    lower = np.linalg.cholesky(M[::-1, ::-1])[::-1, ::-1]
-    shares = 0.5 * np.linalg.solve(lower, p) ** 2
-    assert np.abs(share - shares).max() <= 1e-10 * shares.sum()
+    order = eliminated_order(robot)
+    lower = np.linalg.cholesky(M[np.ix_(order, order)])
+    shares = 0.5 * np.linalg.solve(lower, p[order]) ** 2
+    assert np.abs(share[order] - shares).max() <= 1e-10 * shares.sum()
 
 
 @pytest.mark.parametrize("skew", [0.0, 0.2])
@@ -140,7 +215,9 @@ def test_the_guard_has_the_sign_of_the_least_eigenvalue(robot, skew):
             assert (ratio > 0.0) == (least > 0.0)
             assert ratio >= min(least, 0.0) * (1.0 + 1e-9)
             if least > 0.0:
-                pivots = [np.diag(np.linalg.cholesky(matrix[::-1, ::-1])) ** 2 for matrix in (C, jet.Lvv)]
+                order = eliminated_order(robot)
+                ordered = (matrix[np.ix_(order, order)] for matrix in (C, jet.Lvv))
+                pivots = [np.diag(np.linalg.cholesky(matrix)) ** 2 for matrix in ordered]
                 assert ratio == pytest.approx((pivots[0] / pivots[1]).min(), rel=1e-7)
     assert signs == {True, False} or robot.dof < 3
 
@@ -207,7 +284,7 @@ def test_accelerations_are_pinocchios(robot):
     assert regular
     data, at, rates = robot.free_model.createData(), robot.free_positions(q), robot.free_velocities(v)
     M = vp.lagrangian_jet(scene, q, v, backend="pinocchio").Lvv
-    bias = pin.nonLinearEffects(robot.free_model, data, at, rates)
+    bias = robot.free_velocities(np.eye(robot.dof)) @ pin.nonLinearEffects(robot.free_model, data, at, rates)
     assert np.array_equal(rate[: robot.dof], v)
     assert solved_like(rate[robot.dof :], M, force - bias, eps=1e-11)
     momentum, energy, _ = dynamics.node(np.r_[q, v])
@@ -262,7 +339,38 @@ def test_long_chains_move_and_keep_their_energy(links):
     assert (motion.statistics.residual <= 100.0).all()
 
 
-def test_mimic_joints_keep_the_matrix():
-    scene = vp.Scene(vp.load_robot("panda"))
-    with pytest.raises(ValueError, match="more than one joint"):
-        Elimination(scene.core, np.zeros(scene.robot.dof), np.zeros(scene.robot.dof))
+@pytest.mark.parametrize("links", [60, pytest.param(200, marks=pytest.mark.slow)])
+def test_long_chains_with_ties_are_solved_for_as_with_the_matrix(links):
+    robot = tied_chain(links, ((2, links // 2), (links // 3, links)))
+    scene, (q, v) = vp.Scene(robot), state_of(robot)
+    q, v = 0.1 * q, 0.1 * v
+    jet = vp.lagrangian_jet(scene, q, v)
+    N = jet.Lvv + 1e-3 * (jet.Lvq - jet.Lvq.T) - 1e-6 * jet.Lqq
+    b = np.random.default_rng(9).normal(size=robot.dof)
+    elimination = Elimination(scene.core, q, v)
+    x, *_, positive = elimination.step(1e-3, 1e-3, robot.tree.armature, b)
+    assert positive
+    assert solved_like(x, N, b)
+    x, _, positive = elimination.mass(b)
+    assert positive
+    assert solved_like(x, jet.Lvv, b)
+
+
+@pytest.mark.parametrize(
+    ("build", "chosen"),
+    [(lambda: tied_chain(60), Solver.elimination), (lambda: vp.load_robot("panda"), Solver.dense)],
+    ids=["chain", "panda"],
+)
+@pytest.mark.parametrize("integrator", [vp.Midpoint(guard=LENIENT), vp.Gauss(2, guard=LENIENT)], ids=["one", "two"])
+def test_large_trees_with_ties_do_without_matrices_and_small_ones_do_not(build, chosen, integrator):
+    scene = vp.Scene(build())
+    q, v = state_of(scene.robot)
+    automatic, *ways = (
+        rolled(scene, 0.1 * q, 0.1 * v, 1e-3, 5, solver, integrator)
+        for solver in (Solver.automatic, Solver.dense, Solver.elimination)
+    )
+    alike = [
+        all(np.array_equal(getattr(automatic, name), getattr(way, name)) for name in ("q", "v", "quality"))
+        for way in ways
+    ]
+    assert alike == [chosen is Solver.dense, chosen is Solver.elimination]

@@ -3,10 +3,12 @@
 
 #include <nanobind/stl/tuple.h>
 
+#include <optional>
 #include <tuple>
 
 #include "arrays.hpp"
 #include "registrations.hpp"
+#include "varpin/stage_elimination.hpp"
 
 namespace varpin::border {
 
@@ -18,17 +20,18 @@ using namespace nanobind::literals;
 class BoundElimination {
   public:
     BoundElimination(const Mechanism& mechanism, In<1> q, In<1> v)
-        : n_(static_cast<std::size_t>(mechanism.dof())),
-          jet_(mechanism.tree, false),
-          articulated_(mechanism.tree),
-          own_(mechanism) {
+        : n_(static_cast<std::size_t>(mechanism.dof())), jet_(mechanism.tree, false), articulated_(mechanism.tree) {
         require(q, "q", {n_});
         require(v, "v", {n_});
-        if (!eliminates(mechanism.tree, Solver::elimination))
-            throw std::invalid_argument("a coordinate moves more than one joint");
         regular_ = articulated_.at(mechanism, q.data(), jet_);
         first_order(mechanism, q.data(), v.data(), jet_);
-        own_.take(jet_);
+        if (mechanism.tree.size() == mechanism.dof()) {
+            free_.emplace(mechanism);
+            free_->take(jet_);
+        } else {
+            tied_.emplace(mechanism, tableau_);
+            tied_->take(0, jet_);
+        }
     }
 
     // x with (M + ha A - hb A' - ha hb L_qq + diag(d)) x = b, (A' + ha L_qq) x, x' M x, and whether pivots are
@@ -38,15 +41,17 @@ class BoundElimination {
         require(b, "b", {n_});
         double *x = nullptr, *y = nullptr;
         const Out X = array_for(x, {n_}), Y = array_for(y, {n_});
-        if (!own_.factor(ahead, behind, diagonal.data())) return {X, Y, 0.0, false};
-        own_.solve(b.data(), x);
-        own_.change_of_slope(x, y);
-        return {X, Y, own_.kinetic_size(x), true};
+        tableau_.a[0] = ahead;
+        tableau_.gradient[0] = behind;
+        if (free_ ? !free_->factor(ahead, behind, diagonal.data()) : !tied_->factor(1.0, diagonal.data()))
+            return {X, Y, 0.0, false};
+        return free_ ? solved(*free_, b.data(), x, y, X, Y) : solved(*tied_, b.data(), x, y, X, Y);
     }
 
     double least_pivot_ratio(double coupling, double curvature, In<1> diagonal) {
         require(diagonal, "diagonal", {n_});
-        return own_.least_pivot_ratio(coupling, curvature, diagonal.data());
+        if (free_) return free_->least_pivot_ratio(coupling, curvature, diagonal.data());
+        return tied_->least_pivot_ratio(coupling, curvature, diagonal.data());
     }
 
     // x with M x = b, the shares of 1/2 b . x, and whether M is positive definite.
@@ -59,10 +64,20 @@ class BoundElimination {
     }
 
   private:
+    template <class Own>
+    static std::tuple<Out, Out, double, bool> solved(Own& own, const double* b, double* x, double* y, const Out& X,
+                                                     const Out& Y) {
+        own.solve(b, x);
+        own.change_of_slope(x, y);
+        return {X, Y, own.kinetic_size(x), true};
+    }
+
     std::size_t n_;
     Jet<double> jet_;
     ArticulatedBodies articulated_;
-    Elimination own_;
+    Tableau tableau_{.stages = 1, .a = {0.0}, .gradient = {0.0}, .force = {1.0}, .b = {1.0}, .c = {0.5}};
+    std::optional<Elimination> free_;
+    std::optional<StageElimination> tied_;  // where coordinates move several bodies
     bool regular_ = false;
 };
 

@@ -72,10 +72,7 @@ class Solver(Enum):
     elimination = ...
 
 class Elimination:
-    """Solves at one (q, v) by elimination from the leaves to the roots; see src/core/include/varpin/elimination.hpp.
-
-    Raises ValueError where mimic joints share a coordinate.
-    """
+    """Solves at one (q, v) by elimination from the leaves to the roots; see src/core/include/varpin/elimination.hpp."""
 
     def __init__(self, mechanism: Mechanism, q: Floats, v: Floats) -> None: ...
     def step(self, ahead: float, behind: float, diagonal: Floats, b: Floats) -> tuple[Floats, Floats, float, bool]:

@@ -69,7 +69,7 @@ class Collocation {
         }
         element_curvature.resize(stages * n);
         diagonal.resize(stages * stages * n);
-        if (stages == 1) {
+        if (stages == 1 && mechanism.tree.size() == n) {
             elimination.emplace(mechanism);
         } else {
             stage_elimination.emplace(mechanism, tableau);
@@ -84,7 +84,7 @@ class Collocation {
     int n;
     int stages;
     std::vector<Jet<double>> stage;          // without matrices where there is an elimination
-    std::optional<Elimination> elimination;  // at the iterate of the last factors
+    std::optional<Elimination> elimination;  // at the iterate of the last factors; of one stage, without ties
     std::optional<StageElimination> stage_elimination;
     std::vector<double> V;                   // (s, n) stage velocities: the guess, then the root
     std::vector<double> Q;                   // (s, n)

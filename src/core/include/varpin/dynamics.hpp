@@ -132,13 +132,14 @@ class ForwardDynamics {
             if (articulated_) articulated_->place(j, link.ratio * here.axis, here.inertia);
             accelerate(j, v, nullptr);
         }
+        for (int c = 0; c < jet_.dof && articulated_; ++c) momentum_[c] = tree.armature[c] * v[c];
         bool regular = true;
         for (int j = tree.size() - 1; j >= 0; --j) {
             const Body& link = tree.bodies[j];
             if (articulated_) {
                 regular = regular && articulated_->eliminate(j);
                 const int c = link.coordinate;
-                momentum_[c] = link.ratio * dot(jet_.body[j].axis, jet_.body[j].momentum) + tree.armature[c] * v[c];
+                momentum_[c] += link.ratio * dot(jet_.body[j].axis, jet_.body[j].momentum);
                 if (link.parent >= 0) jet_.body[link.parent].momentum += jet_.body[j].momentum;
             } else {
                 detail::project_mass(tree, j, jet_);

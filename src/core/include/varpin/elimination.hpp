@@ -20,26 +20,29 @@
 #include <algorithm>
 #include <limits>
 #include <memory>
-#include <utility>
+#include <optional>
 #include <vector>
 
+#include "varpin/gathering.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/pair.hpp"
 #include "varpin/spatial.hpp"
+#include "varpin/symmetric_elimination.hpp"
 #include "varpin/tree.hpp"
 
 namespace varpin {
 
-// How to solve with M and with the matrix of a step; elimination cannot where two bodies share a coordinate.
+// How to solve with M and with the matrix of a step.
 enum class Solver { automatic, dense, elimination };
 
 // Times of a dense step for each body, for each pair of a body and one above it, and for each cubed size of a block; in
-// units of what a body costs that is eliminated; and what it costs where steps have more stages. Measured with
-// benchmarks/joints.py.
-inline constexpr double body_cost = 0.6, pair_cost = 0.033, block_cost = 0.0004, stages_cost = 1.3;
+// units of what a body costs that is eliminated; and what it costs where steps have more stages, where they have one
+// and there are ties, and how much each slot of ties adds to that. Measured with benchmarks/joints.py.
+inline constexpr double body_cost = 0.6, pair_cost = 0.033, block_cost = 0.0004, stages_cost = 1.3, tied_cost = 1.45,
+                        slot_cost = 0.1;
 
 inline bool eliminates(const Tree& tree, Solver solver, int stages = 1) {
-    if (solver == Solver::dense || tree.size() != tree.dof()) return false;
+    if (solver == Solver::dense) return false;
     if (solver == Solver::elimination) return true;
     double dense = body_cost * tree.size();
     std::vector<int> depth(tree.size(), 1);
@@ -51,36 +54,10 @@ inline bool eliminates(const Tree& tree, Solver solver, int stages = 1) {
         const double size = block.end - block.begin;
         dense += block_cost * size * size * size;
     }
-    return (stages == 1 ? 1.0 : stages_cost) * tree.size() < dense;
+    const int slots = Ties(tree).slots;
+    const double cost = stages > 1 ? stages_cost : slots > 0 ? tied_cost : 1.0;
+    return cost * (1.0 + slot_cost * slots) * tree.size() < dense;
 }
-
-// Where each body gathers what it carries while bodies are eliminated, the last one first. Places are used again: along
-// a chain there is one, and it stays in the cache.
-struct Gathering {
-    explicit Gathering(const Tree& tree) : place(tree.size(), -1), joins(tree.size(), 0), leaf(tree.size(), 1) {
-        std::vector<int> free;
-        for (int j = tree.size() - 1; j >= 0; --j) {
-            if (place[j] < 0) {
-                if (free.empty()) free.push_back(places++);
-                place[j] = free.back();
-                free.pop_back();
-            }
-            const int k = tree.bodies[j].parent;
-            if (k >= 0 && place[k] < 0) {
-                place[k] = place[j];
-                leaf[k] = 0;
-                continue;
-            }
-            joins[j] = k >= 0;
-            free.push_back(place[j]);
-        }
-    }
-
-    int places = 0;
-    std::vector<int> place;   // of each body; the first child's is its parent's
-    std::vector<char> joins;  // adds to what its parent has already, from a place of its own
-    std::vector<char> leaf;   // nothing is at its place before it
-};
 
 namespace detail {
 
@@ -232,33 +209,6 @@ void keep_linear_rows(double* X) {
     }
 }
 
-// What bodies have gathered while the last of them are eliminated; `entries` numbers at each place.
-class Gathered {
-  public:
-    Gathered(std::shared_ptr<const Gathering> order, int entries)
-        : order_(std::move(order)), entries_(entries), at_(order_->places * entries) {}
-
-    // What body j has of those it carries.
-    double* of(int j) {
-        double* own = of_again(j);
-        if (order_->leaf[j]) std::fill(own, own + entries_, 0.0);
-        return own;
-    }
-    double* of_again(int j) { return at_.data() + order_->place[j] * entries_; }
-    // Body j is done with: its parent goes on with what it leaves, or adds that to its own.
-    void hand_on(int j, int parent) {
-        if (!order_->joins[j]) return;
-        const double* own = of_again(j);
-        double* __restrict up = of_again(parent);
-        for (int k = 0; k < entries_; ++k) up[k] += own[k];
-    }
-
-  private:
-    std::shared_ptr<const Gathering> order_;
-    int entries_;
-    std::vector<double> at_;
-};
-
 }  // namespace detail
 
 // M + diag(armature) as pivots and what goes with them, at one configuration after another.
@@ -266,7 +216,9 @@ class ArticulatedBodies {
   public:
     explicit ArticulatedBodies(const Tree& tree) : ArticulatedBodies(tree, std::make_shared<Gathering>(tree)) {}
     ArticulatedBodies(const Tree& tree, const std::shared_ptr<const Gathering>& order)
-        : tree_(&tree), body_(tree.size()), inertia_(order, 36), force_(order, 6), motion_(6 * (tree.size() + 1)) {}
+        : tree_(&tree), body_(tree.size()), inertia_(order, 36), force_(order, 6), motion_(6 * (tree.size() + 1)) {
+        if (order->ties.slots > 0) tied_.emplace(tree, order, 6);
+    }
 
     // Take M at q, with a jet that potential energies stay in; false at a pivot that is not positive.
     bool at(const Mechanism& mechanism, const double* q, Jet<double>& jet) {
@@ -282,6 +234,8 @@ class ArticulatedBodies {
     void place(int j, const Motion<double>& axis, const Inertia<double>& inertia) {
         detail::write(axis, body_[j].axis);
         body_[j].inertia = inertia;
+        if (!tied_) return;
+        detail::write(axis, tied_->row(j));
     }
 
     // One body after another, from the last to the first; false at a pivot that is not positive. Here and below, that
@@ -289,6 +243,12 @@ class ArticulatedBodies {
     [[gnu::flatten]] bool eliminate(int j) {
         const Body& link = tree_->bodies[j];
         State& own = body_[j];
+        if (tied_) {
+            detail::write(own.inertia * detail::motion_at(own.axis), tied_->u());
+            return tied_->eliminate(j, tree_->armature.data(), [&own](double* X, int width) {
+                detail::add_inertia(1.0, detail::InertiaRows(own.inertia), width, X);
+            });
+        }
         double* X = inertia_.of(j);
         detail::write(own.inertia * detail::motion_at(own.axis), own.u);
         detail::add_symmetric_product<6>(X, own.axis, own.u);
@@ -312,6 +272,7 @@ class ArticulatedBodies {
     // x with (M + diag(armature)) x = b; x may be b. `share`, unless null, receives the terms of 1/2 b . x, none of
     // which is negative: that of coordinate i is what is left of b_i when all it carries is free.
     void solve(const double* b, double* x, double* share) {
+        if (tied_) return tied_->solve(b, x, share);
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
             const State& own = body_[j];
@@ -345,7 +306,8 @@ class ArticulatedBodies {
     const Tree* tree_;
     std::vector<State> body_;
     detail::Gathered inertia_, force_;
-    std::vector<double> motion_;  // (b + 1, 6) of each body, after what stands still
+    std::vector<double> motion_;                // (b + 1, 6) of each body, after what stands still
+    std::optional<SymmetricElimination> tied_;  // where coordinates move several bodies
 };
 
 // What elimination takes over of a body from a sweep of first order.

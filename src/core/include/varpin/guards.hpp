@@ -202,8 +202,9 @@ class EnergyGuard {
         if (step.eliminated()) {
             for (int i = 0; i < n; ++i)
                 diagonal[i] = mechanism.tree.armature[i] + step.stiffening(i, 0.5 * h, exaggerated);
-            if (step.stage_elimination) return step.stage_elimination->least_pivot_ratio(exaggerated, diagonal.data());
-            return step.elimination->least_pivot_ratio(h * tableau.skew, exaggerated, diagonal.data());
+            const double coupling = h * tableau.skew;
+            if (step.elimination) return step.elimination->least_pivot_ratio(coupling, exaggerated, diagonal.data());
+            return step.stage_elimination->least_pivot_ratio(coupling, exaggerated, diagonal.data());
         }
         double least = infinity;
         for (const Block& block : mechanism.tree.blocks) {

@@ -18,74 +18,14 @@
 
 #include "varpin/dense.hpp"
 #include "varpin/elimination.hpp"
+#include "varpin/gathering.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/spatial.hpp"
+#include "varpin/symmetric_elimination.hpp"
 #include "varpin/tableau.hpp"
 #include "varpin/tree.hpp"
 
 namespace varpin {
-
-namespace detail {
-
-// Functions of vectors of even size.
-inline double product(int size, const double* a, const double* b) {
-    double even = 0.0, odd = 0.0;
-    for (int c = 0; c < size; c += 2) {
-        even += a[c] * b[c];
-        odd += a[c + 1] * b[c + 1];
-    }
-    return even + odd;
-}
-inline void add_scaled(int size, double factor, const double* a, double* __restrict b) {
-    for (int c = 0; c < size; ++c) b[c] += factor * a[c];
-}
-// Entries that are no linear parts become zero, those being the first three of every `part`.
-inline void keep_linear(int size, int part, double* z) {
-    for (int r = 0; r < size; ++r) {
-        if (r % part >= 3) z[r] = 0.0;
-    }
-}
-inline void keep_linear_rows(int size, int part, double* X) {
-    for (int r = 0; r < size; ++r) {
-        if (r % part < 3) {
-            keep_linear(size, part, X + r * size);
-        } else {
-            std::fill(X + r * size, X + (r + 1) * size, 0.0);
-        }
-    }
-}
-
-// A symmetric matrix of which pivots alone are asked for: u = X row + u0, D = d + row . u, X - u u' / D is handed on.
-class Pivots {
-  public:
-    Pivots(int size, const std::shared_ptr<const Gathering>& order)
-        : row(size), u(size), size_(size), matrix_(order, size * size) {}
-
-    std::vector<double> row, u;  // u0, then u
-
-    // The pivot of body j.
-    double eliminate(int j, double diagonal) {
-        double* X = matrix_.of(j);
-        for (int r = 0; r < size_; ++r) add_scaled(size_, row[r], X + r * size_, u.data());
-        return diagonal + product(size_, row.data(), u.data());
-    }
-    // What is left without body j, to which its own inertias have to be added.
-    double* rest(int j, double pivot) {
-        double* X = matrix_.of_again(j);
-        for (int r = 0; r < size_; ++r) add_scaled(size_, -u[r] / pivot, u.data(), X + r * size_);
-        return X;
-    }
-    void hand_on(int j, const Body& link) {
-        if (link.origin) keep_linear_rows(size_, 6, matrix_.of_again(j));
-        matrix_.hand_on(j, link.parent);
-    }
-
-  private:
-    int size_;
-    Gathered matrix_;
-};
-
-}  // namespace detail
 
 class StageElimination {
   public:
@@ -99,51 +39,51 @@ class StageElimination {
         for (int j = 0; j < tree_->size(); ++j) state_[j * stages_ + c] = EliminatedBody::of(*mechanism_, j, jet);
     }
 
-    // Factor N with diagonals d (s, s, n), armature included; false where its determinant is not positive.
+    // Factor N with diagonals d (s, s, n), armature included; false where its determinant is not positive, or with one
+    // stage a pivot.
     bool factor(double h, const double* diagonal) {
         h_ = h;
         diagonal_ = diagonal;
-        int sign = 1;
-        for (int j = tree_->size() - 1; j >= 0 && sign != 0; --j) sign *= eliminate(j);
-        return sign > 0;
+        sign_ = 1;
+        for (int j = tree_->size() - 1; j >= 0 && sign_ != 0; --j) eliminate(j);
+        if (ties().slots > 0) eliminate_ties(-1, matrix_.of_ground());
+        return sign_ > 0;
     }
 
     // x with N x = b, (s, n) both.
     void solve(const double* b, double* x) {
-        const int n = tree_->dof();
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
-            const Factors own = factors(j);
             double* z = force_.of(j);
-            for (int i = 0; i < stages_; ++i)
-                small_[i] = b[i * n + link.coordinate] - detail::product(width_, own.row + i * width_, z);
-            for (int m = 0; m < stages_; ++m) {
-                double t = 0.0;
-                for (int i = 0; i < stages_; ++i) t += own.inverse[m * stages_ + i] * small_[i];
-                x[m * n + link.coordinate] = t;
-                if (link.parent >= 0) detail::add_scaled(width_, t, own.u + m * width_, z);
-            }
-            if (link.parent < 0) continue;
-            if (link.origin) detail::keep_linear(width_, 9, z);
+            const int c = link.coordinate, slot = ties().slot[c];
+            double* kept = slot < 0 ? small_.data() : z + at(slot);
+            if (slot < 0) std::fill(small_.begin(), small_.end(), 0.0);
+            for (int i = 0; i < stages_; ++i) kept[i] += detail::product(width_, factors(j).row + i * width_, z);
+            if (slot < 0) settle(c, j, b, z, x);
+            if (link.parent < 0 && ties().slots == 0) continue;
+            settle_ties(j, b, z, x);
+            if (link.origin) detail::keep_linear(bodies_, 9, z);
             force_.hand_on(j, link.parent);
         }
+        if (ties().slots > 0) settle_ties(-1, b, force_.of_ground(), x);
+        move_ties(-1, x);
         for (int j = 0; j < tree_->size(); ++j) {
             const Body& link = tree_->bodies[j];
-            const Factors own = factors(j);
             const double* above = motion(link.parent);
             double* moved = motion(j);
             std::copy(above, above + width_, moved);
-            for (int m = 0; m < stages_; ++m) {
-                double& coordinate = x[m * n + link.coordinate];
-                coordinate -= detail::product(width_, own.l + m * width_, above);
-                detail::add_scaled(width_, coordinate, own.column + m * width_, moved);
-            }
+            move_ties(j, x);
+            if (ties().slot[link.coordinate] < 0) find(link.coordinate, j, moved, x);
+            for (int m = 0; m < stages_; ++m)
+                detail::add_scaled(width_, x[m * tree_->dof() + link.coordinate], factors(j).column + m * width_,
+                                   moved);
         }
     }
 
     // y_c = A_c' x_c + L_qq,c h sum_m a_cm x_m, (s, n), of the x that `solve` left.
     void change_of_slope(const double* x, double* y) {
         const int n = tree_->dof();
+        std::fill(y, y + stages_ * n, 0.0);
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
             double* z = force_.of(j);
@@ -152,10 +92,10 @@ class StageElimination {
                 const double *moved = motion(j) + 9 * c, *above = motion(link.parent) + 9 * c;
                 double own = 0.0;
                 for (int m = 0; m < stages_; ++m) own += h_ * tableau_->a[c * stages_ + m] * x[m * n + link.coordinate];
-                y[c * n + link.coordinate] = state.change_of_slope(own, moved, above, z + 9 * c);
+                y[c * n + link.coordinate] += state.change_of_slope(own, moved, above, z + 9 * c);
             }
             if (link.parent < 0) continue;
-            if (link.origin) detail::keep_linear(width_, 9, z);
+            if (link.origin) detail::keep_linear(bodies_, 9, z);
             force_.hand_on(j, link.parent);
         }
     }
@@ -179,45 +119,49 @@ class StageElimination {
         return total;
     }
 
-    // The smallest ratio of a pivot of M - k L_qq + diag(d) to the same one of M, armature included, both averaged over
-    // the stages with b; 0 if one is not positive. What `factor` left remains.
-    double least_pivot_ratio(double k, const double* diagonal) {
-        double least = std::numeric_limits<double>::infinity();
+    // The smallest ratio of a pivot of M + c (A + A') - k L_qq + diag(d) to the same one of M, armature included, all
+    // averaged over the stages with b; 0 if one is not positive. What `factor` left remains.
+    double least_pivot_ratio(double coupling, double k, const double* diagonal) {
         for (int j = tree_->size() - 1; j >= 0; --j) {
-            const Body& link = tree_->bodies[j];
             for (int c = 0; c < stages_; ++c) {
                 const EliminatedBody& state = state_[j * stages_ + c];
                 const double b = tableau_->b[c];
-                const Force<double> by_axis = b * (state.inertia * state.axis);
-                detail::write(state.axis, &masses_.row[6 * c]);
-                detail::write(by_axis, &masses_.u[6 * c]);
-                detail::write(state.axis, &curved_.row[12 * c]);
-                detail::write(state.rate, &curved_.row[12 * c + 6]);
-                detail::write(by_axis + Force<double>{{}, (b * k) * state.lifted}, &curved_.u[12 * c]);
-                detail::write((-b * k) * (state.inertia * state.rate + state.turned), &curved_.u[12 * c + 6]);
+                const Force<double> by_axis = state.inertia * state.axis,
+                                    by_rate = state.inertia * state.rate + state.turned;
+                detail::write(state.axis, masses_.row(j) + 6 * c);
+                detail::write(b * by_axis, masses_.u() + 6 * c);
+                detail::write(state.axis, curved_.row(j) + 12 * c);
+                detail::write(state.rate, curved_.row(j) + 12 * c + 6);
+                detail::write(b * (by_axis + coupling * by_rate + Force<double>{{}, k * state.lifted}),
+                              curved_.u() + 12 * c);
+                detail::write(b * (coupling * by_axis + (-k) * by_rate), curved_.u() + 12 * c + 6);
             }
-            const double mass = masses_.eliminate(j, tree_->armature[link.coordinate]);
-            const double pivot = curved_.eliminate(j, diagonal[link.coordinate]);
-            if (!(mass > 0.0 && pivot > 0.0)) return 0.0;
-            least = std::min(least, pivot / mass);
-            if (link.parent < 0) continue;
-            double *M = masses_.rest(j, mass), *C = curved_.rest(j, pivot);
-            for (int c = 0; c < stages_; ++c) {
-                const detail::InertiaRows inertia(state_[j * stages_ + c].inertia);
-                const double b = tableau_->b[c];
-                const int m = 6 * stages_, w = 12 * stages_;
-                detail::add_inertia(b, inertia, m, M + 6 * c * (m + 1));
-                detail::add_inertia(b, inertia, w, C + 12 * c * (w + 1));
-                detail::add_inertia(-b * k, inertia, w, C + (12 * c + 6) * (w + 1));
-            }
-            masses_.hand_on(j, link);
-            curved_.hand_on(j, link);
+            const auto add_masses = [&](double* X, int width) {
+                for (int c = 0; c < stages_; ++c)
+                    detail::add_inertia(tableau_->b[c], inertia(j, c), width, X + 6 * c * (width + 1));
+            };
+            const auto add_curved = [&](double* X, int width) {
+                for (int c = 0; c < stages_; ++c) {
+                    const double b = tableau_->b[c];
+                    double* own = X + 12 * c * (width + 1);
+                    detail::add_inertia(b, inertia(j, c), width, own);
+                    detail::add_inertia(-b * k, inertia(j, c), width, own + 6 * (width + 1));
+                    if (coupling == 0.0) continue;
+                    detail::add_inertia(b * coupling, inertia(j, c), width, own + 6);
+                    detail::add_inertia(b * coupling, inertia(j, c), width, own + 6 * width);
+                }
+            };
+            if (!masses_.eliminate(j, tree_->armature.data(), add_masses)) return 0.0;
+            if (!curved_.eliminate(j, diagonal, add_curved)) return 0.0;
         }
+        double least = std::numeric_limits<double>::infinity();
+        for (int c = 0; c < tree_->dof(); ++c) least = std::min(least, curved_.pivot(c) / masses_.pivot(c));
         return least;
     }
 
   private:
-    // Of one body: (s, width), and the inverse of D (s, s). l is multiplied by it.
+    // Of one body: (s, width), and the inverse of D (s, s). l is multiplied by it. Of a tied coordinate u, l and D are
+    // with the first body that it moves.
     struct Factors {
         double *row, *column, *u, *l, *inverse;
     };
@@ -227,7 +171,9 @@ class StageElimination {
           tree_(&mechanism.tree),
           tableau_(&tableau),
           stages_(tableau.stages),
-          width_(9 * stages_ + stages_ % 2),
+          order_(order),
+          bodies_(9 * stages_),
+          width_(detail::even(bodies_ + stages_ * order->ties.slots)),
           state_(tree_->size() * stages_),
           factors_(tree_->size() * factor_size()),
           matrix_(order, width_ * width_),
@@ -237,8 +183,8 @@ class StageElimination {
           small_(stages_),
           lu_(stages_ * stages_),
           rows_(stages_),
-          curved_(12 * stages_, order),
-          masses_(6 * stages_, order) {}
+          curved_(*tree_, order, 12 * stages_),
+          masses_(*tree_, order, 6 * stages_) {}
 
     int factor_size() const { return 4 * stages_ * width_ + stages_ * stages_; }
     Factors factors(int j) {
@@ -248,8 +194,11 @@ class StageElimination {
     }
     double* motion(int j) { return motion_.data() + width_ * (j + 1); }
 
-    // The sign of D's determinant.
-    int eliminate(int j) {
+    const Ties& ties() const { return order_->ties; }
+    int at(int slot) const { return bodies_ + slot * stages_; }
+    detail::InertiaRows inertia(int j, int c) const { return detail::InertiaRows(state_[j * stages_ + c].inertia); }
+
+    void eliminate(int j) {
         const Body& link = tree_->bodies[j];
         const Factors own = factors(j);
         write_rows(j, own);
@@ -261,20 +210,56 @@ class StageElimination {
                 detail::add_scaled(width_, own.row[m * width_ + r], line, own.l + m * width_);
             }
         }
-        const int c = link.coordinate;
         for (int i = 0; i < stages_; ++i) {
+            for (int m = 0; m < stages_; ++m)
+                lu_[i * stages_ + m] = detail::product(width_, own.row + i * width_, own.u + m * width_);
+        }
+        const int slot = ties().slot[link.coordinate];
+        if (slot < 0) {
+            take_out(link.coordinate, own, X);
+            if (sign_ == 0 || (link.parent < 0 && ties().slots == 0)) return;
+        } else {
             for (int m = 0; m < stages_; ++m) {
-                const double D = detail::product(width_, own.row + i * width_, own.u + m * width_);
-                lu_[i * stages_ + m] = D + diagonal_[(i * stages_ + m) * tree_->dof() + c];
+                for (int r = 0; r < width_; ++r) X[r * width_ + at(slot) + m] += own.u[m * width_ + r];
+            }
+            for (int i = 0; i < stages_; ++i) {
+                double* line = X + (at(slot) + i) * width_;
+                detail::add_scaled(width_, 1.0, own.l + i * width_, line);
+                detail::add_scaled(stages_, 1.0, &lu_[i * stages_], line + at(slot));
             }
         }
-        const int sign = factor_lu_pivoting(lu_.data(), stages_, rows_.data());
-        if (sign == 0) return 0;
-        invert(own.inverse);
-        if (link.parent < 0) {
-            std::fill(own.l, own.l + stages_ * width_, 0.0);
-            return sign;
+        for (int k = 0; k < stages_; ++k) detail::add_inertia(1.0, inertia(j, k), width_, X + 9 * k * (width_ + 1));
+        eliminate_ties(j, X);
+        if (link.origin) detail::keep_linear_rows(bodies_, 9, width_, X);
+        matrix_.hand_on(j, link.parent);
+    }
+
+    void eliminate_ties(int j, double* X) {
+        for (const Ties::Tied& tied : ties().ending(j)) {
+            if (sign_ == 0) return;
+            const Factors own = factors(tied.body);
+            const int slot = at(tied.slot);
+            for (int i = 0; i < stages_; ++i) {
+                const double* line = X + (slot + i) * width_;
+                std::copy(line + slot, line + slot + stages_, &lu_[i * stages_]);
+                std::copy(line, line + width_, own.l + i * width_);
+                for (int r = 0; r < width_; ++r) own.u[i * width_ + r] = X[r * width_ + slot + i];
+            }
+            for (int i = 0; i < stages_; ++i) {
+                for (double* x : {own.u, own.l}) std::fill_n(x + i * width_ + slot, stages_, 0.0);
+            }
+            take_out(tied.coordinate, own, X);
+            detail::clear_slot(slot, stages_, width_, X);
         }
+    }
+
+    // Eliminate coordinate c with its u, l and, but for its diagonal, D; takes the sign of D's determinant into sign_.
+    void take_out(int c, const Factors& own, double* X) {
+        for (int k = 0; k < stages_ * stages_; ++k) lu_[k] += diagonal_[k * tree_->dof() + c];
+        const int sign = factor_lu_pivoting(lu_.data(), stages_, rows_.data());
+        sign_ = stages_ == 1 ? std::max(sign, 0) : sign_ * sign;
+        if (sign_ == 0) return;
+        invert(own.inverse);
         for (int r = 0; r < width_; ++r) {
             for (int i = 0; i < stages_; ++i) small_[i] = own.l[i * width_ + r];
             for (int m = 0; m < stages_; ++m) {
@@ -287,12 +272,41 @@ class StageElimination {
             for (int m = 0; m < stages_; ++m)
                 detail::add_scaled(width_, -own.u[m * width_ + r], own.l + m * width_, X + r * width_);
         }
-        for (int k = 0; k < stages_; ++k)
-            detail::add_inertia(1.0, detail::InertiaRows(state_[j * stages_ + k].inertia), width_,
-                                X + 9 * k * (width_ + 1));
-        if (link.origin) detail::keep_linear_rows(width_, 9, X);
-        matrix_.hand_on(j, link.parent);
-        return sign;
+    }
+
+    // t = D^-1 (b - small_) of coordinate c into x, and what it leaves.
+    void settle(int c, int body, const double* b, double* z, double* x) {
+        const int n = tree_->dof();
+        const Factors own = factors(body);
+        for (int i = 0; i < stages_; ++i) small_[i] = b[i * n + c] - small_[i];
+        for (int m = 0; m < stages_; ++m) {
+            double t = 0.0;
+            for (int i = 0; i < stages_; ++i) t += own.inverse[m * stages_ + i] * small_[i];
+            x[m * n + c] = t;
+            detail::add_scaled(width_, t, own.u + m * width_, z);
+        }
+    }
+    void settle_ties(int j, const double* b, double* z, double* x) {
+        for (const Ties::Tied& tied : ties().ending(j)) {
+            double* kept = z + at(tied.slot);
+            std::copy(kept, kept + stages_, small_.begin());
+            settle(tied.coordinate, tied.body, b, z, x);
+            std::fill(kept, kept + stages_, 0.0);
+        }
+    }
+
+    // x = t - l . w_parent
+    void find(int c, int body, const double* above, double* x) {
+        for (int m = 0; m < stages_; ++m)
+            x[m * tree_->dof() + c] -= detail::product(width_, factors(body).l + m * width_, above);
+    }
+    // The last one eliminated is known first.
+    void move_ties(int j, double* x) {
+        const std::vector<Ties::Tied>& ending = ties().ending(j);
+        for (auto tied = ending.rbegin(); tied != ending.rend(); ++tied) {
+            find(tied->coordinate, tied->body, motion(j), x);
+            for (int m = 0; m < stages_; ++m) motion(j)[at(tied->slot) + m] = x[m * tree_->dof() + tied->coordinate];
+        }
     }
 
     // Rows and columns of body j, and u and l as far as they are its own.
@@ -311,9 +325,8 @@ class StageElimination {
                 detail::write(state.inertia * column + ahead * state.turned, ahead * state.lifted, own.u + at);
                 detail::write(state.inertia * row + (-behind) * state.turned, behind * state.lifted, own.l + at);
             }
-            if (width_ > 9 * stages_) {
-                for (double* x : {own.row, own.column, own.u, own.l}) x[(i + 1) * width_ - 1] = 0.0;
-            }
+            for (double* x : {own.row, own.column, own.u, own.l})
+                std::fill(x + i * width_ + bodies_, x + (i + 1) * width_, 0.0);
         }
     }
 
@@ -331,7 +344,9 @@ class StageElimination {
     const Tree* tree_;
     const Tableau* tableau_;
     int stages_;
-    int width_;                          // nine entries for each stage, and a zero where that is odd
+    std::shared_ptr<const Gathering> order_;
+    int bodies_;                         // nine entries for each stage
+    int width_;                          // with one for each stage and slot of ties, and a zero where that is odd
     std::vector<EliminatedBody> state_;  // (b, s)
     std::vector<double> factors_;
     detail::Gathered matrix_, force_;
@@ -339,8 +354,9 @@ class StageElimination {
     std::vector<Motion<double>> twist_;
     std::vector<double> small_, lu_;
     std::vector<int> rows_;
-    detail::Pivots curved_, masses_;
+    SymmetricElimination curved_, masses_;
     double h_ = 0.0;
+    int sign_ = 0;
     const double* diagonal_ = nullptr;
 };
 

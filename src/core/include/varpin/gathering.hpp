@@ -1,0 +1,144 @@
+// What bodies gather of those they carry while they are eliminated one by one, the last one first, and the coordinates
+// that several of them share.
+#pragma once
+
+#include <algorithm>
+#include <memory>
+#include <utility>
+#include <vector>
+
+#include "varpin/tree.hpp"
+
+namespace varpin {
+
+// Coordinates that move several bodies: those that mimic joints follow. Such a coordinate cannot be eliminated with one
+// of its bodies. It borders what is handed on from the first of them on, in a slot, up to the body that carries all of
+// them, or is one of them and carries the others; there it is eliminated. Slots are used again.
+struct Ties {
+    struct Tied {
+        int coordinate = 0;
+        int slot = 0;
+        int body = 0;  // the first that it moves
+    };
+
+    explicit Ties(const Tree& tree) : slot(tree.dof(), -1), ending_(tree.size() + 1) {
+        if (tree.size() == tree.dof()) return;
+        std::vector<std::vector<int>> moved(tree.dof());
+        for (int j = 0; j < tree.size(); ++j) moved[tree.bodies[j].coordinate].push_back(j);
+        // From the root on, that there are as few slots as can be.
+        std::vector<std::pair<int, int>> tops;
+        for (int c = 0; c < tree.dof(); ++c) {
+            if (moved[c].size() < 2) continue;
+            int top = moved[c][0];
+            for (int j : moved[c]) top = common(tree, top, j);
+            tops.emplace_back(top, c);
+        }
+        std::sort(tops.begin(), tops.end());
+        std::vector<std::vector<char>> taken;  // (slots) by a coordinate that borders what a body hands on
+        for (const auto& [top, c] : tops) {
+            std::vector<char> bordered(tree.size() + 1);
+            for (int j : moved[c]) {
+                for (; j > top; j = tree.bodies[j].parent) bordered[j + 1] = 1;
+            }
+            bordered[top + 1] = 1;
+            const auto meets = [&bordered](const std::vector<char>& others) {
+                for (std::size_t k = 0; k < others.size(); ++k) {
+                    if (others[k] && bordered[k]) return true;
+                }
+                return false;
+            };
+            int& own = slot[c];
+            for (own = 0; own < slots && meets(taken[own]);) ++own;
+            if (own == slots) {
+                taken.emplace_back(tree.size() + 1);
+                ++slots;
+            }
+            for (std::size_t k = 0; k < bordered.size(); ++k) taken[own][k] |= bordered[k];
+            ending_[top + 1].push_back({c, own, moved[c][0]});
+        }
+    }
+
+    int slots = 0;
+    std::vector<int> slot;  // (n) -1 for a coordinate of one body
+
+    // The coordinates that are eliminated with body j after its own, or at last, for j = -1.
+    const std::vector<Tied>& ending(int j) const { return ending_[j + 1]; }
+
+  private:
+    std::vector<std::vector<Tied>> ending_;  // (b + 1)
+
+    // The last body that carries both or is one of them; -1 where there is none.
+    static int common(const Tree& tree, int i, int j) {
+        while (i != j) {
+            int& later = i > j ? i : j;
+            later = tree.bodies[later].parent;
+        }
+        return i;
+    }
+};
+
+// Where each body gathers what it carries while bodies are eliminated, the last one first. Places are used again: along
+// a chain there is one, and it stays in the cache. What stands still gathers ties alone, at a place after the bodies'.
+struct Gathering {
+    explicit Gathering(const Tree& tree)
+        : ties(tree), place(tree.size() + 1, -1), joins(tree.size(), 0), leaf(tree.size() + 1, 1) {
+        std::vector<int> free;
+        for (int j = tree.size() - 1; j >= 0; --j) {
+            if (place[j] < 0) {
+                if (free.empty()) free.push_back(places++);
+                place[j] = free.back();
+                free.pop_back();
+            }
+            int k = tree.bodies[j].parent;
+            if (k < 0 && ties.slots > 0) k = tree.size();
+            if (k >= 0 && place[k] < 0) {
+                place[k] = place[j];
+                leaf[k] = 0;
+                continue;
+            }
+            joins[j] = k >= 0;
+            free.push_back(place[j]);
+        }
+    }
+
+    Ties ties;
+    int places = 0;
+    std::vector<int> place;   // of each body; the first child's is its parent's
+    std::vector<char> joins;  // adds to what its parent has already, from a place of its own
+    std::vector<char> leaf;   // nothing is at its place before it
+};
+
+namespace detail {
+
+// What bodies have gathered while the last of them are eliminated; `entries` numbers at each place.
+class Gathered {
+  public:
+    Gathered(std::shared_ptr<const Gathering> order, int entries)
+        : order_(std::move(order)), entries_(entries), at_(order_->places * entries) {}
+
+    // What body j has of those it carries.
+    double* of(int j) {
+        double* own = of_again(j);
+        if (order_->leaf[j]) std::fill(own, own + entries_, 0.0);
+        return own;
+    }
+    double* of_again(int j) { return at_.data() + order_->place[j] * entries_; }
+    // What all have left that stands on the ground, where there are ties.
+    double* of_ground() { return at_.data() + order_->place.back() * entries_; }
+    // Body j is done with: its parent goes on with what it leaves, or adds that to its own.
+    void hand_on(int j, int parent) {
+        if (!order_->joins[j]) return;
+        const double* own = of_again(j);
+        double* __restrict up = parent < 0 ? of_ground() : of_again(parent);
+        for (int k = 0; k < entries_; ++k) up[k] += own[k];
+    }
+
+  private:
+    std::shared_ptr<const Gathering> order_;
+    int entries_;
+    std::vector<double> at_;
+};
+
+}  // namespace detail
+
+}  // namespace varpin
