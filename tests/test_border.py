@@ -18,7 +18,7 @@ TREE = (
     "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio", "offset",
     "origin", "loads", "carried", "periodic", "armature", "group", "groups", "ends",
 )  # fmt: skip
-PLACES = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset")
+PLACES = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset", "mass", "center")
 GUARDS = {"active": True, "branch_margin": 0.5, "energy_balance": 5e-3, "energy_budget": 0.02, "most_halvings": 12}
 
 
@@ -109,6 +109,21 @@ def steps(scene):
     }
 
 
+def cost_terms(links, n, m):
+    """A term on each subject."""
+    costs = core.CostTerms.make(n, m)
+    frame, center = costs.add_frame(links, np.eye(3), draw(3)), costs.add_center(links)
+    none, subject = np.zeros(0, dtype=np.int64), core.Subject
+    costs.add_term(subject.entries, 2 * n, np.eye(m), draw(N, m), none)
+    costs.add_term(subject.excess, n, np.eye(n), np.tile([-0.1, 0.1], (1, n)), none)
+    costs.add_term(subject.position, frame, np.eye(3), draw(N, 3), none)
+    costs.add_term(subject.orientation, frame, np.eye(3), np.eye(3).reshape(1, 9), none)
+    costs.add_term(subject.twist, frame, np.eye(6), draw(2, 6), none)
+    costs.add_term(subject.manipulability, frame, np.eye(1), np.ones((1, 1)), np.arange(6))
+    costs.add_term(subject.position, center, np.eye(3), draw(1, 3), none)
+    return costs
+
+
 def calls():
     """By name, what is called and arguments that fit."""
     own = scene()
@@ -119,8 +134,6 @@ def calls():
     made = core.Links.make(**links)
     many = {**states, "force": draw(N, n)}
     dynamics = core.ForwardDynamics(own.core)
-    rotations = np.array([np.linalg.qr(matrix)[0] for matrix in draw(N, 3, 3)])
-    rotations *= np.linalg.det(rotations)[:, None, None]
     yield "mechanism", core.Mechanism.make, of_mechanism(own)
     yield "jet", own.core.jet, state
     yield "jets", own.core.jets, states
@@ -143,16 +156,21 @@ def calls():
     yield "rate", dynamics.rate, {"x": draw(2 * n), "force": draw(n)}
     yield "node", dynamics.node, {"x": draw(2 * n)}
     yield "links", core.Links.make, links
-    yield "place", made.place, {"q": draw(N, n)}
     frame = {"turned": np.eye(3), "shifted": draw(3), "q": draw(N, n), "jacobian": True}
     yield "place a frame", made.place_frame, frame
-    yield "logarithms", core.rotation_logarithms, {"target": rotations[:2], "R": rotations, "derivative": True}
+    costs = cost_terms(made, n, m)
+    for name, call in (("cost values", costs.values), ("cost expansions", costs.expand)):
+        yield name, call, {**states, "u": draw(N, m)}
+    changes = {"weight": np.eye(m), "before": draw(1, m)}
+    yield "changes", core.change_values, {**changes, "u": draw(P, N, m)}
+    yield "expanded changes", core.expand_changes, {**changes, "u": draw(N, m)}
     box = {"H": np.eye(m), "g": draw(m), "limits": np.array([[-0.1] * m, [0.1] * m]), "guess": np.zeros(m)}
     yield "box", core.box_minimum, box
 
 
-# Sizes that are the caller's to choose: rows of what is done one by one, targets that repeat.
-FREE = {("place", "q", 0), ("place a frame", "q", 0), ("logarithms", "target", 0), ("logarithms", "R", 0)}
+# Sizes that are the caller's to choose: rows of what is done one by one, a control before that may be left out.
+FREE = {("place a frame", "q", 0), ("changes", "u", 0), ("changes", "u", 1), ("expanded changes", "u", 0)}
+FREE |= {("changes", "before", 0), ("expanded changes", "before", 0)}
 
 
 @pytest.fixture(scope="module")

@@ -1,16 +1,19 @@
-"""Costs that the core evaluates against the same in NumPy, term by term."""
+"""Costs that the core evaluates against the same in NumPy and of Pinocchio, term by term."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
+import pinocchio as pin
 import pytest
 from mechanisms import random_tree
 
 import varpin as vp
 from varpin.core import CostTerms, Subject, sample_steps
-from varpin.costs import BoundSum, Points
+from varpin.costs import BoundSum, Points, control_rate
 from varpin.linearization import node_jets, velocity_at_nodes
-from varpin.robot.kinematics import frame_kinematics, rotation_errors
+from varpin.robot.kinematics import frame_kinematics
 
 N, CONTROLS = 7, 3
 
@@ -52,6 +55,24 @@ def plain(residual, J, weight, columns, size):
     return np.einsum("Nr,rs,Ns->N", residual, weight, residual), gradient, hessian
 
 
+def slopes_in_q(function, q, step=1e-2):
+    """Derivative (N, ..., n) of a function of q (N, n), by differences of eighth order."""
+    weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+    columns = [
+        sum(w * (function(q + k * e) - function(q - k * e)) for k, w in weights.items()) / step
+        for e in step * np.eye(q.shape[1])
+    ]
+    return np.stack(columns, axis=-1)
+
+
+def masses(robot, q):
+    """Centres of mass (N, 3) and their derivatives (N, 3, n), by Pinocchio."""
+    model, gear = robot.free_model, robot.free_velocities(np.eye(robot.dof)).T
+    data = model.createData()
+    slopes = np.array([pin.jacobianCenterOfMass(model, data, robot.free_positions(row)) @ gear for row in q])
+    return np.array([pin.centerOfMass(model, data, robot.free_positions(row)).copy() for row in q]), slopes
+
+
 def terms(rng, robot, frame, q, v, u):
     """Costs, and what each is in NumPy."""
     n, size = robot.dof, 2 * robot.dof + CONTROLS
@@ -71,7 +92,8 @@ def terms(rng, robot, frame, q, v, u):
     add(vp.FramePositionCost(robot, frame, place, W), W, p - place, J[:, :3], slice(0, n))
     W, turns = spd(rng, 3), np.linalg.qr(rng.normal(size=(N, 3, 3)))[0]
     turns *= np.sign(np.linalg.det(turns))[:, None, None]
-    error, turn = rotation_errors(turns, R, derivative=True)
+    error = np.array([pin.log3(target.T @ own) for target, own in zip(turns, R, strict=True)])
+    turn = np.array([pin.Jlog3(target.T @ own) for target, own in zip(turns, R, strict=True)])
     add(
         vp.FrameOrientationCost(robot, frame, turns, W),
         W,
@@ -80,8 +102,35 @@ def terms(rng, robot, frame, q, v, u):
         slice(0, n),
     )
     W, twist = spd(rng, 6), rng.normal(size=(N, 6))
-    slopes = np.concatenate([kinematics.motion(q).twist_in_q(v), J], axis=2)
+    in_q = slopes_in_q(lambda q: (kinematics.jacobians(q)[2] @ v[:, :, None])[..., 0], q)
+    slopes = np.concatenate([in_q, J], axis=2)
     add(vp.FrameVelocityCost(robot, frame, twist, W), W, (J @ v[:, :, None])[..., 0] - twist, slopes, slice(0, 2 * n))
+    W, place = spd(rng, 3), rng.normal(size=(N, 3))
+    centers, slopes = masses(robot, q)
+    add(vp.CenterOfMassCost(robot, place, W), W, centers - place, slopes, slice(0, n))
+    # The finger turns in a plane.
+    rows = [0, 1] if robot.name == "finger" else [0, 1, 2]
+
+    def chosen(q):
+        return kinematics.jacobians(q)[2][:, rows]
+
+    J = chosen(q)
+    measured = np.sqrt(np.linalg.det(J @ np.swapaxes(J, 1, 2)))
+    least = 1.01 * float(np.median(measured))
+    slopes = measured[:, None] * np.einsum("Nar,Nrab->Nb", np.linalg.pinv(J), slopes_in_q(chosen, q))
+    slopes = np.where(measured < least, -1.0, 0.0)[:, None, None] * slopes[:, None]
+    cost = vp.ManipulabilityCost(robot, frame, least, 1.7, ["xyz"[row] for row in rows])
+    add(cost, np.array([[1.7]]), np.maximum(0.0, least - measured)[:, None], slopes, slice(0, n))
+    for kind, y, begin in ((vp.JointLimitBarrier, q, 0), (vp.VelocityLimitBarrier, v, n)):
+        W, lower, upper = spd(rng, n), np.full(n, -0.5), np.linspace(0.3, 0.6, n)
+        beyond = y - np.clip(y, lower + 0.1, upper - 0.1)
+        add(
+            kind(robot, W, 0.1, (lower, upper)),
+            W,
+            beyond,
+            np.eye(n) * (beyond != 0.0)[:, None],
+            slice(begin, begin + n),
+        )
     return found
 
 
@@ -134,22 +183,91 @@ def test_linear_terms_share_their_hessian(rng, robot):
     np.testing.assert_array_equal(bound.expand(*at).hessian, expected[None])
 
 
+@pytest.mark.parametrize("before", [None, np.array([0.4, -0.2, 0.1])], ids=["free", "given"])
+def test_changes_of_controls(rng, before):
+    """Each against the quadratic form, its slope and curvature against differences, which a quadratic leaves exact."""
+    W, period, u = spd(rng, CONTROLS), 0.03, rng.normal(size=(4, N, CONTROLS))
+    rate = control_rate(vp.ControlRateCost(W, before), CONTROLS)
+    start = u[:, :1] if before is None else np.tile(before, (4, 1, 1))
+    change = u - np.concatenate([start, u[:, :-1]], axis=1)
+    expected = np.einsum("pki,ij,pkj->pk", change, W, change) / period
+    np.testing.assert_allclose(rate.shares(u, period), expected, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(rate.value(u, period), expected.sum(axis=1), rtol=1e-13)
+    gradient, hessian = rate.expand(u[0], period)
+    first = 1 if before is None else 0
+    assert not gradient[:first].any()
+    assert not hessian[:first].any()
+    for k in range(first, N):
+
+        def at(d, k=k):
+            moved = change[0, k] + d
+            return moved @ W @ moved / period
+
+        axes = np.eye(CONTROLS)
+        np.testing.assert_allclose(gradient[k], [0.5 * (at(e) - at(-e)) for e in axes], rtol=1e-9, atol=1e-9)
+        mixed = [[0.25 * (at(a + b) - at(a - b) - at(b - a) + at(-a - b)) for b in axes] for a in axes]
+        np.testing.assert_allclose(hessian[k], mixed, rtol=1e-9, atol=1e-9)
+
+
+def test_manipulability_where_there_is_none(load):
+    """The slope of |det J| is that of cofactors, whichever rows of J are dependent, and zero where two are lost."""
+    robot = load("ur5")
+    frame = frame_kinematics(robot, "tool0")
+    straight = np.array([0.3, -1.0, 0.0, 0.4, 0.9, 0.2])  # elbow
+    wrist = np.array([0.3, -1.0, 0.7, 0.4, 0.0, 0.2])
+    q = np.array([straight, wrist, straight * [1, 1, 1, 1, 0, 1]])
+    bound = vp.ManipulabilityCost(robot, "tool0", 0.05).bind(Points(np.zeros(3), 1.0, 2, 6, 6))
+    given = bound.expand(q, q, q)
+    slopes = slopes_in_q(lambda q: np.linalg.det(frame.jacobians(q)[2]), q)
+    assert (np.abs(slopes[:2]).max(axis=1) > 1e-3).all()
+    np.testing.assert_allclose(np.abs(given.gradient[:, :6]), 0.1 * np.abs(slopes), atol=1e-10)
+    np.testing.assert_allclose(given.gradient[2], 0.0, atol=1e-10)
+    outer = slopes[:, :, None] * slopes[:, None, :]
+    np.testing.assert_allclose(given.hessian[:, :6, :6], 2.0 * outer, atol=1e-9)
+
+
+def test_states_that_are_no_numbers_have_no_cost(load):
+    robot = load("ur5")
+    bad = np.full((1, 6), np.nan)
+    points, still = Points(np.zeros(1), 1.0, 1, 6, 6), np.zeros((1, 6))
+    for cost in (
+        vp.JointLimitBarrier(robot), vp.ManipulabilityCost(robot, "tool0", 0.1), vp.CenterOfMassCost(robot, [0, 0, 0]),
+    ):  # fmt: skip
+        assert np.isnan(cost.bind(points).value(bad, still, still)).all(), cost
+
+
 def test_terms_of_what_is_not_there_are_refused(robot, frame):
     n = robot.dof
     costs, kinematics = CostTerms.make(n, 2), frame_kinematics(robot, frame)
-    with pytest.raises(ValueError, match="not there"):
-        costs.add_term(Subject.entries, 2 * n, np.eye(3), np.zeros((1, 3)))
-    with pytest.raises(ValueError, match="not there"):
-        costs.add_term(Subject.position, 0, np.eye(3), np.zeros((1, 3)))
+    none = np.zeros(0, dtype=np.int64)
+
+    def refused(match, subject, place, size, target, directions=none):
+        with pytest.raises(ValueError, match=match):
+            costs.add_term(subject, place, np.eye(size), np.zeros(target), directions)
+
+    refused("not there", Subject.entries, 2 * n, 3, (1, 3))
+    refused("not there", Subject.excess, 2 * n, 3, (1, 6))
+    refused("not there", Subject.position, 0, 3, (1, 3))
     costs.add_frame(kinematics.links.core, kinematics.rotation, kinematics.translation)
-    with pytest.raises(ValueError, match="wrong size"):
-        costs.add_term(Subject.twist, 0, np.eye(3), np.zeros((1, 3)))
-    with pytest.raises(ValueError, match="target has size 3"):
-        costs.add_term(Subject.orientation, 0, np.eye(3), np.zeros((1, 3)))
-    with pytest.raises(ValueError, match="no target"):
-        costs.add_term(Subject.position, 0, np.eye(3), np.zeros((0, 3)))
+    refused("wrong size", Subject.twist, 0, 3, (1, 3))
+    refused("wrong size", Subject.manipulability, 0, 3, (1, 3), np.array([0]))
+    refused("target has size 3", Subject.orientation, 0, 3, (1, 3))
+    refused("target has size 2 along axis 1, not 4", Subject.excess, 0, 2, (1, 2))
+    refused("no target", Subject.position, 0, 3, (0, 3))
+    refused("directions are those", Subject.manipulability, 0, 1, (1, 1))
+    refused("directions are those", Subject.manipulability, 0, 1, (1, 1), np.arange(n + 1))
+    refused("directions are those", Subject.position, 0, 3, (1, 3), np.array([0]))
+    refused("rows of a Jacobian", Subject.manipulability, 0, 1, (1, 1), np.array([6]))
+    center = costs.add_center(kinematics.links.core)
+    refused("a position and no more", Subject.twist, center, 6, (1, 6))
+    other = CostTerms.make(n + 1, 2)
     with pytest.raises(ValueError, match="another number"):
-        CostTerms.make(n + 1, 2).add_frame(kinematics.links.core, kinematics.rotation, kinematics.translation)
+        other.add_frame(kinematics.links.core, kinematics.rotation, kinematics.translation)
+    with pytest.raises(ValueError, match="another number"):
+        other.add_center(kinematics.links.core)
+    light = dataclasses.replace(kinematics.links, mass=np.zeros(len(kinematics.links.mass)))
+    with pytest.raises(ValueError, match="bodies with a mass"):
+        costs.add_center(light.core)
 
 
 def test_samples_are_weighted_nodes(rng):

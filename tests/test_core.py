@@ -237,7 +237,7 @@ class TestRollouts:
 )
 def test_what_are_no_links_is_refused(change, match):
     own = links(vp.planar_chain(2).tree)
-    names = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset")
+    names = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset", "mass", "center")
     with pytest.raises(ValueError, match=match):
         Links.make(**({name: getattr(own, name) for name in names} | change), dof=2)
 

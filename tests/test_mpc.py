@@ -339,3 +339,22 @@ def test_a_ur5_holds_its_tool_on_a_moving_target(script):
         off.append(task.off_target(robot, controller.run(plant, duration=3.0, rng=1).motion))
     assert off[0] < 0.4
     assert off[1] > 1.1 * off[0]
+
+
+def test_what_plan_and_motion_have_in_common_is_told_once():
+    """Joints beyond their limits of velocity, which the first plan means to pass, are told of the motion alone."""
+    robot = vp.load_robot("ur5")
+    cost = vp.VelocityCost(1e-3) + vp.ControlCost(1e-5) + vp.TrackingCost(lambda t: np.full(6, 20.0 * t**2), 10.0)
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, gravity=False), cost, np.zeros(6), np.zeros(6), dt=0.02, steps=10
+    )
+    run = vp.Mpc(problem, iterations=1).run(duration=0.2)
+    first = [sentence for sentence in run.plans[0].warnings if "velocity limits" in sentence]
+    (told,) = [sentence for sentence in run.warnings if "velocity limits" in sentence]
+    assert first
+    assert told in run.motion.warnings
+    # A run that ends before the plan gets that far tells it of the plan.
+    short = vp.Mpc(problem, iterations=1).run(duration=0.02)
+    assert [f"the first plan: {sentence}" for sentence in first] == [
+        sentence for sentence in short.warnings if "velocity limits" in sentence
+    ]

@@ -1,5 +1,6 @@
 """The search for a plan: what its trials may take, when it ends; constants, scales and steady noise change nothing."""
 
+import logging
 import re
 
 import numpy as np
@@ -386,3 +387,15 @@ def test_what_is_spent_of_a_running_cost():
         own = short.costs(whole.q[: steps + 1], whole.v[: steps + 1], whole.u[:steps])
         end = short.terminal.value(whole.q[steps : steps + 1], whole.v[steps : steps + 1], np.zeros((1, 2)))[0]
         assert spent(problem, parts, other) == pytest.approx(own - end, rel=1e-12)
+
+
+def test_each_line_of_the_log_names_its_search(caplog):
+    problem = vp.OptimalControlProblem(
+        vp.Scene(vp.load_robot("finger")), vp.TrackingCost([0.3, 0.2, 0.1]) + vp.ControlCost(1e3), np.zeros(3),
+        np.zeros(3), dt=0.01, steps=5,
+    )  # fmt: skip
+    with caplog.at_level(logging.INFO, "varpin.sddp.search"):
+        plans = [vp.solve(own, check=False) for own in (problem, problem.at(t0=1.5, dt=0.005))]
+    lines = [f"finger, 5 steps of 0.01 s from t = 0 s: {item}" for item in plans[0].history]
+    lines += [f"finger, 10 steps of 0.005 s from t = 1.5 s: {item}" for item in plans[1].history]
+    assert [record.getMessage() for record in caplog.records] == lines

@@ -400,3 +400,13 @@ def test_a_noise_field_that_fails_away_from_the_start_costs_a_trial_and_not_the_
     assert np.abs(sol.trajectory.q[:-1, 0]).max() <= limit  # the last node kicks nothing
     assert sol.cost == problem.cost_of(sol.trajectory)
     assert sol.cost <= sol.history[0].cost
+
+
+def test_verification_says_that_the_search_had_not_converged():
+    problem, *_ = tracking("finger", vp.Midpoint())
+    short, done = vp.solve(problem, max_iterations=1), vp.solve(problem)
+    told, calm = (plan.verify(tolerance=1e-3) for plan in (short, done))
+    assert (told.status, calm.status) == (vp.Status.MAX_ITERATIONS, vp.Status.CONVERGED)
+    assert str(told).splitlines()[-1].startswith("the plan is unfinished, not converged: more iterations may help")
+    assert "more iterations may help" in told._repr_html_()
+    assert "unfinished" not in str(calm) + calm._repr_html_()

@@ -7,7 +7,7 @@ import pytest
 
 import varpin as vp
 from varpin.costs import Points
-from varpin.robot.kinematics import center_of_mass, frame_kinematics, links
+from varpin.robot.kinematics import frame_kinematics, links
 
 N = 5
 STEP = 1e-2
@@ -69,7 +69,6 @@ def test_frames(arm):
     robot, frame = arm
     q, v = state(robot)
     kinematics = frame_kinematics(robot, frame)
-    motion = kinematics.motion(q)
     R, p, J = kinematics.jacobians(q)
     for k in range(N):
         rotation, position, twist = pinocchio_frame(robot, frame, q[k], v[k])
@@ -86,28 +85,30 @@ def test_frames(arm):
         np.testing.assert_allclose(J[k], whole @ robot.free_velocities(np.eye(robot.dof)).T, atol=1e-13)
     for placed, once_more in zip(kinematics.placements(q), (R, p), strict=True):
         np.testing.assert_array_equal(placed, once_more)
-    jacobians = differences(lambda q: kinematics.jacobians(q)[2], q)  # (N, 6, n, n)
-    np.testing.assert_allclose(np.moveaxis(motion.jacobian_in_q(), 1, 3), jacobians, atol=1e-10)
-    np.testing.assert_allclose(motion.twist_in_q(v), np.einsum("Nrba,Nb->Nra", jacobians, v), atol=1e-10)
 
 
 def test_center_of_mass(arm):
     robot, _ = arm
-    q, _ = state(robot)
-    center = center_of_mass(robot)
-    position, J = center.motion(q)
-    np.testing.assert_allclose(center.position(q), position, atol=1e-14)
-    gear = robot.free_velocities(np.eye(robot.dof)).T
+    n = robot.dof
+    q, v = state(robot)
+    gear, u = robot.free_velocities(np.eye(n)).T, np.zeros((1, 1))
     for k in range(N):
         data, free = robot.free_model.createData(), robot.free_positions(q[k])
-        np.testing.assert_allclose(position[k], pin.centerOfMass(robot.free_model, data, free), atol=1e-13)
-        np.testing.assert_allclose(J[k], pin.jacobianCenterOfMass(robot.free_model, data, free) @ gear, atol=1e-13)
+        center = pin.centerOfMass(robot.free_model, data, free)
+        J = pin.jacobianCenterOfMass(robot.free_model, data, free) @ gear
+        for axis in np.eye(3):
+            # The centre is 1 m from the target along an axis: the gradient is twice a row of the Jacobian.
+            bound = vp.CenterOfMassCost(robot, center - axis).bind(Points(np.zeros(1), 1.0, 1, n, 1))
+            assert bound.value(q[k : k + 1], v[:1], u)[0] == pytest.approx(1.0, abs=1e-12)
+            given = bound.expand(q[k : k + 1], v[:1], u)
+            np.testing.assert_allclose(given.gradient[0, :n], 2.0 * axis @ J, atol=1e-12)
+        np.testing.assert_allclose(given.hessian[0, :n, :n], 2.0 * J.T @ J, atol=1e-12)
 
 
 def test_only_what_carries_a_frame_is_placed(load):
     robot = load("panda")
-    assert len(links(robot.tree, 3).gear) == 4
-    assert len(links(robot.tree).gear) == robot.tree.parent.size == 9
+    assert len(links(robot.tree, 3).parent) == 4
+    assert len(links(robot.tree).parent) == robot.tree.parent.size == 9
 
 
 def turn(axis, angle):

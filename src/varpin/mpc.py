@@ -21,7 +21,7 @@ from varpin.integrators.base import Failure
 from varpin.loop_stability import examined_in_loop
 from varpin.markup import facts, said
 from varpin.scene import Scene, require_scene
-from varpin.sddp import OptimalControlProblem, Solution, replan, solve
+from varpin.sddp import OptimalControlProblem, Solution, looked_at, replan, solve
 from varpin.simulation import Interrupted, StepFailure, noise_forgotten, simulate
 from varpin.soundness import Finding, announce, evident, with_warnings
 from varpin.trajectory import Trajectory, chained
@@ -68,9 +68,9 @@ class MpcRun(Frozen):
         late: Ticks whose plan came after its budget (K,); the plan of the tick before acted on.
         period: Of the ticks [s].
         budget: For planning in a tick [s]; infinite for any.
-        warnings: What looks wrong with the plant's motion, as in :attr:`Trajectory.warnings`, with its velocities from
-            tick to tick, and with the first plan; and whether planning took longer than the period in more than one
-            tick of twenty, which depends on the machine.
+        warnings: What looks wrong with the first plan, unless it does with the plant's motion, too; with that motion,
+            as in :attr:`Trajectory.warnings`, and its velocities from tick to tick; and whether planning took longer
+            than the period in more than one tick of twenty, which depends on the machine.
     """
 
     motion: Trajectory
@@ -229,10 +229,15 @@ class Mpc:
                 before = previous.controls[min(decisions, len(previous.controls)) - 1]
         problem = self.problem.at(q0=q, v0=v, t0=t, before=before)
         if previous is None:
-            return solve(problem, tolerance=self.tolerance, max_iterations=self.first_iterations)
+            return self._first_plan(problem)[0]
         start = previous.shifted(min(decisions, problem.decisions - 1), before)
         # A tick has no time for a second look at its plan; the run takes one at what came of them all.
         return replan(problem, start, tolerance=self.tolerance, max_iterations=self.iterations, time_limit=self.budget)
+
+    def _first_plan(self, problem: OptimalControlProblem) -> tuple[Solution, tuple[Finding, ...]]:
+        """The plan that a run begins with, and what was found wrong with it."""
+        plan = solve(problem, tolerance=self.tolerance, max_iterations=self.first_iterations, check=False)
+        return looked_at(plan)
 
     def run(
         self,
@@ -280,7 +285,7 @@ class Mpc:
         generator = None if rng is None else np.random.default_rng(rng)
         q, v = problem.q0, problem.v0
         before = None if problem.rate is None else problem.rate.before
-        active, age = self.plan(problem.t0, q, v), 0
+        (active, of_plan), age = self._first_plan(problem), 0
         parts: list[Trajectory] = []
         plans, seconds, iterations, late = [], np.zeros(ticks), np.zeros(ticks, dtype=np.int64), np.zeros(ticks, bool)
         try:
@@ -312,6 +317,8 @@ class Mpc:
         found = (*noise_forgotten(plant.scene, rng), *found, *_alternating(motion, plant.substeps))
         found = (*found, *_behind(seconds, self.period))
         announce(logger, plant.scene, dt, found)
+        again = {(finding.kind, finding.joint) for finding in found}
+        first = [finding.sentence for finding in of_plan if (finding.kind, finding.joint) not in again]
         return MpcRun(
             motion,
             tuple(plans),
@@ -320,7 +327,10 @@ class Mpc:
             late,
             self.period,
             self.budget,
-            warnings=(*plans[0].warnings, *(finding.sentence for finding in found)),
+            warnings=(
+                *(f"the first plan: {sentence}" for sentence in first),
+                *(finding.sentence for finding in found),
+            ),
         )
 
 

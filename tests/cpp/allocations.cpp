@@ -1,5 +1,5 @@
-// Steppers and passes have all their memory once they are made, and linearizations after their first step: a controller
-// may run them at its rate.
+// Steppers, passes and costs have all their memory once they are made, and linearizations after their first step: a
+// controller may run them at its rate.
 #include <cstdio>
 #include <cstdlib>
 #include <limits>
@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "varpin/backward.hpp"
+#include "varpin/costs.hpp"
 #include "varpin/explicit.hpp"
 #include "varpin/linearization.hpp"
 #include "varpin/variational.hpp"
@@ -141,6 +142,33 @@ int main() {
     right &= without_allocation("the backward pass", [&] {
         return pass.run(h, 1, 0.0, steps,
                         {.feedforward = k.data(), .feedback = K.data(), .control_gradient = slopes.data()}) < 0;
+    });
+    const varpin::Links links{mechanism.tree.bodies, n};
+    const varpin::Placement tip{{{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}}, {1.0, 0.0, 0.0}};
+    const std::vector<double> one{1.0}, three{1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0};
+    std::vector<double> six(36);
+    for (int i = 0; i < 6; ++i) six[i * 7] = 1.0;
+    using varpin::Subject;
+    const varpin::CostTerms costs{.dof = n,
+                                  .controls = n,
+                                  .frames = {{links, tip}, {.links = links, .own = {}, .center = true}},
+                                  .terms = {{Subject::entries, 3, 0, three, {0.0, 0.0, 0.0}},
+                                            {Subject::excess, 3, n, three, {0.1, 0.1, 0.1, 0.2, 0.2, 0.2}},
+                                            {Subject::position, 3, 0, three, {0.0, 0.0, 0.0}},
+                                            {Subject::orientation, 3, 0, three, three},
+                                            {Subject::twist, 6, 0, six, std::vector<double>(6)},
+                                            {Subject::manipulability, 1, 0, one, {100.0}, {0, 1}},
+                                            {Subject::position, 3, 1, three, {0.0, 0.0, 0.0}}}};
+    varpin::CostSample sample(costs);
+    varpin::ChangeCost change(n, three, {});
+    std::vector<double> own_gradient(size), own_hessian(size * size), values(costs.terms.size());
+    right &= without_allocation("costs", [&] {
+        for (int s = 0; s + 1 < N; ++s) {
+            sample.values(&q[s * n], &v[s * n], &u[s * n], 0, values.data());
+            sample.expand(&q[s * n], &v[s * n], &u[s * n], 0, own_gradient.data(), own_hessian.data());
+            change.expand(u.data(), s, own_gradient.data(), own_hessian.data());
+        }
+        return values[5] > 0.0;
     });
     return right ? 0 : 1;
 }

@@ -1,4 +1,4 @@
-// Costs at samples.
+// Costs at samples and of changes of controls.
 #include "varpin/costs.hpp"
 
 #include <nanobind/stl/tuple.h>
@@ -30,21 +30,41 @@ std::size_t add_frame(CostTerms& costs, const Links& links, In<2> turned, In<1> 
     return costs.frames.size() - 1;
 }
 
-void add_term(CostTerms& costs, Subject subject, int place, In<2> weight, In<2> target) {
+std::size_t add_center(CostTerms& costs, const Links& links) {
+    double mass = 0.0;
+    for (const Body& link : links.bodies) mass += link.mass;
+    if (!(mass > 0.0)) throw std::invalid_argument("a centre of mass is of bodies with a mass");
+    if (links.dof != costs.dof) throw std::invalid_argument("the bodies are of another number of coordinates");
+    costs.frames.push_back({links, {}, true});
+    return costs.frames.size() - 1;
+}
+
+void add_term(CostTerms& costs, Subject subject, int place, In<2> weight, In<2> target, Integers<1> directions) {
     const std::size_t size = weight.shape(0);
-    const bool entries = subject == Subject::entries;
+    const bool entries = subject == Subject::entries || subject == Subject::excess;
     const int last = entries ? costs.size() - static_cast<int>(size) : static_cast<int>(costs.frames.size()) - 1;
     if (place < 0 || place > last) throw std::invalid_argument("the term is of what is not there");
-    if (!entries && size != (subject == Subject::twist ? 6u : 3u))
-        throw std::invalid_argument("a weight of a wrong size");
+    const bool measures = subject == Subject::manipulability;
+    if (!entries) {
+        if (costs.frames[place].center && subject != Subject::position)
+            throw std::invalid_argument("a centre of mass has a position and no more");
+        if (size != (subject == Subject::twist ? 6u : measures ? 1u : 3u))
+            throw std::invalid_argument("a weight of a wrong size");
+    }
     require(weight, "weight", {size, size});
-    require(target, "target", {target.shape(0), subject == Subject::orientation ? 9 : size});
+    require(target, "target", {target.shape(0), target_width(subject, size)});
     if (target.shape(0) == 0) throw std::invalid_argument("there is no target");
+    const std::vector<int> rows(directions.data(), directions.data() + directions.size());
+    if (rows.empty() == measures || rows.size() > static_cast<std::size_t>(costs.dof))
+        throw std::invalid_argument("directions are those of a manipulability, no more than there are coordinates");
+    for (int row : rows)
+        if (row < 0 || row > 5) throw std::invalid_argument("directions are rows of a Jacobian");
     costs.terms.push_back({subject,
                            static_cast<int>(size),
                            place,
                            {weight.data(), weight.data() + weight.size()},
-                           {target.data(), target.data() + target.size()}});
+                           {target.data(), target.data() + target.size()},
+                           rows});
 }
 
 std::size_t rows_of(const CostTerms& costs, const In<2>& q, const In<2>& v, const In<2>& u) {
@@ -85,6 +105,39 @@ std::tuple<Out, Out> expand(const CostTerms& costs, In<2> q, In<2> v, In<2> u) {
     return {gradient, hessian};
 }
 
+ChangeCost change_cost(const In<2>& weight, const In<2>& before, std::size_t m) {
+    require(weight, "weight", {m, m});
+    const bool starts = given(before, "before", {1, m});
+    return {static_cast<int>(m),
+            {weight.data(), weight.data() + weight.size()},
+            {before.data(), before.data() + (starts ? m : 0)}};
+}
+
+// Values (P, N) of the changes of controls (P, N, m).
+Out change_values(In<2> weight, In<2> before, In<3> u) {
+    const std::size_t paths = u.shape(0), count = u.shape(1), m = u.shape(2);
+    ChangeCost cost = change_cost(weight, before, m);
+    double* found = nullptr;
+    const Out out = array_for(found, {paths, count});
+    nb::gil_scoped_release release;
+    for (std::size_t p = 0; p < paths; ++p)
+        for (std::size_t k = 0; k < count; ++k) *found++ = cost.value(u.data() + p * count * m, k);
+    return out;
+}
+
+// Gradients (N, m) and Hessians (N, m, m) of the changes of controls (N, m).
+std::tuple<Out, Out> expand_changes(In<2> weight, In<2> before, In<2> u) {
+    const std::size_t count = u.shape(0), m = u.shape(1);
+    ChangeCost cost = change_cost(weight, before, m);
+    double *g = nullptr, *H = nullptr;
+    const Out gradient = array_for(g, {count, m}), hessian = array_for(H, {count, m, m});
+    {
+        nb::gil_scoped_release release;
+        for (std::size_t k = 0; k < count; ++k) cost.expand(u.data(), k, g + k * m, H + k * m * m);
+    }
+    return {gradient, hessian};
+}
+
 std::tuple<Out, Out> samples(In<2> rule, In<3> q, In<3> v) {
     const std::size_t motions = q.shape(0), nodes = q.shape(1), n = q.shape(2), count = rule.shape(0);
     require(rule, "rule", {count, 9});
@@ -105,15 +158,20 @@ std::tuple<Out, Out> samples(In<2> rule, In<3> q, In<3> v) {
 void register_costs(nb::module_& m) {
     nb::enum_<Subject>(m, "Subject")
         .value("entries", Subject::entries)
+        .value("excess", Subject::excess)
         .value("position", Subject::position)
         .value("orientation", Subject::orientation)
-        .value("twist", Subject::twist);
+        .value("twist", Subject::twist)
+        .value("manipulability", Subject::manipulability);
     nb::class_<CostTerms>(m, "CostTerms")
         .def_static("make", &terms_for, "dof"_a, "controls"_a)
         .def("add_frame", &add_frame, "links"_a, "turned"_a, "shifted"_a)
-        .def("add_term", &add_term, "subject"_a, "place"_a, "weight"_a, "target"_a)
+        .def("add_center", &add_center, "links"_a)
+        .def("add_term", &add_term, "subject"_a, "place"_a, "weight"_a, "target"_a, "directions"_a)
         .def("values", &values, "q"_a, "v"_a, "u"_a)
         .def("expand", &expand, "q"_a, "v"_a, "u"_a);
+    m.def("change_values", &change_values, "weight"_a, "before"_a, "u"_a);
+    m.def("expand_changes", &expand_changes, "weight"_a, "before"_a, "u"_a);
     m.def("sample_steps", &samples, "rule"_a, "q"_a, "v"_a);
 }
 

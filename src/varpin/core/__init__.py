@@ -20,13 +20,14 @@ from varpin.core._core import Tableau as Tableau
 from varpin.core._core import VariationalRollout as VariationalRollout
 from varpin.core._core import accelerations as accelerations
 from varpin.core._core import box_minimum as box_minimum
+from varpin.core._core import change_values as change_values
 from varpin.core._core import doubled_steps_agree as doubled_steps_agree
 from varpin.core._core import energy_turnover as energy_turnover
+from varpin.core._core import expand_changes as expand_changes
 from varpin.core._core import fastest_damping as fastest_damping
 from varpin.core._core import linearize_explicit as linearize_explicit
 from varpin.core._core import longest_alternation as longest_alternation
 from varpin.core._core import pulls_fast as pulls_fast
-from varpin.core._core import rotation_logarithms as rotation_logarithms
 from varpin.core._core import sample_steps as sample_steps
 from varpin.core._core import variational_curvatures as variational_curvatures
 from varpin.core._core import variational_derivatives as variational_derivatives

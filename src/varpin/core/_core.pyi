@@ -312,12 +312,11 @@ class Links:
         coordinate: Integers,
         ratio: Floats,
         offset: Floats,
+        mass: Floats,
+        center: Floats,
         dof: int,
     ) -> Links:
         """Raises ValueError for arrays that do not fit each other or describe no tree."""
-
-    def place(self, q: Floats) -> tuple[Floats, Floats]:
-        """World rotations (N, c, 3, 3) and positions (N, c, 3) [m] of the bodies at q (N, n)."""
 
     def place_frame(self, turned: Floats, shifted: Floats, q: Floats, jacobian: bool) -> tuple[Floats, Floats, Floats]:
         """World rotations (N, 3, 3) and positions (N, 3) of a frame on the last body, its Jacobians (N, 6, n) if asked.
@@ -325,12 +324,6 @@ class Links:
         The frame stands at (turned (3, 3), shifted (3,)) in the body; Jacobians are linear over angular velocity in
         world axes, and (0, 6, n) where nobody asks for them.
         """
-
-def rotation_logarithms(target: Floats, R: Floats, derivative: bool) -> tuple[Floats, Floats]:
-    """Logarithms (N, 3) of target' R for R (N, 3, 3), and their derivatives (N, 3, 3) or (0, 3, 3).
-
-    Targets (T, 3, 3) repeat after T. The derivative is in a turn of R about its own axes.
-    """
 
 class Outcome(IntEnum):
     """Why a rollout of a path ended; see src/core/include/varpin/nodes.hpp."""
@@ -448,12 +441,18 @@ def longest_alternation(
     """
 
 class Subject(Enum):
-    """What the residual of a cost is of: entries of z = (q, v, u), or a frame's position, orientation or twist."""
+    """What the residual of a cost is of.
+
+    Entries of z = (q, v, u), or what they are beyond limits; a frame's position, orientation or twist, or what its
+    manipulability lacks.
+    """
 
     entries = 0
-    position = 1
-    orientation = 2
-    twist = 3
+    excess = 1
+    position = 2
+    orientation = 3
+    twist = 4
+    manipulability = 5
 
 class CostTerms:
     """Costs weight . r^2 at samples (q, v, u); see src/core/include/varpin/costs.hpp."""
@@ -463,10 +462,15 @@ class CostTerms:
     def add_frame(self, links: Links, turned: Floats, shifted: Floats) -> int:
         """A frame that stands at (turned, shifted) in the last of some bodies; its index."""
 
-    def add_term(self, subject: Subject, place: int, weight: Floats, target: Floats) -> None:
-        """A term with weight (r, r) and targets (T, r), (T, 9) of an orientation, that repeat after T samples.
+    def add_center(self, links: Links) -> int:
+        """The bodies' centre of mass, in the place of a frame; its index."""
 
-        ``place`` is the first of the entries of z, or the index of the frame.
+    def add_term(self, subject: Subject, place: int, weight: Floats, target: Floats, directions: Integers) -> None:
+        """A term with weight (r, r) and targets (T, r) that repeat after T samples.
+
+        Targets of an orientation are (T, 9); of an excess (T, 2 r), the least values and then the greatest. ``place``
+        is the first of the entries of z, or the index of the frame; ``directions`` (d,) are the rows of the Jacobian
+        that a manipulability is of, none for other subjects.
         """
 
     def values(self, q: Floats, v: Floats, u: Floats) -> Floats:
@@ -474,6 +478,15 @@ class CostTerms:
 
     def expand(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats]:
         """Gradient (N, 2n + m) and Hessian (N or 1, 2n + m, 2n + m) of all terms, of Gauss and Newton."""
+
+def change_values(weight: Floats, before: Floats, u: Floats) -> Floats:
+    """What the changes of controls (P, N, m) cost, weight (m, m) . (u_k - u_(k-1))^2, one by one (P, N).
+
+    ``before`` is the control before the first one (1, m), or (0, m) where the first one is free.
+    """
+
+def expand_changes(weight: Floats, before: Floats, u: Floats) -> tuple[Floats, Floats]:
+    """Gradients (N, m) and Hessians (N, m, m) in u_k of the same at controls (N, m), with u_(k-1) as it is."""
 
 def sample_steps(rule: Floats, q: Floats, v: Floats) -> tuple[Floats, Floats]:
     """Samples (P, N s, n) of q and v from their nodes (P, N + 1, n), by a rule (s, 9)."""

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import JointValues, checked_limits, joint_array
-from varpin.costs.base import Cost, Points, Scaled, Terminal
-from varpin.costs.residual import Residual, ResidualCost
+from varpin.costs.base import BoundCost, CompiledCost, Cost, Points, Scaled, Terminal
+from varpin.costs.residual import TaskCost
+from varpin.costs.terms import Terms
 from varpin.errors import InputError
 from varpin.robot import Robot
 
@@ -19,23 +20,19 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class _Excess(Residual):
-    lower: Floats
-    upper: Floats
-    columns: slice
-    in_velocity: bool
+class _BoundBarrier(CompiledCost):
+    begin: int
+    weight: Floats  # (n, n)
+    lower: Floats  # (n,)
+    upper: Floats  # (n,)
+    points: Points
 
-    def value(self, q: Floats, v: Floats) -> Floats:
-        y = v if self.in_velocity else q
-        return np.maximum(0.0, y - self.upper) - np.maximum(0.0, self.lower - y)
-
-    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
-        y = v if self.in_velocity else q
-        outside = ((y > self.upper) | (y < self.lower)).astype(np.float64)
-        return self.value(q, v), outside[:, :, None] * np.eye(y.shape[1])
+    def add_to(self, terms: Terms, factor: float) -> bool:
+        terms.add_excess(self.begin, factor * self.weight, self.lower, self.upper)
+        return True
 
 
-class _Barrier(ResidualCost):
+class _Barrier(TaskCost):
     limits: Floats
     in_velocity: bool
 
@@ -76,10 +73,9 @@ class _Barrier(ResidualCost):
     def _own(robot: Robot) -> tuple[Floats, Floats]:
         """The robot's limits."""
 
-    def _at(self, points: Points) -> Residual:
-        n = points.dof
-        columns = slice(n, 2 * n) if self.in_velocity else slice(0, n)
-        return _Excess(self.limits[0] + self.margin, self.limits[1] - self.margin, columns, self.in_velocity)
+    def _bound(self, points: Points, weight: Floats) -> BoundCost:
+        begin = points.dof if self.in_velocity else 0
+        return _BoundBarrier(begin, weight, self.limits[0] + self.margin, self.limits[1] - self.margin, points)
 
 
 class JointLimitBarrier(_Barrier):

@@ -1,8 +1,8 @@
 """Costs: integrals over time and terms at the end, which add up.
 
 A running cost l(t, q, v, u) stands for its integral over the motion, whatever the time step; ``Terminal`` makes it a
-term at the final time. All of them are evaluated and expanded over many points at once: those of joints, controls and
-frames in the core, others with NumPy, so that a cost of one's own needs no compiled code.
+term at the final time. All of them are evaluated and expanded over many points at once: varpin's in the core, others
+with NumPy, so that a cost of one's own needs no compiled code.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.checks import JointValues, as_floats, control_array, finite_array, require_finite
+from varpin.core import change_values, expand_changes
 from varpin.costs.base import BoundCost, Cost, CostSum, Points, Scaled, checked_weight, weight_matrix
 from varpin.errors import InputError
 from varpin.frozen import Frozen
@@ -88,23 +89,24 @@ class ControlRate(Frozen):
     weight: Floats
     before: Floats | None
 
-    def changes(self, u: Floats) -> Floats:
-        """The change at each of N controls (..., N, m) from the one before; none at the first where it is free."""
-        start = u[..., :1, :] if self.before is None else np.broadcast_to(self.before, u[..., :1, :].shape)
-        return np.diff(u, axis=-2, prepend=start)
+    def shares(self, u: Floats, period: float) -> Floats:
+        """What each of N controls (..., N, m) that change every ``period`` [s] costs beside the one before (..., N)."""
+        rows = np.ascontiguousarray(u).reshape(-1, *u.shape[-2:])
+        return change_values(self.weight / period, self._before, rows).reshape(u.shape[:-1])
 
     def value(self, u: Floats, period: float) -> Floats:
         """The cost (...) of controls (..., N, m) that change every ``period`` [s]."""
-        change = self.changes(u)
-        total: Floats = np.einsum("...ki,...ki->...", change @ self.weight, change) / period
+        total: Floats = self.shares(u, period).sum(axis=-1)
         return total
 
     def expand(self, u: Floats, period: float) -> tuple[Floats, Floats]:
         """Gradients (N, m) in u_k, with u_(k-1) as it is, of each change of the controls (N, m); Hessians (N, m, m)."""
-        hessian = np.repeat(2.0 / period * self.weight[None], len(u), axis=0)
-        if self.before is None:
-            hessian[0] = 0.0
-        return 2.0 / period * (self.changes(u) @ self.weight), hessian
+        return expand_changes(self.weight / period, self._before, np.ascontiguousarray(u))
+
+    @property
+    def _before(self) -> Floats:
+        """(1, m), or (0, m) where the first control is free."""
+        return np.zeros((0, len(self.weight))) if self.before is None else self.before[None]
 
 
 def control_rate(cost: Cost, controls: int, joints: Sequence[str] | None = None) -> ControlRate | None:

@@ -12,18 +12,19 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.checks import as_floats, positive, require_finite
 from varpin.core import Subject
 from varpin.costs.base import BoundCost, CompiledCost, CostError, Points, Reference, sample
-from varpin.costs.residual import Residual, ResidualCost, TaskCost
+from varpin.costs.residual import TaskCost
 from varpin.costs.terms import Terms
 from varpin.errors import InputError
 from varpin.robot import Robot
 from varpin.robot.kinematics import (
-    CenterOfMass,
     FrameKinematics,
-    center_of_mass,
+    Links,
     frame_kinematics,
+    mass_carriers,
 )
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 
 class _FrameCost(TaskCost):
@@ -38,11 +39,6 @@ class _FrameCost(TaskCost):
 
     def _subject(self) -> str:
         return f"{self.frame!r}, "
-
-
-def _rows(x: Floats) -> Floats:
-    """(..., N, n) as (rows, n)."""
-    return x.reshape(-1, x.shape[-1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,20 +180,18 @@ class FrameVelocityCost(_FrameCost):
 
 
 @dataclass(frozen=True, eq=False)
-class _Center(Residual):
-    of: CenterOfMass
+class _BoundCenter(CompiledCost):
+    of: Links
+    weight: Floats  # (3, 3)
     target: Floats  # (N, 3) or (1, 3)
-    columns: slice
+    points: Points
 
-    def value(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
-        return self.of.position(_rows(q)).reshape(*q.shape[:-1], 3) - self.target
-
-    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:  # noqa: ARG002
-        position, J = self.of.motion(q)
-        return position - self.target, J
+    def add_to(self, terms: Terms, factor: float) -> bool:
+        terms.add_center(self.of, factor * self.weight, self.target)
+        return True
 
 
-class CenterOfMassCost(ResidualCost):
+class CenterOfMassCost(TaskCost):
     """weight . (c(q) - c_r(t))^2 with c the centre of mass of the links that joints move."""
 
     size = 3
@@ -209,11 +203,12 @@ class CenterOfMassCost(ResidualCost):
             InputError: The links have no mass, or a weight is no such weight.
         """
         super().__init__(robot, weight)
-        self._center = center_of_mass(robot)
+        self._links = mass_carriers(robot)
         self.target = target if callable(target) else as_floats("CenterOfMassCost target", target)
 
-    def _at(self, points: Points) -> Residual:
-        return _Center(self._center, sample("CenterOfMassCost", self.target, points, 3), slice(0, points.dof))
+    def _bound(self, points: Points, weight: Floats) -> BoundCost:
+        target = sample("CenterOfMassCost", self.target, points, 3)
+        return _BoundCenter(self._links, weight, target, points)
 
 
 _DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
@@ -221,29 +216,19 @@ _SETS = {"all": _DIRECTIONS, "linear": _DIRECTIONS[:3], "angular": _DIRECTIONS[3
 
 
 @dataclass(frozen=True, eq=False)
-class _Dexterity(Residual):
+class _BoundManipulability(CompiledCost):
     of: FrameKinematics
-    rows: list[int]
+    directions: Integers  # rows of the Jacobian
+    weight: Floats  # (1, 1)
     least: float
-    columns: slice
+    points: Points
 
-    def value(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
-        J = self.of.jacobians(_rows(q))[2][:, self.rows]
-        w = np.linalg.svd(J, compute_uv=False).prod(axis=-1)
-        lack: Floats = np.maximum(0.0, self.least - w).reshape(*q.shape[:-1], 1)
-        return lack
-
-    def expand(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:  # noqa: ARG002
-        U, s, Vt = np.linalg.svd(self.of.jacobians(q)[2][:, self.rows], full_matrices=False)
-        # dw = sum_k (product of the other singular values) u_k' dJ v_k, which holds where some of them vanish, too.
-        others = np.stack([np.delete(s, k, axis=1).prod(axis=1) for k in range(s.shape[1])], axis=1)
-        weights = (U * others[:, None, :]) @ Vt
-        slope = np.einsum("Nirb,Nrb->Ni", self.of.motion(q).jacobian_in_q()[:, :, self.rows], weights)
-        lack = self.least - s.prod(axis=1)
-        return np.maximum(0.0, lack)[:, None], np.where(lack > 0.0, -1.0, 0.0)[:, None, None] * slope[:, None, :]
+    def add_to(self, terms: Terms, factor: float) -> bool:
+        terms.add_manipulability(self.of, self.directions, factor * self.weight, self.least)
+        return True
 
 
-class ManipulabilityCost(_FrameCost, ResidualCost):
+class ManipulabilityCost(_FrameCost):
     """weight (least - w(q))^2 where w < least: keep away from singular configurations.
 
     w = sqrt(det(J J')) of the frame's Jacobian (Yoshikawa, "Manipulability of robotic mechanisms", 1985), zero where
@@ -290,5 +275,5 @@ class ManipulabilityCost(_FrameCost, ResidualCost):
         self.least = positive("ManipulabilityCost least", least, "m or rad for each direction")
         self.rows = [_DIRECTIONS.index(name) for name in chosen]
 
-    def _at(self, points: Points) -> Residual:
-        return _Dexterity(self._kinematics, self.rows, self.least, slice(0, points.dof))
+    def _bound(self, points: Points, weight: Floats) -> BoundCost:
+        return _BoundManipulability(self._kinematics, np.array(self.rows, dtype=np.int64), weight, self.least, points)

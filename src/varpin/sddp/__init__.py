@@ -1,5 +1,6 @@
 """S-DDP: optimal control under noise by differential dynamic programming, on any integrator's linearization."""
 
+from varpin.sddp.examination import looked_at as looked_at
 from varpin.sddp.history import Iteration as Iteration
 from varpin.sddp.history import SearchState as SearchState
 from varpin.sddp.history import Status as Status

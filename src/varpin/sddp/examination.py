@@ -49,8 +49,8 @@ class Replay:
         return -GAIN <= self.feedback <= LOSS
 
 
-def looked_at(solution: Solution) -> Solution:
-    """The solution with its warnings, which the log has once for a scene and a time step.
+def looked_at(solution: Solution) -> tuple[Solution, tuple[Finding, ...]]:
+    """The solution with its warnings, which the log has once for a scene and a time step; and what was found.
 
     Ctrl-C ends the look and not the plan.
     """
@@ -60,7 +60,7 @@ def looked_at(solution: Solution) -> Solution:
         found = (Finding("interrupted", "interrupted before the plan was played again: what it is worth is not known"),)
     problem = solution.problem
     announce(logger, problem.scene, problem.dt, found)
-    return replace(solution, warnings=tuple(finding.sentence for finding in found))
+    return replace(solution, warnings=tuple(finding.sentence for finding in found)), found
 
 
 def findings(solution: Solution) -> tuple[Finding, ...]:

@@ -333,8 +333,7 @@ class OptimalControlProblem(Frozen):
         found = [weight * values.ravel() for values in self.running.shares(*self.samples(q, v, u))]
         found += [values.ravel() for values in self.terminal.shares(*end)]
         if self.rate is not None:
-            change = self.rate.changes(u[:: self.hold])
-            found.append(((change @ self.rate.weight) * change).sum(axis=1) / self.period)
+            found.append(self.rate.shares(u[:: self.hold], self.period))
         return np.concatenate(found)
 
     def simulate(

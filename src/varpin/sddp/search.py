@@ -131,7 +131,7 @@ def solve(
         time_limit: No iteration begins when this time has passed since the call [s]. What is found then depends on the
             machine.
         callback: Called with each :class:`Iteration`; ``callback=print`` prints the rows of :meth:`Solution.table` as
-            they come. The log has them too, at level INFO.
+            they come. The log has them too, at level INFO, each after the robot and the horizon that it is of.
         progress: Called after each iteration with (iterations done, max_iterations); few searches need them all.
         resume: A solution of this very problem, as solve returned it or as read from a file: the search goes on where
             it stopped, for at most ``max_iterations`` more, as if it had not been interrupted. Give the other options
@@ -185,7 +185,7 @@ def solve(
     except KeyboardInterrupt:
         status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
     solution = search.solution(status)
-    return looked_at(solution) if check else solution
+    return looked_at(solution)[0] if check else solution
 
 
 def replan(
@@ -354,6 +354,9 @@ class _Search:
         self.anew = anew  # whether a plan is made for the last motion, too
         self.followed = 0.0  # the length of the last step, if none was
         self.steered = _steered(problem)
+        # Before each line of the log, where searches of several problems and of a controller's ticks may stand.
+        robot, begin = problem.scene.robot.name, problem.t0
+        self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {begin:g} s"
 
     def begin(self, commands: Commands) -> None:
         trajectory, failure = self.motions.under(commands)
@@ -401,7 +404,7 @@ class _Search:
             except _LOST as error:
                 if not self.history:
                     raise
-                logger.warning("%s", error)
+                logger.warning("%s: %s", self.label, error)
                 self.reason = str(error)
                 return Status.NOT_DIFFERENTIABLE
             if self.plan is None:
@@ -540,7 +543,7 @@ class _Search:
             seconds=time.perf_counter() - started,
         )
         self.history.append(item)
-        logger.info("%s", item)
+        logger.info("%s: %s", self.label, item)
         report(item)
 
     def _relax(self) -> None:
@@ -558,7 +561,9 @@ class _Search:
         """Go on without bounds on what trials may take, if there were any and one was given up."""
         if not (self.bounded and self.cut):
             return False
-        logger.info("no progress with trials of few parts: from here on they may take as many as they need")
+        logger.info(
+            "%s: no progress with trials of few parts: from here on they may take as many as they need", self.label
+        )
         self.bounded, self.regularization, self.growth = False, 0.0, 1.0
         # One line search without bounds, before what was gained lately is looked at again.
         self.gains = self.gains[1 - _PATIENCE :]
@@ -666,7 +671,7 @@ class _Search:
                 return _Trial(cut=failure.reason == _CUT or (few and failure.reason != _DEAR))
             there, noise = problem.shares(moved), noise_shares(problem, moved, plan)
         except _LOST as error:
-            logger.info("trial of length %g: %s", step, error)
+            logger.info("%s: trial of length %g: %s", self.label, step, error)
             return _Trial()
         if not np.isfinite(there).all():
             return _Trial()
@@ -712,7 +717,7 @@ class _Search:
         reason = self.reason
         if plan is not None and plan.loss > _LOSSY:
             lost = f"rounding may have changed Quu by {plan.loss:.0e} of itself: weights or inertias are too far apart"
-            logger.warning("the gains cannot be trusted: %s", lost)
+            logger.warning("%s: the gains cannot be trusted: %s", self.label, lost)
             reason = f"{reason}; {lost}"
         R, m, n = problem.decisions, problem.scene.controls, problem.scene.robot.dof
         return Solution(

@@ -300,6 +300,7 @@ class Solution(Frozen):
             self.trajectory,
             self.cost,
             lambda substeps: self.policy_on("velocity", substeps),
+            status=self.status,
             tolerance=tolerance,
             max_substeps=max_substeps,
             progress=progress,

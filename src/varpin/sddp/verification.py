@@ -14,11 +14,17 @@ from varpin.integrators import Integrator, RungeKutta4
 from varpin.integrators.base import open_loop
 from varpin.markup import facts, table
 from varpin.policy import LinearPolicy
+from varpin.sddp.history import Status
 from varpin.sddp.problem import OptimalControlProblem, bind_cost
 from varpin.simulation import rollout
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
+
+_READING = (
+    "where feedback loses some percent, the plan holds; where it loses much, dt is too coarse (controls alone also "
+    "lose much where a motion is unstable)"
+)
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,7 @@ class Verification:
         defect: Largest distance in q of an accurately integrated step from the plan's [rad or m].
         substeps: Of the accurate integration, in one step of the plan.
         accuracy: Relative change over the last doubling of the substeps, of the cost that changed more.
+        status: How the search for the plan ended.
     """
 
     planned_cost: float
@@ -46,6 +53,7 @@ class Verification:
     defect: float
     substeps: int
     accuracy: float
+    status: Status = Status.CONVERGED
 
     @property
     def open_loop_loss(self) -> float:
@@ -69,8 +77,9 @@ class Verification:
         shown = [row if np.isfinite(row[1]) else (row[0], "runs away", "", "") for row in self._rows]
         head = ("", "cost", "loss", "end off by [rad or m]")
         said = [
-            ("how to read it", str(self).splitlines()[-1].removeprefix("read it so: ")),
+            ("how to read it", _READING),
             ("a step is off by", f"{self.defect:.2e} rad or m"),
+            *([] if self.status.converged else [("the plan is unfinished", self.status.value)]),
         ]
         return facts("Verification on the continuous system", said, table(head, shown))
 
@@ -85,8 +94,8 @@ class Verification:
                 *lines,
                 f"a step is off by {self.defect:.2e} rad or m at most; costs are good to {good} of themselves "
                 f"({self.substeps} substeps a step)",
-                "read it so: where feedback loses some percent, the plan holds; where it loses much, dt is too coarse "
-                "(controls alone also lose much where a motion is unstable)",
+                f"read it so: {_READING}",
+                *([] if self.status.converged else [f"the plan is unfinished, {self.status.value}"]),
             ]
         )
 
@@ -111,6 +120,7 @@ def verify(
     planned_cost: float,
     policy: Callable[[int], LinearPolicy],
     *,
+    status: Status,
     tolerance: float,
     max_substeps: int,
     progress: Callable[[int, int], None] | None,
@@ -151,6 +161,7 @@ def verify(
         defect=_defect(problem, plan, substeps),
         substeps=substeps,
         accuracy=accuracy,
+        status=status,
     )
 
 

@@ -1,5 +1,5 @@
 // Costs weight . r^2 at samples (q, v, u), with their gradients and the Hessians of Gauss and Newton, 2 J' weight J,
-// in z = (q, v, u). docs/mathematics.md, "Costs in the task".
+// in z = (q, v, u); and those of changes of controls. docs/mathematics.md, "Costs in the task", "Smooth controls".
 #pragma once
 
 #include <algorithm>
@@ -8,24 +8,35 @@
 #include <vector>
 
 #include "varpin/kinematics.hpp"
+#include "varpin/manipulability.hpp"
 
 namespace varpin {
 
-// A frame that stands at `own` in the last of some bodies.
+// A frame that stands at `own` in the last of some bodies. Or, in the place of one, the centre of mass of all of them:
+// it has a position and no more.
 struct CostFrame {
     Links links;
     Placement own;
+    bool center = false;
 };
 
-// What a residual r is of: entries of z; or the position, the orientation or the twist of a frame.
-enum class Subject { entries, position, orientation, twist };
+// What a residual r is of: entries of z; what they are beyond limits; the position, the orientation or the twist of a
+// frame; or what its manipulability lacks.
+enum class Subject { entries, excess, position, orientation, twist, manipulability };
+
+// How many numbers a target has for a residual of some size: the least value of each entry and then the greatest, a
+// rotation matrix row by row, the least manipulability, or an entry of the target for each of r.
+constexpr std::size_t target_width(Subject subject, std::size_t size) {
+    return subject == Subject::excess ? 2 * size : subject == Subject::orientation ? 9 : size;
+}
 
 struct CostTerm {
     Subject subject = Subject::entries;
-    int size = 0;                // of r
-    int place = 0;               // the first of its entries in z, or the index of its frame
-    std::vector<double> weight;  // (r, r) symmetric
-    std::vector<double> target;  // (T, r), of an orientation (T, 9), row by row; sample s has row s % T
+    int size = 0;                   // of r
+    int place = 0;                  // the first of its entries in z, or the index of its frame
+    std::vector<double> weight;     // (r, r) symmetric
+    std::vector<double> target;     // (T, target_width); sample s has row s % T
+    std::vector<int> directions{};  // which rows of the frame's Jacobian its manipulability is of
 };
 
 struct CostTerms {
@@ -36,8 +47,22 @@ struct CostTerms {
 
     int size() const { return 2 * dof + controls; }
     // Whether every residual is linear, and so the Hessian the same at all samples.
-    bool linear() const { return frames.empty(); }
+    bool linear() const {
+        return std::all_of(terms.begin(), terms.end(), [](const CostTerm& t) { return t.subject == Subject::entries; });
+    }
 };
+
+// r' W r of r (size), with W r.
+inline double quadratic(const double* W, const double* r, int size, double* Wr) {
+    double total = 0.0;
+    for (int i = 0; i < size; ++i) {
+        double sum = 0.0;
+        for (int k = 0; k < size; ++k) sum += W[i * size + k] * r[k];
+        Wr[i] = sum;
+        total += sum * r[i];
+    }
+    return total;
+}
 
 // Work arrays for a sample at a time.
 class CostSample {
@@ -45,13 +70,19 @@ class CostSample {
     explicit CostSample(const CostTerms& costs)
         : costs_(costs), z_(costs.size()), frames_(costs.frames.size()), J_(6 * 2 * costs.dof), WJ_(J_.size()) {
         std::size_t most = 0, bodies = 0;
-        for (const CostTerm& term : costs.terms) most = std::max(most, static_cast<std::size_t>(term.size));
         for (std::size_t f = 0; f < frames_.size(); ++f) {
             frames_[f].jacobian.resize(6 * costs.dof);
             frames_[f].joints.resize(costs.frames[f].links.bodies.size());
             bodies = std::max(bodies, frames_[f].joints.size());
         }
+        for (const CostTerm& term : costs.terms) {
+            most = std::max(most, static_cast<std::size_t>(term.size));
+            const bool measures = term.subject == Subject::manipulability;
+            if (measures || term.subject == Subject::twist) frames_[term.place].moves = true;
+            if (measures) dexterity_.make_room(static_cast<int>(term.directions.size()), costs.dof);
+        }
         gives_.resize(bodies);
+        loads_.resize(bodies);
         error_.resize(most);
         weighted_.resize(most);
     }
@@ -62,7 +93,7 @@ class CostSample {
         for (const CostTerm& term : costs_.terms) *found++ = weigh(term, row);
     }
 
-    // Add the gradient of all terms (2n + m), and the Hessians (2n + m, 2n + m) of those of frames.
+    // Add the gradient of all terms (2n + m), and the Hessians (2n + m, 2n + m) of those that are not linear.
     void expand(const double* q, const double* v, const double* u, std::size_t row, double* gradient, double* hessian) {
         look(q, v, u, true);
         for (const CostTerm& term : costs_.terms) {
@@ -71,6 +102,12 @@ class CostSample {
                 for (int i = 0; i < term.size; ++i) gradient[term.place + i] += 2.0 * weighted_[i];
                 continue;
             }
+            if (term.subject == Subject::excess) {
+                add_excess(term, gradient, hessian);
+                continue;
+            }
+            // Its slope is zero, too.
+            if (term.subject == Subject::manipulability && error_[0] == 0.0) continue;
             const int columns = term.subject == Subject::twist ? 2 * costs_.dof : costs_.dof;
             differentiate(term, columns);
             for (int i = 0; i < term.size; ++i) {
@@ -112,6 +149,7 @@ class CostSample {
         Placement placement;
         std::vector<Placement> joints;
         std::vector<double> jacobian;  // (6, n)
+        bool moves = false;            // whether values need the Jacobian
     };
 
     const CostTerms& costs_;
@@ -119,6 +157,8 @@ class CostSample {
     std::vector<FrameAt> frames_;
     std::vector<double> J_, WJ_;  // (r, columns)
     std::vector<Motion<double>> gives_;
+    std::vector<Load> loads_;
+    Manipulability dexterity_;
     std::vector<double> error_, weighted_;
 
     void look(const double* q, const double* v, const double* u, bool slopes) {
@@ -127,14 +167,16 @@ class CostSample {
         std::copy_n(v, n, z_.begin() + n);
         std::copy_n(u, costs_.controls, z_.begin() + 2 * n);
         for (std::size_t f = 0; f < frames_.size(); ++f) {
-            const auto& [links, own] = costs_.frames[f];
+            const auto& [links, own, center] = costs_.frames[f];
             FrameAt& here = frames_[f];
             place(links, q, here.joints.data());
+            if (center) {
+                double* J = slopes ? here.jacobian.data() : nullptr;
+                here.placement.position = center_of_mass(links, here.joints.data(), loads_.data(), J);
+                continue;
+            }
             here.placement = here.joints.back() * own;
-            const bool moves = std::any_of(costs_.terms.begin(), costs_.terms.end(), [&](const CostTerm& term) {
-                return term.subject == Subject::twist && term.place == static_cast<int>(f);
-            });
-            if (slopes || moves)
+            if (slopes || here.moves)
                 frame_jacobian(links, here.joints.data(), here.placement.position, here.jacobian.data());
         }
     }
@@ -142,24 +184,30 @@ class CostSample {
     // The value r' W r of a term, with r and W r.
     double weigh(const CostTerm& term, std::size_t row) {
         residual(term, row);
-        double total = 0.0;
-        for (int i = 0; i < term.size; ++i) {
-            double sum = 0.0;
-            for (int k = 0; k < term.size; ++k) sum += term.weight[i * term.size + k] * error_[k];
-            weighted_[i] = sum;
-            total += sum * error_[i];
-        }
-        return total;
+        return quadratic(term.weight.data(), error_.data(), term.size, weighted_.data());
     }
 
     void residual(const CostTerm& term, std::size_t row) {
-        const std::size_t width = term.subject == Subject::orientation ? 9 : static_cast<std::size_t>(term.size);
+        const std::size_t width = target_width(term.subject, static_cast<std::size_t>(term.size));
         const double* target = term.target.data() + (row % (term.target.size() / width)) * width;
         if (term.subject == Subject::entries) {
             for (int i = 0; i < term.size; ++i) error_[i] = z_[term.place + i] - target[i];
             return;
         }
+        if (term.subject == Subject::excess) {
+            for (int i = 0; i < term.size; ++i) {
+                const double y = z_[term.place + i], least = target[i], most = target[term.size + i];
+                // What is no number stays none.
+                error_[i] = y > most ? y - most : y < least ? y - least : y - y;
+            }
+            return;
+        }
         const FrameAt& frame = frames_[term.place];
+        if (term.subject == Subject::manipulability) {
+            const double lack = target[0] - dexterity_.measure(frame.jacobian.data(), term.directions, costs_.dof);
+            error_[0] = lack <= 0.0 ? 0.0 : lack;
+            return;
+        }
         if (term.subject == Subject::twist) {
             const int n = costs_.dof;
             for (int i = 0; i < 6; ++i) {
@@ -182,6 +230,17 @@ class CostSample {
         error_[2] = r.z;
     }
 
+    // Gradient and Hessian of what entries of z are beyond limits, whose slope there is one.
+    void add_excess(const CostTerm& term, double* gradient, double* hessian) const {
+        for (int i = 0; i < term.size; ++i) {
+            if (error_[i] == 0.0) continue;
+            gradient[term.place + i] += 2.0 * weighted_[i];
+            double* row = hessian + (term.place + i) * costs_.size() + term.place;
+            for (int k = 0; k < term.size; ++k)
+                if (error_[k] != 0.0) row[k] += 2.0 * term.weight[i * term.size + k];
+        }
+    }
+
     // J (r, columns) of a term on a frame, after its residual.
     void differentiate(const CostTerm& term, int columns) {
         const FrameAt& frame = frames_[term.place];
@@ -198,6 +257,8 @@ class CostSample {
                 J_[n + c] = slope.y;
                 J_[2 * n + c] = slope.z;
             }
+        } else if (term.subject == Subject::manipulability) {
+            lack_in_q(term, frame);
         } else {
             std::fill(J_.begin(), J_.end(), 0.0);
             for (int i = 0; i < 6; ++i) std::copy_n(frame.jacobian.begin() + i * n, n, J_.begin() + i * columns + n);
@@ -205,18 +266,15 @@ class CostSample {
         }
     }
 
-    // The derivative of a twist in q into the first n of `columns` of J. A joint turns the axes of all after it: with
-    // w_i and l_i what joint i gives to the frame, d l_j / dq_i is w_i x l_j for i up to j and w_j x l_i beyond, and
-    // d w_j / dq_i is w_i x w_j for i before j, else zero.
+    // A joint turns the axes of all after it: with w_i and l_i what joint i gives to the frame, d l_j / dq_i is
+    // w_i x l_j for i up to j and w_j x l_i beyond, and d w_j / dq_i is w_i x w_j for i before j, else zero. That times
+    // the joints' rates is the derivative of a twist in q, which goes into the first n of `columns` of J.
     void twist_in_q(const Links& links, const FrameAt& frame, int columns) {
         const double* v = z_.data() + costs_.dof;
         Motion<double> ahead{};
         for (int j = 0; j < links.size(); ++j) {
             const Body& link = links.bodies[j];
-            const Vec3<double>& axis = frame.joints[j].rotation.z;
-            gives_[j] = link.prismatic
-                            ? Motion<double>{axis, {}}
-                            : Motion<double>{cross(axis, frame.placement.position - frame.joints[j].position), axis};
+            gives_[j] = given_by(link, frame.joints[j], frame.placement.position);
             ahead = ahead + link.ratio * v[link.coordinate] * gives_[j];
         }
         Vec3<double> before{};
@@ -232,6 +290,66 @@ class CostSample {
             for (int i = 0; i < 6; ++i) J_[i * columns + link.coordinate] += link.ratio * slopes[i];
         }
     }
+
+    // The derivative of what a manipulability w lacks, -sum dw/dJ . dJ/dq, into the first row of J.
+    void lack_in_q(const CostTerm& term, const FrameAt& frame) {
+        const Links& links = costs_.frames[term.place].links;
+        const double* W = dexterity_.slope();
+        const auto weight = [&](const Body& link) {
+            double parts[6] = {};
+            for (std::size_t d = 0; d < term.directions.size(); ++d)
+                parts[term.directions[d]] = link.ratio * W[d * costs_.dof + link.coordinate];
+            return Force<double>{{parts[0], parts[1], parts[2]}, {parts[3], parts[4], parts[5]}};
+        };
+        std::fill(J_.begin(), J_.begin() + costs_.dof, 0.0);
+        Vec3<double> before{};
+        for (int i = 0; i < links.size(); ++i) {
+            const Body& link = links.bodies[i];
+            gives_[i] = given_by(link, frame.joints[i], frame.placement.position);
+            J_[link.coordinate] -= link.ratio * dot(gives_[i].linear, before);
+            before += cross(weight(link).linear, gives_[i].angular);
+        }
+        Vec3<double> from_here{}, beyond{};
+        for (int i = links.size() - 1; i >= 0; --i) {
+            const Body& link = links.bodies[i];
+            const Force<double> own = weight(link);
+            from_here += cross(gives_[i].linear, own.linear);
+            J_[link.coordinate] -= link.ratio * dot(gives_[i].angular, from_here + beyond);
+            beyond += cross(gives_[i].angular, own.angular);
+        }
+    }
+};
+
+// What changes of controls cost, weight . (u_k - u_(k-1))^2, one by one.
+class ChangeCost {
+  public:
+    // `before` is the control before the first one, (m), or empty where the first one is free.
+    ChangeCost(int controls, std::vector<double> weight, std::vector<double> before)
+        : controls_(controls),
+          weight_(std::move(weight)),
+          before_(std::move(before)),
+          change_(controls_),
+          weighted_(controls_) {}
+
+    // Of number k of the controls u (N, m).
+    double value(const double* u, std::size_t k) {
+        const double* from = k > 0 ? u + (k - 1) * controls_ : before_.empty() ? u : before_.data();
+        for (int i = 0; i < controls_; ++i) change_[i] = u[k * controls_ + i] - from[i];
+        return quadratic(weight_.data(), change_.data(), controls_, weighted_.data());
+    }
+
+    // Gradient (m) and Hessian (m, m) in u_k, with u_(k-1) as it is.
+    void expand(const double* u, std::size_t k, double* gradient, double* hessian) {
+        value(u, k);
+        for (int i = 0; i < controls_; ++i) gradient[i] = 2.0 * weighted_[i];
+        const double factor = k == 0 && before_.empty() ? 0.0 : 2.0;
+        for (std::size_t i = 0; i < weight_.size(); ++i) hessian[i] = factor * weight_[i];
+    }
+
+  private:
+    int controls_;
+    std::vector<double> weight_;  // (m, m)
+    std::vector<double> before_, change_, weighted_;
 };
 
 // The samples of the steps of a motion, q and v: row s of the rule (s, 9) is (weight, q from q0, v0, q1, v1, v from q0,

@@ -1,5 +1,5 @@
-// Where bodies and frames are, a frame's Jacobian, and by how much rotations differ. docs/mathematics.md, "Costs in
-// the task". Positions are the world's, unlike those of the jet.
+// Where bodies, frames and the centre of mass are, their Jacobians, and by how much rotations differ.
+// docs/mathematics.md, "Costs in the task". Positions are the world's, unlike those of the jet.
 #pragma once
 
 #include <algorithm>
@@ -20,7 +20,7 @@ constexpr Placement operator*(const Placement& a, const Placement& b) {
     return {a.rotation * b.rotation, a.position + a.rotation * b.position};
 }
 
-// Some bodies of a tree and all their ancestors, among n coordinates. Masses play no part.
+// Some bodies of a tree and all their ancestors, among n coordinates.
 struct Links {
     std::vector<Body> bodies;
     int dof = 0;
@@ -46,15 +46,19 @@ inline void place(const Links& links, const double* q, Placement* at) {
     }
 }
 
+// The velocity that a joint gives to a point which it carries, per unit of its rate, in world axes.
+inline Motion<double> given_by(const Body& link, const Placement& at, const Vec3<double>& point) {
+    const Vec3<double>& axis = at.rotation.z;
+    return link.prismatic ? Motion<double>{axis, {}} : Motion<double>{cross(axis, point - at.position), axis};
+}
+
 // The Jacobian (6, n) of a frame at a point that the last body carries: linear over angular velocity in world axes.
 inline void frame_jacobian(const Links& links, const Placement* at, const Vec3<double>& point, double* J) {
     const int n = links.dof;
     std::fill(J, J + 6 * n, 0.0);
     for (int j = 0; j < links.size(); ++j) {
         const Body& link = links.bodies[j];
-        const Vec3<double>& axis = at[j].rotation.z;
-        const Motion<double> gives =
-            link.prismatic ? Motion<double>{axis, {}} : Motion<double>{cross(axis, point - at[j].position), axis};
+        const Motion<double> gives = given_by(link, at[j], point);
         double* column = J + link.coordinate;
         column[0] += link.ratio * gives.linear.x;
         column[n] += link.ratio * gives.linear.y;
@@ -63,6 +67,41 @@ inline void frame_jacobian(const Links& links, const Placement* at, const Vec3<d
         column[4 * n] += link.ratio * gives.angular.y;
         column[5 * n] += link.ratio * gives.angular.z;
     }
+}
+
+// Mass and first moment of what a joint carries.
+struct Load {
+    double mass = 0.0;      // [kg]
+    Vec3<double> moment{};  // [kg m]
+};
+
+// The centre of mass of all bodies and, where there is room for it, its Jacobian (3, n). `loads` are work, one a body.
+inline Vec3<double> center_of_mass(const Links& links, const Placement* at, Load* loads, double* J) {
+    const int n = links.dof;
+    for (int j = 0; j < links.size(); ++j) {
+        const Body& link = links.bodies[j];
+        loads[j] = {link.mass, link.mass * (at[j].position + at[j].rotation * link.center)};
+    }
+    Load all;
+    for (int j = links.size() - 1; j >= 0; --j) {
+        Load& carrier = links.bodies[j].parent >= 0 ? loads[links.bodies[j].parent] : all;
+        carrier = {carrier.mass + loads[j].mass, carrier.moment + loads[j].moment};
+    }
+    if (J != nullptr) {
+        std::fill(J, J + 3 * n, 0.0);
+        for (int j = 0; j < links.size(); ++j) {
+            // The joint moves what it carries as one body.
+            const Body& link = links.bodies[j];
+            const auto& [mass, moment] = loads[j];
+            const Vec3<double>& axis = at[j].rotation.z;
+            const Vec3<double> momentum = link.prismatic ? mass * axis : cross(axis, moment - mass * at[j].position);
+            const Vec3<double> gives = (link.ratio / all.mass) * momentum;
+            J[link.coordinate] += gives.x;
+            J[n + link.coordinate] += gives.y;
+            J[2 * n + link.coordinate] += gives.z;
+        }
+    }
+    return (1.0 / all.mass) * all.moment;
 }
 
 struct Quaternion {
