@@ -44,7 +44,7 @@ anything = st.one_of(
     st.dictionaries(st.sampled_from(["joint1", "joint2", "a", 1]), numbers | st.text(max_size=2), max_size=2),
     st.just(object()),
 )
-SETTINGS = settings(max_examples=150, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+SETTINGS = settings(max_examples=80, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 
 
 def require_sound(motion: vp.Trajectory) -> None:

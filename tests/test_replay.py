@@ -148,7 +148,7 @@ def assert_ghost_at(browser, robot, q):
         np.testing.assert_allclose(pose, placements.oMg[k].homogeneous, atol=2e-5)
 
 
-@pytest.mark.parametrize("name", ["finger", "ur5", "panda"])
+@pytest.mark.parametrize("name", ["finger", "ur5"])
 def test_ghost_follows_its_own_motion(browser, tmp_path, name):
     robot = vp.load_robot(name)
     rng = np.random.default_rng(7)

@@ -117,9 +117,9 @@ def test_traces_are_where_pinocchio_puts_the_frame(browser, ur5, sweep, tmp_path
 
 
 def test_a_trace_of_a_long_motion_stays_small_and_true(browser, ur5, tmp_path):
-    t = np.linspace(0.0, 20.0, 20_001)
+    t = np.linspace(0.0, 20.0, 4_001)
     q = 0.5 * np.sin(t[:, None] * np.arange(1.0, 7.0) / 5.0)
-    visit(browser, replay(ur5, q, dt=1e-3, html=tmp_path / "long.html", trace=True))
+    visit(browser, replay(ur5, q, dt=5e-3, html=tmp_path / "long.html", trace=True))
     points = along(browser, f"0 motion {ur5.end_effector}")
     assert 500 < len(points) <= 1001
     assert farthest(points, placements(ur5, q, ur5.end_effector)[:, :3, 3]) < 1e-5
