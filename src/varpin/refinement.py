@@ -15,12 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.errors import VarpinError
-from varpin.integrators import Integrator
+from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
 from varpin.lagrangian import lagrangian_jet
 from varpin.scene import Scene
 
 Floats = NDArray[np.float64]
 Run = Callable[[Integrator, int], "Sample"]
+
+# Whom to choose from where nobody is named. A new integrator enters here, and everywhere.
+INTEGRATORS: tuple[Integrator, ...] = (
+    ExplicitEuler(),
+    SemiImplicitEuler(),
+    RungeKutta4(),
+    Midpoint(),
+    *(Gauss(stages=stages) for stages in (2, 3, 4, 5)),
+)
 
 # Predicted errors stay below the tolerance by this factor.
 SAFETY = 1.5
@@ -261,9 +270,13 @@ class Search:
                 method.refine()
         self.judge()
 
+    def limits(self) -> list[tuple[Floats, float]]:
+        """Motions that methods point to, each with its uncertainty [rad or m]."""
+        return [own for own in (method.own_limit() for method in self.methods) if own is not None]
+
     def judge(self) -> None:
         """Errors of all runs, by the best end that is known."""
-        limits = [own for own in (method.own_limit() for method in self.methods) if own is not None]
+        limits = self.limits()
         if limits:
             self.limit, self.uncertainty = min(limits, key=lambda own: own[1])
             self.floor = _ROUNDING * max(1.0, float(np.abs(self.limit).max()))
