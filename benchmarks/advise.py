@@ -5,7 +5,7 @@ against the cheapest of all integrators over steps a factor 2^(1/4) apart that m
 
     python benchmarks/advise.py --cases 200 --seed 0
 
-With ``--simulate`` the same for ``simulate(duration=, tolerance=)``: on random cases, some under controls, the errors at
+With ``--simulate`` the same for ``simulate(duration=, tolerance=)``: on random cases, some under controls, errors at
 all nodes against SciPy's DOP853 on Pinocchio's aba, and costs in evaluations, which are the same on every machine.
 
     python benchmarks/advise.py --simulate --cases 200 --seed 0
@@ -16,6 +16,7 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -171,7 +172,7 @@ def true_motion(
     data = model.createData()
     ends = duration * np.arange(pieces + 1) / pieces
     parts, state = [], np.concatenate([q0, v0])
-    for begin, end in zip(ends[:-1], ends[1:], strict=True):
+    for begin, end in pairwise(ends):
         middle = 0.5 * (begin + end)
 
         def slope(t: float, x: np.ndarray, middle: float = middle) -> np.ndarray:
@@ -180,15 +181,17 @@ def true_motion(
             force = given - scene.damping * v - scene.stiffness * (q - scene.rest)
             return np.concatenate([v, pin.aba(model, data, scene.robot.configuration(q), v, force)])
 
-        solution = solve_ivp(
-            slope, (begin, end), state, "DOP853", rtol=rtol, atol=rtol, dense_output=True, max_step=0.02
-        )
+        options = {"rtol": rtol, "atol": rtol, "max_step": 0.02, "dense_output": True}
+        solution = solve_ivp(slope, (begin, end), state, "DOP853", **options)
         parts.append(solution.sol)
         state = solution.y[:, -1]
 
     def at(times: np.ndarray) -> np.ndarray:
         piece = np.clip(np.searchsorted(ends, times) - 1, 0, pieces - 1)
-        return np.array([parts[k](t)[:n] for k, t in zip(piece, times, strict=True)])
+        q = np.empty((len(times), n))
+        for k in np.unique(piece):
+            q[piece == k] = parts[k](times[piece == k])[:n].T
+        return q
 
     return at
 
