@@ -173,8 +173,11 @@ def choose(
         first: An integrator and a step [s] that are taken if they meet the tolerance.
 
     Raises:
+        SingularMassMatrix: M(q0) is not positive definite.
         VarpinError: No integrator gets to the end.
     """
+    # It refuses states that no motion starts from.
+    integrators[0].start(motion.scene, motion.q0[None], motion.v0[None])
     runs = _Runs(motion)
 
     def of(integrator: Integrator, least: int) -> Method:
