@@ -250,9 +250,6 @@ class Search:
         uncertainty: Of the limit [rad or m].
     """
 
-    # What would let the search go on, in words.
-    more = "more patience [s]"
-
     def __init__(self, methods: Sequence[Method], late: Callable[[], bool], cheap: float) -> None:
         """Each method is run at three steps.
 
@@ -349,7 +346,7 @@ class Search:
             finest = max(method.last.steps for method in self.methods)
             raise VarpinError(
                 f"no integrator has taken this motion in whole steps yet, with up to {finest} of them: "
-                f"give {self.more}, or a shorter duration"
+                "give more patience [s], or a shorter duration"
             )
         if not done:
             raise VarpinError("no integrator gets to the end of this motion, however small its steps were made")

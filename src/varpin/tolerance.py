@@ -28,6 +28,8 @@ _NODES = 4096
 _PATIENCE = 50_000_000
 # A motion whose last differences shrink at least like this is taken to go on so.
 _SHRINKS, _LEFT = 0.75, 3.0
+# An integrator that misses the tolerance by this factor is not worth more of its steps.
+_FAR = 30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +98,6 @@ class _Runs:
 class _Wish(Search):
     """A search whose costs are evaluations, and whose choice is held against a run at half its step."""
 
-    more = "a larger tolerance"
-
     def __init__(self, methods: Sequence[Method], runs: _Runs) -> None:
         patience = _PATIENCE / len(runs.motion.q0)
         super().__init__(methods, lambda: runs.evaluations > patience, math.inf)
@@ -116,10 +116,22 @@ class _Wish(Search):
             best = replace(best, error=max(error, self.floor) if math.isfinite(error) else math.inf, measured=True)
             if best.error <= tolerance or self.late():
                 break
-            # A blow-up says nothing of how many more it takes.
-            growth = min((error / tolerance) ** (1.0 / method.order), 2.0) if math.isfinite(error) else 2.0
-            best = replace(best, steps=method.rounded(1.05 * growth * best.steps))
+            best = replace(best, steps=_more(method, best.steps, error, tolerance))
         return best
+
+    def as_they_are(self) -> list[Found]:
+        """See :meth:`Search.as_they_are`; nothing is known of a motion that no method has taken in whole steps."""
+        if any(method.whole for method in self.methods):
+            return super().as_they_are()
+        method = self.methods[-1]
+        return [Found(method.integrator, method.last.steps, math.inf, method.last.cost, measured=True)]
+
+
+def _more(method: Method, steps: int, error: float, tolerance: float) -> int:
+    """The number of steps to try where so many have missed a tolerance."""
+    # A blow-up says nothing of how many more it takes.
+    growth = min((error / tolerance) ** (1.0 / method.order), 2.0) if math.isfinite(error) else 2.0
+    return method.rounded(1.05 * growth * steps)
 
 
 def _rough_limit(method: Method) -> tuple[Floats, float] | None:
@@ -170,7 +182,7 @@ def choose(
         motion: To integrate.
         integrators: To choose from.
         tolerance: At all nodes [rad or m].
-        first: An integrator and a step [s] that are taken if they meet the tolerance.
+        first: An integrator and a step [s] that are taken if they, or somewhat smaller steps, meet the tolerance.
 
     Raises:
         SingularMassMatrix: M(q0) is not positive definite.
@@ -186,9 +198,15 @@ def choose(
     if first is not None:
         method = of(first[0], motion.parts)
         steps = method.rounded(motion.duration / first[1] * (1.0 - 1e-9))
-        error = _error(method, steps)
-        if error <= tolerance and runs(first[0], steps).pure:
-            return Choice(first[0], steps, error, runs.steps, runs.evaluations, 0.0)
+        for _ in range(CHECKS):
+            error = _error(method, steps)
+            if not (runs(first[0], steps).pure and math.isfinite(error) and error < SENSIBLE):
+                break
+            if error <= tolerance:
+                return Choice(first[0], steps, error, runs.steps, runs.evaluations, 0.0)
+            if error > _FAR * tolerance:
+                break
+            steps = _more(method, steps, error, tolerance)
     coarse = first_steps(motion.scene, motion.q0, motion.v0, motion.duration, motion.parts)
     # Powers of two, for runs to share as many nodes as they can.
     least = motion.parts * 2 ** math.ceil(math.log2(coarse // motion.parts))
