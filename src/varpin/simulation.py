@@ -289,12 +289,11 @@ def simulate(
         dt: Time step [s].
         steps: N, their number.
         duration: steps * dt [s].
-        tolerance: The largest error in q at any node that is welcome [rad or m], in place of ``dt`` and ``steps``.
-            ``Trajectory.accuracy`` says what was taken, what error it estimates and how many steps finding out took;
-            given as the ``tolerance`` of another motion, it is tried first, which takes a few times the steps of the
-            motion itself. Where the tolerance is beyond reach a warning says what is reached. Where the motion depends
-            on rows of controls, each is held over duration / R, and a LinearPolicy needs a period in seconds. Noise and
-            control laws are refused.
+        tolerance: The largest error in q that is welcome at any node [rad or m], in place of ``dt`` and ``steps``.
+            ``Trajectory.accuracy`` says what was taken, what error that estimates and how many steps finding out took;
+            it is itself a ``tolerance``, of the same scene's next motion, which tries first what it found. Where the
+            tolerance is out of reach a warning says what is reached. Rows of controls, (R, m), are then held over
+            duration / R each, a LinearPolicy needs its period in seconds, and noise and control laws are refused.
         controls: None for none; an array (N, m), one row a step; one row (m,) for all steps, by joint name too where
             each control is the force of a joint, with 0 for joints that are not named; a
             :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that returns (m,), or
@@ -327,7 +326,8 @@ def simulate(
         NoiseError: A function of a CustomNoise did; holds the trajectory so far.
         StepFailure: A step has no trustworthy solution; holds the trajectory so far.
         SingularMassMatrix: M(q0) is not positive definite.
-        Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt.
+        Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt; while a tolerance looks for its
+            integrator, a plain one.
     """
     joints = require_scene(scene).robot.joint_names
     n = len(joints)
