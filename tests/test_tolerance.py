@@ -170,8 +170,13 @@ def test_beyond_rounding_it_says_what_is_reached(caplog):
 
 def test_a_chaotic_motion_has_no_end(monkeypatch):
     monkeypatch.setattr(search, "_PATIENCE", 100_000)
-    with pytest.raises(vp.ToleranceError, match=r"tolerance = 1e-06 cannot be met over 200 s: with up to \d+ steps"):
+    with pytest.raises(vp.ToleranceError, match=r"tolerance = 1e-06 cannot be met over 200 s: with \d+ steps"):
         vp.simulate(chain(), REST, REST, duration=200.0, tolerance=1e-6)
+
+
+def test_no_more_steps_are_tried_than_there_is_time_for():
+    with pytest.raises(vp.ToleranceError, match="the error in q is unknown"):
+        vp.simulate(chain(), REST + 1.0, REST, duration=1e12, tolerance=1e-6)
 
 
 def law(t, q, v):

@@ -108,7 +108,7 @@ class ToleranceError(VarpinError, RuntimeError):
         self.tolerance, self.error, self.steps = tolerance, error, steps
         known = f"is still {error:.1e} rad or m" if np.isfinite(error) else "is unknown"
         super().__init__(
-            f"tolerance = {tolerance:g} cannot be met over {duration:g} s: with up to {steps} steps the error in q "
+            f"tolerance = {tolerance:g} cannot be met over {duration:g} s: with {steps} steps the error in q "
             f"{known}. A chaotic motion has no end that any method gets right, and one whose forces are too stiff or "
             "jump may need more; ask for a shorter duration, or give dt and steps"
         )

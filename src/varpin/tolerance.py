@@ -110,11 +110,13 @@ class _Wish(Search):
         """See :meth:`Search.checked`; errors at all nodes."""
         method, best = self._of(choice), choice
         for _ in range(CHECKS):
+            if self.late() and best.steps > method.last.steps:
+                break
             error = _error(method, best.steps)
             if self.limit is not None:
                 error = max(error, distance(method.run(method.integrator, best.steps).q, self.limit) - self.uncertainty)
             best = replace(best, error=max(error, self.floor) if math.isfinite(error) else math.inf, measured=True)
-            if best.error <= tolerance or self.late():
+            if best.error <= tolerance:
                 break
             best = replace(best, steps=_more(method, best.steps, error, tolerance))
         return best
@@ -195,7 +197,8 @@ def choose(
     def of(integrator: Integrator, least: int) -> Method:
         return Method(runs, integrator, least, motion.parts, min(integrator.order, motion.most))
 
-    if first is not None:
+    most = _PATIENCE / len(motion.q0)
+    if first is not None and motion.duration / first[1] < most:
         method = of(first[0], motion.parts)
         steps = method.rounded(motion.duration / first[1] * (1.0 - 1e-9))
         for _ in range(CHECKS):
@@ -208,6 +211,8 @@ def choose(
                 break
             steps = _more(method, steps, error, tolerance)
     coarse = first_steps(motion.scene, motion.q0, motion.v0, motion.duration, motion.parts)
+    if coarse > most:
+        return Choice(integrators[0], coarse, math.inf, 0, 0, 0.0)
     # Powers of two, for runs to share as many nodes as they can.
     least = motion.parts * 2 ** math.ceil(math.log2(coarse // motion.parts))
     search = _Wish([of(member, least) for member in integrators], runs)
