@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 _CHUNK = 100_000
 # Nodes of a run that are kept, about.
 _NODES = 4096
-# Evaluations after which no further run is begun, divided by the number of joints.
+# Evaluations after which no further run is begun, times the number of joints.
 _PATIENCE = 50_000_000
 # A motion whose last differences shrink at least like this is taken to go on so.
 _SHRINKS, _LEFT = 0.75, 3.0
