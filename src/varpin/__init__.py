@@ -64,7 +64,9 @@ from varpin.simulation import ControlError as ControlError
 from varpin.simulation import Interrupted as Interrupted
 from varpin.simulation import NoiseError as NoiseError
 from varpin.simulation import StepFailure as StepFailure
+from varpin.simulation import ToleranceError as ToleranceError
 from varpin.simulation import simulate as simulate
+from varpin.trajectory import Accuracy as Accuracy
 from varpin.trajectory import StepStatistics as StepStatistics
 from varpin.trajectory import Trajectory as Trajectory
 

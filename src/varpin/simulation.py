@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,13 +22,15 @@ from varpin.checks import (
 )
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, UnknownJoint, VarpinError
-from varpin.integrators import Integrator, Midpoint, Segment
+from varpin.integrators import Integrator, Midpoint, Reference, Segment, integrator_of
 from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
 from varpin.loop_stability import examined_in_loop, outgrown, unstable_loop
 from varpin.policy import LinearPolicy, OpenLoop, takes
+from varpin.refinement import INTEGRATORS, SENSIBLE
 from varpin.scene import Scene, require_scene
 from varpin.soundness import Finding, announce, evident, with_warnings
-from varpin.trajectory import STEP_NUMBERS, Trajectory
+from varpin.tolerance import Motion, choose
+from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
 from varpin.wiener import wiener_increments
 
 Floats = NDArray[np.float64]
@@ -90,6 +93,25 @@ class NoiseError(_StepError):
         time: The start of that step [s].
         trajectory: What was computed before.
     """
+
+
+class ToleranceError(VarpinError, RuntimeError):
+    """Not even the first digit of a motion can be had.
+
+    Attributes:
+        tolerance: What was asked for [rad or m].
+        error: The best estimate of an error [rad or m]; infinite where there is none.
+        steps: With how many steps.
+    """
+
+    def __init__(self, tolerance: float, duration: float, steps: int, error: float) -> None:
+        self.tolerance, self.error, self.steps = tolerance, error, steps
+        known = f"is still {error:.1e} rad or m" if np.isfinite(error) else "is unknown"
+        super().__init__(
+            f"tolerance = {tolerance:g} cannot be met over {duration:g} s: with {steps} steps the error in q "
+            f"{known}. A chaotic motion has no end that any method gets right, and one whose forces are too stiff or "
+            "jump may need more; ask for a shorter duration, or give dt and steps"
+        )
 
 
 class StepFailure(VarpinError, RuntimeError):
@@ -243,8 +265,10 @@ def simulate(
     q0: JointValues,
     v0: JointValues,
     *,
-    dt: float,
-    steps: int,
+    dt: float | None = None,
+    steps: int | None = None,
+    duration: float | None = None,
+    tolerance: float | Accuracy | None = None,
     controls: JointValues | ControlLaw | LinearPolicy | OpenLoop | None = None,
     period: int = 1,
     integrator: Integrator | None = None,
@@ -255,12 +279,21 @@ def simulate(
 ) -> Trajectory:
     """Integrate a scene in time.
 
+    Give ``duration`` and ``tolerance``, and the cheapest integrator and step that keep the error in q within it are
+    found out and taken; or give two of ``dt``, ``steps`` and ``duration``.
+
     Main args:
         scene: The scene.
         q0: Initial configuration, (n,) or by joint name, 0 for those not named [rad or m].
         v0: Initial velocity, the same [rad/s or m/s].
         dt: Time step [s].
         steps: N, their number.
+        duration: steps * dt [s].
+        tolerance: The largest error in q that is welcome at any node [rad or m], in place of ``dt`` and ``steps``.
+            ``Trajectory.accuracy`` says what was taken, what error that estimates and how many steps finding out took;
+            it is itself a ``tolerance``, of the same scene's next motion, which tries first what it found. Where the
+            tolerance is out of reach a warning says what is reached. Rows of controls, (R, m), are then held over
+            duration / R each, a LinearPolicy needs its period in seconds, and noise and control laws are refused.
         controls: None for none; an array (N, m), one row a step; one row (m,) for all steps, by joint name too where
             each control is the force of a joint, with 0 for joints that are not named; a
             :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that returns (m,), or
@@ -268,7 +301,7 @@ def simulate(
             each step. A law is a digital controller: it is called once where each of its periods begins, with the time
             and the state of that node, and what it returns is held over the period.
         period: Of a control law, in steps.
-        integrator: :class:`Midpoint` with alpha = 1/2 if left out.
+        integrator: :class:`Midpoint` with alpha = 1/2 if left out; with a tolerance, the cheapest that there is.
 
     Other Args:
         rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero, and a
@@ -285,23 +318,33 @@ def simulate(
 
     Raises:
         InputError: Wrong shapes, values that are not finite, dt <= 0, steps < 0, a law of other arguments than
-            (t, q, v), a period without a law.
+            (t, q, v), a period without a law; dt or steps, noise or a law beside a tolerance.
+        ToleranceError: Not even the first digit of the motion can be had; a chaotic motion over a long time, say.
         UnknownJoint: ``q0`` or ``v0`` names a joint that is no coordinate of the robot, or ``controls`` one that no
             control drives.
         ControlError: The control function returned something unusable; holds the trajectory so far.
         NoiseError: A function of a CustomNoise did; holds the trajectory so far.
         StepFailure: A step has no trustworthy solution; holds the trajectory so far.
         SingularMassMatrix: M(q0) is not positive definite.
-        Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt.
+        Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt; while a tolerance looks for its
+            integrator, a plain one.
     """
     joints = require_scene(scene).robot.joint_names
     n = len(joints)
     q0, v0 = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
-    dt, steps = positive("dt", dt, "s"), count("steps", steps)
+    if integrator is not None and not isinstance(integrator, Integrator):
+        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
+    accuracy: Accuracy | None = None
+    wished: tuple[Finding, ...] = ()
+    if tolerance is not None:
+        span = _time_of_wish(dt, steps, duration)
+        chosen = _chosen(scene, q0, v0, span, tolerance, controls, integrator)
+        integrator, steps, controls, accuracy, wished = chosen
+        dt = span / steps
+    else:
+        dt, steps = _times(dt, steps, duration)
     period = count("period", period, least=1)
     integrator = Midpoint() if integrator is None else integrator
-    if not isinstance(integrator, Integrator):
-        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
     law = controls if callable(controls) else None
     if law is not None:
         _require_law(law)
@@ -361,14 +404,164 @@ def simulate(
         interrupted = True
     try:
         trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
-        found = (*noise_forgotten(scene, rng, increments), *found)
-        trajectory = with_warnings(trajectory, found)
+        found = (*noise_forgotten(scene, rng, increments), *wished, *found)
+        trajectory = replace(with_warnings(trajectory, found), accuracy=accuracy)
     except KeyboardInterrupt:
         raise Interrupted(record.trajectory()) from None
     if interrupted:
         raise Interrupted(trajectory)
     announce(logger, scene, dt, found)
     return trajectory
+
+
+def _times(dt: float | None, steps: int | None, duration: float | None) -> tuple[float, int]:
+    """Dt [s] and the number of steps, from two of the three."""
+    given = {name: value for name, value in (("dt", dt), ("steps", steps), ("duration", duration)) if value is not None}
+    if len(given) != 2:
+        got = " and ".join(given) or "none of them"
+        raise InputError(
+            f"give two of dt [s], steps and duration [s], or duration and tolerance [rad or m], which chooses dt; "
+            f"got {got if len(given) < 3 else 'all three'}"
+        )
+    if duration is None:
+        return positive("dt", dt, "s"), count("steps", steps)
+    duration = positive("duration", duration, "s")
+    if dt is None:
+        steps = count("steps", steps, least=1)
+        return duration / steps, steps
+    dt = positive("dt", dt, "s")
+    steps = max(1, round(min(duration / dt, 1e15)))
+    if abs(steps * dt - duration) > 1e-9 * duration:
+        raise InputError(f"duration = {duration:g} s is no multiple of dt = {dt:g} s: dt = {duration / steps!r} s is")
+    return dt, steps
+
+
+def _time_of_wish(dt: float | None, steps: int | None, duration: float | None) -> float:
+    """The duration of a motion with a tolerance [s]."""
+    for name, value in (("dt", dt), ("steps", steps)):
+        if value is not None:
+            raise InputError(
+                f"{name} and tolerance do not go together: a tolerance chooses the steps; give duration and tolerance, "
+                f"or {name} without it"
+            )
+    if duration is None:
+        raise InputError("tolerance needs the duration of the motion [s]")
+    return positive("duration", duration, "s")
+
+
+def _chosen(
+    scene: Scene,
+    q0: Floats,
+    v0: Floats,
+    duration: float,
+    tolerance: float | Accuracy,
+    controls: JointValues | ControlLaw | LinearPolicy | OpenLoop | None,
+    integrator: Integrator | None,
+) -> tuple[Integrator, int, JointValues | LinearPolicy | OpenLoop | None, Accuracy, tuple[Finding, ...]]:
+    """Integrator, steps and controls for a tolerance, with the estimate and what is to be said of it."""
+    earlier = tolerance if isinstance(tolerance, Accuracy) else None
+    wish = positive("tolerance", tolerance.tolerance if isinstance(tolerance, Accuracy) else tolerance, "rad or m")
+    if scene.processes:
+        raise InputError(
+            "tolerance is of single motions without noise: leave the noise out of the scene, or give dt and steps"
+        )
+    if isinstance(integrator, Reference):
+        raise InputError("Reference chooses its own steps: its tolerance is rtol; give it dt and steps")
+    if callable(controls):
+        _require_law(controls)
+        raise InputError(
+            "a control law is called once every period, in steps, and a tolerance chooses the steps: give dt and "
+            "steps with a law, or a varpin.LinearPolicy with a period, or a varpin.OpenLoop(f)"
+        )
+    members = INTEGRATORS if integrator is None else (integrator,)
+    parts, most = 1, max(member.order for member in members)
+    given: Callable[[Integrator, int], Commands]
+    held = np.zeros((0, 0))
+    if isinstance(controls, LinearPolicy):
+        policy = controls
+        if controls.period is None:
+            raise InputError("tolerance chooses dt, so a LinearPolicy needs the period of its intervals, period= [s]")
+        parts = len(controls.gains)
+        if abs(parts * controls.period - duration) > 1e-9 * duration:
+            raise InputError(
+                f"the policy has {parts} intervals of {controls.period:g} s, {parts * controls.period:g} s in all, and "
+                f"duration = {duration:g} s"
+            )
+        if integrator is None:
+            members = tuple(member for member in members if member.variational != (controls.on == "velocity"))
+
+        def given(member: Integrator, steps: int) -> Commands:
+            return commands_of(scene, member, policy, steps, duration / steps)
+    elif isinstance(controls, OpenLoop):
+        # Held from the middle of each step.
+        most, of_time = 2, controls
+        sampled: dict[int, Commands] = {}
+
+        def given(member: Integrator, steps: int) -> Commands:
+            if steps not in sampled:
+                sampled[steps] = commands_of(scene, member, of_time, steps, duration / steps)
+            return sampled[steps]
+    else:
+        held = held_rows(scene, controls)
+        parts = len(held)
+
+        def given(member: Integrator, steps: int) -> Commands:  # noqa: ARG001 - as for the others
+            return open_loop(np.repeat(held, steps // parts, axis=0))
+
+    motion = Motion(scene, q0, v0, duration, parts, given, most)
+    first = None
+    if earlier is not None:
+        known = integrator_of(earlier.integrator)
+        if any(member.same_map(known) for member in members):
+            first = known, earlier.dt
+    choice = choose(motion, members, wish, first)
+    record = Accuracy(
+        wish,
+        choice.error,
+        str(choice.integrator),
+        duration / choice.steps,
+        choice.search_steps,
+        choice.search_evaluations,
+    )
+    if not choice.error < SENSIBLE:
+        raise ToleranceError(wish, duration, choice.steps, choice.error)
+    found: tuple[Finding, ...] = ()
+    if not record.met:
+        cause = (
+            f"rounding leaves {choice.floor:.1e}"
+            if wish < choice.floor
+            else "errors grow along this motion, or its controls and forces jump inside steps"
+        )
+        found = (
+            Finding(
+                "tolerance not met",
+                f"tolerance = {wish:g} is not met: the estimated error in q is {record.error:.1e} with "
+                f"{record.integrator} at dt = {record.dt:.4g} s; {cause}",
+            ),
+        )
+    if not isinstance(controls, LinearPolicy | OpenLoop):
+        controls = np.repeat(held, choice.steps // parts, axis=0)
+    return choice.integrator, choice.steps, controls, record, found
+
+
+def held_rows(scene: Scene, controls: JointValues | None) -> Floats:
+    """Controls that are each held over an equal part of a motion, (R, m).
+
+    Raises:
+        UnknownJoint: A name that is no driven joint's.
+        InputError: The array is neither (R, m) nor (m,), or not finite.
+    """
+    m = scene.controls
+    if controls is None:
+        return np.zeros((1, m))
+    if isinstance(controls, Mapping):
+        return control_array("controls", controls, scene.control_joints)[None]
+    if hasattr(controls, "policy"):
+        raise InputError("controls is a plan: give its law, plan.policy, or its controls, plan.trajectory.u")
+    held = np.atleast_2d(require_finite("controls", as_floats("controls", controls)))
+    if held.ndim != 2 or held.shape[1] != m or not len(held):
+        raise InputError(f"controls must have shape (R, {m}) or ({m},), got {np.shape(controls)}")
+    return held
 
 
 def _told(

@@ -128,6 +128,45 @@ def joined(statistics: Sequence[StepStatistics]) -> StepStatistics:
     return StepStatistics(**{name: np.concatenate([getattr(own, name) for own in statistics]) for name in names})
 
 
+@dataclass(frozen=True)
+class Accuracy:
+    """How a motion came by its integrator and step where it was asked for with a tolerance, and what it is good for.
+
+    It is a tolerance itself: ``simulate(..., tolerance=trajectory.accuracy)`` begins with this integrator and step.
+
+    Attributes:
+        tolerance: What was asked for [rad or m].
+        error: The estimate of what was reached: in q, the largest over nodes and joints [rad or m].
+        integrator: What was taken, as text; ``varpin.integrators.integrator_of`` makes it again.
+        dt: The step that was taken [s].
+        search_steps: Steps of all the runs that finding out took.
+        search_evaluations: Evaluations of forward dynamics or of the jet in them.
+    """
+
+    tolerance: float
+    error: float
+    integrator: str
+    dt: float
+    search_steps: int
+    search_evaluations: int
+
+    @property
+    def met(self) -> bool:
+        """Whether the estimate is within the tolerance."""
+        return self.error <= self.tolerance
+
+    def __str__(self) -> str:
+        met = "within" if self.met else "not within"
+        return (
+            f"error {self.error:.1e}, {met} {self.tolerance:g}, by {self.integrator} at dt = {self.dt:.4g} s; "
+            f"found in {self.search_steps} steps"
+        )
+
+
+# Numbers of an accuracy in a file, beside what the trajectory has itself.
+_ACCURACY = ("tolerance", "error", "search_steps", "search_evaluations")
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory(Frozen):
     """A motion over N steps and N + 1 nodes.
@@ -151,6 +190,8 @@ class Trajectory(Frozen):
         warnings: What varpin said of the motion, a sentence each: dt too coarse, energy off, steps taken in parts.
         scene_values: Numbers of the scene it was made in, :attr:`varpin.Scene.values`; empty in files that varpin wrote
             before it kept them.
+        accuracy: The estimated error, and what finding integrator and step took, of a motion that was asked for with a
+            tolerance; None of others.
     """
 
     t: Floats
@@ -169,6 +210,7 @@ class Trajectory(Frozen):
     version: str = __version__
     warnings: tuple[str, ...] = ()
     scene_values: Mapping[str, Floats] = field(default_factory=lambda: MappingProxyType({}), repr=False)
+    accuracy: Accuracy | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         nodes, n = np.size(self.t), len(self.joint_names)
@@ -215,9 +257,10 @@ class Trajectory(Frozen):
     def __repr__(self) -> str:
         split = self.statistics.split_steps
         flag = f", {split} steps split by the guards" if split else ""
+        reached = f", estimated error {self.accuracy.error:.1e}" if self.accuracy is not None else ""
         return (
             f"Trajectory({self.robot}: {len(self.joint_names)} joints, {self.steps} steps of {self.dt:g} s, "
-            f"{self.integrator}{flag}{said(self.warnings)})"
+            f"{self.integrator}{flag}{reached}{said(self.warnings)})"
         )
 
     def _repr_html_(self) -> str:
@@ -228,6 +271,8 @@ class Trajectory(Frozen):
             ("energy [J]", f"{self.energy[0]:.6g} at first, {self.energy[-1]:.6g} in the end"),
             ("energy's largest change [J]", f"{np.abs(self.energy - self.energy[0]).max():.3g}"),
         ]
+        if self.accuracy is not None:
+            rows.append(("estimated error in q [rad or m]", f"{self.accuracy.error:.2g}"))
         if own.energy_defect.any():
             rows.append(("of it, what no force accounts for [J]", f"{np.abs(own.energy_defect).max():.3g}"))
         if own.newton_iterations.any():
@@ -260,6 +305,8 @@ class Trajectory(Frozen):
         members |= {"version": self.version, "integrator": self.integrator, "robot": self.robot}
         members |= {"warnings": np.array(self.warnings, dtype=str)}
         members |= {f"{_SCENE}{name}": values for name, values in self.scene_values.items()}
+        if self.accuracy is not None:
+            members["accuracy"] = np.array([getattr(self.accuracy, name) for name in _ACCURACY], dtype=np.float64)
         return members | {"dt": self.dt, "joint_names": np.array(self.joint_names, dtype=str)}
 
     @classmethod
@@ -324,6 +371,14 @@ class Trajectory(Frozen):
         statistics = StepStatistics(**{x.name: members[f"statistics.{x.name}"] for x in fields(StepStatistics)})
         if damage := statistics.damage():
             raise FileError(f"{source}: {damage}")
+        accuracy = None
+        if "accuracy" in members:
+            numbers = members["accuracy"]
+            if not (np.isfinite(numbers).all() and (numbers >= 0.0).all()):
+                raise FileError(f"{source}: accuracy holds numbers that no accuracy has")
+            tolerance, error, *work = map(float, numbers)
+            made = str(members["integrator"]), float(members["dt"])
+            accuracy = Accuracy(tolerance, error, *made, *map(int, work))
         return cls(
             **{name: members[name] for name in _ARRAYS},
             dt=float(members["dt"]),
@@ -334,6 +389,7 @@ class Trajectory(Frozen):
             version=str(members["version"]),
             warnings=tuple(str(sentence) for sentence in members["warnings"]),
             scene_values=MappingProxyType(kept),
+            accuracy=accuracy,
         )
 
 
@@ -349,6 +405,7 @@ def require_layout(source: Path, members: Mapping[str, NDArray[Any] | Header]) -
     shapes |= {"u": (steps, -1), "dw": (steps, -1), "joint_names": (-1,), "warnings": (-1,)}
     shapes |= {f"statistics.{name}": (steps,) for name in STEP_NUMBERS} | {"statistics.halvings": (-1,)}
     shapes |= dict.fromkeys(_TEXTS[:3], ())
+    shapes |= {"accuracy": (len(_ACCURACY),)} if "accuracy" in members else {}
     ends = {"gravity": (3,), "actuation": (n, -1)} | dict.fromkeys(("damping", "stiffness", "rest", "armature"), (n,))
     ends |= dict.fromkeys(("ratio", "offset"), (-1,)) | dict.fromkeys(("center", "translation"), (-1, 3))
     ends |= {"inertia": (-1, 6), "rotation": (-1, 3, 3)} | dict.fromkeys(OF_FORCES, (-1, -1))
@@ -384,6 +441,7 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
         **arrays,
         statistics=joined([part.statistics for part in parts]),
         warnings=(),
+        accuracy=None,
     )
 
 
@@ -425,7 +483,7 @@ def require_scene_of(scene: Scene, trajectory: Trajectory) -> None:
 # What a file of a trajectory holds beside its format, and what it may hold.
 MEMBERS = frozenset(_ARRAYS) | {"dt", "version", "integrator", "robot", "joint_names", "warnings"}
 MEMBERS |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
-OPTIONAL = frozenset(_SCENE + name for name in VALUES)
+OPTIONAL = frozenset(_SCENE + name for name in VALUES) | {"accuracy"}
 
 
 def read_members(

@@ -37,9 +37,11 @@ from varpin.trajectory import Trajectory
 
 # More steps than anyone can hold in memory, said before NumPy says it in its own words.
 MOST_STEPS = 10**9
+# The step where nothing is said of it [s].
+DT = 1e-3
 # Options that a scene file leaves no room for.
 _OF_MOTIONS = (
-    *("lock", "package_dir", "dt", "duration", "steps", "integrator", "alpha", "stages"),
+    *("lock", "package_dir", "dt", "tolerance", "duration", "steps", "integrator", "alpha", "stages"),
     *("q0", "v0", "gravity", "damping", "stiffness", "rest", "torque"),
 )
 
@@ -53,7 +55,14 @@ def add_simulate(parser: argparse.ArgumentParser) -> None:
     )
     parser.set_defaults(run=_simulate, log_level=logging.WARNING)
     add_robot(parser, scenes=True)
-    parser.add_argument("--dt", type=float, default=1e-3, metavar="S", help="time step [s]; default: %(default)g")
+    parser.add_argument("--dt", type=float, metavar="S", help=f"time step [s]; default: {DT:g}")
+    parser.add_argument(
+        "--tolerance",
+        type=float,
+        metavar="E",
+        help="the largest error in q that is welcome [rad or m], in place of --dt: the cheapest step, and integrator "
+        "if none is given, that keep to it are found out and taken",
+    )
     length = parser.add_mutually_exclusive_group()
     length.add_argument(
         "--duration", type=float, metavar="S", help="time to simulate [s], rounded to whole steps; default: 2"
@@ -72,13 +81,16 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
         return _run(request, errors, file.scene, driven, file.spec.steps, lambda p: file.simulate(progress=p), outputs)
     outputs = outputs_of(request)
     steps = _steps(request)
-    integrator = integrator_asked_for(request)
+    free = request.tolerance is not None and request.integrator is request.stages is request.alpha is None
+    integrator = None if free else integrator_asked_for(request)
     scene, q0, v0, torque = motion_of(request)
 
     def run(progress: Callable[[int, int], None]) -> Trajectory:
-        return simulate(
-            scene, q0, v0, dt=request.dt, steps=steps, controls=torque, integrator=integrator, progress=progress
-        )
+        if steps is None:
+            wish = {"duration": _duration(request), "tolerance": request.tolerance}
+        else:
+            wish = {"dt": _dt(request), "steps": steps}
+        return simulate(scene, q0, v0, **wish, controls=torque, integrator=integrator, progress=progress)
 
     return _run(request, errors, scene, bool(scene.dissipates or torque is not None), steps, run, outputs)
 
@@ -88,7 +100,7 @@ def _run(
     errors: Console,
     scene: Scene,
     driven: bool,
-    steps: int,
+    steps: int | None,
     run: Callable[[Callable[[int, int], None]], Trajectory],
     outputs: list[Output] | None = None,
 ) -> int:
@@ -99,11 +111,12 @@ def _run(
     status, complaint, begin = 0, "", time.perf_counter()
     with request.interrupts.keeping():
         try:
-            with progress_bar(errors, steps, quiet=request.quiet) as progress:
+            with progress_bar(errors, steps or 1, quiet=request.quiet) as progress:
                 trajectory = run(progress)
         except Interrupted as interruption:
             trajectory, status = interruption.trajectory, INTERRUPTED
-            complaint = f"interrupted after {trajectory.steps} of {steps} steps, which are kept"
+            of = "" if steps is None else f" of {steps}"
+            complaint = f"interrupted after {trajectory.steps}{of} steps, which are kept"
         except StepFailure as failure:
             trajectory, status = failure.trajectory, STEP_FAILED
             complaint = str(failure).replace("is in error.trajectory", "is kept")
@@ -121,10 +134,25 @@ def _run(
     return status
 
 
-def _steps(request: argparse.Namespace) -> int:
-    dt = positive("--dt", request.dt, "s")
+def _dt(request: argparse.Namespace) -> float:
+    return positive("--dt", DT if request.dt is None else request.dt, "s")
+
+
+def _duration(request: argparse.Namespace) -> float:
+    return positive("--duration", 2.0 if request.duration is None else request.duration, "s")
+
+
+def _steps(request: argparse.Namespace) -> int | None:
+    """The number of steps; None where a tolerance decides."""
+    if request.tolerance is not None:
+        positive("--tolerance", request.tolerance, "rad or m")
+        for option in ("dt", "steps"):
+            if getattr(request, option) is not None:
+                raise InputError(f"--{option} and --tolerance do not go together: a tolerance chooses the steps")
+        return None
+    dt = _dt(request)
     if request.steps is None:
-        ratio = positive("--duration", 2.0 if request.duration is None else request.duration, "s") / dt
+        ratio = _duration(request) / dt
         if ratio < 0.5:
             raise InputError(f"--duration {request.duration:g} s is less than one step of {dt:g} s")
         steps = round(ratio) if math.isfinite(ratio) else MOST_STEPS + 1
@@ -135,13 +163,21 @@ def _steps(request: argparse.Namespace) -> int:
     return steps
 
 
-def _summary(trajectory: Trajectory, asked: int, wall_time: float, driven: bool, files: Iterable[Path]) -> Table:
+def _summary(trajectory: Trajectory, asked: int | None, wall_time: float, driven: bool, files: Iterable[Path]) -> Table:
     """What a run was, took and made."""
     table = facts(f"{trajectory.robot}: {trajectory.integrator}")
     statistics, steps = trajectory.statistics, trajectory.steps
-    of = f" of {asked}" if steps < asked else ""
+    of = f" of {asked}" if asked is not None and steps < asked else ""
     add_row(table, "steps", f"{steps}{of}, {trajectory.dt:g} s each, {trajectory.duration:g} s in all")
     add_row(table, "wall time", f"{wall_time:.3g} s")
+    if (own := trajectory.accuracy) is not None:
+        met = "" if own.met else ", not"
+        add_row(
+            table,
+            "estimated error in q",
+            f"{own.error:.2g} rad or m{met} within {own.tolerance:g}; finding out took {own.search_steps} steps",
+            style="" if own.met else "bold yellow",
+        )
     if steps:
         newton, split = statistics.newton_iterations, statistics.split_steps
         add_row(table, "Newton iterations", f"{newton.mean():.2f} a step, {newton.max()} at most")

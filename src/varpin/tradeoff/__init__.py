@@ -4,6 +4,7 @@
 S-DDP, and :func:`advise` picks an integrator and a step from a few short runs.
 """
 
+from varpin.refinement import INTEGRATORS as INTEGRATORS
 from varpin.tradeoff.advice import Advice as Advice
 from varpin.tradeoff.advice import Choice as Choice
 from varpin.tradeoff.advice import advise as advise
@@ -13,4 +14,3 @@ from varpin.tradeoff.optimal_control import optimal_control_tradeoff as optimal_
 from varpin.tradeoff.precision import WorkPrecision as WorkPrecision
 from varpin.tradeoff.precision import WorkPrecisionRun as WorkPrecisionRun
 from varpin.tradeoff.precision import work_precision as work_precision
-from varpin.tradeoff.setting import INTEGRATORS as INTEGRATORS

@@ -12,26 +12,20 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.checks import JointValues, as_floats, control_array, joint_array, positive, require_finite
+from varpin.checks import JointValues, joint_array, positive
 from varpin.errors import InputError
 from varpin.frozen import Frozen
-from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
+from varpin.integrators import Integrator
 from varpin.integrators.base import Segment, open_loop
+from varpin.refinement import INTEGRATORS
 from varpin.scene import Scene, require_scene
+from varpin.simulation import held_rows
 
 Floats = NDArray[np.float64]
 Result = TypeVar("Result")
 
 # What a motion depends on, in the order of its fingerprint.
 PARTS = ("scene", "initial state", "controls", "duration")
-# Whom to compare where nobody is named. A new integrator enters here, and everywhere.
-INTEGRATORS: tuple[Integrator, ...] = (
-    ExplicitEuler(),
-    SemiImplicitEuler(),
-    RungeKutta4(),
-    Midpoint(),
-    *(Gauss(stages=stages) for stages in (2, 3, 4, 5)),
-)
 
 # Work between two chances for Ctrl-C, in steps of one joint.
 _CHUNK = 100_000
@@ -95,19 +89,12 @@ class Setting(Frozen):
         Raises:
             InputError: Wrong shapes or values, a scene with noise, controls that are a function.
         """
-        joints, m = require_scene(scene).robot.joint_names, scene.controls
+        joints = require_scene(scene).robot.joint_names
         if scene.processes:
             raise InputError("errors of single motions are compared here: leave the noise out of the scene")
-        if controls is None:
-            rows = np.zeros((1, m))
-        elif isinstance(controls, Mapping):
-            rows = control_array("controls", controls, scene.control_joints)[None]
-        elif callable(controls):
+        if callable(controls):
             raise InputError("controls must be rows (R, m), each held over duration / R, or one row (m,)")
-        else:
-            rows = np.atleast_2d(require_finite("controls", as_floats("controls", controls)))
-            if rows.ndim != 2 or rows.shape[1] != m or not len(rows):
-                raise InputError(f"controls must have shape (R, {m}) or ({m},), got {np.shape(controls)}")
+        rows = held_rows(scene, controls)
         return cls(
             scene,
             joint_array("q0", q0, joints),

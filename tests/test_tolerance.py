@@ -1,0 +1,281 @@
+"""Motions that are asked for with a tolerance: errors at all nodes, what is said of them, what goes together."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+
+import varpin as vp
+from varpin import tolerance as search
+from varpin.cli import main
+from varpin.integrators import integrator_of
+
+REST = np.zeros(3)
+
+
+def chain(**options):
+    return vp.Scene(vp.planar_chain(3), **options)
+
+
+def shake(t):
+    return np.array([np.sin(5.0 * t), 0.2, np.cos(3.0 * t)])
+
+
+def true_positions(scene, q0, v0, torque, times):
+    """q (K, n) at times (K,) from 0 on: DOP853 on Pinocchio's aba, begun anew at each."""
+    model, n = scene.robot.model, len(q0)
+    data = model.createData()
+
+    def slope(t, x, u=None):
+        q, v = x[:n], x[n:]
+        force = (torque(t) if u is None else u) - scene.damping * v - scene.stiffness * (q - scene.rest)
+        return np.concatenate([v, pin.aba(model, data, q, v, force)])
+
+    states = [np.concatenate([q0, v0])]
+    for begin, end in pairwise(times):
+        states.append(solve_ivp(slope, (begin, end), states[-1], "DOP853", rtol=1e-12, atol=1e-13).y[:, -1])
+    return np.array(states)[:, :n]
+
+
+def exact(scene, motion):
+    """q at the nodes under the controls of a motion, held as it holds them."""
+    n = scene.robot.dof
+    options = {"dt": motion.dt, "steps": motion.steps, "controls": motion.u, "integrator": vp.Reference(rtol=1e-13)}
+    return vp.simulate(scene, motion.q[0], motion.v[0], **options, check=False).q.reshape(-1, n)
+
+
+@pytest.mark.parametrize("wish", [1e-3, 1e-6, 1e-10])
+def test_error_at_all_nodes_is_within_the_tolerance_and_told(wish):
+    scene = chain(damping=0.3, stiffness=2.0)
+    motion = vp.simulate(scene, [0.5, 0.0, -0.3], REST, duration=1.0, tolerance=wish)
+    true = true_positions(scene, np.array([0.5, 0.0, -0.3]), REST, lambda _: REST, motion.t)
+    error = np.abs(motion.q - true).max()
+    own = motion.accuracy
+    assert error <= wish
+    assert error / 2 <= own.error <= 2 * error
+    assert own.met
+    assert own.tolerance == wish
+    assert (own.integrator, own.dt) == (motion.integrator, motion.dt)
+    assert own.search_steps > 2 * motion.steps
+    assert own.search_evaluations > own.search_steps
+    assert motion.t[-1] == pytest.approx(1.0, rel=1e-12)
+
+
+def test_torques_of_time_are_right_in_continuous_time():
+    """Held over each step they cost the order; the tolerance is met all the same."""
+    scene = chain()
+    motion = vp.simulate(scene, REST, REST, duration=0.5, tolerance=1e-5, controls=vp.OpenLoop(shake))
+    true = true_positions(scene, REST, REST, shake, motion.t)
+    assert np.abs(motion.q - true).max() <= 1e-5
+    assert np.abs(motion.u[0] - shake(0.5 * motion.dt)).max() == 0.0
+
+
+def test_rows_of_controls_are_each_held_over_their_part():
+    rows = np.random.default_rng(0).normal(size=(3, 3))
+    motion = vp.simulate(chain(), REST, REST, duration=0.6, tolerance=1e-7, controls=rows)
+    assert motion.steps % 3 == 0
+    assert np.array_equal(motion.u, np.repeat(rows, motion.steps // 3, axis=0))
+    assert np.abs(motion.q - exact(chain(), motion)).max() <= 1e-7
+    one = vp.simulate(chain(), REST, REST, duration=0.6, tolerance=1e-7, controls={"joint1": 2.0})
+    assert (one.u == [2.0, 0.0, 0.0]).all()
+
+
+def test_friction_and_servos():
+    """Where friction turns round no method shows its order."""
+    rubbing = chain(forces=[vp.CoulombFriction(0.5)])
+    motion = vp.simulate(rubbing, REST, REST, duration=0.5, tolerance=1e-4)
+    assert np.abs(motion.q - exact(rubbing, motion)).max() <= 1e-4
+    served = chain(forces=[vp.PositionServo(200.0, 20.0)])
+    motion = vp.simulate(served, REST, REST, duration=0.5, tolerance=1e-6, controls=[0.3, 0.0, -0.2])
+    assert np.abs(motion.q - exact(served, motion)).max() <= 1e-6
+
+
+def policy(on, period=0.05):
+    gains = np.tile(-np.hstack([10.0 * np.eye(3), np.eye(3)]), (10, 1, 1))
+    return vp.LinearPolicy(np.ones((10, 3)), gains, np.zeros((10, 6)), on=on, period=period)
+
+
+@pytest.mark.parametrize("on", ["momentum", "velocity", None])
+def test_policies_with_a_period(on):
+    motion = vp.simulate(chain(), REST, REST, duration=0.5, tolerance=1e-7, controls=policy(on))
+    taken = integrator_of(motion.integrator)
+    assert motion.steps % 10 == 0
+    assert taken.variational == (on != "velocity")
+    # The decisions on the exact states: the loop closed once a period, by hand.
+    q, v = REST, REST
+    scene = chain()
+    for k in range(10):
+        x = np.concatenate([q, v if on == "velocity" else vp.lagrangian_jet(scene, q, v).Lv])
+        u = 1.0 + policy(on).gains[k] @ x
+        part = vp.simulate(scene, q, v, dt=0.05, steps=1, controls=u, integrator=vp.Reference(rtol=1e-13))
+        q, v = part.q[-1], part.v[-1]
+        assert np.abs(motion.q[(k + 1) * motion.steps // 10] - q).max() <= 1e-7
+
+
+def test_the_integrator_may_be_fixed():
+    motion = vp.simulate(chain(), REST, REST, duration=0.5, tolerance=1e-2, integrator=vp.Midpoint(alpha=0.4))
+    assert motion.integrator == "Midpoint(alpha=0.4)"
+    assert np.abs(motion.q - exact(chain(), motion)).max() <= 1e-2
+    radau = vp.simulate(chain(damping=30.0), REST, REST, duration=0.5, tolerance=1e-5, integrator=vp.Radau(3))
+    assert radau.integrator == "Radau(stages=3)"
+    assert np.abs(radau.q - exact(chain(damping=30.0), radau)).max() <= 1e-5
+
+
+def test_it_is_the_motion_of_its_integrator_and_step_the_same_each_time():
+    motion, again = (vp.simulate(chain(), REST, REST, duration=0.5, tolerance=1e-6) for _ in range(2))
+    fixed = vp.simulate(
+        chain(), REST, REST, dt=motion.dt, steps=motion.steps, integrator=integrator_of(motion.integrator)
+    )
+    assert motion.q.tobytes() == again.q.tobytes() == fixed.q.tobytes()
+    assert motion.accuracy == again.accuracy
+    assert motion.warnings == fixed.warnings
+    assert fixed.accuracy is None
+
+
+def test_what_an_earlier_motion_found_is_tried_first():
+    scene = chain()
+    first = vp.simulate(scene, REST, REST, duration=0.5, tolerance=1e-6)
+    same = vp.simulate(scene, REST, REST, duration=0.5, tolerance=first.accuracy)
+    assert same.q.tobytes() == first.q.tobytes()
+    assert same.accuracy.search_steps == 3 * same.steps
+    other = vp.simulate(scene, REST + 0.05, REST, duration=0.7, tolerance=first.accuracy)
+    assert other.integrator == first.integrator
+    assert first.dt / 2 < other.dt <= first.dt
+    assert other.accuracy.search_steps < 10 * other.steps
+    assert np.abs(other.q - exact(scene, other)).max() <= 1e-6
+    # A faster motion needs more than that, and gets it.
+    fast = vp.simulate(scene, REST, REST + 6.0, duration=0.5, tolerance=first.accuracy)
+    assert fast.accuracy.search_steps > 10 * fast.steps
+    assert np.abs(fast.q - exact(scene, fast)).max() <= 1e-6
+    # Nor is it taken where the user has fixed another integrator.
+    fixed = vp.simulate(scene, REST, REST, duration=0.5, tolerance=first.accuracy, integrator=vp.Midpoint())
+    assert fixed.integrator == "Midpoint(alpha=0.5)"
+
+
+def test_beyond_rounding_it_says_what_is_reached(caplog):
+    motion = vp.simulate(chain(), REST, REST, duration=0.3, tolerance=1e-17)
+    assert not motion.accuracy.met
+    (warning,) = motion.warnings
+    assert warning.startswith("tolerance = 1e-17 is not met: the estimated error in q is ")
+    assert "rounding leaves" in warning
+    assert warning in caplog.text
+    assert np.abs(motion.q - exact(chain(), motion)).max() <= 2 * motion.accuracy.error
+
+
+def test_a_chaotic_motion_has_no_end(monkeypatch):
+    monkeypatch.setattr(search, "_PATIENCE", 100_000)
+    with pytest.raises(vp.ToleranceError, match=r"tolerance = 1e-06 cannot be met over 200 s: with \d+ steps"):
+        vp.simulate(chain(), REST, REST, duration=200.0, tolerance=1e-6)
+
+
+def test_no_more_steps_are_tried_than_there_is_time_for():
+    with pytest.raises(vp.ToleranceError, match="the error in q is unknown"):
+        vp.simulate(chain(), REST + 1.0, REST, duration=1e12, tolerance=1e-6)
+
+
+def law(t, q, v):
+    return REST
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dt": 1e-3, "duration": 1.0, "tolerance": 1e-6}, "dt and tolerance do not go together"),
+        ({"steps": 10, "tolerance": 1e-6}, "steps and tolerance do not go together"),
+        ({"tolerance": 1e-6}, "tolerance needs the duration"),
+        ({"duration": 1.0, "tolerance": 0.0}, "tolerance must be positive"),
+        ({"duration": -1.0, "tolerance": 1e-6}, "duration must be positive"),
+        ({"duration": 1.0, "tolerance": 1e-6, "controls": law}, "a tolerance chooses the steps"),
+        ({"duration": 1.0, "tolerance": 1e-6, "controls": np.ones((4, 2))}, r"controls must have shape \(R, 3\)"),
+        ({"duration": 1.0, "tolerance": 1e-6, "controls": policy(None, None)}, "needs the period of its intervals"),
+        ({"duration": 1.0, "tolerance": 1e-6, "controls": policy(None)}, "10 intervals of 0.05 s, 0.5 s in all"),
+        ({"duration": 1.0, "tolerance": 1e-6, "integrator": vp.Reference()}, "its tolerance is rtol"),
+        ({"duration": 1.0, "tolerance": 1e-6, "integrator": "Midpoint"}, "integrator must be one of varpin's"),
+        ({"duration": 1.0}, "give two of dt .* got duration"),
+        ({}, "give two of dt .* got none of them"),
+        ({"dt": 0.1, "steps": 10, "duration": 1.0}, "got all three"),
+        ({"dt": 0.3, "duration": 1.0}, r"duration = 1 s is no multiple of dt = 0.3 s: dt = 0.333\d* s is"),
+    ],
+)
+def test_what_does_not_go_together(options, message):
+    with pytest.raises(vp.InputError, match=message):
+        vp.simulate(chain(), REST, REST, **options)
+
+
+def test_noise_is_refused():
+    with pytest.raises(vp.InputError, match="leave the noise out of the scene"):
+        vp.simulate(chain(noise=vp.AdditiveNoise(0.1)), REST, REST, duration=1.0, tolerance=1e-3)
+
+
+def test_duration_in_place_of_steps_or_dt():
+    by_steps = vp.simulate(chain(), REST, REST, dt=0.01, steps=30)
+    for options in ({"dt": 0.01, "duration": 0.3}, {"steps": 30, "duration": 0.3}):
+        motion = vp.simulate(chain(), REST, REST, **options)
+        assert motion.steps == 30
+        assert motion.q == pytest.approx(by_steps.q, abs=1e-12)
+        assert motion.accuracy is None
+
+
+def test_the_estimate_is_saved(tmp_path):
+    motion = vp.simulate(chain(), REST, REST, duration=0.2, tolerance=1e-6)
+    path = motion.save(tmp_path / "a.npz")
+    assert vp.Trajectory.load(path).accuracy == motion.accuracy
+    assert "estimated error" in repr(motion)
+    assert "estimated error" in motion._repr_html_()
+    assert str(motion.accuracy).startswith("error ")
+    plain = replace(motion, accuracy=None).save(tmp_path / "b.npz")
+    assert vp.Trajectory.load(plain).accuracy is None
+
+
+@pytest.mark.parametrize("numbers", [[1e-6, np.nan, 1.0, 1.0], [1e-6, 1e-7, -1.0, 1.0], [1e-6, 1e-7]])
+def test_a_damaged_estimate_is_refused(tmp_path, numbers):
+    motion = vp.simulate(chain(), REST, REST, duration=0.2, tolerance=1e-3)
+    path = motion.save(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", accuracy=np.array(numbers))
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(tmp_path / "c.npz", "w") as target:
+        for name in source.namelist():
+            if name != "accuracy.npy":
+                target.writestr(name, source.read(name))
+        target.writestr("accuracy.npy", zipfile.ZipFile(tmp_path / "b.npz").read("accuracy.npy"))
+    with pytest.raises(vp.FileError, match="accuracy"):
+        vp.Trajectory.load(tmp_path / "c.npz")
+
+
+def test_command(tmp_path, capsys):
+    path = tmp_path / "a.npz"
+    words = ["simulate", "finger", "--duration", "0.5", "--q0", "0.5"]
+    assert main([*words, "--tolerance", "1e-7", "--save", str(path)]) == 0
+    assert "estimated error in q" in capsys.readouterr().out
+    motion = vp.Trajectory.load(path)
+    scene = vp.Scene(vp.load_robot("finger"))
+    assert motion.accuracy.tolerance == 1e-7
+    assert np.abs(motion.q - exact(scene, motion)).max() <= 1e-7
+    assert main([*words, "--tolerance", "1e-4", "--integrator", "Midpoint", "--quiet", "--save", str(path)]) == 0
+    assert vp.Trajectory.load(path).integrator == "Midpoint(alpha=0.5)"
+    for option in ("--dt", "--steps"):
+        assert main(["simulate", "finger", option, "1", "--tolerance", "1e-7"]) == 2
+        assert f"{option} and --tolerance do not go together" in capsys.readouterr().err
+
+
+def test_random_motions(script):
+    """The benchmark's own cases, a few of them that are quick."""
+    benchmark = script("advise")
+    verdict = benchmark.judge_simulation(np.random.default_rng(3))
+    assert verdict.met
+    assert verdict.ratio <= 2.0
+
+
+@pytest.mark.slow
+def test_many_random_motions(script):
+    """The tolerance met on 95 %, and as many within twice the evaluations of the cheapest fixed choice."""
+    benchmark, rng = script("advise"), np.random.default_rng(7)
+    verdicts = [verdict for verdict in (benchmark.judge_simulation(rng) for _ in range(40)) if verdict is not None]
+    assert len(verdicts) > 25
+    assert np.mean([verdict.met for verdict in verdicts]) >= 0.95
+    assert np.mean([verdict.ratio <= 2.0 for verdict in verdicts]) >= 0.95
