@@ -39,6 +39,8 @@ logger = logging.getLogger(__name__)
 
 # Work between two looks at the progress callback and at Ctrl-C, in steps of one joint: some tens of milliseconds.
 _CHUNK = 30_000
+# What steps where no integrator is given.
+_MIDPOINT = Midpoint()
 # Parts of a motion that are kept one by one.
 _PARTS = 256
 
@@ -299,7 +301,7 @@ def simulate(
     q0, v0 = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
     dt, steps = positive("dt", dt, "s"), count("steps", steps)
     period = count("period", period, least=1)
-    integrator = Midpoint() if integrator is None else integrator
+    integrator = _MIDPOINT if integrator is None else integrator
     if not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
     law = controls if callable(controls) else None
