@@ -252,6 +252,7 @@ template <class Factor, class Row>
 void subtract_rows(double* row, int columns, int begin, int end, const Factor& factor, const Row& other) {
     if (begin == end) return;
     int c = 0;
+    for (; c + 11 < columns; c += 12) detail::subtract_pairs<6>(row, c, begin, end, factor, other);
     for (; c + 7 < columns; c += 8) detail::subtract_pairs<4>(row, c, begin, end, factor, other);
     if (c + 5 < columns) {
         detail::subtract_pairs<3>(row, c, begin, end, factor, other);
@@ -274,6 +275,7 @@ inline void subtract_product(const double* a, int rows, int inner, const double*
     int i = 0;
     for (; i + 1 < rows; i += 2, a += 2 * inner, out += 2 * columns) {
         int c = 0;
+        for (; c + 11 < columns; c += 12) detail::subtract_product_pairs<6>(a, inner, x + c, columns, out + c);
         for (; c + 7 < columns; c += 8) detail::subtract_product_pairs<4>(a, inner, x + c, columns, out + c);
         if (c + 5 < columns) {
             detail::subtract_product_pairs<3>(a, inner, x + c, columns, out + c);
