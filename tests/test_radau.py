@@ -55,6 +55,28 @@ def test_an_oscillator_damped_far_faster_than_the_step_is_at_rest_after_it():
     assert left[vp.Gauss(2)] > 0.9
 
 
+def test_one_stage_is_the_implicit_euler_method():
+    """Of first order; a damper stops a joint by 1 / (1 + h rate); p1 = p0 + h (L_q + F) at the end of the step."""
+    euler = vp.Radau(1, guard=None)
+    assert euler.order == 1
+    scene = vp.Scene(vp.planar_chain(3), damping=0.1)
+    start = {"q0": np.zeros(3), "v0": np.ones(3)}
+    exact = vp.simulate(scene, **start, dt=0.5, steps=1, integrator=vp.Reference()).q[-1]
+    motions = [vp.simulate(scene, **start, dt=0.5 / n, steps=n, integrator=euler) for n in (240, 480)]
+    errors = [np.abs(motion.q[-1] - exact).max() for motion in motions]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(1.0, abs=0.1)
+
+    motion = motions[0]
+    v = np.diff(motion.q, axis=0)[0] / motion.dt
+    slope = vp.lagrangian_jet(scene, motion.q[1], v).Lq - 0.1 * v
+    np.testing.assert_allclose(motion.p[1] - motion.p[0], motion.dt * slope, rtol=0, atol=1e-12)
+
+    stiff = vp.Scene(vp.planar_chain(1), gravity=False, damping=1e5)
+    inertia = vp.lagrangian_jet(stiff, np.zeros(1), np.zeros(1)).Lvv[0, 0]
+    left = vp.simulate(stiff, [0.0], [1.0], dt=1e-2, steps=1, integrator=euler, check=False).v[-1, 0]
+    assert left == pytest.approx(1.0 / (1.0 + 1e-2 * 1e5 / inertia), rel=1e-9)
+
+
 @pytest.mark.parametrize("damping", [[10, 10, 5, 5, 5, 2, 2], 0.1], ids=["the file's", "0.1"])
 def test_torques_that_jump_on_a_damped_arm(damping):
     """Against SciPy's Radau on Pinocchio's forward dynamics: q within 1 % of the way, node velocities within 10 %."""
@@ -116,7 +138,7 @@ def test_energy_of_an_undamped_motion_decays_with_its_order():
 
 @pytest.mark.parametrize(
     ("option", "words"),
-    [({"stages": 1}, "stages must be at least 2, got 1"), ({"stages": 7}, "stages must be at most 6, got 7")],
+    [({"stages": 0}, "stages must be at least 1, got 0"), ({"stages": 7}, "stages must be at most 6, got 7")],
 )
 def test_options_out_of_range(option, words):
     with pytest.raises(vp.InputError, match=words):

@@ -24,8 +24,6 @@ EFFORT = "controls pass the joints' effort limits"
 KINDS = (POSITION, VELOCITY, EFFORT)
 # Beyond its limit by more than this a joint is spoken of: of position [rad or m], of others as a share of the limit.
 _OUTSIDE, _SHARE = 1e-6, 1e-6
-# How far a joint may go into a stop, in units of the width over which that becomes stiff.
-_GIVES = 2.0
 # So many joints are told of with numbers.
 _NAMED = 6
 
@@ -33,29 +31,21 @@ _NAMED = 6
 def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
     """Which kinds of limits a motion leaves, and for each a sentence: which joints, by how much, and when."""
     robot, t = scene.robot, trajectory.t
-    slides = robot.slides
-    lower, upper = robot.position_limits
-    # Limits that leave no room are a fault of the description, which inspect_robot tells of.
-    none = ~(lower < upper)
-    lower, upper = np.where(none, -np.inf, lower), np.where(none, np.inf, upper)
-    for stop in of_kind(scene.elements, "JointStop"):
-        # What goes on against a stop is no motion that nothing stops, as far as the stop does not give way.
-        c, (first, last, *_, width) = stop.coordinate, stop.values
-        lower[c] = min(lower[c], first - _GIVES * width) if first > lower[c] - width else lower[c]
-        upper[c] = max(upper[c], last + _GIVES * width) if last < upper[c] + width else upper[c]
-    speed, effort = robot.velocity_limit, robot.effort_limit
-    force = trajectory.u @ scene.actuation.T
-    for servo in of_kind(scene.elements, "PositionServo"):
-        c = servo.coordinate
-        force[:, c] = drive_force(servo, trajectory.q[:-1, c], trajectory.v[:-1, c], force[:, c])
-    for kind, why, values, least, most, beyond, units in (
-        (POSITION, "which nothing stops", trajectory.q, lower, upper, _OUTSIDE, ("rad", "m")),
-        (VELOCITY, "which nothing holds back", trajectory.v, -speed, speed, _SHARE * speed, ("rad/s", "m/s")),
-        (EFFORT, "which nothing cuts off", force, -effort, effort, _SHARE * effort, ("N m", "N")),
+    for kind, why, of, (least, most), beyond, units in (
+        (POSITION, "which nothing stops", _positions, scene.bounds.position, _OUTSIDE, ("rad", "m")),
+        (VELOCITY, "which nothing holds back", _velocities, scene.bounds.velocity, None, ("rad/s", "m/s")),
+        (EFFORT, "which nothing cuts off", _efforts, scene.bounds.effort, None, ("N m", "N")),
     ):
+        if not (np.isfinite(least).any() or np.isfinite(most).any()):
+            continue
+        values = of(scene, trajectory)
+        top, bottom = values.max(axis=0, initial=-np.inf), values.min(axis=0, initial=np.inf)
+        if ((top <= most) & (bottom >= least)).all():
+            continue
+        slides = robot.slides
         with np.errstate(invalid="ignore"):
             excess = np.maximum(least - values, values - most)
-            excess = np.where(excess > beyond, excess, -np.inf)
+            excess = np.where(excess > (_SHARE * most if beyond is None else beyond), excess, -np.inf)
         parts = []
         worst = excess.max(axis=0, initial=-np.inf)
         joints = [int(c) for c in np.argsort(-worst, kind="stable") if worst[c] > 0.0]
@@ -68,3 +58,20 @@ def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
         if parts:
             more = f"; and {len(joints) - _NAMED} more" if len(joints) > _NAMED else ""
             yield kind, f"{kind}, {why}: {'; '.join(parts)}{more}"
+
+
+def _positions(_: Scene, trajectory: Trajectory) -> Floats:
+    return trajectory.q
+
+
+def _velocities(_: Scene, trajectory: Trajectory) -> Floats:
+    return trajectory.v
+
+
+def _efforts(scene: Scene, trajectory: Trajectory) -> Floats:
+    """Forces of the motors (N, n) [N m or N]."""
+    force = trajectory.u @ scene.actuation.T
+    for servo in of_kind(scene.elements, "PositionServo"):
+        c = servo.coordinate
+        force[:, c] = drive_force(servo, trajectory.q[:-1, c], trajectory.v[:-1, c], force[:, c])
+    return force

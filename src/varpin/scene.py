@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,6 +59,18 @@ _TREE = (
     "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio", "offset",
     "origin", "loads", "carried", "periodic", "group",
 )  # fmt: skip
+
+
+# How far a joint may go into a stop, in units of the width over which that becomes stiff.
+_GIVES = 2.0
+
+
+class Bounds(NamedTuple):
+    """Least and greatest position, velocity and force (n,) of the joints; infinite where there is no limit."""
+
+    position: tuple[Floats, Floats]  # [rad or m]
+    velocity: tuple[Floats, Floats]  # [rad/s or m/s]
+    effort: tuple[Floats, Floats]  # [N m or N]
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -246,7 +258,22 @@ class Scene(Frozen):
             centers=fields.center,
         )
 
-    @property
+    @cached_property
+    def bounds(self) -> Bounds:
+        """What the robot's description lets its joints do, and how far stops let them go."""
+        lower, upper = self.robot.position_limits
+        # Limits that leave no room are a fault of the description, which inspect_robot tells of.
+        none = ~(lower < upper)
+        lower, upper = np.where(none, -np.inf, lower), np.where(none, np.inf, upper)
+        for stop in of_kind(self.elements, "JointStop"):
+            # What goes on against a stop is no motion that nothing stops, as far as the stop does not give way.
+            c, (first, last, *_, width) = stop.coordinate, stop.values
+            lower[c] = min(lower[c], first - _GIVES * width) if first > lower[c] - width else lower[c]
+            upper[c] = max(upper[c], last + _GIVES * width) if last < upper[c] + width else upper[c]
+        speed, effort = self.robot.velocity_limit, self.robot.effort_limit
+        return Bounds((lower, upper), (-speed, speed), (-effort, effort))
+
+    @cached_property
     def diffusion(self) -> Diffusion:
         """The noise's fields that the core can evaluate; without those that only Python can."""
         n, m = self.actuation.shape
@@ -273,10 +300,12 @@ class Scene(Frozen):
             own |= {"noise.quadratic": fields.quadratic, "noise.center": fields.center}
         return MappingProxyType(own)
 
-    @property
+    @cached_property
     def silence(self) -> Floats:
         """The increments of Wiener processes that a rollout without noise is given."""
-        return np.zeros((0, 0, self.diffusion.constant.shape[1]))
+        none = np.zeros((0, 0, self.diffusion.constant.shape[1]))
+        none.setflags(write=False)
+        return none
 
     def holding_torque(self, q: JointValues) -> Floats:
         """The generalized forces (n,) that hold the robot at rest at ``q``, against gravity and springs [N m or N].

@@ -42,6 +42,8 @@ logger = logging.getLogger(__name__)
 
 # Work between two looks at the progress callback and at Ctrl-C, in steps of one joint: some tens of milliseconds.
 _CHUNK = 30_000
+# What steps where no integrator is given.
+_MIDPOINT = Midpoint()
 # Parts of a motion that are kept one by one.
 _PARTS = 256
 
@@ -344,7 +346,7 @@ def simulate(
     else:
         dt, steps = _times(dt, steps, duration)
     period = count("period", period, least=1)
-    integrator = Midpoint() if integrator is None else integrator
+    integrator = _MIDPOINT if integrator is None else integrator
     law = controls if callable(controls) else None
     if law is not None:
         _require_law(law)

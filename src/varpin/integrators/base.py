@@ -260,15 +260,16 @@ def segments_of(
     ``halvings`` gives those of the parts of a path's steps; it is asked where steps were not taken whole.
     """
     segments = []
-    split = np.any(nodes.tally[:, :, 3] > 1, axis=1)
-    for i, done in enumerate(nodes.done):
+    for i, done in enumerate(nodes.done.tolist()):
         tally, quality = nodes.tally[i], nodes.quality[i]
+        substeps = tally[:done, 3]
+        split = halvings is not None and (substeps > 1).any()
         statistics = StepStatistics(
             newton_iterations=tally[:done, 0],
             jets=tally[:done, 1],
             sweeps=tally[:done, 2],
-            substeps=tally[:done, 3],
-            halvings=np.zeros(0, dtype=np.uint8) if halvings is None or not split[i] else halvings(i),
+            substeps=substeps,
+            halvings=halvings(i) if halvings is not None and split else np.zeros(0, dtype=np.uint8),
             residual=quality[:done, 0],
             branch_margin=quality[:done, 1],
             energy_defect=quality[:done, 2],
@@ -288,6 +289,14 @@ def segments_of(
             )
         )
     return segments
+
+
+def first_nodes(q: Floats, p: Floats, v: Floats, energy: Floats, controls: int) -> list[Segment]:
+    """A segment of the node alone that each of P paths starts at, from q, p and v (P, n) and energies (P,)."""
+    none, zero, u = np.zeros(1, dtype=np.int64), np.zeros(1), np.zeros((1, controls))
+    statistics = StepStatistics(none, none, none, none, np.zeros(0, dtype=np.uint8), zero, zero, zero)
+    rows = (slice(i, i + 1) for i in range(len(q)))
+    return [Segment(q[row], p[row], v[row], u, energy[row], statistics) for row in rows]
 
 
 def open_loop(u: Floats) -> Commands:
@@ -322,6 +331,9 @@ def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> 
 
 def contiguous(commands: Commands) -> Commands:
     """Commands as the core takes them: rows of numbers one after another."""
+    arrays = commands.u, commands.gains, commands.reference, commands.limits
+    if all(array.flags.c_contiguous for array in arrays):
+        return commands
     return commands._replace(
         u=np.ascontiguousarray(commands.u),
         gains=np.ascontiguousarray(commands.gains),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 from varpin.checks import count
 from varpin.errors import InputError
@@ -14,7 +14,7 @@ MOST_STAGES = 6
 
 @dataclass(frozen=True)
 class Collocation(Variational):
-    """A variational integrator with ``stages`` stages, from ``least`` on."""
+    """A variational integrator with ``stages`` stages."""
 
     stages: int = 2
     guard: Guard | None = Guard()  # noqa: RUF009
@@ -22,9 +22,8 @@ class Collocation(Variational):
     kick: Literal["left", "split"] = "left"
 
     named = ("stages",)
-    least: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
-        if count("stages", self.stages, self.least) > MOST_STAGES:
+        if count("stages", self.stages, least=1) > MOST_STAGES:
             raise InputError(f"stages must be at most {MOST_STAGES}, got {self.stages}")
         super().__post_init__()

@@ -25,7 +25,7 @@ class Radau(Collocation):
     Steps are accepted or taken in parts as :class:`Midpoint` does.
 
     Main args:
-        stages: s, from 2 to 6. One would be the implicit Euler method, whose error is in percents of the motion.
+        stages: s, from 1 to 6. One is the implicit Euler method, whose error is in percents of the motion.
 
     Other Args:
         guard: As of :class:`Midpoint`, and so are the others.
@@ -33,7 +33,6 @@ class Radau(Collocation):
         kick: When noise kicks the momentum, ``"left"`` or ``"split"``.
     """
 
-    least = 2
     l_stable = True
 
     @property

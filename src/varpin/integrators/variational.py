@@ -27,6 +27,7 @@ from varpin.integrators.base import (
     control_of,
     diffusion_and_drift,
     drifts,
+    first_nodes,
     open_loop,
     segments_of,
     steps_of,
@@ -149,10 +150,7 @@ class Variational(Integrator):
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[VariationalRun, list[Segment]]:
         """See :meth:`Integrator.start`; p0 = M(q0) v0."""
         run = self._begun(scene, q0, v0)
-        nodes = new_nodes(len(q0), 1, scene.robot.dof, scene.controls)
-        nodes.q[:, 0], nodes.p[:, 0], nodes.v[:, 0], nodes.energy[:, 0] = run.paths.nodes()
-        nodes.done[:] = 1
-        return run, segments_of(nodes, REASONS)
+        return run, first_nodes(*run.paths.nodes(), scene.controls)
 
     def _begun(self, scene: Scene, q0: Floats, v0: Floats) -> VariationalRun:
         rollout = VariationalRollout(

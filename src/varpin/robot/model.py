@@ -232,12 +232,12 @@ class Robot(Frozen):
             limit.setflags(write=False)
         return lower, upper
 
-    @property
+    @cached_property
     def velocity_limit(self) -> Floats:
         """Bound (n,) [rad/s or m/s]; infinite where there is none, or one of 0."""
         return self._limit("velocityLimit")
 
-    @property
+    @cached_property
     def effort_limit(self) -> Floats:
         """Bound (n,) [N m or N]; infinite where there is none, or one of 0."""
         return self._limit("effortLimit")
@@ -273,7 +273,9 @@ class Robot(Frozen):
         values = np.asarray(getattr(self.model, attribute), dtype=float)
         limit = np.array([values[self.model.joints[index[name]].idx_v] for name in self.joint_names])
         # Pinocchio writes the absence of a limit as the largest double or as infinity, a URDF as 0.
-        return np.where((limit >= 1e300) | ~(limit > 0.0), np.inf, limit)
+        limit = np.where((limit >= 1e300) | ~(limit > 0.0), np.inf, limit)
+        limit.setflags(write=False)
+        return limit
 
     def _spread(self, model: pin.Model, q: Floats) -> Floats:
         configuration = np.empty((*q.shape[:-1], model.nq))

@@ -286,7 +286,7 @@ class Collocation {
         for (int i = 0; i < stages; ++i) stage_elimination->take(i, stage[i]);
     }
 
-    void sweep(double h, const Start& start, bool second, Effort& effort) {
+    [[gnu::always_inline]] inline void move_stages(const int stages, double h, const Start& start) {
         for (int i = 0; i < stages; ++i) {
             for (int c = 0; c < n; ++c) {
                 double total = 0.0;
@@ -294,6 +294,10 @@ class Collocation {
                 Q[i * n + c] = start.place[c].place.high + (start.place[c].place.low + h * total);
             }
         }
+    }
+
+    void sweep(double h, const Start& start, bool second, Effort& effort) {
+        stages == 1 ? move_stages(1, h, start) : move_stages(stages, h, start);
         for (int i = 0; i < stages; ++i) {
             if (second && !eliminated()) {
                 lagrangian_jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
@@ -343,6 +347,11 @@ class Collocation {
 
     // r(V); returns its largest entry in rounding units of its terms.
     double residuals(double h, const Start& start) {
+        return stages == 1 ? residuals_of(1, h, start) : residuals_of(stages, h, start);
+    }
+
+    // Here and elsewhere, loops over stages whose number the compiler knows to be one are none.
+    [[gnu::always_inline]] inline double residuals_of(const int stages, double h, const Start& start) {
         double worst = 0.0;
         for (int i = 0; i < stages; ++i) {
             for (int c = 0; c < n; ++c) slope[i * n + c] = stage[i].Lq[c] + (start.force[c] + acting[i * n + c].value);
@@ -370,6 +379,7 @@ class Collocation {
 
     // The block's part of N, (s width, s width).
     void assemble(double h, Block block, double* matrix) {
+        if (stages == 1) return assemble_one(h, block, matrix);
         const int width = block.end - block.begin, size = stages * width;
         std::fill(matrix, matrix + size * size, 0.0);
         // Row r of slope j's derivative in all of V, of which the rows of N take their share in one long loop.
@@ -400,6 +410,22 @@ class Collocation {
                 const double* M = &stage[i].M[row * n + block.begin];
                 for (int c = 0; c < width; ++c) line[i * width + c] += M[c];
             }
+        }
+    }
+
+    // The same of a single stage, which asks for no sums over stages.
+    void assemble_one(double h, Block block, double* matrix) const {
+        const double ahead = h * tableau.a[0], behind = h * tableau.gradient[0];
+        const double *M = stage[0].M.data(), *A = stage[0].A.data(), *Lqq = stage[0].Lqq.data();
+        const bool elements = mechanism.forces.any();
+        for (int r = block.begin; r < block.end; ++r) {
+            const int row = r * n;
+            double* line = matrix + (r - block.begin) * (block.end - block.begin) - block.begin;
+            for (int c = block.begin; c < block.end; ++c) {
+                line[c] = ahead * A[row + c] - behind * (ahead * Lqq[row + c] + A[c * n + r]);
+            }
+            if (elements) line[r] += element_entry(h, 0, 0, r, false);
+            for (int c = block.begin; c < block.end; ++c) line[c] += M[row + c];
         }
     }
 

@@ -8,9 +8,28 @@
 #include <limits>
 #include <utility>
 
+#include "varpin/pair.hpp"
 #include "varpin/tree.hpp"
 
 namespace varpin {
+
+namespace detail {
+
+// y -= s x over columns [first, last) of two rows, two at a time: on rows as short as an arm's, what compilers make of
+// the plain loop takes longer to set up than to run. Pairs begin at even columns, whatever `first` is: a processor
+// waits for a pair half of which it has just written.
+[[gnu::always_inline]] inline void subtract_scaled(double* y, double s, const double* x, int first, int last) {
+    const Pair factor{s, s};
+    int c = first;
+    if (c % 2 != 0 && c < last) {
+        y[c] -= s * x[c];
+        ++c;
+    }
+    for (; c + 1 < last; c += 2) put_pair(pair_at(y + c) - factor * pair_at(x + c), y + c);
+    if (c < last) y[c] -= s * x[c];
+}
+
+}  // namespace detail
 
 // LU in place without pivoting; false at a pivot that is not positive. For a matrix whose symmetric part is positive
 // definite every pivot is positive and none grows without bound.
@@ -23,7 +42,7 @@ inline bool factor_lu(double* a, int n, Block block) {
             double* row = a + i * n;
             const double factor = row[k] * inverse;
             row[k] = factor;
-            for (int j = k + 1; j < block.end; ++j) row[j] -= factor * top[j];
+            detail::subtract_scaled(row, factor, top, k + 1, block.end);
         }
     }
     return true;
@@ -123,18 +142,20 @@ inline void solve_lu_transposed(const double* lu, int n, const int* order, doubl
     for (int i = 0; i < n; ++i) x[order ? order[i] : i] = b[i];
 }
 
-// L D L' of a symmetric matrix in place: pivots on the diagonal, unit L below it. Reads the lower triangle; false at a
-// pivot that is not positive.
+// L D L' of a symmetric matrix in place: pivots on the diagonal, unit L below it, and nothing of use above. Reads the
+// lower triangle; false at a pivot that is not positive.
 inline bool factor_ldl(double* a, int n, Block block) {
     for (int k = block.begin; k < block.end; ++k) {
-        const double pivot = a[k * n + k];
-        if (!(pivot > 0.0)) return false;
-        const double inverse = 1.0 / pivot;
+        double* top = a + k * n;
+        if (!(top[k] > 0.0)) return false;
+        const double inverse = 1.0 / top[k];
+        // The column once more as a row, along which the loop runs.
         for (int i = k + 1; i < block.end; ++i) {
-            const double factor = a[i * n + k] * inverse;
-            for (int j = k + 1; j <= i; ++j) a[i * n + j] -= factor * a[j * n + k];
+            double* row = a + i * n;
+            top[i] = row[k];
+            row[k] *= inverse;
+            detail::subtract_scaled(row, row[k], top, k + 1, i + 1);
         }
-        for (int i = k + 1; i < block.end; ++i) a[i * n + k] *= inverse;
     }
     return true;
 }
@@ -145,20 +166,16 @@ inline bool factor_ldl(double* a, int n, Block block) {
 inline double least_pivot_ratio(double* a, double* b, int n, Block block) {
     double least = std::numeric_limits<double>::infinity();
     for (int k = block.end - 1; k >= block.begin; --k) {
-        const double* __restrict last_a = a + k * n;
-        const double* __restrict last_b = b + k * n;
+        const double* last_a = a + k * n;
+        const double* last_b = b + k * n;
         const double pivot_a = last_a[k], pivot_b = last_b[k];
         if (!(pivot_a > 0.0 && pivot_b > 0.0)) return 0.0;
         least = std::min(least, pivot_a / pivot_b);
         const double inverse_a = 1.0 / pivot_a, inverse_b = 1.0 / pivot_b;
         for (int i = block.begin; i < k; ++i) {
             const double factor_a = last_a[i] * inverse_a, factor_b = last_b[i] * inverse_b;
-            double* __restrict row_a = a + i * n;
-            double* __restrict row_b = b + i * n;
-            for (int j = block.begin; j <= i; ++j) {
-                row_a[j] -= factor_a * last_a[j];
-                row_b[j] -= factor_b * last_b[j];
-            }
+            detail::subtract_scaled(a + i * n, factor_a, last_a, block.begin, i + 1);
+            detail::subtract_scaled(b + i * n, factor_b, last_b, block.begin, i + 1);
         }
     }
     return least;
@@ -187,23 +204,89 @@ inline void solve_ldl(const double* ldl, int n, Block block, const double* b, do
     solve_upper(ldl, n, block, x);
 }
 
-// row -= sum_k factor(k) other(k) over k in [begin, end), four rows at a time.
-template <class Factor, class Row>
-void subtract_rows(double* __restrict row, int columns, int begin, int end, Factor factor, Row other) {
-    int k = begin;
-    for (; k + 3 < end; k += 4) {
-        const double f0 = factor(k), f1 = factor(k + 1), f2 = factor(k + 2), f3 = factor(k + 3);
-        const double* __restrict x0 = other(k);
-        const double* __restrict x1 = other(k + 1);
-        const double* __restrict x2 = other(k + 2);
-        const double* __restrict x3 = other(k + 3);
-        for (int c = 0; c < columns; ++c) row[c] -= (f0 * x0[c] + f1 * x1[c]) + (f2 * x2[c] + f3 * x3[c]);
-    }
-    for (; k < end; ++k) {
+namespace detail {
+
+// 2 * pairs columns of row -= sum_k factor(k) other(k), whose sums stay in registers.
+template <int pairs, class Factor, class Row>
+[[gnu::always_inline]] inline void subtract_pairs(double* row, int column, int begin, int end, const Factor& factor,
+                                                  const Row& other) {
+    Pair sum[pairs];
+    for (int c = 0; c < pairs; ++c) sum[c] = pair_at(row + column + 2 * c);
+    for (int k = begin; k < end; ++k) {
         const double f = factor(k);
-        const double* __restrict x = other(k);
-        for (int c = 0; c < columns; ++c) row[c] -= f * x[c];
+        const Pair both{f, f};
+        const double* x = other(k) + column;
+        for (int c = 0; c < pairs; ++c) sum[c] = sum[c] - both * pair_at(x + 2 * c);
     }
+    for (int c = 0; c < pairs; ++c) put_pair(sum[c], row + column + 2 * c);
+}
+
+// The same of two rows, with factors (2, end).
+template <int pairs>
+[[gnu::always_inline]] inline void subtract_product_pairs(const double* a, int inner, const double* x, int columns,
+                                                          double* out) {
+    Pair first[pairs], second[pairs];
+    double* below = out + columns;
+    for (int c = 0; c < pairs; ++c) {
+        first[c] = pair_at(out + 2 * c);
+        second[c] = pair_at(below + 2 * c);
+    }
+    for (int k = 0; k < inner; ++k, x += columns) {
+        const Pair upper{a[k], a[k]}, lower{a[inner + k], a[inner + k]};
+        for (int c = 0; c < pairs; ++c) {
+            const Pair own = pair_at(x + 2 * c);
+            first[c] = first[c] - upper * own;
+            second[c] = second[c] - lower * own;
+        }
+    }
+    for (int c = 0; c < pairs; ++c) {
+        put_pair(first[c], out + 2 * c);
+        put_pair(second[c], below + 2 * c);
+    }
+}
+
+}  // namespace detail
+
+// row -= sum_k factor(k) other(k) over k in [begin, end).
+template <class Factor, class Row>
+void subtract_rows(double* row, int columns, int begin, int end, const Factor& factor, const Row& other) {
+    if (begin == end) return;
+    int c = 0;
+    for (; c + 11 < columns; c += 12) detail::subtract_pairs<6>(row, c, begin, end, factor, other);
+    for (; c + 7 < columns; c += 8) detail::subtract_pairs<4>(row, c, begin, end, factor, other);
+    if (c + 5 < columns) {
+        detail::subtract_pairs<3>(row, c, begin, end, factor, other);
+        c += 6;
+    } else if (c + 3 < columns) {
+        detail::subtract_pairs<2>(row, c, begin, end, factor, other);
+        c += 4;
+    } else if (c + 1 < columns) {
+        detail::subtract_pairs<1>(row, c, begin, end, factor, other);
+        c += 2;
+    }
+    if (c == columns) return;
+    double sum = row[c];
+    for (int k = begin; k < end; ++k) sum -= factor(k) * other(k)[c];
+    row[c] = sum;
+}
+
+// out -= a x, for a (rows, inner), x (inner, columns) and out (rows, columns); columns are even.
+inline void subtract_product(const double* a, int rows, int inner, const double* x, int columns, double* out) {
+    int i = 0;
+    for (; i + 1 < rows; i += 2, a += 2 * inner, out += 2 * columns) {
+        int c = 0;
+        for (; c + 11 < columns; c += 12) detail::subtract_product_pairs<6>(a, inner, x + c, columns, out + c);
+        for (; c + 7 < columns; c += 8) detail::subtract_product_pairs<4>(a, inner, x + c, columns, out + c);
+        if (c + 5 < columns) {
+            detail::subtract_product_pairs<3>(a, inner, x + c, columns, out + c);
+        } else if (c + 3 < columns) {
+            detail::subtract_product_pairs<2>(a, inner, x + c, columns, out + c);
+        } else if (c + 1 < columns) {
+            detail::subtract_product_pairs<1>(a, inner, x + c, columns, out + c);
+        }
+    }
+    if (i < rows)
+        subtract_rows(out, columns, 0, inner, [&](int k) { return a[k]; }, [&](int k) { return x + k * columns; });
 }
 
 // The X with L D L' X = B, B and X (size of the block, columns) row by row and in one place, all columns at once.

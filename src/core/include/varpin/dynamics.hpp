@@ -19,26 +19,34 @@
 #include "varpin/dense.hpp"
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
+#include "varpin/pair.hpp"
 #include "varpin/spatial.hpp"
 #include "varpin/tree.hpp"
 
 namespace varpin {
 
-// Derivatives of something in a coordinate and in its velocity.
+// Derivatives of something in a coordinate and in its velocity, which go through the processor together.
 struct Slopes {
-    double q = 0.0, v = 0.0;
+    Pair both{0.0, 0.0};
+
+    Slopes() = default;
+    explicit Slopes(Pair both) : both(both) {}
+    Slopes(double q, double v) : both{q, v} {}
+
+    double q() const { return both[0]; }
+    double v() const { return both[1]; }
 };
 
-constexpr Slopes operator+(Slopes a, Slopes b) { return {a.q + b.q, a.v + b.v}; }
-constexpr Slopes operator-(Slopes a, Slopes b) { return {a.q - b.q, a.v - b.v}; }
-constexpr Slopes operator*(double s, Slopes a) { return {s * a.q, s * a.v}; }
-constexpr Slopes operator*(Slopes a, double s) { return s * a; }
-constexpr Slopes& operator+=(Slopes& a, Slopes b) { return a = a + b; }
+inline Slopes operator+(Slopes a, Slopes b) { return Slopes(a.both + b.both); }
+inline Slopes operator-(Slopes a, Slopes b) { return Slopes(a.both - b.both); }
+inline Slopes operator*(double s, Slopes a) { return Slopes(Pair{s, s} * a.both); }
+inline Slopes operator*(Slopes a, double s) { return s * a; }
+inline Slopes& operator+=(Slopes& a, Slopes b) { return a = a + b; }
 
-constexpr Vec3<Slopes> slopes(const Vec3<double>& q, const Vec3<double>& v) {
+inline Vec3<Slopes> slopes(const Vec3<double>& q, const Vec3<double>& v) {
     return {{q.x, v.x}, {q.y, v.y}, {q.z, v.z}};
 }
-constexpr Motion<Slopes> slopes(const Motion<double>& q, const Motion<double>& v) {
+inline Motion<Slopes> slopes(const Motion<double>& q, const Motion<double>& v) {
     return {slopes(q.linear, v.linear), slopes(q.angular, v.angular)};
 }
 
@@ -79,9 +87,10 @@ constexpr Coupling& operator+=(Coupling& a, const Coupling& b) {
     a.turn.z += b.turn.z;
     return a;
 }
+// C x of the x with this angular part b.
 template <class T>
-constexpr Force<T> operator*(const Coupling& C, const Motion<T>& x) {
-    return {2.0 * cross(x.angular, C.momentum), C.turn * x.angular};
+constexpr Force<T> operator*(const Coupling& C, const Vec3<T>& b) {
+    return {2.0 * cross(b, C.momentum), C.turn * b};
 }
 
 // Forward dynamics M a = force - bias at one state after another, with work arrays. Derivatives need a mass matrix;
@@ -106,7 +115,9 @@ class ForwardDynamics {
         }
         jet_.M.resize(entries(n, n));
         ldl_.resize(n * n);
-        if (derivatives) slopes_.resize(n * n);
+        if (!derivatives) return;
+        slopes_.resize(n * n);
+        weights_.resize(n * n);
     }
 
     int dof() const { return jet_.dof; }
@@ -202,7 +213,7 @@ class ForwardDynamics {
             const int k = tree.bodies[j].parent;
             Motion<double> Z = cross(acceleration_above(j), here.axis);
             if (k >= 0) Z += cross(jet_.body[k].velocity, here.axis_rate);
-            body_[j].velocity_slopes = slopes(here.axis_rate, here.axis);
+            body_[j].turning_slopes = slopes(here.axis_rate.angular, here.axis.angular);
             body_[j].acceleration_slopes = slopes(Z, 2.0 * here.axis_rate);
         }
         for (int j = tree.size() - 1; j >= 0; --j) {
@@ -223,8 +234,8 @@ class ForwardDynamics {
             const int size = block.end - block.begin, corner = block.begin * n + block.begin;
             for (int at = corner; at < block.end * n; at += n) {
                 for (int j = 0; j < size; ++j) {
-                    in_q[at + j] = -slopes_[at + j].q;
-                    in_v[at + j] = -slopes_[at + j].v;
+                    in_q[at + j] = -slopes_[at + j].q();
+                    in_v[at + j] = -slopes_[at + j].v();
                 }
                 in_force[at + at / n - block.begin] = 1.0 + acting_[at / n].by_f;
             }
@@ -234,26 +245,39 @@ class ForwardDynamics {
         }
     }
 
-    // How the accelerations of one block of b coordinates change (b, 3b) with q, v and force, once after
+    // How many columns of a slope are of each of q, v and force: b of a block of b coordinates, and a zero where b is
+    // odd.
+    static int slope_width(int size) { return size + size % 2; }
+
+    // How the accelerations of one block of b coordinates change (b, 3 widths) with q, v and force, once after
     // differentiate(): M^-1 (-tau_q, -tau_v - reach tau_q, 1) with reach = 0. Where q and v change with reach v and
-    // with other accelerations x_k (b, 3b) themselves, by in_q[k] x_k and in_v[k] x_k, that is added.
+    // with other accelerations x_k (b, 3 widths) themselves, by in_q[k] x_k and in_v[k] x_k, that is added.
     void slope(Block block, double* a, double reach, int others, const double* const* x, const double* in_q,
-               const double* in_v) const {
-        const int n = jet_.dof, size = block.end - block.begin, columns = 3 * size;
+               const double* in_v) {
+        const int n = jet_.dof, size = block.end - block.begin, width = slope_width(size), columns = 3 * width;
         for (int i = 0; i < size; ++i) {
             const Slopes* by = slopes_.data() + (block.begin + i) * n + block.begin;
+            const double own = 1.0 + acting_[block.begin + i].by_f;
             double* row = a + i * columns;
-            for (int j = 0; j < size; ++j) {
-                row[j] = -by[j].q;
-                row[size + j] = -by[j].v - reach * by[j].q;
-                row[2 * size + j] = i == j ? 1.0 + acting_[block.begin + i].by_f : 0.0;
+            // Written in pairs, as they are read next.
+            for (int j = 0; j < size; j += 2) {
+                const Slopes one = by[j], two = j + 1 < size ? by[j + 1] : Slopes();
+                put_pair(Pair{-one.q(), -two.q()}, row + j);
+                put_pair(Pair{-one.v() - reach * one.q(), -two.v() - reach * two.q()}, row + width + j);
+                put_pair(Pair{i == j ? own : 0.0, i == j + 1 ? own : 0.0}, row + 2 * width + j);
             }
-            for (int k = 0; k < others; ++k) {
-                if (in_q[k] == 0.0 && in_v[k] == 0.0) continue;
-                subtract_rows(
-                    row, columns, 0, size, [&](int j) { return in_q[k] * by[j].q + in_v[k] * by[j].v; },
-                    [&](int j) { return x[k] + j * columns; });
+        }
+        for (int k = 0; k < others; ++k) {
+            if (in_q[k] == 0.0 && in_v[k] == 0.0) continue;
+            const Pair share{in_q[k], in_v[k]};
+            for (int i = 0; i < size; ++i) {
+                const Slopes* by = slopes_.data() + (block.begin + i) * n + block.begin;
+                for (int j = 0; j < size; ++j) {
+                    const Pair parts = share * by[j].both;
+                    weights_[i * size + j] = parts[0] + parts[1];
+                }
             }
+            subtract_product(weights_.data(), size, size, x[k], columns, a);
         }
         solve_ldl_rows(ldl_.data(), n, block, a, columns, columns);
     }
@@ -262,7 +286,7 @@ class ForwardDynamics {
     struct BodyState {
         Inertia<double> inertia{};             // of the body alone
         Motion<double> acceleration{};         // A
-        Motion<Slopes> velocity_slopes{};      // U
+        Vec3<Slopes> turning_slopes{};         // U, angular
         Motion<Slopes> acceleration_slopes{};  // X
         Force<double> force{};                 // Phi
         Coupling coupling{};
@@ -319,17 +343,19 @@ class ForwardDynamics {
         const Force<double> F = here.inertia * here.axis;
         const Vec3<double> back = own.coupling.back(here.axis);
         const Force<double> turned = cross(here.axis, own.force);
-        Force<Slopes> moved = here.inertia * own.acceleration_slopes + own.coupling * own.velocity_slopes;
+        Force<Slopes> moved = here.inertia * own.acceleration_slopes + own.coupling * own.turning_slopes;
         moved += {slopes(turned.linear, {}), slopes(turned.angular, {})};
-        const int cj = link.coordinate;
+        Slopes* row = slopes_.data() + link.coordinate * n;
         for (int i = j; i >= 0; i = tree.bodies[i].parent) {
             const Body& above = tree.bodies[i];
             const BodyState& there = body_[i];
-            const int ci = above.coordinate;
-            const double ratio = above.ratio * link.ratio;
-            slopes_[cj * n + ci] +=
-                ratio * (dot(there.acceleration_slopes, F) + dot(there.velocity_slopes.angular, back));
-            if (i != j) slopes_[ci * n + cj] += ratio * dot(jet_.body[i].axis, moved);
+            row[above.coordinate] +=
+                (above.ratio * link.ratio) * (dot(there.acceleration_slopes, F) + dot(there.turning_slopes, back));
+        }
+        Slopes* column = slopes_.data() + link.coordinate;
+        for (int i = link.parent; i >= 0; i = tree.bodies[i].parent) {
+            const Body& above = tree.bodies[i];
+            column[above.coordinate * n] += (above.ratio * link.ratio) * dot(jet_.body[i].axis, moved);
         }
     }
 
@@ -344,6 +370,7 @@ class ForwardDynamics {
     std::vector<double> momentum_;                  // (n) where bodies are articulated
     std::vector<double> ldl_;                       // (n, n) factors of M
     std::vector<Slopes> slopes_;                    // (n, n) of inverse dynamics
+    std::vector<double> weights_;                   // (b, b) of them, in another stage's accelerations
 };
 
 }  // namespace varpin

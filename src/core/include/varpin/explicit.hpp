@@ -95,15 +95,15 @@ class ExplicitStepper {
         const int n = mechanism_->dof();
         const double *in_q = sum_q_.data(), *in_v = sum_v_.data();
         for (const Block& block : mechanism_->tree.blocks) {
-            const int size = block.end - block.begin;
-            for (int row = block.begin; row < block.end; ++row, in_q += 3 * size, in_v += 3 * size) {
+            const int size = block.end - block.begin, width = ForwardDynamics::slope_width(size);
+            for (int row = block.begin; row < block.end; ++row, in_q += 3 * width, in_v += 3 * width) {
                 for (auto [sum, at] : {std::pair{in_q, row}, {in_v, n + row}}) {
                     double* const x = Jx + at * 2 * n + block.begin;
                     double* const f = Jf + at * n + block.begin;
                     for (int c = 0; c < size; ++c) {
                         x[c] = sum[c];
-                        x[n + c] = sum[size + c];
-                        f[c] = sum[2 * size + c];
+                        x[n + c] = sum[width + c];
+                        f[c] = sum[2 * width + c];
                     }
                 }
                 Jx[row * 2 * n + row] += 1.0;
@@ -116,7 +116,10 @@ class ExplicitStepper {
   private:
     static int blocks_size(const Tree& tree) {
         int size = 0;
-        for (const Block& block : tree.blocks) size += 3 * (block.end - block.begin) * (block.end - block.begin);
+        for (const Block& block : tree.blocks) {
+            const int own = block.end - block.begin;
+            size += 3 * own * ForwardDynamics::slope_width(own);
+        }
         return size;
     }
 
@@ -148,7 +151,7 @@ class ExplicitStepper {
             const double* before[4] = {};
             for (int k = 0; k < i; ++k) before[k] = slope_[k].data() + first;
             dynamics.slope(block, slope_[i].data() + first, h * coefficients_.reach[i], i, before, in_q, in_v);
-            first += 3 * size * size;
+            first += 3 * size * ForwardDynamics::slope_width(size);
         }
     }
 
@@ -172,7 +175,7 @@ class ExplicitStepper {
     bool derivatives_;
     std::vector<double> stage_q_, stage_v_;
     std::vector<double> a_[4];           // (n) of each stage
-    std::vector<double> slope_[4];       // their derivatives (b, 3b) in q, v and force, block after block
+    std::vector<double> slope_[4];       // their derivatives (b, 3 widths) in q, v and force, block after block
     std::vector<double> sum_q_, sum_v_;  // of those at the end of a step
 };
 

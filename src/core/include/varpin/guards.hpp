@@ -209,18 +209,19 @@ class EnergyGuard {
         double least = infinity;
         for (const Block& block : mechanism.tree.blocks) {
             for (int i = block.begin; i < block.end; ++i) {
-                for (int j = block.begin; j <= i; ++j) {
-                    double inertia = 0.0, curvature = 0.0, coupling = 0.0;
-                    for (int s = 0; s < step.stages; ++s) {
-                        inertia += tableau.b[s] * step.stage[s].M[i * n + j];
-                        curvature += tableau.b[s] * step.stage[s].Lqq[i * n + j];
-                        if (tableau.skew != 0.0)
-                            coupling += tableau.b[s] * (step.stage[s].A[i * n + j] + step.stage[s].A[j * n + i]);
-                    }
-                    curved[i * n + j] = inertia - exaggerated * curvature + h * tableau.skew * coupling;
-                    mass[i * n + j] = inertia;
+                double *inertia = &mass[i * n], *line = &curved[i * n];
+                std::fill(inertia + block.begin, inertia + i + 1, 0.0);
+                for (int s = 0; s < step.stages; ++s)
+                    detail::subtract_scaled(inertia, -tableau.b[s], &step.stage[s].M[i * n], block.begin, i + 1);
+                std::copy(inertia + block.begin, inertia + i + 1, line + block.begin);
+                for (int s = 0; s < step.stages; ++s) {
+                    const Jet<double>& own = step.stage[s];
+                    detail::subtract_scaled(line, exaggerated * tableau.b[s], &own.Lqq[i * n], block.begin, i + 1);
+                    if (tableau.skew == 0.0) continue;
+                    const double twist = h * tableau.skew * tableau.b[s];
+                    for (int j = block.begin; j <= i; ++j) line[j] += twist * (own.A[i * n + j] + own.A[j * n + i]);
                 }
-                curved[i * n + i] += step.stiffening(i, 0.5 * h, exaggerated);
+                line[i] += step.stiffening(i, 0.5 * h, exaggerated);
             }
             least = std::min(least, least_pivot_ratio(curved.data(), mass.data(), n, block));
         }

@@ -253,14 +253,19 @@ template <class T>
 
 template <class T>
 void clear_first(Jet<T>& w) {
-    for (auto* sum : {&w.potential, &w.Lq, &w.Lv}) std::fill(sum->begin(), sum->end(), T{});
-    for (auto* sum : {&w.potential_scale, &w.Lq_scale, &w.Lv_scale}) std::fill(sum->begin(), sum->end(), 0.0);
+    std::fill(w.potential.begin(), w.potential.end(), T{});
+    std::fill(w.potential_scale.begin(), w.potential_scale.end(), 0.0);
+    for (int c = 0; c < w.dof; ++c) {
+        w.Lq[c] = w.Lv[c] = T{};
+        w.Lq_scale[c] = w.Lv_scale[c] = 0.0;
+    }
 }
 
 // Zero the blocks of a matrix; outside of them nothing is ever written.
 template <class T>
 void clear_blocks(const Tree& tree, std::vector<T>& matrix) {
     const int n = tree.dof();
+    if (tree.blocks.size() == 1) return std::fill(matrix.begin(), matrix.end(), T{});
     for (const Block& block : tree.blocks) {
         for (int i = block.begin; i < block.end; ++i) {
             std::fill(matrix.begin() + i * n + block.begin, matrix.begin() + i * n + block.end, T{});

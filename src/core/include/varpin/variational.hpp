@@ -227,12 +227,31 @@ class VariationalStepper {
         if (solved != Outcome::solved) return solved;
         const double margin = guards.active ? energy_guard.branch_margin(h, guards, equation) : infinity;
         if (!(margin > 0.0)) return Outcome::fold;
+        equation.stages == 1 ? advance(1, h, state) : advance(equation.stages, h, state);
+        const Outcome outcome = energy_guard.settle(guards, tableau, state.energies, state.place, state.v, trial);
+        if (outcome != Outcome::solved) return outcome;
+        effort.branch_margin = std::min(effort.branch_margin, margin);
+        ++effort.substeps;
+        std::swap(state.place, trial.place);
+        std::swap(state.p, trial.p);
+        for (int i = 0; i < n; ++i) {
+            unwind(i, state);
+            state.q[i] = state.place[i].shown();
+        }
+        std::copy(trial.momentum.begin(), trial.momentum.end(), state.momentum.begin());
+        std::copy(trial.v.begin(), trial.v.end(), state.v.begin());
+        return Outcome::solved;
+    }
+
+    // Where the root takes the path, into `trial`, and the work on the way.
+    [[gnu::always_inline]] inline void advance(const int stages, double h, const PathState& state) {
+        const Collocation& equation = step_equation;
         for (int c = 0; c < n; ++c) {
             double move = 0.0, impulse = 0.0;
             trial.work[c] = trial.dissipated[c] = trial.magnitude[c] = 0.0;
             // Whole turns are no distance.
             const double distance = std::min(std::abs(state.place[c].place.high), unwinds(c) ? Place::turn : infinity);
-            for (int i = 0; i < equation.stages; ++i) {
+            for (int i = 0; i < stages; ++i) {
                 const double share = h * tableau.b[i], velocity = equation.V[i * n + c];
                 const JointForce<double>& element = equation.acting[i * n + c];
                 move += tableau.b[i] * velocity;
@@ -247,19 +266,6 @@ class VariationalStepper {
             trial.place[c] = {state.place[c].place.plus(h * move), state.place[c].turns};
             trial.p[c] = state.p[c].plus(h * impulse);
         }
-        const Outcome outcome = energy_guard.settle(guards, tableau, state.energies, state.place, state.v, trial);
-        if (outcome != Outcome::solved) return outcome;
-        effort.branch_margin = std::min(effort.branch_margin, margin);
-        ++effort.substeps;
-        std::swap(state.place, trial.place);
-        std::swap(state.p, trial.p);
-        for (int i = 0; i < n; ++i) {
-            unwind(i, state);
-            state.q[i] = state.place[i].shown();
-        }
-        std::copy(trial.momentum.begin(), trial.momentum.end(), state.momentum.begin());
-        std::copy(trial.v.begin(), trial.v.end(), state.v.begin());
-        return Outcome::solved;
     }
 
     // Extrapolate the last whole step into the stage velocities. The polynomial through them and the velocity at its
