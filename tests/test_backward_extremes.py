@@ -8,7 +8,7 @@ import pytest
 import varpin as vp
 from varpin import core
 from varpin.linearization import linearize_steps
-from varpin.sddp.backward import TRUSTED, _one_pass, backward
+from varpin.sddp.backward import TRUSTED, _Along, _one_pass, backward
 from varpin.sddp.square_root import squares_of
 from varpin.simulation import simulate
 
@@ -80,7 +80,7 @@ def passes(A, B, gradient, hessian, end_gradient, end_hessian, h):
     steps = core.ExpandedSteps(
         A=A, B=B, G=nothing, Gx=np.zeros((N, x, 0, x)), Gu=np.zeros((N, x, 0, m)), rule=rule,
         gradient=gradient, hessian=hessian, velocity=np.zeros((0, x // 2, x)), curvature=np.zeros((0, x + m, x + m)),
-        slack=np.zeros((0, 2, m)), rate=np.zeros((0, m, m)), pull=np.zeros((0, m)),
+        slack=np.zeros((0, 2, m)), expected=np.zeros((0, x + m)), rate=np.zeros((0, m, m)), pull=np.zeros((0, m)),
     )  # fmt: skip
     for roots in (False, True):
         feedforward, feedback = np.zeros((N, m)), np.zeros((N, m, x))
@@ -179,7 +179,7 @@ def test_both_forms_agree_where_digits_are_plenty(name, regularization):
     controls = np.sin(np.arange(3 * problem.decisions)).reshape(-1, 3) * 0.4
     motion = vp.solve(problem, controls, max_iterations=0).trajectory
     (plain, first), (roots, second) = (
-        _one_pass(problem, motion, regularization, True, None, roots=roots) for roots in (False, True)
+        _one_pass(_Along(problem, motion), regularization, True, None, None, roots=roots) for roots in (False, True)
     )
     if problem.limited:
         at_limits = np.isclose(np.abs(motion.u[:: problem.hold] + plain.feedforward), 0.5)
