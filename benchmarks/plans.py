@@ -2,8 +2,8 @@
 
     PYTHONPATH=src python benchmarks/plans.py [--best FILE] [words that a task's name has]
 
-Five arms reach, track and carry, two links swing up; each task but the swing-ups' without limits and within them. Cold
-starts, all options as they are. ``--best FILE`` keeps the least cost that any run has found, and compares with it. What
+Five arms reach, without limits on their torques and within them; one carries a load, one follows a wave, and two links
+swing up. Cold starts, all options as they are. ``--best FILE`` keeps the least cost that any run has found, and compares with it. What
 is counted does not depend on the machine's load.
 """
 
