@@ -3,8 +3,8 @@
     PYTHONPATH=src python benchmarks/plans.py [--best FILE] [words that a task's name has]
 
 Five arms reach, without limits on their torques and within them; one carries a load, one follows a wave, and two links
-swing up. Cold starts, all options as they are. ``--best FILE`` keeps the least cost that any run has found, and compares with it. What
-is counted does not depend on the machine's load.
+swing up. Cold starts, all options as they are. ``--best FILE`` keeps the least cost that any run has found, and
+compares with it. What is counted does not depend on the machine's load.
 """
 
 from __future__ import annotations

@@ -28,9 +28,6 @@ Floats = NDArray[np.float64]
 # Nodes that are linearized at a time: their derivatives are not kept.
 _BLOCK = 2048
 
-# Passes that look for the controls that meet their limits, at most.
-_LOOKS = 10
-
 # A pass whose Quu rounding may have changed by more than this part is made anew on square roots.
 TRUSTED = 1e-9
 
@@ -156,22 +153,26 @@ def _within_limits(along: _Along, regularization: float, curvature: Floats | Non
 
     Around the nominal states alone, late decisions seem to meet their limits: each would have to do by itself what
     those before it are to do. So the first pass knows no limits. What its motion meets of them the next ones take into
-    account, until they meet no others.
+    account, until they meet no others. Where more and more of that changes, nominal states are what is left.
     """
     if not along.problem.limited:
         return _pass(along, regularization, curvature=curvature)[0]
-    plan, held = _pass(along, regularization, curvature=curvature)[0], None
-    for _ in range(_LOOKS):
+    plan = _pass(along, regularization, curvature=curvature)[0]
+    held: NDArray[np.bool_] = np.zeros(along.slack[:, 0].shape, dtype=np.bool_)
+    others = held.size + 1
+    while plan is not None and others > 0:
+        expected, moves = _foreseen(along, plan)
+        if not held.any() and not ((moves <= along.slack[:, 0]) | (moves >= along.slack[:, 1])).any():
+            break
+        plan = _pass(along, regularization, curvature=curvature, limits=_Limits(along.slack, expected))[0]
         if plan is None:
             break
-        expected, moves = _foreseen(along, plan)
-        met = (moves <= along.slack[:, 0]) | (moves >= along.slack[:, 1])
-        now = None if held is None else ~plan.feedback.any(axis=2)
-        if (held is None and not met.any()) or (now is not None and np.array_equal(now, held)):
-            break
-        held = np.zeros_like(met) if now is None else now
-        limits = _Limits(along.slack, expected)
-        plan = _pass(along, regularization, curvature=curvature, limits=limits)[0]
+        now = np.logical_not(plan.feedback.any(axis=2))
+        # Where motions run into limits for long, looking ahead may lead nowhere.
+        changed = int((now != held).sum())
+        if changed >= others:
+            plan = None
+        held, others = now, changed
     if plan is not None and plan.promise > 0.0:
         # Feed-forward parts hold together with the feedback that the others ask for: the slope is that of both.
         slope = float((plan.gradient * _foreseen(along, plan)[1]).sum())
