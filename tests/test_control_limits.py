@@ -157,7 +157,7 @@ def test_one_plan_solves_a_linear_quadratic_problem_with_limits(hold, rate, root
 
 @pytest.mark.parametrize(("effort", "speed"), [(1.0, 1.0), (0.1, 0.0)], ids=["on the way", "at the end alone"])
 def test_limits_that_the_optimum_does_not_touch(effort, speed):
-    """From a cold start, with a stiff end, they cost no iteration."""
+    """From a cold start, with a stiff end."""
     robot = vp.load_robot("z1", lock={"jointGripper": 0.0})
     begin = np.array([0.2, 1.2, -1.4, 0.1, -0.3, 0.2])
     goal = begin + np.array([0.7, -0.5, 0.6, -0.4, 0.5, -0.6])

@@ -107,9 +107,9 @@ def solve(
 
     Where controls have limits, each decision minimizes the model within them at the state that the linearized motion
     will have then, and a control at a limit has no feedback (after Tassa, Mansard and Todorov, "Control-limited
-    differential dynamic programming", 2014). Limits that the optimum does not touch cost no iterations. What
-    noise adds is then that of the linear feedback: that noise may drive a control into its limit is not in the model.
-    ``monte_carlo`` has it.
+    differential dynamic programming", 2014). Limits that the motions on the way do not run into cost no iterations.
+    What noise adds is then that of the linear feedback: that noise may drive a control into its limit is not in the
+    model. ``monte_carlo`` has it.
 
     Main args:
         problem: What to minimize.
