@@ -8,7 +8,7 @@ import pytest
 import varpin as vp
 from varpin import core
 from varpin.linearization import linearize_steps
-from varpin.sddp.backward import TRUSTED, _one_pass, backward
+from varpin.sddp.backward import TRUSTED, _Along, _foreseen, _Limits, _one_pass, backward
 from varpin.sddp.square_root import squares_of
 from varpin.simulation import simulate
 
@@ -80,7 +80,7 @@ def passes(A, B, gradient, hessian, end_gradient, end_hessian, h):
     steps = core.ExpandedSteps(
         A=A, B=B, G=nothing, Gx=np.zeros((N, x, 0, x)), Gu=np.zeros((N, x, 0, m)), rule=rule,
         gradient=gradient, hessian=hessian, velocity=np.zeros((0, x // 2, x)), curvature=np.zeros((0, x + m, x + m)),
-        slack=np.zeros((0, 2, m)), rate=np.zeros((0, m, m)), pull=np.zeros((0, m)),
+        slack=np.zeros((0, 2, m)), expected=np.zeros((0, x + m)), rate=np.zeros((0, m, m)), pull=np.zeros((0, m)),
     )  # fmt: skip
     for roots in (False, True):
         feedforward, feedback = np.zeros((N, m)), np.zeros((N, m, x))
@@ -172,18 +172,29 @@ OPTIONS = {
 
 
 @pytest.mark.parametrize("regularization", [0.0, 0.1])
-@pytest.mark.parametrize("name", OPTIONS)
-def test_both_forms_agree_where_digits_are_plenty(name, regularization):
-    """Noise, held controls, limits and every sampling mean the same to both."""
+@pytest.mark.parametrize(
+    ("name", "foresight"), [*((name, False) for name in OPTIONS), ("limited", True), ("held and limited", True)]
+)
+def test_both_forms_agree_where_digits_are_plenty(name, foresight, regularization):
+    """Noise, held controls, limits (where states are expected, too) and every sampling mean the same to both."""
     problem = reach(vp.planar_chain(3), 1e-2, 1.0, 10.0, **OPTIONS[name])
     controls = np.sin(np.arange(3 * problem.decisions)).reshape(-1, 3) * 0.4
     motion = vp.solve(problem, controls, max_iterations=0).trajectory
+    along, limits = _Along(problem, motion), None
+    if problem.limited:
+        expected = np.zeros((0, 9))
+        if foresight:
+            free = _one_pass(along, regularization, False, None, None, roots=False)[0]
+            expected = _foreseen(along, free)[0]
+        limits = _Limits(along.slack, expected)
     (plain, first), (roots, second) = (
-        _one_pass(problem, motion, regularization, True, None, roots=roots) for roots in (False, True)
+        _one_pass(along, regularization, True, None, limits, roots=roots) for roots in (False, True)
     )
     if problem.limited:
+        held = ~plain.feedback.any(axis=2)
+        assert 0.0 < held.mean() < 1.0
         at_limits = np.isclose(np.abs(motion.u[:: problem.hold] + plain.feedforward), 0.5)
-        assert 0.0 < at_limits.mean() < 1.0
+        assert at_limits[held].all()
     for field in ("feedforward", "feedback", "gradient", "spread", "slope", "curvature", "noise", "promise"):
         right = getattr(plain, field)
         near = 1e-9 * np.abs(right).max(initial=0.0)

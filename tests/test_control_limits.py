@@ -8,6 +8,7 @@ from test_sddp import sliders
 import varpin as vp
 from varpin.core import box_minimum
 from varpin.robot.kinematics import frame_kinematics
+from varpin.sddp import backward as passes
 from varpin.sddp.backward import backward
 
 
@@ -128,6 +129,65 @@ def test_linear_quadratic_problem_with_limits(integrator, hold):
     assert not sol.violations.any
 
 
+@pytest.mark.parametrize("roots", [False, True], ids=["plain", "square roots"])
+@pytest.mark.parametrize(("hold", "rate"), [(1, None), (5, None), (1, 2e-3), (5, 2e-3)])
+def test_one_plan_solves_a_linear_quadratic_problem_with_limits(hold, rate, roots, monkeypatch):
+    """Which controls meet their limits is found before anything moves: SciPy's solution after one step."""
+    if roots:
+        monkeypatch.setattr(passes, "TRUSTED", 0.0)
+    lower, upper = np.array([-3.0, -0.8]), np.array([2.0, 5.0])
+    problem = pushed((lower, upper), integrator=vp.Midpoint(), hold=hold, dt=0.2 / hold, steps=10 * hold)
+    if rate is not None:
+        problem = vp.OptimalControlProblem(
+            problem.scene, problem.cost + vp.ControlRateCost(rate), problem.q0, problem.v0, dt=problem.dt,
+            steps=problem.steps, hold=hold, integrator=vp.Midpoint(), control_limits=(lower, upper),
+        )  # fmt: skip
+    sol = vp.solve(problem, max_iterations=1)
+    g, H = transcribed(problem)
+    L = np.linalg.cholesky(H)
+    R = problem.decisions
+    bounds = np.tile(lower, R), np.tile(upper, R)
+    reference = lsq_linear(L.T, -np.linalg.solve(L, g), bounds, method="bvls", tol=1e-15, max_iter=1000).x
+    np.testing.assert_allclose(sol.controls.ravel(), reference, atol=2e-5)
+    assert ((sol.controls == lower) | (sol.controls == upper)).sum() >= 2
+    first = sol.history[0]
+    assert first.step == 1.0
+    np.testing.assert_allclose(first.decrease, first.promised_decrease, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("effort", "speed"), [(1.0, 1.0), (0.1, 0.0)], ids=["on the way", "at the end alone"])
+def test_limits_that_the_optimum_does_not_touch(effort, speed):
+    """From a cold start, with a stiff end."""
+    robot = vp.load_robot("z1", lock={"jointGripper": 0.0})
+    begin = np.array([0.2, 1.2, -1.4, 0.1, -0.3, 0.2])
+    goal = begin + np.array([0.7, -0.5, 0.6, -0.4, 0.5, -0.6])
+    cost = vp.ControlCost(effort / robot.effort_limit**2) + speed * vp.VelocityCost(1.0)
+    cost += vp.Terminal(vp.TrackingCost(goal, 1e4) + vp.VelocityCost(1e3))
+    scene = vp.Scene(robot, damping="robot")
+    free, limited = (
+        vp.solve(
+            vp.OptimalControlProblem(scene, cost, begin, np.zeros(6), dt=0.02, steps=50, control_limits=limits),
+            check=False,
+        )
+        for limits in ((-np.inf, np.inf), (-robot.effort_limit, robot.effort_limit))
+    )
+    assert (np.abs(free.controls) < robot.effort_limit).all()
+    assert limited.status.converged
+    assert limited.iterations <= free.iterations + 1
+    np.testing.assert_allclose(limited.cost, free.cost, rtol=1e-6)
+    np.testing.assert_allclose(limited.controls, free.controls, atol=1e-3)
+
+
+def around_the_nominal_states(problem, motion, second_order):
+    along = passes._Along(problem, motion)
+    curvature = None
+    if second_order:
+        plan, costate = passes._pass(along, 1e-3, costates=True)
+        curvature = passes._curvature(problem, motion, plan, costate)
+    limits = passes._Limits(along.slack, np.zeros((0, 18)))
+    return passes._pass(along, 0.0, curvature=curvature, limits=limits)[0]
+
+
 @pytest.mark.parametrize("second_order", [False, True])
 def test_each_decision_is_the_minimum_in_its_box(load, second_order):
     """Along any motion: the last decision against SciPy, on the model that the same pass without limits leaves."""
@@ -143,7 +203,8 @@ def test_each_decision_is_the_minimum_in_its_box(load, second_order):
     )
     motion = vp.solve(problem, max_iterations=0).trajectory
     free = vp.OptimalControlProblem(scene, cost, begin, np.zeros(6), dt=1e-2, steps=2, integrator=vp.Midpoint())
-    within, without = (backward(p, motion, 0.0, second_order) for p in (problem, free))
+    without = backward(free, motion, 0.0, second_order)
+    within = around_the_nominal_states(problem, motion, second_order)
     # The last decision's Q: its gradient is the cost's own, and its Hessian that of the cost in the last control.
     Qu = without.gradient[-1]
     tail = problem.at(q0=motion.q[1], v0=motion.v[1], steps=1)

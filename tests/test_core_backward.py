@@ -33,6 +33,7 @@ def random_steps(dof, m, k, *, seed, steps=6, hold=1, samples=2, velocity=True, 
         "velocity": rng.normal(size=(steps + 1, dof, x) if velocity else (0, dof, x)),
         "curvature": curvature if curved else np.zeros((0, size, size)),
         "slack": np.zeros((0, 2, m)),
+        "expected": np.zeros((0, size)),
         "rate": definite(decisions, m) if rated else np.zeros((0, m, m)),
         "pull": rng.normal(size=(decisions if rated else 0, m)),
     }

@@ -33,7 +33,7 @@ std::vector<Sample> rule_of(In<2> rule) {
 // Steps that keep the arrays they look at; what may be left out is empty then.
 struct HeldSteps {
     HeldSteps(In<3> A_, In<3> B_, In<3> G_, In<4> Gx_, In<4> Gu_, In<2> rule, In<2> gradient_, In<3> hessian_,
-              In<3> velocity_, In<3> curvature_, In<3> slack_, In<3> rate_, In<2> pull_)
+              In<3> velocity_, In<3> curvature_, In<3> slack_, In<2> expected_, In<3> rate_, In<2> pull_)
         : A(A_),
           B(B_),
           G(G_),
@@ -44,6 +44,7 @@ struct HeldSteps {
           velocity(velocity_),
           curvature(curvature_),
           slack(slack_),
+          expected(expected_),
           rate(rate_),
           pull(pull_) {
         const std::size_t N = A.shape(0), x = A.shape(1), m = B.shape(2), k = G.shape(2), size = x + m;
@@ -73,6 +74,7 @@ struct HeldSteps {
                  .velocity = given(velocity, "velocity", {N + 1, x / 2, x}) ? velocity.data() : nullptr,
                  .curvature = given(curvature, "curvature", {N, size, size}) ? curvature.data() : nullptr,
                  .slack = R > 0 && given(slack, "slack", {R, 2, m}) ? slack.data() : nullptr,
+                 .expected = given(expected, "expected", {R, size}) ? expected.data() : nullptr,
                  .rate = rated > 0 && given(rate, "rate", {rated, m, m}) ? rate.data() : nullptr,
                  .pull = rated > 0 ? pull.data() : nullptr};
         require(pull, "pull", {rated, m});
@@ -81,7 +83,9 @@ struct HeldSteps {
     In<3> A, B, G;
     In<4> Gx, Gu;
     In<2> gradient;
-    In<3> hessian, velocity, curvature, slack, rate;
+    In<3> hessian, velocity, curvature, slack;
+    In<2> expected;
+    In<3> rate;
     In<2> pull;
     ExpandedSteps steps;
 };
@@ -183,6 +187,19 @@ std::ptrdiff_t run_on_roots(RootPass& pass, double h, int hold, double regulariz
     return pass.run(h, hold, regularization, steps, samples, changes, gains);
 }
 
+// Where the linearized motion goes under gains from `state`: expected (R, 2n + m), moves (R, m), and the state then.
+void foresee(int hold, const HeldSteps& given, const HeldGains& held, InOut<1> state, InOut<2> expected,
+             InOut<2> moves) {
+    const Gains gains = held.fitting(given, hold);
+    const auto R = static_cast<std::size_t>(given.steps.steps / hold);
+    const auto m = static_cast<std::size_t>(given.steps.controls), size = static_cast<std::size_t>(given.steps.size());
+    require(state, "state", {size});
+    require(expected, "expected", {R, size});
+    require(moves, "moves", {R, m});
+    nb::gil_scoped_release release;
+    predict(hold, given.steps, gains, state.data(), expected.data(), moves.data());
+}
+
 template <class Pass>
 void define_results(nb::class_<Pass>& type) {
     type.def_prop_ro("slope", [](const Pass& pass) { return pass.found.slope; })
@@ -213,9 +230,10 @@ std::optional<std::tuple<Out, Out, nb::ndarray<nb::numpy, bool>>> box_minimum(In
 
 void register_backward(nb::module_& m) {
     nb::class_<HeldSteps>(m, "ExpandedSteps")
-        .def(nb::init<In<3>, In<3>, In<3>, In<4>, In<4>, In<2>, In<2>, In<3>, In<3>, In<3>, In<3>, In<3>, In<2>>(),
+        .def(nb::init<In<3>, In<3>, In<3>, In<4>, In<4>, In<2>, In<2>, In<3>, In<3>, In<3>, In<3>, In<2>, In<3>,
+                      In<2>>(),
              nb::kw_only(), "A"_a, "B"_a, "G"_a, "Gx"_a, "Gu"_a, "rule"_a, "gradient"_a, "hessian"_a, "velocity"_a,
-             "curvature"_a, "slack"_a, "rate"_a, "pull"_a);
+             "curvature"_a, "slack"_a, "expected"_a, "rate"_a, "pull"_a);
     nb::class_<HeldGains>(m, "Gains")
         .def(nb::init<InOut<2>, InOut<3>, InOut<3>, InOut<2>, InOut<2>, InOut<3>>(), nb::kw_only(),
              "feedforward"_a.noconvert(), "feedback"_a.noconvert(), "previous"_a.noconvert(),
@@ -230,6 +248,8 @@ void register_backward(nb::module_& m) {
         .def("run", &run_on_roots, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "running"_a,
              "change"_a.none() = nb::none());
     define_results(root_pass);
+    m.def("foresee", &foresee, "hold"_a, "steps"_a, "gains"_a, "state"_a.noconvert(), "expected"_a.noconvert(),
+          "moves"_a.noconvert());
     m.def("box_minimum", &box_minimum, "H"_a, "g"_a, "limits"_a, "guess"_a);
 }
 

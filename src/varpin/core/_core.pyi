@@ -223,6 +223,7 @@ class ExpandedSteps:
         velocity: Floats,
         curvature: Floats,
         slack: Floats,
+        expected: Floats,
         rate: Floats,
         pull: Floats,
     ) -> None:
@@ -291,6 +292,13 @@ class RootPass(_Found):
         change: Squares | None = None,
     ) -> int:
         """As that of :class:`BackwardPass`; ``running`` are the samples' costs, ``change`` those of R changes."""
+
+def foresee(hold: int, steps: ExpandedSteps, gains: Gains, state: Floats, expected: Floats, moves: Floats) -> None:
+    """Where the linearized motion goes under gains, each control clipped to its limits.
+
+    ``state`` (2n + m,), the deviations before the first step of the state and of the control before it, becomes those
+    after the last; ``expected`` (R, 2n + m) are those before each decision, ``moves`` (R, m) the controls' changes.
+    """
 
 def box_minimum(H: Floats, g: Floats, limits: Floats, guess: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]] | None:
     """The x (m,) within ``limits`` (2, m) that minimizes g . x + (1/2) x'Hx; None where H is not positive definite.

@@ -138,28 +138,154 @@ def backward(
     Raises:
         LinearizationError: A step has no derivative.
     """
+    along = _Along(problem, trajectory)
     if not second_order:
-        return _pass(problem, trajectory, regularization)[0]
+        return _within_limits(along, regularization, None)
     # First derivatives of the cost to go, then with them second derivatives of the dynamics (stagewise Newton).
-    plan, costate = _pass(problem, trajectory, max(regularization, 1e-3), costates=True)
+    plan, costate = _pass(along, max(regularization, 1e-3), costates=True)
     if plan is None:
         return None
-    return _pass(problem, trajectory, regularization, curvature=_curvature(problem, trajectory, plan, costate))[0]
+    return _within_limits(along, regularization, _curvature(problem, trajectory, plan, costate))
+
+
+def _within_limits(along: _Along, regularization: float, curvature: Floats | None) -> Plan | None:
+    """The pass whose controls are kept within their limits where the linearized motion is expected.
+
+    Around the nominal states alone, late decisions seem to meet their limits: each would have to do by itself what
+    those before it are to do. So the first pass knows no limits. What its motion meets of them the next ones take into
+    account, until they meet no others. Where more and more of that changes, nominal states are what is left.
+    """
+    if not along.problem.limited:
+        return _pass(along, regularization, curvature=curvature)[0]
+    plan = _pass(along, regularization, curvature=curvature)[0]
+    held: NDArray[np.bool_] = np.zeros(along.slack[:, 0].shape, dtype=np.bool_)
+    others = held.size + 1
+    while plan is not None and others > 0:
+        expected, moves = _foreseen(along, plan)
+        if not held.any() and not ((moves <= along.slack[:, 0]) | (moves >= along.slack[:, 1])).any():
+            break
+        plan = _pass(along, regularization, curvature=curvature, limits=_Limits(along.slack, expected))[0]
+        if plan is None:
+            break
+        now = np.logical_not(plan.feedback.any(axis=2))
+        # Where motions run into limits for long, looking ahead may lead nowhere.
+        changed = int((now != held).sum())
+        if changed >= others:
+            plan = None
+        held, others = now, changed
+    if plan is not None and plan.promise > 0.0:
+        # Feed-forward parts hold together with the feedback that the others ask for: the slope is that of both.
+        slope = float((plan.gradient * _foreseen(along, plan)[1]).sum())
+        if slope < 0.0:
+            return replace(plan, slope=slope, curvature=-2.0 * (plan.promise + slope), limited=True)
+    nominal = _Limits(along.slack, np.zeros((0, along.running.gradient.shape[1])))
+    return _pass(along, regularization, curvature=curvature, limits=nominal)[0]
+
+
+def _foreseen(along: _Along, plan: Plan) -> tuple[Floats, Floats]:
+    """Where the linearized motion goes under a plan whose controls are clipped to their limits.
+
+    The state, and the change of the control before, before each decision (R, 2n + m), and the controls' changes (R, m).
+    """
+    problem, (R, m, x) = along.problem, plan.feedback.shape
+    expected, moves, state = np.empty((R, x + m)), np.empty((R, m)), np.zeros(x + m)
+    previous = np.zeros((0, m, m)) if plan.previous is None else plan.previous
+    for begin, end in along.blocks:
+        rows = slice(begin // problem.hold, end // problem.hold)
+        gains = core.Gains(
+            feedforward=plan.feedforward[rows],
+            feedback=plan.feedback[rows],
+            previous=previous[rows],
+            control_gradient=plan.gradient[rows],
+            costate=np.zeros((0, x)),
+            spread=plan.spread[begin:end],
+        )
+        steps = along.steps(begin, end, None, _Limits(along.slack, np.zeros((0, x + m))))
+        core.foresee(problem.hold, steps, gains, state, expected[rows], moves[rows])
+    return expected, moves
+
+
+class _Limits(NamedTuple):
+    """What keeps controls within their limits: their ``slack`` (R, 2, m), and the states expected (R, 2n + m).
+
+    Either may be empty: without limits, and around the nominal states.
+    """
+
+    slack: Floats
+    expected: Floats
+
+
+class _Along:
+    """What passes along a motion are made from; the linearization is kept where it is one block."""
+
+    def __init__(self, problem: OptimalControlProblem, trajectory: Trajectory) -> None:
+        self.problem, self.trajectory = problem, trajectory
+        m = problem.scene.controls
+        self.running = problem.expand_running(trajectory)
+        for name, array in (("gradient", self.running.gradient), ("Hessian", self.running.hessian)):
+            if not np.isfinite(array).all():
+                raise CostError(repr(problem.cost), f"its {name} along the motion is not finite")
+        self.rate, self.pull = np.zeros((0, m, m)), np.zeros((0, m))
+        if problem.rate is not None:
+            self.pull, self.rate = problem.rate.expand(trajectory.u[:: problem.hold], problem.period)
+        self.slack = np.zeros((0, 2, m))
+        if problem.limited:
+            self.slack = problem.control_limits - trajectory.u[:: problem.hold, None]
+        block = max(1, _BLOCK // problem.hold) * problem.hold
+        self.blocks = [(max(0, end - block), end) for end in range(problem.steps, 0, -block)][::-1]
+        self.kept: tuple[Linearization, Floats] | None = None
+
+    def linearized(self, begin: int, end: int) -> tuple[Linearization, Floats]:
+        """A block of steps, and dv/dx at its nodes where they are needed."""
+        if self.kept is not None:
+            return self.kept
+        problem, part = self.problem, self.trajectory.part(begin, end)
+        # Velocities at nodes are needed where they are sampled and x does not hold them.
+        nodes = problem.integrator.variational and bool(problem.rule[:, [2, 4, 6, 8]].any())
+        lin = _linearize(problem, part, begin)
+        n = problem.scene.robot.dof
+        velocity = velocity_at_nodes(problem.scene, part.q, part.v) if nodes else np.zeros((0, n, 2 * n))
+        if len(self.blocks) == 1:
+            self.kept = lin, velocity
+        return lin, velocity
+
+    def steps(self, begin: int, end: int, curvature: Floats | None, limits: _Limits) -> core.ExpandedSteps:
+        """A block of steps as the core takes them."""
+        problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.rule)
+        size = hessian.shape[-1]
+        rows, points = slice(begin // problem.hold, end // problem.hold), slice(begin * samples, end * samples)
+        lin, velocity = self.linearized(begin, end)
+        return core.ExpandedSteps(
+            A=lin.A,
+            B=lin.B,
+            G=lin.G,
+            Gx=lin.Gx,
+            Gu=lin.Gu,
+            rule=problem.rule,
+            gradient=self.running.gradient[points],
+            hessian=hessian[points] if len(hessian) > 1 else hessian,
+            velocity=velocity,
+            curvature=np.zeros((0, size, size)) if curvature is None else curvature[begin:end],
+            slack=limits.slack[rows],
+            expected=limits.expected[rows],
+            rate=self.rate[rows],
+            pull=self.pull[rows],
+        )
 
 
 def _pass(
-    problem: OptimalControlProblem,
-    trajectory: Trajectory,
+    along: _Along,
     regularization: float,
     *,
     costates: bool = False,
     curvature: Floats | None = None,
+    limits: _Limits | None = None,
 ) -> tuple[Plan | None, Floats]:
     """The pass by the plain recursion, or, where that has lost its digits and the model is convex, on square roots."""
-    plain = _one_pass(problem, trajectory, regularization, costates, curvature, roots=False)
+    plain = _one_pass(along, regularization, costates, curvature, limits, roots=False)
     if curvature is not None or (plain[0] is not None and plain[0].loss <= TRUSTED):
         return plain
-    by_roots = _one_pass(problem, trajectory, regularization, costates, None, roots=True)
+    by_roots = _one_pass(along, regularization, costates, None, limits, roots=True)
     return plain if by_roots[0] is None else by_roots
 
 
@@ -172,70 +298,39 @@ class _ByRoots(NamedTuple):
 
 
 def _one_pass(
-    problem: OptimalControlProblem,
-    trajectory: Trajectory,
+    along: _Along,
     regularization: float,
     costates: bool,
     curvature: Floats | None,
+    limits: _Limits | None,
     *,
     roots: bool,
 ) -> tuple[Plan | None, Floats]:
+    problem, running = along.problem, along.running
     scene = problem.scene
     n, m, k, N, R = scene.robot.dof, scene.controls, scene.processes, problem.steps, problem.decisions
-    size = 2 * n + m
-    terminal, D, by_state, by_states = _terminal(problem, trajectory, curvature is not None)
-    running = problem.expand_running(trajectory)
-    for name, array in (("gradient", running.gradient), ("Hessian", running.hessian)):
-        if not np.isfinite(array).all():
-            raise CostError(repr(problem.cost), f"its {name} along the motion is not finite")
+    terminal, D, by_state, by_states = _terminal(problem, along.trajectory, curvature is not None)
     noisy = N if k else 0
     jumps, spread = np.empty((noisy, 2 * n, n)), np.empty((noisy, 2 * n, 2 * n))
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, 2 * n)), np.empty((R, m))
-    rate, pull = np.zeros((0, m, m)), np.zeros((0, m))
-    if problem.rate is not None:
-        pull, rate = problem.rate.expand(trajectory.u[:: problem.hold], problem.period)
-    previous = np.empty(rate.shape)
+    previous = np.empty(along.rate.shape)
     costate = np.empty((N if costates else 0, 2 * n))
-    hessian = running.hessian
     plain, by_roots = core.BackwardPass(m, by_state, by_states), None
     if roots:
-        final, squares = squares_of(terminal.gradient, terminal.hessian), squares_of(running.gradient, hessian)
-        change = squares_of(pull, rate)
+        final, squares = squares_of(terminal.gradient, terminal.hessian), squares_of(running.gradient, running.hessian)
+        change = squares_of(along.pull, along.rate)
         if final is None or squares is None or change is None:
             return None, costate
         by_roots = _ByRoots(core.RootPass(m, final.after(D).core, by_state), squares, change)
-    rule = problem.rule
-    samples = len(rule)
-    # Velocities at nodes are needed where they are sampled and x does not hold them.
-    nodes = problem.integrator.variational and bool(rule[:, [2, 4, 6, 8]].any())
-    slack = np.zeros((0, 2, m))
-    if problem.limited:
-        slack = problem.control_limits - trajectory.u[:: problem.hold, None]
-    block = max(1, _BLOCK // problem.hold) * problem.hold
-    for end in range(N, 0, -block):
-        begin = max(0, end - block)
-        part, steps = trajectory.part(begin, end), slice(begin, end)
+    if limits is None:
+        limits = _Limits(np.zeros((0, 2, m)), np.zeros((0, 2 * n + m)))
+    samples = len(problem.rule)
+    for begin, end in reversed(along.blocks):
+        steps, points = slice(begin, end), slice(begin * samples, end * samples)
         rows = slice(begin // problem.hold, end // problem.hold)
-        lin = _linearize(problem, part, begin)
         if k:
-            jumps[steps] = lin.J
-        velocity = velocity_at_nodes(scene, part.q, part.v) if nodes else np.zeros((0, n, 2 * n))
-        points = slice(begin * samples, end * samples)
-        given = core.ExpandedSteps(
-            A=lin.A,
-            B=lin.B,
-            G=lin.G,
-            Gx=lin.Gx,
-            Gu=lin.Gu,
-            rule=rule,
-            gradient=running.gradient[points],
-            hessian=hessian[points] if len(hessian) > 1 else hessian,
-            velocity=velocity,
-            curvature=np.zeros((0, size, size)) if curvature is None else curvature[steps],
-            slack=slack[rows],
-            rate=rate[rows],
-            pull=pull[rows],
-        )
+            jumps[steps] = along.linearized(begin, end)[0].J
+        given = along.steps(begin, end, curvature, limits)
         gains = core.Gains(
             feedforward=feedforward[rows],
             feedback=feedback[rows],
@@ -265,7 +360,7 @@ def _one_pass(
         found.noise,
         jumps,
         spread,
-        problem.limited,
+        limits.slack.size > 0,
         found.loss,
         Model(running, terminal),
     )

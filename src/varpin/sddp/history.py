@@ -50,7 +50,8 @@ class Iteration:
         step: Length of the step taken, in (0, 1]; 0 if none was.
         regularization: Relative to the diagonal of Quu.
         gradient: Largest entry of the cost's gradient in the controls.
-        backward_passes: How many it took.
+        backward_passes: How many it took, with other regularizations; looking for the controls that meet their limits,
+            on the same derivatives, does not count.
         rollouts: Trials of the line search.
         seconds: It took [s].
     """

@@ -105,9 +105,11 @@ def solve(
     Ctrl-C ends the search and returns the best motion so far, with ``status`` INTERRUPTED, as long as there is one: the
     first motion has been integrated. ``solve(problem, plan)`` goes on from there.
 
-    Where controls have limits, each decision minimizes the model within them, and a control at a limit has no feedback
-    (Tassa, Mansard and Todorov, "Control-limited differential dynamic programming", 2014). What noise adds is then that
-    of the linear feedback: that noise may drive a control into its limit is not in the model. ``monte_carlo`` has it.
+    Where controls have limits, each decision minimizes the model within them at the state that the linearized motion
+    will have then, and a control at a limit has no feedback (after Tassa, Mansard and Todorov, "Control-limited
+    differential dynamic programming", 2014). Limits that the motions on the way do not run into cost no iterations.
+    What noise adds is then that of the linear feedback: that noise may drive a control into its limit is not in the
+    model. ``monte_carlo`` has it.
 
     Main args:
         problem: What to minimize.

@@ -52,6 +52,7 @@ class BackwardPass {
           Qux(m, x),
           rest(m, x),
           residual(m),
+          pulled(m),
           box(m) {
         for (int i = 0; i < x; ++i) {
             gradient[i] = costate[i] = terminal_gradient[i];
@@ -203,8 +204,8 @@ class BackwardPass {
 
     // Gains of decision r, and the value under them; false where Quu is not positive definite.
     //
-    // Within limits the feed-forward part minimizes the model there, and controls at a limit have no feedback (Tassa,
-    // Mansard and Todorov 2014).
+    // Within limits the decision minimizes the model where the state is expected, and controls at a limit have no
+    // feedback (Tassa, Mansard and Todorov 2014, who expect the nominal state).
     bool decide(double regularization, const ExpandedSteps& steps, std::ptrdiff_t r, const Gains& gains) {
         const double* rate = steps.rate ? steps.rate + r * m * m : nullptr;
         const double* pull = steps.rate ? steps.pull + r * m : nullptr;
@@ -216,9 +217,8 @@ class BackwardPass {
         for (int i = 0; i < m; ++i) k[i] = -Qz[x + i];
         solve_ldl(factors.data(), m, {0, m}, k, k);
         if (steps.slack) {
-            const double* slack = steps.slack + r * 2 * m;
-            if (!box.solve(Quu.data(), Qz.data() + x, slack, slack + m, k)) return false;
-            factors = box.factors;
+            const double* ahead = steps.expected ? steps.expected + r * size : nullptr;
+            if (!keep_within(steps.slack + r * 2 * m, ahead, rate, k)) return false;
         }
         for (int i = 0; i < m; ++i) {
             if (box.held[i]) continue;
@@ -230,6 +230,40 @@ class BackwardPass {
         std::copy_n(Cz.begin() + x, m, gains.control_gradient + r * m);
         minimized_value(k);
         if (rate) value_of_previous(rate, pull, k, gains.previous + r * m * m);
+        return true;
+    }
+
+    // k within limits where the state, and the control before, are `ahead` of the nominal ones (2n + m), or at those if
+    // null; its free part holds for deviations from the nominal ones again.
+    bool keep_within(const double* slack, const double* ahead, const double* rate, double* k) {
+        const double* Qu = Qz.data() + x;
+        std::copy_n(Qu, m, pulled.data());
+        if (ahead) {
+            for (int i = 0; i < m; ++i) {
+                for (int c = 0; c < x; ++c) pulled[i] += Q[x + i][c] * ahead[c];
+                if (!rate) continue;
+                for (int c = 0; c < m; ++c) pulled[i] -= rate[i * m + c] * ahead[x + c];
+            }
+            for (int i = 0; i < m; ++i) k[i] = -pulled[i];
+            solve_ldl(factors.data(), m, {0, m}, k, k);
+        }
+        if (!box.solve(Quu.data(), pulled.data(), slack, slack + m, k)) return false;
+        factors = box.factors;
+        if (!ahead) return true;
+        for (int i = 0; i < m; ++i) {
+            if (box.held[i]) continue;
+            pulled[i] = -Qu[i];
+            for (int j = 0; j < m; ++j) {
+                if (box.held[j]) pulled[i] -= Quu[i * m + j] * k[j];
+            }
+        }
+        for (int i = 0; i < m; ++i) {
+            if (box.held[i]) pulled[i] = k[i];
+        }
+        solve_ldl(factors.data(), m, {0, m}, pulled.data(), k);
+        for (int i = 0; i < m; ++i) {
+            if (box.held[i]) k[i] = pulled[i];
+        }
         return true;
     }
 
@@ -363,6 +397,7 @@ class BackwardPass {
     std::vector<double> Quu, factors;  // (m, m) regularized; L D L' of its free part
     TiledMatrix K, Qux, rest;          // (m, x); the last is Quu K + Qux
     std::vector<double> residual;      // (m) Quu k + Qu
+    std::vector<double> pulled;        // (m) the gradient where the state is expected
     BoxMinimum box;
 };
 

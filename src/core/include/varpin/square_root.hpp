@@ -88,6 +88,7 @@ class RootPass {
           own(m),
           weight(m),
           Qu(m),
+          pulled(m),
           moved(m),
           forced(m),
           H(m * m),
@@ -269,7 +270,8 @@ class RootPass {
         }
         const bool regular = regularize(regularization, largest);
         double* k = gains.feedforward + r * m;
-        if (!minimize(steps.slack ? steps.slack + r * 2 * m : nullptr, others, k)) return false;
+        const double* ahead = steps.expected ? steps.expected + r * size : nullptr;
+        if (!minimize(steps.slack ? steps.slack + r * 2 * m : nullptr, ahead, others, k)) return false;
         for (int i = 0; i < m; ++i) {
             std::copy_n(&K[i * others], x, gains.feedback + (r * m + i) * x);
             if (steps.rate) std::copy_n(&K[i * others + x], m, gains.previous + (r * m + i) * m);
@@ -317,8 +319,8 @@ class RootPass {
         return false;
     }
 
-    // k and K (m, others) from the firm rows, within limits if there are any.
-    bool minimize(const double* slack, int others, double* k) {
+    // k and K (m, others) from the firm rows, within limits if there are any, where the state is `ahead` if not null.
+    bool minimize(const double* slack, const double* ahead, int others, double* k) {
         std::fill_n(k, m, 0.0);
         std::fill_n(K.begin(), m * others, 0.0);
         if (slack) {
@@ -329,7 +331,13 @@ class RootPass {
                     for (int l = 0; l <= std::min(i, j); ++l) H[i * m + j] += firm[l][i] * firm[l][j];
                 }
             }
-            if (!box.solve(H.data(), Qu.data(), slack, slack + m, k)) return false;
+            pulled = Qu;
+            for (int i = 0; ahead && i < m; ++i) {
+                for (int l = 0; l <= i; ++l) {
+                    for (int c = 0; c < others; ++c) pulled[i] += stack[l][i] * stack[l][m + c] * ahead[c];
+                }
+            }
+            if (!box.solve(H.data(), pulled.data(), slack, slack + m, k)) return false;
         }
         int count = 0;
         for (int i = 0; i < m; ++i) {
@@ -353,7 +361,7 @@ class RootPass {
             if (!idle) found.loss = std::max(found.loss, epsilon * std::max(scale[x + control], own[control]) / pivot);
         }
         solve_free(count, others, k);
-        if (slack) {
+        if (slack && !ahead) {
             for (int i = 0; i < m; ++i) k[i] = std::min(std::max(k[i], slack[i]), slack[m + i]);
         }
         return true;
@@ -436,9 +444,10 @@ class RootPass {
     std::vector<double> gradient;  // (size) the next costate
     std::vector<double> terms;     // (size) the next scale
     // And of a decision.
-    RowStack firm, U;                             // rows of the controls, regularized; of the free ones
-    std::vector<double> own, weight;              // (m) norms of the controls' columns; regularization
-    std::vector<double> Qu, moved, forced, H, K;  // gradient; R_uu k; U'^-1 linear; (m, m); (m, others)
+    RowStack firm, U;                         // rows of the controls, regularized; of the free ones
+    std::vector<double> own, weight;          // (m) norms of the controls' columns; regularization
+    std::vector<double> Qu, pulled;           // gradient, also where the state is expected
+    std::vector<double> moved, forced, H, K;  // R_uu k; U'^-1 linear; (m, m); (m, others)
     std::vector<int> free;
     BoxMinimum box;
 };

@@ -2,6 +2,7 @@
 // of 2n entries and m controls. docs/mathematics.md, "The backward pass".
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <vector>
 
@@ -35,8 +36,11 @@ struct ExpandedSteps {
     const double* curvature = nullptr;  // (N, 2n + m, 2n + m) to be added to the Hessian in (x, u), or null
     // Of R decisions:
     const double* slack = nullptr;  // (R, 2, m) least and greatest change of each control, or null without limits
-    const double* rate = nullptr;   // (R, m, m) Hessian of what the change from the control before costs, or null
-    const double* pull = nullptr;   // (R, m) its gradient in the control
+    // (R, 2n + m) where the state, and the control before, are expected when a decision is made: there controls are
+    // kept within their limits; null for the nominal ones.
+    const double* expected = nullptr;
+    const double* rate = nullptr;  // (R, m, m) Hessian of what the change from the control before costs, or null
+    const double* pull = nullptr;  // (R, m) its gradient in the control
 
     int states() const { return 2 * dof; }
     int size() const { return 2 * dof + controls; }
@@ -55,6 +59,43 @@ struct Gains {
     double* costate = nullptr;           // (N, 2n) gradient of the cost after each step in the state there, or null
     double* spread = nullptr;            // (N, 2n, 2n) S, where there is noise
 };
+
+// Where the linearized motion goes under the gains, each control clipped to its limits, from `state` (2n + m): the
+// deviation before the first step, and that of the control before it, which become those after the last. Into
+// `expected` (R, 2n + m) before each decision, and the changes `moves` (R, m) of the controls.
+inline void predict(int hold, const ExpandedSteps& steps, const Gains& gains, double* state, double* expected,
+                    double* moves) {
+    const int x = steps.states(), m = steps.controls, size = steps.size();
+    std::vector<double> next(x);
+    for (std::ptrdiff_t s = 0; s < steps.steps; ++s) {
+        const std::ptrdiff_t r = s / hold;
+        if (s % hold == 0) {
+            std::copy_n(state, size, expected + r * size);
+            const double* before = expected + r * size + x;
+            for (int i = 0; i < m; ++i) {
+                double move = gains.feedforward[r * m + i];
+                const double* row = gains.feedback + (r * m + i) * x;
+                for (int c = 0; c < x; ++c) move += row[c] * state[c];
+                if (steps.rate) {
+                    for (int c = 0; c < m; ++c) move += gains.previous[(r * m + i) * m + c] * before[c];
+                }
+                if (steps.slack) {
+                    const double* slack = steps.slack + r * 2 * m;
+                    move = std::min(std::max(move, slack[i]), slack[m + i]);
+                }
+                moves[r * m + i] = state[x + i] = move;
+            }
+        }
+        const double *A = steps.A + s * x * x, *B = steps.B + s * x * m;
+        for (int i = 0; i < x; ++i) {
+            double total = 0.0;
+            for (int c = 0; c < x; ++c) total += A[i * x + c] * state[c];
+            for (int c = 0; c < m; ++c) total += B[i * m + c] * state[x + c];
+            next[i] = total;
+        }
+        std::copy_n(next.data(), x, state);
+    }
+}
 
 // Sums over a pass.
 struct Found {
