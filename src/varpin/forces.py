@@ -244,6 +244,15 @@ def drive_force(servo: Element, q: Floats, v: Floats, force: Floats) -> Floats:
     return bent
 
 
+def drive_forces(elements: Iterable[Element], q: Floats, v: Floats, force: Floats) -> Floats:
+    """The forces (K, n) that drives make of the controls' constant forces (K, n), at q and v (K, n) [N m or N]."""
+    driven = force.copy()
+    for own in of_kind(elements, "PositionServo"):
+        c = own.coordinate
+        driven[:, c] = drive_force(own, q[:, c], v[:, c], force[:, c])
+    return driven
+
+
 def dissipates(element: Element) -> bool:
     """Whether an element turns energy into heat."""
     if element.kind == "JointStop":

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.forces import drive_force, of_kind
+from varpin.forces import drive_forces, of_kind
 from varpin.scene import Scene
 from varpin.trajectory import Trajectory
 
@@ -44,10 +44,7 @@ def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
         lower[c] = min(lower[c], first - _GIVES * width) if first > lower[c] - width else lower[c]
         upper[c] = max(upper[c], last + _GIVES * width) if last < upper[c] + width else upper[c]
     speed, effort = robot.velocity_limit, robot.effort_limit
-    force = trajectory.u @ scene.actuation.T
-    for servo in of_kind(scene.elements, "PositionServo"):
-        c = servo.coordinate
-        force[:, c] = drive_force(servo, trajectory.q[:-1, c], trajectory.v[:-1, c], force[:, c])
+    force = drive_forces(scene.elements, trajectory.q[:-1], trajectory.v[:-1], trajectory.u @ scene.actuation.T)
     for kind, why, values, least, most, beyond, units in (
         (POSITION, "which nothing stops", trajectory.q, lower, upper, _OUTSIDE, ("rad", "m")),
         (VELOCITY, "which nothing holds back", trajectory.v, -speed, speed, _SHARE * speed, ("rad/s", "m/s")),

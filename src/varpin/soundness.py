@@ -295,7 +295,7 @@ def _turnover(scene: Scene, trajectory: Trajectory) -> tuple[float, Floats, Floa
     The kinetic energy of the largest change of its velocity, for all it has to move; and the controls' work.
     """
     kinetic, work, turned, worked = energy_turnover(
-        scene.core, trajectory.q, trajectory.v, trajectory.p, trajectory.u, even=EVEN, looks=_NODES
+        scene.core, trajectory.q, trajectory.v, trajectory.p, trajectory.u, trajectory.dt, even=EVEN, looks=_NODES
     )
     return min(kinetic, float(turned.sum())) + work, turned, worked
 

@@ -413,12 +413,13 @@ def pulls_fast(mechanism: Mechanism, q: Floats, v: Floats, f: Floats, dt: float)
     """Whether springs, servos or gravity turn a mode by more than a radian over dt [s], at a row of q, v, f (K, n)."""
 
 def energy_turnover(
-    mechanism: Mechanism, q: Floats, v: Floats, p: Floats, u: Floats, *, even: float, looks: int
+    mechanism: Mechanism, q: Floats, v: Floats, p: Floats, u: Floats, dt: float, *, even: float, looks: int
 ) -> tuple[float, float, Floats, Floats]:
-    """The energy that a motion turns over [J]; of its nodes (N + 1, n) and controls (N, m).
+    """The energy that a motion turns over [J]; of its nodes (N + 1, n), ``dt`` [s] apart, and controls (N, m).
 
-    The largest kinetic energy; the largest work so far of all controls. For each coordinate (n,): the kinetic energy of
-    the largest change of its velocity, at least by the part ``even`` of its largest; the largest work so far.
+    The largest kinetic energy; the largest work so far of all controls, of servos that of their drives. For each
+    coordinate (n,): the kinetic energy of the largest change of its velocity, at least by the part ``even`` of its
+    largest; the largest work so far.
     """
 
 def doubled_steps_agree(

@@ -95,9 +95,10 @@ def idle_joints(layout: Layout, scene: Scene) -> Mask:
         if model.kind != "control":
             touched |= model.intensity != 0.0
     if isinstance(layout.controls, Timeline):
-        touched[layout.actuated] |= layout.controls.at(t).any(axis=0)
-    elif layout.controls == "hold":
-        touched[layout.actuated] |= holding_controls(scene, layout.q0) != 0.0
+        commands = layout.controls.at(t)
+    else:
+        commands = (holding_controls(scene, layout.q0) if layout.controls == "hold" else np.zeros(scene.controls))[None]
+    touched[layout.actuated] |= (commands != _resting(layout)).any(axis=0)
     for term in layout.costs:
         touched |= _costs(term, layout, scene, t)
     group = layout.robot.tree.group
@@ -106,9 +107,14 @@ def idle_joints(layout: Layout, scene: Scene) -> Mask:
     return ~busy if busy.any() else np.zeros_like(busy)
 
 
+def _resting(layout: Layout) -> Floats:
+    """Controls (m,) that do nothing where the joints start: no force, or the place where a servo's joint stands."""
+    return np.where(layout.served, layout.q0, 0.0)[layout.actuated]
+
+
 def _pushed(layout: Layout, scene: Scene) -> Mask:
     """Which joints springs and stops push at where they start."""
-    floating = Scene(layout.robot, gravity=False, forces=scene.forces)
+    floating = Scene(layout.robot, gravity=False, forces=scene.forces, actuation=layout.actuation)
     return np.asarray(lagrangian_jet(floating, layout.q0, np.zeros(layout.robot.dof)).Lq != 0.0)
 
 
@@ -132,7 +138,7 @@ def _costs(term: CostTerm, layout: Layout, scene: Scene, t: Floats) -> Mask:
         return joints_of_frame(layout.robot, term.spec.frame)
     if space == "robot":
         return ~touched
-    rest = {"q": layout.q0, "v": np.zeros(layout.robot.dof), "u": np.zeros(len(layout.actuated))}[space]
+    rest = {"q": layout.q0, "v": np.zeros(layout.robot.dof), "u": _resting(layout)}[space]
     if term.spec.term.limits is not None:
         lower, upper = term.spec.term.limits(layout.robot)
         margin = term.spec.numbers["margin"]

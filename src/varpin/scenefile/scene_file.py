@@ -80,7 +80,7 @@ class SceneFile:
         spec = self.spec
         if not spec.costs:
             raise spec.root.error("cost", "is missing; a scene to solve has a [[cost]] at least")
-        most = layout.torque_limit / np.abs(layout.gear)
+        most = layout.control_limit
         try:
             return OptimalControlProblem(
                 scene,

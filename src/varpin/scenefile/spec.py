@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from varpin.checks import is_file
 from varpin.errors import FileError, InputError
-from varpin.forces import Armature, CoulombFriction, Force, JointDamper, JointSpring, JointStop
+from varpin.forces import Armature, CoulombFriction, Force, JointDamper, JointSpring, JointStop, PositionServo
 from varpin.integrators import BY_NAME, Integrator, options_of
 from varpin.robot import Payload, models_dir
 from varpin.scenefile.references import Reference, read_reference
@@ -37,6 +37,7 @@ FORCES: Mapping[str, type[Force]] = {
     "armature": Armature,
     "damper": JointDamper,
     "friction": CoulombFriction,
+    "servo": PositionServo,
     "spring": JointSpring,
     "stop": JointStop,
 }

@@ -129,12 +129,13 @@ struct Record {
     const double* v = nullptr;  // (N + 1, n)
     const double* p = nullptr;  // (N + 1, n)
     const double* u = nullptr;  // (N, m)
+    double h = 0.0;             // [s]
 };
 
 // The energy that a motion turns over [J].
 struct Turnover {
     double kinetic = 0.0;            // the largest kinetic energy
-    double work = 0.0;               // the controls' so far, where it is largest
+    double work = 0.0;               // the controls' so far, where it is largest; of servos what their drives do
     std::vector<double> kinetic_of;  // (n) of the largest change of each joint's velocity, for all it has to move
     std::vector<double> work_of;     // (n) as `work`, at each joint
 };
@@ -153,12 +154,20 @@ inline Turnover turnover(const Mechanism& mechanism, const Record& record, doubl
         }
         found.kinetic = larger(found.kinetic, 0.5 * kinetic);
     }
-    std::vector<double> force(n), work_of(n);
+    std::vector<double> force(n), work_of(n), middle(n), rate(n);
     double work = 0.0;
     for (std::size_t k = 0; k + 1 < nodes; ++k) {
         std::fill(force.begin(), force.end(), 0.0);
         for (const Transmission& own : mechanism.actuation)
             force[own.coordinate] += own.ratio * record.u[k * m + own.control];
+        if (mechanism.forces.drives()) {
+            for (int c = 0; c < n; ++c) {
+                const double before = record.q[k * n + c], after = record.q[(k + 1) * n + c];
+                middle[c] = 0.5 * (before + after);
+                rate[c] = (after - before) / record.h;
+            }
+            mechanism.forces.drive(middle.data(), rate.data(), force.data());
+        }
         for (int c = 0; c < n; ++c) {
             const double done = force[c] * (record.q[(k + 1) * n + c] - record.q[k * n + c]);
             work += done;
