@@ -254,13 +254,13 @@ def _balances(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> l
     """
     at = np.arange(1, trajectory.steps + 1)
     found = [(at, trajectory.statistics.energy_defect, energy_scale(scene, trajectory))]
-    tree = scene.robot.tree
-    if integrator.variational or tree.groups < 2 or scene.noise.diffusion is None:
+    groups = int(scene.group.max()) + 1
+    if integrator.variational or groups < 2 or scene.noise.diffusion is None:
         return found
     _, turned, worked = _turnover(scene, trajectory)
     some = np.unique(np.linspace(1, trajectory.steps, _NODES).astype(np.int64))
-    for group in range(tree.groups):
-        own = tree.group == group
+    for group in range(groups):
+        own = scene.group == group
         scale = float(turned[own].sum() + worked[own].sum())
         found.append((some, _defects_of(scene, trajectory, own)[some], scale))
     return found
@@ -330,7 +330,7 @@ def _works(scene: Scene, trajectory: Trajectory, kicked: Floats | float = 0.0) -
         work = force * way
         even = (way / h) ** 2
         heat = h * np.minimum((before**2 + before * after + after**2) / 3.0, even) * scene.damping
-        if scene.dissipates:
+        if scene.dissipates or scene.couplings:
             middle = 0.5 * (trajectory.q[1:] + trajectory.q[:-1])
             heat -= scene.core.forces(middle, way / h, force)[0] * way + h * even * scene.damping
     return work, heat

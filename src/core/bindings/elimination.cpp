@@ -24,8 +24,8 @@ class BoundElimination {
           own_(mechanism) {
         require(q, "q", {n_});
         require(v, "v", {n_});
-        if (!eliminates(mechanism.tree, Solver::elimination))
-            throw std::invalid_argument("a coordinate moves more than one joint");
+        if (!eliminates(mechanism, Solver::elimination))
+            throw std::invalid_argument("a coordinate moves more than one joint, or couplings act");
         regular_ = articulated_.at(mechanism, q.data(), jet_);
         first_order(mechanism, q.data(), v.data(), jet_);
         own_.take(jet_);

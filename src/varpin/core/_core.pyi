@@ -38,6 +38,7 @@ class Mechanism:
         ends: Integers,
         gravity: Floats,
         forces: Sequence[tuple[str, int, tuple[float, ...]]],
+        couplings: Sequence[tuple[str, int, int, tuple[float, ...]]],
         actuation: Floats,
         constant: Floats,
         control: Floats,
@@ -56,10 +57,13 @@ class Mechanism:
         """The derivative of v in (q, p) (N, n, 2n) at each row of q and v; NaN where M is not positive definite."""
 
     def forces(self, q: Floats, v: Floats, f: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Forces F of the elements beside L_q, dF/dq, dF/dv and the power turned into heat (N, n).
+        """Forces F beside L_q, what elements have of dF/dq and dF/dv, and the power turned into heat (N, n).
 
         They are at rows of q, v and f (N, n), f being the constant force of the controls, to which F adds.
         """
+
+    def coupled_forces(self, q: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
+        """The couplings' forces beside L_q (N, n), and dF/dq and dF/dv (N, n, n), at rows of q and v (N, n)."""
 
     def jets_along(self, q: Floats, v: Floats, alpha: Floats, beta: Floats) -> tuple[Floats, Floats, Floats]:
         """Derivatives of M, L_vq and L_qq (N, n, n) at each row of q and v along that of alpha and beta (N, n)."""
@@ -74,7 +78,7 @@ class Solver(Enum):
 class Elimination:
     """Solves at one (q, v) by elimination from the leaves to the roots; see src/core/include/varpin/elimination.hpp.
 
-    Raises ValueError where mimic joints share a coordinate.
+    Raises ValueError where mimic joints share a coordinate, or couplings act.
     """
 
     def __init__(self, mechanism: Mechanism, q: Floats, v: Floats) -> None: ...

@@ -101,7 +101,7 @@ def idle_joints(layout: Layout, scene: Scene) -> Mask:
     touched[layout.actuated] |= (commands != _resting(layout)).any(axis=0)
     for term in layout.costs:
         touched |= _costs(term, layout, scene, t)
-    group = layout.robot.tree.group
+    group = scene.group
     busy = np.isin(group, group[touched])
     # Where nothing happens at all, all of it is the scene.
     return ~busy if busy.any() else np.zeros_like(busy)
@@ -152,9 +152,9 @@ def _costs(term: CostTerm, layout: Layout, scene: Scene, t: Floats) -> Mask:
     return touched
 
 
-def requirements(layout: Layout, whole: Layout, idle: Sequence[str]) -> Required:
-    """The report on what ``layout`` has left of ``whole``."""
-    names, group = layout.robot.joint_names, layout.robot.tree.group
+def requirements(layout: Layout, whole: Layout, idle: Sequence[str], scene: Scene) -> Required:
+    """The report on what ``layout``, the ``scene``, has left of ``whole``."""
+    names, group = layout.robot.joint_names, scene.group
     parts = [tuple(name for name, g in zip(names, group, strict=True) if g == label) for label in np.unique(group)]
     together = ", ".join(
         sorted({term.spec.table.data["type"] for term in layout.costs if term.spec.term.space == "robot"})

@@ -239,10 +239,11 @@ def load_scene(source: str | Path, *, required_only: bool = True) -> SceneFile:
         stays = idle_joints(whole, scene)
         idle = [name for name, out in zip(whole.robot.joint_names, stays, strict=True) if out]
     layout = whole.without(idle)
+    scene = scene if layout is whole else layout.scene()
     file = SceneFile(
         spec=spec,
-        required=requirements(layout, whole, idle),
-        scene=scene if layout is whole else layout.scene(),
+        required=requirements(layout, whole, idle, scene),
+        scene=scene,
         q0=layout.q0,
         v0=layout.v0,
         _layout=layout,

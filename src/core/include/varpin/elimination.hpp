@@ -30,7 +30,8 @@
 
 namespace varpin {
 
-// How to solve with M and with the matrix of a step; elimination cannot where two bodies share a coordinate.
+// How to solve with M and with the matrix of a step; elimination cannot where two bodies share a coordinate, nor of the
+// latter where couplings act.
 enum class Solver { automatic, dense, elimination };
 
 // Times of a dense step for each body, for each pair of a body and one above it, and for each cubed size of a block; in
@@ -52,6 +53,11 @@ inline bool eliminates(const Tree& tree, Solver solver, int stages = 1) {
         dense += block_cost * size * size * size;
     }
     return (stages == 1 ? 1.0 : stages_cost) * tree.size() < dense;
+}
+
+// Couplings fill more of a step's matrix than the bodies do.
+inline bool eliminates(const Mechanism& mechanism, Solver solver, int stages = 1) {
+    return !mechanism.couplings.any() && eliminates(mechanism.tree, solver, stages);
 }
 
 // Where each body gathers what it carries while bodies are eliminated, the last one first. Places are used again: along

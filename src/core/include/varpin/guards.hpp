@@ -217,6 +217,7 @@ class EnergyGuard {
                             coupling += tableau.b[s] * (step.stage[s].A[i * n + j] + step.stage[s].A[j * n + i]);
                     }
                     curved[i * n + j] = inertia - exaggerated * curvature + h * tableau.skew * coupling;
+                    if (step.coupled()) curved[i * n + j] += step.coupled_stiffening(i, j, 0.5 * h, exaggerated);
                     mass[i * n + j] = inertia;
                 }
                 curved[i * n + i] += step.stiffening(i, 0.5 * h, exaggerated);
@@ -396,6 +397,17 @@ class EnergyGuard {
                 own.potential += element.energy;
                 own.scale += element.magnitude(q[c]);
             });
+            // A coupling that moves the part is part of its Lagrangian, and moves with others too.
+            mechanism.couplings.potentials(
+                q, jet.couplings, [&](const auto& arms, const auto& coupling, double, double size) {
+                    const auto carried = [&](const Arm<double>& arm) { return light.carried[arm.coordinate] != 0; };
+                    if (std::none_of(arms.begin(), arms.end(), carried)) return;
+                    own.potential += coupling.energy;
+                    own.scale += size;
+                    for (const Arm<double>& arm : arms) {
+                        if (!carried(arm)) own.Lq[arm.coordinate] -= dot(coupling.slope, arm.linear);
+                    }
+                });
             const Force<double> weight{top.inertia.mass * g, cross(top.inertia.moment, g)};
             for (int a = carrier; a >= 0; a = tree.bodies[a].parent) {
                 const Body& link = tree.bodies[a];
