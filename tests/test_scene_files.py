@@ -219,6 +219,74 @@ def test_servos_of_a_scene_are_commanded_positions(tmp_path):
     assert again.policy.servos == ("elbow_joint", "wrist_1_joint")
 
 
+ON_FRAMES = """
+gravity = false
+[robot]
+source = "allegro_right_hand"
+[[force]]
+type = "frame_spring"
+a = "link_3.0"
+b = { frame = "link_7.0", place = [0.0, 0.0, 0.01] }
+stiffness = 5.0
+rest = [0.0, 0.01, 0.0]
+[[force]]
+type = "frame_damper"
+a = "link_3.0"
+b = [0.0, 0.1, 0.1]
+damping = [0.1, 0.2, 0.3]
+[[force]]
+type = "frame_wrench"
+frame = "link_7.0"
+wrench = [0.01, 0.0, 0.02, 0.0, 1e-3, 0.0]
+axes = "frame"
+[horizon]
+dt = 1e-3
+steps = 20
+"""
+
+
+def test_forces_on_frames_of_a_scene_are_those_written_in_python(tmp_path):
+    """Two fingers that a spring joins are one group; the two others are left out with the damper on one of them."""
+    more = '[[force]]\ntype = "frame_damper"\na = "link_11.0"\nb = [0, 0, 0]\ndamping = 1.0\n[horizon]'
+    path = write(tmp_path, ON_FRAMES.replace("[horizon]", more))
+    file = vp.load_scene(path)
+    forces = [
+        vp.FrameSpring("link_3.0", ("link_7.0", [0.0, 0.0, 0.01]), 5.0, [0.0, 0.01, 0.0]),
+        vp.FrameDamper("link_3.0", [0.0, 0.1, 0.1], [0.1, 0.2, 0.3]),
+        vp.FrameWrench("link_7.0", [0.01, 0.0, 0.02, 0.0, 1e-3, 0.0], "frame"),
+    ]
+    assert file.robot.dof == 8
+    assert file.scene.couplings == vp.Scene(file.robot, forces=forces).couplings
+    assert file.required.parts == (file.robot.joint_names,)
+    assert file.required.terms["other forces"] == "frame_damper, frame_spring, frame_wrench"
+    whole = vp.load_scene(path, required_only=False)
+    assert len(whole.scene.couplings) == 4
+    own = [whole.robot.joint_names.index(name) for name in file.robot.joint_names]
+    np.testing.assert_allclose(file.simulate().q, whole.simulate().q[:, own], rtol=1e-10, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "words"),
+    [
+        (('a = "link_3.0"\nb = {', 'a = "link_33"\nb = {'), "force[0]", "there is no frame 'link_33'"),
+        (("0.01] }", "0.01], at = 1 }"), "force[0].b.at", "unknown key"),
+        (("b = [0.0, 0.1, 0.1]", "b = 3"), "force[1].b", "must be a text"),
+        (("damping = [0.1, 0.2, 0.3]", "damping = -1"), "force[1]", "must be >= 0"),
+        (("damping = [0.1, 0.2, 0.3]", "damping = [0.1, 0.2]"), "force[1].damping", "must have 3 numbers"),
+        (('axes = "frame"', 'axes = "local"'), "force[2].axes", "there is no 'local'"),
+        (('frame = "link_7.0"\nwrench', "frame = [0, 0, 0]\nwrench"), "force[2].frame", "must be a frame"),
+        (('a = "link_3.0"\nb = [', "a = [1, 1, 1]\nb = ["), "force[1]", "both ends are fixed"),
+    ],
+)
+def test_forces_on_frames_that_cannot_be(change, key, words, tmp_path):
+    text = ON_FRAMES.replace(*change)
+    assert text != ON_FRAMES
+    with pytest.raises(vp.SceneFileError) as caught:
+        vp.load_scene(write(tmp_path, text))
+    assert caught.value.key == key
+    assert words in str(caught.value)
+
+
 def test_servos_that_stand_where_they_are_told_leave_joints_idle(tmp_path):
     """A finger that nothing moves is left out with its servos; told to go elsewhere, it is not."""
     text = """
@@ -384,7 +452,11 @@ MISTAKES = {
         "simulate.controls",
         "torque_limit is 0.5",
     ),
-    "unknown force": (GOOD + '[[force]]\ntype = "glue"', "force[0].type", "friction, servo, spring, stop"),
+    "unknown force": (
+        GOOD + '[[force]]\ntype = "glue"',
+        "force[0].type",
+        "friction, servo, spring, stop, frame_damper",
+    ),
     "force without a number": (GOOD + '[[force]]\ntype = "armature"', "force[0].inertia", "by name"),
     "negative friction": (GOOD + '[[force]]\ntype = "friction"\nlevel = -1', "force[0]", "must be >= 0"),
     "force on no joint": (

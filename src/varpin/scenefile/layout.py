@@ -15,7 +15,7 @@ from varpin.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
 from varpin.robot import Robot, load_robot
 from varpin.scene import Scene, closest_controls, damping_of
 from varpin.scenefile.references import Timeline, constant
-from varpin.scenefile.spec import CostSpec, ForceSpec, SceneSpec, degrees_for_radians
+from varpin.scenefile.spec import CostSpec, ForceSpec, FrameForceSpec, SceneSpec, degrees_for_radians
 from varpin.scenefile.table import Floats, SceneFileError, Table, suggestion
 from varpin.scenefile.terms import Given
 
@@ -63,6 +63,7 @@ class Layout:
         robot: The robot.
         damping: (n,), like stiffness, rest, q0 and v0.
         forces: Others on joints.
+        frame_forces: Others on frames.
         actuated: Indices of the driven joints (m,).
         gear: Generalized force per control (m,).
         torque_limit: (m,) [N m or N], infinite where there is none.
@@ -78,6 +79,7 @@ class Layout:
     stiffness: Floats
     rest: Floats
     forces: tuple[JointForces, ...]
+    frame_forces: tuple[Force, ...]
     q0: Floats
     v0: Floats
     actuated: NDArray[np.int64]
@@ -123,6 +125,7 @@ class Layout:
                 JointForces(own.kind, {name: values[keep] for name, values in own.values.items()})
                 for own in self.forces
             ),
+            frame_forces=tuple(own for own in self.frame_forces if _has_moving_end(own, robot)),
             q0=self.q0[keep],
             v0=self.v0[keep],
             actuated=np.array([position[int(joint)] for joint in self.actuated[driven]], dtype=np.int64),
@@ -174,7 +177,7 @@ class Layout:
             damping=self.damping,
             stiffness=self.stiffness,
             rest=self.rest,
-            forces=[self._force(own) for own in self.forces],
+            forces=[*(self._force(own) for own in self.forces), *self.frame_forces],
             actuation=self.actuation,
             noise=[model for model in map(self._noise, self.noise) if model is not None] or None,
         )
@@ -316,6 +319,7 @@ def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
         stiffness=springs.spread("stiffness", spec.stiffness, names),
         rest=rest,
         forces=forces,
+        frame_forces=tuple(_frame_force(force, robot) for force in spec.frame_forces),
         q0=q0,
         v0=initial.spread("v", spec.v0, names),
         actuated=actuated,
@@ -426,6 +430,25 @@ def _force(spec: ForceSpec, robot: Robot) -> JointForces:
     except InputError as error:
         raise spec.table.error("", str(error)) from None
     return found
+
+
+def _frame_force(spec: FrameForceSpec, robot: Robot) -> Force:
+    try:
+        spec.force.bind(robot)
+    except UnknownFrame as error:
+        raise spec.table.error(
+            "", f"there is no frame {error.frame!r}; {suggestion(error.frame, error.frames, 'frames')}"
+        ) from None
+    except InputError as error:
+        raise spec.table.error("", str(error)) from None
+    return spec.force
+
+
+def _has_moving_end(force: Force, robot: Robot) -> bool:
+    """Whether a joint that is left moves what a force acts on."""
+    points = [getattr(force, name) for name in ("frame", "a", "b") if hasattr(force, name)]
+    frames = [point if isinstance(point, str) else point[0] for point in points if isinstance(point, str | tuple)]
+    return any(joints_of_frame(robot, frame).any() for frame in frames)
 
 
 def _noises(spec: SceneSpec, names: Sequence[str], driven: Sequence[str]) -> list[Noises]:

@@ -14,7 +14,7 @@ from varpin.markup import facts, listed
 from varpin.scene import Scene
 from varpin.scenefile.layout import CostTerm, Layout, holding_controls, joints_of_frame
 from varpin.scenefile.references import Timeline
-from varpin.scenefile.spec import FORCES
+from varpin.scenefile.spec import FORCES, FRAME_FORCES
 from varpin.scenefile.table import Floats
 
 Mask = NDArray[np.bool_]
@@ -113,9 +113,9 @@ def _resting(layout: Layout) -> Floats:
 
 
 def _pushed(layout: Layout, scene: Scene) -> Mask:
-    """Which joints springs and stops push at where they start."""
+    """Which joints springs, stops and what acts on frames push at where they start."""
     floating = Scene(layout.robot, gravity=False, forces=scene.forces, actuation=layout.actuation)
-    return np.asarray(lagrangian_jet(floating, layout.q0, np.zeros(layout.robot.dof)).Lq != 0.0)
+    return np.asarray(floating.holding_torque(layout.q0) != 0.0)
 
 
 def _weighed(layout: Layout) -> Mask:
@@ -189,7 +189,7 @@ def _terms(layout: Layout) -> dict[str, str]:
     noise = [f"{model.kind} ({np.count_nonzero(model.intensity)} processes)" for model in layout.noise]
     limited = np.isfinite(layout.torque_limit)
     costs = [term.spec.table.data["type"] + (" at the end" if term.spec.terminal else "") for term in layout.costs]
-    kinds = {force.kind for force in layout.forces}
+    kinds: set[type[Force]] = {force.kind for force in layout.forces} | {type(own) for own in layout.frame_forces}
     absent = [words for words, kind in _ABSENT.items() if kind not in kinds] + ["contact"]
     loads = [f"{load.mass:g} kg at {load.frame}" for load in spec.robot.payload]
     return {
@@ -201,6 +201,6 @@ def _terms(layout: Layout) -> dict[str, str]:
         "driven": ", ".join(layout.driven) or "none",
         "torque limits": of(limited.astype(float), layout.driven),
         "cost": ", ".join(costs) or "none",
-        "other forces": ", ".join(word for word, kind in FORCES.items() if kind in kinds) or "none",
+        "other forces": ", ".join(word for word, kind in {**FORCES, **FRAME_FORCES}.items() if kind in kinds) or "none",
         "not modelled": f"{', '.join(absent)}; shapes are read only for a replay",
     }
