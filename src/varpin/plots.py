@@ -362,8 +362,13 @@ def _served(trajectory: Trajectory) -> list[int | None]:
     values = trajectory.scene_values
     if "PositionServo" not in values or "actuation" not in values or not values["PositionServo"].size:
         return none
-    for joint in values["PositionServo"][:, 0].astype(np.int64):
-        none[int(np.flatnonzero(values["actuation"][joint])[0])] = int(joint)
+    actuation = values["actuation"]
+    joints = range(min(len(trajectory.joint_names), len(actuation)))
+    for joint in values["PositionServo"][:, 0].tolist():
+        # A file may hold anything.
+        drives = np.flatnonzero(actuation[int(joint)]) if joint in joints else np.zeros(0, dtype=np.int64)
+        if len(drives) and drives[0] < len(none):
+            none[int(drives[0])] = int(joint)
     return none
 
 

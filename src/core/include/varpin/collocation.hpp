@@ -64,6 +64,7 @@ class Collocation {
           acting(stages * n),
           residual(stages * n),
           delta(stages * n) {
+        for (Jet<double>& jet : stage) mechanism.couplings.fit(jet.couplings);
         if (mechanism.couplings.pushes()) {
             coupled_q.resize(entries(stages * n, n));
             coupled_v.resize(stages * n * n);

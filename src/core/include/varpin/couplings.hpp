@@ -133,7 +133,7 @@ struct Arm {
     Vec3<T> angular{};  // of the point's body
 };
 
-// Work arrays; they grow at their first use.
+// Work arrays; Couplings::fit makes room in them, at their first use at the latest.
 template <class T>
 struct CouplingRoom {
     std::vector<PlacementOf<T>> at;
@@ -182,6 +182,13 @@ class Couplings {
     bool any() const { return !joined_.empty(); }
     // Whether there are forces beside those of potentials.
     bool pushes() const { return pushes_; }
+
+    template <class T>
+    void fit(CouplingRoom<T>& room) const {
+        room.at.resize(links_.bodies.size());
+        room.arms.reserve(most_arms_);
+        room.change.reserve(most_arms_);
+    }
 
     // Calls visit(arms, VectorPotential, scale, magnitude) for each that has a potential, at q: `scale` of the terms
     // that cancel in V_d, `magnitude` of those that make up the energy.
@@ -249,9 +256,7 @@ class Couplings {
 
     template <class T>
     void place_all(const T* q, CouplingRoom<T>& room) const {
-        room.at.resize(links_.bodies.size());
-        room.arms.reserve(most_arms_);
-        room.change.reserve(most_arms_);
+        fit(room);
         place(links_, q, room.at.data());
     }
 

@@ -100,6 +100,7 @@ class ForwardDynamics {
           room_(jet_.dof),
           momentum_(jet_.dof) {
         const int n = jet_.dof;
+        mechanism.couplings.fit(jet_.couplings);
         if (!derivatives && eliminates(mechanism.tree, solver)) {
             articulated_.emplace(mechanism.tree);
             return;

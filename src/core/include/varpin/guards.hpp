@@ -108,6 +108,7 @@ class EnergyGuard {
           share(n),
           diagonal(n),
           part(Energies(mechanism.tree).part) {
+        mechanism.couplings.fit(jet.couplings);
         if (eliminates(mechanism.tree, solver)) {
             articulated.emplace(mechanism.tree);
         } else {
