@@ -174,7 +174,7 @@ class Collocation {
     bool coupled() const { return !coupled_q.empty(); }
 
     // The same of couplings at an entry of the symmetric part.
-    double coupled_stiffening(int r, int c, double by_rate, double by_place) const {
+    [[gnu::noinline]] double coupled_stiffening(int r, int c, double by_rate, double by_place) const {
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
             const int one = (i * n + r) * n + c, other = (i * n + c) * n + r;
@@ -429,8 +429,8 @@ class Collocation {
         }
     }
 
-    // What the couplings' forces add to a row of N_im.
-    void add_coupled_row(double h, int i, int m, int row, Block block, double* line) const {
+    // What the couplings' forces add to a row of N_im. Inlined it would slow down steps without any.
+    [[gnu::noinline]] void add_coupled_row(double h, int i, int m, int row, Block block, double* line) const {
         const int width = block.end - block.begin;
         const double by_rate = h * tableau.force[i * stages + m];
         const double* own = &coupled_v[(m * n + row) * n + block.begin];
