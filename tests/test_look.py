@@ -74,7 +74,7 @@ def test_a_pull_is_fast_where_a_mode_turns_by_a_radian(scene, motion):
 
 def test_energy_that_is_turned_over(scene, motion):
     kinetic, work, turned, worked = energy_turnover(
-        scene.core, motion.q, motion.v, motion.p, motion.u, even=EVEN, looks=LOOKS
+        scene.core, motion.q, motion.v, motion.p, motion.u, motion.dt, even=EVEN, looks=LOOKS
     )
     done = (motion.u @ scene.actuation.T) * np.diff(motion.q, axis=0)
     at = np.unique(np.linspace(0, motion.steps, LOOKS).astype(int))
@@ -85,10 +85,36 @@ def test_energy_that_is_turned_over(scene, motion):
     np.testing.assert_allclose(worked, np.abs(np.cumsum(done, axis=0)).max(axis=0))
 
 
+def test_the_work_of_servos_is_that_of_their_drives():
+    """Not stiffness times command times way, which is far more and depends on where 0 is."""
+    forces = vp.PositionServo({"joint1": 400.0}, {"joint1": 40.0}, {"joint1": 20.0})
+    scene = vp.Scene(vp.planar_chain(2), forces=forces)
+    u = np.tile([2.7, 0.3], (200, 1))
+    motion = vp.simulate(scene, [2.5, 0.2], [0.0, 0.0], dt=5e-3, steps=200, controls=u, check=False)
+    _, work, _, worked = energy_turnover(
+        scene.core, motion.q, motion.v, motion.p, motion.u, motion.dt, even=EVEN, looks=LOOKS
+    )
+    way = np.diff(motion.q, axis=0)
+    force = np.tile(u[0], (200, 1))
+    wanted = 400.0 * (u[:, 0] - 0.5 * (motion.q[1:, 0] + motion.q[:-1, 0])) - 40.0 * way[:, 0] / motion.dt
+    force[:, 0] = 20.0 * np.sign(wanted) * np.interp(np.abs(wanted) / 20.0, (y := np.linspace(0, 1.2, 4801)), bent(y))
+    done = force * way
+    assert (np.abs(wanted) > 22.0).any()
+    assert work == pytest.approx(np.abs(np.cumsum(done.sum(axis=1))).max(), rel=1e-5)
+    np.testing.assert_allclose(worked, np.abs(np.cumsum(done, axis=0)).max(axis=0), rtol=1e-5)
+
+
+def bent(y):
+    """What a drive makes of a wanted force, both in units of the effort."""
+    return np.where(y < 0.9, y, np.where(y < 1.1, y - 2.5 * (y - 0.9) ** 2, 1.0))
+
+
 def test_energy_that_is_turned_over_is_no_number_where_the_motion_is_none(scene, motion):
     v = motion.v.copy()
     v[7, 2] = np.nan
-    kinetic, _, turned, _ = energy_turnover(scene.core, motion.q, v, motion.p, motion.u, even=EVEN, looks=LOOKS)
+    kinetic, _, turned, _ = energy_turnover(
+        scene.core, motion.q, v, motion.p, motion.u, motion.dt, even=EVEN, looks=LOOKS
+    )
     assert np.isnan(kinetic)
     assert np.isnan(turned).tolist() == [False, False, True, False, False]
 

@@ -113,6 +113,33 @@ def test_controls_that_are_no_joints_have_their_own_names():
         plots.plot_controls(trajectory, labels=["a", "b", "c"])
 
 
+def test_controls_of_servos_are_commanded_positions():
+    robot = vp.planar_chain(2)
+
+    def drawn_with(stiffness, actuation=None, robot=robot, **given):
+        scene = vp.Scene(robot, forces=vp.PositionServo(stiffness, 1.0), actuation=actuation)
+        q = np.zeros(robot.dof)
+        motion = vp.simulate(scene, q, q, dt=0.01, steps=3, controls=np.full(scene.controls, 0.1))
+        return motion, plots.plot_controls(motion, **given)[1]
+
+    _, axes = drawn_with(50.0, robot=robot)
+    assert axes.get_ylabel() == "commanded position [rad or m]"
+    motion, axes = drawn_with(50.0)
+    _, axes = plots.plot_controls(motion, robot=robot)
+    assert (axes.get_ylabel(), list(drawn(axes))) == ("commanded position [rad]", ["joint1", "joint2"])
+    mixed, _ = drawn_with({"joint2": 50.0})
+    _, axes = plots.plot_controls(mixed, robot=robot)
+    assert list(drawn(axes)) == ["joint1", "joint2, commanded position [rad]"]
+    assert axes.get_ylabel() == "control [units of each]"
+    _, axes = plots.plot_trajectory(mixed, robot=robot)
+    assert axes[2].get_legend() is not None
+    some, axes = drawn_with({"joint2": 50.0}, ["joint2"])
+    _, axes = plots.plot_controls(some, robot=robot)
+    assert (axes.get_ylabel(), axes.get_legend()) == ("commanded position [rad]", None)
+    _, axes = plots.plot_controls(some, labels=["hinge"])
+    assert list(drawn(axes)) == ["hinge"]
+
+
 def test_energy_error_in_joules_or_relative_to_the_initial_energy():
     _, trajectory = swing()
     _, axes = plots.plot_energy_error(trajectory)

@@ -155,6 +155,190 @@ def test_forces_of_a_scene_are_those_written_in_python(tmp_path):
     assert vp.load_scene(write(tmp_path, GOOD)).required.terms["not modelled"].startswith("stops at joint limits, dry")
 
 
+SERVED = """
+gravity = false
+damping = 0.5
+[robot]
+source = "ur5"
+[[force]]
+type = "servo"
+stiffness = { elbow_joint = 300.0, wrist_1_joint = 50.0 }
+damping = { elbow_joint = 30.0, wrist_1_joint = 5.0 }
+effort = { elbow_joint = 80.0 }
+[actuation]
+joints = ["elbow_joint", "wrist_1_joint", "wrist_2_joint"]
+torque_limit = { elbow_joint = 100.0, wrist_1_joint = 20.0, wrist_2_joint = 8.0 }
+[initial]
+q = { elbow_joint = 0.5, wrist_1_joint = 0.2 }
+[horizon]
+dt = 1e-2
+steps = 20
+[integrator]
+type = "gauss"
+stages = 2
+[[cost]]
+type = "tracking"
+weight = 10.0
+terminal = true
+reference = { elbow_joint = 0.6, wrist_1_joint = 0.2 }
+[[cost]]
+type = "control"
+weight = 1e-2
+hold = true
+[simulate]
+controls = { elbow_joint = 0.8, wrist_1_joint = 0.2, wrist_2_joint = 1.0 }
+"""
+
+
+def test_servos_of_a_scene_are_commanded_positions(tmp_path):
+    file = vp.load_scene(write(tmp_path, SERVED))
+    servo = vp.PositionServo(
+        {"elbow_joint": 300.0, "wrist_1_joint": 50.0},
+        {"elbow_joint": 30.0, "wrist_1_joint": 5.0},
+        {"elbow_joint": 80.0, "wrist_1_joint": 20.0},
+    )
+    driven = ["elbow_joint", "wrist_1_joint", "wrist_2_joint"]
+    scene = vp.Scene(file.robot, gravity=False, damping=0.5, forces=servo, actuation=driven)
+    assert file.scene.elements == scene.elements
+    np.testing.assert_array_equal(file.scene.actuation, scene.actuation)
+    # Torque limits are those of drives: positions have none.
+    np.testing.assert_array_equal(file.problem.control_limits[1], [np.inf, np.inf, 8.0])
+    assert file.required.terms["other forces"] == "servo"
+    motion = file.simulate()
+    same = vp.simulate(scene, file.q0, file.v0, dt=1e-2, steps=20, controls=[0.8, 0.2, 1.0], integrator=vp.Gauss(2))
+    assert motion.q.tobytes() == same.q.tobytes()
+    motion.save(tmp_path / "motion.npz")
+    back = vp.Trajectory.load(tmp_path / "motion.npz")
+    np.testing.assert_array_equal(back.scene_values["PositionServo"], scene.values["PositionServo"])
+    plan = file.solve()
+    assert plan.status.converged
+    assert plan.trajectory.q[-1, 2] == pytest.approx(0.6, abs=0.02)
+    plan.save(tmp_path / "plan.npz")
+    again = file.load_solution(tmp_path / "plan.npz")
+    assert again.trajectory.q.tobytes() == plan.trajectory.q.tobytes()
+    assert again.policy.servos == ("elbow_joint", "wrist_1_joint")
+
+
+ON_FRAMES = """
+gravity = false
+[robot]
+source = "allegro_right_hand"
+[[force]]
+type = "frame_spring"
+a = "link_3.0"
+b = { frame = "link_7.0", place = [0.0, 0.0, 0.01] }
+stiffness = 5.0
+rest = [0.0, 0.01, 0.0]
+[[force]]
+type = "frame_damper"
+a = "link_3.0"
+b = [0.0, 0.1, 0.1]
+damping = [0.1, 0.2, 0.3]
+[[force]]
+type = "frame_wrench"
+frame = "link_7.0"
+wrench = [0.01, 0.0, 0.02, 0.0, 1e-3, 0.0]
+axes = "frame"
+[horizon]
+dt = 1e-3
+steps = 20
+"""
+
+
+def test_forces_on_frames_of_a_scene_are_those_written_in_python(tmp_path):
+    """Two fingers that a spring joins are one group; the two others are left out with the damper on one of them."""
+    more = '[[force]]\ntype = "frame_damper"\na = "link_11.0"\nb = [0, 0, 0]\ndamping = 1.0\n[horizon]'
+    path = write(tmp_path, ON_FRAMES.replace("[horizon]", more))
+    file = vp.load_scene(path)
+    forces = [
+        vp.FrameSpring("link_3.0", ("link_7.0", [0.0, 0.0, 0.01]), 5.0, [0.0, 0.01, 0.0]),
+        vp.FrameDamper("link_3.0", [0.0, 0.1, 0.1], [0.1, 0.2, 0.3]),
+        vp.FrameWrench("link_7.0", [0.01, 0.0, 0.02, 0.0, 1e-3, 0.0], "frame"),
+    ]
+    assert file.robot.dof == 8
+    assert file.scene.couplings == vp.Scene(file.robot, forces=forces).couplings
+    assert file.required.parts == (file.robot.joint_names,)
+    assert file.required.terms["other forces"] == "frame_damper, frame_spring, frame_wrench"
+    whole = vp.load_scene(path, required_only=False)
+    assert len(whole.scene.couplings) == 4
+    own = [whole.robot.joint_names.index(name) for name in file.robot.joint_names]
+    np.testing.assert_allclose(file.simulate().q, whole.simulate().q[:, own], rtol=1e-10, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "words"),
+    [
+        (('a = "link_3.0"\nb = {', 'a = "link_33"\nb = {'), "force[0]", "there is no frame 'link_33'"),
+        (("0.01] }", "0.01], at = 1 }"), "force[0].b.at", "unknown key"),
+        (("b = [0.0, 0.1, 0.1]", "b = 3"), "force[1].b", "must be a text"),
+        (("damping = [0.1, 0.2, 0.3]", "damping = -1"), "force[1]", "must be >= 0"),
+        (("damping = [0.1, 0.2, 0.3]", "damping = [0.1, 0.2]"), "force[1].damping", "must have 3 numbers"),
+        (('axes = "frame"', 'axes = "local"'), "force[2].axes", "there is no 'local'"),
+        (('frame = "link_7.0"\nwrench', "frame = [0, 0, 0]\nwrench"), "force[2].frame", "must be a frame"),
+        (('a = "link_3.0"\nb = [', "a = [1, 1, 1]\nb = ["), "force[1]", "both ends are fixed"),
+    ],
+)
+def test_forces_on_frames_that_cannot_be(change, key, words, tmp_path):
+    text = ON_FRAMES.replace(*change)
+    assert text != ON_FRAMES
+    with pytest.raises(vp.SceneFileError) as caught:
+        vp.load_scene(write(tmp_path, text))
+    assert caught.value.key == key
+    assert words in str(caught.value)
+
+
+def test_servos_that_stand_where_they_are_told_leave_joints_idle(tmp_path):
+    """A finger that nothing moves is left out with its servos; told to go elsewhere, it is not."""
+    text = """
+gravity = false
+[robot]
+source = "allegro_right_hand"
+[[force]]
+type = "servo"
+stiffness = 2.0
+damping = 0.05
+[initial]
+q = { "joint_12.0" = 0.3, "joint_5.0" = 0.4 }
+[horizon]
+dt = 5e-3
+steps = 10
+[simulate]
+controls = { "joint_0.0" = 0.1, "joint_12.0" = 0.3, "joint_5.0" = %s }
+"""
+    fingers = [vp.load_scene(write(tmp_path, text % command)) for command in (0.4, 0.5)]
+    assert [len(file.robot.joint_names) for file in fingers] == [4, 8]
+    alone, whole = fingers[0].simulate(), vp.load_scene(write(tmp_path, text % 0.4), required_only=False).simulate()
+    np.testing.assert_allclose(alone.q, whole.q[:, :4], rtol=1e-12, atol=1e-14)
+    np.testing.assert_array_equal(whole.q[:, 4:], np.tile(whole.q[0, 4:], (11, 1)))
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "words"),
+    [
+        (('joints = ["elbow_joint", ', "joints = ["), "force[0].stiffness", "'elbow_joint' is not driven"),
+        (("torque_limit", "gear = 2.0\ntorque_limit"), "actuation.gear", "must be 1 for 'elbow_joint'"),
+        (("elbow_joint = 0.8, wrist_1_joint = 0.2, w", "elbow_joint = 45, w"), "simulate.controls", "looks like degr"),
+        (("wrist_2_joint = 1.0", "wrist_2_joint = 9.0"), "simulate.controls", "of 'wrist_2_joint' reach 9"),
+        (("[initial]", '[[noise]]\ntype = "control"\nintensity = 0.1\n[initial]'), "noise[0].intensity", "position of"),
+        (
+            ("[actuation]", '[[force]]\ntype = "servo"\nstiffness = { elbow_joint = 1 }\n[actuation]'),
+            "force[1].stiffness",
+            "a servo al",
+        ),
+        (("effort = { elbow_joint = 80.0", "effort = { elbow_joint = 0.0"), "force[0]", "must be > 0"),
+    ],
+)
+def test_servos_that_cannot_be(change, key, words, tmp_path):
+    text = SERVED.replace(*change)
+    assert text != SERVED
+    if key == "actuation.gear" or "not driven" in words:
+        text = text.replace("torque_limit = { elbow_joint = 100.0, wrist_1_joint = 20.0, wrist_2_joint = 8.0 }", "")
+    with pytest.raises(vp.SceneFileError) as caught:
+        vp.load_scene(write(tmp_path, text))
+    assert caught.value.key == key
+    assert words in str(caught.value)
+
+
 def test_cost_of_a_scene_is_that_written_in_python(tmp_path):
     file = vp.load_scene(write(tmp_path, GOOD))
 
@@ -268,7 +452,11 @@ MISTAKES = {
         "simulate.controls",
         "torque_limit is 0.5",
     ),
-    "unknown force": (GOOD + '[[force]]\ntype = "glue"', "force[0].type", "friction, spring, stop"),
+    "unknown force": (
+        GOOD + '[[force]]\ntype = "glue"',
+        "force[0].type",
+        "friction, servo, spring, stop, frame_damper",
+    ),
     "force without a number": (GOOD + '[[force]]\ntype = "armature"', "force[0].inertia", "by name"),
     "negative friction": (GOOD + '[[force]]\ntype = "friction"\nlevel = -1', "force[0]", "must be >= 0"),
     "force on no joint": (

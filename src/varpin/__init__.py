@@ -28,6 +28,9 @@ from varpin.errors import VarpinError as VarpinError
 from varpin.forces import Armature as Armature
 from varpin.forces import CoulombFriction as CoulombFriction
 from varpin.forces import Force as Force
+from varpin.forces import FrameDamper as FrameDamper
+from varpin.forces import FrameSpring as FrameSpring
+from varpin.forces import FrameWrench as FrameWrench
 from varpin.forces import JointDamper as JointDamper
 from varpin.forces import JointSpring as JointSpring
 from varpin.forces import JointStop as JointStop

@@ -1,10 +1,11 @@
-"""Forces on single joints: springs, dampers, friction, stops, rotors, servos. A scene takes any number of them.
+"""Forces on joints and on frames: springs, dampers, friction, stops, rotors, servos, wrenches; any number in a scene.
 
     scene = vp.Scene(robot, forces=[vp.CoulombFriction(0.5), vp.JointStop(stiffness=1e3, damping=5.0)])
 
 Every integrator and every derivative knows them: steps, linearizations of first and second order, energies and the part
-of them that turns into heat. Parameters are one number for every joint, (n,), or numbers by joint name; joints that are
-not named have none.
+of them that turns into heat. Parameters of forces on joints are one number for every joint, (n,), or numbers by joint
+name; joints that are not named have none. Forces on frames act at points: a frame's name for its origin, a pair of that
+and a place in the frame's axes (3,) [m], or, where there is another end, a place in the world (3,) [m].
 """
 
 from __future__ import annotations
@@ -13,51 +14,67 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import JointValues, as_floats, joint_array
-from varpin.core.arrays import Element
+from varpin.checks import JointValues, as_floats, finite_array, is_one_of, joint_array
+from varpin.core.arrays import Coupling, Element
 from varpin.errors import InputError, UnknownJoint
 from varpin.frozen import Frozen
 from varpin.robot import Robot
+from varpin.robot.tree import place_of_frame
 
 Floats = NDArray[np.float64]
+# A frame's origin, a place in its axes, or a place in the world.
+FramePoint: TypeAlias = str | tuple[str, ArrayLike]
+Point: TypeAlias = FramePoint | ArrayLike
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Force(Frozen, ABC):
-    """A force that acts on joints one by one."""
+    """A force that acts on joints one by one, or on frames."""
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            value: Any = getattr(self, item.name)
-            if isinstance(value, Mapping):
-                value = MappingProxyType(dict(value))
-            elif value is not None:
-                value = as_floats(item.name, value)
-                value.setflags(write=False)
-            object.__setattr__(self, item.name, value)
+            object.__setattr__(self, item.name, _kept(item.name, getattr(self, item.name)))
 
     def __repr__(self) -> str:
         own = [(item.name, getattr(self, item.name)) for item in fields(self)]
-        given = [
-            f"{name}={dict(value) if isinstance(value, Mapping) else value.tolist()}"
-            for name, value in own
-            if value is not None
-        ]
+        given = [f"{name}={_shown(value)}" for name, value in own if value is not None]
         return f"{type(self).__name__}({', '.join(given)})"
 
     @abstractmethod
-    def bind(self, robot: Robot) -> tuple[Element, ...]:
-        """The force on a robot, one element for each joint that it acts on.
+    def bind(self, robot: Robot) -> tuple[Element | Coupling, ...]:
+        """The force on a robot, as the core takes it: one element for each joint that it acts on, or couplings.
 
         Raises:
             InputError: A wrong shape, or a value that is not finite or out of range.
             UnknownJoint: It names a joint that is no coordinate of the robot.
+            UnknownFrame: It names a frame that the robot does not have.
         """
+
+
+def _kept(name: str, value: Any) -> Any:
+    """A parameter that no one can change any more."""
+    if value is None or isinstance(value, str):
+        return value
+    if isinstance(value, Mapping):
+        return MappingProxyType(dict(value))
+    if isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], str):
+        return value[0], _kept(name, value[1])
+    given = as_floats(name, value)
+    given.setflags(write=False)
+    return given
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, str):
+        return repr(value)
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_shown, value))})"
+    return str(dict(value) if isinstance(value, Mapping) else value.tolist())
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -221,6 +238,139 @@ class PositionServo(Force):
         return tuple(_elements("PositionServo", acts, stiffness, damping, effort))
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class FrameWrench(Force):
+    """A constant wrench at a frame. The joints feel J(q)' w.
+
+    A force that is constant in the world is part of the potential energy, -force . x; a moment, or a wrench that turns
+    with the frame, is not, and does work.
+
+    Attributes:
+        frame: Where it acts: a frame's name, or (name, place in the frame's axes).
+        wrench: Force [N] and moment about that place [N m] (6,), linear part first.
+        axes: ``"world"``, or ``"frame"`` for a wrench that turns with the frame.
+    """
+
+    frame: FramePoint
+    wrench: ArrayLike
+    axes: Literal["world", "frame"] = "world"
+
+    def bind(self, robot: Robot) -> tuple[Coupling, ...]:
+        """See :meth:`Force.bind`."""
+        if not is_one_of(self.axes, ("world", "frame")):
+            raise InputError(f"axes must be 'world' or 'frame', got {self.axes!r}")
+        wrench = finite_array("wrench", self.wrench, (6,))
+        body, turned, place = _point("frame", self.frame, robot)
+        if body < 0:
+            raise InputError(f"frame {self.frame!r} of robot {robot.name!r} is fixed to the base: no joint moves it")
+        at = (*place.tolist(), 0.0, 0.0, 0.0)
+        force, moment = wrench[:3], wrench[3:]
+        if self.axes == "frame":
+            numbers = (*(turned @ force).tolist(), *(turned @ moment).tolist(), 1.0)
+            return (Coupling("FrameWrench", body, -1, (*at, *numbers)),) if wrench.any() else ()
+        found = []
+        if force.any():
+            found.append(Coupling("FrameLoad", body, -1, (*at, *force.tolist())))
+        if moment.any():
+            found.append(Coupling("FrameWrench", body, -1, (*at, 0.0, 0.0, 0.0, *moment.tolist(), 0.0)))
+        return tuple(found)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrameSpring(Force):
+    """A linear spring between two points, part of the potential energy.
+
+    With d = x_a - x_b in world axes the energy is 1/2 sum of stiffness (d - rest)^2 over the axes; with a number > 0
+    for ``rest``, 1/2 stiffness (|d| - rest)^2, whose force has no direction at d = 0, and is none there.
+
+    Attributes:
+        a: The one end: a frame's name, (name, place in the frame's axes), or a place in the world (3,) [m].
+        b: The other end.
+        stiffness: >= 0, one number or along each axis of the world (3,) [N/m].
+        rest: Where it is slack: d in world axes (3,), or a length >= 0 [m].
+    """
+
+    a: Point
+    b: Point
+    stiffness: ArrayLike
+    rest: ArrayLike = 0.0
+
+    def bind(self, robot: Robot) -> tuple[Coupling, ...]:
+        """See :meth:`Force.bind`."""
+        bodies, places = _ends_of(self, robot)
+        stiffness = _along_axes("stiffness", self.stiffness)
+        rest = as_floats("rest", self.rest)
+        if rest.shape not in ((), (3,)) or not np.isfinite(rest).all() or (rest.ndim == 0 and rest < 0.0):
+            raise InputError(f"rest must be a length >= 0, or finite along three axes (3,), got {_shown(rest)}")
+        if not stiffness.any():
+            return ()
+        if rest.ndim == 0 and rest > 0.0:
+            if np.ndim(self.stiffness):
+                raise InputError("a spring with a length at rest has one stiffness, and not one along each axis")
+            return (Coupling("FrameLengthSpring", *bodies, (*places, float(stiffness[0]), float(rest))),)
+        slack = np.broadcast_to(rest, (3,))
+        return (Coupling("FrameSpring", *bodies, (*places, *stiffness.tolist(), *slack.tolist())),)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrameDamper(Force):
+    """A viscous damper between two points: the force -damping (v_a - v_b) on a, and its opposite on b.
+
+    Attributes:
+        a: The one end, as of :class:`FrameSpring`.
+        b: The other end.
+        damping: >= 0, one number or along each axis of the world (3,) [N s/m].
+    """
+
+    a: Point
+    b: Point
+    damping: ArrayLike
+
+    def bind(self, robot: Robot) -> tuple[Coupling, ...]:
+        """See :meth:`Force.bind`."""
+        bodies, places = _ends_of(self, robot)
+        damping = _along_axes("damping", self.damping)
+        return (Coupling("FrameDamper", *bodies, (*places, *damping.tolist())),) if damping.any() else ()
+
+
+def _point(name: str, point: Any, robot: Robot) -> tuple[int, Floats, Floats]:
+    """The body that carries a point, -1 for the world, with the frame's rotation (3, 3) and the place (3,) on it."""
+    offset: Any = (0.0, 0.0, 0.0)
+    frame = point
+    if isinstance(point, tuple) and len(point) == 2:
+        frame, offset = point
+    if not isinstance(frame, str):
+        shape = np.shape(point)
+        if shape != (3,):
+            raise InputError(
+                f"{name} must be a frame's name, (name, place in the frame (3,)) or a place in the world (3,), got "
+                f"shape {shape}"
+            )
+        return -1, np.eye(3), finite_array(name, point, (3,))
+    place = finite_array(f"{name}, the place in frame {frame!r},", offset, (3,))
+    body, turned, at = place_of_frame(robot.free_model, frame, robot.name)
+    return body, turned, at + turned @ place
+
+
+def _ends_of(force: FrameSpring | FrameDamper, robot: Robot) -> tuple[tuple[int, int], tuple[float, ...]]:
+    """The bodies at both ends, and the places on them one after the other."""
+    (a, _, here), (b, _, there) = _point("a", force.a, robot), _point("b", force.b, robot)
+    if a < 0 and b < 0:
+        raise InputError(
+            f"{type(force).__name__}: both ends are fixed, in the world or to the base of robot {robot.name!r}: no "
+            "joint moves one"
+        )
+    return (a, b), (*here.tolist(), *there.tolist())
+
+
+def _along_axes(name: str, value: ArrayLike) -> Floats:
+    """``value``, one number or (3,), as numbers >= 0 along the axes of the world."""
+    given = as_floats(name, value)
+    if given.shape not in ((), (3,)) or not (np.isfinite(given).all() and (given >= 0.0).all()):
+        raise InputError(f"{name} must be >= 0, one number or along three axes (3,), got {_shown(given)}")
+    return np.array(np.broadcast_to(given, (3,)))
+
+
 def of_kind(elements: Iterable[Element], kind: str) -> tuple[Element, ...]:
     """The elements of one kind."""
     return tuple(own for own in elements if own.kind == kind)
@@ -244,11 +394,25 @@ def drive_force(servo: Element, q: Floats, v: Floats, force: Floats) -> Floats:
     return bent
 
 
-def dissipates(element: Element) -> bool:
-    """Whether an element turns energy into heat."""
+def drive_forces(elements: Iterable[Element], q: Floats, v: Floats, force: Floats) -> Floats:
+    """The forces (K, n) that drives make of the controls' constant forces (K, n), at q and v (K, n) [N m or N]."""
+    driven = force.copy()
+    for own in of_kind(elements, "PositionServo"):
+        c = own.coordinate
+        driven[:, c] = drive_force(own, q[:, c], v[:, c], force[:, c])
+    return driven
+
+
+def dissipates(element: Element | Coupling) -> bool:
+    """Whether an element or a coupling turns energy into heat."""
     if element.kind == "JointStop":
         return element.values[3] > 0.0
-    return element.kind in ("JointDamper", "CoulombFriction", "PositionServo")
+    return element.kind in ("JointDamper", "CoulombFriction", "PositionServo", "FrameDamper")
+
+
+def keeps_energy(coupling: Coupling) -> bool:
+    """Whether a coupling is part of the potential energy."""
+    return coupling.kind in ("FrameLoad", "FrameSpring", "FrameLengthSpring")
 
 
 def forces_of(given: Force | Sequence[Force]) -> tuple[Force, ...]:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from varpin.checks import JointValues, fraction, joint_array, positive
 from varpin.errors import InputError
-from varpin.forces import of_kind
+from varpin.forces import keeps_energy, of_kind
+from varpin.robot.kinematics import FrameKinematics, links
 from varpin.scene import Scene, require_scene
 from varpin.textbook import rigid_body_Lqq
 
@@ -99,7 +100,53 @@ def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
     potential = pin.computePotentialEnergy(model, data, full_q) + energy
     springs = of_kind(scene.elements, "JointSpring")
     potential += sum(0.5 * own.values[0] * (q[own.coordinate] - own.values[1]) ** 2 for own in springs)
+    held, pull, bend = _coupled(scene, q)
+    potential, Lq, Lqq = potential + held, Lq - pull, Lqq - bend
     return LagrangianJet(float(0.5 * v @ Lvv @ v - potential), Lq, Lvv @ v, Lqq, G.T @ A @ G, Lvv)
+
+
+def _coupled(scene: Scene, q: Floats) -> tuple[float, Floats, Floats]:
+    """The energy V of all couplings that have one, with dV/dq (n,) and d2V/dq2 (n, n)."""
+    n = q.size
+    energy, slope, curvature = 0.0, np.zeros(n), np.zeros((n, n))
+    for own in scene.couplings:
+        if not keeps_energy(own):
+            continue
+        d, J, H = np.zeros(3), np.zeros((3, n)), np.zeros((n, 3, n))
+        numbers = np.array(own.values)
+        for side, body, place in ((1.0, own.a, numbers[:3]), (-1.0, own.b, numbers[3:6])):
+            if body < 0:
+                d += side * place
+                continue
+            point = FrameKinematics("", links(scene.robot.tree, body), np.eye(3), place)
+            _, at, jacobian = point.jacobians(q[None])
+            d += side * at[0]
+            J += side * jacobian[0, :3]
+            H += side * point.motion(q[None]).jacobian_in_q()[0, :, :3]
+        own_energy, force, stiff = _between(own.kind, numbers[6:], d)
+        energy += own_energy
+        slope += J.T @ force
+        curvature += J.T @ stiff @ J + np.einsum("irj,r->ij", H, force)
+    return energy, slope, curvature
+
+
+def _between(kind: str, numbers: Floats, d: Floats) -> tuple[float, Floats, Floats]:
+    """The energy V of a coupling and its derivatives (3,) and (3, 3) in d = x_a - x_b."""
+    if kind == "FrameLoad":
+        return float(-numbers @ d), -numbers, np.zeros((3, 3))
+    if kind == "FrameSpring":
+        stiffness, stretch = numbers[:3], d - numbers[3:]
+        return float(0.5 * stiffness @ stretch**2), stiffness * stretch, np.diag(stiffness)
+    (stiffness, length), far = numbers, float(np.linalg.norm(d))
+    if far == 0.0:
+        return float(0.5 * stiffness * length**2), np.zeros(3), np.zeros((3, 3))
+    e, stretch = d / far, far - length
+    along = np.outer(e, e)
+    return (
+        float(0.5 * stiffness * stretch**2),
+        stiffness * stretch * e,
+        stiffness * (along + stretch / far * (np.eye(3) - along)),
+    )
 
 
 def _stops(scene: Scene, q: Floats) -> tuple[float, Floats, Floats]:

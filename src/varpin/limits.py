@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.forces import drive_force, of_kind
+from varpin.forces import drive_forces
 from varpin.scene import Scene
 from varpin.trajectory import Trajectory
 
@@ -70,8 +70,4 @@ def _velocities(_: Scene, trajectory: Trajectory) -> Floats:
 
 def _efforts(scene: Scene, trajectory: Trajectory) -> Floats:
     """Forces of the motors (N, n) [N m or N]."""
-    force = trajectory.u @ scene.actuation.T
-    for servo in of_kind(scene.elements, "PositionServo"):
-        c = servo.coordinate
-        force[:, c] = drive_force(servo, trajectory.q[:-1, c], trajectory.v[:-1, c], force[:, c])
-    return force
+    return drive_forces(scene.elements, trajectory.q[:-1], trajectory.v[:-1], trajectory.u @ scene.actuation.T)

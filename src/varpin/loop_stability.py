@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from varpin.chatter import RUN, alternation
 from varpin.errors import LinearizationError
+from varpin.forces import drive_forces
 from varpin.integrators import Integrator
 from varpin.integrators.explicit import accelerations
 from varpin.lagrangian import lagrangian_jet
@@ -329,7 +330,9 @@ def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[
 
 def _does_work(scene: Scene, trajectory: Trajectory) -> bool:
     """Whether the controls bring energy into a motion, rather than take it out."""
-    ways, force = np.diff(trajectory.q, axis=0), trajectory.u @ scene.actuation.T
+    ways, before = np.diff(trajectory.q, axis=0), trajectory.u @ scene.actuation.T
+    middle = 0.5 * (trajectory.q[1:] + trajectory.q[:-1])
+    force = drive_forces(scene.elements, middle, ways / trajectory.dt, before)
     return bool(((force / np.abs(force).max()) * (ways / np.abs(ways).max())).sum() > 0.0)
 
 

@@ -65,7 +65,7 @@ def plot_controls(
     robot: Robot | None = None,
     labels: Sequence[str] | None = None,
 ) -> tuple[Figure | SubFigure, Axes]:
-    """Controls over time, as the steps they are.
+    """Controls over time, as the steps they are; those of position servos as commanded positions [rad or m].
 
     Args:
         trajectory: The motion.
@@ -85,14 +85,27 @@ def plot_controls(
         raise InputError(f"labels must be {controls}, one a control, got {len(labels)}")
     slides = _slides(trajectory, robot)
     figure, axes = _axes(axes)
-    if labels is None and controls == len(trajectory.joint_names):
+    joints = _served(trajectory)
+    served = [joint is not None for joint in joints]
+    what = "control"
+    if labels is None and controls == len(trajectory.joint_names) and not any(served):
         names, unit = _labels(trajectory.joint_names, ("N m", "N"), slides)
+    elif controls and all(served):
+        what, own = "commanded position", np.array([joint for joint in joints if joint is not None])
+        plain = [trajectory.joint_names[joint] for joint in own] if labels is None else labels
+        names, unit = _labels(plain, ("rad", "m"), None if slides is None else slides[own])
     else:
-        names, unit = list(labels or (f"u{i + 1}" for i in range(controls))), "units of each"
+        every = labels is None and controls == len(trajectory.joint_names)
+        plain = trajectory.joint_names if every else (labels or [f"u{i + 1}" for i in range(controls)])
+        names = [
+            name if joint is None else f"{name}, commanded position [{_position_unit(joint, slides)}]"
+            for name, joint in zip(plain, joints, strict=True)
+        ]
+        unit = "units of each"
     for row, name, style in zip(trajectory.u.T, names, _styles(controls), strict=True):
         edges, values = _thin_steps(trajectory.t, row)
         axes.step(edges, values, where="post", label=name, **style)
-    _finish(axes, trajectory, f"control [{unit}]", controls)
+    _finish(axes, trajectory, f"{what} [{unit}]", controls)
     return figure, axes
 
 
@@ -160,8 +173,9 @@ def plot_trajectory(
     plot_energy_error(trajectory, panels[3])
     # The same joints have the same colours in all panels, so one legend serves them.
     handles, names = panels[0].get_legend_handles_labels()
+    mixed = len({joint is None for joint in _served(trajectory)}) > 1
     for panel in panels[1:3]:
-        same = len(panel.get_legend_handles_labels()[1]) == len(names)
+        same = len(panel.get_legend_handles_labels()[1]) == len(names) and not (panel is panels[2] and mixed)
         if panel.get_legend() is not None and (panel is panels[1] or (same and labels is None)):
             panel.get_legend().remove()
     if axes is None and panels[0].get_legend() is not None:
@@ -340,6 +354,26 @@ def _labels(names: Sequence[str], units: tuple[str, str], slides: NDArray[np.boo
     if slides.all() or not slides.any():
         return list(names), units[int(slides[0])]
     return [f"{name} [{units[1]}]" if s else name for name, s in zip(names, slides, strict=True)], ", ".join(units)
+
+
+def _served(trajectory: Trajectory) -> list[int | None]:
+    """For each control (m,) the joint whose servo goes to it; None for forces, and where the record does not say."""
+    none: list[int | None] = [None] * trajectory.u.shape[1]
+    values = trajectory.scene_values
+    if "PositionServo" not in values or "actuation" not in values or not values["PositionServo"].size:
+        return none
+    actuation = values["actuation"]
+    joints = range(min(len(trajectory.joint_names), len(actuation)))
+    for joint in values["PositionServo"][:, 0].tolist():
+        # A file may hold anything.
+        drives = np.flatnonzero(actuation[int(joint)]) if joint in joints else np.zeros(0, dtype=np.int64)
+        if len(drives) and drives[0] < len(none):
+            none[int(drives[0])] = int(joint)
+    return none
+
+
+def _position_unit(joint: int, slides: NDArray[np.bool_] | None) -> str:
+    return "rad or m" if slides is None else ("rad", "m")[int(slides[joint])]
 
 
 def _styles(lines: int) -> list[dict[str, Any]]:

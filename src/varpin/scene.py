@@ -14,13 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.checks import JointValues, as_floats, finite_array, joint_array
 from varpin.core import Mechanism as Core
-from varpin.core.arrays import Diffusion, Element
+from varpin.core.arrays import Coupling, Diffusion, Element
 from varpin.errors import InputError, RobotError
 from varpin.forces import CoulombFriction, Force, JointDamper, JointSpring, dissipates, forces_of, not_negative, of_kind
 from varpin.frozen import Frozen
 from varpin.markup import facts, listed
 from varpin.noise import BoundNoise, ControlNoise, Noise, NoiseSum, bind
 from varpin.robot import Robot, require_sound
+from varpin.robot.tree import block_ends, path_coordinates
 
 Floats = NDArray[np.float64]
 
@@ -43,13 +44,21 @@ VALUES = {
     "CoulombFriction": "dry friction is another",
     "JointStop": "joint stops are others",
     "PositionServo": "position servos are others",
+    "FrameLoad": "forces on frames are others",
+    "FrameWrench": "forces on frames are others",
+    "FrameSpring": "springs between frames are others",
+    "FrameLengthSpring": "springs between frames are others",
+    "FrameDamper": "dampers between frames are others",
     "noise.constant": "the noise has another strength",
     "noise.control": "the noise has another strength",
     "noise.quadratic": "the noise has another strength",
     "noise.center": "the noise has another center",
 }
 # Kinds of forces that have an entry of their own, a row of the coordinate and the numbers for each element.
-OF_FORCES = ("CoulombFriction", "JointStop", "PositionServo")
+OF_ELEMENTS = ("CoulombFriction", "JointStop", "PositionServo")
+# The same of couplings, with the bodies of both ends; entries are there only if couplings are.
+OF_COUPLINGS = ("FrameLoad", "FrameWrench", "FrameSpring", "FrameLengthSpring", "FrameDamper")
+OF_FORCES = (*OF_ELEMENTS, *OF_COUPLINGS)
 # So many joints are told of with numbers.
 _NAMED = 7
 _OF_JOINTS = ("damping", "stiffness", "rest", "armature")
@@ -57,7 +66,7 @@ EARTH = (0.0, 0.0, -9.81)
 # Fields of the tree that the core takes.
 _TREE = (
     "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio", "offset",
-    "origin", "loads", "carried", "periodic", "group",
+    "origin", "loads", "carried", "periodic",
 )  # fmt: skip
 
 
@@ -80,8 +89,9 @@ class Scene(Frozen):
     Attributes:
         robot: The arm.
         gravity: Gravity (3,) [m/s^2] in world axes.
-        forces: What acts on the joints one by one, ``damping`` and ``stiffness`` among it.
-        elements: The same joint by joint, as the core takes it, armature apart.
+        forces: What acts on joints and frames, ``damping`` and ``stiffness`` among it.
+        elements: What of it acts on single joints, one by one, as the core takes it, armature apart.
+        couplings: What of it acts on frames and between them.
         damping: Viscous damping (n,) of all dampers [N m s/rad or N s/m]: the force -damping * v.
         stiffness: Of all joint springs (n,) [N m/rad or N/m]; they are part of the potential energy.
         rest: Configuration (n,) at which the springs are slack, those of a joint taken together [rad or m].
@@ -95,6 +105,7 @@ class Scene(Frozen):
     gravity: Floats
     forces: tuple[Force, ...]
     elements: tuple[Element, ...] = field(repr=False)
+    couplings: tuple[Coupling, ...] = field(repr=False)
     damping: Floats
     stiffness: Floats
     rest: Floats
@@ -122,7 +133,8 @@ class Scene(Frozen):
             robot: From :func:`varpin.load_robot`.
             gravity: ``True`` for (0, 0, -9.81), ``False`` for none, or any vector (3,) [m/s^2].
             forces: What acts on the joints: friction, stops, rotors, springs, dampers, servos, as
-                :class:`varpin.CoulombFriction` does.
+                :class:`varpin.CoulombFriction` does; and on frames: wrenches, springs and dampers, as
+                :class:`varpin.FrameSpring` does.
             damping: Short for a :class:`varpin.JointDamper` in ``forces``: one number, (n,), or numbers by joint name,
                 ``{"elbow": 0.1}``, >= 0 [N m s/rad or N s/m]. Joints that are not named have none. ``"robot"`` takes
                 what the robot's description gives (:attr:`varpin.Robot.damping`). Left out there is none, and where
@@ -139,6 +151,7 @@ class Scene(Frozen):
                 fit the robot.
             UnknownJoint: ``actuation``, ``damping``, ``stiffness``, ``rest`` or one of ``forces`` names a joint that is
                 no coordinate of the robot.
+            UnknownFrame: One of ``forces`` names a frame that the robot does not have.
         """
         if not isinstance(robot, Robot):
             raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
@@ -197,13 +210,34 @@ class Scene(Frozen):
         for force in self.forces:
             if not isinstance(force, JointSpring | JointDamper):
                 own = acting.setdefault(type(force).__name__, {})
-                own |= dict.fromkeys(self.robot.joint_names[each.coordinate] for each in force.bind(self.robot))
+                own |= dict.fromkeys(self.robot.joint_names[c] for c in self._moved(force.bind(self.robot)))
         return [(kind, list(joints)) for kind, joints in acting.items()]
+
+    def _moved(self, bound: Sequence[Element | Coupling]) -> list[int]:
+        """The coordinates that forces act on."""
+        found: set[int] = set()
+        for each in bound:
+            if isinstance(each, Element):
+                found.add(each.coordinate)
+            else:
+                found.update(*(path_coordinates(self.robot.tree, body).tolist() for body in (each.a, each.b)))
+        return sorted(found)
 
     @property
     def dissipates(self) -> bool:
         """Whether anything turns energy into heat."""
-        return any(map(dissipates, self.elements))
+        return any(map(dissipates, self.elements)) or any(map(dissipates, self.couplings))
+
+    @cached_property
+    def group(self) -> NDArray[np.int64]:
+        """Which coordinates (n,) move each other, labels from 0: the robot's groups, some joined by couplings."""
+        group = self.robot.tree.group.copy()
+        for own in self.couplings:
+            joined = np.unique(group[self._moved([own])])
+            group[np.isin(group, joined)] = joined[0]
+        label: NDArray[np.int64] = np.unique(group, return_inverse=True)[1].astype(np.int64)
+        label.setflags(write=False)
+        return label
 
     @property
     def _gear(self) -> Floats:
@@ -246,11 +280,13 @@ class Scene(Frozen):
         tree, fields = self.robot.tree, self.diffusion
         return Core.make(
             **{name: getattr(tree, name) for name in _TREE},
-            groups=tree.groups,
-            ends=tree.ends,
+            group=self.group,
+            groups=int(self.group.max()) + 1,
+            ends=block_ends(self.group),
             armature=self.armature,
             gravity=self.gravity,
             forces=self.elements,
+            couplings=self.couplings,
             actuation=self.actuation,
             constant=fields.constant,
             control=fields.control,
@@ -289,9 +325,12 @@ class Scene(Frozen):
         """
         tree, own = self.robot.tree, {name: getattr(self, name) for name in ("gravity", "damping", "stiffness", "rest")}
         own |= {"actuation": self.actuation, "armature": self.armature, "center": tree.center, "inertia": tree.inertia}
-        for kind in OF_FORCES:
+        for kind in OF_ELEMENTS:
             rows = [(each.coordinate, *each.values) for each in of_kind(self.elements, kind)]
             own[kind] = np.array(rows) if rows else np.zeros((0, 0))
+        for kind in OF_COUPLINGS:
+            if ends := [(each.a, each.b, *each.values) for each in self.couplings if each.kind == kind]:
+                own[kind] = np.array(ends, dtype=np.float64)
         own |= {"rotation": tree.rotation, "translation": tree.translation}
         own |= {"ratio": tree.ratio, "offset": tree.offset}
         if self.noise.diffusion is not None:
@@ -308,9 +347,9 @@ class Scene(Frozen):
         return none
 
     def holding_torque(self, q: JointValues) -> Floats:
-        """The generalized forces (n,) that hold the robot at rest at ``q``, against gravity and springs [N m or N].
+        """The generalized forces (n,) that hold the robot at rest at ``q`` [N m or N].
 
-        The gradient of the potential energy, -L_q(q, 0).
+        Against gravity and springs, the gradient of the potential energy, -L_q(q, 0), and against wrenches on frames.
 
         Args:
             q: Configuration, (n,) or by joint name [rad or m].
@@ -321,7 +360,8 @@ class Scene(Frozen):
         """
         at = joint_array("q", q, self.robot.joint_names)
         _, Lq, *_ = self.core.jet(at, np.zeros_like(at))
-        return np.asarray(-Lq, dtype=np.float64)
+        wrenches = self.core.coupled_forces(at[None], np.zeros((1, at.size)))[0][0] if self.couplings else 0.0
+        return np.asarray(-Lq - wrenches, dtype=np.float64)
 
     def holding_controls(self, q: JointValues) -> Floats:
         """The controls (m,) that hold the robot at rest at ``q``; of several that do, the smallest.
@@ -337,7 +377,10 @@ class Scene(Frozen):
         torque = self.holding_torque(at)
         controls = closest_controls(self, at)
         force = self.actuation @ controls
-        left = torque - force - self.core.forces(at[None], np.zeros((1, at.size)), force[None])[0][0]
+        still = at[None], np.zeros((1, at.size))
+        # Wrenches on frames are in both.
+        drives = self.core.forces(*still, force[None])[0][0] - self.core.coupled_forces(*still)[0][0]
+        left = torque - force - drives
         # Where nothing pulls, rounding leaves a trace of the weights' own moments, those at a metre say.
         weight = float(self.robot.tree.mass.sum() * np.linalg.norm(self.gravity))
         if (np.abs(left) > 1e-9 * (np.abs(torque).max() + weight)).any():
@@ -388,6 +431,10 @@ def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> l
                 found.append(f"gravity was {then} m/s^2, and is {here} in the scene")
                 continue
         found.append(f"{VALUES[name]} in the scene")
+    if values:
+        found += [
+            f"{VALUES[name]} in the scene" for name in OF_COUPLINGS if name in scene.values and name not in values
+        ]
     return list(dict.fromkeys(found))
 
 
@@ -465,7 +512,8 @@ def _forces(
         given = (JointDamper(short[0]), *given)
     if short[1].any():
         given = (JointSpring(short[1], slack), *given)
-    elements = [element for force in given for element in force.bind(robot)]
+    bound = [each for force in given for each in force.bind(robot)]
+    elements = [each for each in bound if isinstance(each, Element)]
     total = {kind: np.zeros(robot.dof) for kind in ("JointDamper", "JointSpring", "Armature")}
     for own in elements:
         if own.kind in total:
@@ -477,6 +525,7 @@ def _forces(
     return {
         "forces": given,
         "elements": tuple(own for own in elements if own.kind != "Armature"),
+        "couplings": tuple(each for each in bound if isinstance(each, Coupling)),
         "damping": total["JointDamper"],
         "stiffness": total["JointSpring"],
         "rest": slack,

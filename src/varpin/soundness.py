@@ -254,13 +254,13 @@ def _balances(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> l
     """
     at = np.arange(1, trajectory.steps + 1)
     found = [(at, trajectory.statistics.energy_defect, energy_scale(scene, trajectory))]
-    tree = scene.robot.tree
-    if integrator.variational or tree.groups < 2 or scene.noise.diffusion is None:
+    groups = int(scene.group.max()) + 1
+    if integrator.variational or groups < 2 or scene.noise.diffusion is None:
         return found
     _, turned, worked = _turnover(scene, trajectory)
     some = np.unique(np.linspace(1, trajectory.steps, _NODES).astype(np.int64))
-    for group in range(tree.groups):
-        own = tree.group == group
+    for group in range(groups):
+        own = scene.group == group
         scale = float(turned[own].sum() + worked[own].sum())
         found.append((some, _defects_of(scene, trajectory, own)[some], scale))
     return found
@@ -295,7 +295,7 @@ def _turnover(scene: Scene, trajectory: Trajectory) -> tuple[float, Floats, Floa
     The kinetic energy of the largest change of its velocity, for all it has to move; and the controls' work.
     """
     kinetic, work, turned, worked = energy_turnover(
-        scene.core, trajectory.q, trajectory.v, trajectory.p, trajectory.u, even=EVEN, looks=_NODES
+        scene.core, trajectory.q, trajectory.v, trajectory.p, trajectory.u, trajectory.dt, even=EVEN, looks=_NODES
     )
     return min(kinetic, float(turned.sum())) + work, turned, worked
 
@@ -330,7 +330,7 @@ def _works(scene: Scene, trajectory: Trajectory, kicked: Floats | float = 0.0) -
         work = force * way
         even = (way / h) ** 2
         heat = h * np.minimum((before**2 + before * after + after**2) / 3.0, even) * scene.damping
-        if scene.dissipates:
+        if scene.dissipates or scene.couplings:
             middle = 0.5 * (trajectory.q[1:] + trajectory.q[:-1])
             heat -= scene.core.forces(middle, way / h, force)[0] * way + h * even * scene.damping
     return work, heat

@@ -23,6 +23,7 @@ class BoundElimination {
         : n_(static_cast<std::size_t>(mechanism.dof())), jet_(mechanism.tree, false), articulated_(mechanism.tree) {
         require(q, "q", {n_});
         require(v, "v", {n_});
+        if (mechanism.couplings.any()) throw std::invalid_argument("couplings act");
         regular_ = articulated_.at(mechanism, q.data(), jet_);
         first_order(mechanism, q.data(), v.data(), jet_);
         if (mechanism.tree.size() == mechanism.dof()) {

@@ -39,17 +39,18 @@ bool pulls_fast_at(const Mechanism& mechanism, In<2> q, In<2> v, In<2> f, double
 }
 
 std::tuple<double, double, Out, Out> energy_turnover(const Mechanism& mechanism, In<2> q, In<2> v, In<2> p, In<2> u,
-                                                     double even, int looks) {
+                                                     double dt, double even, int looks) {
     const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
     const std::size_t steps = u.shape(0);
     for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}, {&p, "p"}}) require(*array, name, {steps + 1, n});
     require(u, "u", {steps, m});
+    if (!(dt > 0.0)) throw std::invalid_argument("dt is positive");
     if (looks < 2) throw std::invalid_argument("inertias are looked at at both ends at least");
     Turnover found;
     {
         nb::gil_scoped_release release;
-        found = turnover(mechanism, {static_cast<std::int64_t>(steps), q.data(), v.data(), p.data(), u.data()}, even,
-                         looks);
+        found = turnover(mechanism, {static_cast<std::int64_t>(steps), q.data(), v.data(), p.data(), u.data(), dt},
+                         even, looks);
     }
     return {found.kinetic, found.work, array_of(found.kinetic_of.data(), {n}), array_of(found.work_of.data(), {n})};
 }
@@ -87,8 +88,8 @@ void register_look(nb::module_& m) {
     m.def("longest_alternation", &alternation, "v"_a, "u"_a.none(), nb::kw_only(), "counts"_a, "idle"_a, "even"_a);
     m.def("fastest_damping", &fastest_damping_at, "mechanism"_a, "q"_a, "v"_a, "f"_a, "least"_a);
     m.def("pulls_fast", &pulls_fast_at, "mechanism"_a, "q"_a, "v"_a, "f"_a, "dt"_a);
-    m.def("energy_turnover", &energy_turnover, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, nb::kw_only(), "even"_a,
-          "looks"_a);
+    m.def("energy_turnover", &energy_turnover, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, "dt"_a, nb::kw_only(),
+          "even"_a, "looks"_a);
     m.def("doubled_steps_agree", &doubled_steps_agree, "mechanism"_a, "q"_a, "v"_a, "begins"_a, "length"_a, "dt"_a,
           "again_q"_a, "again_v"_a, nb::kw_only(), "way"_a, "velocity"_a, "little"_a, "light"_a, "even"_a);
 }

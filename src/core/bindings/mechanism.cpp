@@ -57,11 +57,34 @@ Element element_of(const std::string& kind, int coordinate, const std::vector<do
     throw std::invalid_argument("there is no element of kind " + kind);
 }
 
+// Couplings by the name of their kind, with the bodies of their points, -1 for the world, and their numbers in order,
+// the places of both points first.
+using NamedCouplings = std::vector<std::tuple<std::string, int, int, std::vector<double>>>;
+
+CoupledElement coupling_of(const std::string& kind, int a, int b, const std::vector<double>& values) {
+    const auto require_numbers = [&](std::size_t count) {
+        if (values.size() != 6 + count)
+            throw std::invalid_argument("a coupling of kind " + kind + " has " + std::to_string(6 + count) +
+                                        " numbers, not " + std::to_string(values.size()));
+    };
+    const auto vector = [&](std::size_t at) { return Vec3<double>{values[at], values[at + 1], values[at + 2]}; };
+    const auto from = [&] { return Anchor{a, vector(0)}; };
+    const auto to = [&] { return Anchor{b, vector(3)}; };
+    if (kind == "FrameLoad") return require_numbers(3), FrameLoad{from(), to(), vector(6)};
+    if (kind == "FrameSpring") return require_numbers(6), FrameSpring{from(), to(), vector(6), vector(9)};
+    if (kind == "FrameLengthSpring") return require_numbers(2), FrameLengthSpring{from(), to(), values[6], values[7]};
+    if (kind == "FrameDamper") return require_numbers(3), FrameDamper{from(), to(), vector(6)};
+    if (kind == "FrameWrench")
+        return require_numbers(7), FrameWrench{from(), to(), vector(6), vector(9), values[12] != 0.0};
+    throw std::invalid_argument("there is no coupling of kind " + kind);
+}
+
 Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation, In<2> translation, In<1> mass,
                        In<2> center, In<2> inertia, Integers<1> coordinate, In<1> ratio, In<1> offset,
                        Integers<1> origin, Integers<1> loads, Integers<2> carried, Integers<1> periodic, In<1> armature,
                        Integers<1> group, int groups, Integers<1> ends, In<1> gravity, const Named& forces,
-                       In<2> actuation, In<2> constant, In<3> control, In<2> quadratic, In<2> centers) {
+                       const NamedCouplings& couplings, In<2> actuation, In<2> constant, In<3> control, In<2> quadratic,
+                       In<2> centers) {
     const std::size_t bodies = parent.shape(0), n = armature.shape(0), m = actuation.shape(1);
     const std::size_t processes = constant.shape(1);
     require(origin, "origin", {bodies});
@@ -117,6 +140,13 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
         elements.push_back(element_of(kind, coordinate, values));
     }
     out.forces = Forces(elements);
+    std::vector<CoupledElement> between;
+    for (const auto& [kind, a, b, values] : couplings) {
+        if (std::min(a, b) < -1 || std::max(a, b) >= static_cast<int>(bodies) || std::max(a, b) < 0)
+            throw std::invalid_argument("a coupling's bodies are out of range");
+        between.push_back(coupling_of(kind, a, b, values));
+    }
+    out.couplings = Couplings(between, out.tree.bodies);
     out.controls = static_cast<int>(m);
     for (std::size_t r = 0; r < n; ++r) {
         for (std::size_t c = 0; c < m; ++c) {
@@ -190,8 +220,8 @@ Out velocity_slopes(const Mechanism& mechanism, In<2> q, In<2> v) {
     return out;
 }
 
-// At each row of q, v and the constant force f (N, n) the forces that the elements have beside L_q, dF/dq, dF/dv and
-// the power they turn into heat.
+// At each row of q, v and the constant force f (N, n) the forces that elements and couplings have beside L_q, the
+// elements' dF/dq and dF/dv, and the power turned into heat.
 std::tuple<Out, Out, Out, Out> forces(const Mechanism& mechanism, In<2> q, In<2> v, In<2> f) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
     require(q, "q", {rows, n});
@@ -201,14 +231,34 @@ std::tuple<Out, Out, Out, Out> forces(const Mechanism& mechanism, In<2> q, In<2>
     const Out value = array_for(of[0], {rows, n}), by_q = array_for(of[1], {rows, n}),
               by_v = array_for(of[2], {rows, n}), lost = array_for(of[3], {rows, n});
     std::vector<JointForce<double>> sum(n);
+    CouplingRoom<double> room;
     for (std::size_t s = 0; s < rows; ++s) {
-        mechanism.forces.sum(mechanism.dof(), q.data() + s * n, v.data() + s * n, f.data() + s * n, sum.data());
+        sum_forces(mechanism, q.data() + s * n, v.data() + s * n, f.data() + s * n, sum.data(), room,
+                   static_cast<double*>(nullptr), static_cast<double*>(nullptr));
         for (std::size_t c = 0; c < n; ++c) {
             const JointForce<double>& own = sum[c];
             for (int i = 0; i < 4; ++i) of[i][s * n + c] = std::array{own.value, own.by_q, own.by_v, own.lost}[i];
         }
     }
     return {value, by_q, by_v, lost};
+}
+
+// At each row of q and v (N, n) the forces that couplings have beside L_q, dF/dq and dF/dv (N, n, n).
+std::tuple<Out, Out, Out> coupled_forces(const Mechanism& mechanism, In<2> q, In<2> v) {
+    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
+    require(q, "q", {rows, n});
+    require(v, "v", {rows, n});
+    double *value = nullptr, *by_q = nullptr, *by_v = nullptr;
+    const Out F = array_for(value, {rows, n}), Fq = array_for(by_q, {rows, n, n}), Fv = array_for(by_v, {rows, n, n});
+    std::vector<JointForce<double>> sum(n);
+    CouplingRoom<double> room;
+    for (std::size_t s = 0; s < rows; ++s) {
+        std::fill(sum.begin(), sum.end(), JointForce<double>{});
+        mechanism.couplings.add_forces(static_cast<int>(n), q.data() + s * n, v.data() + s * n, room, sum.data(),
+                                       by_q + s * n * n, by_v + s * n * n);
+        for (std::size_t c = 0; c < n; ++c) value[s * n + c] = sum[c].value;
+    }
+    return {F, Fq, Fv};
 }
 
 // Derivatives of M, L_vq and L_qq along (alpha, beta) at each row of q, v, alpha and beta (N, n).
@@ -246,11 +296,12 @@ void register_mechanism(nb::module_& m) {
         .def_static("make", &mechanism_of, nb::kw_only(), "parent"_a, "prismatic"_a, "rotation"_a, "translation"_a,
                     "mass"_a, "center"_a, "inertia"_a, "coordinate"_a, "ratio"_a, "offset"_a, "origin"_a, "loads"_a,
                     "carried"_a, "periodic"_a, "armature"_a, "group"_a, "groups"_a, "ends"_a, "gravity"_a, "forces"_a,
-                    "actuation"_a, "constant"_a, "control"_a, "quadratic"_a, "centers"_a)
+                    "couplings"_a, "actuation"_a, "constant"_a, "control"_a, "quadratic"_a, "centers"_a)
         .def("jet", &jet, "q"_a, "v"_a)
         .def("jets", &jets, "q"_a, "v"_a)
         .def("velocity_slopes", &velocity_slopes, "q"_a, "v"_a)
         .def("forces", &forces, "q"_a, "v"_a, "f"_a)
+        .def("coupled_forces", &coupled_forces, "q"_a, "v"_a)
         .def("jets_along", &jets_along, "q"_a, "v"_a, "alpha"_a, "beta"_a);
 }
 

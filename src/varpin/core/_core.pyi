@@ -38,6 +38,7 @@ class Mechanism:
         ends: Integers,
         gravity: Floats,
         forces: Sequence[tuple[str, int, tuple[float, ...]]],
+        couplings: Sequence[tuple[str, int, int, tuple[float, ...]]],
         actuation: Floats,
         constant: Floats,
         control: Floats,
@@ -56,10 +57,13 @@ class Mechanism:
         """The derivative of v in (q, p) (N, n, 2n) at each row of q and v; NaN where M is not positive definite."""
 
     def forces(self, q: Floats, v: Floats, f: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Forces F of the elements beside L_q, dF/dq, dF/dv and the power turned into heat (N, n).
+        """Forces F beside L_q, what elements have of dF/dq and dF/dv, and the power turned into heat (N, n).
 
         They are at rows of q, v and f (N, n), f being the constant force of the controls, to which F adds.
         """
+
+    def coupled_forces(self, q: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
+        """The couplings' forces beside L_q (N, n), and dF/dq and dF/dv (N, n, n), at rows of q and v (N, n)."""
 
     def jets_along(self, q: Floats, v: Floats, alpha: Floats, beta: Floats) -> tuple[Floats, Floats, Floats]:
         """Derivatives of M, L_vq and L_qq (N, n, n) at each row of q and v along that of alpha and beta (N, n)."""
@@ -72,7 +76,10 @@ class Solver(Enum):
     elimination = ...
 
 class Elimination:
-    """Solves at one (q, v) by elimination from the leaves to the roots; see src/core/include/varpin/elimination.hpp."""
+    """Solves at one (q, v) by elimination from the leaves to the roots; see src/core/include/varpin/elimination.hpp.
+
+    Raises ValueError where couplings act.
+    """
 
     def __init__(self, mechanism: Mechanism, q: Floats, v: Floats) -> None: ...
     def step(self, ahead: float, behind: float, diagonal: Floats, b: Floats) -> tuple[Floats, Floats, float, bool]:
@@ -411,12 +418,13 @@ def pulls_fast(mechanism: Mechanism, q: Floats, v: Floats, f: Floats, dt: float)
     """Whether springs, servos or gravity turn a mode by more than a radian over dt [s], at a row of q, v, f (K, n)."""
 
 def energy_turnover(
-    mechanism: Mechanism, q: Floats, v: Floats, p: Floats, u: Floats, *, even: float, looks: int
+    mechanism: Mechanism, q: Floats, v: Floats, p: Floats, u: Floats, dt: float, *, even: float, looks: int
 ) -> tuple[float, float, Floats, Floats]:
-    """The energy that a motion turns over [J]; of its nodes (N + 1, n) and controls (N, m).
+    """The energy that a motion turns over [J]; of its nodes (N + 1, n), ``dt`` [s] apart, and controls (N, m).
 
-    The largest kinetic energy; the largest work so far of all controls. For each coordinate (n,): the kinetic energy of
-    the largest change of its velocity, at least by the part ``even`` of its largest; the largest work so far.
+    The largest kinetic energy; the largest work so far of all controls, of servos that of their drives. For each
+    coordinate (n,): the kinetic energy of the largest change of its velocity, at least by the part ``even`` of its
+    largest; the largest work so far.
     """
 
 def doubled_steps_agree(

@@ -45,6 +45,15 @@ class Element(NamedTuple):
     values: tuple[float, ...]  # its numbers, in order
 
 
+class Coupling(NamedTuple):
+    """What acts between two points; src/core/include/varpin/couplings.hpp has the kinds."""
+
+    kind: str
+    a: int  # the body that carries the one point, -1 for the world
+    b: int  # that of the other
+    values: tuple[float, ...]  # both places (3,) in their body's axes [m], then its numbers in order
+
+
 class Diffusion(NamedTuple):
     """Fields F_i of k Wiener processes that the core can evaluate.
 

@@ -166,6 +166,18 @@ def frame_on_body(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats
     return joint - 1, turn.T @ found.placement.rotation, turn.T @ found.placement.translation
 
 
+def place_of_frame(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats, Floats]:
+    """As :func:`frame_on_body`; of a frame that is fixed to the base -1, and where it stands in the world.
+
+    Raises:
+        UnknownFrame: There is no such frame.
+    """
+    found = model.frames[frame_index(model, frame, robot)]
+    if found.parentJoint == 0:
+        return -1, found.placement.rotation.copy(), found.placement.translation.copy()
+    return frame_on_body(model, frame, robot)
+
+
 def coordinate_armature(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...]) -> Floats:
     """Armature (n,) seen by each coordinate: its own and its followers', by the square of their ratios."""
     own = np.asarray(model.armature, dtype=float)
@@ -396,6 +408,15 @@ def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Inte
     )
     _, label = scipy.sparse.csgraph.connected_components(links, directed=False)
     return np.asarray(label, dtype=np.int64)
+
+
+def path_coordinates(tree: Tree, body: int) -> Integers:
+    """The coordinates that move a body; none move the world, -1."""
+    found = []
+    while body >= 0:
+        found.append(int(tree.coordinate[body]))
+        body = int(tree.parent[body])
+    return np.array(found, dtype=np.int64)
 
 
 def block_ends(group: Integers) -> Integers:

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from varpin.costs import Cost, CostSum, Terminal
 from varpin.errors import InputError, RobotError, RobotNotFound, UnknownFrame, UnknownJoint, VarpinError
-from varpin.forces import Force
+from varpin.forces import Force, PositionServo
 from varpin.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
 from varpin.robot import Robot, load_robot
 from varpin.scene import Scene, closest_controls, damping_of
 from varpin.scenefile.references import Timeline, constant
-from varpin.scenefile.spec import CostSpec, ForceSpec, SceneSpec, degrees_for_radians
+from varpin.scenefile.spec import CostSpec, ForceSpec, FrameForceSpec, SceneSpec, degrees_for_radians
 from varpin.scenefile.table import Floats, SceneFileError, Table, suggestion
 from varpin.scenefile.terms import Given
 
@@ -63,6 +63,7 @@ class Layout:
         robot: The robot.
         damping: (n,), like stiffness, rest, q0 and v0.
         forces: Others on joints.
+        frame_forces: Others on frames.
         actuated: Indices of the driven joints (m,).
         gear: Generalized force per control (m,).
         torque_limit: (m,) [N m or N], infinite where there is none.
@@ -78,6 +79,7 @@ class Layout:
     stiffness: Floats
     rest: Floats
     forces: tuple[JointForces, ...]
+    frame_forces: tuple[Force, ...]
     q0: Floats
     v0: Floats
     actuated: NDArray[np.int64]
@@ -123,6 +125,7 @@ class Layout:
                 JointForces(own.kind, {name: values[keep] for name, values in own.values.items()})
                 for own in self.forces
             ),
+            frame_forces=tuple(own for own in self.frame_forces if _has_moving_end(own, robot)),
             q0=self.q0[keep],
             v0=self.v0[keep],
             actuated=np.array([position[int(joint)] for joint in self.actuated[driven]], dtype=np.int64),
@@ -133,6 +136,26 @@ class Layout:
             controls=self.controls.columns(driven.tolist()) if isinstance(self.controls, Timeline) else self.controls,
             held=held,
         )
+
+    @property
+    def served(self) -> NDArray[np.bool_]:
+        """Which joints (n,) have a servo: their control is a position."""
+        servos = [own.values["stiffness"] > 0.0 for own in self.forces if own.kind is PositionServo]
+        return np.asarray(np.any([np.zeros(self.robot.dof, dtype=np.bool_), *servos], axis=0))
+
+    @property
+    def control_limit(self) -> Floats:
+        """Of controls (m,), infinite where there is none: of positions none, the torque limit is their servo's."""
+        return np.where(self.served[self.actuated], np.inf, self.torque_limit / np.abs(self.gear))
+
+    def _force(self, own: JointForces) -> Force:
+        """As a scene takes it. A torque limit bounds the effort of a servo."""
+        if own.kind is not PositionServo:
+            return own.force()
+        limit = np.full(self.robot.dof, np.inf)
+        limit[self.actuated] = self.torque_limit
+        effort = own.values.get("effort", np.full(self.robot.dof, np.inf))
+        return JointForces(own.kind, {**own.values, "effort": np.minimum(effort, limit)}).force()
 
     @property
     def actuation(self) -> Floats:
@@ -154,7 +177,7 @@ class Layout:
             damping=self.damping,
             stiffness=self.stiffness,
             rest=self.rest,
-            forces=[own.force() for own in self.forces],
+            forces=[*(self._force(own) for own in self.forces), *self.frame_forces],
             actuation=self.actuation,
             noise=[model for model in map(self._noise, self.noise) if model is not None] or None,
         )
@@ -280,6 +303,8 @@ def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
     if not gear.all():
         raise actuation.error("gear", f"must not be 0, and is for {driven[int(np.argmin(np.abs(gear)))]!r}")
     actuated = np.array([names.index(joint) for joint in driven], dtype=np.int64)
+    forces = tuple(_force(force, robot) for force in spec.forces)
+    _require_own_controls(spec, forces, names, actuated, gear)
     limit = _torque_limit(spec, robot, actuated, driven)
     controls = spec.controls
     timeline: Timeline | str | None
@@ -287,20 +312,14 @@ def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
         timeline = controls
     else:
         timeline = controls.timeline(driven, spec.duration, "driven joint")
-        force = np.abs(timeline.at(_times(spec))) * np.abs(gear)
-        if (force > limit * (1.0 + 1e-9)).any():
-            worst = int(np.argmax((force - limit).max(axis=0)))
-            raise root.table("simulate").error(
-                "controls",
-                f"of {driven[worst]!r} reach {force[:, worst].max():g} N m or N; torque_limit is {limit[worst]:g}",
-            )
-    return Layout(
+    layout = Layout(
         spec=spec,
         robot=robot,
         damping=damping,
         stiffness=springs.spread("stiffness", spec.stiffness, names),
         rest=rest,
-        forces=tuple(_force(force, robot) for force in spec.forces),
+        forces=forces,
+        frame_forces=tuple(_frame_force(force, robot) for force in spec.frame_forces),
         q0=q0,
         v0=initial.spread("v", spec.v0, names),
         actuated=actuated,
@@ -311,6 +330,61 @@ def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
         controls=timeline,
         held={},
     )
+    _require_controls(layout)
+    return layout
+
+
+def _require_own_controls(
+    spec: SceneSpec,
+    forces: Sequence[JointForces],
+    names: Sequence[str],
+    actuated: NDArray[np.int64],
+    gear: Floats,
+) -> None:
+    """Refuse servos on joints that no control is the position of."""
+    seen: set[int] = set()
+    for force, own in zip(spec.forces, forces, strict=True):
+        if own.kind is not PositionServo:
+            continue
+        for joint in np.flatnonzero(own.values["stiffness"]).tolist():
+            name = names[joint]
+            if joint in seen:
+                raise force.table.error("stiffness", f"joint {name!r} has a servo already")
+            seen.add(joint)
+            if joint not in actuated:
+                raise force.table.error("stiffness", f"joint {name!r} is not driven: [actuation] joints leaves it out")
+            if gear[actuated == joint] != 1.0:
+                raise spec.root.table("actuation").error(
+                    "gear", f"must be 1 for {name!r}, whose control is the position of its servo"
+                )
+
+
+def _require_controls(layout: Layout) -> None:
+    """Refuse controls of a simulation beyond their limits, degrees for positions, and noise in proportion to those."""
+    spec, served = layout.spec, layout.served[layout.actuated]
+    for table, model in zip(spec.root.tables("noise"), layout.noise, strict=True):
+        if model.kind == "control" and (served & (model.intensity != 0.0)).any():
+            joint = layout.driven[int(np.argmax(served & (model.intensity != 0.0)))]
+            raise table.error(
+                "intensity", f"is in proportion to forces, and the control of {joint!r} is the position of its servo"
+            )
+    if not isinstance(layout.controls, Timeline):
+        return
+    table = spec.root.table("simulate")
+    given = layout.controls.at(_times(spec))
+    for joint, column in zip(layout.actuated[served].tolist(), given.T[served], strict=True):
+        worst = float(column[np.argmax(np.abs(column))])
+        if not layout.robot.slides[joint] and degrees_for_radians(worst):
+            name = layout.robot.joint_names[joint]
+            raise table.error("controls", f"{worst:g} of {name!r} looks like degrees: positions of servos are in rad")
+    force, limit = np.abs(given * layout.gear), np.where(served, np.inf, layout.torque_limit)
+    if (force > limit * (1.0 + 1e-9)).any():
+        worst_joint = int(np.argmax((force - limit).max(axis=0)))
+        raise table.error(
+            "controls",
+            f"of {layout.driven[worst_joint]!r} reach {force[:, worst_joint].max():g} N m or N; torque_limit is "
+            f"{limit[worst_joint]:g}",
+        )
 
 
 def _times(spec: SceneSpec) -> Floats:
@@ -345,7 +419,7 @@ def _torque_limit(spec: SceneSpec, robot: Robot, actuated: NDArray[np.int64], dr
 
 
 def _force(spec: ForceSpec, robot: Robot) -> JointForces:
-    absent = {"lower": -np.inf, "upper": np.inf}
+    absent = {"lower": -np.inf, "upper": np.inf, "effort": np.inf}
     values = {
         name: spec.table.spread(name, value, robot.joint_names, absent=absent.get(name, 0.0))
         for name, value in spec.values.items()
@@ -356,6 +430,25 @@ def _force(spec: ForceSpec, robot: Robot) -> JointForces:
     except InputError as error:
         raise spec.table.error("", str(error)) from None
     return found
+
+
+def _frame_force(spec: FrameForceSpec, robot: Robot) -> Force:
+    try:
+        spec.force.bind(robot)
+    except UnknownFrame as error:
+        raise spec.table.error(
+            "", f"there is no frame {error.frame!r}; {suggestion(error.frame, error.frames, 'frames')}"
+        ) from None
+    except InputError as error:
+        raise spec.table.error("", str(error)) from None
+    return spec.force
+
+
+def _has_moving_end(force: Force, robot: Robot) -> bool:
+    """Whether a joint that is left moves what a force acts on."""
+    points = [getattr(force, name) for name in ("frame", "a", "b") if hasattr(force, name)]
+    frames = [point if isinstance(point, str) else point[0] for point in points if isinstance(point, str | tuple)]
+    return any(joints_of_frame(robot, frame).any() for frame in frames)
 
 
 def _noises(spec: SceneSpec, names: Sequence[str], driven: Sequence[str]) -> list[Noises]:

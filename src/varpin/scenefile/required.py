@@ -14,7 +14,7 @@ from varpin.markup import facts, listed
 from varpin.scene import Scene
 from varpin.scenefile.layout import CostTerm, Layout, holding_controls, joints_of_frame
 from varpin.scenefile.references import Timeline
-from varpin.scenefile.spec import FORCES
+from varpin.scenefile.spec import FORCES, FRAME_FORCES
 from varpin.scenefile.table import Floats
 
 Mask = NDArray[np.bool_]
@@ -95,21 +95,27 @@ def idle_joints(layout: Layout, scene: Scene) -> Mask:
         if model.kind != "control":
             touched |= model.intensity != 0.0
     if isinstance(layout.controls, Timeline):
-        touched[layout.actuated] |= layout.controls.at(t).any(axis=0)
-    elif layout.controls == "hold":
-        touched[layout.actuated] |= holding_controls(scene, layout.q0) != 0.0
+        commands = layout.controls.at(t)
+    else:
+        commands = (holding_controls(scene, layout.q0) if layout.controls == "hold" else np.zeros(scene.controls))[None]
+    touched[layout.actuated] |= (commands != _resting(layout)).any(axis=0)
     for term in layout.costs:
         touched |= _costs(term, layout, scene, t)
-    group = layout.robot.tree.group
+    group = scene.group
     busy = np.isin(group, group[touched])
     # Where nothing happens at all, all of it is the scene.
     return ~busy if busy.any() else np.zeros_like(busy)
 
 
+def _resting(layout: Layout) -> Floats:
+    """Controls (m,) that do nothing where the joints start: no force, or the place where a servo's joint stands."""
+    return np.where(layout.served, layout.q0, 0.0)[layout.actuated]
+
+
 def _pushed(layout: Layout, scene: Scene) -> Mask:
-    """Which joints springs and stops push at where they start."""
-    floating = Scene(layout.robot, gravity=False, forces=scene.forces)
-    return np.asarray(lagrangian_jet(floating, layout.q0, np.zeros(layout.robot.dof)).Lq != 0.0)
+    """Which joints springs, stops and what acts on frames push at where they start."""
+    floating = Scene(layout.robot, gravity=False, forces=scene.forces, actuation=layout.actuation)
+    return np.asarray(floating.holding_torque(layout.q0) != 0.0)
 
 
 def _weighed(layout: Layout) -> Mask:
@@ -132,7 +138,7 @@ def _costs(term: CostTerm, layout: Layout, scene: Scene, t: Floats) -> Mask:
         return joints_of_frame(layout.robot, term.spec.frame)
     if space == "robot":
         return ~touched
-    rest = {"q": layout.q0, "v": np.zeros(layout.robot.dof), "u": np.zeros(len(layout.actuated))}[space]
+    rest = {"q": layout.q0, "v": np.zeros(layout.robot.dof), "u": _resting(layout)}[space]
     if term.spec.term.limits is not None:
         lower, upper = term.spec.term.limits(layout.robot)
         margin = term.spec.numbers["margin"]
@@ -146,9 +152,9 @@ def _costs(term: CostTerm, layout: Layout, scene: Scene, t: Floats) -> Mask:
     return touched
 
 
-def requirements(layout: Layout, whole: Layout, idle: Sequence[str]) -> Required:
-    """The report on what ``layout`` has left of ``whole``."""
-    names, group = layout.robot.joint_names, layout.robot.tree.group
+def requirements(layout: Layout, whole: Layout, idle: Sequence[str], scene: Scene) -> Required:
+    """The report on what ``layout``, the ``scene``, has left of ``whole``."""
+    names, group = layout.robot.joint_names, scene.group
     parts = [tuple(name for name, g in zip(names, group, strict=True) if g == label) for label in np.unique(group)]
     together = ", ".join(
         sorted({term.spec.table.data["type"] for term in layout.costs if term.spec.term.space == "robot"})
@@ -183,7 +189,7 @@ def _terms(layout: Layout) -> dict[str, str]:
     noise = [f"{model.kind} ({np.count_nonzero(model.intensity)} processes)" for model in layout.noise]
     limited = np.isfinite(layout.torque_limit)
     costs = [term.spec.table.data["type"] + (" at the end" if term.spec.terminal else "") for term in layout.costs]
-    kinds = {force.kind for force in layout.forces}
+    kinds: set[type[Force]] = {force.kind for force in layout.forces} | {type(own) for own in layout.frame_forces}
     absent = [words for words, kind in _ABSENT.items() if kind not in kinds] + ["contact"]
     loads = [f"{load.mass:g} kg at {load.frame}" for load in spec.robot.payload]
     return {
@@ -195,6 +201,6 @@ def _terms(layout: Layout) -> dict[str, str]:
         "driven": ", ".join(layout.driven) or "none",
         "torque limits": of(limited.astype(float), layout.driven),
         "cost": ", ".join(costs) or "none",
-        "other forces": ", ".join(word for word, kind in FORCES.items() if kind in kinds) or "none",
+        "other forces": ", ".join(word for word, kind in {**FORCES, **FRAME_FORCES}.items() if kind in kinds) or "none",
         "not modelled": f"{', '.join(absent)}; shapes are read only for a replay",
     }

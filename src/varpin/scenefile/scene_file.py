@@ -80,7 +80,7 @@ class SceneFile:
         spec = self.spec
         if not spec.costs:
             raise spec.root.error("cost", "is missing; a scene to solve has a [[cost]] at least")
-        most = layout.torque_limit / np.abs(layout.gear)
+        most = layout.control_limit
         try:
             return OptimalControlProblem(
                 scene,
@@ -239,10 +239,11 @@ def load_scene(source: str | Path, *, required_only: bool = True) -> SceneFile:
         stays = idle_joints(whole, scene)
         idle = [name for name, out in zip(whole.robot.joint_names, stays, strict=True) if out]
     layout = whole.without(idle)
+    scene = scene if layout is whole else layout.scene()
     file = SceneFile(
         spec=spec,
-        required=requirements(layout, whole, idle),
-        scene=scene if layout is whole else layout.scene(),
+        required=requirements(layout, whole, idle, scene),
+        scene=scene,
         q0=layout.q0,
         v0=layout.v0,
         _layout=layout,

@@ -13,7 +13,19 @@ from typing import Any, Literal
 
 from varpin.checks import is_file
 from varpin.errors import FileError, InputError
-from varpin.forces import Armature, CoulombFriction, Force, JointDamper, JointSpring, JointStop
+from varpin.forces import (
+    Armature,
+    CoulombFriction,
+    Force,
+    FrameDamper,
+    FrameSpring,
+    FrameWrench,
+    JointDamper,
+    JointSpring,
+    JointStop,
+    Point,
+    PositionServo,
+)
 from varpin.integrators import BY_NAME, Integrator, options_of
 from varpin.robot import Payload, models_dir
 from varpin.scenefile.references import Reference, read_reference
@@ -37,8 +49,15 @@ FORCES: Mapping[str, type[Force]] = {
     "armature": Armature,
     "damper": JointDamper,
     "friction": CoulombFriction,
+    "servo": PositionServo,
     "spring": JointSpring,
     "stop": JointStop,
+}
+# The same of forces on frames.
+FRAME_FORCES: Mapping[str, type[Force]] = {
+    "frame_damper": FrameDamper,
+    "frame_spring": FrameSpring,
+    "frame_wrench": FrameWrench,
 }
 FIGURES = (".png", ".pdf", ".svg")
 
@@ -89,6 +108,19 @@ class ForceSpec:
 
     kind: type[Force]
     values: Mapping[str, ByName]
+    table: Table
+
+
+@dataclass(frozen=True, eq=False)
+class FrameForceSpec:
+    """A force on frames.
+
+    Attributes:
+        force: What the file says.
+        table: Where it stands, for messages.
+    """
+
+    force: Force
     table: Table
 
 
@@ -151,6 +183,7 @@ class SceneSpec:
         stiffness: Of joint springs, by joint [N m/rad or N/m].
         rest: Where springs are slack, by joint [rad or m].
         forces: Others on joints.
+        frame_forces: Others on frames.
         actuated: Joints that are driven; None for all.
         gear: Generalized force per control, by driven joint.
         torque_limit: By driven joint [N m or N]; ``"robot"`` for the robot description's; None for none.
@@ -179,6 +212,7 @@ class SceneSpec:
     stiffness: ByName
     rest: ByName
     forces: tuple[ForceSpec, ...]
+    frame_forces: tuple[FrameForceSpec, ...]
     actuated: tuple[str, ...] | None
     gear: ByName
     torque_limit: ByName | str | None
@@ -328,6 +362,7 @@ def _scene(root: Table, path: Path, name: str) -> SceneSpec:
             "",
             f"{horizon['steps']} steps times {len(costs)} costs are too many; {MOST_EVALUATIONS} are the most",
         )
+    forces = [_force(table) for table in root.tables("force")]
     joints = actuation.texts("joints")
     if "joints" in actuation and not joints:
         raise actuation.error("joints", "must name a joint at least; leave it out to drive all of them")
@@ -341,7 +376,8 @@ def _scene(root: Table, path: Path, name: str) -> SceneSpec:
         damping=_damping(root),
         stiffness=springs.by_name("stiffness", 0.0, least=0.0, unit="N m/rad or N/m"),
         rest=springs.by_name("rest", 0.0, unit="rad or m"),
-        forces=tuple(_force(table) for table in root.tables("force")),
+        forces=tuple(force for force in forces if isinstance(force, ForceSpec)),
+        frame_forces=tuple(force for force in forces if isinstance(force, FrameForceSpec)),
         actuated=joints or None,
         gear=actuation.by_name("gear", 1.0),
         torque_limit=limit,
@@ -411,12 +447,50 @@ def _gravity(root: Table) -> bool | tuple[float, ...]:
     return root.numbers("gravity", 3)
 
 
-def _force(table: Table) -> ForceSpec:
-    kind = FORCES[table.choice("type", tuple(FORCES))]
+def _force(table: Table) -> ForceSpec | FrameForceSpec:
+    word = table.choice("type", (*FORCES, *FRAME_FORCES))
+    if word in FRAME_FORCES:
+        return _frame_force(table, word)
+    kind = FORCES[word]
     own = fields(kind)
     table.allow("type", *(item.name for item in own))
     values = {item.name: table.by_name(item.name) for item in own if item.name in table or item.default is MISSING}
     return ForceSpec(kind, values, table)
+
+
+def _frame_force(table: Table, word: str) -> FrameForceSpec:
+    if word == "frame_wrench":
+        table.allow("type", "frame", "wrench", "axes")
+        point = _point(table, "frame")
+        if not isinstance(point, str | tuple):
+            raise table.error("frame", "must be a frame: its name, or a table of frame and place")
+        axes = table.choice("axes", ("world", "frame"), "world")
+        return FrameForceSpec(FrameWrench(point, table.numbers("wrench", 6), axes), table)  # type: ignore[arg-type]
+    ends = _point(table, "a"), _point(table, "b")
+    if word == "frame_damper":
+        table.allow("type", "a", "b", "damping")
+        return FrameForceSpec(FrameDamper(*ends, _along(table, "damping", "N s/m")), table)
+    table.allow("type", "a", "b", "stiffness", "rest")
+    rest = _along(table, "rest", "m") if "rest" in table else 0.0
+    return FrameForceSpec(FrameSpring(*ends, _along(table, "stiffness", "N/m"), rest), table)
+
+
+def _along(table: Table, name: str, unit: str) -> float | list[float]:
+    """One number, or three along the axes of the world."""
+    if isinstance(table.data.get(name), list):
+        return list(table.numbers(name, 3))
+    return table.number(name, unit=unit)
+
+
+def _point(table: Table, name: str) -> Point:
+    """A frame's name, a table of a frame and a place in it, or a place in the world."""
+    value = table.require(name, "a frame's name, { frame, place } or a place in the world [m]")
+    if isinstance(value, list):
+        return list(table.numbers(name, 3))
+    if isinstance(value, dict):
+        own = table.table(name).allow("frame", "place")
+        return own.text("frame"), list(own.numbers("place", 3))
+    return table.text(name)
 
 
 def _noise(table: Table) -> NoiseSpec:

@@ -247,7 +247,8 @@ class OptimalControlProblem(Frozen):
         for name in ("gravity", "damping", "stiffness", "rest", "armature", "actuation"):
             if not np.array_equal(getattr(self.scene, name), getattr(other.scene, name)):
                 return f"another {name}"
-        if sorted(self.scene.elements) != sorted(other.scene.elements):
+        forces = [sorted([*own.elements, *own.couplings], key=repr) for own in (self.scene, other.scene)]
+        if forces[0] != forces[1]:
             return "other forces"
         return ""
 

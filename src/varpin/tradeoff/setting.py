@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from varpin.checks import JointValues, joint_array, positive
 from varpin.errors import InputError
+from varpin.forces import keeps_energy
 from varpin.frozen import Frozen
 from varpin.integrators import Integrator
 from varpin.integrators.base import Segment, open_loop
@@ -106,7 +107,8 @@ class Setting(Frozen):
     @property
     def conservative(self) -> bool:
         """Whether the energy is to stay."""
-        return not (self.scene.dissipates or (self.controls @ self.scene.actuation.T).any())
+        given = self.scene.dissipates or not all(map(keeps_energy, self.scene.couplings))
+        return not (given or (self.controls @ self.scene.actuation.T).any())
 
     @property
     def fingerprint(self) -> str:
@@ -116,6 +118,7 @@ class Setting(Frozen):
             *(scene.robot.tree, scene.gravity, scene.damping, scene.stiffness, scene.rest, scene.actuation),
             scene.diffusion,
             *([scene.elements, scene.armature] if scene.forces else []),
+            *([scene.couplings] if scene.couplings else []),
         )
         parts = surroundings, (self.q0, self.v0), self.controls, self.duration
         return " ".join(digest(part) for part in parts)

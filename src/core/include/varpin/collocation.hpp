@@ -1,6 +1,7 @@
 // The equation of a collocation step, its Newton iteration and its derivatives. docs/mathematics.md, "Higher order" and
 // "Structured linearization". The unknowns are the stage velocities V_i (tableau.hpp); with F = f + the forces of the
-// elements (forces.hpp), whose derivatives F_q, F_v and F_f - 1 are diagonal,
+// elements (forces.hpp), whose derivatives F_q, F_v and F_f - 1 are diagonal, and of couplings (couplings.hpp), whose
+// F_q and F_v are full in their blocks,
 //
 //     r_i(V) = p0 + h sum_j (abar_ij L_q + f_ij F)(Q_j, V_j) - L_v(Q_i, V_i) = 0
 //     N_im = -dr_i/dV_m = delta_im M_i + h (a_im A_i - abar_im A_m' - f_im F_v,m)
@@ -63,7 +64,12 @@ class Collocation {
           acting(stages * n),
           residual(stages * n),
           delta(stages * n) {
-        if (stages > StageElimination::most_stages || !eliminates(mechanism.tree, solver, stages)) {
+        for (Jet<double>& jet : stage) mechanism.couplings.fit(jet.couplings);
+        if (mechanism.couplings.pushes()) {
+            coupled_q.resize(entries(stages * n, n));
+            coupled_v.resize(stages * n * n);
+        }
+        if (stages > StageElimination::most_stages || !eliminates(mechanism, solver, stages)) {
             make_room();
             return;
         }
@@ -89,7 +95,9 @@ class Collocation {
     std::vector<double> V;                   // (s, n) stage velocities: the guess, then the root
     std::vector<double> Q;                   // (s, n)
     std::vector<double> slope;               // (s, n) L_q + F
-    std::vector<JointForce<double>> acting;  // (s, n) of the elements
+    std::vector<JointForce<double>> acting;  // (s, n) of the elements and couplings; derivatives of elements alone
+    std::vector<double> coupled_q;           // (s, n, n) dF/dq of the couplings, if there are such forces
+    std::vector<double> coupled_v;           // (s, n, n) dF/dv
 
     // Solve the step equation from the guess in V.
     //
@@ -159,6 +167,19 @@ class Collocation {
             const JointForce<double>& own = acting[i * n + c];
             const double in_place = own.by_q + (eliminated() ? element_curvature[i * n + c] : 0.0);
             total -= tableau.b[i] * (by_rate * own.by_v + by_place * in_place);
+        }
+        return total;
+    }
+
+    bool coupled() const { return !coupled_q.empty(); }
+
+    // The same of couplings at an entry of the symmetric part.
+    [[gnu::noinline]] double coupled_stiffening(int r, int c, double by_rate, double by_place) const {
+        double total = 0.0;
+        for (int i = 0; i < stages; ++i) {
+            const int one = (i * n + r) * n + c, other = (i * n + c) * n + r;
+            total -= 0.5 * tableau.b[i] *
+                     (by_rate * (coupled_v[one] + coupled_v[other]) + by_place * (coupled_q[one] + coupled_q[other]));
         }
         return total;
     }
@@ -306,12 +327,16 @@ class Collocation {
             }
         }
         if (second) take_over();
-        if (mechanism.forces.any()) look_at_elements(start.force);
+        if (mechanism.pushes()) look_at_elements(start.force);
         (second ? effort.jets : effort.sweeps) += stages;
     }
 
     void look_at_elements(const double* force) {
-        for (int i = 0; i < stages; ++i) mechanism.forces.sum(n, &Q[i * n], &V[i * n], force, &acting[i * n]);
+        for (int i = 0; i < stages; ++i) {
+            double* const by_q = coupled() ? &coupled_q[i * n * n] : nullptr;
+            double* const by_v = coupled() ? &coupled_v[i * n * n] : nullptr;
+            sum_forces(mechanism, &Q[i * n], &V[i * n], force, &acting[i * n], stage[i].couplings, by_q, by_v);
+        }
         if (!eliminated()) return;
         std::fill(element_curvature.begin(), element_curvature.end(), 0.0);
         for (int i = 0; i < stages; ++i) {
@@ -406,6 +431,7 @@ class Collocation {
                     const double* A = &stage[i].A[row * n + block.begin];
                     for (int c = 0; c < width; ++c) line[j * width + c] += factor * A[c];
                     if (mechanism.forces.any()) line[j * width + r] += element_entry(h, i, j, row, false);
+                    if (coupled()) add_coupled_row(h, i, j, row, block, line + j * width);
                 }
                 const double* M = &stage[i].M[row * n + block.begin];
                 for (int c = 0; c < width; ++c) line[i * width + c] += M[c];
@@ -425,7 +451,21 @@ class Collocation {
                 line[c] = ahead * A[row + c] - behind * (ahead * Lqq[row + c] + A[c * n + r]);
             }
             if (elements) line[r] += element_entry(h, 0, 0, r, false);
+            if (coupled()) add_coupled_row(h, 0, 0, r, block, line + block.begin);
             for (int c = block.begin; c < block.end; ++c) line[c] += M[row + c];
+        }
+    }
+
+    // What the couplings' forces add to a row of N_im. Inlined it would slow down steps without any.
+    [[gnu::noinline]] void add_coupled_row(double h, int i, int m, int row, Block block, double* line) const {
+        const int width = block.end - block.begin;
+        const double by_rate = h * tableau.force[i * stages + m];
+        const double* own = &coupled_v[(m * n + row) * n + block.begin];
+        for (int c = 0; c < width; ++c) line[c] -= by_rate * own[c];
+        for (int j = 0; j < stages; ++j) {
+            const double by_place = h * h * tableau.a[j * stages + m] * tableau.force[i * stages + j];
+            own = &coupled_q[(j * n + row) * n + block.begin];
+            for (int c = 0; c < width; ++c) line[c] -= by_place * own[c];
         }
     }
 
@@ -542,6 +582,14 @@ class Collocation {
             for (int k = 0; k < stages * n; ++k)
                 acting[k].value += acting[k].by_v * delta[k] + acting[k].by_q * moved[k];
         }
+        for (int k = 0; k < stages * n && coupled(); ++k) {
+            const double *own_q = &coupled_q[k * n], *own_v = &coupled_v[k * n];
+            const int first = k - k % n;
+            double total = 0.0;
+            for (int c = 0; c < n; ++c) total += own_v[c] * delta[first + c] + own_q[c] * moved[first + c];
+            acting[k].value += total;
+            slope[k] += total;
+        }
         if (eliminated()) {
             change_of_slope(h, moved);
             for (int k = 0; k < stages * n; ++k) slope[k] += moved[k];
@@ -573,6 +621,8 @@ class Collocation {
                         total += tableau.gradient[i * stages + j] * stage[j].Lqq[r * n + c];
                     for (int j = 0; j < stages && r == c; ++j)
                         total += tableau.force[i * stages + j] * acting[j * n + r].by_q;
+                    for (int j = 0; j < stages && coupled(); ++j)
+                        total += tableau.force[i * stages + j] * coupled_q[(j * n + r) * n + c];
                     row[c] = h * total - stage[i].A[r * n + c];
                     row[n + c] = r == c ? 1.0 : 0.0;
                     row[2 * n + c] = r == c ? h * (share + changed(i, r)) : 0.0;
@@ -633,8 +683,12 @@ class Collocation {
             for (int r = block.begin; r < block.end; ++r) {
                 for (int m = block.begin; m < block.end; ++m) {
                     const JointForce<double> own = m == r ? acting[i * n + r] : JointForce<double>{};
-                    const double curvature = weight * (stage[i].Lqq[r * n + m] + own.by_q);
-                    const double coupling = weight * (stage[i].A[m * n + r] + own.by_v);
+                    double curvature = weight * (stage[i].Lqq[r * n + m] + own.by_q);
+                    double coupling = weight * (stage[i].A[m * n + r] + own.by_v);
+                    if (coupled()) {
+                        curvature += weight * coupled_q[(i * n + r) * n + m];
+                        coupling += weight * coupled_v[(i * n + r) * n + m];
+                    }
                     for (int kind = 0; kind < 3; ++kind) {
                         const double* __restrict dQ = &shift[((m - block.begin) * 3 + kind) * width];
                         const double* __restrict dv = &dV[(i * n + m) * 3 * n + kind * n + block.begin];

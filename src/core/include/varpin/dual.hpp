@@ -23,6 +23,10 @@ constexpr Dual& operator+=(Dual& a, Dual b) { return a = a + b; }
 constexpr Dual& operator-=(Dual& a, Dual b) { return a = a - b; }
 constexpr double value_of(double a) { return a; }
 constexpr double value_of(Dual a) { return a.value; }
+inline Dual sqrt(Dual a) {
+    const double root = std::sqrt(a.value);
+    return {root, 0.5 * a.slope / root};
+}
 inline Dual sin(Dual a) { return {std::sin(a.value), a.slope * std::cos(a.value)}; }
 inline Dual tanh(Dual a) {
     const double t = std::tanh(a.value);

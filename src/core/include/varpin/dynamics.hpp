@@ -109,6 +109,7 @@ class ForwardDynamics {
           room_(jet_.dof),
           momentum_(jet_.dof) {
         const int n = jet_.dof;
+        mechanism.couplings.fit(jet_.couplings);
         if (!derivatives && eliminates(mechanism.tree, solver)) {
             articulated_.emplace(mechanism.tree);
             return;
@@ -118,6 +119,9 @@ class ForwardDynamics {
         if (!derivatives) return;
         slopes_.resize(n * n);
         weights_.resize(n * n);
+        if (mechanism.couplings.any()) {
+            for (auto* matrix : {&coupled_q_, &coupled_v_, &coupled_curvature_}) matrix->resize(n * n);
+        }
     }
 
     int dof() const { return jet_.dof; }
@@ -194,7 +198,9 @@ class ForwardDynamics {
 
     // The accelerations a under a force, which the derivatives that follow are about too.
     void acceleration(const double* force, double* a) {
-        mechanism_->forces.sum(jet_.dof, q_.data(), v_.data(), force, acting_.data());
+        double* const by_q = coupled_q_.empty() ? nullptr : coupled_q_.data();
+        double* const by_v = coupled_v_.empty() ? nullptr : coupled_v_.data();
+        sum_forces(*mechanism_, q_.data(), v_.data(), force, acting_.data(), jet_.couplings, by_q, by_v);
         for (int i = 0; i < jet_.dof; ++i) room_[i] = force[i] + acting_[i].value - bias_[i];
         solve_mass(room_.data(), a);
     }
@@ -206,6 +212,8 @@ class ForwardDynamics {
         const int n = jet_.dof;
         detail::clear_blocks(tree, slopes_);
         for (int i = 0; i < n; ++i) slopes_[i * n + i] = {-acting_[i].by_q - curvature_[i], -acting_[i].by_v};
+        for (std::size_t k = 0; k < coupled_curvature_.size(); ++k)
+            slopes_[k] += {-coupled_q_[k] - coupled_curvature_[k], -coupled_v_[k]};
         for (int j = 0; j < tree.size(); ++j) {
             const auto& here = jet_.body[j];
             accelerate(j, v, a);
@@ -301,6 +309,14 @@ class ForwardDynamics {
             bias_[c] -= own.force;
             curvature_[c] += own.curvature;
         });
+        if (!mechanism_->couplings.any()) return;
+        std::fill(coupled_curvature_.begin(), coupled_curvature_.end(), 0.0);
+        mechanism_->couplings.potentials(q, jet_.couplings, [&](const auto& arms, const auto& own, double, double) {
+            jet_.potential[mechanism_->tree.group[arms.front().coordinate]] += own.energy;
+            for (const Arm<double>& arm : arms) bias_[arm.coordinate] += dot(own.slope, arm.linear);
+            if (coupled_curvature_.empty()) return;
+            Couplings::subtract_curvature(arms, own, jet_.dof, coupled_curvature_.data());
+        });
     }
 
     bool factor() {
@@ -362,9 +378,10 @@ class ForwardDynamics {
     const Mechanism* mechanism_;
     Jet<double> jet_;  // placements, velocities, inertias of what bodies carry, M, potential
     std::vector<BodyState> body_;
-    std::vector<double> q_, v_;               // (n)
-    std::vector<JointForce<double>> acting_;  // (n) of the elements, under the last force
-    std::vector<double> curvature_;           // (n) of their potentials
+    std::vector<double> q_, v_;                                      // (n)
+    std::vector<JointForce<double>> acting_;                         // (n) of the elements, under the last force
+    std::vector<double> curvature_;                                  // (n) of their potentials
+    std::vector<double> coupled_q_, coupled_v_, coupled_curvature_;  // (n, n) of couplings, for derivatives
     std::vector<double> bias_, room_;
     std::optional<ArticulatedBodies> articulated_;  // in place of M
     std::vector<double> momentum_;                  // (n) where bodies are articulated

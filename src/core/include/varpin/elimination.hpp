@@ -32,7 +32,7 @@
 
 namespace varpin {
 
-// How to solve with M and with the matrix of a step.
+// How to solve with M and with the matrix of a step; elimination cannot of the latter where couplings act.
 enum class Solver { automatic, dense, elimination };
 
 // Times of a dense step for each body, for each pair of a body and one above it, and for each cubed size of a block; in
@@ -57,6 +57,11 @@ inline bool eliminates(const Tree& tree, Solver solver, int stages = 1) {
     const int slots = Ties(tree).slots;
     const double cost = stages > 1 ? stages_cost : slots > 0 ? tied_cost : 1.0;
     return cost * (1.0 + slot_cost * slots) * tree.size() < dense;
+}
+
+// Couplings fill more of a step's matrix than the bodies do.
+inline bool eliminates(const Mechanism& mechanism, Solver solver, int stages = 1) {
+    return !mechanism.couplings.any() && eliminates(mechanism.tree, solver, stages);
 }
 
 namespace detail {

@@ -241,6 +241,17 @@ class Forces {
         });
     }
 
+    // Whether an element makes something else of the constant force on its joint.
+    bool drives() const { return drives_; }
+
+    // Turns the constant forces f (n) into what such elements make of them at q and v (n).
+    void drive(const double* q, const double* v, double* f) const {
+        each([&](const auto& own) {
+            const int c = own.coordinate;
+            if constexpr (requires { own.force(0.0, 0.0, 0.0); }) f[c] += own.force(q[c], v[c], f[c]).value;
+        });
+    }
+
   private:
     template <class>
     struct ByKind;
@@ -252,11 +263,13 @@ class Forces {
     ByKind<Element>::type kinds_;
     std::vector<char> anchored_;
     bool any_ = false;
+    bool drives_ = false;
 
     template <class Kind>
     void add(const Kind& own) {
         std::get<std::vector<Kind>>(kinds_).push_back(own);
         any_ = true;
+        if constexpr (requires { own.force(0.0, 0.0, 0.0); }) drives_ = true;
         if (!Kind::anchored) return;
         if (!anchors(own.coordinate)) anchored_.resize(std::max<std::size_t>(anchored_.size(), own.coordinate + 1));
         anchored_[own.coordinate] = 1;

@@ -108,6 +108,7 @@ class EnergyGuard {
           share(n),
           diagonal(n),
           part(Energies(mechanism.tree).part) {
+        mechanism.couplings.fit(jet.couplings);
         if (eliminates(mechanism.tree, solver)) {
             articulated.emplace(mechanism.tree);
         } else {
@@ -220,6 +221,10 @@ class EnergyGuard {
                     if (tableau.skew == 0.0) continue;
                     const double twist = h * tableau.skew * tableau.b[s];
                     for (int j = block.begin; j <= i; ++j) line[j] += twist * (own.A[i * n + j] + own.A[j * n + i]);
+                }
+                if (step.coupled()) {
+                    for (int j = block.begin; j <= i; ++j)
+                        line[j] += step.coupled_stiffening(i, j, 0.5 * h, exaggerated);
                 }
                 line[i] += step.stiffening(i, 0.5 * h, exaggerated);
             }
@@ -398,6 +403,17 @@ class EnergyGuard {
                 own.potential += element.energy;
                 own.scale += element.magnitude(q[c]);
             });
+            // A coupling that moves the part is part of its Lagrangian, and moves with others too.
+            mechanism.couplings.potentials(
+                q, jet.couplings, [&](const auto& arms, const auto& coupling, double, double size) {
+                    const auto carried = [&](const Arm<double>& arm) { return light.carried[arm.coordinate] != 0; };
+                    if (std::none_of(arms.begin(), arms.end(), carried)) return;
+                    own.potential += coupling.energy;
+                    own.scale += size;
+                    for (const Arm<double>& arm : arms) {
+                        if (!carried(arm)) own.Lq[arm.coordinate] -= dot(coupling.slope, arm.linear);
+                    }
+                });
             const Force<double> weight{top.inertia.mass * g, cross(top.inertia.moment, g)};
             for (int a = carrier; a >= 0; a = tree.bodies[a].parent) {
                 const Body& link = tree.bodies[a];

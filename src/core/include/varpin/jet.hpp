@@ -70,6 +70,7 @@ struct Jet {
     std::vector<T> potential;  // of each group [J]
     std::vector<T> Lq, Lv, M, A, Lqq;
     std::vector<double> potential_scale, Lq_scale, Lv_scale;  // sums of the magnitudes that make them up
+    CouplingRoom<T> couplings;
 
     T total_potential() const {
         T sum{};
@@ -273,6 +274,22 @@ void clear_blocks(const Tree& tree, std::vector<T>& matrix) {
     }
 }
 
+// The couplings' potential energy, and its derivatives up to an order. Inlined it would slow down sweeps without any.
+template <class T>
+[[gnu::noinline]] void add_couplings(const Mechanism& mechanism, const T* q, Jet<T>& w, int order) {
+    mechanism.couplings.potentials(q, w.couplings, [&](const auto& arms, const auto& own, double scale, double size) {
+        const int group = mechanism.tree.group[arms.front().coordinate];
+        w.potential[group] += own.energy;
+        if constexpr (Jet<T>::scaled) w.potential_scale[group] += size;
+        if (order == 0) return;
+        for (const Arm<T>& arm : arms) {
+            w.Lq[arm.coordinate] += -dot(own.slope, arm.linear);
+            if constexpr (Jet<T>::scaled) w.Lq_scale[arm.coordinate] += scale * norm1(arm.linear);
+        }
+        if (order > 1) Couplings::subtract_curvature(arms, own, w.dof, w.Lqq.data());
+    });
+}
+
 // The elements' potential energy, and its derivatives up to an order.
 template <class T>
 void add_elements(const Mechanism& mechanism, const T* q, Jet<T>& w, int order) {
@@ -286,6 +303,7 @@ void add_elements(const Mechanism& mechanism, const T* q, Jet<T>& w, int order) 
             if (order > 0) w.Lq_scale[c] += own.scale;
         }
     });
+    if (mechanism.couplings.any()) add_couplings(mechanism, q, w, order);
 }
 
 // Armature's momentum, and the kinetic energy.

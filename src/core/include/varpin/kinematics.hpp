@@ -6,17 +6,20 @@
 #include <cmath>
 #include <vector>
 
+#include "varpin/body.hpp"
 #include "varpin/spatial.hpp"
-#include "varpin/tree.hpp"
 
 namespace varpin {
 
-struct Placement {
-    Mat3<double> rotation{};
-    Vec3<double> position{};  // [m]
+template <class T>
+struct PlacementOf {
+    Mat3<T> rotation{};
+    Vec3<T> position{};  // [m]
 };
+using Placement = PlacementOf<double>;
 
-constexpr Placement operator*(const Placement& a, const Placement& b) {
+template <class T>
+constexpr PlacementOf<T> operator*(const PlacementOf<T>& a, const Placement& b) {
     return {a.rotation * b.rotation, a.position + a.rotation * b.position};
 }
 
@@ -29,17 +32,25 @@ struct Links {
 };
 
 // The placement of every body at q.
-inline void place(const Links& links, const double* q, Placement* at) {
+template <class T>
+void place(const Links& links, const T* q, PlacementOf<T>* at) {
+    using std::cos, std::sin;
     for (int j = 0; j < links.size(); ++j) {
         const Body& link = links.bodies[j];
-        Placement here{link.rotation, link.translation};
-        if (link.parent >= 0) here = at[link.parent] * here;
-        const double angle = link.ratio * q[link.coordinate] + link.offset;
-        const Mat3<double>& R = here.rotation;
+        const Mat3<double>& E = link.rotation;
+        const Vec3<double>& p = link.translation;
+        PlacementOf<T> here;
+        if (link.parent >= 0) {
+            here = at[link.parent] * Placement{E, p};
+        } else {
+            here = {{{E.x.x, E.x.y, E.x.z}, {E.y.x, E.y.y, E.y.z}, {E.z.x, E.z.y, E.z.z}}, {p.x, p.y, p.z}};
+        }
+        const T angle = link.ratio * q[link.coordinate] + link.offset;
+        const Mat3<T>& R = here.rotation;
         if (link.prismatic) {
             here.position += angle * R.z;
         } else {
-            const double c = std::cos(angle), s = std::sin(angle);
+            const T c = cos(angle), s = sin(angle);
             here.rotation = {c * R.x + s * R.y, c * R.y - s * R.x, R.z};
         }
         at[j] = here;

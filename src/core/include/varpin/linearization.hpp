@@ -137,6 +137,7 @@ class VariationalLinearization {
     std::vector<Dual> at_q, at_v;
     std::vector<double> inner;  // (2n, 3n)
     std::vector<Dual> at_f;
+    std::vector<Dual> coupled_q, coupled_v;                   // (n, n) of couplings, along a direction
     std::vector<JointForce<Dual>> along_q, along_v, along_f;  // (n) of the elements, with derivatives in q, in v, in f
 
     // The root of a step that was taken whole: from a guess (s, n); where that is too far away, as where friction turns
@@ -252,7 +253,11 @@ class VariationalLinearization {
                     const double factor = h * tableau.b[i] * tableau.a[i * stages + m];
                     total += factor * equation.acting[i * n + c].by_q * z[n + c];
                     for (int j = 0; j < n; ++j) total += factor * equation.stage[i].Lqq[c * n + j] * z[n + j];
+                    for (int j = 0; j < n && equation.coupled(); ++j)
+                        total += factor * equation.coupled_q[(i * n + j) * n + c] * z[n + j];
                 }
+                for (int j = 0; j < n && equation.coupled(); ++j)
+                    total += tableau.b[m] * equation.coupled_v[(m * n + j) * n + c] * z[n + j];
                 slope[m * n + c] = h * total;
             }
         }
@@ -288,6 +293,7 @@ class VariationalLinearization {
                 }
             }
             if (mechanism.forces.any()) add_elements(h, i, z, H);
+            if (equation.coupled()) add_couplings(h, i, z);
             for (int c = 0; c < n; ++c) {
                 const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w];
                 const double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w];
@@ -315,9 +321,7 @@ class VariationalLinearization {
             stepper.mechanism.forces.sum(n, at_q.data(), at_v.data(), at_f.data(), along->data());
         }
         for (int c = 0; c < n; ++c) {
-            double gamma = equation.tableau.b[i] * z[n + c];
-            for (int j = 0; j < stages; ++j) gamma += equation.tableau.force[j * stages + i] * multiplier[j * n + c];
-            gamma *= h;
+            const double gamma = weight(h, i, c, z);
             const double qq = gamma * along_q[c].by_q.slope, qv = gamma * along_q[c].by_v.slope;
             const double vv = gamma * along_v[c].by_v.slope;
             const double qf = gamma * along_f[c].by_q.slope, vf = gamma * along_f[c].by_v.slope;
@@ -332,6 +336,44 @@ class VariationalLinearization {
             in_q[f] += qf;
             in_v[f] += vf;
             in_f[f] += gamma * along_f[c].by_f.slope;
+        }
+    }
+
+    // The weight gamma of stage i's force on coordinate c in what second derivatives are taken of.
+    double weight(double h, int i, int c, const double* z) const {
+        const Tableau& tableau = stepper.step_equation.tableau;
+        double gamma = tableau.b[i] * z[n + c];
+        for (int j = 0; j < stages; ++j) gamma += tableau.force[j * stages + i] * multiplier[j * n + c];
+        return h * gamma;
+    }
+
+    // Add to `inner` what stage i's gamma . F of couplings has of second derivatives, column by column of the Hessian.
+    void add_couplings(double h, int i, const double* z) {
+        const Collocation& equation = stepper.step_equation;
+        const int w = 3 * n;
+        for (auto* matrix : {&coupled_q, &coupled_v}) matrix->resize(n * n);
+        for (int along = 0; along < 2 * n; ++along) {
+            for (int c = 0; c < n; ++c) {
+                at_q[c] = {equation.Q[i * n + c], c == along ? 1.0 : 0.0};
+                at_v[c] = {equation.V[i * n + c], n + c == along ? 1.0 : 0.0};
+            }
+            std::fill(along_q.begin(), along_q.end(), JointForce<Dual>{});
+            stepper.mechanism.couplings.add_forces(n, at_q.data(), at_v.data(), direction.couplings, along_q.data(),
+                                                   coupled_q.data(), coupled_v.data());
+            const double* moved = along < n ? &dQ[along * w] : &dV[(i * n + along - n) * w];
+            for (int c = 0; c < n; ++c) {
+                double by_q = 0.0, by_v = 0.0;
+                for (int r = 0; r < n; ++r) {
+                    const double gamma = weight(h, i, r, z);
+                    by_q += gamma * coupled_q[r * n + c].slope;
+                    by_v += gamma * coupled_v[r * n + c].slope;
+                }
+                double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w];
+                for (int k = 0; k < w; ++k) {
+                    in_q[k] += by_q * moved[k];
+                    in_v[k] += by_v * moved[k];
+                }
+            }
         }
     }
 

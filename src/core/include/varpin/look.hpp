@@ -42,14 +42,18 @@ class Inertias {
           jet_(mechanism.tree),
           still_(mechanism.dof()),
           work_(jet_.M.size()),
-          forces_(mechanism.dof()) {}
+          forces_(mechanism.dof()) {
+        if (!mechanism.couplings.pushes()) return;
+        by_q_.resize(work_.size());
+        by_v_.resize(work_.size());
+    }
 
     int dof() const { return jet_.dof; }
     void at(const double* q) { lagrangian_jet(mechanism_, q, still_.data(), jet_); }
     // With the forces at velocities v under the controls' forces f (n).
     void at(const double* q, const double* v, const double* f) {
         at(q);
-        mechanism_.forces.sum(dof(), q, v, f, forces_.data());
+        sum_forces(mechanism_, q, v, f, forces_.data(), jet_.couplings, by_q_.data(), by_v_.data());
     }
     double diagonal(int c) const { return jet_.M[c * jet_.dof + c]; }
 
@@ -58,6 +62,7 @@ class Inertias {
     bool outpaces_dampers(double rate) {
         std::transform(jet_.M.begin(), jet_.M.end(), work_.begin(), [&](double m) { return rate * m; });
         for (int c = 0; c < dof(); ++c) work_[c * dof() + c] += std::min(forces_[c].by_v, 0.0);
+        add_symmetric(1.0, by_v_);
         return definite();
     }
 
@@ -65,6 +70,7 @@ class Inertias {
     bool carries(double weight) {
         for (std::size_t i = 0; i < work_.size(); ++i) work_[i] = jet_.M[i] + weight * jet_.Lqq[i];
         for (int c = 0; c < dof(); ++c) work_[c * dof() + c] += weight * forces_[c].by_q;
+        add_symmetric(weight, by_q_);
         return definite();
     }
 
@@ -73,6 +79,14 @@ class Inertias {
     Jet<double> jet_;
     std::vector<double> still_, work_;
     std::vector<JointForce<double>> forces_;
+    std::vector<double> by_q_, by_v_;  // (n, n) of couplings, if there are such forces
+
+    void add_symmetric(double weight, const std::vector<double>& matrix) {
+        for (std::size_t i = 0; i < matrix.size(); ++i) {
+            const std::size_t n = dof(), mirrored = i % n * n + i / n;
+            work_[i] += 0.5 * weight * (matrix[i] + matrix[mirrored]);
+        }
+    }
 
     bool definite() {
         const auto& blocks = mechanism_.tree.blocks;
@@ -129,12 +143,13 @@ struct Record {
     const double* v = nullptr;  // (N + 1, n)
     const double* p = nullptr;  // (N + 1, n)
     const double* u = nullptr;  // (N, m)
+    double h = 0.0;             // [s]
 };
 
 // The energy that a motion turns over [J].
 struct Turnover {
     double kinetic = 0.0;            // the largest kinetic energy
-    double work = 0.0;               // the controls' so far, where it is largest
+    double work = 0.0;               // the controls' so far, where it is largest; of servos what their drives do
     std::vector<double> kinetic_of;  // (n) of the largest change of each joint's velocity, for all it has to move
     std::vector<double> work_of;     // (n) as `work`, at each joint
 };
@@ -153,12 +168,20 @@ inline Turnover turnover(const Mechanism& mechanism, const Record& record, doubl
         }
         found.kinetic = larger(found.kinetic, 0.5 * kinetic);
     }
-    std::vector<double> force(n), work_of(n);
+    std::vector<double> force(n), work_of(n), middle(n), rate(n);
     double work = 0.0;
     for (std::size_t k = 0; k + 1 < nodes; ++k) {
         std::fill(force.begin(), force.end(), 0.0);
         for (const Transmission& own : mechanism.actuation)
             force[own.coordinate] += own.ratio * record.u[k * m + own.control];
+        if (mechanism.forces.drives()) {
+            for (int c = 0; c < n; ++c) {
+                const double before = record.q[k * n + c], after = record.q[(k + 1) * n + c];
+                middle[c] = 0.5 * (before + after);
+                rate[c] = (after - before) / record.h;
+            }
+            mechanism.forces.drive(middle.data(), rate.data(), force.data());
+        }
         for (int c = 0; c < n; ++c) {
             const double done = force[c] * (record.q[(k + 1) * n + c] - record.q[k * n + c]);
             work += done;

@@ -1,6 +1,7 @@
 // The robot as a tree of bodies, each on one joint about or along the z axis of its own frame, and what a scene adds.
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <limits>
@@ -8,6 +9,8 @@
 #include <string>
 #include <vector>
 
+#include "varpin/body.hpp"
+#include "varpin/couplings.hpp"
 #include "varpin/forces.hpp"
 #include "varpin/spatial.hpp"
 
@@ -21,21 +24,6 @@ inline int entries(std::int64_t rows, std::int64_t columns) {
                                 "integrator too many stages for so many");
     return static_cast<int>(rows * columns);
 }
-
-// Body and joint. The joint stands at ratio * q[coordinate] + offset; mimic joints have ratios other than 1.
-struct Body {
-    int parent = -1;  // -1 at a root; parents come first
-    bool prismatic = false;
-    Mat3<double> rotation{};     // of the joint's frame in its parent's, at joint position 0
-    Vec3<double> translation{};  // [m]
-    double mass = 0.0;           // [kg]
-    Vec3<double> center{};       // in the body's frame [m]
-    Sym3<double> inertia{};      // about the centre, in the body's axes [kg m^2]
-    int coordinate = 0;
-    double ratio = 1.0;
-    double offset = 0.0;  // [rad or m]
-    bool origin = false;  // no joint above turns: moments of what it carries are taken about its own joint
-};
 
 // Coordinates [begin, end) outside of which a block of M, L_vq and L_qq vanishes.
 struct Block {
@@ -84,11 +72,27 @@ struct Mechanism {
     Tree tree;
     Vec3<double> gravity{};  // [m/s^2]
     Forces forces;           // of single joints
+    Couplings couplings;     // between points of bodies
     int controls = 0;        // m
     std::vector<Transmission> actuation;
     Diffusion diffusion;
 
     int dof() const { return tree.dof(); }
+
+    // Whether there are forces beside L_q.
+    bool pushes() const { return forces.any() || couplings.pushes(); }
 };
+
+// The sum (n) of the forces beside L_q on each coordinate at q, v and the controls' f (n), into what is zero if there
+// are none. Of couplings its derivatives are diagonal no more: they go into by_q and by_v (n, n), which may be null.
+template <class T>
+void sum_forces(const Mechanism& mechanism, const T* q, const T* v, const T* f, JointForce<T>* out,
+                CouplingRoom<T>& room, T* by_q, T* by_v) {
+    const int n = mechanism.dof();
+    mechanism.forces.sum(n, q, v, f, out);
+    if (!mechanism.couplings.pushes()) return;
+    if (!mechanism.forces.any()) std::fill(out, out + n, JointForce<T>{});
+    mechanism.couplings.add_forces(n, q, v, room, out, by_q, by_v);
+}
 
 }  // namespace varpin

@@ -1,0 +1,377 @@
+// Forces at points that bodies carry, and between them: what couples joints besides inertia. docs/core.md, "Couplings".
+//
+// A coupling acts between points a and b, d = x_a - x_b. With l_i and w_i the velocity and the angular velocity that
+// joint i gives to the one or the other point, l_i taken negative for b, and J the matrix of their sums over both
+// points, d(l_j)/dq_i = w_i x l_j for i above j or j itself, in which it is symmetric, and d(w_j)/dq_i = w_i x w_j for
+// i above j alone. A coupling is one of
+//
+//     potential(d)   an energy V(d), part of the Lagrangian: V_q = J' V_d,  V_qq = J' V_dd J + V_d . d(J)/dq
+//     a damper       F = -J' D J v
+//     a wrench       F_i = l_i . f + w_i . m, constant in the world's axes or in those of a's body
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <type_traits>
+#include <utility>
+#include <variant>
+#include <vector>
+
+#include "varpin/body.hpp"
+#include "varpin/dual.hpp"
+#include "varpin/forces.hpp"
+#include "varpin/kinematics.hpp"
+#include "varpin/spatial.hpp"
+
+namespace varpin {
+
+// A point in the axes of the body that carries it, from its joint; of the world where there is none, -1.
+struct Anchor {
+    int body = -1;
+    Vec3<double> place{};  // [m]
+};
+
+namespace detail {
+
+template <class T>
+Vec3<T> entrywise(const Vec3<double>& a, const Vec3<T>& b) {
+    return {a.x * b.x, a.y * b.y, a.z * b.z};
+}
+template <class T>
+double size_of(const Vec3<T>& a) {
+    return std::abs(value_of(a.x)) + std::abs(value_of(a.y)) + std::abs(value_of(a.z));
+}
+
+}  // namespace detail
+
+// An energy V(d) of the vector from b to a.
+template <class T>
+struct VectorPotential {
+    T energy{};           // V [J]
+    Vec3<T> slope{};      // V_d [N]
+    Sym3<T> curvature{};  // V_dd [N/m]
+};
+
+// A constant force at a, in world axes; b is the world's origin.
+struct FrameLoad {
+    Anchor a, b;
+    Vec3<double> force{};  // [N]
+
+    template <class T>
+    VectorPotential<T> potential(const Vec3<T>& d) const {
+        return {-dot(force, d), {T(-force.x), T(-force.y), T(-force.z)}, {}};
+    }
+    // Of the terms that cancel in the force, points being as far from the origin as this.
+    double scale(double) const { return detail::size_of(force); }
+};
+
+// Three springs along the world's axes, slack where d = rest.
+struct FrameSpring {
+    Anchor a, b;
+    Vec3<double> stiffness{};  // [N/m]
+    Vec3<double> rest{};       // [m]
+
+    template <class T>
+    VectorPotential<T> potential(const Vec3<T>& d) const {
+        const Vec3<T> stretch = d + -1.0 * rest;
+        const Vec3<T> slope = detail::entrywise(stiffness, stretch);
+        return {0.5 * dot(slope, stretch), slope, {T(stiffness.x), T{}, T(stiffness.y), T{}, T{}, T(stiffness.z)}};
+    }
+    double scale(double far) const { return detail::size_of(stiffness) * (far + detail::size_of(rest)); }
+};
+
+// A spring along d, slack where |d| is its length, which is positive.
+struct FrameLengthSpring {
+    Anchor a, b;
+    double stiffness = 0.0;  // [N/m]
+    double length = 0.0;     // [m]
+
+    template <class T>
+    VectorPotential<T> potential(const Vec3<T>& d) const {
+        using std::sqrt;
+        // At d = 0 the direction of the force is none: there it is left out.
+        const T square = dot(d, d);
+        if (!(value_of(square) > 0.0)) return {T(0.5 * stiffness * length * length), {}, {}};
+        const T far = sqrt(square), stretch = far - T(length), inverse = reciprocal(far);
+        const Vec3<T> e = inverse * d;
+        const T across = stiffness * (stretch * inverse), along = T(stiffness) - across;
+        return {0.5 * stiffness * (stretch * stretch),
+                stiffness * stretch * e,
+                {across + along * (e.x * e.x), along * (e.x * e.y), across + along * (e.y * e.y), along * (e.x * e.z),
+                 along * (e.y * e.z), across + along * (e.z * e.z)}};
+    }
+    double scale(double far) const { return stiffness * (far + length); }
+
+  private:
+    static double reciprocal(double x) { return 1.0 / x; }
+    static Dual reciprocal(Dual x) { return {1.0 / x.value, -x.slope / (x.value * x.value)}; }
+};
+
+// Three dampers along the world's axes.
+struct FrameDamper {
+    Anchor a, b;
+    Vec3<double> damping{};  // [N s/m]
+};
+
+// A constant wrench at a; b is the world's origin.
+struct FrameWrench {
+    Anchor a, b;
+    Vec3<double> force{};   // [N]
+    Vec3<double> moment{};  // about a [N m]
+    bool carried = false;   // in the axes of a's body, and not in the world's
+};
+
+using CoupledElement = std::variant<FrameLoad, FrameSpring, FrameLengthSpring, FrameDamper, FrameWrench>;
+
+// What one joint does to one of the points.
+template <class T>
+struct Arm {
+    int coordinate = 0;
+    int point = 0;      // 0 for a, 1 for b
+    Vec3<T> linear{};   // of d
+    Vec3<T> angular{};  // of the point's body
+};
+
+// Work arrays; Couplings::fit makes room in them, at their first use at the latest.
+template <class T>
+struct CouplingRoom {
+    std::vector<PlacementOf<T>> at;
+    std::vector<Arm<T>> arms;
+    std::vector<Vec3<T>> change;  // of the velocity of d with the coordinate of each arm
+    Vec3<T> place[2];             // of the points of the coupling that arms are of
+    Mat3<T> rotation{};           // of a's body
+};
+
+class Couplings {
+  public:
+    Couplings() = default;
+    // Between points of some bodies, parents first.
+    Couplings(const std::vector<CoupledElement>& couplings, const std::vector<Body>& bodies) {
+        std::vector<int> own(bodies.size(), -1);
+        const auto take = [&](auto& self, int body) -> int {
+            if (body < 0) return -1;
+            if (own[body] < 0) {
+                Body link = bodies[body];
+                link.parent = self(self, link.parent);
+                own[body] = links_.size();
+                links_.bodies.push_back(link);
+            }
+            return own[body];
+        };
+        for (CoupledElement coupling : couplings) {
+            Joined joined;
+            std::visit(
+                [&](auto& element) {
+                    Anchor* const anchors[2] = {&element.a, &element.b};
+                    for (int point = 0; point < 2; ++point) {
+                        anchors[point]->body = take(take, anchors[point]->body);
+                        for (int j = anchors[point]->body; j >= 0; j = links_.bodies[j].parent)
+                            joined.path[point].push_back(j);
+                        std::reverse(joined.path[point].begin(), joined.path[point].end());
+                    }
+                    if constexpr (!has_potential<std::decay_t<decltype(element)>>) pushes_ = true;
+                },
+                coupling);
+            most_arms_ = std::max(most_arms_, joined.path[0].size() + joined.path[1].size());
+            joined.element = std::move(coupling);
+            joined_.push_back(std::move(joined));
+        }
+    }
+
+    bool any() const { return !joined_.empty(); }
+    // Whether there are forces beside those of potentials.
+    bool pushes() const { return pushes_; }
+
+    template <class T>
+    void fit(CouplingRoom<T>& room) const {
+        room.at.resize(links_.bodies.size());
+        room.arms.reserve(most_arms_);
+        room.change.reserve(most_arms_);
+    }
+
+    // Calls visit(arms, VectorPotential, scale, magnitude) for each that has a potential, at q: `scale` of the terms
+    // that cancel in V_d, `magnitude` of those that make up the energy.
+    template <class T, class Visit>
+    void potentials(const T* q, CouplingRoom<T>& room, const Visit& visit) const {
+        place_all(q, room);
+        for (const Joined& joined : joined_) {
+            std::visit(
+                [&](const auto& element) {
+                    if constexpr (has_potential<std::decay_t<decltype(element)>>) {
+                        write_arms(element, joined, room);
+                        const VectorPotential<T> own = element.potential(room.place[0] - room.place[1]);
+                        const double far = detail::size_of(room.place[0]) + detail::size_of(room.place[1]);
+                        visit(std::as_const(room.arms), own, element.scale(far),
+                              std::abs(value_of(own.energy)) + detail::size_of(own.slope) * far);
+                    }
+                },
+                joined.element);
+        }
+    }
+
+    // Adds -V_qq of a potential to a matrix (n, n).
+    template <class T>
+    static void subtract_curvature(const std::vector<Arm<T>>& arms, const VectorPotential<T>& own, int n, T* Lqq) {
+        for (const Arm<T>& i : arms) {
+            const Vec3<T> stiff = own.curvature * i.linear;
+            for (const Arm<T>& j : arms) Lqq[i.coordinate * n + j.coordinate] -= dot(stiff, j.linear);
+        }
+        turning(arms, own.slope, [&](int i, int j, const T& term) { Lqq[i * n + j] -= term; });
+    }
+
+    // Adds the forces beside those of potentials to `out` (n), and writes their derivatives in q and v (n, n), which
+    // may be null.
+    template <class T>
+    void add_forces(int n, const T* q, const T* v, CouplingRoom<T>& room, JointForce<T>* out, T* by_q, T* by_v) const {
+        for (T* matrix : {by_q, by_v}) {
+            if (matrix) std::fill(matrix, matrix + n * n, T{});
+        }
+        place_all(q, room);
+        for (const Joined& joined : joined_) {
+            std::visit(
+                [&](const auto& element) {
+                    if constexpr (!has_potential<std::decay_t<decltype(element)>>) {
+                        write_arms(element, joined, room);
+                        push(element, n, v, room, out, by_q, by_v);
+                    }
+                },
+                joined.element);
+        }
+    }
+
+  private:
+    template <class Element>
+    static constexpr bool has_potential = requires(const Element& own) { own.potential(Vec3<double>{}); };
+
+    struct Joined {
+        CoupledElement element;
+        std::vector<int> path[2];  // of bodies, from the root to each point
+    };
+
+    Links links_;
+    std::vector<Joined> joined_;
+    std::size_t most_arms_ = 0;
+    bool pushes_ = false;
+
+    template <class T>
+    void place_all(const T* q, CouplingRoom<T>& room) const {
+        fit(room);
+        place(links_, q, room.at.data());
+    }
+
+    template <class T, class Element>
+    void write_arms(const Element& element, const Joined& joined, CouplingRoom<T>& room) const {
+        room.arms.clear();
+        const Anchor* const anchors[2] = {&element.a, &element.b};
+        for (int point = 0; point < 2; ++point) {
+            const auto& [body, place] = *anchors[point];
+            Vec3<T>& x = room.place[point];
+            x = {T(place.x), T(place.y), T(place.z)};
+            if (body < 0) continue;
+            x = room.at[body].position + room.at[body].rotation * place;
+            if (point == 0) room.rotation = room.at[body].rotation;
+            for (int j : joined.path[point]) {
+                const Body& link = links_.bodies[j];
+                const Vec3<T>& axis = room.at[j].rotation.z;
+                const double side = point == 0 ? link.ratio : -link.ratio;
+                if (link.prismatic) {
+                    room.arms.push_back({link.coordinate, point, side * axis, {}});
+                } else {
+                    room.arms.push_back(
+                        {link.coordinate, point, side * cross(axis, x - room.at[j].position), link.ratio * axis});
+                }
+            }
+        }
+    }
+
+    // add(i, j, g . dl_i/dq_j) for all pairs of coordinates whose arms move each other.
+    template <class T, class Add>
+    static void turning(const std::vector<Arm<T>>& arms, const Vec3<T>& g, const Add& add) {
+        for (std::size_t i = 0; i < arms.size(); ++i) {
+            for (std::size_t j = i; j < arms.size() && arms[j].point == arms[i].point; ++j) {
+                const T term = dot(g, cross(arms[i].angular, arms[j].linear));
+                add(arms[i].coordinate, arms[j].coordinate, term);
+                if (i != j) add(arms[j].coordinate, arms[i].coordinate, term);
+            }
+        }
+    }
+
+    template <class T>
+    static void push(const FrameDamper& own, int n, const T* v, CouplingRoom<T>& room, JointForce<T>* out, T* by_q,
+                     T* by_v) {
+        const auto& arms = room.arms;
+        Vec3<T> rate{};
+        double rates = 0.0;
+        for (const Arm<T>& arm : arms) {
+            const Vec3<T> share = v[arm.coordinate] * arm.linear;
+            rate += share;
+            rates += detail::size_of(share);
+        }
+        const Vec3<T> drag = detail::entrywise(own.damping, rate);
+        for (const Arm<T>& arm : arms) {
+            JointForce<T>& at = out[arm.coordinate];
+            at.value += -dot(drag, arm.linear);
+            at.scale += detail::size_of(own.damping) * rates * detail::size_of(arm.linear);
+        }
+        if (!arms.empty()) out[arms[0].coordinate].lost += value_of(dot(drag, rate));
+        if (by_v) {
+            for (const Arm<T>& i : arms) {
+                const Vec3<T> damped = detail::entrywise(own.damping, i.linear);
+                for (const Arm<T>& j : arms) by_v[i.coordinate * n + j.coordinate] -= dot(damped, j.linear);
+            }
+        }
+        if (!by_q) return;
+        turning(arms, drag, [&](int i, int j, const T& term) { by_q[i * n + j] -= term; });
+        // d(J v)/dq_j = w_j x sum of l_i v_i from j on + (sum of w_i v_i before j) x l_j
+        room.change.assign(arms.size(), Vec3<T>{});
+        Vec3<T> before{}, beyond{};
+        for (std::size_t j = 0; j < arms.size(); ++j) {
+            if (j > 0 && arms[j].point != arms[j - 1].point) before = {};
+            room.change[j] = cross(before, arms[j].linear);
+            before += v[arms[j].coordinate] * arms[j].angular;
+        }
+        for (std::size_t j = arms.size(); j-- > 0;) {
+            if (j + 1 < arms.size() && arms[j].point != arms[j + 1].point) beyond = {};
+            beyond += v[arms[j].coordinate] * arms[j].linear;
+            room.change[j] += cross(arms[j].angular, beyond);
+        }
+        for (const Arm<T>& i : arms) {
+            const Vec3<T> damped = detail::entrywise(own.damping, i.linear);
+            for (std::size_t j = 0; j < arms.size(); ++j)
+                by_q[i.coordinate * n + arms[j].coordinate] -= dot(damped, room.change[j]);
+        }
+    }
+
+    template <class T>
+    static void push(const FrameWrench& own, int n, const T*, CouplingRoom<T>& room, JointForce<T>* out, T* by_q, T*) {
+        const auto& arms = room.arms;
+        Vec3<T> force{T(own.force.x), T(own.force.y), T(own.force.z)};
+        Vec3<T> moment{T(own.moment.x), T(own.moment.y), T(own.moment.z)};
+        if (own.carried) {
+            force = room.rotation * own.force;
+            moment = room.rotation * own.moment;
+        }
+        for (const Arm<T>& arm : arms) {
+            JointForce<T>& at = out[arm.coordinate];
+            at.value += dot(force, arm.linear) + dot(moment, arm.angular);
+            at.scale += detail::size_of(own.force) * detail::size_of(arm.linear) +
+                        detail::size_of(own.moment) * detail::size_of(arm.angular);
+        }
+        if (!by_q) return;
+        turning(arms, force, [&](int i, int j, const T& term) { by_q[i * n + j] += term; });
+        for (std::size_t i = 0; i < arms.size(); ++i) {
+            for (std::size_t j = 0; j < arms.size(); ++j) {
+                const Vec3<T>& turn = arms[j].angular;
+                T term{};
+                if (j < i) term += dot(moment, cross(turn, arms[i].angular));
+                if (own.carried) {
+                    term += dot(arms[i].linear, cross(turn, force)) + dot(arms[i].angular, cross(turn, moment));
+                }
+                by_q[arms[i].coordinate * n + arms[j].coordinate] += term;
+            }
+        }
+    }
+};
+
+}  // namespace varpin

@@ -1,0 +1,411 @@
+"""Forces on frames and between them: against kinematics written out body by body, differences, Pinocchio and SciPy."""
+
+import pickle
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from naive import directional, gradient, joint_axis, rotation
+from scipy.integrate import solve_ivp
+from test_elimination import rolled
+from test_forces import WEIGHTS, everything, one_step
+from test_groups import forest
+
+import varpin as vp
+from varpin.core import Elimination, Solver
+from varpin.tradeoff.setting import Setting
+
+INTEGRATORS = [vp.Midpoint(), vp.Midpoint(0.3), vp.Gauss(2), vp.Radau(2), vp.RungeKutta4(), vp.SemiImplicitEuler()]
+# Tip and a frame before it, or on another branch.
+ROBOTS = {
+    "chain": (lambda: vp.planar_chain(3), "joint3", "joint1"),
+    "finger": (lambda: vp.load_robot("finger"), "dip", "mcp"),
+    "ur5": (lambda: vp.load_robot("ur5"), "tool0", "forearm_link"),
+    "panda": (lambda: vp.load_robot("panda"), "panda_leftfinger", "panda_rightfinger"),
+    "forest": (lambda: forest(0, 2), "0.2", "2.3"),
+}
+
+
+def robot_of(name):
+    make, tip, other = ROBOTS[name]
+    return make(), tip, other
+
+
+def placed(robot, frame, q):
+    """Rotation (..., 3, 3) and place (..., 3) of a frame at complex q (..., n), body by body."""
+    model, names = robot.free_model, list(robot.joint_names)
+    ties = {tie.follower: tie for tie in robot.ties}
+    found = model.frames[model.getFrameId(frame)]
+    R, x = np.eye(3), np.zeros(3)
+    for joint in list(model.supports[found.parentJoint])[1:]:
+        tie = ties.get(joint)
+        c = names.index(model.names[tie.leader if tie else joint])
+        s = q[..., c] * (tie.ratio if tie else 1.0) + (tie.offset if tie else 0.0)
+        placement = model.jointPlacements[joint]
+        prismatic, axis = joint_axis(model, joint)
+        x, R = x + R @ placement.translation, R @ placement.rotation
+        if prismatic:
+            x = x + (R @ axis) * s[..., None]
+        else:
+            R = R @ rotation(axis, s)
+    return R @ found.placement.rotation, x + R @ found.placement.translation
+
+
+def point(robot, at, q):
+    """Where a point of a force is."""
+    if not isinstance(at, str | tuple):
+        return np.asarray(at) + 0.0 * q[..., :1]
+    frame, offset = at if isinstance(at, tuple) else (at, np.zeros(3))
+    R, x = placed(robot, frame, q)
+    return x + R @ offset
+
+
+def jacobian(robot, at, q):
+    return np.stack([gradient(lambda y, k=k: point(robot, at, y)[..., k], q) for k in range(3)])
+
+
+def spins(robot, frame, q):
+    """Angular velocity (3, n) that each coordinate gives to a frame, of dR/dq R'."""
+    R = placed(robot, frame, q)[0]
+    dR = np.stack([gradient(lambda y, i=i: placed(robot, frame, y)[0].reshape(*y.shape[:-1], 9)[..., i], q)
+                   for i in range(9)]).reshape(3, 3, -1)  # fmt: skip
+    turn = np.einsum("ikc,jk->ijc", dR, R)
+    return np.stack([turn[2, 1], turn[0, 2], turn[1, 0]])
+
+
+def energy(robot, force, q):
+    """The potential energy of one force at complex q (..., n)."""
+    if isinstance(force, vp.FrameWrench):
+        return -point(robot, force.frame, q) @ force.wrench[:3] if force.axes == "world" else 0.0 * q[..., 0]
+    if isinstance(force, vp.FrameDamper):
+        return 0.0 * q[..., 0]
+    d = point(robot, force.a, q) - point(robot, force.b, q)
+    if force.rest.ndim == 0 and force.rest > 0.0:
+        return 0.5 * force.stiffness * (np.sqrt((d**2).sum(-1)) - force.rest) ** 2
+    return 0.5 * (force.stiffness * (d - force.rest) ** 2).sum(-1)
+
+
+def push(robot, force, q, v):
+    """The force (n,) beside that of the energy."""
+    if isinstance(force, vp.FrameWrench):
+        frame = force.frame if isinstance(force.frame, str) else force.frame[0]
+        J, W, R = jacobian(robot, force.frame, q), spins(robot, frame, q), placed(robot, frame, q)[0]
+        f, m = np.split(force.wrench, 2)
+        return J.T @ R @ f + W.T @ R @ m if force.axes == "frame" else W.T @ m
+    if isinstance(force, vp.FrameDamper):
+        J = jacobian(robot, force.a, q) - jacobian(robot, force.b, q)
+        return -J.T @ (force.damping * (J @ v))
+    return np.zeros_like(q)
+
+
+def forces(tip, other, scale=1.0):
+    """One of each kind, between bodies, to the world, off the frames' origins."""
+    s = scale
+    return [
+        vp.FrameWrench(tip, s * np.array([3.0, -2.0, 5.0, 0.0, 0.0, 0.0])),
+        vp.FrameWrench((other, [0.1, 0.0, -0.2]), s * np.array([1.0, 2.0, -1.0, 0.5, -0.3, 0.8])),
+        vp.FrameWrench((tip, [0.0, 0.1, 0.0]), s * np.array([1.0, -2.0, 0.5, 0.2, 0.4, -0.3]), axes="frame"),
+        vp.FrameSpring(tip, (other, [0.05, 0.1, 0.0]), 8.0 * s),
+        vp.FrameSpring((tip, [0.0, 0.0, 0.1]), [0.4, 0.3, 0.2], s * np.array([5.0, 0.0, 9.0]), [0.1, 0.0, -0.2]),
+        vp.FrameSpring([1.2, -0.9, 1.1], other, 6.0 * s, 0.7),
+        vp.FrameDamper(tip, other, 0.6 * s),
+        vp.FrameDamper((other, [0.1, 0.0, 0.0]), [0.0, 0.0, 0.0], s * np.array([0.3, 0.0, 0.5])),
+    ]
+
+
+def state(robot):
+    rng = np.random.default_rng(3)
+    return rng.normal(size=robot.dof), rng.normal(size=robot.dof)
+
+
+@pytest.mark.parametrize("kind", range(8))
+@pytest.mark.parametrize("name", ROBOTS)
+def test_each_against_its_formula(name, kind):
+    robot, tip, other = robot_of(name)
+    given, (q, v) = forces(tip, other)[kind], state(robot)
+    scene, bare = vp.Scene(robot, damping=0.0, forces=given), vp.Scene(robot, damping=0.0)
+    own, before = vp.lagrangian_jet(scene, q, v), vp.lagrangian_jet(bare, q, v)
+    size = 1.0 + abs(energy(robot, given, q))
+    assert pytest.approx(energy(robot, given, q), rel=1e-11, abs=1e-11 * (size + abs(own.L))) == before.L - own.L
+
+    def slope(x):
+        return gradient(lambda y: energy(robot, given, y), x)
+
+    np.testing.assert_allclose(before.Lq - own.Lq, slope(q), rtol=1e-10, atol=1e-11 * (1 + np.abs(own.Lq).max()))
+    curvature = directional(slope, q, np.eye(robot.dof))
+    np.testing.assert_allclose(before.Lqq - own.Lqq, curvature, rtol=1e-8, atol=1e-9 * (1 + np.abs(own.Lqq).max()))
+    for name_ in ("Lv", "Lvq", "Lvv"):
+        assert getattr(own, name_).tobytes() == getattr(before, name_).tobytes()
+    value, by_q, by_v = (array[0] for array in scene.core.coupled_forces(q[None], v[None]))
+    expected = push(robot, given, q, v)
+    np.testing.assert_allclose(value, expected, rtol=1e-10, atol=1e-12 * (1 + np.abs(expected).max()))
+    for found, move in ((by_q, lambda y: (y, v)), (by_v, lambda y: (q, y))):
+        at = q if found is by_q else v
+        slopes = directional(
+            lambda y, move=move: np.array([push(robot, given, *move(x)) for x in y]), at, np.eye(at.size)
+        )
+        np.testing.assert_allclose(found, slopes.T, rtol=1e-8, atol=1e-9 * (1 + np.abs(slopes).max()))
+    all_, _, _, lost = scene.core.forces(q[None], v[None], np.zeros((1, robot.dof)))
+    np.testing.assert_array_equal(all_[0], value)
+    heat = -expected @ v if isinstance(given, vp.FrameDamper) else 0.0
+    assert lost.sum() == pytest.approx(heat, rel=1e-12, abs=1e-15)
+
+
+@pytest.mark.parametrize("name", ["finger", "ur5", "panda"])
+def test_all_together_by_pinocchio(name):
+    robot, tip, other = robot_of(name)
+    q, v = state(robot)
+    scene = vp.Scene(robot, damping=0.0, forces=forces(tip, other))
+    one, two = (vp.lagrangian_jet(scene, q, v, backend=backend) for backend in ("compiled", "pinocchio"))
+    for part in ("L", "Lq", "Lv", "Lqq", "Lvq", "Lvv"):
+        a, b = getattr(one, part), getattr(two, part)
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-11 * (1.0 + np.abs(b).max()), err_msg=part)
+
+
+def test_a_wrench_is_what_pinocchio_makes_of_it():
+    robot, tip, _ = robot_of("ur5")
+    q, v = state(robot)
+    model, data = robot.model, robot.model.createData()
+    wrench = np.array([3.0, -1.0, 2.0, 0.4, 0.5, -0.6])
+    for axes, frame in (("world", pin.LOCAL_WORLD_ALIGNED), ("frame", pin.LOCAL)):
+        J = pin.computeFrameJacobian(model, data, q, model.getFrameId(tip), frame)
+        scene = vp.Scene(robot, gravity=False, damping=0.0, forces=vp.FrameWrench(tip, wrench, axes))
+        still = np.zeros_like(v)
+        np.testing.assert_allclose(scene.holding_torque(q), -J.T @ wrench, rtol=1e-12, atol=1e-13)
+        motion = vp.simulate(scene, q, still, dt=1e-3, steps=5, controls=scene.holding_controls(q))
+        np.testing.assert_allclose(motion.q, np.tile(q, (6, 1)), atol=1e-9)
+
+
+def busy(robot, tip, other, q, scale):
+    """Everything on joints and on frames."""
+    own = everything(robot, q, scale)
+    return vp.Scene(robot, forces=[*own.forces, *forces(tip, other, scale)])
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS, ids=str)
+@pytest.mark.parametrize("name", ROBOTS)
+def test_linearization_of_a_step_with_all_of_them(name, integrator):
+    robot, tip, other = robot_of(name)
+    n, scale = robot.dof, 1e-4 if name == "finger" else 1.0
+    q, v = state(robot)
+    scene = vp.Scene(robot, damping=0.0, forces=forces(tip, other, scale))
+    u, dt = scale * np.linspace(-1.0, 1.0, n), 2e-3
+    motion = vp.simulate(scene, q, v, dt=dt, steps=1, controls=u, integrator=integrator, check=False)
+    assert motion.statistics.split_steps == 0
+    lin = vp.linearize(scene, motion, integrator=integrator)
+    light = 1.0 / np.diag(np.linalg.inv(vp.lagrangian_jet(scene, q, v).Lvv)) if integrator.variational else np.ones(n)
+    rows = np.concatenate([np.ones(n), light])
+    units = np.concatenate([rows, np.full(n, scale)])
+    point_ = np.concatenate([q, motion.p[0] if integrator.variational else v, u])
+    given = np.hstack([lin.A[0], lin.B[0]])
+    for c in range(3 * n):
+        e = 4e-3 * units[c] * np.eye(3 * n)[c]
+        found = sum(
+            w * (one_step(scene, *np.split(point_ + i * e, [2 * n]), dt, integrator)
+                 - one_step(scene, *np.split(point_ - i * e, [2 * n]), dt, integrator))
+            for i, w in WEIGHTS.items()
+        ) / 4e-3  # fmt: skip
+        expected = found / rows
+        assert np.abs(given[:, c] * units[c] / rows - expected).max() <= 1e-8 * max(1.0, np.abs(expected).max())
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS[:4], ids=str)
+@pytest.mark.parametrize("name", ROBOTS)
+def test_second_derivatives_of_a_step_with_all_of_them(name, integrator):
+    """Against differences of the first, of eighth order, along some directions, with all forces on joints too."""
+    robot, tip, other = robot_of(name)
+    n, dt, scale = robot.dof, 2e-3, 1e-4 if name == "finger" else 1.0
+    q, v = state(robot)
+    scene, u = busy(robot, tip, other, q, scale), scale * np.linspace(-1.0, 1.0, n)
+    u[[1, -1]] = q[1] + 0.4, q[-1] + 1.5
+    motion = vp.simulate(scene, q, v, dt=dt, steps=1, controls=u, integrator=integrator, check=False)
+    light = 1.0 / np.diag(np.linalg.inv(vp.lagrangian_jet(scene, q, v).Lvv))
+    z = np.random.default_rng(1).normal(size=2 * n) / np.concatenate([np.ones(n), light])
+    units = np.concatenate([np.ones(n), light, np.full(n, scale)])
+    units[[2 * n + 1, -1]] = 1.0
+    own = vp.second_order(scene, motion, z, integrator=integrator)
+    given = np.block([[own.xx[0], own.ux[0].T], [own.ux[0], own.uu[0]]])
+
+    def slope(y):
+        rate = np.linalg.solve(vp.lagrangian_jet(scene, y[:n], np.zeros(n)).Lvv, y[n : 2 * n])
+        end = vp.simulate(scene, y[:n], rate, dt=dt, steps=1, controls=y[2 * n :], integrator=integrator, check=False)
+        lin = vp.linearize(scene, end, integrator=integrator)
+        return z @ np.hstack([lin.A[0], lin.B[0]])
+
+    point_, size = np.concatenate([q, motion.p[0], u]), 4e-3
+    for c in (0, n - 1, n, 2 * n - 1, 3 * n - 1):
+        e = size * units[c] * np.eye(3 * n)[c]
+        found = sum(w * (slope(point_ + i * e) - slope(point_ - i * e)) for i, w in WEIGHTS.items()) / size
+        expected = found * units
+        error = given[:, c] * units[c] * units - expected
+        assert np.abs(error).max() <= 1e-8 * max(1.0, np.abs(expected).max())
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)], ids=str)
+@pytest.mark.parametrize("name", ROBOTS)
+def test_potentials_keep_steps_symplectic(name, integrator):
+    robot, tip, other = robot_of(name)
+    q, v = state(robot)
+    scale, n = 1e-4 if name == "finger" else 1.0, robot.dof
+    given = forces(tip, other, scale)
+    scene = vp.Scene(robot, damping=0.0, forces=[given[0], *given[3:6]])
+    motion = vp.simulate(scene, q, v, dt=2e-3, steps=10, integrator=integrator, check=False)
+    A = vp.linearize(scene, motion, integrator=integrator).A
+    J = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
+    assert np.abs(A.transpose(0, 2, 1) @ J @ A - J).max() <= 1e-11 * np.abs(A).max() ** 2
+    assert Setting.of(scene, q, v, None, 1.0).conservative
+    assert not Setting.of(vp.Scene(robot, forces=given[2]), q, v, None, 1.0).conservative
+
+
+@pytest.mark.parametrize("integrator", [vp.Gauss(3), vp.RungeKutta4()], ids=str)
+def test_power_balance(integrator):
+    """The energy, that of springs and loads included, changes by what wrenches give and dampers take."""
+    scene = vp.Scene(vp.planar_chain(3), forces=forces("joint3", "joint1"))
+    motion = vp.simulate(scene, [0.4, 0.1, -0.3], [1.0, -2.0, 0.5], dt=5e-4, steps=2000, integrator=integrator)
+    power = (scene.core.coupled_forces(motion.q, motion.v)[0] * motion.v).sum(axis=1)
+    gained = (power[:-1:2] + 4.0 * power[1::2] + power[2::2]).cumsum() * motion.dt / 3.0  # Simpson's rule
+    assert np.abs(gained).max() > 0.5
+    np.testing.assert_allclose(motion.energy[2::2] - motion.energy[0], gained, atol=1e-7 * np.abs(gained).max())
+    assert not motion.warnings
+    assert np.abs(motion.statistics.energy_defect).max() <= 1e-4 * np.abs(gained).max()
+
+
+def test_two_arms_and_a_spring_against_scipy():
+    """Arms that share nothing but a spring and a damper between their hands."""
+    robot, tip, other = robot_of("forest")
+    given = forces(tip, other)
+    scene, model = vp.Scene(robot, damping=0.2, forces=given), robot.model.copy()
+    data, n = model.createData(), robot.dof
+    q, v = 0.3 * state(robot)[0], np.zeros(n)
+
+    def slope(_, y):
+        at, rate = np.split(y, 2)
+        total = sum(
+            push(robot, own, at, rate) - gradient(lambda x, own=own: energy(robot, own, x), at) for own in given
+        )
+        return np.concatenate([rate, pin.aba(model, data, at, rate, total - 0.2 * rate)])
+
+    exact = solve_ivp(slope, (0.0, 0.1), np.concatenate([q, v]), "DOP853", rtol=1e-9, atol=1e-11).y[:, -1]
+    for integrator, error in (
+        (vp.Gauss(3), 1e-7),
+        (vp.Midpoint(), 1e-3),
+        (vp.Radau(3), 1e-7),
+        (vp.RungeKutta4(), 1e-6),
+    ):
+        motion = vp.simulate(scene, q, v, dt=1e-3, steps=100, integrator=integrator, check=False)
+        np.testing.assert_allclose(np.concatenate([motion.q[-1], motion.v[-1]]), exact, rtol=error, atol=error)
+
+
+def test_groups_that_couplings_join():
+    robot, tip, other = robot_of("forest")
+    spring = vp.FrameSpring(tip, other, 5.0)
+    assert vp.Scene(robot).group.tolist() == [0, 0, 0, 1, 1, 1, 1]
+    assert vp.Scene(robot, forces=vp.FrameSpring(tip, [0.0, 0.0, 0.0], 5.0)).group.max() == 1
+    assert vp.Scene(robot, forces=spring).group.tolist() == [0] * 7
+    q, v = state(robot)
+    scene = vp.Scene(robot, forces=spring)
+    A = vp.linearize(scene, vp.simulate(scene, q, v, dt=1e-3, steps=1)).A[0]
+    assert np.abs(A[7:10, 3:7]).min() > 0.0
+    # Errors of the energy that passes between arms are no errors.
+    motion = vp.simulate(scene, q, np.zeros(7), dt=1e-3, steps=300, integrator=vp.RungeKutta4())
+    assert not [words for words in motion.warnings if "energy" in words]
+
+
+def test_elimination_leaves_steps_with_couplings_to_the_dense_solver():
+    robot = vp.planar_chain(20)
+    q, v = np.linspace(-0.5, 0.5, 20), np.linspace(1.0, -1.0, 20)
+    scene = vp.Scene(
+        robot, forces=[vp.FrameSpring("joint20", [1.0, 0.0, 0.0], 30.0), vp.FrameDamper("joint20", "joint2", 0.5)]
+    )
+    ways = [rolled(scene, q, v, 1e-3, 10, way, vp.Gauss(2)) for way in (Solver.dense, Solver.elimination)]
+    for name in ("q", "p", "energy"):
+        np.testing.assert_allclose(getattr(ways[0], name), getattr(ways[1], name), rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match="couplings act"):
+        Elimination(scene.core, q, v)
+
+
+def test_a_hanging_spring_finds_its_rest():
+    """A slider on a spring with a length: where stiffness and weight are even."""
+    robot = vp.planar_chain(1)
+    load = vp.FrameWrench("joint1", [0, 0, 0, 0, -2.0, 0])
+    scene = vp.Scene(robot, gravity=False, damping=3.0, forces=[vp.JointSpring(4.0), load])
+    motion = vp.simulate(scene, [0.0], [0.0], dt=1e-2, steps=2000)
+    axis = spins(robot, "joint1", np.zeros(1))[:, 0]
+    np.testing.assert_allclose(motion.q[-1], load.wrench[3:] @ axis / 4.0, atol=1e-6)
+
+
+def carrier():
+    """A heavy wheel that carries a light pendulum of two links."""
+    model = pin.Model()
+    parent = 0
+    for k, mass in enumerate((500.0, 0.01, 0.01)):
+        parent = model.addJoint(parent, pin.JointModelRY(), pin.SE3(np.eye(3), np.array([0.3 * k, 0, 0])), f"j{k}")
+        model.appendBodyToJoint(parent, pin.Inertia.FromSphere(mass, 0.2), pin.SE3(np.eye(3), np.array([0.2, 0, 0])))
+        placement = pin.SE3(np.eye(3), np.array([0.3, 0, 0]))
+        model.addFrame(pin.Frame(f"tip{k}", parent, 0, placement, pin.FrameType.OP_FRAME))
+    return vp.load_robot(model)
+
+
+@pytest.mark.parametrize("ends", [("tip2", "tip0"), ("tip2", [0.5, 0.0, -0.8]), ("tip2", "tip1")])
+def test_light_parts_balance_with_springs(ends):
+    """A spring on a light part belongs to its balance: steps that resolve the motion stay whole."""
+    robot = carrier()
+    assert robot.tree.loads.size
+    scene = vp.Scene(robot, forces=[vp.FrameSpring(*ends, 2.0), vp.FrameDamper(*ends, 0.002)])
+    q, v = np.array([0.1, 0.8, -0.5]), np.array([0.4, 0.0, 1.0])
+    motion = vp.simulate(scene, q, v, dt=2e-3, steps=500, integrator=vp.Gauss(2), check=False)
+    assert motion.statistics.split_steps == 0
+
+
+def test_scenes_with_frame_forces_travel_and_are_told_apart(tmp_path):
+    robot, tip, other = robot_of("ur5")
+    scene = vp.Scene(robot, damping=0.1, forces=forces(tip, other))
+    back = pickle.loads(pickle.dumps(scene))
+    assert back.couplings == scene.couplings
+    assert repr(back.forces) == repr(scene.forces)
+    assert "FrameSpring(a='tool0', b=('forearm_link', [0.05, 0.1, 0.0]), stiffness=8.0, rest=0.0)" in repr(scene.forces)
+    assert "FrameWrench, FrameSpring, FrameDamper" in repr(scene)
+    assert "FrameSpring on" in scene._repr_html_()
+    motions = [vp.simulate(own, np.zeros(6), np.ones(6), dt=1e-3, steps=20) for own in (scene, back)]
+    assert motions[0].q.tobytes() == motions[1].q.tobytes()
+    motions[0].save(tmp_path / "motion.npz")
+    loaded = vp.Trajectory.load(tmp_path / "motion.npz")
+    np.testing.assert_array_equal(loaded.scene_values["FrameDamper"], scene.values["FrameDamper"])
+    bare = vp.Scene(robot, damping=0.1)
+    with pytest.raises(vp.VarpinError, match="springs between frames are others in the scene"):
+        vp.linearize(bare, loaded)
+    with pytest.raises(vp.VarpinError, match="forces on frames are others in the scene"):
+        vp.linearize(scene, vp.simulate(bare, np.zeros(6), np.ones(6), dt=1e-3, steps=5))
+    assert not [name for name in bare.values if name.startswith("Frame")]
+
+
+def test_plans_with_a_spring_on_the_tool():
+    """S-DDP, second order too: the plan's derivatives are those of what it steps through."""
+    scene = vp.Scene(vp.planar_chain(2), damping=0.1, forces=forces("joint2", "joint1"))
+    cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost([0.5, 0.3], 50.0))
+    problem = vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=0.02, steps=20)
+    plans = [vp.solve(problem, second_order=second) for second in (False, True)]
+    assert all(plan.status.converged for plan in plans)
+    assert plans[0].cost == pytest.approx(plans[1].cost, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: vp.FrameWrench("tool", np.ones(6)), "did you mean 'tool0'"),
+        (lambda: vp.FrameWrench("base_link", np.ones(6)), "fixed to the base"),
+        (lambda: vp.FrameWrench("tool0", np.ones(3)), r"wrench must have shape \(6,\)"),
+        (lambda: vp.FrameWrench("tool0", [np.nan] * 6), "wrench"),
+        (lambda: vp.FrameWrench("tool0", np.ones(6), "local"), "axes must be 'world' or 'frame', got 'local'"),
+        (lambda: vp.FrameSpring("tool0", [0, 0], 1.0), r"b must be a frame's name, .* got shape \(2,\)"),
+        (lambda: vp.FrameSpring([0, 0, 0], "base_link", 1.0), "both ends are fixed"),
+        (lambda: vp.FrameSpring("tool0", [0, 0, 0], -1.0), "stiffness must be >= 0"),
+        (lambda: vp.FrameSpring("tool0", [0, 0, 0], 1.0, -0.1), "rest must be a length >= 0"),
+        (lambda: vp.FrameSpring("tool0", [0, 0, 0], [1, 1, 1], 0.1), "one stiffness"),
+        (lambda: vp.FrameDamper(("tool0", [0, 0]), [0, 0, 0], 1.0), r"must have shape \(3,\)"),
+        (lambda: vp.FrameDamper("tool0", [0, 0, 0], [1, np.inf, 1]), "damping must be >= 0"),
+    ],
+)
+def test_what_cannot_be_is_refused(make, words):
+    with pytest.raises(vp.VarpinError, match=words):
+        vp.Scene(vp.load_robot("ur5"), forces=make())
