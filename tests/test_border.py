@@ -37,6 +37,7 @@ def of_mechanism(scene):
         **{name: getattr(tree, name) for name in TREE},
         **{name: getattr(scene, name) for name in ("gravity", "actuation")},
         "forces": scene.elements,
+        "couplings": scene.couplings,
         **dict(zip(("constant", "control", "quadratic", "centers"), fields, strict=True)),
     }
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from varpin.checks import JointValues, fraction, joint_array, positive
 from varpin.errors import InputError
 from varpin.forces import keeps_energy, of_kind
-from varpin.robot.kinematics import FrameKinematics, links
+from varpin.robot.tree import joint_axis, z_to
 from varpin.scene import Scene, require_scene
 from varpin.textbook import rigid_body_Lqq
 
@@ -100,14 +100,16 @@ def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
     potential = pin.computePotentialEnergy(model, data, full_q) + energy
     springs = of_kind(scene.elements, "JointSpring")
     potential += sum(0.5 * own.values[0] * (q[own.coordinate] - own.values[1]) ** 2 for own in springs)
-    held, pull, bend = _coupled(scene, q)
+    held, pull, bend = _coupled(scene, model, full_q, G)
     potential, Lq, Lqq = potential + held, Lq - pull, Lqq - bend
     return LagrangianJet(float(0.5 * v @ Lvv @ v - potential), Lq, Lvv @ v, Lqq, G.T @ A @ G, Lvv)
 
 
-def _coupled(scene: Scene, q: Floats) -> tuple[float, Floats, Floats]:
+def _coupled(scene: Scene, model: pin.Model, full_q: Floats, G: Floats) -> tuple[float, Floats, Floats]:
     """The energy V of all couplings that have one, with dV/dq (n,) and d2V/dq2 (n, n)."""
-    n = q.size
+    n = G.shape[1]
+    data = model.createData()
+    pin.forwardKinematics(model, data, full_q)
     energy, slope, curvature = 0.0, np.zeros(n), np.zeros((n, n))
     for own in scene.couplings:
         if not keeps_energy(own):
@@ -118,11 +120,17 @@ def _coupled(scene: Scene, q: Floats) -> tuple[float, Floats, Floats]:
             if body < 0:
                 d += side * place
                 continue
-            point = FrameKinematics("", links(scene.robot.tree, body), np.eye(3), place)
-            _, at, jacobian = point.jacobians(q[None])
-            d += side * at[0]
-            J += side * jacobian[0, :3]
-            H += side * point.motion(q[None]).jacobian_in_q()[0, :, :3]
+            joint = body + 1
+            point = pin.SE3(np.eye(3), z_to(joint_axis(model, joint)[1]) @ place)
+            here = data.oMi[joint] * point
+            d += side * here.translation
+            for i, rates in enumerate(G.T):
+                pin.computeForwardKinematicsDerivatives(model, data, full_q, rates, np.zeros(model.nv))
+                by_q, by_v = pin.getFrameVelocityDerivatives(model, data, joint, point, pin.LOCAL)
+                moved = by_v[:3] @ rates
+                J[:, i] += side * here.rotation @ moved
+                # What turns the frame turns its velocity.
+                H[i] += side * here.rotation @ (by_q[:3] + np.cross(by_v[3:].T, moved).T) @ G
         own_energy, force, stiff = _between(own.kind, numbers[6:], d)
         energy += own_energy
         slope += J.T @ force
