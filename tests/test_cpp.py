@@ -1,5 +1,6 @@
 """The core from C++: programs that link nothing but its headers."""
 
+import importlib
 import os
 import shutil
 import subprocess
@@ -140,3 +141,20 @@ def planned():
     _, K = backward(motion)
     followed = rollout(start + 0.05, policy(motion.u, K, motion))
     return motion.u, motion.q[1:], motion.p[1:], K, followed.q[1:]
+
+
+@pytest.mark.parametrize("surroundings", [{}, {"damping": 0.1, "forces": vp.JointStop(100.0)}], ids=["alone", "forces"])
+def test_a_scene_with_any_number_of_forces_is_written(surroundings, monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(ROOT / "examples" / "cpp"))
+    text = importlib.import_module("arm").header(vp.Scene(vp.load_robot("ur5"), **surroundings))
+    source = tmp_path / "arm.cpp"
+    source.write_text(f"{text.replace('#pragma once', '')}\nint main() {{ return arm().dof() == 6 ? 0 : 1; }}\n")
+    subprocess.run([COMPILER, *FLAGS, source, "-o", tmp_path / "program"], check=True)
+    subprocess.run([tmp_path / "program"], check=True)
+
+
+def test_what_the_example_does_not_write_is_refused(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "examples" / "cpp"))
+    scene = vp.Scene(vp.load_robot("ur5"), forces=vp.FrameWrench("tool0", [0.0, 0.0, -1.0, 0.0, 0.0, 0.0]))
+    with pytest.raises(SystemExit, match="forces on frames are not written"):
+        importlib.import_module("arm").header(scene)

@@ -15,6 +15,7 @@ HEADER = """// Written by arm.py: {robot}.
 #pragma once
 
 #include <cmath>
+#include <vector>
 
 #include "varpin/tree.hpp"
 
@@ -30,7 +31,7 @@ inline varpin::Mechanism arm() {{
     out.tree.blocks = {blocks};
     out.tree.light_parts = {light_parts};
     out.gravity = {gravity};
-    out.forces = varpin::Forces({forces});
+    out.forces = varpin::Forces(std::vector<varpin::Element>{forces});
     out.controls = {controls};
     out.actuation = {actuation};
     return out;
@@ -70,6 +71,8 @@ def elements(scene: vp.Scene) -> str:
 
 def header(scene: vp.Scene) -> str:
     """The header's text; noise is left out, which a controller does not simulate."""
+    if scene.couplings:
+        raise SystemExit("forces on frames are not written here: fill Mechanism::couplings by hand, as tests/cpp does")
     tree = scene.robot.tree
     named = ("parent", "mass", "center", "inertia", "coordinate", "ratio", "offset", "translation")
     bodies = [
