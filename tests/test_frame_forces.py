@@ -409,3 +409,20 @@ def test_plans_with_a_spring_on_the_tool():
 def test_what_cannot_be_is_refused(make, words):
     with pytest.raises(vp.VarpinError, match=words):
         vp.Scene(vp.load_robot("ur5"), forces=make())
+
+
+def test_a_place_in_the_world_carries_no_wrench():
+    robot = vp.load_robot("ur5")
+    with pytest.raises(vp.InputError, match=r"frame must be a frame's name or \(name, place\), got \[0.5, 0.0, 0.4\]"):
+        vp.Scene(robot, forces=vp.FrameWrench([0.5, 0.0, 0.4], np.ones(6)))
+    listed, paired = (
+        vp.Scene(robot, forces=vp.FrameSpring(kind(("tool0", [0.0, 0.0, 0.1])), [0.5, 0.0, 0.4], 10.0)).couplings
+        for kind in (list, tuple)
+    )
+    assert listed == paired
+
+
+def test_a_wrench_of_the_frame_keeps_no_energy():
+    robot = vp.load_robot("ur5")
+    assert vp.Scene(robot, forces=vp.FrameSpring("tool0", [0.5, 0.0, 0.4], 10.0)).conservative
+    assert not vp.Scene(robot, forces=vp.FrameWrench("tool0", [1.0, 0, 0, 0, 0, 0], "frame")).conservative

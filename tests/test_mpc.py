@@ -358,3 +358,8 @@ def test_what_plan_and_motion_have_in_common_is_told_once():
     assert [f"the first plan: {sentence}" for sentence in first] == [
         sentence for sentence in short.warnings if "velocity limits" in sentence
     ]
+
+
+def test_a_scene_is_no_plant():
+    with pytest.raises(vp.InputError, match=r"plant must be a varpin.Plant, for example varpin.Plant\(scene\)"):
+        vp.Mpc(tracking()).run(tracking().scene, duration=0.1)

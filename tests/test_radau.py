@@ -143,3 +143,13 @@ def test_energy_of_an_undamped_motion_decays_with_its_order():
 def test_options_out_of_range(option, words):
     with pytest.raises(vp.InputError, match=words):
         vp.Radau(**option)
+
+
+@pytest.mark.parametrize("damping", [0.0, 1.0, 100.0])
+def test_one_stage_moves_from_rest_under_the_default_guard(damping):
+    """It loses a part of what a first step from rest gains, which is its first order and no fault of the step."""
+    scene = vp.Scene(vp.planar_chain(3), damping=damping)
+    motion = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=100, integrator=vp.Radau(1), check=False)
+    assert motion.statistics.substeps.max() == 1
+    free = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=100, integrator=vp.Radau(1, guard=None))
+    np.testing.assert_allclose(motion.q, free.q, rtol=0, atol=1e-12)

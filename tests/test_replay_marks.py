@@ -514,3 +514,9 @@ def test_a_reference_keeps_its_corners():
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     (trace,) = references(points)
     np.testing.assert_array_equal(trace.points, points)
+
+
+def test_another_robot_s_motion_is_refused(ur5, tmp_path):
+    motion = vp.simulate(vp.Scene(vp.load_robot("ur10")), np.zeros(6), np.zeros(6), dt=0.01, steps=2, check=False)
+    with pytest.raises(vp.InputError, match="of robot 'ur10', whose joints lie otherwise than those of 'ur5'"):
+        replay(ur5, motion, html=tmp_path / "other.html")

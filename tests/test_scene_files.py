@@ -906,3 +906,11 @@ def test_no_other_key_is_taken(key, data, tmp_path_factory):
 
 def at(data, place):
     return functools.reduce(lambda table, key: table[key], place, data)
+
+
+def test_stages_of_radau_are_taken(tmp_path):
+    head = '[robot]\nsource = "ur5"\n[horizon]\ndt = 2e-3\nduration = 0.02\n[integrator]\ntype = "radau"\n'
+    path = tmp_path / "radau.toml"
+    for line, expected in (("stages = 3\n", vp.Radau(3)), ("", vp.Radau())):
+        path.write_text(head + line)
+        assert vp.load_scene(path).spec.integrator == expected

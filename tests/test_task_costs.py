@@ -433,3 +433,12 @@ def test_a_robot_without_mass(tmp_path):
     robot = vp.load_robot(str(mechanisms.arm(tmp_path, inertia)))
     with pytest.raises(vp.InputError, match="have no mass"):
         vp.CenterOfMassCost(robot, [0, 0, 0])
+
+
+def test_a_cost_of_another_robot_is_refused(load):
+    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.FramePositionCost(load("ur10"), "tool0", [0.45, 0.1, 0.4]))
+    with pytest.raises(vp.InputError, match=r"FramePositionCost is for robot 'ur10'.* make it with scene.robot"):
+        vp.OptimalControlProblem(vp.Scene(load("ur5")), cost, np.zeros(6), np.zeros(6), dt=0.01, steps=5)
+    heavier = vp.load_robot("ur5", payload=vp.Payload("tool0", 1.0))
+    own = vp.ControlCost(1e-3) + vp.FramePositionCost(load("ur5"), "tool0", [0.45, 0.1, 0.4])
+    vp.OptimalControlProblem(vp.Scene(heavier), own, np.zeros(6), np.zeros(6), dt=0.01, steps=5)

@@ -76,6 +76,27 @@ def test_torques_of_time_are_right_in_continuous_time():
     assert np.abs(motion.u[0] - shake(0.5 * motion.dt)).max() == 0.0
 
 
+@pytest.mark.parametrize("jump", [0.1234, 0.37, 0.777])
+def test_a_torque_that_jumps_inside_steps_is_not_taken_for_met(jump):
+    """Steps and half steps may have it on the same side of the times where they look."""
+    scene, torque = chain(damping=1.0), np.array([20.0, 0.0, 0.0])
+    motion = vp.simulate(
+        scene, REST, REST, duration=1.0, tolerance=1e-6, controls=vp.OpenLoop(lambda t: torque * (t < jump))
+    )
+    true = true_positions(scene, REST, REST, lambda t: torque * (t < jump), [jump, 1.0])[-1]
+    assert np.abs(motion.q[-1] - true).max() < 1e-6 or any("is not met" in told for told in motion.warnings)
+
+
+def test_an_estimate_is_taken_up_with_the_user_s_own_guard_and_by_any_method():
+    scene = chain(damping=1.0)
+    free = vp.simulate(scene, REST, REST, duration=0.5, tolerance=1e-4, integrator=vp.Midpoint(guard=None))
+    again = vp.simulate(scene, REST, REST, duration=0.5, tolerance=free.accuracy, integrator=vp.Midpoint())
+    assert again.accuracy.integrator == str(vp.Midpoint())
+    implicit = vp.simulate(scene, REST, REST, duration=0.5, tolerance=1e-4, integrator=vp.Radau(2))
+    taken = vp.simulate(scene, REST, REST, duration=0.5, tolerance=implicit.accuracy)
+    assert taken.accuracy.integrator == implicit.accuracy.integrator
+
+
 def test_rows_of_controls_are_each_held_over_their_part():
     rows = np.random.default_rng(0).normal(size=(3, 3))
     motion = vp.simulate(chain(), REST, REST, duration=0.6, tolerance=1e-7, controls=rows)

@@ -225,6 +225,10 @@ def simulate_ensemble(
     integrator = Midpoint() if integrator is None else integrator
     if not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
+    if controls is None and scene.servo_joints:
+        if (start[0] != start[0][0]).any():
+            raise InputError("controls are needed: the scene has servos, and the paths begin at different positions")
+        controls = scene.command_at(start[0][0])
     commands = commands_of(scene, integrator, controls, steps, dt)
     with executing(executor, workers) as pool:
         shared = Shared(without_geometry(scene), integrator, commands, dt, steps, children(rng, paths))

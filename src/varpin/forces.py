@@ -62,7 +62,7 @@ def _kept(name: str, value: Any) -> Any:
         return value
     if isinstance(value, Mapping):
         return MappingProxyType(dict(value))
-    if isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], str):
+    if isinstance(value, tuple | list) and len(value) == 2 and isinstance(value[0], str):
         return value[0], _kept(name, value[1])
     given = as_floats(name, value)
     given.setflags(write=False)
@@ -260,6 +260,8 @@ class FrameWrench(Force):
         if not is_one_of(self.axes, ("world", "frame")):
             raise InputError(f"axes must be 'world' or 'frame', got {self.axes!r}")
         wrench = finite_array("wrench", self.wrench, (6,))
+        if not isinstance(self.frame, str | tuple):
+            raise InputError(f"frame must be a frame's name or (name, place), got {_shown(self.frame)}")
         body, turned, place = _point("frame", self.frame, robot)
         if body < 0:
             raise InputError(f"frame {self.frame!r} of robot {robot.name!r} is fixed to the base: no joint moves it")

@@ -269,6 +269,8 @@ class Mpc:
         """
         problem = self.problem
         plant = Plant(problem.scene) if plant is None else plant
+        if not isinstance(plant, Plant):
+            raise InputError(f"plant must be a varpin.Plant, for example varpin.Plant(scene), got {plant!r}")
         joints, controls = plant.scene.robot.joint_names, plant.scene.controls
         if joints != problem.scene.robot.joint_names or controls != problem.scene.controls:
             raise InputError(

@@ -43,7 +43,7 @@ REACH = 4.0
 # A difference between two motions is the error of one where the other is known this much better.
 _CLEARLY = 0.25
 # What rounding adds up to, relative to q: no method is asked for less, or promises it.
-_ROUNDING = 200.0 * float(np.finfo(np.float64).eps)
+ROUNDING = 200.0 * float(np.finfo(np.float64).eps)
 # Runs of the final choice, each with a few steps more, until one meets the tolerance.
 CHECKS = 4
 # Halvings that bring nothing, after which rounding is in charge of a method that has shown its order at small errors.
@@ -276,7 +276,7 @@ class Search:
         limits = self.limits()
         if limits:
             self.limit, self.uncertainty = min(limits, key=lambda own: own[1])
-            self.floor = _ROUNDING * max(1.0, float(np.abs(self.limit).max()))
+            self.floor = ROUNDING * max(1.0, float(np.abs(self.limit).max()))
         for method in self.methods:
             method.judge(self.limit, self.uncertainty)
 

@@ -16,7 +16,17 @@ from varpin.checks import JointValues, as_floats, finite_array, joint_array
 from varpin.core import Mechanism as Core
 from varpin.core.arrays import Coupling, Diffusion, Element
 from varpin.errors import InputError, RobotError
-from varpin.forces import CoulombFriction, Force, JointDamper, JointSpring, dissipates, forces_of, not_negative, of_kind
+from varpin.forces import (
+    CoulombFriction,
+    Force,
+    JointDamper,
+    JointSpring,
+    dissipates,
+    forces_of,
+    keeps_energy,
+    not_negative,
+    of_kind,
+)
 from varpin.frozen import Frozen
 from varpin.markup import facts, listed
 from varpin.noise import BoundNoise, ControlNoise, Noise, NoiseSum, bind
@@ -228,6 +238,11 @@ class Scene(Frozen):
         """Whether anything turns energy into heat."""
         return any(map(dissipates, self.elements)) or any(map(dissipates, self.couplings))
 
+    @property
+    def conservative(self) -> bool:
+        """Whether energy stays where no controls and no noise act: all forces are gradients."""
+        return not self.dissipates and all(map(keeps_energy, self.couplings))
+
     @cached_property
     def group(self) -> NDArray[np.int64]:
         """Which coordinates (n,) move each other, labels from 0: the robot's groups, some joined by couplings."""
@@ -268,6 +283,13 @@ class Scene(Frozen):
     def servo_joints(self) -> tuple[str, ...]:
         """The joints whose control is the position that a servo goes to."""
         return tuple(self.robot.joint_names[own.coordinate] for own in of_kind(self.elements, "PositionServo"))
+
+    def command_at(self, q: Floats) -> Floats:
+        """The controls (m,) that stand for none at q (n,): no forces, and servos that stay where they are."""
+        command = np.zeros(self.controls)
+        for own in of_kind(self.elements, "PositionServo"):
+            command[int(np.argmax(np.abs(self.actuation[own.coordinate])))] = q[own.coordinate]
+        return command
 
     @property
     def processes(self) -> int:

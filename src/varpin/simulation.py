@@ -98,7 +98,7 @@ class NoiseError(_StepError):
 
 
 class ToleranceError(VarpinError, RuntimeError):
-    """Not even the first digit of a motion can be had.
+    """No number of steps that was tried gives an error below 1 rad or m.
 
     Attributes:
         tolerance: What was asked for [rad or m].
@@ -291,17 +291,17 @@ def simulate(
         dt: Time step [s].
         steps: N, their number.
         duration: steps * dt [s].
-        tolerance: The largest error in q that is welcome at any node [rad or m], in place of ``dt`` and ``steps``.
+        tolerance: The largest error in q allowed at any node [rad or m], in place of ``dt`` and ``steps``.
             ``Trajectory.accuracy`` says what was taken, what error that estimates and how many steps finding out took;
             it is itself a ``tolerance``, of the same scene's next motion, which tries first what it found. Where the
             tolerance is out of reach a warning says what is reached. Rows of controls, (R, m), are then held over
             duration / R each, a LinearPolicy needs its period in seconds, and noise and control laws are refused.
-        controls: None for none; an array (N, m), one row a step; one row (m,) for all steps, by joint name too where
-            each control is the force of a joint, with 0 for joints that are not named; a
-            :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that returns (m,), or
-            numbers by joint name; or :class:`varpin.OpenLoop`, a function of time alone. Controls are constant over
-            each step. A law is a digital controller: it is called once where each of its periods begins, with the time
-            and the state of that node, and what it returns is held over the period.
+        controls: None for none, servos staying where they are at ``q0``; an array (N, m), one row a step; one row
+            (m,) for all steps, by joint name too where each control is the force of a joint, with 0 for joints that
+            are not named; a :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that
+            returns (m,), or numbers by joint name; or :class:`varpin.OpenLoop`, a function of time alone. Controls are
+            constant over each step. A law is a digital controller: it is called once where each of its periods begins,
+            with the time and the state of that node, and what it returns is held over the period.
         period: Of a control law, in steps.
         integrator: :class:`Midpoint` with alpha = 1/2 if left out; with a tolerance, the cheapest that there is.
 
@@ -321,7 +321,7 @@ def simulate(
     Raises:
         InputError: Wrong shapes, values that are not finite, dt <= 0, steps < 0, a law of other arguments than
             (t, q, v), a period without a law; dt or steps, noise or a law beside a tolerance.
-        ToleranceError: Not even the first digit of the motion can be had; a chaotic motion over a long time, say.
+        ToleranceError: No step brings the error below 1 rad or m; a chaotic motion over a long time, say.
         UnknownJoint: ``q0`` or ``v0`` names a joint that is no coordinate of the robot, or ``controls`` one that no
             control drives.
         ControlError: The control function returned something unusable; holds the trajectory so far.
@@ -336,6 +336,8 @@ def simulate(
     q0, v0 = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
     if integrator is not None and not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
+    if controls is None and scene.servo_joints:
+        controls = scene.command_at(q0)
     accuracy: Accuracy | None = None
     wished: tuple[Finding, ...] = ()
     if tolerance is not None:
@@ -409,7 +411,7 @@ def simulate(
         found = (*noise_forgotten(scene, rng, increments), *wished, *found)
         trajectory = replace(with_warnings(trajectory, found), accuracy=accuracy)
     except KeyboardInterrupt:
-        raise Interrupted(record.trajectory()) from None
+        raise Interrupted(replace(record.trajectory(), accuracy=accuracy)) from None
     if interrupted:
         raise Interrupted(trajectory)
     announce(logger, scene, dt, found)
@@ -510,12 +512,14 @@ def _chosen(
         def given(member: Integrator, steps: int) -> Commands:  # noqa: ARG001 - as for the others
             return open_loop(np.repeat(held, steps // parts, axis=0))
 
-    motion = Motion(scene, q0, v0, duration, parts, given, most)
+    motion = Motion(scene, q0, v0, duration, parts, given, most, isinstance(controls, OpenLoop))
     first = None
     if earlier is not None:
         known = integrator_of(earlier.integrator)
-        if any(member.same_map(known) for member in members):
-            first = known, earlier.dt
+        # The user's own guard and tolerance, where the integrator is given.
+        same = known if integrator is None else next((own for own in members if own.same_map(known)), None)
+        if same is not None:
+            first = same, earlier.dt
     choice = choose(motion, members, wish, first)
     record = Accuracy(
         wish,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from varpin.core.arrays import Commands
 from varpin.integrators import Integrator
 from varpin.integrators.base import rows, steps_of
-from varpin.refinement import CHECKS, SAFETY, SENSIBLE, Found, Method, Sample, Search, distance, first_steps
+from varpin.refinement import CHECKS, ROUNDING, SAFETY, SENSIBLE, Found, Method, Sample, Search, distance, first_steps
 from varpin.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -28,6 +28,8 @@ _NODES = 4096
 _PATIENCE = 50_000_000
 # A motion whose last differences shrink at least like this is taken to go on so.
 _SHRINKS, _LEFT = 0.75, 3.0
+# Controls of time are held over steps of this many times the number, too: a jump lies elsewhere in each of those.
+_OTHER = 1.37
 # An integrator that misses the tolerance by this factor is not worth more of its steps.
 _FAR = 30.0
 
@@ -44,6 +46,8 @@ class Motion:
         parts: A number that goes into all numbers of steps.
         commands: Those of an integrator for a number of steps.
         most: The greatest order that a method can have under these commands.
+        sampled: Whether the commands are samples of a function, which steps and half steps may see alike where it
+            jumps between them.
     """
 
     scene: Scene
@@ -53,6 +57,7 @@ class Motion:
     parts: int
     commands: Callable[[Integrator, int], Commands]
     most: int
+    sampled: bool = False
 
 
 class _Runs:
@@ -101,6 +106,7 @@ class _Wish(Search):
     def __init__(self, methods: Sequence[Method], runs: _Runs) -> None:
         patience = _PATIENCE / len(runs.motion.q0)
         super().__init__(methods, lambda: runs.evaluations > patience, math.inf)
+        self.sampled = runs.motion.sampled
 
     def limits(self) -> list[tuple[Floats, float]]:
         """See :meth:`Search.limits`; where no method shows its order, what differences that shrink point to."""
@@ -109,14 +115,16 @@ class _Wish(Search):
     def checked(self, choice: Found, tolerance: float) -> Found:
         """See :meth:`Search.checked`; errors at all nodes."""
         method, best = self._of(choice), choice
-        for _ in range(CHECKS):
+        for trial in range(CHECKS):
             if self.late() and best.steps > method.last.steps:
                 break
             error = _error(method, best.steps)
+            if self.sampled:
+                error = max(error, _error_of_samples(method, best.steps))
             if self.limit is not None:
                 error = max(error, distance(method.run(method.integrator, best.steps).q, self.limit) - self.uncertainty)
             best = replace(best, error=max(error, self.floor) if math.isfinite(error) else math.inf, measured=True)
-            if best.error <= tolerance:
+            if best.error <= tolerance or trial == CHECKS - 1:
                 break
             best = replace(best, steps=_more(method, best.steps, error, tolerance))
         return best
@@ -152,6 +160,13 @@ def _error(method: Method, steps: int) -> float:
     once, twice = (method.run(method.integrator, k) for k in (steps, 2 * steps))
     gain = 2.0**method.order if len(method.errors) == 0 or method.regular else 2.0
     return distance(once.q, twice.q) * gain / (gain - 1.0)
+
+
+def _error_of_samples(method: Method, steps: int) -> float:
+    """How far the end is from that of a run whose steps lie otherwise; NaN where one of them fails."""
+    other = method.rounded(_OTHER * steps)
+    one, two = (method.run(method.integrator, k).q[-1] for k in (steps, other))
+    return float(np.abs(one - two).max())
 
 
 @dataclass(frozen=True)
@@ -203,10 +218,11 @@ def choose(
         steps = method.rounded(motion.duration / first[1] * (1.0 - 1e-9))
         for _ in range(CHECKS):
             error = _error(method, steps)
+            floor = ROUNDING * max(1.0, float(np.abs(runs(first[0], steps).q).max()))
             if not (runs(first[0], steps).pure and math.isfinite(error) and error < SENSIBLE):
                 break
-            if error <= tolerance:
-                return Choice(first[0], steps, error, runs.steps, runs.evaluations, 0.0)
+            if max(error, floor) <= tolerance:
+                return Choice(first[0], steps, max(error, floor), runs.steps, runs.evaluations, floor)
             if error > _FAR * tolerance:
                 break
             steps = _more(method, steps, error, tolerance)

@@ -60,7 +60,7 @@ def add_simulate(parser: argparse.ArgumentParser) -> None:
         "--tolerance",
         type=float,
         metavar="E",
-        help="the largest error in q that is welcome [rad or m], in place of --dt: the cheapest step, and integrator "
+        help="the largest error in q allowed [rad or m], in place of --dt: the cheapest step, and integrator "
         "if none is given, that keep to it are found out and taken",
     )
     length = parser.add_mutually_exclusive_group()
@@ -76,7 +76,7 @@ def add_simulate(parser: argparse.ArgumentParser) -> None:
 def _simulate(request: argparse.Namespace, errors: Console) -> int:
     if names_scene(request.robot):
         file = scene_file(request, request.robot, "simulate", *_OF_MOTIONS)
-        driven = bool(file.scene.dissipates or file.controls() is not None or file.spec.seed is not None)
+        driven = bool(not file.scene.conservative or file.controls() is not None or file.spec.seed is not None)
         outputs = outputs_of(request, file.marks)
         return _run(request, errors, file.scene, driven, file.spec.steps, lambda p: file.simulate(progress=p), outputs)
     outputs = outputs_of(request)
@@ -92,7 +92,7 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
             wish = {"dt": _dt(request), "steps": steps}
         return simulate(scene, q0, v0, **wish, controls=torque, integrator=integrator, progress=progress)
 
-    return _run(request, errors, scene, bool(scene.dissipates or torque is not None), steps, run, outputs)
+    return _run(request, errors, scene, bool(not scene.conservative or torque is not None), steps, run, outputs)
 
 
 def _run(

@@ -22,6 +22,7 @@ from varpin.costs.terms import Terms
 from varpin.errors import InputError, VarpinError
 from varpin.frozen import Frozen
 from varpin.markup import facts
+from varpin.robot import Robot
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -58,6 +59,7 @@ class Points(Frozen):
         t0: When the horizon begins [s].
         joints: Names of the coordinates, if costs are to find theirs by name.
         control_joints: The joint whose force each control is; None where controls are something else.
+        robot: Whose horizon it is, if costs are to be sure that they are of the same.
     """
 
     t: Floats
@@ -68,6 +70,7 @@ class Points(Frozen):
     t0: float = 0.0
     joints: tuple[str, ...] = ()
     control_joints: tuple[str, ...] | None = None
+    robot: Robot | None = None
 
     @property
     def elapsed(self) -> Floats:

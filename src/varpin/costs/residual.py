@@ -51,6 +51,11 @@ class TaskCost(Cost):
                 f"{name} is for robot {self.robot.name!r} with {self.robot.dof} coordinates; "
                 f"the problem has {points.dof}"
             )
+        if points.robot is not None and not self.robot.built_like(points.robot):
+            raise InputError(
+                f"{name} is for robot {self.robot.name!r}, whose links are of other lengths or turned otherwise than "
+                f"those of the problem's robot {points.robot.name!r}; make it with scene.robot"
+            )
         return self._bound(points, weight_matrix(name, self.weight, self.size))
 
     @abstractmethod

@@ -199,7 +199,7 @@ def velocity_error(exact: Exact, trajectory: Trajectory) -> float:
 
 def unforced(scene: Scene, trajectory: Trajectory) -> bool:
     """Whether nothing but gravity and springs acts."""
-    return not (scene.dissipates or (trajectory.u @ scene.actuation.T).any() or trajectory.dw.any())
+    return scene.conservative and not ((trajectory.u @ scene.actuation.T).any() or trajectory.dw.any())
 
 
 def energy_error(scene: Scene, trajectory: Trajectory) -> float:
@@ -285,7 +285,7 @@ def linearized(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
     """A of some steps that were not taken in parts (K, 2n, 2n); of variational methods, where nothing damps."""
     n = scene.robot.dof
     nothing = np.zeros((0, 2 * n, 2 * n))
-    if not integrator.variational or scene.dissipates or trajectory.dw.any():
+    if not integrator.variational or not scene.conservative or trajectory.dw.any():
         return nothing
     whole = np.flatnonzero(trajectory.statistics.substeps == 1)
     if not len(whole):

@@ -240,6 +240,11 @@ def torque_shares(
                 f"torques=True takes one control for each of the {robot.dof} joints, this trajectory has "
                 f"{values.shape[1]}; give the torques (N, {robot.dof}) themselves"
             )
+        if motion.scene_values.get("PositionServo", np.zeros(0)).size:
+            raise InputError(
+                "torques=True takes controls for torques, and controls of this trajectory are positions that servos go "
+                f"to; give the torques (N, {robot.dof}) themselves"
+            )
     else:
         values = as_floats("torques", torques)
         if values.ndim != 2 or values.shape[1] != robot.dof:

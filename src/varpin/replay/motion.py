@@ -281,6 +281,13 @@ def _nodes(robot: Robot, title: str, name: str, motion: Trajectory) -> tuple[Flo
             f"the {title} is of robot {motion.robot!r} with joints {', '.join(motion.joint_names)}; "
             f"{robot.name!r} has joints {', '.join(robot.joint_names)}"
         )
+    for what in ("rotation", "translation"):
+        made, own = motion.scene_values.get(what), getattr(robot.tree, what)
+        if made is not None and not (made.shape == own.shape and np.allclose(made, own, rtol=1e-6, atol=1e-9)):
+            raise InputError(
+                f"the {title} is of robot {motion.robot!r}, whose joints lie otherwise than those of {robot.name!r}, "
+                "which have the same names"
+            )
     return motion.t - motion.t[0], require_finite(f"{name}.q", motion.q)
 
 

@@ -258,6 +258,17 @@ class Robot(Frozen):
         sliding.setflags(write=False)
         return sliding
 
+    def built_like(self, other: "Robot") -> bool:
+        """Whether another robot's joints lie as this one's do, but for rounding; masses may differ."""
+        own, its = self.tree, other.tree
+        if self is other or own is its:
+            return True
+        exact = ("parent", "prismatic", "coordinate")
+        near = ("rotation", "translation", "ratio", "offset")
+        return all(np.array_equal(getattr(own, name), getattr(its, name)) for name in exact) and all(
+            np.allclose(getattr(own, name), getattr(its, name), rtol=1e-6, atol=1e-9) for name in near
+        )
+
     @property
     def friction(self) -> Floats:
         """Dry friction that the description gives (n,) [N m or N]; ``CoulombFriction(robot.friction)`` takes it."""

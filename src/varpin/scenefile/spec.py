@@ -547,7 +547,9 @@ def _integrator(table: Table) -> Integrator:
     if "alpha" in table:
         given["alpha"] = table.number("alpha", least=0.0, most=1.0)
     if kind == "gauss":
-        given["stages"] = table.whole("stages", default_integrator().stages, least=1)
+        given["stages"] = default_integrator().stages
+    if "stages" in table:
+        given["stages"] = table.whole("stages", least=1)
     if "kick" in table:
         given["kick"] = table.choice("kick", ("left", "split"))
     try:

@@ -10,7 +10,7 @@ import numpy as np
 from varpin.chatter import alternation, restlessness
 from varpin.errors import VarpinError
 from varpin.integrators.base import open_loop
-from varpin.sddp.history import Status
+from varpin.sddp.history import ITERATIONS, Status
 from varpin.sddp.problem import OptimalControlProblem, default_integrator
 from varpin.sddp.solution import Solution
 from varpin.sddp.verification import accurate_cost, percent
@@ -132,7 +132,10 @@ def _alternating(solution: Solution) -> list[Finding]:
 def _unfinished(solution: Solution) -> list[Finding]:
     """Says if the search ended without a plan that it could call the best."""
     history = solution.history
-    if solution.status not in (Status.STALLED, Status.INDEFINITE, Status.NOT_DIFFERENTIABLE) or not history:
+    # Who asks for few iterations knows that there were few.
+    cut = solution.status is Status.MAX_ITERATIONS and len(history) >= ITERATIONS
+    ended = solution.status in (Status.STALLED, Status.INDEFINITE, Status.NOT_DIFFERENTIABLE)
+    if not (cut or ended) or not history:
         return []
     promised = history[-1].promised_decrease
     # What promises next to nothing is as good as the best.

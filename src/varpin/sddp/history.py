@@ -7,6 +7,9 @@ from enum import Enum
 
 from varpin.trajectory import Trajectory
 
+# Of a search that is not told how many.
+ITERATIONS = 100
+
 
 class Status(Enum):
     """How a solver ended; its value says what that means and what to do."""

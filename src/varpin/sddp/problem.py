@@ -136,7 +136,9 @@ class OptimalControlProblem(Frozen):
         places, rule = _rule(sampling, dt)
         times = ((np.arange(steps, dtype=np.float64)[:, None] + places) * dt).reshape(-1)
         t0 = real("t0", t0)
-        points = Points(t0 + times, dt * steps, steps, n, m, t0, scene.robot.joint_names, scene.control_joints)
+        points = Points(
+            t0 + times, dt * steps, steps, n, m, t0, scene.robot.joint_names, scene.control_joints, scene.robot
+        )
         running, terminal = bind_cost(cost, t0 + times, points)
         values = {
             "scene": scene,

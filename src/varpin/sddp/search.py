@@ -34,7 +34,7 @@ from varpin.policy import LinearPolicy
 from varpin.sddp.backward import Plan, backward, noise_shares
 from varpin.sddp.descent import Stake, at_stake, rounding, spent
 from varpin.sddp.examination import looked_at
-from varpin.sddp.history import Iteration, SearchState, Status
+from varpin.sddp.history import ITERATIONS, Iteration, SearchState, Status
 from varpin.sddp.problem import OptimalControlProblem
 from varpin.sddp.solution import Solution
 from varpin.simulation import Motions, StepFailure
@@ -77,7 +77,7 @@ def solve(
     controls: JointValues | LinearPolicy | Solution | None = None,
     *,
     tolerance: float = 1e-7,
-    max_iterations: int = 100,
+    max_iterations: int = ITERATIONS,
     second_order: bool = False,
     forward: Literal["closed", "open"] = "closed",
     armijo: float = ARMIJO,

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from varpin.checks import JointValues, joint_array, positive
 from varpin.errors import InputError
-from varpin.forces import keeps_energy
 from varpin.frozen import Frozen
 from varpin.integrators import Integrator
 from varpin.integrators.base import Segment, open_loop
@@ -95,10 +94,11 @@ class Setting(Frozen):
             raise InputError("errors of single motions are compared here: leave the noise out of the scene")
         if callable(controls):
             raise InputError("controls must be rows (R, m), each held over duration / R, or one row (m,)")
-        rows = held_rows(scene, controls)
+        begin = joint_array("q0", q0, joints)
+        rows = held_rows(scene, scene.command_at(begin) if controls is None else controls)
         return cls(
             scene,
-            joint_array("q0", q0, joints),
+            begin,
             joint_array("v0", v0, joints),
             rows,
             positive("duration", duration, "s"),
@@ -107,8 +107,7 @@ class Setting(Frozen):
     @property
     def conservative(self) -> bool:
         """Whether the energy is to stay."""
-        given = self.scene.dissipates or not all(map(keeps_energy, self.scene.couplings))
-        return not (given or (self.controls @ self.scene.actuation.T).any())
+        return self.scene.conservative and not ((self.controls @ self.scene.actuation.T).any())
 
     @property
     def fingerprint(self) -> str:

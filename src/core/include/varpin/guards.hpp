@@ -252,7 +252,8 @@ class EnergyGuard {
             work[tree.group[i]] += trial.work[i];
             lost[tree.group[i]] += trial.dissipated[i];
         }
-        const double off_middle = 2.0 * std::abs(tableau.skew);
+        // Methods of first order: Midpoint's with another alpha, and Radau's with one stage, which is alpha = 1.
+        const double off_middle = tableau.c.size() == 1 && tableau.stiffly_accurate ? 1.0 : 2.0 * std::abs(tableau.skew);
         const Limit limit{guards.energy_balance * (1.0 + 9.0 * off_middle), guards.energy_budget};
         if (guards.active) {
             for (int r = 0; r < tree.groups; ++r) {
