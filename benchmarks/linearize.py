@@ -49,7 +49,7 @@ def main() -> None:
         start = np.full(robot.dof, 0.1), np.zeros(robot.dof)
         motion = vp.simulate(scene, *start, dt=1e-3, steps=STEPS)
         midpoint = vp.Midpoint()
-        step = best(lambda s=scene, x=start: vp.simulate(s, *x, dt=1e-3, steps=STEPS)) / STEPS
+        step = best(lambda s=scene, x=start: vp.simulate(s, *x, dt=1e-3, steps=STEPS, check=False)) / STEPS
         core = best(lambda s=scene, m=motion, i=midpoint: i.linearize(s, m)) / STEPS
         whole = best(lambda s=scene, m=motion: vp.linearize(s, m)) / STEPS
         line = f"{robot.name:8} step {1e6 * step:6.2f} us, derivatives {1e6 * core:6.2f} us ({core / step:.2f} of it)"
@@ -72,13 +72,15 @@ def ensembles() -> None:
         return best(lambda: vp.simulate_ensemble(scene, **start, **options, workers=workers), 1)
 
     def single() -> float:
-        return 10.0 * best(lambda: vp.simulate(scene, **start, steps=100_000, rng=0), 1)
+        return 10.0 * best(lambda: vp.simulate(scene, **start, steps=100_000, rng=0, check=False), 1)
 
     ensemble(1)
     times = np.array([(ensemble(1), ensemble(2), single()) for _ in range(ROUNDS)])
     # Short motions from the same start are other work than one long motion.
-    paths = [vp.simulate(scene, **start, steps=1000, rng=child) for child in np.random.default_rng(0).spawn(50)]
-    long = vp.simulate(scene, **start, steps=100_000, rng=0)
+    paths = [
+        vp.simulate(scene, **start, steps=1000, rng=child, check=False) for child in np.random.default_rng(0).spawn(50)
+    ]
+    long = vp.simulate(scene, **start, steps=100_000, rng=0, check=False)
     jets = np.mean([path.statistics.jets for path in paths]) / long.statistics.jets.mean()
     one, two, alone = times.min(axis=0)
     print(f"ensemble of 1000 paths: two workers {in_words(times[:, 0] / times[:, 1])} times as fast as one")
