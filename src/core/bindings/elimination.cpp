@@ -76,7 +76,7 @@ class BoundElimination {
     std::size_t n_;
     Jet<double> jet_;
     ArticulatedBodies articulated_;
-    Tableau tableau_{.stages = 1, .a = {0.0}, .gradient = {0.0}, .force = {1.0}, .b = {1.0}, .c = {0.5}};
+    Tableau tableau_{.stages = 1, .a = {0.0}, .gradient = {0.0}, .force = {1.0}, .b = {1.0}, .c = {0.5}, .ahead = {}};
     std::optional<Elimination> free_;
     std::optional<StageElimination> tied_;  // where coordinates move several bodies
     bool regular_ = false;

@@ -253,7 +253,7 @@ class EnergyGuard {
             lost[tree.group[i]] += trial.dissipated[i];
         }
         // Methods of first order: Midpoint's with another alpha, and Radau's with one stage, which is alpha = 1.
-        const double off_middle = tableau.c.size() == 1 && tableau.stiffly_accurate ? 1.0 : 2.0 * std::abs(tableau.skew);
+        const double off_middle = tableau.stages == 1 && tableau.stiffly_accurate ? 1.0 : 2.0 * std::abs(tableau.skew);
         const Limit limit{guards.energy_balance * (1.0 + 9.0 * off_middle), guards.energy_budget};
         if (guards.active) {
             for (int r = 0; r < tree.groups; ++r) {
