@@ -283,7 +283,7 @@ class FrameSpring(Force):
     """A linear spring between two points, part of the potential energy.
 
     With d = x_a - x_b in world axes the energy is 1/2 sum of stiffness (d - rest)^2 over the axes; with a number > 0
-    for ``rest``, 1/2 stiffness (|d| - rest)^2, whose force has no direction at d = 0, and is none there.
+    for ``rest``, 1/2 stiffness (``|d|`` - rest)^2, whose force has no direction at d = 0, and is none there.
 
     Attributes:
         a: The one end: a frame's name, (name, place in the frame's axes), or a place in the world (3,) [m].
