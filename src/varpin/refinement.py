@@ -229,6 +229,12 @@ class Method:
         rows = self.rows
         return rows * math.ceil(min(steps, 1e15) / rows)
 
+    def more(self, steps: int, error: float, tolerance: float) -> int:
+        """The number of steps to try where so many have missed a tolerance."""
+        # A blow-up says nothing of how many more it takes.
+        growth = min((error / tolerance) ** (1.0 / self.order), 2.0) if math.isfinite(error) else 2.0
+        return self.rounded(1.05 * growth * steps)
+
     def choice(self, steps: int, floor: float) -> Found:
         """The method at so many steps; no error below ``floor`` is promised."""
         return Found(
@@ -321,9 +327,7 @@ class Search:
             error = distance(method.run(method.integrator, steps).q, self.limit) + self.uncertainty
             if error <= tolerance:
                 return replace(method.choice(steps, self.floor), error=max(error, self.floor))
-            # A blow-up says nothing of how many more it takes.
-            growth = min((error / tolerance) ** (1.0 / method.order), 2.0) if math.isfinite(error) else 2.0
-            steps = method.rounded(1.05 * growth * steps)
+            steps = method.more(steps, error, tolerance)
         return choice
 
     def _of(self, choice: Found) -> Method:

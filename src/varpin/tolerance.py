@@ -65,6 +65,7 @@ class _Runs:
 
     def __init__(self, motion: Motion) -> None:
         self.motion = motion
+        self.most = _PATIENCE / len(motion.q0)
         self.steps = self.evaluations = 0
         self._done: dict[tuple[str, int], Sample] = {}
 
@@ -104,8 +105,7 @@ class _Wish(Search):
     """A search whose costs are evaluations, and whose choice is held against a run at half its step."""
 
     def __init__(self, methods: Sequence[Method], runs: _Runs) -> None:
-        patience = _PATIENCE / len(runs.motion.q0)
-        super().__init__(methods, lambda: runs.evaluations > patience, math.inf)
+        super().__init__(methods, lambda: runs.evaluations > runs.most, math.inf)
         self.sampled = runs.motion.sampled
 
     def limits(self) -> list[tuple[Floats, float]]:
@@ -126,7 +126,7 @@ class _Wish(Search):
             best = replace(best, error=max(error, self.floor) if math.isfinite(error) else math.inf, measured=True)
             if best.error <= tolerance or trial == CHECKS - 1:
                 break
-            best = replace(best, steps=_more(method, best.steps, error, tolerance))
+            best = replace(best, steps=method.more(best.steps, error, tolerance))
         return best
 
     def as_they_are(self) -> list[Found]:
@@ -135,13 +135,6 @@ class _Wish(Search):
             return super().as_they_are()
         method = self.methods[-1]
         return [Found(method.integrator, method.last.steps, math.inf, method.last.cost, measured=True)]
-
-
-def _more(method: Method, steps: int, error: float, tolerance: float) -> int:
-    """The number of steps to try where so many have missed a tolerance."""
-    # A blow-up says nothing of how many more it takes.
-    growth = min((error / tolerance) ** (1.0 / method.order), 2.0) if math.isfinite(error) else 2.0
-    return method.rounded(1.05 * growth * steps)
 
 
 def _rough_limit(method: Method) -> tuple[Floats, float] | None:
@@ -212,8 +205,7 @@ def choose(
     def of(integrator: Integrator, least: int) -> Method:
         return Method(runs, integrator, least, motion.parts, min(integrator.order, motion.most))
 
-    most = _PATIENCE / len(motion.q0)
-    if first is not None and motion.duration / first[1] < most:
+    if first is not None and motion.duration / first[1] < runs.most:
         method = of(first[0], motion.parts)
         steps = method.rounded(motion.duration / first[1] * (1.0 - 1e-9))
         for _ in range(CHECKS):
@@ -225,9 +217,9 @@ def choose(
                 return Choice(first[0], steps, max(error, floor), runs.steps, runs.evaluations, floor)
             if error > _FAR * tolerance:
                 break
-            steps = _more(method, steps, error, tolerance)
+            steps = method.more(steps, error, tolerance)
     coarse = first_steps(motion.scene, motion.q0, motion.v0, motion.duration, motion.parts)
-    if coarse > most:
+    if coarse > runs.most:
         return Choice(integrators[0], coarse, math.inf, 0, 0, 0.0)
     # Powers of two, for runs to share as many nodes as they can.
     least = motion.parts * 2 ** math.ceil(math.log2(coarse // motion.parts))
