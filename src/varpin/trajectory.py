@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import reprlib
-import secrets
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, BinaryIO
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from varpin._version import __version__
 from varpin.errors import FileError, InputError
-from varpin.io.archive import Check, Header, read_npz
-from varpin.mechanics.scene import OF_FORCES, VALUES, Scene, differences, same
+from varpin.io.archive import Axes, read_npz, record_of, save_npz
+from varpin.mechanics.scene import VALUES, Scene, differences, same
 from varpin.model import Robot
-from varpin.support.checks import path_like, writable
+from varpin.support.checks import path_like
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, said, table
 
@@ -31,13 +29,7 @@ Bytes = NDArray[np.uint8]
 FORMAT = "varpin.trajectory/2"
 
 _ARRAYS = ("t", "q", "v", "p", "u", "dw", "energy", "masses")
-_TEXTS = ("version", "integrator", "robot", "joint_names", "warnings")
 _AT_A_TIME = 1_000_000  # parts of steps
-# Before the names of the scene's values in a file.
-_SCENE = "scene."
-_MOST_WORDS = 1_000_000  # bytes of what does not grow with the steps
-_KINDS = {f"statistics.{name}": "int64" for name in ("newton_iterations", "jets", "sweeps", "substeps")}
-_KINDS["statistics.halvings"] = "uint8"
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,14 +50,14 @@ class StepStatistics(Frozen):
         branch_margin: Distance from the fold of the step equation's solutions (N,): 1 as dt -> 0, refused at 0.
     """
 
-    newton_iterations: Integers
-    jets: Integers
-    sweeps: Integers
-    substeps: Integers
-    halvings: Bytes
-    residual: Floats
-    branch_margin: Floats
-    energy_defect: Floats
+    newton_iterations: Annotated[Integers, Axes("steps")]
+    jets: Annotated[Integers, Axes("steps")]
+    sweeps: Annotated[Integers, Axes("steps")]
+    substeps: Annotated[Integers, Axes("steps")]
+    halvings: Annotated[Bytes, Axes("parts")]
+    residual: Annotated[Floats, Axes("steps")]
+    branch_margin: Annotated[Floats, Axes("steps")]
+    energy_defect: Annotated[Floats, Axes("steps")]
 
     def __repr__(self) -> str:
         if not len(self.substeps):
@@ -163,10 +155,6 @@ class Accuracy:
         )
 
 
-# Numbers of an accuracy in a file, beside what the trajectory has itself.
-_ACCURACY = ("tolerance", "error", "search_steps", "search_evaluations")
-
-
 @dataclass(frozen=True, eq=False)
 class Trajectory(Frozen):
     """A motion over N steps and N + 1 nodes.
@@ -194,14 +182,14 @@ class Trajectory(Frozen):
             tolerance; None of others.
     """
 
-    t: Floats
-    q: Floats
-    v: Floats
-    p: Floats
-    u: Floats
-    dw: Floats
-    energy: Floats
-    masses: Floats
+    t: Annotated[Floats, Axes("nodes", finite=True)]
+    q: Annotated[Floats, Axes("nodes", "joints", finite=True)]
+    v: Annotated[Floats, Axes("nodes", "joints", finite=True)]
+    p: Annotated[Floats, Axes("nodes", "joints")]
+    u: Annotated[Floats, Axes("steps", "controls", finite=True)]
+    dw: Annotated[Floats, Axes("steps", "processes", finite=True)]
+    energy: Annotated[Floats, Axes("nodes")]
+    masses: Annotated[Floats, Axes("bodies", finite=True)]
     dt: float
     integrator: str
     robot: str
@@ -209,7 +197,9 @@ class Trajectory(Frozen):
     statistics: StepStatistics
     version: str = __version__
     warnings: tuple[str, ...] = ()
-    scene_values: Mapping[str, Floats] = field(default_factory=lambda: MappingProxyType({}), repr=False)
+    scene_values: Mapping[str, Floats] = field(
+        default_factory=lambda: MappingProxyType({}), repr=False, metadata={"entry": "scene"}
+    )
     accuracy: Accuracy | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -294,20 +284,7 @@ class Trajectory(Frozen):
         Raises:
             FileError: The path cannot be written.
         """
-        with atomic_file(path) as stream:
-            np.savez_compressed(stream, **self.members(), format=FORMAT)
-        return Path(path)
-
-    def members(self) -> dict[str, Any]:
-        """What an npz file holds of it, by name."""
-        members: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
-        members |= {f"statistics.{item.name}": getattr(self.statistics, item.name) for item in fields(StepStatistics)}
-        members |= {"version": self.version, "integrator": self.integrator, "robot": self.robot}
-        members |= {"warnings": np.array(self.warnings, dtype=str)}
-        members |= {f"{_SCENE}{name}": values for name, values in self.scene_values.items()}
-        if self.accuracy is not None:
-            members["accuracy"] = np.array([getattr(self.accuracy, name) for name in _ACCURACY], dtype=np.float64)
-        return members | {"dt": self.dt, "joint_names": np.array(self.joint_names, dtype=str)}
+        return save_npz(path, FORMAT, self)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], robot: Robot | None = None) -> Trajectory:
@@ -325,102 +302,56 @@ class Trajectory(Frozen):
         source = path_like("path", path)
         if robot is not None and not isinstance(robot, Robot):
             raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
-        members = read_members(
-            source, FORMAT, MEMBERS, optional=OPTIONAL, check=lambda headers: require_layout(source, headers)
-        )
-        return cls.of_members(source, members, robot)
+        return cls.of_members(source, read_npz(source, FORMAT), robot)
 
     @classmethod
-    def of_members(cls, source: Path, members: Mapping[str, NDArray[Any]], robot: Robot | None) -> Trajectory:
-        """The trajectory that members of the file ``source`` describe, by the names that :meth:`members` gives.
+    def of_members(
+        cls, source: Path, members: Mapping[str, NDArray[Any]], robot: Robot | None, prefix: str = ""
+    ) -> Trajectory:
+        """The trajectory whose entries in the file ``source`` have names that begin with ``prefix``.
 
         Raises:
             FileError: As for :meth:`load`.
         """
-        require_layout(source, members)
-        steps = members["t"].size - 1
-        # Energies, momenta with them, and what is said of steps overflow before q and v do, and are saved as they are.
-        held = np.isfinite(members["energy"])
-        given = {name: members[name] for name in ("t", "q", "v", "u", "dw", "masses", "dt")} | {"p": members["p"][held]}
-        kept = {name: members[_SCENE + name] for name in VALUES if _SCENE + name in members}
-        # A noise without a center of its own has NaN there, a stop of one end an infinite other one.
-        endless = {"noise.center", *OF_FORCES}
-        given |= {_SCENE + name: values for name, values in kept.items() if name not in endless}
-        for name, values in given.items():
-            if not np.isfinite(values).all():
-                raise FileError(f"{source}: {name} holds values that are not finite numbers")
-        if steps < 0 or not members["dt"] > 0.0:
-            raise FileError(f"{source}: it has {steps + 1} nodes and dt = {members['dt']} s")
-        expected = members["t"][0] + np.arange(steps + 1) * members["dt"]
-        if not np.allclose(members["t"], expected, rtol=1e-9, atol=1e-9 * float(members["dt"])):
-            raise FileError(f"{source}: its times t are not dt = {members['dt']} s apart")
-        names = tuple(str(name) for name in members["joint_names"])
-        if robot is not None and names != robot.joint_names:
+        found = record_of(cls, _with_accuracy(members, prefix), source, prefix=prefix)
+        kept = {name: values for name, values in found.scene_values.items() if name in VALUES}
+        found = replace(found, scene_values=MappingProxyType(kept))
+        # Energies overflow before q and v do, and momenta with them: they are saved as they are.
+        if not np.isfinite(found.p[np.isfinite(found.energy)]).all():
+            raise FileError(f"{source}: p holds values that are not finite numbers")
+        expected = found.t[0] + np.arange(found.steps + 1) * found.dt
+        if not found.dt > 0.0 or not np.allclose(found.t, expected, rtol=1e-9, atol=1e-9 * found.dt):
+            raise FileError(f"{source}: its times t are not dt = {found.dt} s apart")
+        if damage := found.statistics.damage():
+            raise FileError(f"{source}: {damage}")
+        if robot is not None:
+            found._require_robot(source, robot)
+        return found
+
+    def _require_robot(self, source: Path, robot: Robot) -> None:
+        """Refuse a robot that the motion in the file ``source`` is not of: by its joints, and by its masses."""
+        if self.joint_names != robot.joint_names:
             raise FileError(
-                f"{source} is of robot {members['robot']!s} with joints {', '.join(names)}; "
+                f"{source} is of robot {self.robot} with joints {', '.join(self.joint_names)}; "
                 f"{robot.name!r} has joints {', '.join(robot.joint_names)}"
             )
-        masses = members["masses"]
-        if robot is not None and (
-            masses.shape != robot.tree.mass.shape or not np.allclose(masses, robot.tree.mass, rtol=1e-6)
-        ):
+        masses = robot.tree.mass
+        if self.masses.shape != masses.shape or not np.allclose(self.masses, masses, rtol=1e-6):
             raise FileError(
-                f"{source} is of robot {members['robot']!s}, whose links weigh {masses.sum():.6g} kg in all; "
-                f"{robot.name!r} has joints of the same names, but its links weigh {robot.tree.mass.sum():.6g} kg"
+                f"{source} is of robot {self.robot}, whose links weigh {self.masses.sum():.6g} kg in all; "
+                f"{robot.name!r} has joints of the same names, but its links weigh {masses.sum():.6g} kg"
             )
-        statistics = StepStatistics(**{x.name: members[f"statistics.{x.name}"] for x in fields(StepStatistics)})
-        if damage := statistics.damage():
-            raise FileError(f"{source}: {damage}")
-        accuracy = None
-        if "accuracy" in members:
-            numbers = members["accuracy"]
-            if not (np.isfinite(numbers).all() and (numbers >= 0.0).all()):
-                raise FileError(f"{source}: accuracy holds numbers that no accuracy has")
-            tolerance, error, *work = map(float, numbers)
-            made = str(members["integrator"]), float(members["dt"])
-            accuracy = Accuracy(tolerance, error, *made, *map(int, work))
-        return cls(
-            **{name: members[name] for name in _ARRAYS},
-            dt=float(members["dt"]),
-            integrator=str(members["integrator"]),
-            robot=str(members["robot"]),
-            joint_names=names,
-            statistics=statistics,
-            version=str(members["version"]),
-            warnings=tuple(str(sentence) for sentence in members["warnings"]),
-            scene_values=MappingProxyType(kept),
-            accuracy=accuracy,
-        )
 
 
-def require_layout(source: Path, members: Mapping[str, NDArray[Any] | Header]) -> None:
-    """Refuse arrays, or headers of arrays, that are not those of one motion.
-
-    Raises:
-        FileError: It names the member, its shape or type, and what belongs there.
-    """
-    steps, n = members["t"].size - 1, members["joint_names"].size
-    nodes: tuple[int, ...] = (steps + 1,)
-    shapes = dict.fromkeys("qvp", (*nodes, n)) | dict.fromkeys(("t", "energy"), nodes) | {"masses": (-1,), "dt": ()}
-    shapes |= {"u": (steps, -1), "dw": (steps, -1), "joint_names": (-1,), "warnings": (-1,)}
-    shapes |= {f"statistics.{name}": (steps,) for name in STEP_NUMBERS} | {"statistics.halvings": (-1,)}
-    shapes |= dict.fromkeys(_TEXTS[:3], ())
-    shapes |= {"accuracy": (len(_ACCURACY),)} if "accuracy" in members else {}
-    ends = {"gravity": (3,), "actuation": (n, -1)} | dict.fromkeys(("damping", "stiffness", "rest", "armature"), (n,))
-    ends |= dict.fromkeys(("ratio", "offset"), (-1,)) | dict.fromkeys(("center", "translation"), (-1, 3))
-    ends |= {"inertia": (-1, 6), "rotation": (-1, 3, 3)} | dict.fromkeys(OF_FORCES, (-1, -1))
-    shapes |= {_SCENE + name: ends.get(name, (n, -1)) for name in VALUES if _SCENE + name in members}
-    for name, shape in shapes.items():
-        found, kind = members[name].shape, members[name].dtype
-        if len(found) != len(shape) or any(b not in (-1, a) for a, b in zip(found, shape, strict=True)):
-            raise FileError(f"{source}: {name} has shape {found}, where {shape} belongs")
-        if name in _TEXTS:
-            if kind.kind != "U":
-                raise FileError(f"{source}: {name} holds {kind}, where text belongs")
-        elif kind != _KINDS.get(name, "float64"):
-            raise FileError(f"{source}: {name} holds {kind}, where {_KINDS.get(name, 'float64')} belongs")
-        if name in (*_TEXTS, "masses") and members[name].size * kind.itemsize > _MOST_WORDS:
-            raise FileError(f"{source}: {name} is longer than any: {found} of {kind}")
+def _with_accuracy(members: Mapping[str, Any], prefix: str) -> Mapping[str, Any]:
+    """The entries of an accuracy by name, where a file of varpin 0.1 has its four numbers in one array."""
+    numbers = members.get(f"{prefix}accuracy")
+    if numbers is None or numbers.shape != (4,) or numbers.dtype != np.float64:
+        return members
+    own = {name: members.get(prefix + name) for name in ("integrator", "dt")}
+    own |= dict(zip(("tolerance", "error"), numbers[:2], strict=True))
+    own |= dict(zip(("search_steps", "search_evaluations"), numbers[2:].astype(np.int64), strict=True))
+    return {**members, **{f"{prefix}accuracy.{name}": np.asarray(value) for name, value in own.items()}}
 
 
 def chained(parts: Sequence[Trajectory]) -> Trajectory:
@@ -478,56 +409,3 @@ def require_scene_of(scene: Scene, trajectory: Trajectory) -> None:
             f"the trajectory was made in another scene than the one given: {'; '.join(found)}. Give the scene that "
             "made it, or simulate again in this one"
         )
-
-
-# What a file of a trajectory holds beside its format, and what it may hold.
-MEMBERS = frozenset(_ARRAYS) | {"dt", "version", "integrator", "robot", "joint_names", "warnings"}
-MEMBERS |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
-OPTIONAL = frozenset(_SCENE + name for name in VALUES) | {"accuracy"}
-
-
-def read_members(
-    source: Path,
-    kind: str,
-    expected: Iterable[str],
-    *,
-    optional: Collection[str] = (),
-    others: bool = False,
-    most: int | None = None,
-    check: Check | None = None,
-) -> dict[str, NDArray[Any]]:
-    """The ``expected`` arrays of an npz file of format ``kind``, the ``optional`` that it has, with ``others`` all.
-
-    ``most`` and ``check`` as for :func:`varpin.io.archive.read_npz`.
-
-    Raises:
-        FileError: It says what is wrong with the file.
-    """
-    what = f"varpin {kind.removeprefix('varpin.').partition('/')[0]}"
-    names = {*expected, "format"}
-    found = read_npz(source, names, what, wanted={"format"}, most=_MOST_WORDS)["format"]
-    if found.shape != () or str(found) != kind:
-        raise FileError(f"{source} is not a {what}: its format is {reprlib.repr(str(found))[1:-1]}, not {kind!r}")
-    wanted = None if others else {*names, *optional}
-    return read_npz(source, names, what, wanted=wanted, most=most, check=check)
-
-
-@contextlib.contextmanager
-def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A binary stream whose contents take the place of ``path`` when the block ends well, and vanish if not.
-
-    Raises:
-        FileError: The path cannot be written.
-    """
-    target = writable(path)
-    # Not by tempfile, which gives files to their owner alone.
-    own = target.with_name(f".{target.name}.{secrets.token_hex(8)}")
-    try:
-        with own.open("xb") as stream:
-            yield stream
-        own.replace(target)
-    except BaseException as error:
-        own.unlink(missing_ok=True)
-        if isinstance(error, OSError) and not isinstance(error, FileError):
-            raise FileError(f"cannot write {target}: {error.strerror or error}") from None
-        raise

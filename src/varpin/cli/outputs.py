@@ -14,11 +14,12 @@ from varpin.cli.console import complain
 from varpin.cli.exits import INTERRUPTED, MISTAKE
 from varpin.cli.interrupts import Interrupts
 from varpin.errors import FileError, InputError, VarpinError
+from varpin.io.archive import atomic_file
 from varpin.io.scenefile.spec import FIGURES
 from varpin.model import Robot
 from varpin.show.replay import check_film, replay
 from varpin.support.checks import positive, writable
-from varpin.trajectory import Trajectory, atomic_file
+from varpin.trajectory import Trajectory
 
 
 def add_outputs(parser: argparse.ArgumentParser, what: str) -> None:

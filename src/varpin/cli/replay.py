@@ -18,7 +18,7 @@ from varpin.cli.console import say
 from varpin.cli.outputs import Output, add_shown, replays_of, write_all
 from varpin.control import solution_trajectory
 from varpin.errors import FileError, InputError, RobotNotFound
-from varpin.io.archive import read_npz
+from varpin.io.archive import read_format
 from varpin.io.scenefile import SceneFile, load_scene
 from varpin.model import Robot, load_robot
 from varpin.show.replay import frame_names, replay
@@ -99,8 +99,8 @@ def _window(
 def _motion(path: Path, robot: Robot | None = None) -> Trajectory:
     """The trajectory in a file of a trajectory or of a solution."""
     source = path_like("NPZ", path)
-    kind = str(read_npz(source, {"format"}, "varpin trajectory or solution", wanted={"format"})["format"])
-    return solution_trajectory(source, robot) if kind.startswith("varpin.solution/") else Trajectory.load(source, robot)
+    solution = read_format(source).startswith("varpin.solution/")
+    return solution_trajectory(source, robot) if solution else Trajectory.load(source, robot)
 
 
 def _robot(request: argparse.Namespace, motion: Trajectory) -> tuple[Robot, SceneFile | None]:

@@ -1,174 +1,386 @@
-"""Reading npz archives that may be damaged, foreign or meant to harm.
+"""Records in files: frozen dataclasses of arrays and plain values, as npz without pickle or as JSON.
 
-``np.load`` makes room for as much as a header asks for, and zip files unpack to a thousand times their size. Here
-nothing is unpickled, no memory is taken that the file's own entries do not add up to, and whoever knows what belongs in
-a file can refuse it by the headers of its arrays, before any of them is read.
+An entry of a file is a field of the record, under its name: ``dt``, ``statistics.jets`` of a record within the record,
+``runs.dt`` of a tuple of records as one array for each of their fields. The annotations of the fields say what an entry
+holds; a field with a default may be missing. Every file has a ``format``, a name and a version.
 """
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import io
+import json
 import math
+import os
+import reprlib
+import secrets
+import typing
 import zipfile
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
 from pathlib import Path
-from typing import IO, Any
+from types import NoneType, UnionType
+from typing import Annotated, Any, BinaryIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.errors import FileError
+from varpin.errors import FileError, InputError
+from varpin.support.checks import is_file, path_like, writable
 
-# An archive may unpack to this many bytes, or to this many times its own size where that is more: a motion of a million
-# steps stays below both, and one at rest is nothing but repetitions.
-MOST_BYTES = 400_000_000
-MOST_RATIO = 100
-# Bytes of one entry of an array, which may be a text.
-_ENTRY = 1_000_000
-# Bytes that are unpacked at a time.
-_CHUNK = 1 << 20
-
-_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+T = TypeVar("T")
+Members = Mapping[str, NDArray[Any]]
 
 
-@dataclass(frozen=True)
-class Header:
-    """What an array of an archive says of itself.
+class Axes:
+    """The shape of an array in a record, as the annotation of its field: ``Annotated[Floats, Axes("steps", 3)]``.
 
-    Attributes:
-        shape: Its shape.
-        dtype: Of its entries.
-        by_columns: Whether it lies there in Fortran's order.
+    Args:
+        axes: Lengths, or names: axes of one name have one length throughout the record.
+        finite: Whether NaN and infinite entries are refused.
     """
 
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    by_columns: bool
-
-    @property
-    def ndim(self) -> int:
-        """How many axes it has."""
-        return len(self.shape)
-
-    @property
-    def size(self) -> int:
-        """How many entries."""
-        return math.prod(self.shape)
-
-    @property
-    def bytes(self) -> int:
-        """What they take."""
-        return self.size * self.dtype.itemsize
+    def __init__(self, *axes: str | int, finite: bool = False) -> None:
+        self.axes = axes
+        self.finite = finite
 
 
-Check = Callable[[Mapping[str, Header]], None]
-
-
-def read_npz(
-    source: Path,
-    names: Collection[str] = (),
-    what: str = "npz file",
-    *,
-    wanted: Collection[str] | None = None,
-    most: int | None = None,
-    check: Check | None = None,
-) -> dict[str, NDArray[Any]]:
-    """The arrays of an npz file; without those in ``names`` it is not ``what`` it should be.
-
-    Of others than ``wanted``, if given, nothing is read; of these, what is there. ``most`` is how many bytes it may
-    unpack to, if that is known. ``check`` is given the headers of what is to be read, and raises a FileError where they
-    do not fit.
-
-    Arrays are C-contiguous and cannot be written to.
+def save_npz(path: str | os.PathLike[str], form: str, record: Any) -> Path:
+    """Write a record of the format ``form`` as compressed npz; returns its path.
 
     Raises:
-        FileError: The file is missing, unreadable, no npz, truncated or damaged, lacks one of ``names``, holds pickled
-            objects, or unpacks to more than ``most``, or :data:`MOST_BYTES` and :data:`MOST_RATIO` times its size.
+        FileError: The path cannot be written.
     """
+    return write_npz(path, form, members_of(record))
+
+
+def load_npz(path: str | os.PathLike[str], form: str, kind: type[T]) -> T:
+    """The record of a ``kind`` that :func:`save_npz` wrote.
+
+    Raises:
+        FileError: As :func:`read_npz` and :func:`record_of`.
+    """
+    source = path_like("path", path)
+    return record_of(kind, read_npz(source, form), source)
+
+
+def save_json(path: str | os.PathLike[str], form: str, record: Any) -> Path:
+    """Write a record of plain values as JSON; returns its path. NaN stands there as null, infinity as "inf".
+
+    Raises:
+        FileError: The path cannot be written.
+    """
+    text = json.dumps({"format": form} | _plain(record), indent=1, allow_nan=False)
+    with atomic_file(path) as stream:
+        stream.write(text.encode())
+    return Path(path)
+
+
+def load_json(path: str | os.PathLike[str], form: str, kind: type[T]) -> T:
+    """The record of a ``kind`` that :func:`save_json` wrote.
+
+    Raises:
+        FileError: The file is missing, no JSON, of another format, or an entry is not what the record holds.
+    """
+    source = path_like("path", path)
+    if not is_file(source):
+        raise FileError(f"there is no file {source}")
     try:
-        if source.is_dir():
-            raise FileError(f"{source} is a folder, not an npz file")
-        if not source.is_file():
-            raise FileError(f"there is no file {source}")
-        with source.open("rb") as stream:
-            if not zipfile.is_zipfile(stream):
-                raise FileError(f"{source} is not an npz file, or it is truncated")
+        entries = json.loads(source.read_bytes())
+    except OSError as error:
+        raise FileError(f"cannot read {source}: {error.strerror or error}") from None
+    except (ValueError, RecursionError) as error:
+        raise FileError(f"{source} is truncated, or no JSON file: {error}") from None
+    _require_format(source, entries.get("format") if isinstance(entries, dict) else None, form)
+    record: T = _Builder(source, {}).build(kind, entries, "")
+    return record
+
+
+def write_npz(path: str | os.PathLike[str], form: str, members: Mapping[str, Any]) -> Path:
+    """Write arrays of the format ``form``; a file that is there is replaced only once the new one is whole.
+
+    Raises:
+        FileError: The path cannot be written.
+    """
+    with atomic_file(path) as stream:
+        np.savez_compressed(stream, **members, format=form)
+    return Path(path)
+
+
+def read_npz(source: Path, form: str | None = None) -> dict[str, NDArray[Any]]:
+    """The arrays of an npz file; of the format ``form``, if it is given.
+
+    Raises:
+        FileError: The file is missing, no npz, truncated or damaged, holds pickled objects, or is of another format.
+    """
+    with _opened(source) as archive:
+        members = {name.removesuffix(".npy"): _array(archive, name, source) for name in archive.namelist()}
+    if form is not None:
+        _require_format(source, members.get("format"), form)
+    return members
+
+
+def read_format(source: Path) -> str:
+    """The format of an npz file; empty if it has none.
+
+    Raises:
+        FileError: As :func:`read_npz`.
+    """
+    with _opened(source) as archive:
+        return str(_array(archive, "format.npy", source)) if "format.npy" in archive.namelist() else ""
+
+
+@contextlib.contextmanager
+def _opened(source: Path) -> Iterator[zipfile.ZipFile]:
+    if source.is_dir():
+        raise FileError(f"{source} is a folder, not an npz file")
+    if not is_file(source):
+        raise FileError(f"there is no file {source}")
+    try:
         with zipfile.ZipFile(source) as archive:
-            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            if missing := sorted(set(names) - set(members)):
-                raise FileError(f"{source} is not a {what}: it has no {', '.join(missing)}")
-            if wanted is not None:
-                members = {name: members[name] for name in wanted if name in members}
-            _require_size(source, what, sum(info.file_size for info in members.values()), most)
-            headers = {}
-            for name, info in members.items():
-                if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                    raise FileError(f"{source} is damaged: {name} is packed in a way that varpin does not write")
-                with archive.open(info) as stream:
-                    headers[name] = _read_header(stream, info, name, source)
-            # What lies by columns is turned around, for which there has to be room.
-            turned = [header for header in headers.values() if header.by_columns and header.ndim > 1]
-            size = sum(header.bytes for header in headers.values())
-            _require_size(source, what, size + max((header.bytes for header in turned), default=0), most)
-            if check is not None:
-                check(headers)
-            arrays = {}
-            for name, info in members.items():
-                with archive.open(info) as stream:
-                    _read_header(stream, info, name, source)
-                    arrays[name] = _read_array(stream, headers[name], name, source)
-            return arrays
+            yield archive
     except FileError:
         raise
     except OSError as error:
         raise FileError(f"cannot read {source}: {error.strerror or error}") from None
-    # A damaged archive raises whatever zipfile, zlib and numpy stumble over: there is no list of it.
+    # A damaged archive raises whatever zipfile, zlib and numpy meet first.
     except Exception as error:
-        raise FileError(f"{source} is truncated or damaged: {error}") from None
+        raise FileError(f"{source} is no npz file, or it is truncated or damaged: {error}") from None
 
 
-def _require_size(source: Path, what: str, size: int, most: int | None) -> None:
-    if most is not None and size > most:
-        raise FileError(f"{source} unpacks to {size / 1e6:.6g} MB, which no {what} does that fits here")
-    if most is None and size > max(source.stat().st_size * MOST_RATIO, MOST_BYTES):
-        raise FileError(
-            f"{source} unpacks to {size / 1e6:.6g} MB, which is over {MOST_BYTES / 1e6:g} MB and over "
-            f"{MOST_RATIO} times its size: no motion or record does"
-        )
+def _array(archive: zipfile.ZipFile, name: str, source: Path) -> NDArray[Any]:
+    # The whole entry at once: zipfile compares its checksum only at its end.
+    content = io.BytesIO(archive.read(name))
+    try:
+        return np.asarray(np.lib.format.read_array(content, allow_pickle=False), order="C")
+    except ValueError as error:
+        raise FileError(f"{source}: {name.removesuffix('.npy')} is no array: {error}") from None
 
 
-def _read_header(stream: IO[bytes], info: zipfile.ZipInfo, name: str, source: Path) -> Header:
-    version = np.lib.format.read_magic(stream)
-    if version not in _HEADERS:
-        raise FileError(f"{source} is damaged: {name} is of npy version {version}")
-    shape, by_columns, dtype = _HEADERS[version](stream)
-    if dtype.hasobject:
-        raise FileError(f"{source} cannot be read without unpickling objects, which is not done")
-    if dtype.names is not None or dtype.subdtype is not None or not 0 < dtype.itemsize <= _ENTRY:
-        raise FileError(f"{source} is damaged: {name} is an array of {dtype}")
-    size, left = math.prod(shape) * dtype.itemsize, info.file_size - stream.tell()
-    if any(number < 0 for number in shape) or size != left:
-        raise FileError(f"{source} is truncated or damaged: {name} has {left} bytes for shape {shape} of {dtype}")
-    return Header(shape, dtype, by_columns)
+def _require_format(source: Path, found: object, form: str) -> None:
+    if str(found) != form:
+        what = "it has no format" if found is None else f"its format is {reprlib.repr(str(found))}"
+        raise FileError(f"{source} is not a varpin {_noun(form)}: {what}, and should have {form!r}")
 
 
-def _read_array(stream: IO[bytes], header: Header, name: str, source: Path) -> NDArray[Any]:
-    """What follows a header, unpacked into its place piece by piece."""
-    size, end = header.bytes, 0
-    content = np.empty(size, dtype=np.uint8)
-    # Once more after the last, so that its checksum is looked at.
-    while piece := stream.read(_CHUNK):
-        if end + len(piece) > size:
-            raise FileError(f"{source} is truncated or damaged: {name} goes on after {size} bytes")
-        content[end : end + len(piece)] = np.frombuffer(piece, dtype=np.uint8)
-        end += len(piece)
-    if end != size:
-        raise FileError(f"{source} is truncated or damaged: {name} ends after {end} of {size} bytes")
-    if size == 0:
-        array = np.zeros(header.shape, header.dtype)
-    else:
-        array = np.asarray(
-            content.view(header.dtype).reshape(header.shape, order="F" if header.by_columns else "C"), order="C"
-        )
-    array.setflags(write=False)
-    return array
+def _noun(form: str) -> str:
+    return form.removeprefix("varpin.").partition("/")[0]
+
+
+def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
+    """The entries of a record in an npz file, each name after ``prefix``."""
+    members: dict[str, Any] = {}
+    hints = _hints(type(record))
+    for item in fields(record):
+        name, value, hint = prefix + _entry(item), getattr(record, item.name), _required(hints[item.name])
+        if value is None:
+            continue
+        if is_dataclass(value):
+            members |= members_of(value, f"{name}.")
+        elif isinstance(value, Mapping):
+            members |= {f"{name}.{key}": array for key, array in value.items()}
+        elif row := _row(hint):
+            columns = [own.name for own in fields(row)]
+            members |= {f"{name}.{key}": np.array([getattr(entry, key) for entry in value]) for key in columns}
+        else:
+            members[name] = np.array(value, dtype=np.str_) if hint == tuple[str, ...] else value
+    return members
+
+
+def record_of(
+    kind: type[T], members: Members, source: Path, *, prefix: str = "", sizes: Mapping[str, int] | None = None
+) -> T:
+    """The record of a ``kind`` with the entries of an npz file whose names begin with ``prefix``.
+
+    Args:
+        kind: A dataclass.
+        members: The arrays of the file.
+        source: The file, for errors.
+        prefix: Of the names of the entries, empty or with a dot at its end.
+        sizes: Lengths of named axes; those that are not given are found.
+
+    Raises:
+        FileError: An entry is missing, or is not of the type, shape or values of its field: file, entry, and what
+            belongs there.
+    """
+    builder = _Builder(source, dict(sizes or {}))
+    record: T = builder.build(kind, builder.tables(kind, members, prefix), prefix.removesuffix("."))
+    return record
+
+
+class _Builder:
+    """Records from the entries of a file.
+
+    Attributes:
+        source: The file, for errors.
+        sizes: Lengths of named axes, as far as they are known.
+    """
+
+    def __init__(self, source: Path, sizes: dict[str, int]) -> None:
+        self.source = source
+        self.sizes = sizes
+
+    def tables(self, kind: Any, members: Members, prefix: str) -> dict[str, Any]:
+        """The entries of an npz file as JSON has them: a table for a record, a list of tables for a tuple of them."""
+        tables: dict[str, Any] = {}
+        hints = _hints(kind)
+        for item in fields(kind):
+            key, hint = _entry(item), _required(hints[item.name])
+            name = prefix + key
+            below = {own.removeprefix(f"{name}."): members[own] for own in members if own.startswith(f"{name}.")}
+            if is_dataclass(hint) and below:
+                tables[key] = self.tables(hint, members, f"{name}.")
+            elif name in members:
+                tables[key] = members[name]
+            elif typing.get_origin(hint) is Mapping:
+                tables[key] = below
+            elif (row := _row(hint)) and below:
+                columns = {own.name: below[own.name] for own in fields(row) if own.name in below}
+                for own, array in columns.items():
+                    if array.ndim != 1 or array.size != next(iter(columns.values())).size:
+                        raise self.error(
+                            f"{name}.{own}", f"{array.dtype} {array.shape}", "a list as long as the others"
+                        )
+                rows = zip(*(array.tolist() for array in columns.values()), strict=True)
+                tables[key] = [dict(zip(columns, row, strict=True)) for row in rows]
+        return tables
+
+    def error(self, entry: str, found: str, expected: str) -> FileError:
+        return FileError(f"{self.source}: {entry or 'the file'} is {found}, where {expected} belongs")
+
+    def build(self, hint: Any, value: Any, entry: str) -> Any:
+        """``value``, an array or as JSON has it, as the annotation ``hint`` of a field."""
+        hint, optional = _required(hint), hint
+        if value is None and hint is not optional:
+            return None
+        if typing.get_origin(hint) in (Annotated, np.ndarray):
+            return self._array(hint, value, entry)
+        if isinstance(value, np.ndarray):
+            value = value.tolist()
+        if is_dataclass(hint):
+            return self._record(hint, value, entry)
+        if typing.get_origin(hint) is tuple:
+            return self._tuple(hint, value, entry)
+        if typing.get_origin(hint) is Mapping:
+            inner = typing.get_args(hint)[1]
+            return {name: self.build(inner, array, f"{entry}.{name}") for name, array in value.items()}
+        return self._scalar(hint, value, entry)
+
+    def _array(self, hint: Any, array: Any, entry: str) -> NDArray[Any]:
+        kind, axes = _array_type(hint)
+        found = array if isinstance(array, np.ndarray) else np.array(None)
+        names = axes.axes if axes is not None else found.shape
+        expected = tuple(self.sizes.get(name, name) if isinstance(name, str) else name for name in names)
+        fits = found.dtype == kind and found.ndim == len(expected)
+        if not fits or any(isinstance(a, int) and a != b for a, b in zip(expected, found.shape, strict=True)):
+            raise self.error(entry, f"{found.dtype} {found.shape}", f"{kind} ({', '.join(map(str, expected))})")
+        self.sizes |= {name: size for name, size in zip(names, found.shape, strict=True) if isinstance(name, str)}
+        if axes is not None and axes.finite and not np.isfinite(found).all():
+            raise FileError(f"{self.source}: {entry} holds values that are not finite numbers")
+        found.setflags(write=False)
+        return found
+
+    def _record(self, kind: Any, value: Any, entry: str) -> Any:
+        if not isinstance(value, dict):
+            raise self.error(entry, reprlib.repr(value), "a table")
+        hints, given = _hints(kind), {}
+        for item in fields(kind):
+            key = _entry(item)
+            name = f"{entry}.{key}" if entry else key
+            if key in value:
+                given[item.name] = self.build(hints[item.name], value[key], name)
+            elif item.default is MISSING and item.default_factory is MISSING:
+                raise FileError(f"{self.source}: {name} is missing")
+        try:
+            return kind(**given)
+        except InputError as error:
+            raise FileError(f"{self.source}: {error}") from None
+
+    def _tuple(self, hint: Any, value: Any, entry: str) -> tuple[Any, ...]:
+        kinds = typing.get_args(hint)
+        if not isinstance(value, list) or (kinds[-1] is not ... and len(value) != len(kinds)):
+            raise self.error(entry, reprlib.repr(value), "a list" if kinds[-1] is ... else f"a list of {len(kinds)}")
+        wanted = [kinds[0]] * len(value) if kinds[-1] is ... else kinds
+        pairs = enumerate(zip(wanted, value, strict=True))
+        return tuple(self.build(kind, own, f"{entry}[{index}]") for index, (kind, own) in pairs)
+
+    def _scalar(self, kind: Any, value: Any, entry: str) -> Any:
+        if issubclass(kind, Enum):
+            allowed = [member.value for member in kind]
+            if value not in allowed:
+                raise self.error(entry, reprlib.repr(value), f"one of {', '.join(map(str, allowed))}")
+            return kind(value)
+        if kind is float and (value is None or value in ("inf", "-inf")):
+            return math.nan if value is None else float(value)
+        if kind is float and type(value) is int and abs(value) < 2**53:
+            return float(value)
+        if type(value) is not kind:
+            raise self.error(entry, reprlib.repr(value), f"a value of type {kind.__name__}")
+        return value
+
+
+def _plain(value: Any) -> Any:
+    """A record as JSON has it."""
+    if is_dataclass(value):
+        return {_entry(item): _plain(getattr(value, item.name)) for item in fields(value)}
+    if isinstance(value, tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else str(value)
+    return value
+
+
+@functools.cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return typing.get_type_hints(kind, include_extras=True)
+
+
+def _entry(item: Any) -> str:
+    """The name of a field in files: its own, or the one its metadata gives."""
+    return str(item.metadata.get("entry", item.name))
+
+
+def _required(hint: Any) -> Any:
+    """What an annotation allows beside None."""
+    if typing.get_origin(hint) not in (UnionType, typing.Union):
+        return hint
+    (own,) = (option for option in typing.get_args(hint) if option is not NoneType)
+    return own
+
+
+def _row(hint: Any) -> Any:
+    """The records of a tuple of records; None of others."""
+    first, *_ = typing.get_args(hint) or (None,)
+    return first if typing.get_origin(hint) is tuple and is_dataclass(first) else None
+
+
+def _array_type(hint: Any) -> tuple[np.dtype[Any], Axes | None]:
+    """The type of an array's entries, and its axes if they are annotated."""
+    array, axes = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint, None)
+    (scalar,) = typing.get_args(typing.get_args(array)[1])
+    return np.dtype(scalar), axes
+
+
+@contextlib.contextmanager
+def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """A binary stream whose contents take the place of ``path`` when the block ends well, and vanish if not.
+
+    Raises:
+        FileError: The path cannot be written.
+    """
+    target = writable(path)
+    # Not by tempfile, which gives files to their owner alone.
+    draft = target.with_name(f".{target.name}.{secrets.token_hex(8)}")
+    try:
+        with draft.open("xb") as stream:
+            yield stream
+        draft.replace(target)
+    except BaseException as error:
+        draft.unlink(missing_ok=True)
+        if isinstance(error, OSError) and not isinstance(error, FileError):
+            raise FileError(f"cannot write {target}: {error.strerror or error}") from None
+        raise

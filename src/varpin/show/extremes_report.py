@@ -8,10 +8,10 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from varpin.io.archive import atomic_file
 from varpin.study.extremes import Cell, Kind, Record
 from varpin.study.extremes.battery import families
 from varpin.support.checks import writable
-from varpin.trajectory import atomic_file
 
 # What a kind looks like: a letter for those who see no colours, and a colour for those who do (after Okabe and Ito).
 LETTERS = {Kind.ACCURATE: "A", Kind.DEGRADED: "D", Kind.REFUSED: "R", Kind.STOPPED: "S", Kind.WRONG: "W"}

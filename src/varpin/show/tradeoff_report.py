@@ -12,10 +12,10 @@ from pathlib import Path
 from matplotlib.figure import Figure, SubFigure
 
 from varpin._version import __version__
+from varpin.io.archive import atomic_file
 from varpin.show.plots import plot_advice, plot_work_precision
 from varpin.study.tradeoff import Advice, WorkPrecision, WorkPrecisionRun
 from varpin.study.tradeoff.advice import Choice
-from varpin.trajectory import atomic_file
 
 # Heading and text of a run in the table.
 COLUMNS = ("integrator", "dt [s]", "wall time [s]", "error in q", "energy error [J]", "end effector [m]", "note")

@@ -242,7 +242,7 @@ def _lines(stream: TextIO, wrong: Callable[[str], Exception]) -> Iterator[str]:
 def _npz(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
     """The columns of an npz file: arrays of one length, or the joint positions of a saved trajectory."""
     try:
-        arrays = read_npz(path, what="file of values", most=8 * _MOST_NUMBERS)
+        arrays = read_npz(path)
     except FileError as error:
         raise wrong(f"cannot be read: {error}") from None
     if {"t", "q", "joint_names"} <= set(arrays) and arrays["q"].ndim == 2:

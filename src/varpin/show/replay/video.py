@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.errors import InputError, MissingDependency, VarpinError
+from varpin.io.archive import atomic_file
 from varpin.support.checks import count
-from varpin.trajectory import atomic_file
 
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome

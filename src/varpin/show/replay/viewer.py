@@ -10,10 +10,10 @@ from pathlib import Path
 
 import meshcat
 
+from varpin.io.archive import atomic_file
 from varpin.show.replay.drawing import draw
 from varpin.show.replay.page import Inline, Page
 from varpin.show.replay.script import Script
-from varpin.trajectory import atomic_file
 
 logger = logging.getLogger(__name__)
 

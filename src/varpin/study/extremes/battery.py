@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import os
-import reprlib
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from varpin._version import __version__
-from varpin.errors import FileError, VarpinError
+from varpin.errors import VarpinError
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
+from varpin.io.archive import load_json, save_json
 from varpin.model import Robot
 from varpin.simulation import limits
 from varpin.simulation.run import Interrupted, simulate
@@ -25,8 +24,8 @@ from varpin.study.extremes.checks import Exact, condition, exact_motion, finding
 from varpin.study.extremes.plans import PLANS, Plan
 from varpin.study.extremes.scenes import TRIALS, trials_on
 from varpin.study.extremes.trial import Cell, Kind, Setup, Trial
-from varpin.support.checks import is_file, path_like, positive, writable
-from varpin.trajectory import Trajectory, atomic_file
+from varpin.support.checks import positive, writable
+from varpin.trajectory import Trajectory
 
 FORMAT = "varpin.extremes/3"
 
@@ -93,11 +92,7 @@ class Record:
         Raises:
             FileError: The path cannot be written.
         """
-        facts = {"format": FORMAT} | {name: getattr(self, name) for name in ("version", "robot", "deep", "missing")}
-        text = json.dumps(facts | {"cells": [_plain(cell) for cell in self.cells]}, indent=1, allow_nan=False)
-        with atomic_file(path) as stream:
-            stream.write(text.encode())
-        return Path(path)
+        return save_json(path, FORMAT, self)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Record:
@@ -106,73 +101,7 @@ class Record:
         Raises:
             FileError: The file is missing, damaged or something else.
         """
-        source = path_like("path", path)
-        if not is_file(source):
-            raise FileError(f"there is no file {source}")
-        try:
-            with source.open("rb") as stream:
-                content = stream.read(_MOST_BYTES + 1)
-            if len(content) > _MOST_BYTES:
-                raise ValueError(f"it is larger than {_MOST_BYTES / 1e6:g} MB")
-            facts = _typed("the record", json.loads(content), _FACTS)
-            if facts["format"] != FORMAT:
-                raise ValueError(f"its format is {reprlib.repr(facts['format'])}, not {FORMAT!r}")
-            cells = tuple(_cell(entry) for entry in facts["cells"])
-        except OSError as error:
-            raise FileError(f"cannot read {source}: {error.strerror or error}") from None
-        except (ValueError, RecursionError) as error:
-            raise FileError(f"{source} is damaged, or no record of varpin.study.extremes: {error}") from None
-        return cls(cells, facts["robot"], facts["deep"], facts["missing"], facts["version"])
-
-
-# What a record's file holds; larger than that of any battery is none.
-_MOST_BYTES = 5_000_000
-_FACTS: dict[str, type] = {
-    "format": str, "version": str, "robot": str, "deep": bool, "missing": int, "cells": list,
-}  # fmt: skip
-_KINDS: dict[str, type] = {"str": str, "int": int, "float": float, "Kind": str, "tuple[str, ...]": list}
-
-
-def _typed(what: str, found: Any, kinds: Mapping[str, type]) -> dict[str, Any]:
-    """A table of JSON with a value of each kind and nothing else; whole numbers are taken for floats.
-
-    Raises:
-        ValueError: It says what is wrong.
-    """
-    if not isinstance(found, dict) or set(found) != set(kinds):
-        raise ValueError(f"{what} does not have {', '.join(kinds)}")
-    values = {}
-    for name, kind in kinds.items():
-        value = found[name]
-        if kind is float and isinstance(value, int) and abs(value) < 2**53:
-            value = float(value)
-        if type(value) is not kind or (isinstance(value, int) and not 0 <= value < 2**63):
-            raise ValueError(f"{name} of {what} is {reprlib.repr(value)}")
-        values[name] = value
-    return values
-
-
-def _plain(cell: Cell) -> dict[str, Any]:
-    entry = {item.name: getattr(cell, item.name) for item in fields(Cell)} | {"kind": cell.kind.value}
-    for name in _MEASURES:
-        value = entry[name]
-        entry[name] = None if math.isnan(value) else "inf" if math.isinf(value) else value
-    return entry
-
-
-def _cell(entry: Any) -> Cell:
-    if isinstance(entry, dict):
-        absent = [name for name in _MEASURES if name in entry and entry[name] is None]
-        endless = [name for name in _MEASURES if entry.get(name) == "inf"]
-        entry = entry | dict.fromkeys(absent, math.nan) | dict.fromkeys(endless, math.inf)
-    values = _typed("a cell", entry, {item.name: _KINDS[str(item.type)] for item in fields(Cell)})
-    for name in ("said", "found"):
-        if not all(isinstance(sentence, str) for sentence in values[name]):
-            raise ValueError(f"{name} of a cell is {reprlib.repr(values[name])}")
-        values[name] = tuple(values[name])
-    if not math.isfinite(values["seconds"]):
-        raise ValueError(f"seconds of a cell is {values['seconds']}")
-    return Cell(**values | {"kind": Kind(values["kind"])})
+        return load_json(path, FORMAT, cls)
 
 
 def run(

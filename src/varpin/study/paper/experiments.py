@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
-import reprlib
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +17,10 @@ from varpin._version import __version__
 from varpin.control import Solution, solve
 from varpin.errors import FileError, VarpinError
 from varpin.integrators import RungeKutta4
-from varpin.io.archive import read_npz
+from varpin.io.archive import Axes, members_of, read_npz, record_of, write_npz
 from varpin.linearization import linearize
 from varpin.study.paper import cases
 from varpin.study.paper.cases import CASES, MAIN, METHODS, VARIATIONS, Case, Setting
-from varpin.trajectory import atomic_file
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -38,6 +36,8 @@ _PATHS = 400
 _MORE_PATHS = 1000
 # Where gains of different time steps are compared [s].
 GAIN_TIMES = np.linspace(0.02, 1.4, 47)
+
+_FORMAT = "varpin.paper-cell/1"
 
 logger = logging.getLogger(__name__)
 
@@ -79,20 +79,15 @@ class Cell:
     closed_loop: float
     accuracy: float
     sampled: tuple[float, float] = (np.nan, np.nan)
-    t: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
-    q: Floats = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
-    u: Floats = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
-    gains: Floats = field(default_factory=lambda: np.zeros((0, 3, 6)), repr=False)
+    t: Annotated[Floats, Axes("nodes")] = field(default_factory=lambda: np.zeros(0), repr=False)
+    q: Annotated[Floats, Axes("nodes", 3)] = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
+    u: Annotated[Floats, Axes("steps", 3)] = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
+    gains: Annotated[Floats, Axes("times", 3, 6)] = field(default_factory=lambda: np.zeros((0, 3, 6)), repr=False)
 
     @property
     def true_cost(self) -> float:
         """The better of open and closed loop: what a user gets who chooses well."""
         return float(np.nanmin([self.open_loop, self.closed_loop, np.inf]))
-
-
-# Shapes of the rows of a cell's arrays, and the types of the rest as JSON gives them.
-_ARRAYS: dict[str, tuple[int, ...]] = {"t": (), "q": (3,), "u": (3,), "gains": (3, 6)}
-_TYPES: dict[str, type] = {"str": str, "int": int, "float": float, "tuple[float, float]": list}
 
 
 @dataclass(frozen=True)
@@ -212,39 +207,6 @@ def _middle_gains(solution: Solution) -> Floats:
     return np.array(rows).T.reshape(len(GAIN_TIMES), *gains.shape[1:])
 
 
-# No cell unpacks to as much.
-_MOST_BYTES = 50_000_000
-
-
-def _facts(path: Path, text: NDArray[Any]) -> dict[str, Any] | None:
-    """All of a cell that is no array, or None where another version wrote it."""
-    try:
-        facts = json.loads(str(text))
-    except (ValueError, RecursionError) as error:
-        raise FileError(f"{path} is damaged: {error}") from None
-    if isinstance(facts, dict) and isinstance(facts.get("version"), str) and facts.pop("version") != __version__:
-        return None
-    kinds = {item.name: _TYPES[str(item.type)] for item in fields(Cell) if item.name not in _ARRAYS}
-    if not isinstance(facts, dict) or set(facts) != set(kinds):
-        raise FileError(f"{path} is damaged: its facts are not {', '.join(kinds)}")
-    for name, kind in kinds.items():
-        if type(facts[name]) is not kind:
-            raise FileError(f"{path} is damaged: its {name} is {reprlib.repr(facts[name])}")
-    pair = facts["sampled"]
-    if len(pair) != 2 or not all(type(number) is float for number in pair):
-        raise FileError(f"{path} is damaged: its sampled is {reprlib.repr(pair)}")
-    return facts | {"sampled": tuple(pair)}
-
-
-def _require_fit(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    for name, shape in _ARRAYS.items():
-        array = arrays[name]
-        if array.dtype != np.float64 or array.ndim != len(shape) + 1 or array.shape[1:] != shape:
-            raise FileError(f"{path} is damaged: its array {name} is not one of numbers (N, ...) = (N, *{shape})")
-    if len(arrays["t"]) != len(arrays["q"]):
-        raise FileError(f"{path} is damaged: it has {len(arrays['t'])} times and {len(arrays['q'])} configurations")
-
-
 class Store:
     """Cells on disk, one file each."""
 
@@ -264,23 +226,19 @@ class Store:
         if not path.is_file():
             return None
         try:
-            members = read_npz(path, {"facts", *_ARRAYS}, "cell", wanted={"facts", *_ARRAYS}, most=_MOST_BYTES)
-            facts = _facts(path, members.pop("facts"))
-            if facts is None:
+            members = read_npz(path)
+            if "facts" in members:  # written by varpin 0.1
+                members |= {name: np.asarray(value) for name, value in json.loads(str(members["facts"])).items()}
+            if str(members.get("version")) != __version__:
                 return None
-            _require_fit(path, members)
-        except FileError as error:
+            return record_of(Cell, members, path)
+        except (FileError, ValueError) as error:
             logger.warning("%s cannot be read (%s); it is computed again", path, error)
             return None
-        arrays: dict[str, Any] = {**members}
-        return Cell(**facts, **arrays)
 
     def save(self, task: Task, cell: Cell) -> None:
         """Write the cell; a file is there whole or not at all."""
-        facts = {item.name: getattr(cell, item.name) for item in fields(Cell) if item.name not in _ARRAYS}
-        arrays = {name: getattr(cell, name) for name in _ARRAYS}
-        with atomic_file(self._path(task)) as stream:
-            np.savez_compressed(stream, facts=json.dumps({**facts, "version": __version__}), **arrays)
+        write_npz(self._path(task), _FORMAT, {**members_of(cell), "version": __version__})
 
 
 def fill(store: Store, *, quick: bool, progress: Progress | None = None) -> dict[str, Cell]:

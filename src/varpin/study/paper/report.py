@@ -12,10 +12,10 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from varpin._version import __version__
+from varpin.io.archive import atomic_file
 from varpin.study.paper.cases import CASES, FOURTH_ORDER, MAIN, METHODS, VARIATIONS
 from varpin.study.paper.claims import Cells, Claim, series
 from varpin.study.paper.experiments import OPTIMUM, SEARCH, Cell
-from varpin.trajectory import atomic_file
 
 _COLUMNS: dict[str, Callable[[Cell], str]] = {
     "setting": lambda c: c.setting,

@@ -101,7 +101,6 @@ class OptimalControlTradeoff(Record):
         missing: Runs that an interruption left out.
     """
 
-    _run = OptimalControlRun
     _format = "varpin.optimal-control-tradeoff/2"
     _headings = HEADINGS
     _shown = ("integrator", "dt", "seconds", "planned_cost", "open_loop_cost", "closed_loop_cost", "failure")

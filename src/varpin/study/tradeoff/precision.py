@@ -123,7 +123,6 @@ class WorkPrecision(Record):
         missing: Runs that an interruption left out.
     """
 
-    _run = WorkPrecisionRun
     _format = "varpin.work-precision/2"
     _headings = HEADINGS
     _shown = ("integrator", "dt", "seconds", "error", "energy_error", "tip_error", "failure")

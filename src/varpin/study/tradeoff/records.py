@@ -6,26 +6,16 @@ import csv
 import io
 import math
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
-from varpin.errors import FileError
-from varpin.io.archive import read_npz
+from varpin.io.archive import atomic_file, load_npz, save_npz
 from varpin.support import markup
-from varpin.support.checks import is_file, path_like
-from varpin.trajectory import atomic_file
 
 Row = TypeVar("Row")
-
-# What numpy keeps the types of fields in.
-_DTYPES = {"int": "iu", "float": "fiu", "str": "U"}
-
-# No record unpacks to as much.
-_MOST_BYTES = 50_000_000
 
 # Costs closer than this, relative, are the same.
 MARGIN = 0.02
@@ -34,12 +24,10 @@ MARGIN = 0.02
 class Record:
     """A frozen dataclass of ``runs`` and of the facts that belong to them all, kept as npz and written as CSV.
 
-    Whoever makes one of it says what a run is, what the file is called, the headings of its columns, and which of
-    them a notebook shows.
+    A subclass says the format of its files, the headings of its columns, and which of them a notebook shows.
     """
 
     runs: tuple[Any, ...]
-    _run: ClassVar[type[Any]]
     _format: ClassVar[str]
     _headings: ClassVar[Mapping[str, str]]
     _shown: ClassVar[Sequence[str]]
@@ -55,18 +43,13 @@ class Record:
         title = f"{self!r}; nothing beats the bold runs" if strong else repr(self)
         return markup.facts(title, [], markup.table([self._headings[name] for name in self._shown], rows, strong))
 
-    @classmethod
-    def _facts(cls) -> list[str]:
-        return [item.name for item in fields(cls) if item.name != "runs"]  # type: ignore[arg-type]
-
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the record as npz; returns its path.
 
         Raises:
             FileError: The path cannot be written.
         """
-        facts = {name: getattr(self, name) for name in self._facts()}
-        return write_table(path, self._format, self.runs, self._run, **facts)
+        return save_npz(path, self._format, self)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
@@ -75,8 +58,7 @@ class Record:
         Raises:
             FileError: The file is missing, damaged or something else.
         """
-        runs, facts = read_table(path, cls._format, cls._run, cls, cls._facts())
-        return cls(runs=runs, **facts)  # type: ignore[call-arg]
+        return load_npz(path, cls._format, cls)
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write the runs as a table; returns its path.
@@ -90,57 +72,6 @@ class Record:
 def _cell(value: object) -> object:
     """A field as a notebook shows it."""
     return "" if isinstance(value, float) and math.isnan(value) else value
-
-
-def write_table(path: str | os.PathLike[str], form: str, rows: Sequence[Any], kind: type[Any], **facts: Any) -> Path:
-    """Write rows of one dataclass and what belongs to them all as npz, without pickle; the old file stays until then.
-
-    Raises:
-        FileError: The path cannot be written.
-    """
-    members: dict[str, Any] = {"format": form, **facts}
-    for item in fields(kind):
-        members[f"runs.{item.name}"] = np.array([getattr(row, item.name) for row in rows])
-    with atomic_file(path) as stream:
-        np.savez_compressed(stream, **members)
-    return Path(path)
-
-
-def read_table(
-    path: str | os.PathLike[str], form: str, kind: type[Row], record: type[Any], facts: Collection[str]
-) -> tuple[tuple[Row, ...], dict[str, Any]]:
-    """What :func:`write_table` wrote: the rows, and by name the ``facts``, which are fields of ``record``.
-
-    Raises:
-        FileError: The file is missing, damaged, or something else.
-    """
-    source = path_like("path", path)
-    if not is_file(source):
-        raise FileError(f"there is no file {source}")
-    try:
-        members = read_npz(source, what="record", most=_MOST_BYTES)
-    except FileError as error:
-        raise FileError(f"{source} is damaged, or no record of varpin.study.tradeoff: {error}") from None
-    found = str(members.pop("format", "missing"))
-    if found != form:
-        raise FileError(f"{source} is not what is expected: its format is {found}, not {form!r}")
-    columns = {item.name: (f"runs.{item.name}", str(item.type)) for item in fields(kind)}  # type: ignore[arg-type]
-    own = {item.name: (item.name, str(item.type)) for item in fields(record) if item.name in facts}
-    wanted = {name for name, _ in (*columns.values(), *own.values())}
-    if set(members) != wanted:
-        odd = ", ".join(sorted(set(members) ^ wanted))
-        raise FileError(f"{source} is damaged: it lacks, or has beyond what it should, {odd}")
-    rows = members[columns[next(iter(columns))][0]].size
-    for dimensions, places in (((rows,), columns), ((), own)):
-        for name, wants in places.values():
-            array = members[name]
-            # A column of no rows has forgotten what it was to hold.
-            if array.shape != dimensions or (array.size and array.dtype.kind not in _DTYPES[wants]):
-                raise FileError(
-                    f"{source} is damaged: {name} is {array.dtype} {array.shape}, where {wants} {dimensions} belongs"
-                )
-    runs = zip(*(members[name].tolist() for name, _ in columns.values()), strict=True)
-    return tuple(kind(*values) for values in runs), {key: members[name].item() for key, (name, _) in own.items()}
 
 
 def write_csv(path: str | os.PathLike[str], rows: Sequence[Any], headings: Mapping[str, str]) -> Path:

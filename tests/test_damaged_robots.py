@@ -1,0 +1,150 @@
+"""Robot descriptions that are odd or damaged: refused in words, or read as Pinocchio reads them."""
+
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from mechanisms import INERTIAL, joint, link, mass_matrix, random_tree, write_urdf
+
+import varpin as vp
+from varpin.model import geometry
+from varpin.model.tree import tree_mass_matrix
+
+
+class TestUrdf:
+    def chain(self, folder, links, kind="fixed"):
+        parts = [
+            link(f"l{k}") + joint(f"j{k}", f"l{k - 1}" if k > 1 else "base", f"l{k}", kind) for k in range(1, links)
+        ]
+        return write_urdf(folder, *parts)
+
+    def refused(self, path, words):
+        with pytest.raises(vp.RobotError, match=words):
+            vp.load_robot(path)
+
+    def test_deeper_than_the_parser_s_stack(self, tmp_path):
+        # At 4000 links Pinocchio ends the process, on a stack of the usual size.
+        path = self.chain(tmp_path, 5001)
+        path.write_text(path.read_text().replace('name="j1" type="fixed"', 'name="j1" type="continuous"'))
+        before = threading.stack_size()
+        assert vp.load_robot(path).joint_names == ("j1",)
+        # Also from a thread.
+        with ThreadPoolExecutor(1) as thread:
+            assert thread.submit(vp.load_robot, path).result().dof == 1
+        assert threading.stack_size() == before
+
+    def test_entities_that_expand_without_bound(self, tmp_path):
+        laughs = "".join(f'<!ENTITY e{k} "{f"&e{k - 1};" * 10}">' for k in range(1, 12))
+        path = tmp_path / "a.urdf"
+        path.write_text(f'<!DOCTYPE robot [<!ENTITY e0 "ha">{laughs}]><robot name="a"><link name="&e11;"/></robot>')
+        with pytest.raises(vp.RobotError):
+            vp.load_robot(path)
+
+    def test_nested_elements(self, tmp_path):
+        self.refused(
+            write_urdf(tmp_path, "<a>" * 20_000 + "</a>" * 20_000, link("l1", extra="<a>" * 5000 + "</a>" * 5000)),
+            "Two root links|no joint that moves",
+        )
+        nested = joint("j1", "base", "l1", inside="<a>" * 5000 + "</a>" * 5000)
+        self.refused(write_urdf(tmp_path, link("l1"), nested), "its elements are nested too deep")
+
+    def test_numbers_that_only_one_of_the_parsers_reads(self, tmp_path):
+        # Pinocchio drops the inertial with a line on stderr.
+        for word in ("1_000", "٣", "0x1p3"):
+            path = write_urdf(tmp_path, link("l1", INERTIAL.replace('"1.3"', f'"{word}"')), joint("j1", "base", "l1"))
+            self.refused(path, "motion of 'j1' carries no inertia")
+            assert any("no finite number: it is massless" in said for said in vp.inspect_robot(path).warnings)
+
+    def test_numbers_in_odd_white_space(self, tmp_path):
+        odd = INERTIAL.replace('value="1.3"', 'value=" 1.3&#9;"').replace("0.02 0.05 0.1", "&#10;0.02&#9;0.05  0.1 ")
+        body = vp.load_robot(write_urdf(tmp_path, link("l1", odd), joint("j1", "base", "l1"))).model.inertias[1]
+        assert body.mass == 1.3
+        np.testing.assert_array_equal(body.lever, [0.02, 0.05, 0.1])
+
+    def test_bytes_that_are_no_utf_8(self, tmp_path):
+        path = write_urdf(tmp_path, link("l1"), joint("jXX", "base", "l1"))
+        path.write_bytes(path.read_bytes().replace(b"jXX", b"j\xff\xfe"))
+        robot = vp.load_robot(path)
+        assert robot.joint_names == ("j\ufffd\ufffd",)
+        assert vp.inspect_robot(path).joints
+        assert geometry(robot).ngeoms == 0
+
+    def test_masses_beyond_floating_point(self, tmp_path):
+        heavy = INERTIAL.replace('ixx="0.02"', 'ixx="1e308"').replace('iyy="0.03"', 'iyy="1e308"')
+        path = write_urdf(
+            tmp_path, link("l1", heavy), link("l2", heavy), joint("j1", "base", "l1"), joint("j2", "l1", "l2")
+        )
+        self.refused(path, "the mass matrix of robot 'made_up' is not finite")
+        with pytest.raises(vp.RobotError, match="not finite"):
+            vp.inspect_robot(path)
+
+    @pytest.mark.parametrize("axis", ["1e-200 0 0", "0 1e-320 0"])
+    def test_axes_beyond_floating_point(self, tmp_path, axis):
+        # What is not normalised moves other inertia in Pinocchio than in varpin, whose rotations were NaN.
+        path = write_urdf(
+            tmp_path, link("l1"), link("l2"), joint("j1", "base", "l1"), joint("j2", "l1", "l2", axis=axis)
+        )
+        self.refused(path, "joint 'j2' has an axis of length .*, which Pinocchio makes no unit vector of")
+
+    def test_dampers_beyond_floating_point(self):
+        scene = vp.Scene(vp.planar_chain(2, mass=1e-150, length=1e-5), damping=1e160)
+        motion = vp.simulate(scene, np.zeros(2), np.ones(2), dt=1e-3, steps=2)
+        assert np.isfinite(motion.q).all()
+        assert "damping is faster than the step" in motion.warnings[0]
+
+    def test_links_that_pinocchio_loses(self, tmp_path, monkeypatch):
+        path = write_urdf(tmp_path, link("l1"), joint("j1", "base", "l1"))
+        build = pin.buildModelFromXML
+
+        def lossy(text):
+            model = build(text)
+            model.inertias[1] = pin.Inertia.Zero()
+            return model
+
+        monkeypatch.setattr(pin, "buildModelFromXML", lossy)
+        self.refused(path, "describes links of 1.3 kg in all, of which Pinocchio reads 0 kg")
+
+
+class TestModels:
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            (lambda model: model.parents.__setitem__(2, 77), "comes before its parent"),
+            (lambda model: setattr(model, "armature", np.zeros(1)), "its armature has 1 entries, where 3 belong"),
+            (lambda model: setattr(model, "lowerPositionLimit", np.zeros(9)), "its lowerPositionLimit has 9 entries"),
+            (lambda model: model.names.append("more"), "its names has 5 entries, where 4 belong"),
+            (lambda model: model.inertias.append(pin.Inertia.Zero()), "its inertias has 5 entries"),
+            (lambda model: setattr(model.frames[1], "parentJoint", 99), "hangs on what is not there"),
+        ],
+    )
+    def test_whose_parts_do_not_fit(self, change, words):
+        model = random_tree(0, 3, branching=False)
+        model.addFrame(pin.Frame("tool", 1, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
+        while any(joint.nq != 1 for joint in list(model.joints)[1:]):
+            model = random_tree(int(model.name[4:]) + 1, 3, branching=False)
+            model.addFrame(pin.Frame("tool", 1, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
+        change(model)
+        with pytest.raises(vp.RobotError, match=words):
+            vp.load_robot(model)
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_mass_matrix_in_numpy_is_pinocchio_s(self, seed):
+        robot = vp.load_robot(random_tree(seed, 8))
+        q = np.random.default_rng(seed).normal(size=8)
+        expected = mass_matrix(robot, q, robot.free_model.createData())
+        np.testing.assert_allclose(
+            tree_mass_matrix(robot.tree, q), expected, rtol=0, atol=1e-13 * np.abs(expected).max()
+        )
+
+    @pytest.mark.parametrize("name", ["tiago", "allegro_left_hand", "panda"])
+    def test_mass_matrix_in_numpy_knows_mimic_joints(self, load, name):
+        robot = load(name)
+        q = np.random.default_rng(0).normal(size=robot.dof)
+        expected = mass_matrix(robot, q, robot.free_model.createData())
+        np.testing.assert_allclose(
+            tree_mass_matrix(robot.tree, q), expected, rtol=0, atol=1e-13 * np.abs(expected).max()
+        )

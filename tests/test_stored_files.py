@@ -1,0 +1,279 @@
+"""Files of every kind of record: those of varpin 0.1 are read, and damaged or foreign ones are refused by name."""
+
+from __future__ import annotations
+
+import functools
+import json
+import operator
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin.io.archive import read_npz
+from varpin.study.extremes import Record
+from varpin.study.paper import cases
+from varpin.study.paper.experiments import Store, Task
+from varpin.study.tradeoff import OptimalControlTradeoff, WorkPrecision
+
+DATA = Path(__file__).parent / "data" / "files"
+TASK = Task(cases.MAIN, cases.CASES[0], "variational", 1e-2)
+
+
+@functools.cache
+def problem() -> vp.OptimalControlProblem:
+    """Of the stored solution."""
+    scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=vp.AdditiveNoise(0.1))
+    cost = vp.TrackingCost([0.8, 0.1], 10.0) + vp.ControlCost(0.1) + vp.ControlRateCost(0.01)
+    return vp.OptimalControlProblem(scene, cost, [0.4, -0.3], [0.0, 0.0], dt=0.02, steps=8)
+
+
+LOADERS: dict[str, Callable[[Path], Any]] = {
+    "trajectory.npz": vp.Trajectory.load,
+    "trajectory_accuracy.npz": vp.Trajectory.load,
+    "solution.npz": lambda path: vp.Solution.load(path, problem()),
+    "precision.npz": WorkPrecision.load,
+    "tradeoff.npz": OptimalControlTradeoff.load,
+    "record.json": Record.load,
+}
+ARCHIVES = [name for name in LOADERS if name.endswith(".npz")]
+
+
+def members_of(name: str) -> dict[str, np.ndarray]:
+    with np.load(DATA / name) as archive:
+        return dict(archive)
+
+
+def changed(folder: Path, name: str, **members: Any) -> Path:
+    """A stored file with other entries, or without those that are None."""
+    path = folder / name
+    np.savez(path, **{key: value for key, value in {**members_of(name), **members}.items() if value is not None})
+    return path
+
+
+def refused(name: str, path: Path, *words: str) -> None:
+    with pytest.raises(vp.FileError) as caught:
+        LOADERS[name](path)
+    for word in (path.name, *words):
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ARCHIVES)
+def test_what_varpin_0_1_wrote_is_read(name):
+    record, compared = LOADERS[name](DATA / name), 0
+    motion = record.trajectory if name == "solution.npz" else record
+    for entry, expected in members_of(name).items():
+        first, *rest = entry.split(".")
+        if first == "runs":
+            found: Any = [getattr(run, rest[0]) for run in record.runs]
+        elif first == "scene":
+            found = motion.scene_values[".".join(rest)]
+        else:
+            owner = motion if first in ("statistics", *vars(motion)) else record
+            try:
+                found = operator.attrgetter(entry)(owner)
+            except AttributeError:
+                continue
+            if entry in ("history", "search.history", "accuracy", "status", "problem.integrator"):
+                continue
+        np.testing.assert_array_equal(found, expected)
+        compared += 1
+    assert compared >= {"precision.npz": 24, "tradeoff.npz": 17, "solution.npz": 35}.get(name, 40)
+
+
+def test_accuracy_of_varpin_0_1_is_read():
+    motion = vp.Trajectory.load(DATA / "trajectory_accuracy.npz")
+    numbers = members_of("trajectory_accuracy.npz")["accuracy"]
+    own = motion.accuracy
+    assert [own.tolerance, own.error, own.search_steps, own.search_evaluations] == numbers.tolist()
+    assert (own.integrator, own.dt) == (motion.integrator, motion.dt)
+
+
+def test_solution_of_varpin_0_1_is_gone_on_from():
+    stored = vp.Solution.load(DATA / "solution.npz", problem())
+    again = vp.solve(problem(), max_iterations=3)
+    assert stored.history[0].cost == pytest.approx(again.history[0].cost, rel=1e-9)
+    assert vp.solve(problem(), resume=stored).cost == pytest.approx(again.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", LOADERS)
+def test_read_and_written_again_it_is_the_same(name, tmp_path):
+    path = LOADERS[name](DATA / name).save(tmp_path / name)
+    if name.endswith(".json"):
+        assert json.loads(path.read_text()) == json.loads((DATA / name).read_text())
+        return
+    LOADERS[name](path)
+    before, after = members_of(name), read_npz(path)
+    assert before.keys() - after.keys() <= {"accuracy", "motion"}
+    for key in before.keys() & after.keys():
+        assert before[key].dtype == after[key].dtype
+        np.testing.assert_array_equal(before[key], after[key])
+
+
+def test_cells_of_the_paper(tmp_path, caplog):
+    """A cell of varpin 0.1 is read; one of another version, or a damaged one, is computed again."""
+    store = Store(tmp_path)
+    path = tmp_path / f"{TASK.name}.npz"
+    path.write_bytes((DATA / "cell.npz").read_bytes())
+    cell = store.load(TASK)
+    facts = json.loads(str(members_of("cell.npz")["facts"]))
+    assert (cell.cost, cell.iterations, cell.closed_loop) == (facts["cost"], facts["iterations"], np.inf)
+    np.testing.assert_array_equal(cell.q, members_of("cell.npz")["q"])
+    store.save(TASK, cell)
+    np.testing.assert_equal(vars(store.load(TASK)), vars(cell))
+    assert not caplog.records
+    members = read_npz(path)
+    np.savez(path, **members | {"version": "0.0.1"})
+    assert store.load(TASK) is None
+    np.savez(path, **members | {"q": np.zeros((4, 2))})
+    assert store.load(TASK) is None
+    assert "is computed again" in caplog.text
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.99])
+@pytest.mark.parametrize("name", LOADERS)
+def test_truncated(name, share, tmp_path):
+    whole = (DATA / name).read_bytes()
+    path = tmp_path / name
+    path.write_bytes(whole[: int(share * len(whole))])
+    refused(name, path, "truncated")
+
+
+@pytest.mark.parametrize("name", ["trajectory.npz", "tradeoff.npz"])
+def test_any_damaged_byte_is_an_error_or_harmless(name, tmp_path):
+    whole, sound = (DATA / name).read_bytes(), members_of(name)
+    rng, refusals, path = np.random.default_rng(0), 0, tmp_path / name
+    for place in rng.choice(len(whole), 40, replace=False):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        try:
+            loaded = LOADERS[name](path)
+        except vp.FileError:
+            refusals += 1
+        else:
+            loaded.save(path)
+            np.testing.assert_equal(
+                members_of(name), {**sound, **{k: v for k, v in read_npz(path).items() if k in sound}}
+            )
+    assert refusals > 15
+
+
+# The last part of the names of entries that may be missing.
+OPTIONAL = {"version", "warnings", "missing", "fingerprint", "accuracy", "motion"}
+
+
+@pytest.mark.parametrize("name", ARCHIVES)
+def test_every_entry_is_checked(name, tmp_path):
+    """An entry that is missing, of another shape or of another type is named: one of the three for each."""
+    same = ("scene.", "statistics.", "best.") if name == "solution.npz" else ("scene.",)
+    entries = {key: array for key, array in members_of(name).items() if not key.startswith(same)}
+    for index, (entry, array) in enumerate(entries.items()):
+        other = (None, array[None], array.astype("S9"))[index % 3]
+        if entry.split(".")[-1] in OPTIONAL and (other is None or not array.size or entry.endswith("motion")):
+            continue
+        with pytest.raises(vp.FileError) as caught:
+            LOADERS[name](changed(tmp_path, name, **{entry: other}))
+        assert entry.split(".")[-1] in str(caught.value), entry
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize(
+    ("name", "entry"),
+    [*(("trajectory.npz", entry) for entry in ("t", "q", "v", "p", "u", "dw", "dt")), ("solution.npz", "gains")],
+)
+def test_numbers_that_are_not_finite(name, entry, value, tmp_path):
+    array = members_of(name)[entry].copy()
+    array[(-1,) * array.ndim] = value
+    refused(
+        name, changed(tmp_path, name, **{entry: array}), "t are not dt" if entry == "dt" else f"{entry} holds values"
+    )
+
+
+@pytest.mark.parametrize("other", LOADERS)
+@pytest.mark.parametrize("name", LOADERS)
+def test_another_kind(name, other, tmp_path):
+    if LOADERS[name] != LOADERS[other]:
+        path = tmp_path / other
+        path.write_bytes((DATA / other).read_bytes())
+        refused(name, path)
+
+
+@pytest.mark.parametrize("name", LOADERS)
+def test_another_version(name, tmp_path):
+    path = tmp_path / name
+    if name.endswith(".json"):
+        text = (DATA / name).read_text()
+        path.write_text(text.replace("extremes/3", "extremes/9"))
+    else:
+        form = str(members_of(name)["format"])
+        path = changed(tmp_path, name, format=form[:-1] + "9")
+    refused(name, path, "/9'", "should have")
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"\x93NUMPY", bytes(1000), pickle.dumps({"q": 1})])
+@pytest.mark.parametrize("name", LOADERS)
+def test_another_file(name, content, tmp_path):
+    path = tmp_path / name
+    path.write_bytes(content)
+    refused(name, path)
+
+
+@pytest.mark.parametrize("name", LOADERS)
+def test_no_file(name, tmp_path):
+    refused(name, tmp_path / "none.npz", "there is no file")
+    refused(name, tmp_path)
+    os.mkfifo(tmp_path / "pipe.npz")
+    refused(name, tmp_path / "pipe.npz", "there is no file")
+
+
+@pytest.mark.parametrize("name", LOADERS)
+def test_unreadable(name):
+    # A regular file whose every read fails, even for root.
+    refused(name, Path("/proc/self/mem"))
+
+
+@pytest.mark.parametrize("name", ARCHIVES)
+def test_foreign_archive(name, tmp_path):
+    path = tmp_path / name
+    np.savez(path, q=np.zeros((3, 2)), t=np.zeros(3))
+    refused(name, path, "it has no format")
+
+
+@pytest.mark.parametrize("name", ARCHIVES)
+def test_pickles_are_not_opened(name, tmp_path):
+    witness = tmp_path / "witness"
+
+    class Trap:
+        def __reduce__(self):
+            return (Path.touch, (witness,))
+
+    path = changed(tmp_path, name, format=np.array([Trap()], dtype=object))
+    refused(name, path, "format")
+    assert not witness.exists()
+    # The trap is live.
+    with np.load(path, allow_pickle=True) as archive:
+        archive["format"]
+    assert witness.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (('"deep": false', '"deep": 0'), "deep is 0"),
+        (('"error": 0.0,', '"error": "small",'), "cells[0].error"),
+        (('"said": []', '"said": [[]]'), "cells[0].said[0]"),
+        (('"trial"', '"trail"'), "cells[0].trial is missing"),
+        (('"kind": "accurate"', '"kind": "good"'), "one of accurate"),
+    ],
+)
+def test_records_of_the_battery(change, words, tmp_path):
+    path, text = tmp_path / "record.json", (DATA / "record.json").read_text()
+    assert change[0] in text
+    path.write_text(text.replace(*change))
+    refused("record.json", path, words)
