@@ -172,7 +172,8 @@ def _noun(form: str) -> str:
 def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
     """The entries of a record in an npz file, each name after ``prefix``."""
     members: dict[str, Any] = {}
-    hints = _hints(type(record))
+    kind: Any = type(record)
+    hints = _hints(kind)
     for item in fields(record):
         name, value, hint = prefix + _entry(item), getattr(record, item.name), _required(hints[item.name])
         if value is None:

@@ -362,11 +362,12 @@ def _require_own_controls(
 def _require_controls(layout: Layout) -> None:
     """Refuse controls of a simulation beyond their limits, degrees for positions, and noise in proportion to those."""
     spec, served = layout.spec, layout.served[layout.actuated]
-    for table, model in zip(spec.root.tables("noise"), layout.noise, strict=True):
+    for index, model in enumerate(layout.noise):
         if model.kind == "control" and (served & (model.intensity != 0.0)).any():
             joint = layout.driven[int(np.argmax(served & (model.intensity != 0.0)))]
-            raise table.error(
-                "intensity", f"is in proportion to forces, and the control of {joint!r} is the position of its servo"
+            raise spec.root.error(
+                f"noise[{index}].intensity",
+                f"is in proportion to forces, and the control of {joint!r} is the position of its servo",
             )
     if not isinstance(layout.controls, Timeline):
         return
@@ -453,7 +454,8 @@ def _has_moving_end(force: Force, robot: Robot) -> bool:
 
 def _noises(spec: SceneSpec, names: Sequence[str], driven: Sequence[str]) -> list[Noises]:
     found = []
-    for table, model in zip(spec.root.tables("noise"), spec.noise, strict=True):
+    for index, model in enumerate(spec.noise):
+        table = spec.root.table(f"noise[{index}]")
         whose, what = (driven, "driven joint") if model.kind == "control" else (names, "joint")
         center = None if model.center is None else table.spread("center", model.center, names)
         found.append(Noises(model.kind, table.spread("intensity", model.intensity, whose, what), center))

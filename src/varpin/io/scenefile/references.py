@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import array
 import csv
-import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 import scipy
@@ -18,13 +16,7 @@ from numpy.typing import NDArray
 
 from varpin.errors import FileError
 from varpin.io.archive import read_npz
-from varpin.io.scenefile.table import ByName, Floats, Table, inside, shown, suggestion
-from varpin.support.checks import is_file
-
-KINDS = ("offset", "sines", "times", "values", "between", "file")
-# Of a file: a motion of seven joints over a million steps has eight million.
-_MOST_NUMBERS = 20_000_000
-_LONGEST_LINE = 100_000
+from varpin.io.scenefile.table import ByName, Floats, Table, shown, suggestion
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +196,7 @@ def _csv(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
     head: list[str] = []
     try:
         with path.open(newline="", encoding="utf-8") as stream:
-            for number, row in enumerate(filter(None, csv.reader(_lines(stream, wrong))), start=1):
+            for number, row in enumerate(filter(None, csv.reader(stream)), start=1):
                 if not head:
                     head = [name.strip() for name in row]
                     twice = [name for name, times in Counter(head).items() if times > 1]
@@ -223,20 +215,11 @@ def _csv(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
                     if not math.isfinite(value):
                         raise wrong(f"row {number}, column {shown(column)} is not finite")
                     numbers.append(value)
-                if len(numbers) > _MOST_NUMBERS:
-                    raise wrong(f"it has more than {_MOST_NUMBERS} numbers")
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise wrong(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if not len(numbers):
         raise wrong("it must have a line of column names and lines of numbers")
     return dict(zip(head, np.array(numbers).reshape(-1, len(head)).T, strict=True))
-
-
-def _lines(stream: TextIO, wrong: Callable[[str], Exception]) -> Iterator[str]:
-    while line := stream.readline(_LONGEST_LINE):
-        if len(line) == _LONGEST_LINE:
-            raise wrong(f"it has a line of more than {_LONGEST_LINE} characters")
-        yield line
 
 
 def _npz(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
@@ -256,43 +239,3 @@ def _npz(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
         if not np.isfinite(values).all():
             raise wrong(f"its array {shown(name)} is not finite")
     return {name: np.asarray(values, dtype=np.float64) for name, values in arrays.items()}
-
-
-def read_reference(table: Table, name: str, folder: Path, dt: float, default: float | None = None) -> Reference:
-    """The reference under ``name``: numbers, or a table of sines, waypoints or a file."""
-    value = table.data.get(name, default)
-    if not isinstance(value, dict) or not set(value) & set(KINDS):
-        return Reference(table, name, offset=table.by_name(name, default))
-    own = table.table(name).allow(*KINDS)
-    kind = own.one_of("sines", "times", "file")
-    if kind == "file":
-        own.allow("file")
-        path = inside(own, "file", own.text("file"), folder, "the scene's folder")
-        if path.suffix not in (".csv", ".npz"):
-            raise own.error("file", f"must be a .csv or .npz file, got {path.name!r}")
-        if not is_file(path):
-            raise own.error("file", f"there is no file {path}")
-        return Reference(table, name, file=path)
-    if kind == "times":
-        own.allow("times", "values", "between")
-        times = own.numbers("times")
-        if len(times) < 2 or not all(b > a for a, b in itertools.pairwise(times)):
-            raise own.error("times", f"must be two or more, and increase [s], got {list(times)}")
-        rows = own.require("values", "a list of rows, one for each of times")
-        if not isinstance(rows, list) or len(rows) != len(times):
-            got = f"{len(rows)} rows" if isinstance(rows, list) else "no list"
-            raise own.error("values", f"must have {len(times)} rows, one for each of times; got {got}")
-        values = tuple(own.as_numbers(f"values[{index}]", row) for index, row in enumerate(rows))
-        smooth = own.choice("between", ("lines", "smooth"), "lines") == "smooth"
-        return Reference(table, name, times=times, values=values, smooth=smooth)
-    own.allow("offset", "sines")
-    sines = []
-    for sine in own.tables("sines"):
-        sine.allow("of", "amplitude", "frequency", "phase")
-        frequency = sine.number("frequency", unit="Hz", above=0.0)
-        if frequency > 0.5 / dt:
-            raise sine.error(
-                "frequency", f"must be <= {0.5 / dt:g} [Hz], the most that dt = {dt:g} s resolves, got {frequency:g}"
-            )
-        sines.append(Sine(sine.text("of"), sine.number("amplitude"), frequency, sine.number("phase", 0.0, unit="rad")))
-    return Reference(table, name, offset=own.by_name("offset", 0.0), sines=tuple(sines))

@@ -156,9 +156,7 @@ def requirements(layout: Layout, whole: Layout, idle: Sequence[str], scene: Scen
     """The report on what ``layout``, the ``scene``, has left of ``whole``."""
     names, group = layout.robot.joint_names, scene.group
     parts = [tuple(name for name, g in zip(names, group, strict=True) if g == label) for label in np.unique(group)]
-    together = ", ".join(
-        sorted({term.spec.table.data["type"] for term in layout.costs if term.spec.term.space == "robot"})
-    )
+    together = ", ".join(sorted({term.spec.kind for term in layout.costs if term.spec.term.space == "robot"}))
     if together or len(parts) == 1:
         coupled = f"the cost has a term on the whole robot ({together})" if together and len(parts) > 1 else ""
         parts = [names]
@@ -188,7 +186,7 @@ def _terms(layout: Layout) -> dict[str, str]:
 
     noise = [f"{model.kind} ({np.count_nonzero(model.intensity)} processes)" for model in layout.noise]
     limited = np.isfinite(layout.torque_limit)
-    costs = [term.spec.table.data["type"] + (" at the end" if term.spec.terminal else "") for term in layout.costs]
+    costs = [term.spec.kind + (" at the end" if term.spec.terminal else "") for term in layout.costs]
     kinds: set[type[Force]] = {force.kind for force in layout.forces} | {type(own) for own in layout.frame_forces}
     absent = [words for words, kind in _ABSENT.items() if kind not in kinds] + ["contact"]
     loads = [f"{load.mass:g} kg at {load.frame}" for load in spec.robot.payload]

@@ -22,8 +22,8 @@ def marks_of(layout: Layout, duration: float) -> dict[str, Any]:
         duration: Of the motion that is shown [s].
     """
     wanted = [term for term in layout.costs if term.target is not None and term.weight.all()]
-    places = [term for term in wanted if term.spec.table.data["type"] == "frame_position"]
-    turns = [term for term in wanted if term.spec.table.data["type"] == "frame_orientation"]
+    places = [term for term in wanted if term.spec.kind == "frame_position"]
+    turns = [term for term in wanted if term.spec.kind == "frame_orientation"]
     marks: dict[str, Any] = {"trace": list(dict.fromkeys(term.spec.frame for term in places))}
     targets: dict[str, Floats] = {}
     references: dict[str, Floats] = {}
@@ -76,7 +76,7 @@ def _where(place: CostTerm, turn: CostTerm | None, duration: float) -> Floats:
 
 def _followed(layout: Layout, duration: float) -> Floats | None:
     """Configurations (K, n) that the joints are to follow, or to end at; None if none are."""
-    terms = [term for term in layout.costs if term.spec.table.data["type"] == "tracking" and term.weight.any()]
+    terms = [term for term in layout.costs if term.spec.kind == "tracking" and term.weight.any()]
     if not terms:
         return None
     term = next((term for term in terms if not term.spec.terminal), terms[0])

@@ -1,0 +1,510 @@
+"""The tables of a scene file: their keys, and what these take."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, create_model, model_validator
+
+from varpin.control.problem import default_integrator
+from varpin.errors import InputError
+from varpin.integrators import BY_NAME, Integrator, options_of
+from varpin.io.scenefile.keys import (
+    FLAG,
+    TEXT,
+    Keys,
+    Rule,
+    either,
+    mistake,
+    number,
+    numbers,
+    read_keys,
+    toml_type,
+    typed,
+    values,
+    whole,
+    word,
+)
+from varpin.io.scenefile.references import Reference, Sine
+from varpin.io.scenefile.spec import (
+    FIGURES,
+    FORCES,
+    FRAME_FORCES,
+    MOST_EVALUATIONS,
+    MOST_STEPS,
+    CostSpec,
+    ForceSpec,
+    FrameForceSpec,
+    NoiseSpec,
+    Outputs,
+    RobotSpec,
+    SceneSpec,
+)
+from varpin.io.scenefile.table import ByName, Table, inside
+from varpin.io.scenefile.terms import TERMS, Term
+from varpin.model import Payload
+from varpin.support.checks import is_file
+
+_THREE = tuple[float, float, float]
+
+
+def _distinct(entries: tuple[str, ...]) -> tuple[str, ...]:
+    for index, entry in enumerate(entries):
+        if entry in entries[:index]:
+            raise mistake(index, f"{entry!r} is there twice")
+    return entries
+
+
+_TEXTS = Rule(Annotated[tuple[Annotated[str, TEXT], ...], AfterValidator(_distinct)], "a list of texts", parts=True)
+
+
+class PayloadKeys(Keys):
+    """[[robot.payload]]."""
+
+    frame: Annotated[str, TEXT]
+    mass: Annotated[float, number("kg", above=0.0)]
+    com: Annotated[_THREE, numbers(3, "m")] = (0.0, 0.0, 0.0)
+    inertia: Annotated[tuple[float, ...] | None, numbers(unit="kg m^2")] = None
+
+
+class RobotKeys(Keys):
+    """[robot]."""
+
+    source: Annotated[str, TEXT]
+    lock: dict[str, Annotated[float, number("rad or m")]] = Field(default_factory=dict)
+    mimic: Annotated[str, word("tied", "free")] = "tied"
+    package_dirs: Annotated[tuple[str, ...], _TEXTS] = ()
+    payload: tuple[PayloadKeys, ...] = ()
+
+
+class SpringKeys(Keys):
+    """[springs]."""
+
+    stiffness: Annotated[ByName, values("N m/rad or N/m", least=0.0)] = 0.0
+    rest: Annotated[ByName, values("rad or m")] = 0.0
+
+
+class ActuationKeys(Keys):
+    """[actuation]."""
+
+    joints: Annotated[tuple[str, ...] | None, _TEXTS] = None
+    gear: Annotated[ByName, values()] = 1.0
+    torque_limit: Annotated[ByName | str | None, values("N m or N", least=0.0, text=Annotated[str, word("robot")])] = (
+        None
+    )
+
+    @model_validator(mode="after")
+    def _require_joints(self) -> ActuationKeys:
+        if self.joints == ():
+            raise mistake("joints", "must name a joint at least; leave it out to drive all of them")
+        return self
+
+
+class NoiseKeys(Keys):
+    """[[noise]]."""
+
+    type: Annotated[str, word("additive", "control", "state")]
+    intensity: Annotated[ByName, values(least=0.0)]
+    center: Annotated[ByName | None, values("rad or m")] = None
+
+    @model_validator(mode="after")
+    def _require_no_center(self) -> NoiseKeys:
+        if self.type != "state" and self.center is not None:
+            raise mistake("center", f"is of state noise alone, and this is {self.type} noise")
+        return self
+
+
+class InitialKeys(Keys):
+    """[initial]."""
+
+    q: Annotated[ByName, values("rad or m")] = 0.0
+    v: Annotated[ByName, values("rad/s or m/s")] = 0.0
+
+
+class HorizonKeys(Keys):
+    """[horizon]."""
+
+    dt: Annotated[float, number("s", above=0.0)]
+    steps: Annotated[int | None, whole(1, MOST_STEPS)] = None
+    duration: Annotated[float | None, number("s", above=0.0)] = None
+    hold: Annotated[int, whole(1)] = 1
+    sampling: Annotated[str, word("gauss", "midpoint", "start")] = "gauss"
+
+    @property
+    def count(self) -> int:
+        """Steps."""
+        return self.steps or round(min((self.duration or 0.0) / self.dt, 2.0 * MOST_STEPS))
+
+    @model_validator(mode="after")
+    def _require_whole_steps(self) -> HorizonKeys:
+        duration, steps = self.duration, self.count
+        if (duration is None) == (self.steps is None):
+            wrong = "one of steps, duration is missing" if duration is None else "steps and duration exclude each other"
+            raise ValueError(wrong)
+        if duration is not None and (steps < 1 or abs(min(steps, MOST_STEPS) * self.dt - duration) > 1e-9 * duration):
+            raise mistake(
+                "duration", f"{duration:g} s is no whole number of steps of dt = {self.dt:g} s, {MOST_STEPS} at most"
+            )
+        if steps % self.hold:
+            raise mistake("hold", f"{steps} steps are no multiple of {self.hold}")
+        return self
+
+
+class SineKeys(Keys):
+    """A sine of a reference."""
+
+    of: Annotated[str, TEXT]
+    amplitude: Annotated[float, number()]
+    frequency: Annotated[float, number("Hz", above=0.0)]
+    phase: Annotated[float, number("rad")] = 0.0
+
+
+class SinesKeys(Keys):
+    """A reference of sines."""
+
+    offset: Annotated[ByName, values()] = 0.0
+    sines: tuple[SineKeys, ...]
+
+
+class WaypointKeys(Keys):
+    """A reference of waypoints."""
+
+    times: Annotated[tuple[float, ...], numbers(unit="s")]
+    values: tuple[Annotated[tuple[float, ...], numbers()], ...]
+    between: Annotated[str, word("lines", "smooth")] = "lines"
+
+    @model_validator(mode="after")
+    def _require_rows(self) -> WaypointKeys:
+        if len(self.times) < 2 or not all(b > a for a, b in itertools.pairwise(self.times)):
+            raise mistake("times", f"must be two or more, and increase [s], got {list(self.times)}")
+        if len(self.values) != len(self.times):
+            raise mistake("values", f"must have {len(self.times)} rows, one for each of times; got {len(self.values)}")
+        return self
+
+
+class FileKeys(Keys):
+    """A reference in a file."""
+
+    file: Annotated[str, TEXT]
+
+
+_REFERENCES: Mapping[str, type[Keys]] = {"file": FileKeys, "waypoints": WaypointKeys, "sines": SinesKeys}
+
+
+def _reference_shape(value: Any) -> str:
+    keys = set(value) if isinstance(value, dict) else set()
+    return next((name for name, kind in _REFERENCES.items() if keys & set(kind.model_fields)), toml_type(value))
+
+
+def _reference(**others: Any) -> Rule:
+    own = Annotated[float, number()]
+    what = "a number for all, a list, a table by name, sines, waypoints or a file"
+    numbers_of = {"number": own, "list": tuple[own, ...], "table": dict[str, own]}
+    return either(what, _reference_shape, **numbers_of, **_REFERENCES, **others)
+
+
+class SimulateKeys(Keys):
+    """[simulate]."""
+
+    controls: Annotated[Any, _reference(text=Annotated[str, word("hold")])] = None
+    seed: Annotated[int | None, whole()] = None
+
+
+class SolveKeys(Keys):
+    """[solve]."""
+
+    tolerance: Annotated[float, number(above=0.0)] = 0.0
+    max_iterations: Annotated[int, whole()] = 0
+    second_order: Annotated[bool, FLAG] = False
+    forward: Annotated[str, word("closed", "open")] = "closed"
+    regularization: Annotated[float, number(least=0.0)] = 0.0
+
+
+class OutputKeys(Keys):
+    """[outputs]."""
+
+    save: Annotated[str | None, TEXT] = None
+    plot: Annotated[str | None, TEXT] = None
+    html: Annotated[str | None, TEXT] = None
+    speed: Annotated[float, number(above=0.0)] = 1.0
+
+
+class TypedKeys(Keys):
+    """A table of the kind that its ``type`` says."""
+
+    type: str = ""
+
+
+# [integrator]: by their names in scene files, RungeKutta4 as runge_kutta_4, with the options that can be given there.
+_OPTIONS = {
+    "alpha": Annotated[float, number(least=0.0, most=1.0)],
+    "stages": Annotated[int, whole(1)],
+    "kick": Annotated[str, word("left", "split")],
+}
+INTEGRATORS: Mapping[str, Callable[..., Integrator]] = {
+    re.sub(r"(?<!^)([A-Z0-9])", r"_\1", name).lower(): kind for name, kind in BY_NAME.items() if name != "Reference"
+}
+
+
+def _integrator_keys(kind: Any) -> type[Keys]:
+    options: dict[str, Any] = {name: (_OPTIONS[name], None) for name in options_of(kind) if name in _OPTIONS}
+    return create_model(kind.__name__, __base__=TypedKeys, **options)
+
+
+# [[force]] on joints: the fields of the force, by joint.
+def _force_keys(kind: Any) -> type[Keys]:
+    own: dict[str, Any] = {item.name: (Annotated[Any, values()], _default(item)) for item in fields(kind)}
+    return create_model(kind.__name__, __base__=TypedKeys, **own)
+
+
+def _default(item: Any) -> Any:
+    return ... if item.default is MISSING else None
+
+
+class PointKeys(Keys):
+    """A place in a frame."""
+
+    frame: Annotated[str, TEXT]
+    place: Annotated[_THREE, numbers(3, "m")]
+
+
+_PLACE = Annotated[Any, numbers(3)]
+
+
+def _along(unit: str) -> Rule:
+    what = f"a number, or three along the axes of the world [{unit}]"
+    return either(what, number=Annotated[float, number(unit)], list=_PLACE)
+
+
+_ON_FRAME: dict[str, Any] = {"text": Annotated[str, TEXT], "table": PointKeys}
+_POINT = either("a frame's name, { frame, place } or a place in the world [m]", **_ON_FRAME, list=_PLACE)
+# What the fields of forces on frames take.
+_OF_FRAMES = {
+    "a": _POINT,
+    "b": _POINT,
+    "frame": either("a frame's name, or { frame, place }", **_ON_FRAME),
+    "wrench": numbers(6, "N and N m"),
+    "axes": word("world", "frame"),
+    "stiffness": _along("N/m"),
+    "damping": _along("N s/m"),
+    "rest": _along("m"),
+}
+
+
+def _frame_force_keys(kind: Any) -> type[Keys]:
+    own: dict[str, Any] = {item.name: (Annotated[Any, _OF_FRAMES[item.name]], _default(item)) for item in fields(kind)}
+    return create_model(kind.__name__, __base__=TypedKeys, **own)
+
+
+# [[cost]]
+def _cost_keys(name: str, term: Term) -> type[Keys]:
+    weight = number(least=0.0) if len(term.axes) == 1 else values(least=0.0)
+    own: dict[str, Any] = {"weight": (Annotated[Any, weight], 1.0)}
+    if term.reference is not None:
+        rule = values() if term.initial else _reference()
+        own[term.reference] = (Annotated[Any, rule], None if term.optional or term.hold else ...)
+    if term.frame:
+        own["frame"] = (Annotated[str, TEXT], ...)
+    if term.hold:
+        own["hold"] = (Annotated[Any, values("rad or m", flag=Literal[True])], None)
+    if term.can_end:
+        own["terminal"] = (Annotated[bool, FLAG], False)
+    for key, default in term.numbers.items():
+        own[key] = (Annotated[float, number(least=0.0)], ... if default is None else default)
+    own |= {key: (Annotated[str, word(*options)], options[0]) for key, options in term.words.items()}
+    return create_model(name, __base__=TypedKeys, **own)
+
+
+_FORCE = typed(
+    {name: _force_keys(kind) for name, kind in FORCES.items()}
+    | {name: _frame_force_keys(kind) for name, kind in FRAME_FORCES.items()}
+)
+_INTEGRATOR = typed({name: _integrator_keys(kind) for name, kind in INTEGRATORS.items()}, "gauss")
+_COST = typed({name: _cost_keys(name, term) for name, term in TERMS.items()})
+
+
+class SceneKeys(Keys):
+    """A scene file."""
+
+    title: Annotated[str | None, TEXT] = None
+    gravity: Annotated[
+        bool | tuple[float, ...],
+        either("true, false or three numbers [m/s^2]", flag=bool, list=Annotated[Any, numbers(3, "m/s^2")]),
+    ] = True
+    damping: Annotated[Any, values("N m s/rad or N s/m", least=0.0, text=Annotated[str, word("robot")])] = None
+    robot: RobotKeys
+    springs: SpringKeys = SpringKeys()
+    force: tuple[Annotated[Any, _FORCE], ...] = ()
+    actuation: ActuationKeys = ActuationKeys()
+    noise: tuple[NoiseKeys, ...] = ()
+    initial: InitialKeys = InitialKeys()
+    horizon: HorizonKeys
+    integrator: Annotated[Any, _INTEGRATOR] = TypedKeys(type="gauss")
+    cost: tuple[Annotated[Any, _COST], ...] = ()
+    simulate: SimulateKeys = SimulateKeys()
+    solve: SolveKeys = SolveKeys()
+    outputs: OutputKeys = OutputKeys()
+
+
+def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
+    """The tables of the file ``path``, checked as far as that goes without the robot.
+
+    Raises:
+        SceneFileError: A mistake in them.
+    """
+    root = Table(path.name, "")
+    keys = read_keys(SceneKeys, dict(data), path.name)
+    folder, horizon = path.resolve().parent, keys.horizon
+    if horizon.count * len(keys.cost) > MOST_EVALUATIONS:
+        costs = f"{horizon.count} steps times {len(keys.cost)} costs"
+        raise root.error("horizon", f"{costs} are too many; {MOST_EVALUATIONS} are the most")
+    forces = [_force(root.table(f"force[{index}]"), own) for index, own in enumerate(keys.force)]
+    controls = keys.simulate.controls
+    if controls is not None and controls != "hold":
+        controls = _reference_of(root.table("simulate"), "controls", controls, folder, horizon.dt)
+    return SceneSpec(
+        name=name,
+        title=name if keys.title is None else keys.title,
+        path=path,
+        root=root,
+        robot=_robot(root.table("robot"), keys.robot, folder),
+        gravity=keys.gravity,
+        damping=keys.damping,
+        stiffness=keys.springs.stiffness,
+        rest=keys.springs.rest,
+        forces=tuple(force for force in forces if isinstance(force, ForceSpec)),
+        frame_forces=tuple(force for force in forces if isinstance(force, FrameForceSpec)),
+        actuated=keys.actuation.joints,
+        gear=keys.actuation.gear,
+        torque_limit=keys.actuation.torque_limit,
+        noise=tuple(NoiseSpec(own.type, own.intensity, own.center) for own in keys.noise),
+        q0=keys.initial.q,
+        v0=keys.initial.v,
+        dt=horizon.dt,
+        steps=horizon.count,
+        hold=horizon.hold,
+        sampling=horizon.sampling,
+        integrator=_integrator(root.table("integrator"), keys.integrator),
+        costs=tuple(_cost(root.table(f"cost[{k}]"), own, folder, horizon.dt) for k, own in enumerate(keys.cost)),
+        controls=controls,
+        seed=keys.simulate.seed,
+        options=_given(keys.solve),
+        outputs=_outputs(root.table("outputs"), keys.outputs),
+    )
+
+
+def _given(keys: Keys) -> dict[str, Any]:
+    """The keys that a table has, its type apart."""
+    return {name: getattr(keys, name) for name in keys.model_fields_set if name != "type"}
+
+
+def _robot(table: Table, keys: RobotKeys, folder: Path) -> RobotSpec:
+    source: str | Path = keys.source
+    if Path(keys.source).suffix or "/" in keys.source or "\\" in keys.source:
+        source = inside(table, "source", keys.source, folder, "the scene's folder")
+        if not is_file(source):
+            raise table.error("source", f"there is no file {source}")
+    folders = tuple(
+        str(inside(table, f"package_dirs[{index}]", entry, folder, "the scene's folder"))
+        for index, entry in enumerate(keys.package_dirs)
+    )
+    payload = tuple(_payload(table.table(f"payload[{index}]"), own) for index, own in enumerate(keys.payload))
+    return RobotSpec(source, keys.lock, keys.mimic, folders, payload)
+
+
+def _payload(table: Table, keys: PayloadKeys) -> Payload:
+    inertia: Any = 0.0 if keys.inertia is None else keys.inertia
+    if keys.inertia is not None and len(keys.inertia) == 6:
+        xx, xy, xz, yy, yz, zz = keys.inertia
+        inertia = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+    elif keys.inertia is not None and len(keys.inertia) != 3:
+        entries = "3 principal moments or 6 entries ixx, ixy, ixz, iyy, iyz, izz"
+        raise table.error("inertia", f"must be {entries}; got {len(keys.inertia)}")
+    try:
+        return Payload(frame=keys.frame, mass=keys.mass, center=keys.com, inertia=inertia)
+    except InputError as error:
+        raise table.error("inertia", str(error).removeprefix("payload inertia ")) from None
+
+
+def _force(table: Table, keys: TypedKeys) -> ForceSpec | FrameForceSpec:
+    if keys.type in FORCES:
+        return ForceSpec(FORCES[keys.type], _given(keys), table)
+    given = {name: _point(value) for name, value in _given(keys).items()}
+    return FrameForceSpec(FRAME_FORCES[keys.type](**given), table)
+
+
+def _point(value: Any) -> Any:
+    """A place of a table as forces take it."""
+    if isinstance(value, PointKeys):
+        return value.frame, list(value.place)
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _integrator(table: Table, keys: TypedKeys) -> Integrator:
+    kind = keys.type or "gauss"
+    given = {"stages": default_integrator().stages} if kind == "gauss" else {}
+    try:
+        return INTEGRATORS[kind](**given | _given(keys))
+    except InputError as error:
+        raise table.error("", str(error)) from None
+
+
+def _cost(table: Table, keys: TypedKeys, folder: Path, dt: float) -> CostSpec:
+    term = TERMS[keys.type]
+    given = _given(keys)
+    hold, value = given.get("hold"), given.get(term.reference or "")
+    if hold is not None and value is not None:
+        raise table.error("", f"hold and {term.reference} exclude each other: give one of them")
+    reference = None
+    if term.reference is not None and hold is None and not (term.initial and value is None):
+        reference = _reference_of(table, term.reference, 0.0 if value is None else value, folder, dt)
+    return CostSpec(
+        table=table,
+        kind=keys.type,
+        term=term,
+        weight=given.get("weight", 1.0),
+        terminal=given.get("terminal", False),
+        reference=reference,
+        hold=() if hold is True else hold,
+        frame=given.get("frame", ""),
+        numbers={name: getattr(keys, name) for name in term.numbers},
+        words={name: getattr(keys, name) for name in term.words},
+    )
+
+
+def _reference_of(table: Table, name: str, value: Any, folder: Path, dt: float) -> Reference:
+    own = table.table(name)
+    if isinstance(value, WaypointKeys):
+        return Reference(table, name, times=value.times, values=value.values, smooth=value.between == "smooth")
+    if isinstance(value, FileKeys):
+        path = inside(own, "file", value.file, folder, "the scene's folder")
+        if path.suffix not in (".csv", ".npz"):
+            raise own.error("file", f"must be a .csv or .npz file, got {path.name!r}")
+        if not is_file(path):
+            raise own.error("file", f"there is no file {path}")
+        return Reference(table, name, file=path)
+    if not isinstance(value, SinesKeys):
+        return Reference(table, name, offset=value)
+    for index, sine in enumerate(value.sines):
+        if sine.frequency > 0.5 / dt:
+            most = f"<= {0.5 / dt:g} [Hz], the most that dt = {dt:g} s resolves"
+            raise own.error(f"sines[{index}].frequency", f"must be {most}, got {sine.frequency:g}")
+    sines = tuple(Sine(sine.of, sine.amplitude, sine.frequency, sine.phase) for sine in value.sines)
+    return Reference(table, name, offset=value.offset, sines=sines)
+
+
+def _outputs(table: Table, keys: OutputKeys) -> Outputs:
+    endings = {"save": (".npz",), "plot": FIGURES, "html": (".html",)}
+    paths: dict[str, Path | None] = dict.fromkeys(endings)
+    for name, allowed in endings.items():
+        text = getattr(keys, name)
+        if text is not None:
+            path = paths[name] = inside(table, name, text, Path.cwd(), "the working directory")
+            if path.suffix.lower() not in allowed:
+                raise table.error(name, f"must end in {', '.join(allowed)}, got {path.name!r}")
+    return Outputs(**paths, speed=keys.speed)
