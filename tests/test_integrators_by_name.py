@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import varpin as vp
 from varpin.integrators import BY_NAME, integrator_of, options_of
-from varpin.io.scenefile.spec import _INTEGRATORS
+from varpin.io.scenefile.tables import INTEGRATOR_KEYS, INTEGRATORS
 
 MADE = [
     vp.Midpoint(),
@@ -46,8 +46,9 @@ def test_every_integrator_is_known_and_has_a_name_in_scene_files():
     own = {kind for kind in vars(vp).values() if isinstance(kind, type) and issubclass(kind, vp.Integrator)}
     assert set(BY_NAME.values()) == own - {vp.Integrator}
     names = ["midpoint", "gauss", "radau", "explicit_euler", "semi_implicit_euler", "runge_kutta_4"]
-    assert list(_INTEGRATORS) == names
-    assert _INTEGRATORS["gauss"] == (vp.Gauss, ("stages", "kick"))
+    assert list(INTEGRATORS) == names
+    assert INTEGRATORS["gauss"] is vp.Gauss
+    assert list(INTEGRATOR_KEYS["gauss"].model_fields) == ["type", "stages", "kick"]
     assert options_of(vp.Reference) == ("rtol", "atol")
     assert integrator_of(" Gauss(3, kick='split') ") == vp.Gauss(3, kick="split")
 

@@ -193,19 +193,19 @@ class FileKeys(Keys):
     file: Annotated[str, TEXT]
 
 
-_REFERENCES: Mapping[str, type[Keys]] = {"file": FileKeys, "waypoints": WaypointKeys, "sines": SinesKeys}
+REFERENCE_KEYS: Mapping[str, type[Keys]] = {"file": FileKeys, "waypoints": WaypointKeys, "sines": SinesKeys}
 
 
 def _reference_shape(value: Any) -> str:
     keys = set(value) if isinstance(value, dict) else set()
-    return next((name for name, kind in _REFERENCES.items() if keys & set(kind.model_fields)), toml_type(value))
+    return next((name for name, kind in REFERENCE_KEYS.items() if keys & set(kind.model_fields)), toml_type(value))
 
 
 def _reference(**others: Any) -> Rule:
     own = Annotated[float, number()]
     what = "a number for all, a list, a table by name, sines, waypoints or a file"
     numbers_of = {"number": own, "list": tuple[own, ...], "table": dict[str, own]}
-    return either(what, _reference_shape, **numbers_of, **_REFERENCES, **others)
+    return either(what, _reference_shape, **numbers_of, **REFERENCE_KEYS, **others)
 
 
 class SimulateKeys(Keys):
@@ -320,12 +320,11 @@ def _cost_keys(name: str, term: Term) -> type[Keys]:
     return create_model(name, __base__=TypedKeys, **own)
 
 
-_FORCE = typed(
-    {name: _force_keys(kind) for name, kind in FORCES.items()}
-    | {name: _frame_force_keys(kind) for name, kind in FRAME_FORCES.items()}
-)
-_INTEGRATOR = typed({name: _integrator_keys(kind) for name, kind in INTEGRATORS.items()}, "gauss")
-_COST = typed({name: _cost_keys(name, term) for name, term in TERMS.items()})
+FORCE_KEYS = {name: _force_keys(kind) for name, kind in FORCES.items()} | {
+    name: _frame_force_keys(kind) for name, kind in FRAME_FORCES.items()
+}
+INTEGRATOR_KEYS = {name: _integrator_keys(kind) for name, kind in INTEGRATORS.items()}
+COST_KEYS = {name: _cost_keys(name, term) for name, term in TERMS.items()}
 
 
 class SceneKeys(Keys):
@@ -339,13 +338,13 @@ class SceneKeys(Keys):
     damping: Annotated[Any, values("N m s/rad or N s/m", least=0.0, text=Annotated[str, word("robot")])] = None
     robot: RobotKeys
     springs: SpringKeys = SpringKeys()
-    force: tuple[Annotated[Any, _FORCE], ...] = ()
+    force: tuple[Annotated[Any, typed(FORCE_KEYS)], ...] = ()
     actuation: ActuationKeys = ActuationKeys()
     noise: tuple[NoiseKeys, ...] = ()
     initial: InitialKeys = InitialKeys()
     horizon: HorizonKeys
-    integrator: Annotated[Any, _INTEGRATOR] = TypedKeys(type="gauss")
-    cost: tuple[Annotated[Any, _COST], ...] = ()
+    integrator: Annotated[Any, typed(INTEGRATOR_KEYS, "gauss")] = TypedKeys(type="gauss")
+    cost: tuple[Annotated[Any, typed(COST_KEYS)], ...] = ()
     simulate: SimulateKeys = SimulateKeys()
     solve: SolveKeys = SolveKeys()
     outputs: OutputKeys = OutputKeys()
