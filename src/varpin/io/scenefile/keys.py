@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import (
@@ -15,6 +16,7 @@ from pydantic import (
     StrictBool,
     TypeAdapter,
     ValidationError,
+    ValidationInfo,
     model_validator,
 )
 from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
@@ -118,11 +120,11 @@ def either(what: str, shape: Callable[[Any], str] | None = None, **kinds: Any) -
     """One of several kinds, by the ``shape`` of a value: by its type in TOML, if left out."""
     readers = {name: TypeAdapter(kind) for name, kind in kinds.items()}
 
-    def chosen(value: Any) -> Any:
+    def chosen(value: Any, info: ValidationInfo) -> Any:
         found = (shape or toml_type)(value)
         if found not in readers:
             raise ValueError(f"must be {what}, got {shown(value)}")
-        return readers[found].validate_python(value)
+        return readers[found].validate_python(value, context=info.context)
 
     return Rule(Annotated[Any, PlainValidator(chosen)], what, parts=True)
 
@@ -131,7 +133,7 @@ def typed(kinds: Mapping[str, type[Keys]], default: str | None = None) -> Rule:
     """A table of one of several kinds, by its key ``type``."""
     options = f"one of {', '.join(kinds)}"
 
-    def chosen(table: Any) -> Keys:
+    def chosen(table: Any, info: ValidationInfo) -> Keys:
         if not isinstance(table, dict):
             raise ValueError(f"must be a table, got {shown(table)}")
         kind = table.get("type", default)
@@ -141,7 +143,7 @@ def typed(kinds: Mapping[str, type[Keys]], default: str | None = None) -> Rule:
             raise mistake("type", f"must be {options}, got {shown(kind)}")
         if kind not in kinds:
             raise mistake("type", f"there is no {kind!r}; {suggestion(kind, kinds, 'allowed')}")
-        return kinds[kind].model_validate(table)
+        return kinds[kind].model_validate(table, context=info.context)
 
     return Rule(Annotated[Any, PlainValidator(chosen)], "a table", parts=True)
 
@@ -162,14 +164,14 @@ def mistake(key: str | int, problem: str) -> ValidationError:
     return ValidationError.from_exception_data("scene", [InitErrorDetails(type=error, loc=(key,), input=None)])
 
 
-def read_keys(kind: type[K], data: Any, source: str) -> K:
-    """The tables of a file, of a ``kind``.
+def read_keys(kind: type[K], data: Any, path: Path) -> K:
+    """The tables of the file ``path``, of a ``kind``.
 
     Raises:
         SceneFileError: The first thing that is wrong with them.
     """
     try:
-        return kind.model_validate(data)
+        return kind.model_validate(data, context={"folder": path.resolve().parent})
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
     value, context = first["input"], first.get("ctx", {})
@@ -184,4 +186,4 @@ def read_keys(kind: type[K], data: Any, source: str) -> K:
         "tuple_type": f"must be a list, got {shown(value)}; tables in a list are written [[{key}]]",
     }
     problem = problems.get(first["type"], f"{first['msg']}, got {shown(value)}")
-    raise SceneFileError(source, key, problem)
+    raise SceneFileError(path.name, key, problem)

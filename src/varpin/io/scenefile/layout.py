@@ -456,9 +456,9 @@ def _noises(spec: SceneSpec, names: Sequence[str], driven: Sequence[str]) -> lis
     found = []
     for index, model in enumerate(spec.noise):
         table = spec.root.table(f"noise[{index}]")
-        whose, what = (driven, "driven joint") if model.kind == "control" else (names, "joint")
+        whose, what = (driven, "driven joint") if model.type == "control" else (names, "joint")
         center = None if model.center is None else table.spread("center", model.center, names)
-        found.append(Noises(model.kind, table.spread("intensity", model.intensity, whose, what), center))
+        found.append(Noises(model.type, table.spread("intensity", model.intensity, whose, what), center))
     return found
 
 

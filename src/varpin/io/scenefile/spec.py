@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from varpin.errors import FileError, InputError
 from varpin.integrators import Integrator
@@ -27,8 +27,11 @@ from varpin.mechanics.forces import (
     JointStop,
     PositionServo,
 )
-from varpin.model import Payload, models_dir
+from varpin.model import models_dir
 from varpin.support.checks import is_file
+
+if TYPE_CHECKING:
+    from varpin.io.scenefile.tables import NoiseKeys, OutputKeys, RobotKeys
 
 # A motion of seven joints over so many steps takes gigabytes.
 MOST_STEPS = 10**7
@@ -50,40 +53,6 @@ FRAME_FORCES: Mapping[str, type[Force]] = {
     "frame_wrench": FrameWrench,
 }
 FIGURES = (".png", ".pdf", ".svg")
-
-
-@dataclass(frozen=True)
-class RobotSpec:
-    """Which robot, and how it is taken.
-
-    Attributes:
-        source: A name, or the path of a URDF file.
-        lock: Joints held still, and where [rad or m].
-        mimic: ``"tied"`` or ``"free"``.
-        package_dirs: Where meshes are looked up.
-        payload: What it carries.
-    """
-
-    source: str | Path
-    lock: Mapping[str, float]
-    mimic: str
-    package_dirs: tuple[str, ...]
-    payload: tuple[Payload, ...]
-
-
-@dataclass(frozen=True)
-class NoiseSpec:
-    """A noise model.
-
-    Attributes:
-        kind: ``"additive"``, ``"control"`` or ``"state"``.
-        intensity: By joint, or by control for ``"control"``.
-        center: Of state noise; None for where the motion starts.
-    """
-
-    kind: str
-    intensity: ByName
-    center: ByName | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,23 +112,6 @@ class CostSpec:
     words: Mapping[str, str]
 
 
-@dataclass(frozen=True)
-class Outputs:
-    """Files to write, relative ones below the working directory.
-
-    Attributes:
-        save: Trajectory or solution, npz.
-        plot: Figure.
-        html: Replay.
-        speed: Of the replay.
-    """
-
-    save: Path | None
-    plot: Path | None
-    html: Path | None
-    speed: float
-
-
 @dataclass(frozen=True, eq=False)
 class SceneSpec:
     """A scene file.
@@ -169,7 +121,7 @@ class SceneSpec:
         title: For people.
         path: Of the file.
         root: Its tables, for messages.
-        robot: See :class:`RobotSpec`.
+        robot: Which robot, and how it is taken.
         gravity: [m/s^2], or whether there is any.
         damping: By joint [N m s/rad or N s/m], or "robot" for the description's own; None where nothing is said.
         stiffness: Of joint springs, by joint [N m/rad or N/m].
@@ -198,7 +150,7 @@ class SceneSpec:
     title: str
     path: Path
     root: Table
-    robot: RobotSpec
+    robot: RobotKeys
     gravity: bool | tuple[float, ...]
     damping: ByName | Literal["robot"] | None
     stiffness: ByName
@@ -208,7 +160,7 @@ class SceneSpec:
     actuated: tuple[str, ...] | None
     gear: ByName
     torque_limit: ByName | str | None
-    noise: tuple[NoiseSpec, ...]
+    noise: tuple[NoiseKeys, ...]
     q0: ByName
     v0: ByName
     dt: float
@@ -220,7 +172,7 @@ class SceneSpec:
     controls: Reference | str | None
     seed: int | None
     options: Mapping[str, Any]
-    outputs: Outputs
+    outputs: OutputKeys
 
     @property
     def duration(self) -> float:

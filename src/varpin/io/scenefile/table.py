@@ -97,16 +97,19 @@ def suggestion(word: str, names: Iterable[str], what: str) -> str:
     return f"{hint}{what}: {', '.join(names) or 'none'}"
 
 
-def inside(table: Table, name: str, text: str, folder: Path, what: str) -> Path:
-    """A path that a file names: below ``folder`` if it is relative, links followed, and anywhere if it is absolute."""
+def inside(text: str, folder: Path, what: str) -> Path:
+    """A path that a file names: below ``folder`` if it is relative, links followed, and anywhere if it is absolute.
+
+    Raises:
+        ValueError: It is no path, or leads out of the folder.
+    """
     path = Path(text)
     if path.is_absolute():
         return path
     try:
-        found = (folder / path).resolve()
-        root = folder.resolve()
+        found, root = (folder / path).resolve(), folder.resolve()
     except (OSError, RuntimeError) as error:
-        raise table.error(name, f"{text!r} is no path: {error}") from None
+        raise ValueError(f"{text!r} is no path: {error}") from None
     if not found.is_relative_to(root):
-        raise table.error(name, f"{text!r} leads out of {what} {root}; name files below it, or give an absolute path")
+        raise ValueError(f"{text!r} leads out of {what} {root}; name files below it, or give an absolute path")
     return found

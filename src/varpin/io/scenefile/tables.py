@@ -9,7 +9,7 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, create_model, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, create_model, model_validator
 
 from varpin.control.problem import default_integrator
 from varpin.errors import InputError
@@ -40,9 +40,6 @@ from varpin.io.scenefile.spec import (
     CostSpec,
     ForceSpec,
     FrameForceSpec,
-    NoiseSpec,
-    Outputs,
-    RobotSpec,
     SceneSpec,
 )
 from varpin.io.scenefile.table import ByName, Table, inside
@@ -53,14 +50,44 @@ from varpin.support.checks import is_file
 _THREE = tuple[float, float, float]
 
 
-def _distinct(entries: tuple[str, ...]) -> tuple[str, ...]:
-    for index, entry in enumerate(entries):
-        if entry in entries[:index]:
-            raise mistake(index, f"{entry!r} is there twice")
-    return entries
+def _checked(kind: Any, check: Callable[..., Any]) -> Rule:
+    """What ``check`` makes of a value of a kind; it raises a ValueError."""
+    plain, what = (Annotated[Any, kind], kind.what) if isinstance(kind, Rule) else (kind, "")
+    return Rule(Annotated[plain, AfterValidator(check)], what, parts=True)
 
 
-_TEXTS = Rule(Annotated[tuple[Annotated[str, TEXT], ...], AfterValidator(_distinct)], "a list of texts", parts=True)
+def _distinct(rule: Rule) -> Rule:
+    """A list without repetitions."""
+
+    def once(entries: tuple[str, ...]) -> tuple[str, ...]:
+        for index, entry in enumerate(entries):
+            if entry in entries[:index]:
+                raise mistake(index, f"{entry!r} is there twice")
+        return entries
+
+    return _checked(tuple[Annotated[str, rule], ...], once)
+
+
+def _beside(text: str, info: ValidationInfo) -> Path:
+    """A path that a scene names; relative ones are below its folder."""
+    context: Any = info.context
+    return inside(text, context["folder"], "the scene's folder")
+
+
+def _folder(text: str, info: ValidationInfo) -> str:
+    return str(_beside(text, info))
+
+
+def _existing(path: Path) -> Path:
+    if not is_file(path):
+        raise ValueError(f"there is no file {path}")
+    return path
+
+
+def _robot_source(text: str, info: ValidationInfo) -> str | Path:
+    """A name, or the path of a file."""
+    named = not Path(text).suffix and "/" not in text and "\\" not in text
+    return text if named else _existing(_beside(text, info))
 
 
 class PayloadKeys(Keys):
@@ -69,17 +96,31 @@ class PayloadKeys(Keys):
     frame: Annotated[str, TEXT]
     mass: Annotated[float, number("kg", above=0.0)]
     com: Annotated[_THREE, numbers(3, "m")] = (0.0, 0.0, 0.0)
-    inertia: Annotated[tuple[float, ...] | None, numbers(unit="kg m^2")] = None
+    inertia: Annotated[tuple[float, ...], numbers(unit="kg m^2")] = (0.0, 0.0, 0.0)
+
+    def payload(self) -> Payload:
+        """As a robot takes it."""
+        inertia: Any = self.inertia
+        if len(inertia) == 6:
+            xx, xy, xz, yy, yz, zz = inertia
+            inertia = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+        elif len(inertia) != 3:
+            entries = "3 principal moments or 6 entries ixx, ixy, ixz, iyy, iyz, izz"
+            raise mistake("inertia", f"must be {entries}; got {len(inertia)}")
+        try:
+            return Payload(self.frame, self.mass, self.com, inertia)
+        except InputError as error:
+            raise mistake("inertia", str(error).removeprefix("payload inertia ")) from None
 
 
 class RobotKeys(Keys):
     """[robot]."""
 
-    source: Annotated[str, TEXT]
+    source: Annotated[str | Path, _checked(TEXT, _robot_source)]
     lock: dict[str, Annotated[float, number("rad or m")]] = Field(default_factory=dict)
     mimic: Annotated[str, word("tied", "free")] = "tied"
-    package_dirs: Annotated[tuple[str, ...], _TEXTS] = ()
-    payload: tuple[PayloadKeys, ...] = ()
+    package_dirs: Annotated[tuple[str, ...], _distinct(_checked(TEXT, _folder))] = ()
+    payload: tuple[Annotated[Payload, _checked(PayloadKeys, PayloadKeys.payload)], ...] = ()
 
 
 class SpringKeys(Keys):
@@ -92,7 +133,7 @@ class SpringKeys(Keys):
 class ActuationKeys(Keys):
     """[actuation]."""
 
-    joints: Annotated[tuple[str, ...] | None, _TEXTS] = None
+    joints: Annotated[tuple[str, ...] | None, _distinct(TEXT)] = None
     gear: Annotated[ByName, values()] = 1.0
     torque_limit: Annotated[ByName | str | None, values("N m or N", least=0.0, text=Annotated[str, word("robot")])] = (
         None
@@ -187,10 +228,17 @@ class WaypointKeys(Keys):
         return self
 
 
+def _values_file(text: str, info: ValidationInfo) -> Path:
+    path = _beside(text, info)
+    if path.suffix not in (".csv", ".npz"):
+        raise ValueError(f"must be a .csv or .npz file, got {path.name!r}")
+    return _existing(path)
+
+
 class FileKeys(Keys):
     """A reference in a file."""
 
-    file: Annotated[str, TEXT]
+    file: Annotated[Path, _checked(TEXT, _values_file)]
 
 
 REFERENCE_KEYS: Mapping[str, type[Keys]] = {"file": FileKeys, "waypoints": WaypointKeys, "sines": SinesKeys}
@@ -225,12 +273,22 @@ class SolveKeys(Keys):
     regularization: Annotated[float, number(least=0.0)] = 0.0
 
 
+def _output(*endings: str) -> Rule:
+    def written(text: str) -> Path:
+        path = inside(text, Path.cwd(), "the working directory")
+        if path.suffix.lower() not in endings:
+            raise ValueError(f"must end in {', '.join(endings)}, got {path.name!r}")
+        return path
+
+    return _checked(TEXT, written)
+
+
 class OutputKeys(Keys):
     """[outputs]."""
 
-    save: Annotated[str | None, TEXT] = None
-    plot: Annotated[str | None, TEXT] = None
-    html: Annotated[str | None, TEXT] = None
+    save: Annotated[Path | None, _output(".npz")] = None
+    plot: Annotated[Path | None, _output(*FIGURES)] = None
+    html: Annotated[Path | None, _output(".html")] = None
     speed: Annotated[float, number(above=0.0)] = 1.0
 
 
@@ -357,21 +415,21 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
         SceneFileError: A mistake in them.
     """
     root = Table(path.name, "")
-    keys = read_keys(SceneKeys, dict(data), path.name)
-    folder, horizon = path.resolve().parent, keys.horizon
+    keys = read_keys(SceneKeys, data, path)
+    horizon = keys.horizon
     if horizon.count * len(keys.cost) > MOST_EVALUATIONS:
         costs = f"{horizon.count} steps times {len(keys.cost)} costs"
         raise root.error("horizon", f"{costs} are too many; {MOST_EVALUATIONS} are the most")
     forces = [_force(root.table(f"force[{index}]"), own) for index, own in enumerate(keys.force)]
     controls = keys.simulate.controls
     if controls is not None and controls != "hold":
-        controls = _reference_of(root.table("simulate"), "controls", controls, folder, horizon.dt)
+        controls = _reference_of(root.table("simulate"), "controls", controls, horizon.dt)
     return SceneSpec(
         name=name,
         title=name if keys.title is None else keys.title,
         path=path,
         root=root,
-        robot=_robot(root.table("robot"), keys.robot, folder),
+        robot=keys.robot,
         gravity=keys.gravity,
         damping=keys.damping,
         stiffness=keys.springs.stiffness,
@@ -381,7 +439,7 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
         actuated=keys.actuation.joints,
         gear=keys.actuation.gear,
         torque_limit=keys.actuation.torque_limit,
-        noise=tuple(NoiseSpec(own.type, own.intensity, own.center) for own in keys.noise),
+        noise=keys.noise,
         q0=keys.initial.q,
         v0=keys.initial.v,
         dt=horizon.dt,
@@ -389,45 +447,17 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
         hold=horizon.hold,
         sampling=horizon.sampling,
         integrator=_integrator(root.table("integrator"), keys.integrator),
-        costs=tuple(_cost(root.table(f"cost[{k}]"), own, folder, horizon.dt) for k, own in enumerate(keys.cost)),
+        costs=tuple(_cost(root.table(f"cost[{k}]"), own, horizon.dt) for k, own in enumerate(keys.cost)),
         controls=controls,
         seed=keys.simulate.seed,
         options=_given(keys.solve),
-        outputs=_outputs(root.table("outputs"), keys.outputs),
+        outputs=keys.outputs,
     )
 
 
 def _given(keys: Keys) -> dict[str, Any]:
     """The keys that a table has, its type apart."""
     return {name: getattr(keys, name) for name in keys.model_fields_set if name != "type"}
-
-
-def _robot(table: Table, keys: RobotKeys, folder: Path) -> RobotSpec:
-    source: str | Path = keys.source
-    if Path(keys.source).suffix or "/" in keys.source or "\\" in keys.source:
-        source = inside(table, "source", keys.source, folder, "the scene's folder")
-        if not is_file(source):
-            raise table.error("source", f"there is no file {source}")
-    folders = tuple(
-        str(inside(table, f"package_dirs[{index}]", entry, folder, "the scene's folder"))
-        for index, entry in enumerate(keys.package_dirs)
-    )
-    payload = tuple(_payload(table.table(f"payload[{index}]"), own) for index, own in enumerate(keys.payload))
-    return RobotSpec(source, keys.lock, keys.mimic, folders, payload)
-
-
-def _payload(table: Table, keys: PayloadKeys) -> Payload:
-    inertia: Any = 0.0 if keys.inertia is None else keys.inertia
-    if keys.inertia is not None and len(keys.inertia) == 6:
-        xx, xy, xz, yy, yz, zz = keys.inertia
-        inertia = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
-    elif keys.inertia is not None and len(keys.inertia) != 3:
-        entries = "3 principal moments or 6 entries ixx, ixy, ixz, iyy, iyz, izz"
-        raise table.error("inertia", f"must be {entries}; got {len(keys.inertia)}")
-    try:
-        return Payload(frame=keys.frame, mass=keys.mass, center=keys.com, inertia=inertia)
-    except InputError as error:
-        raise table.error("inertia", str(error).removeprefix("payload inertia ")) from None
 
 
 def _force(table: Table, keys: TypedKeys) -> ForceSpec | FrameForceSpec:
@@ -453,7 +483,7 @@ def _integrator(table: Table, keys: TypedKeys) -> Integrator:
         raise table.error("", str(error)) from None
 
 
-def _cost(table: Table, keys: TypedKeys, folder: Path, dt: float) -> CostSpec:
+def _cost(table: Table, keys: TypedKeys, dt: float) -> CostSpec:
     term = TERMS[keys.type]
     given = _given(keys)
     hold, value = given.get("hold"), given.get(term.reference or "")
@@ -461,7 +491,7 @@ def _cost(table: Table, keys: TypedKeys, folder: Path, dt: float) -> CostSpec:
         raise table.error("", f"hold and {term.reference} exclude each other: give one of them")
     reference = None
     if term.reference is not None and hold is None and not (term.initial and value is None):
-        reference = _reference_of(table, term.reference, 0.0 if value is None else value, folder, dt)
+        reference = _reference_of(table, term.reference, 0.0 if value is None else value, dt)
     return CostSpec(
         table=table,
         kind=keys.type,
@@ -476,17 +506,12 @@ def _cost(table: Table, keys: TypedKeys, folder: Path, dt: float) -> CostSpec:
     )
 
 
-def _reference_of(table: Table, name: str, value: Any, folder: Path, dt: float) -> Reference:
+def _reference_of(table: Table, name: str, value: Any, dt: float) -> Reference:
     own = table.table(name)
     if isinstance(value, WaypointKeys):
         return Reference(table, name, times=value.times, values=value.values, smooth=value.between == "smooth")
     if isinstance(value, FileKeys):
-        path = inside(own, "file", value.file, folder, "the scene's folder")
-        if path.suffix not in (".csv", ".npz"):
-            raise own.error("file", f"must be a .csv or .npz file, got {path.name!r}")
-        if not is_file(path):
-            raise own.error("file", f"there is no file {path}")
-        return Reference(table, name, file=path)
+        return Reference(table, name, file=value.file)
     if not isinstance(value, SinesKeys):
         return Reference(table, name, offset=value)
     for index, sine in enumerate(value.sines):
@@ -495,15 +520,3 @@ def _reference_of(table: Table, name: str, value: Any, folder: Path, dt: float) 
             raise own.error(f"sines[{index}].frequency", f"must be {most}, got {sine.frequency:g}")
     sines = tuple(Sine(sine.of, sine.amplitude, sine.frequency, sine.phase) for sine in value.sines)
     return Reference(table, name, offset=value.offset, sines=sines)
-
-
-def _outputs(table: Table, keys: OutputKeys) -> Outputs:
-    endings = {"save": (".npz",), "plot": FIGURES, "html": (".html",)}
-    paths: dict[str, Path | None] = dict.fromkeys(endings)
-    for name, allowed in endings.items():
-        text = getattr(keys, name)
-        if text is not None:
-            path = paths[name] = inside(table, name, text, Path.cwd(), "the working directory")
-            if path.suffix.lower() not in allowed:
-                raise table.error(name, f"must end in {', '.join(allowed)}, got {path.name!r}")
-    return Outputs(**paths, speed=keys.speed)
