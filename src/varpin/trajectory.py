@@ -75,9 +75,9 @@ class StepStatistics(Frozen):
 
     def part(self, begin: int, end: int) -> StepStatistics:
         """Of the steps begin .. end, as views."""
-        first, last = (_parts_in(self.substeps[:place]) for place in (begin, end))
-        own = {name: getattr(self, name)[begin:end] for name in STEP_NUMBERS}
-        return StepStatistics(**own, halvings=self.halvings[first:last])
+        first, last = (_parts_in(self.substeps[:step]) for step in (begin, end))
+        numbers = {name: getattr(self, name)[begin:end] for name in STEP_NUMBERS}
+        return StepStatistics(**numbers, halvings=self.halvings[first:last])
 
     def damage(self) -> str | None:
         """What is wrong with a record of parts that no motion has, in words."""

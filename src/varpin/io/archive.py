@@ -368,7 +368,7 @@ def _array_type(hint: Any) -> tuple[np.dtype[Any], Axes | None]:
 
 @contextlib.contextmanager
 def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A binary stream whose contents take the place of ``path`` when the block ends well, and vanish if not.
+    """A binary stream whose contents replace ``path`` when the block ends without an error, and are deleted otherwise.
 
     Raises:
         FileError: The path cannot be written.

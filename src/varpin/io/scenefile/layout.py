@@ -19,8 +19,8 @@ from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNois
 from varpin.mechanics.scene import Scene, closest_controls, damping_of
 from varpin.model import Robot, load_robot
 
-# Times at which it is looked whether a reference ever leaves a place.
-_LOOKS = 2000
+# Times at which controls and references are compared with what stays, at most.
+_SAMPLES = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,12 +97,12 @@ class Layout:
         """
         if not joints:
             return self
-        own = self.robot.joint_names
-        held = {**self.held, **{name: float(self.q0[own.index(name)]) for name in joints}}
+        names = self.robot.joint_names
+        held = {**self.held, **{name: float(self.q0[names.index(name)]) for name in joints}}
         robot = _load(self.spec, held)
-        keep = np.array([own.index(name) for name in robot.joint_names], dtype=np.int64)
+        keep = np.array([names.index(name) for name in robot.joint_names], dtype=np.int64)
         driven = np.flatnonzero(np.isin(self.actuated, keep))
-        position = {int(joint): place for place, joint in enumerate(keep)}
+        position = {int(joint): index for index, joint in enumerate(keep)}
         costs = []
         for term in self.costs:
             space = term.spec.term.space
@@ -372,7 +372,7 @@ def _require_controls(layout: Layout) -> None:
     if not isinstance(layout.controls, Timeline):
         return
     table = spec.root.table("simulate")
-    given = layout.controls.at(_times(spec))
+    given = layout.controls.at(times_of(spec))
     for joint, column in zip(layout.actuated[served].tolist(), given.T[served], strict=True):
         worst = float(column[np.argmax(np.abs(column))])
         if not layout.robot.slides[joint] and degrees_for_radians(worst):
@@ -388,8 +388,9 @@ def _require_controls(layout: Layout) -> None:
         )
 
 
-def _times(spec: SceneSpec) -> Floats:
-    return np.linspace(0.0, spec.duration, min(spec.steps, _LOOKS) + 1)
+def times_of(spec: SceneSpec) -> Floats:
+    """Times over the horizon [s] at which references are evaluated before there is a motion."""
+    return np.linspace(0.0, spec.duration, min(spec.steps, _SAMPLES) + 1)
 
 
 def _refuse_degrees(table: Table, name: str, values: Floats, robot: Robot) -> None:

@@ -46,7 +46,7 @@ def constant(values: Floats) -> Timeline:
     return Timeline(_Constant(values), True)
 
 
-# Functions of time, as classes: those that are made in place cannot be pickled.
+# Functions of time are classes, because functions within functions cannot be pickled.
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +70,11 @@ class _Columns:
 class _Sines:
     offset: Floats
     sines: tuple[Sine, ...]
-    place: tuple[int, ...]
+    columns: tuple[int, ...]
 
     def __call__(self, t: Floats) -> Floats:
         total = np.tile(self.offset, (len(t), 1))
-        for column, sine in zip(self.place, self.sines, strict=True):
+        for column, sine in zip(self.columns, self.sines, strict=True):
             total[:, column] += sine.amplitude * np.sin(2.0 * math.pi * sine.frequency * t + sine.phase)
         return total
 
@@ -162,8 +162,8 @@ class Reference:
                     f"{self.name}.sines[{index}].of",
                     f"there is no {what} {sine.of!r}; {suggestion(sine.of, names, what + 's')}",
                 )
-        place = tuple(names.index(sine.of) for sine in self.sines)
-        return Timeline(_Sines(offset, self.sines, place), constant=False)
+        columns = tuple(names.index(sine.of) for sine in self.sines)
+        return Timeline(_Sines(offset, self.sines, columns), constant=False)
 
     def _of_file(self, path: Path, names: Sequence[str], duration: float, what: str) -> Timeline:
         def wrong(problem: str) -> Exception:

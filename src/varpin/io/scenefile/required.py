@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.io.scenefile.layout import CostTerm, Layout, holding_controls, joints_of_frame
+from varpin.io.scenefile.layout import CostTerm, Layout, holding_controls, joints_of_frame, times_of
 from varpin.io.scenefile.references import Timeline
 from varpin.io.scenefile.spec import FORCES, FRAME_FORCES
 from varpin.io.scenefile.table import Floats
@@ -20,8 +20,6 @@ from varpin.support.markup import facts, listed
 Mask = NDArray[np.bool_]
 # What a scene has if it asks for it.
 _ABSENT: Mapping[str, type[Force]] = {"stops at joint limits": JointStop, "dry friction": CoulombFriction}
-# Times at which it is looked whether a reference ever leaves a place.
-_LOOKS = 2000
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,7 @@ def idle_joints(layout: Layout, scene: Scene) -> Mask:
     touched = layout.v0 != 0.0
     touched |= _pushed(layout, scene)
     touched |= _weighed(layout)
-    t = np.linspace(0.0, layout.spec.duration, min(layout.spec.steps, _LOOKS) + 1)
+    t = times_of(layout.spec)
     for model in layout.noise:
         if model.kind != "control":
             touched |= model.intensity != 0.0

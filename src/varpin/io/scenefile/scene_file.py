@@ -249,6 +249,6 @@ def load_scene(source: str | Path, *, required_only: bool = True) -> SceneFile:
         _layout=layout,
     )
     if spec.costs:
-        # So that every mistake in the file is said now.
+        # A mistake in the cost is raised now, not at the first use of the problem.
         file.problem  # noqa: B018
     return file

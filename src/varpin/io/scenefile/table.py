@@ -1,4 +1,4 @@
-"""Tables of a TOML file, read key by key: what is wrong is said with the key it stands under."""
+"""Keys of scene files in messages, and values by joint."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class SceneFileError(VarpinError, ValueError):
 
 @dataclass(frozen=True)
 class Table:
-    """Where a table of a scene file stands, for messages.
+    """The key of a table of a scene file, for messages.
 
     Attributes:
         source: The file.

@@ -325,22 +325,22 @@ def _default(item: Any) -> Any:
 
 
 class PointKeys(Keys):
-    """A place in a frame."""
+    """A point in a frame."""
 
     frame: Annotated[str, TEXT]
     place: Annotated[_THREE, numbers(3, "m")]
 
 
-_PLACE = Annotated[Any, numbers(3)]
+_THREE_NUMBERS = Annotated[Any, numbers(3)]
 
 
 def _along(unit: str) -> Rule:
     what = f"a number, or three along the axes of the world [{unit}]"
-    return either(what, number=Annotated[float, number(unit)], list=_PLACE)
+    return either(what, number=Annotated[float, number(unit)], list=_THREE_NUMBERS)
 
 
 _ON_FRAME: dict[str, Any] = {"text": Annotated[str, TEXT], "table": PointKeys}
-_POINT = either("a frame's name, { frame, place } or a place in the world [m]", **_ON_FRAME, list=_PLACE)
+_POINT = either("a frame's name, { frame, place } or a place in the world [m]", **_ON_FRAME, list=_THREE_NUMBERS)
 # What the fields of forces on frames take.
 _OF_FRAMES = {
     "a": _POINT,
@@ -468,7 +468,7 @@ def _force(table: Table, keys: TypedKeys) -> ForceSpec | FrameForceSpec:
 
 
 def _point(value: Any) -> Any:
-    """A place of a table as forces take it."""
+    """A point as forces take it."""
     if isinstance(value, PointKeys):
         return value.frame, list(value.place)
     return list(value) if isinstance(value, tuple) else value
