@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from varpin._version import __version__
 from varpin.errors import FileError, InputError
 from varpin.io.archive import Axes, read_npz, record_of, save_npz
-from varpin.mechanics.scene import VALUES, Scene, differences, same
+from varpin.mechanics.scene import OF_FORCES, VALUES, Scene, differences, same
 from varpin.model import Robot
 from varpin.support.checks import path_like
 from varpin.support.frozen import Frozen
@@ -316,6 +316,7 @@ class Trajectory(Frozen):
         found = record_of(cls, _with_accuracy(members, prefix), source, prefix=prefix)
         kept = {name: values for name, values in found.scene_values.items() if name in VALUES}
         found = replace(found, scene_values=MappingProxyType(kept))
+        _require_scene_values(source, kept, len(found.joint_names))
         # Energies overflow before q and v do, and momenta with them: they are saved as they are.
         if not np.isfinite(found.p[np.isfinite(found.energy)]).all():
             raise FileError(f"{source}: p holds values that are not finite numbers")
@@ -341,6 +342,20 @@ class Trajectory(Frozen):
                 f"{source} is of robot {self.robot}, whose links weigh {self.masses.sum():.6g} kg in all; "
                 f"{robot.name!r} has joints of the same names, but its links weigh {masses.sum():.6g} kg"
             )
+
+
+def _require_scene_values(source: Path, values: Mapping[str, Floats], n: int) -> None:
+    """Refuse numbers of a scene that are not finite, or not as many as a scene with n joints has."""
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("damping", "stiffness", "rest", "armature"), (n,))
+    shapes |= {"gravity": (3,), "actuation": (n, -1), "center": (-1, 3), "translation": (-1, 3)}
+    shapes |= {"inertia": (-1, 6), "rotation": (-1, 3, 3)}
+    for name, array in values.items():
+        shape = shapes.get(name, array.shape)
+        if array.ndim != len(shape) or any(b not in (-1, a) for a, b in zip(array.shape, shape, strict=True)):
+            raise FileError(f"{source}: scene.{name} has shape {array.shape}, where {shape} belongs")
+        # A noise without a center of its own has NaN there, a stop of one end an infinite other one.
+        if name not in {"noise.center", *OF_FORCES} and not np.isfinite(array).all():
+            raise FileError(f"{source}: scene.{name} holds values that are not finite numbers")
 
 
 def _with_accuracy(members: Mapping[str, Any], prefix: str) -> Mapping[str, Any]:
