@@ -13,7 +13,7 @@ from matplotlib.ticker import NullFormatter
 from varpin.show.plots import COLORS
 from varpin.study.paper import cases
 from varpin.study.paper.cases import CASES, COARSE, COARSEST, MAIN
-from varpin.study.paper.claims import REFERENCE, Cells, Motions, cell, series, series_of_noise
+from varpin.study.paper.claims import REFERENCE, Cells, Motions, cell, main_steps, series, series_of_noise
 from varpin.study.paper.experiments import OPTIMUM, PLAIN, STOCHASTIC
 
 # Tracking errors are linear below this [rad] and logarithmic beyond: a start away from the optimum outweighs the rest a
@@ -27,8 +27,7 @@ _METHOD_COLOR = {"variational": COLORS[0], "Euler": COLORS[1], cases.FOURTH_ORDE
 
 def draw(cells: Cells, motions: Motions) -> dict[str, tuple[Figure, str]]:
     """Each figure with its caption, by the name of its file."""
-    steps = sorted({c.dt for c in cells.values() if c.setting == MAIN.key})
-    fine = steps[0]
+    fine = main_steps(cells)[0]
     return {
         "figure1": (
             _free(motions),
@@ -88,9 +87,7 @@ def _tracking(cells: Cells, case: str, fine: float, third: Callable[[Axes, Cells
     axes[1].sharey(axes[0])
     for panel, method in zip(axes[:2], ("Euler", "variational"), strict=True):
         for dt, dash in ((fine, ":"), (COARSE, "-")):
-            own = cell(cells, MAIN, case, method, dt)
-            if own is None:
-                continue
+            own = cell(cells, case, method, dt)
             error = own.q - np.array([cases.reference(t) for t in own.t])
             for joint in range(3):
                 label = rf"$\theta_{joint + 1}$, {dt:g} s"
@@ -120,9 +117,7 @@ def _cost_over_time(axes: Axes, cells: Cells, case: str, fine: float) -> None:  
 
 def _first_controls(axes: Axes, cells: Cells, case: str, fine: float) -> None:
     for dt, dash in ((fine, ":"), (COARSEST, "-")):
-        own = cell(cells, MAIN, case, "variational", dt)
-        if own is None:
-            continue
+        own = cell(cells, case, "variational", dt)
         shown = own.t[:-1] <= 0.1
         for joint in range(3):
             axes.step(
@@ -135,9 +130,8 @@ def _first_controls(axes: Axes, cells: Cells, case: str, fine: float) -> None:
 
 def _first_joint(axes: Axes, cells: Cells, case: str, fine: float) -> None:
     for dt, dash in ((fine, ":"), (COARSE, "-")):
-        own = cell(cells, MAIN, case, "variational", dt)
-        if own is not None:
-            axes.plot(own.t, own.q[:, 0], dash, color=COLORS[0], label=f"dt = {dt:g} s")
+        own = cell(cells, case, "variational", dt)
+        axes.plot(own.t, own.q[:, 0], dash, color=COLORS[0], label=f"dt = {dt:g} s")
     t = np.linspace(0.0, cases.DURATION, 301)
     axes.plot(t, [cases.reference(x)[0] for x in t], color="0.6", lw=1, label="reference", zorder=0)
     axes.set(xlabel="time [s]", ylabel=r"$\theta_1$ [rad]")
