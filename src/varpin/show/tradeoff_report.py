@@ -13,13 +13,12 @@ from matplotlib.figure import Figure, SubFigure
 from varpin._version import __version__
 from varpin.show.plots import plot_advice, plot_work_precision
 from varpin.study.tradeoff import Advice, WorkPrecision, WorkPrecisionRun
-from varpin.study.tradeoff.advice import Choice
+from varpin.study.tradeoff.advice import COLUMNS as _ADVICE_COLUMNS
 from varpin.support.markup import page, picture
 from varpin.trajectory import atomic_file
 
 # Heading and text of a run in the table.
 COLUMNS = ("integrator", "dt [s]", "wall time [s]", "error in q", "energy error [J]", "end effector [m]", "note")
-ADVICE_COLUMNS = ("integrator", "dt [s]", "steps", "predicted time [s]", "predicted error in q", "note")
 
 _STYLE = "tr.front { background: #dff2e1; }"
 
@@ -71,21 +70,14 @@ def write_advice(folder: Path, advice: Advice, title: str) -> list[Path]:
     image = b""
     if any(math.isfinite(choice.error) and choice.error > 0.0 for choice in choices):
         image = _write_image(figure, plot_advice(advice)[0])
-    rows = [(advice_cells(choice), choice is advice.best and advice.reached) for choice in choices]
+    rows = [(choice.cells(), choice is advice.best and advice.reached) for choice in choices]
     said = "</p><p>".join(html.escape(line) for line in advice.reason.splitlines())
     text = f"""{said}</p>
 <p>varpin {__version__}. Times are predicted for this machine, on one thread, without the look at the finished
 motion."""
     with atomic_file(document) as file:
-        file.write(_document(title, text, "predicted error over time", image, ADVICE_COLUMNS, rows).encode())
+        file.write(_document(title, text, "predicted error over time", image, _ADVICE_COLUMNS, rows).encode())
     return [path for path in (figure, document) if path != figure or image]
-
-
-def advice_cells(choice: Choice) -> tuple[str, ...]:
-    """A choice as the entries of :data:`ADVICE_COLUMNS`."""
-    error = f"{choice.error:.2e}" if math.isfinite(choice.error) else "unknown"
-    note = "" if choice.measured else "by the method's order"
-    return str(choice.integrator), f"{choice.dt:.4g}", str(choice.steps), f"{choice.seconds:.2e}", error, note
 
 
 def _write_image(path: Path, figure: Figure | SubFigure) -> bytes:

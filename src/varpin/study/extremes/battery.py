@@ -214,38 +214,38 @@ def run(
     path = None if save is None else writable(save)
     known = Record.load(path).cells if path is not None and path.exists() else ()
     done = {cell.fingerprint: cell for cell in known}
-    chores = {
+    jobs = {
         fingerprint(trial, member, name, limit): (trial, member)
         for trial in trials
         for member in members
         if trial.takes(member)
     }
-    cells = {mark: done[mark] for mark in chores if mark in done}
+    cells = {key: done[key] for key in jobs if key in done}
     saved = time.monotonic()
 
-    def now() -> Record:
-        # What is known already stays known, however early an interruption comes.
-        return Record(tuple(cells[mark] for mark in chores if mark in cells), name, deep, len(chores) - len(cells))
+    def current() -> Record:
+        # Cells of an earlier run stay, however early an interruption comes.
+        return Record(tuple(cells[key] for key in jobs if key in cells), name, deep, len(jobs) - len(cells))
 
     try:
         bench = None
-        for mark, (trial, member) in chores.items():
-            if mark in cells:
+        for key, (trial, member) in jobs.items():
+            if key in cells:
                 continue
             if progress is not None:
-                progress(len(cells), len(chores), f"{trial.name}, {member}")
+                progress(len(cells), len(jobs), f"{trial.name}, {member}")
             if bench is None or bench.trial is not trial:
                 bench = Bench(trial)
             # A plan cut short is another plan; it has its number of iterations.
-            cells[mark] = bench.run(member, limit if isinstance(trial, Trial) or patience else math.inf, mark)
+            cells[key] = bench.run(member, limit if isinstance(trial, Trial) or patience else math.inf, key)
             if path is not None and time.monotonic() - saved > _SAVED_EVERY:
-                now().save(path)
+                current().save(path)
                 saved = time.monotonic()
     except KeyboardInterrupt:
         pass
     if path is not None:
-        now().save(path)
-    return now()
+        current().save(path)
+    return current()
 
 
 @cache
@@ -272,7 +272,7 @@ class Bench:
         self.trial = trial
         self._exact: dict[bool, Exact | None] = {}
 
-    def run(self, integrator: Integrator, patience: float, mark: str = "") -> Cell:
+    def run(self, integrator: Integrator, patience: float, key: str = "") -> Cell:
         """The trial with one integrator."""
         trial, begin = self.trial, time.perf_counter()
         if isinstance(trial, Plan):
@@ -292,7 +292,7 @@ class Bench:
             done=outcome.done,
             steps=trial.steps,
             seconds=round(time.perf_counter() - begin, 3),
-            fingerprint=mark,
+            fingerprint=key,
             **dict.fromkeys(_MEASURES, math.nan) | outcome.measures,
         )
 

@@ -200,8 +200,8 @@ def exact_motion(setup: Setup, dt: float, steps: int, window: float, *, late: bo
         q, v = np.split(states[nodes[nodes < len(states)]], 2, axis=1)
         q = q + setup.shift
     # At the last of the known steps the disturbance has grown already, if they are not all.
-    told = nodes <= (known if known >= nodes[-1] else max(1, known - 1))
-    return _in_units(setup, dt, nodes[told], q[: told.sum()], v[: told.sum()], cut=not told.all())
+    count = int((nodes <= (known if known >= nodes[-1] else max(1, known - 1))).sum())
+    return _in_units(setup, dt, nodes[:count], q[:count], v[:count], cut=count < len(nodes))
 
 
 def _reference(setup: Setup, dt: float, steps: int, late: bool) -> tuple[Floats, int]:

@@ -294,10 +294,10 @@ def _claims(cells: Cells, motions: Motions) -> list[tuple[str, str, Callable[[],
 
 def _error(motions: Motions, method: str, dt: float) -> float:
     """The largest error of theta_1 [rad]; infinite of a motion that stopped early."""
-    own, exact = motions[method, dt], motions[REFERENCE, cases.FINE]
-    if own.t[-1] < exact.t[-1] - 0.5 * dt:
+    motion, exact = motions[method, dt], motions[REFERENCE, cases.FINE]
+    if motion.t[-1] < exact.t[-1] - 0.5 * dt:
         return np.inf
-    return float(np.abs(own.theta - np.interp(own.t, exact.t, exact.theta)).max())
+    return float(np.abs(motion.theta - np.interp(motion.t, exact.t, exact.theta)).max())
 
 
 def _order(motions: Motions) -> Judgement:
@@ -305,9 +305,9 @@ def _order(motions: Motions) -> Judgement:
     for method in METHODS:
         errors = [_error(motions, method, dt) for dt in steps]
         orders[method] = np.diff(np.log(errors)) / np.diff(np.log(steps))
-    own, other = (", ".join(f"{x:.2f}" for x in orders[method]) for method in METHODS)
+    vi, euler = (", ".join(f"{x:.2f}" for x in orders[method]) for method in METHODS)
     return (
-        f"Of theta_1 in figure 1's motion, from dt = {steps[0]:g} s to {steps[-1]:g} s: order {own}; Euler's {other}.",
+        f"Of theta_1 in figure 1's motion, from dt = {steps[0]:g} s to {steps[-1]:g} s: order {vi}; Euler's {euler}.",
         verdict(bool((np.abs(orders["variational"] - 2.0) < 0.1).all())),
     )
 
@@ -315,10 +315,10 @@ def _order(motions: Motions) -> Judgement:
 def _conserved(motions: Motions) -> Judgement:
     drifts = {method: motions[method, COARSEST].drifts for method in METHODS}
     text = "; ".join(f"{method}: energy {a:.1e}, momentum {b:.1e}" for method, (a, b) in drifts.items())
-    (energy, momentum), (other, _) = drifts["variational"], drifts["Euler"]
+    (energy, momentum), (euler, _) = drifts["variational"], drifts["Euler"]
     return (
         f"Largest relative change in figure 1's motion at dt = {COARSEST:g} s, momentum about the base: {text}.",
-        verdict(momentum < 1e-12, energy < 1e-3 and energy < 0.1 * other),
+        verdict(momentum < 1e-12, energy < 1e-3 and energy < 0.1 * euler),
     )
 
 
@@ -329,13 +329,13 @@ def _free(motions: Motions) -> Judgement:
         motion = motions[method, COARSEST]
         split = f"{motion.split_steps} of {motion.steps} steps taken in parts"
         rows.append(f"{method}: {coarse:.2g} rad (at dt = {cases.FINE:g} s {fine:.1g} rad), {split}")
-    own, finest, other = (
+    vi, finest, euler = (
         _error(motions, *key) for key in (("variational", COARSEST), ("Euler", cases.FINE), ("Euler", COARSEST))
     )
     return (
         f"Largest error of theta_1 at dt = {COARSEST:g} s over {cases.DURATION:g} s in the horizontal plane, way "
         f"{travel:.3g} rad: {'; '.join(rows)}.",
-        verdict(other > 10.0 * finest and other > 10.0 * own, own < 1e-3 * travel),
+        verdict(euler > 10.0 * finest and euler > 10.0 * vi, vi < 1e-3 * travel),
     )
 
 
@@ -384,35 +384,35 @@ def _controls_apart(fine: Cell, coarse: Cell, until: float) -> float:
 
 def _solution(cells: Cells, case: str) -> Judgement:
     pairs = {method: _pair(cells, case, method) for method in METHODS}
-    own, other = (_apart(*pair) for pair in pairs.values())
+    vi, euler = (_apart(*pair) for pair in pairs.values())
     fine = pairs["variational"][0]
     return (
-        f"Solutions at dt = {fine.dt:g} s and {COARSE:g} s are at most {own:.2g} rad (variational) and {other:.2g} rad "
+        f"Solutions at dt = {fine.dt:g} s and {COARSE:g} s are at most {vi:.2g} rad (variational) and {euler:.2g} rad "
         "(Euler) apart.",
-        verdict(other > FAR * own),
+        verdict(euler > FAR * vi),
     )
 
 
 def _growths(cells: Cells, case: str) -> tuple[tuple[float, float], tuple[float, float], str]:
     """Growth of both methods' optimized costs: expected, of the mean motion alone, and in words."""
     pairs = [_pair(cells, case, method) for method in METHODS]
-    own, other = ((b.cost + b.noise_cost) / (a.cost + a.noise_cost) for a, b in pairs)
-    own_mean, other_mean = (b.cost / a.cost for a, b in pairs)
+    vi, euler = ((b.cost + b.noise_cost) / (a.cost + a.noise_cost) for a, b in pairs)
+    vi_mean, euler_mean = (b.cost / a.cost for a, b in pairs)
     text = (
-        f"Optimized expected cost from {_steps_of(pairs[0][0])}: times {own:.3g} (variational) and {other:.3g} "
-        f"(Euler); of the mean motion alone times {own_mean:.3g} and {other_mean:.3g}"
+        f"Optimized expected cost from {_steps_of(pairs[0][0])}: times {vi:.3g} (variational) and {euler:.3g} "
+        f"(Euler); of the mean motion alone times {vi_mean:.3g} and {euler_mean:.3g}"
     )
-    return (own, other), (own_mean, other_mean), text
+    return (vi, euler), (vi_mean, euler_mean), text
 
 
 def _growth(cells: Cells, case: str) -> Judgement:
-    (own, other), (own_mean, other_mean), text = _growths(cells, case)
-    return f"{text}.", verdict(other > own, other_mean > own_mean)
+    (vi, euler), (vi_mean, euler_mean), text = _growths(cells, case)
+    return f"{text}.", verdict(euler > vi, euler_mean > vi_mean)
 
 
 def _far_growth(cells: Cells, case: str) -> Judgement:
     *growths, text = _growths(cells, case)
-    far = [other - 1.0 > FAR * abs(own - 1.0) for own, other in growths]
+    far = [euler - 1.0 > FAR * abs(vi - 1.0) for vi, euler in growths]
     note = " Only the mean motion's does so; noise makes the growth of both." if far == [False, True] else ""
     return f"{text}.{note}", verdict(far[0])
 
@@ -424,12 +424,12 @@ def _iterations(cells: Cells) -> Judgement:
     }
     if not all(counts.values()):
         raise NotRunError
-    text = "; ".join(f"{method} {min(own)} to {max(own)}" for method, own in counts.items())
-    own, other = (max(numbers) - min(numbers) <= 2 for numbers in counts.values())
-    note = " Both are predictable: here the problem is close to a linear-quadratic one." if own and other else ""
+    text = "; ".join(f"{method} {min(vi)} to {max(vi)}" for method, vi in counts.items())
+    vi, euler = (max(numbers) - min(numbers) <= 2 for numbers in counts.values())
+    note = " Both are predictable: here the problem is close to a linear-quadratic one." if vi and euler else ""
     return (
         f"Iterations over all cases and all steps up to 6e-3 s, from rest on the reference: {text}.{note}",
-        verdict(own, not other),
+        verdict(vi, not euler),
     )
 
 
@@ -459,37 +459,37 @@ def _bandwidth(cells: Cells) -> Judgement:
 
 def _controls(cells: Cells) -> Judgement:
     noisy, plain = (_pair(cells, case, "variational", COARSEST) for case in ("2", "0"))
-    own, quiet = (_controls_apart(*pair, until=0.1) for pair in (noisy, plain))
+    change, quiet = (_controls_apart(*pair, until=0.1) for pair in (noisy, plain))
     fine, coarse = (float(np.abs(a.u - b.u).max() / np.abs(b.u).max()) for a, b in zip(noisy, plain, strict=True))
     return (
-        f"In parts of the largest control: from {noisy[0].dt:g} s to {COARSEST:g} s it changes by {own:.2g} in the "
+        f"In parts of the largest control: from {noisy[0].dt:g} s to {COARSEST:g} s it changes by {change:.2g} in the "
         f"first 0.1 s, without noise by {quiet:.2g}; by the noise {fine:.1e} ({noisy[0].dt:g} s) and {coarse:.1e} "
         f"({COARSEST:g} s).",
-        verdict(own > 0.02, coarse > 0.02 and abs(own - quiet) > 0.5 * own),
+        verdict(change > 0.02, coarse > 0.02 and abs(change - quiet) > 0.5 * change),
     )
 
 
 def _state_dependent(cells: Cells) -> Judgement:
-    (own, other), _, _ = _growths(cells, "3")
+    (vi, euler), _, _ = _growths(cells, "3")
     pairs = [_pair(cells, "3", method) for method in METHODS]
-    own_way, other_way = (_apart(*pair) for pair in pairs)
+    vi_way, euler_way = (_apart(*pair) for pair in pairs)
     return (
-        f"Expected cost from {_steps_of(pairs[0][0])}: times {own:.3g} (variational), times {other:.3g} (Euler), as a "
-        f"kick is countered only at the next decision. Solutions {own_way:.2g} rad and {other_way:.2g} rad apart.",
-        verdict(min(own, other) > 1.5),
+        f"Expected cost from {_steps_of(pairs[0][0])}: times {vi:.3g} (variational), times {euler:.3g} (Euler), as a "
+        f"kick is countered only at the next decision. Solutions {vi_way:.2g} rad and {euler_way:.2g} rad apart.",
+        verdict(min(vi, euler) > 1.5),
     )
 
 
 def _trajectory(cells: Cells) -> Judgement:
     noisy, plain = (_pair(cells, case, "variational") for case in ("3", "0"))
-    own, quiet = (_apart(*pair, slice(1)) for pair in (noisy, plain))
+    change, quiet = (_apart(*pair, slice(1)) for pair in (noisy, plain))
     by_noise = _apart(plain[1], noisy[1], slice(1))
     fine = noisy[0]
     error = float(np.abs(fine.q[:, 0] - [cases.reference(time)[0] for time in fine.t]).max())
     return (
-        f"theta_1 changes from {_steps_of(fine)} by {own:.2g} rad, without noise by {quiet:.2g} rad; by the noise "
+        f"theta_1 changes from {_steps_of(fine)} by {change:.2g} rad, without noise by {quiet:.2g} rad; by the noise "
         f"{by_noise:.2g} rad. Largest tracking error {error:.2g} rad.",
-        verdict(own > 0.1 * error, by_noise > 0.5 * own),
+        verdict(change > 0.1 * error, by_noise > 0.5 * change),
     )
 
 
@@ -498,35 +498,35 @@ def _trajectory(cells: Cells) -> Judgement:
 
 def _excess(cells: Cells, method: str) -> Judgement:
     rows, small, large = [], [], []
-    own, other = ({c.dt: c for c in series(cells, MAIN, "0", name)} for name in (method, "Euler"))
+    plans, eulers = ({c.dt: c for c in series(cells, MAIN, "0", name)} for name in (method, "Euler"))
     for best in series(cells, MAIN, "0", OPTIMUM):
-        if best.dt not in own or best.dt not in other:
+        if best.dt not in plans or best.dt not in eulers:
             continue
-        ours, eulers = (c[best.dt].true_cost / best.true_cost - 1.0 for c in (own, other))
-        rows.append(f"{best.dt:g} s: {ours:.2%} / {eulers:.2%}")
+        excess, worse = (c[best.dt].true_cost / best.true_cost - 1.0 for c in (plans, eulers))
+        rows.append(f"{best.dt:g} s: {excess:.2%} / {worse:.2%}")
         if best.dt <= COARSE:
-            small.append(ours < 0.02)
-            large.append(eulers > 10.0 * ours)
+            small.append(excess < 0.02)
+            large.append(worse > 10.0 * excess)
     if not small:
         raise NotRunError
     return f"Excess (own / Euler), each {_BETTER}: {'; '.join(rows)}.", verdict(all(small), all(large))
 
 
 def _true_cost(cells: Cells) -> Judgement:
-    other = {c.dt: c.true_cost for c in series(cells, MAIN, "0", "Euler")}
-    own = series(cells, MAIN, "0", "variational")
-    wins = [c.true_cost <= other[c.dt] for c in own if c.dt in other]
+    eulers = {c.dt: c.true_cost for c in series(cells, MAIN, "0", "Euler")}
+    plans = series(cells, MAIN, "0", "variational")
+    wins = [c.true_cost <= eulers[c.dt] for c in plans if c.dt in eulers]
     return f"At {sum(wins)} of {len(wins)} steps, of each {_BETTER}.", verdict(*wins)
 
 
 def _gains(cells: Cells) -> Judgement:
     rows, good = [], []
     for setting in (MAIN, *VARIATIONS):
-        own = series(cells, setting, "0", "variational")
-        if len(own) < 6 or ("heavier-1000" not in setting.key and setting is not MAIN):
+        plans = series(cells, setting, "0", "variational")
+        if len(plans) < 6 or ("heavier-1000" not in setting.key and setting is not MAIN):
             continue
-        finest = own[0]
-        usable = [c for c in own[1:] if c.dt >= 4.0 * finest.dt and c.status == "CONVERGED"]
+        finest = plans[0]
+        usable = [c for c in plans[1:] if c.dt >= 4.0 * finest.dt and c.status == "CONVERGED"]
         errors = [np.abs(c.gains - finest.gains).max() / np.abs(finest.gains).max() for c in usable]
         slopes = np.diff(np.log(errors)) / np.diff(np.log([c.dt for c in usable]))
         text = ", ".join(f"{x:.2f}" for x in slopes)
@@ -540,13 +540,13 @@ def _gains(cells: Cells) -> Judgement:
 
 def _under_noise(cells: Cells) -> Judgement:
     rows, good, near = [], [], []
-    for own, other in zip(series_of_noise(cells, STOCHASTIC), series_of_noise(cells, PLAIN), strict=True):
-        (mean, error), (plain, plain_error) = own.sampled, other.sampled
-        predicted = own.cost + own.noise_cost
+    for known, blind in zip(series_of_noise(cells, STOCHASTIC), series_of_noise(cells, PLAIN), strict=True):
+        (mean, error), (plain, plain_error) = known.sampled, blind.sampled
+        predicted = known.cost + known.noise_cost
         apart = (plain - mean) / np.hypot(error, plain_error) if np.isfinite(plain) else np.inf
         text = f"{plain:.4g} ({apart:.0f} standard errors more)" if np.isfinite(plain) else "some paths run away"
         rows.append(
-            f"C = {cases.strength_of(own.case):g}: predicted {predicted:.4g}, "
+            f"C = {cases.strength_of(known.case):g}: predicted {predicted:.4g}, "
             f"S-DDP {mean:.4g} +- {error:.1g}, DDP {text}"
         )
         good.append(apart > 4.0)
@@ -569,18 +569,18 @@ def _hinge(cells: Cells, setting: Setting) -> Judgement:
             f"({b.status.lower().replace('_', ' ')}), true cost at {COARSE:g} s {_both(b)}"
         )
     names = OPTIMUM, "variational", "Euler", cases.FOURTH_ORDER
-    best, own, other, fourth = (cell(cells, "0", method, COARSE, setting) for method in names)
+    best, vi, euler, fourth = (cell(cells, "0", method, COARSE, setting) for method in names)
     parts += [f"fourth order: true cost {_both(fourth)}", f"sampled-data optimum {best.true_cost:.4g}, {_BETTER}"]
     # Being better than Euler is no merit where the plan is of no use.
-    useful = own.true_cost <= 1.1 * best.true_cost and own.status == "CONVERGED"
+    useful = vi.true_cost <= 1.1 * best.true_cost and vi.status == "CONVERGED"
     flatter = abs(factors[0] - 1.0) < abs(factors[1] - 1.0)
     return (
         f"From dt = {fine:g} s to {COARSE:g} s: {'; '.join(parts)}.",
-        verdict(useful, useful and own.true_cost <= other.true_cost, useful and flatter),
+        verdict(useful, useful and vi.true_cost <= euler.true_cost, useful and flatter),
     )
 
 
 def _both(c: Cell) -> str:
     """Both true costs in words."""
-    own, fed = (f"{x:.4g}" if np.isfinite(x) else "(runs away)" for x in (c.open_loop, c.closed_loop))
-    return f"{own} open loop and {fed} with feedback"
+    opened, fed = (f"{x:.4g}" if np.isfinite(x) else "(runs away)" for x in (c.open_loop, c.closed_loop))
+    return f"{opened} open loop and {fed} with feedback"

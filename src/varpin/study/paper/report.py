@@ -56,7 +56,7 @@ def write(
         figure.savefig(stream, format="png", dpi=110)
         images[name] = stream.getvalue()
         _write(folder / f"{name}.png", images[name])
-    rows = ([column(own) for column in _COLUMNS.values()] for own in cells.values())
+    rows = ([column(cell) for column in _COLUMNS.values()] for cell in cells.values())
     _write(folder / "table1.csv", csv_text(_COLUMNS, rows).encode())
     rows = ([claim.source, claim.sentence, claim.measured, claim.verdict] for claim in claims)
     _write(folder / "claims.csv", csv_text(("source", "sentence", "measured", "verdict"), rows).encode())
@@ -116,8 +116,8 @@ def _table(cells: Cells) -> str:
     names = list(_COLUMNS)[1:]
     for case in (*(case.key for case in CASES), "0"):
         for method in (*METHODS, FOURTH_ORDER, OPTIMUM):
-            for own in series(cells, MAIN, case, method):
-                rows.append("".join(f"<td>{_entry(own, name)}</td>" for name in names))
+            for cell in series(cells, MAIN, case, method):
+                rows.append("".join(f"<td>{_entry(cell, name)}</td>" for name in names))
     head = "".join(f"<th>{html.escape(name)}</th>" for name in names)
     return f"<table><tr>{head}</tr>" + "".join(f"<tr>{row}</tr>" for row in rows) + "</table>"
 
