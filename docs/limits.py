@@ -23,7 +23,8 @@ import varpin as vp
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.study.extremes import PLANS, TRIALS, Cell, Kind, Record, Trial
 from varpin.study.extremes.battery import INTEGRATORS, families
-from varpin.study.extremes.checks import LEVELS, Exact, exact_motion
+from varpin.study.extremes.exact import Exact, exact_motion
+from varpin.study.extremes.trial import LEVELS
 
 DOCUMENT = Path(__file__).resolve().parent / "limits.md"
 sys.path.insert(0, str(DOCUMENT.parents[1] / "benchmarks"))

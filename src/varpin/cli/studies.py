@@ -100,7 +100,8 @@ def add_advise(parser: argparse.ArgumentParser) -> None:
 
 
 def _advise(request: argparse.Namespace, _errors: Console) -> int:
-    from varpin.show.tradeoff_report import ADVICE_COLUMNS, advice_cells, write_advice  # noqa: PLC0415 - as above
+    from varpin.show.tradeoff_report import write_advice  # noqa: PLC0415 - as above
+    from varpin.study.tradeoff.advice import COLUMNS  # noqa: PLC0415
 
     folder = None if request.out is None else folder_at(request.out)
     scene, q0, v0, torque = motion_of(request)
@@ -117,9 +118,9 @@ def _advise(request: argparse.Namespace, _errors: Console) -> int:
     for line in advice.reason.splitlines():
         say(console, line, prefix="")
     say(console, simulate_words(request, advice.integrator, advice.dt, advice.steps), prefix="run it")
-    table = table_of("The best of each method", ADVICE_COLUMNS)
+    table = table_of("The best of each method", COLUMNS)
     for choice in (advice.best, *advice.alternatives):
-        add_row(table, *advice_cells(choice))
+        add_row(table, *choice.cells())
     console.print(table)
     say(console, f"(found in {advice.calibration:.2g} s)", prefix="")
     if folder is not None:

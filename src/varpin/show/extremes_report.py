@@ -11,7 +11,9 @@ from pathlib import Path
 from varpin.io.archive import atomic_file
 from varpin.study.extremes import Cell, Kind, Record
 from varpin.study.extremes.battery import families
+from varpin.study.extremes.trial import LEVELS
 from varpin.support.checks import writable
+from varpin.support.markup import page
 
 # What a kind looks like: a letter for those who see no colours, and a colour for those who do (after Okabe and Ito).
 LETTERS = {Kind.ACCURATE: "A", Kind.DEGRADED: "D", Kind.REFUSED: "R", Kind.STOPPED: "S", Kind.WRONG: "W"}
@@ -30,9 +32,9 @@ _MEANING = {
     Kind.WRONG: "a check fails, and varpin says nothing",
 }
 _STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; max-width: 88rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-table { border-collapse: collapse; font-size: 0.78rem; margin: 1rem 0; }
-th { text-align: left; font-weight: 600; padding: 0.15rem 0.5rem; }
+body { font-size: 15px; max-width: 88rem; }
+table { font-size: 0.78rem; }
+th { border: 0; font-weight: 600; padding: 0.15rem 0.5rem; }
 thead th { position: sticky; top: 0; background: #fff; font-size: 0.72rem; vertical-align: bottom; }
 td { border: 1px solid #fff; padding: 0.15rem 0.4rem; min-width: 4.2rem; text-align: right; white-space: nowrap; }
 td.name { text-align: left; } tr.family th { padding-top: 0.8rem; font-size: 0.9rem; border-bottom: 1px solid #bbb; }
@@ -98,20 +100,16 @@ def _page(record: Record) -> str:
         f'<dt class="{_class(kind, math.nan)}">{LETTERS[kind]} {kind.value}: {counts[kind]}</dt><dd>{text}</dd>'
         for kind, text in _MEANING.items()
     )
-    head = "".join(f"<th>{_broken(name)}</th>" for name in columns)
-    title = f"Varpin at the extremes: {html.escape(record.robot)}"
+    head = "".join(f"<th>{html.escape(name).replace('(', '<br>(')}</th>" for name in columns)
     missing = f" An interruption left out {record.missing} cells." if record.missing else ""
-    return f"""<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style></head><body>
-<h1>{title}</h1>
-<p>varpin {html.escape(record.version)}. Errors are the largest distance in q from the exact motion over some periods,
+    body = f"""<p>varpin {html.escape(record.version)}.
+Errors are the largest distance in q from the exact motion over some periods,
 in units of how far that motion goes; E stands before the error of the energy balance over the whole run, in units of
 the energy there is to turn over, where no exact motion is known. Point at a cell for all of its measures.{missing}</p>
 <dl>{legend}</dl>
 <p>{false_alarms(record)}</p>
-<table><thead><tr><th>scene</th>{head}</tr></thead><tbody>{"".join(_rows(columns, rows))}</tbody></table>
-</body></html>
-"""
+<table><thead><tr><th>scene</th>{head}</tr></thead><tbody>{"".join(_rows(columns, rows))}</tbody></table>"""
+    return page(f"Varpin at the extremes: {record.robot}", body, _STYLE)
 
 
 def _rows(columns: list[str], rows: list[tuple[str, str, dict[str, Cell]]]) -> Iterable[str]:
@@ -131,8 +129,7 @@ def _box(cell: Cell) -> str:
 
 def details(cell: Cell) -> str:
     """All there is to say of a cell."""
-    names = ("error", "joint", "velocity", "period", "energy", "momentum", "reversal", "symplecticity", "record")
-    values = [f"{name} {getattr(cell, name):.2g}" for name in names if not math.isnan(getattr(cell, name))]
+    values = [f"{name} {getattr(cell, name):.2g}" for name in LEVELS if not math.isnan(getattr(cell, name))]
     kind = f"{cell.kind.value}, needlessly" if cell.needless else cell.kind.value
     lines = [f"{kind}; {cell.done} of {cell.steps} steps, {cell.seconds:.2g} s", ", ".join(values)]
     return "\n".join(line for line in (*lines, *cell.found, *cell.said) if line)
@@ -142,7 +139,3 @@ def _class(kind: Kind, error: float) -> str:
     if kind is not Kind.ACCURATE:
         return "wrong" if kind is Kind.WRONG else str(kind.value)
     return "accurate2" if error > 1e-2 else "accurate1" if error > 1e-6 else "accurate0"
-
-
-def _broken(name: str) -> str:
-    return html.escape(name).replace("(", "<br>(")

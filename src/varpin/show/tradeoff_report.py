@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import io
 import math
@@ -15,20 +14,13 @@ from varpin._version import __version__
 from varpin.io.archive import atomic_file
 from varpin.show.plots import plot_advice, plot_work_precision
 from varpin.study.tradeoff import Advice, WorkPrecision, WorkPrecisionRun
-from varpin.study.tradeoff.advice import Choice
+from varpin.study.tradeoff.advice import COLUMNS as _ADVICE_COLUMNS
+from varpin.support.markup import page, picture
 
 # Heading and text of a run in the table.
 COLUMNS = ("integrator", "dt [s]", "wall time [s]", "error in q", "energy error [J]", "end effector [m]", "note")
-ADVICE_COLUMNS = ("integrator", "dt [s]", "steps", "predicted time [s]", "predicted error in q", "note")
 
-_STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-table { border-collapse: collapse; margin: 1rem 0; font-size: 0.85rem; }
-td, th { border: 1px solid #ccc; padding: 0.25rem 0.6rem; text-align: right; vertical-align: top; }
-td.text, th { text-align: left; }
-tr.front { background: #dff2e1; }
-img { max-width: 100%; }
-"""
+_STYLE = "tr.front { background: #dff2e1; }"
 
 
 def cells(record: WorkPrecision, run: WorkPrecisionRun, front: bool) -> tuple[str, ...]:
@@ -55,14 +47,14 @@ def write_report(folder: Path, record: WorkPrecision, title: str) -> list[Path]:
     Raises:
         FileError: A file cannot be written.
     """
-    table, figure, page = (folder / f"tradeoff.{kind}" for kind in ("csv", "png", "html"))
+    table, figure, document = (folder / f"tradeoff.{kind}" for kind in ("csv", "png", "html"))
     record.to_csv(table)
     image = b""
     if record.pareto():
         image = _write_image(figure, plot_work_precision(record)[0])
-    with atomic_file(page) as file:
+    with atomic_file(document) as file:
         file.write(_page(record, title, image).encode())
-    return [path for path in (table, figure, page) if path != figure or image]
+    return [path for path in (table, figure, document) if path != figure or image]
 
 
 def write_advice(folder: Path, advice: Advice, title: str) -> list[Path]:
@@ -73,26 +65,19 @@ def write_advice(folder: Path, advice: Advice, title: str) -> list[Path]:
     Raises:
         FileError: A file cannot be written.
     """
-    figure, page = (folder / f"advice.{kind}" for kind in ("png", "html"))
+    figure, document = (folder / f"advice.{kind}" for kind in ("png", "html"))
     choices = advice.best, *advice.alternatives
     image = b""
     if any(math.isfinite(choice.error) and choice.error > 0.0 for choice in choices):
         image = _write_image(figure, plot_advice(advice)[0])
-    rows = [(advice_cells(choice), choice is advice.best and advice.reached) for choice in choices]
+    rows = [(choice.cells(), choice is advice.best and advice.reached) for choice in choices]
     said = "</p><p>".join(html.escape(line) for line in advice.reason.splitlines())
     text = f"""{said}</p>
 <p>varpin {__version__}. Times are predicted for this machine, on one thread, without the look at the finished
 motion."""
-    with atomic_file(page) as file:
-        file.write(_document(title, text, "predicted error over time", image, ADVICE_COLUMNS, rows).encode())
-    return [path for path in (figure, page) if path != figure or image]
-
-
-def advice_cells(choice: Choice) -> tuple[str, ...]:
-    """A choice as the entries of :data:`ADVICE_COLUMNS`."""
-    error = f"{choice.error:.2e}" if math.isfinite(choice.error) else "unknown"
-    note = "" if choice.measured else "by the method's order"
-    return str(choice.integrator), f"{choice.dt:.4g}", str(choice.steps), f"{choice.seconds:.2e}", error, note
+    with atomic_file(document) as file:
+        file.write(_document(title, text, "predicted error over time", image, _ADVICE_COLUMNS, rows).encode())
+    return [path for path in (figure, document) if path != figure or image]
 
 
 def _write_image(path: Path, figure: Figure | SubFigure) -> bytes:
@@ -125,15 +110,8 @@ def _document(
     """A page of a paragraph, which is markup, a picture and a table, some of whose rows stand out."""
     head = "".join(f"<th>{html.escape(name)}</th>" for name in columns)
     body = "".join(_row(entries, marked) for entries, marked in rows)
-    picture = f'<img alt="{caption}" src="data:image/png;base64,{base64.b64encode(image).decode()}">' if image else ""
-    return f"""<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>
-<h1>{html.escape(title)}</h1>
-<p>{text}</p>
-{picture}
-<table><tr>{head}</tr>{body}</table>
-</body></html>
-"""
+    figure = picture(image, caption) if image else ""
+    return page(title, f"<p>{text}</p>\n{figure}\n<table><tr>{head}</tr>{body}</table>", _STYLE)
 
 
 def _row(entries: tuple[str, ...], front: bool) -> str:

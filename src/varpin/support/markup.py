@@ -1,12 +1,21 @@
-"""What objects look like in a notebook: tables in HTML, of plain text that is escaped here."""
+"""HTML: tables of objects in a notebook, whose plain text is escaped here, and pages of reports."""
 
 from __future__ import annotations
 
+import base64
 import html
 from collections.abc import Iterable, Sequence
 
 # Longer tables say how much they leave out.
 _MOST = 50
+
+_PAGE_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
+table { border-collapse: collapse; margin: 1rem 0; font-size: 0.85rem; }
+td, th { border: 1px solid #ccc; padding: 0.25rem 0.6rem; text-align: right; vertical-align: top; }
+td.text, th { text-align: left; }
+img { max-width: 100%; }
+"""
 
 _LEFT, _RIGHT = "text-align: left; vertical-align: top", "text-align: right; vertical-align: top"
 
@@ -56,3 +65,18 @@ def _text(value: object) -> str:
 def said(warnings: Sequence[str]) -> str:
     """How many warnings there are, for one line; nothing if there are none."""
     return f", {len(warnings)} warning{'s' * (len(warnings) > 1)}" if warnings else ""
+
+
+def page(title: str, body: str, style: str = "") -> str:
+    """A whole page of a title, a body that is markup, and rules of style beside those of all pages."""
+    return f"""<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>{_text(title)}</title><style>{_PAGE_STYLE}{style}</style></head>
+<body><h1>{_text(title)}</h1>
+{body}
+</body></html>
+"""
+
+
+def picture(png: bytes, caption: str) -> str:
+    """A picture inside a page."""
+    return f'<img alt="{_text(caption)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'

@@ -1,7 +1,8 @@
-"""Tables in plain text, for terminals and for print()."""
+"""Tables in plain text: for terminals, for print(), and as CSV."""
 
 from __future__ import annotations
 
+import csv
 import io
 from collections.abc import Iterable, Sequence
 
@@ -33,6 +34,15 @@ def add_row(table: Table, *cells: str, style: str = "") -> None:
     """Add a row of plain words to a table."""
     # As Text: rich takes what stands in brackets for markup, and units stand in brackets.
     table.add_row(*(Text(cell) for cell in cells), style=style)
+
+
+def csv_text(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    """Rows under their headings as CSV."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def plain(parts: Iterable[RenderableType]) -> str:

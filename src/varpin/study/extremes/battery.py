@@ -8,9 +8,8 @@ import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
 
 from varpin._version import __version__
 from varpin.errors import VarpinError
@@ -19,11 +18,11 @@ from varpin.io.archive import load_json, save_json
 from varpin.model import Robot
 from varpin.simulation import limits
 from varpin.simulation.run import Interrupted, simulate
-from varpin.study.extremes import plans
-from varpin.study.extremes.checks import Exact, condition, exact_motion, findings, finite, measures
-from varpin.study.extremes.plans import PLANS, Plan
+from varpin.study.extremes.checks import condition, findings, finite, measures
+from varpin.study.extremes.exact import Exact, exact_motion
+from varpin.study.extremes.plans import PLANS, Plan, judge_plan
 from varpin.study.extremes.scenes import TRIALS, trials_on
-from varpin.study.extremes.trial import Cell, Kind, Setup, Trial
+from varpin.study.extremes.trial import LEVELS, Cell, Kind, Outcome, Setup, Trial, line_of
 from varpin.support.checks import positive, writable
 from varpin.trajectory import Trajectory
 
@@ -45,11 +44,11 @@ _SAVED_EVERY = 2.0
 Progress = Callable[[int, int, str], None]
 # What no coarse step excuses: a record that contradicts itself, and derivatives without their structure.
 _STRUCTURE = ("record", "symplecticity")
-_MEASURES = ("error", "joint", "velocity", "period", "energy", "momentum", "reversal", "symplecticity", "record")
+_MEASURES = tuple(LEVELS)
 
 
 class _OutOfTime(KeyboardInterrupt):
-    """Ends a motion that takes too long, through the door for Ctrl-C."""
+    """Ends a motion that takes too long, as Ctrl-C does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,38 +142,38 @@ def run(
     path = None if save is None else writable(save)
     known = Record.load(path).cells if path is not None and path.exists() else ()
     done = {cell.fingerprint: cell for cell in known}
-    chores = {
+    jobs = {
         fingerprint(trial, member, name, limit): (trial, member)
         for trial in trials
         for member in members
         if trial.takes(member)
     }
-    cells = {mark: done[mark] for mark in chores if mark in done}
-    said = time.monotonic()
+    cells = {key: done[key] for key in jobs if key in done}
+    saved = time.monotonic()
 
-    def now() -> Record:
-        # What is known already stays known, however early an interruption comes.
-        return Record(tuple(cells[mark] for mark in chores if mark in cells), name, deep, len(chores) - len(cells))
+    def current() -> Record:
+        # Cells of an earlier run stay, however early an interruption comes.
+        return Record(tuple(cells[key] for key in jobs if key in cells), name, deep, len(jobs) - len(cells))
 
     try:
         bench = None
-        for mark, (trial, member) in chores.items():
-            if mark in cells:
+        for key, (trial, member) in jobs.items():
+            if key in cells:
                 continue
             if progress is not None:
-                progress(len(cells), len(chores), f"{trial.name}, {member}")
+                progress(len(cells), len(jobs), f"{trial.name}, {member}")
             if bench is None or bench.trial is not trial:
                 bench = Bench(trial)
             # A plan cut short is another plan; it has its number of iterations.
-            cells[mark] = bench.run(member, limit if isinstance(trial, Trial) or patience else math.inf, mark)
-            if path is not None and time.monotonic() - said > _SAVED_EVERY:
-                now().save(path)
-                said = time.monotonic()
+            cells[key] = bench.run(member, limit if isinstance(trial, Trial) or patience else math.inf, key)
+            if path is not None and time.monotonic() - saved > _SAVED_EVERY:
+                current().save(path)
+                saved = time.monotonic()
     except KeyboardInterrupt:
         pass
     if path is not None:
-        now().save(path)
-    return now()
+        current().save(path)
+    return current()
 
 
 @cache
@@ -199,98 +198,101 @@ class Bench:
 
     def __init__(self, trial: Trial | Plan) -> None:
         self.trial = trial
-        self._setup: Setup | None = None
         self._exact: dict[bool, Exact | None] = {}
 
-    def run(self, integrator: Integrator, patience: float, mark: str = "") -> Cell:
+    def run(self, integrator: Integrator, patience: float, key: str = "") -> Cell:
         """The trial with one integrator."""
-        begin = time.perf_counter()
-        if isinstance(self.trial, Plan):
-            outcome = plans.attempt(self.trial, integrator, patience)
+        trial, begin = self.trial, time.perf_counter()
+        if isinstance(trial, Plan):
+            outcome = judge_plan(trial, integrator, patience)
         else:
-            outcome = self._motion(self.trial, integrator, patience)
+            try:
+                outcome = self._judge_motion(trial, integrator, patience)
+            except Exception as error:
+                outcome = Outcome.of_error(error, Kind.REFUSED)
         return Cell(
-            family=self.trial.family,
-            trial=self.trial.name,
+            family=trial.family,
+            trial=trial.name,
             integrator=str(integrator),
-            steps=self.trial.steps,
+            kind=outcome.kind,
+            said=outcome.said,
+            found=outcome.found,
+            done=outcome.done,
+            steps=trial.steps,
             seconds=round(time.perf_counter() - begin, 3),
-            fingerprint=mark,
-            **outcome,
+            fingerprint=key,
+            **dict.fromkeys(_MEASURES, math.nan) | outcome.measures,
         )
 
-    def _motion(self, trial: Trial, integrator: Integrator, patience: float) -> dict[str, Any]:
-        nothing = dict.fromkeys(_MEASURES, math.nan)
-        try:
-            trajectory, complaint = self._simulate(trial, integrator, patience)
-            found = measures(self._setup, integrator, trajectory, self._truth(trial, integrator))  # type: ignore[arg-type]
-        except VarpinError as error:
-            return nothing | {"kind": Kind.REFUSED, "said": (_line(error),), "found": (), "done": 0}
-        except Exception as error:
-            # Whatever has no name of varpin's own is a fault, and the others are worth having.
-            text = (f"unnamed error: {type(error).__name__}: {error}",)
-            return nothing | {"kind": Kind.WRONG, "said": (), "found": text, "done": 0}
-        wrong = findings(found, integrator, condition(self._setup))  # type: ignore[arg-type]
-        said = tuple(sentence for sentence in trajectory.warnings if not sentence.startswith(limits.KINDS))
+    @cached_property
+    def _setup(self) -> Setup:
+        assert isinstance(self.trial, Trial)
+        return self.trial.build()
+
+    def _judge_motion(self, trial: Trial, integrator: Integrator, patience: float) -> Outcome:
+        trajectory, error = _simulated(self._setup, trial, integrator, patience)
+        found = measures(self._setup, integrator, trajectory, self._exact_motion(trial, integrator))
+        wrong = findings(found, integrator, condition(self._setup))
+        warnings = (warning for warning in trajectory.warnings if not warning.startswith(limits.KINDS))
+        said = (*(() if error is None else (line_of(error),)), *warnings)
         if not finite(trajectory):
             kind, wrong = Kind.WRONG, ("the record is not finite", *wrong)
-        elif any(sentence.startswith(_STRUCTURE) for sentence in wrong):
+        elif any(text.startswith(_STRUCTURE) for text in wrong):
             kind = Kind.WRONG
-        elif complaint is not None:
+        elif error is not None:
             kind = Kind.STOPPED
         elif said:
             kind = Kind.DEGRADED
         else:
             kind = Kind.WRONG if wrong else Kind.ACCURATE
-        said = said if complaint is None else (complaint, *said)
-        return found | {"kind": kind, "said": said, "found": wrong, "done": trajectory.steps}
+        return Outcome(kind, found, said, wrong, trajectory.steps)
 
-    def _simulate(self, trial: Trial, integrator: Integrator, patience: float) -> tuple[Trajectory, str | None]:
-        """The motion, as far as it goes, and the named error that stopped it."""
-        if self._setup is None:
-            self._setup = trial.build()
-        setup, begin = self._setup, time.process_time()
-
-        def watch(done: int, steps: int) -> None:
-            if done < steps and time.process_time() - begin > patience:
-                raise _OutOfTime
-
-        try:
-            return simulate(
-                setup.scene,
-                setup.q0,
-                setup.v0,
-                dt=trial.dt,
-                steps=trial.steps,
-                controls=setup.controls,
-                increments=setup.increments,
-                integrator=integrator,
-                progress=watch,
-            ), None
-        except Interrupted as error:
-            if time.process_time() - begin <= patience:
-                raise
-            return error.trajectory, None
-        except VarpinError as error:
-            kept = getattr(error, "trajectory", None)
-            if kept is None:
-                raise
-            return kept, _line(error)
-
-    def _truth(self, trial: Trial, integrator: Integrator) -> Exact | None:
-        """The exact motion, computed once; None where even the reference cannot."""
+    def _exact_motion(self, trial: Trial, integrator: Integrator) -> Exact | None:
+        """The exact motion, computed once; None where even that cannot be integrated."""
         # The explicit Euler method kicks beside its step: the way of that step does not know of it.
-        late = isinstance(integrator, ExplicitEuler) and self._setup is not None and self._setup.increments is not None
-        if late not in self._exact and self._setup is not None:
+        late = isinstance(integrator, ExplicitEuler) and self._setup.increments is not None
+        if late not in self._exact:
             try:
                 self._exact[late] = exact_motion(self._setup, trial.dt, trial.steps, trial.window, late=late)
             except VarpinError:
                 self._exact[late] = None
-        return self._exact.get(late)
+        return self._exact[late]
 
 
-def _line(error: BaseException) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+def _simulated(
+    setup: Setup, trial: Trial, integrator: Integrator, patience: float
+) -> tuple[Trajectory, VarpinError | None]:
+    """The motion, as far as it goes, and the error that stopped it.
+
+    Raises:
+        VarpinError: It is refused before anything ran.
+    """
+    begin = time.process_time()
+
+    def stop_late(done: int, steps: int) -> None:
+        if done < steps and time.process_time() - begin > patience:
+            raise _OutOfTime
+
+    try:
+        return simulate(
+            setup.scene,
+            setup.q0,
+            setup.v0,
+            dt=trial.dt,
+            steps=trial.steps,
+            controls=setup.controls,
+            increments=setup.increments,
+            integrator=integrator,
+            progress=stop_late,
+        ), None
+    except Interrupted as error:
+        if time.process_time() - begin <= patience:
+            raise
+        return error.trajectory, None
+    except VarpinError as error:
+        if getattr(error, "trajectory", None) is None:
+            raise
+        return error.trajectory, error  # type: ignore[attr-defined]
 
 
 def families(cells: Iterable[Cell]) -> dict[str, list[str]]:

@@ -23,7 +23,7 @@ from varpin.model import Robot
 from varpin.model.chain import rod_chain
 from varpin.simulation.run import simulate
 from varpin.study.extremes.checks import energy_error
-from varpin.study.extremes.trial import LEVELS, Kind
+from varpin.study.extremes.trial import LEVELS, Kind, Outcome
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -42,7 +42,8 @@ _PLANNERS = (Midpoint(), Gauss(stages=4), ExplicitEuler())
 _QUIET = 1e-4
 # Controls that are varied one by one.
 _VARIED = 12
-_UP = -0.5 * math.pi  # of a rod whose angle is 0 along x and turns down
+# Angle of a rod that stands upright: at 0 it lies along x, and turns down.
+UP = -0.5 * math.pi
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,11 +80,11 @@ class Task:
         t, q, u, dt = motion.t, motion.q, motion.u, motion.dt
         given = np.atleast_2d(self.reference)
         # Between its rows a reference is straight.
-        places = np.linspace(0.0, len(given) - 1.0, len(q))
-        rows = np.stack([np.interp(places, np.arange(len(given)), column) for column in given.T], axis=1)
+        at = np.linspace(0.0, len(given) - 1.0, len(q))
+        rows = np.stack([np.interp(at, np.arange(len(given)), column) for column in given.T], axis=1)
         path, tracking = scipy.interpolate.CubicHermiteSpline(t, q, motion.v), 0.0
-        for place in (0.5 - math.sqrt(3.0) / 6.0, 0.5 + math.sqrt(3.0) / 6.0):
-            off = path(t[:-1] + place * dt) - ((1.0 - place) * rows[:-1] + place * rows[1:])
+        for part in (0.5 - math.sqrt(3.0) / 6.0, 0.5 + math.sqrt(3.0) / 6.0):
+            off = path(t[:-1] + part * dt) - ((1.0 - part) * rows[:-1] + part * rows[1:])
             tracking += 0.5 * (off**2).sum()
         running = dt * (self.tracking * tracking + self.effort * (u**2).sum())
         return float(running + self.final * ((q[-1] - rows[-1]) ** 2).sum())
@@ -106,77 +107,73 @@ class Plan:
         return integrator in _PLANNERS
 
 
-def attempt(plan: Plan, integrator: Integrator, patience: float = math.inf) -> dict[str, Any]:
-    """Solve it, within about this time [s], and judge the solution: what a cell holds."""
-    outcome: dict[str, Any] = dict.fromkeys(
-        ("error", "joint", "velocity", "period", "energy", "momentum", "reversal", "symplecticity", "record"), math.nan
-    ) | {"said": (), "found": (), "done": 0}
+def judge_plan(plan: Plan, integrator: Integrator, patience: float = math.inf) -> Outcome:
+    """Solve it, within about this time [s], and judge the solution."""
     try:
         task = plan.build()
         problem = task.problem(plan.dt, plan.steps, integrator)
     except VarpinError as error:
-        return outcome | {"kind": Kind.REFUSED, "said": (_line(error),)}
+        return Outcome.of_error(error, Kind.REFUSED)
     try:
-        with _heard() as warnings:
+        with _logged() as warnings:
             solution = solve(problem, task.controls, max_iterations=plan.iterations, time_limit=patience)
-    except VarpinError as error:
-        done = getattr(getattr(error, "trajectory", None), "steps", 0)
-        return outcome | {"kind": Kind.STOPPED, "said": (_line(error),), "done": done}
     except Exception as error:
-        return outcome | {"kind": Kind.WRONG, "found": (f"unnamed error: {type(error).__name__}: {error}",)}
+        done = getattr(getattr(error, "trajectory", None), "steps", 0)
+        return Outcome.of_error(error, Kind.STOPPED, done)
+    converged = solution.status.converged
+    said = (*(() if converged else (solution.status.value,)), *warnings)
     record, left = cost_error(task, solution), part_left(task, solution)
-    found = []
-    # Written such that NaN is found.
-    if not record <= COST_LEVEL:
-        found.append(f"cost off by {record:.2g} of itself (wrong from {COST_LEVEL:g})")
-    if not (np.isfinite(solution.gains).all() and np.isfinite(solution.feedforward).all()):
-        found.append("the policy is not finite")
-    # No word excuses a cost that is not the plan's own; one that is not the least, that it is not claimed to be.
-    wrong = bool(found)
-    if not (math.isnan(left) or left <= LEFT_LEVEL):
-        wrong = wrong or solution.status.converged
-        found.append(f"single controls take {left:.2g} off the cost (wrong from {LEFT_LEVEL:g})")
-    said = (*(() if solution.status.converged else (solution.status.value,)), *warnings)
-    energy = energy_error(problem.scene, solution.trajectory)
-    if energy > LEVELS["energy"]:
-        wrong = wrong or not said
-        found.append(f"energy {energy:.2g} (wrong from {LEVELS['energy']:g})")
-    # What is said of a plan is mostly of what the robot pays, which takes a while to find out.
+    energy, restless = energy_error(problem.scene, solution.trajectory), changes(solution.trajectory)
+    # Each rule: what is wrong, and whether what was said does not excuse it. No word excuses a cost that is not the
+    # plan's own; one that is not the least, that it is not claimed to be. Written such that NaN is wrong.
+    rules = (
+        (not record <= COST_LEVEL, f"cost off by {record:.2g} of itself (wrong from {COST_LEVEL:g})", True),
+        (
+            not (np.isfinite(solution.gains).all() and np.isfinite(solution.feedforward).all()),
+            "the policy is not finite",
+            True,
+        ),
+        (
+            not (math.isnan(left) or left <= LEFT_LEVEL),
+            f"single controls take {left:.2g} off the cost (wrong from {LEFT_LEVEL:g})",
+            converged,
+        ),
+        (energy > LEVELS["energy"], f"energy {energy:.2g} (wrong from {LEVELS['energy']:g})", not said),
+        (
+            restless > max(_RESTLESS * plan.steps / 100.0, _FEW),
+            f"a velocity goes up and down {restless} times in {plan.steps} steps",
+            not said,
+        ),
+    )
+    found = [text for broken, text, _ in rules if broken]
+    # Most warnings of a plan are of what the robot pays, which takes a while to find out.
     if said and not abs(paid := paid_by_robot(task, solution)) <= PAID_LEVEL:
         found.append(f"the robot pays {paid:+.2g} of the cost more for its controls (worth a word from {PAID_LEVEL:g})")
-    restless = changes(solution.trajectory)
-    if restless > max(_RESTLESS * plan.steps / 100.0, _FEW):
-        wrong = wrong or not said
-        found.append(f"a velocity goes up and down {restless} times in {plan.steps} steps")
-    # Plans have a number of iterations here; one that it cuts short is no better and no worse than that.
-    cut = solution.status is Status.MAX_ITERATIONS
-    kind = Kind.WRONG if wrong else Kind.STOPPED if cut else Kind.DEGRADED if said else Kind.ACCURATE
-    return outcome | {
-        "kind": kind,
-        "error": left,
-        "energy": energy,
-        "record": record,
-        "said": said,
-        "found": tuple(found),
-        "done": plan.steps,
-    }
+    if any(broken and unexcused for broken, _, unexcused in rules):
+        kind = Kind.WRONG
+    elif solution.status is Status.MAX_ITERATIONS:
+        # Plans have a number of iterations here; one that it cuts short is no better and no worse than that.
+        kind = Kind.STOPPED
+    else:
+        kind = Kind.DEGRADED if said else Kind.ACCURATE
+    return Outcome(kind, {"error": left, "energy": energy, "record": record}, said, tuple(found), plan.steps)
 
 
 @contextlib.contextmanager
-def _heard() -> Iterator[list[str]]:
-    """What the solver warns of within this context."""
-    heard: list[str] = []
+def _logged() -> Iterator[list[str]]:
+    """The solver's warnings within this context."""
+    messages: list[str] = []
 
-    class Ear(logging.Handler):
+    class Collector(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            heard.append(record.getMessage())
+            messages.append(record.getMessage())
 
-    logger, ear = logging.getLogger("varpin.control"), Ear(logging.WARNING)
-    logger.addHandler(ear)
+    logger, collector = logging.getLogger("varpin.control"), Collector(logging.WARNING)
+    logger.addHandler(collector)
     try:
-        yield heard
+        yield messages
     finally:
-        logger.removeHandler(ear)
+        logger.removeHandler(collector)
 
 
 def cost_error(task: Task, solution: Solution) -> float:
@@ -252,10 +249,6 @@ def _gain(task: Task, solution: Solution, change: float) -> float:
     return gain * len(cells) / len(chosen) / max(here, np.finfo(np.float64).tiny)
 
 
-def _line(error: BaseException) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
-
-
 def _arm(
     links: int = 2,
     *,
@@ -281,28 +274,26 @@ def _plans() -> Iterator[Plan]:
         yield Plan(f"{steps} nodes", "plans: horizon", _arm(), 1e-2, steps)
     yield Plan("1e4 nodes", "plans: horizon", _arm(1), 1e-2, 10_000)
     yield Plan("1e5 nodes", "plans: horizon", _arm(1), 1e-2, 100_000, deep=True)
-    for weight in (1e-9, 1e-3, 1e3, 1e9):
-        yield Plan(f"tracking weight {weight:g}", "plans: weights", _arm(tracking=weight, final=weight), 1e-2, 100)
-    for weight in (0.0, 1e-9, 1e9):
-        yield Plan(f"control weight {weight:g}", "plans: weights", _arm(effort=weight), 1e-2, 100)
-    yield Plan("all weights 1e-9", "plans: weights", _arm(tracking=1e-9, effort=1e-9, final=1e-9), 1e-2, 100)
-    yield Plan("all weights 1e9", "plans: weights", _arm(tracking=1e9, effort=1e9, final=1e9), 1e-2, 100)
+    weights, request, actuation, noise = (f"plans: {part}" for part in ("weights", "request", "actuation", "noise"))
     jumps = np.where(np.arange(101) % 2 == 0, 10.0, -10.0)[:, None] * np.ones(2)
-    yield Plan("reference jumps by 20 rad a step", "plans: request", _arm(reference=jumps), 1e-2, 100)
-    yield Plan("reference at 1e6 rad", "plans: request", _arm(reference=1e6), 1e-2, 100)
-    up = _arm(q0=[_UP, 0.0], reference=[_UP, 0.0], controls=np.array([2.0, -1.0]))
-    yield Plan("upright, pushed over at first", "plans: request", up, 1e-2, 200)
-    wild = _arm(controls=np.array([1e4, -1e4]))
-    yield Plan("first controls of 1e4 N m", "plans: request", wild, 1e-2, 100)
-    yield Plan("a joint without motor", "plans: actuation", _arm(actuation=[[1.0], [0.0]]), 1e-2, 100)
-    yield Plan("motors that do nothing", "plans: actuation", _arm(actuation=[[0.0], [0.0]]), 1e-2, 100)
-    yield Plan("two motors on one joint", "plans: actuation", _arm(actuation=[[1.0, 1.0], [0.0, 0.0]]), 1e-2, 100)
-    for strength in (1e-9, 1.0, 1e6):
-        name = f"added noise of {strength:g}"
-        yield Plan(name, "plans: noise", _arm(noise=AdditiveNoise(strength)), 1e-2, 100)
-    for strength in (0.1, 10.0, 1e4):
-        name = f"controls tremble by {strength:g}"
-        yield Plan(name, "plans: noise", _arm(noise=ControlNoise(strength)), 1e-2, 100)
+    up = _arm(q0=[UP, 0.0], reference=[UP, 0.0], controls=np.array([2.0, -1.0]))
+    tasks = (
+        *((weights, f"tracking weight {x:g}", _arm(tracking=x, final=x)) for x in (1e-9, 1e-3, 1e3, 1e9)),
+        *((weights, f"control weight {x:g}", _arm(effort=x)) for x in (0.0, 1e-9, 1e9)),
+        (weights, "all weights 1e-9", _arm(tracking=1e-9, effort=1e-9, final=1e-9)),
+        (weights, "all weights 1e9", _arm(tracking=1e9, effort=1e9, final=1e9)),
+        (request, "reference jumps by 20 rad a step", _arm(reference=jumps)),
+        (request, "reference at 1e6 rad", _arm(reference=1e6)),
+        (request, "upright, pushed over at first", up),
+        (request, "first controls of 1e4 N m", _arm(controls=np.array([1e4, -1e4]))),
+        (actuation, "a joint without motor", _arm(actuation=[[1.0], [0.0]])),
+        (actuation, "motors that do nothing", _arm(actuation=[[0.0], [0.0]])),
+        (actuation, "two motors on one joint", _arm(actuation=[[1.0, 1.0], [0.0, 0.0]])),
+        *((noise, f"added noise of {x:g}", _arm(noise=AdditiveNoise(x))) for x in (1e-9, 1.0, 1e6)),
+        *((noise, f"controls tremble by {x:g}", _arm(noise=ControlNoise(x))) for x in (0.1, 10.0, 1e4)),
+    )
+    for family, name, build in tasks:
+        yield Plan(name, family, build, 1e-2, 200 if build is up else 100)
 
 
 PLANS: tuple[Plan, ...] = tuple(_plans())

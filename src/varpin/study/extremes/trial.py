@@ -1,23 +1,26 @@
-"""A scene at an extreme, and what came of it with one integrator."""
+"""A scene at an extreme, and the judgement of what came of it with one integrator."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.errors import VarpinError
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import WRONG_ENERGY, WRONG_MOTION, WRONG_POSITION, WRONG_VELOCITY
 
 Floats = NDArray[np.float64]
 
+# A motion in closed form: q and v, each (n,), at a time [s].
+ClosedForm = Callable[[float], tuple[Floats, Floats]]
 
-# From here on a result is wrong. Accuracy in units of the motion itself, structure in units of rounding with room for
-# ill-conditioned mass matrices.
+# The measures of a motion in the order of a cell's fields, and the value from which on each of them is wrong: accuracy
+# in units of the motion itself, structure in units of rounding, with a margin for ill-conditioned mass matrices.
 LEVELS = {
     "error": WRONG_MOTION,
     "joint": WRONG_POSITION,
@@ -25,15 +28,16 @@ LEVELS = {
     "period": 1.0,
     "energy": WRONG_ENERGY,
     "momentum": 0.1,
-    "kept momentum": 1e-6,
     "reversal": 1e-4,
     "symplecticity": 1e-7,
     "record": 1e-6,
 }
+# The level of the momentum where the method conserves it by construction.
+CONSERVED_MOMENTUM = 1e-6
 
 
 class Kind(Enum):
-    """What a cell is; the value says it in words."""
+    """The judgement of a cell; the value is its name in texts."""
 
     ACCURATE = "accurate"
     DEGRADED = "degraded"
@@ -44,7 +48,7 @@ class Kind(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """All that a motion starts from.
+    """Initial state and inputs of a motion.
 
     Attributes:
         scene: The scene.
@@ -52,10 +56,9 @@ class Setup:
         v0: (n,) [rad/s or m/s].
         controls: None, one row (m,), or a row for each step (N, m).
         increments: Of the Wiener processes (N, k) [s^0.5], or None.
-        exact: The motion in closed form, q (n,) at a time [s], or None.
-        rate: Its velocity (n,) at a time [s], or None.
+        exact: The motion in closed form, or None.
         twin: A scene with the same motion that is easier to compute, or None: at the origin, with angles reduced.
-        shift: By how much q is ahead of the twin's (n,).
+        shift: Distance of q from the twin's (n,) [rad or m].
     """
 
     scene: Scene
@@ -63,8 +66,7 @@ class Setup:
     v0: Floats
     controls: Floats | None = None
     increments: Floats | None = None
-    exact: Callable[[float], Floats] | None = None
-    rate: Callable[[float], Floats] | None = None
+    exact: ClosedForm | None = None
     twin: Scene | None = None
     shift: Floats | float = 0.0
 
@@ -74,12 +76,12 @@ class Trial:
     """A scene at an extreme.
 
     Attributes:
-        name: One of a kind in a battery.
-        family: Which extreme.
-        build: Makes it; may raise what varpin refuses it with.
+        name: Unique in a battery.
+        family: The extreme.
+        build: Makes the setup; may raise varpin's refusal of it.
         dt: Time step [s].
         steps: N.
-        window: How long it is held against the exact motion [s]: some periods of what moves.
+        window: Duration of the comparison with the exact motion [s]: some periods of what moves.
         deep: Whether it takes long, and is left out of the usual battery.
     """
 
@@ -98,7 +100,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Cell:
-    """What came of a trial with one integrator. Measures are NaN where they do not apply.
+    """A trial with one integrator. Measures are NaN where they do not apply.
 
     Attributes:
         family: Of the trial.
@@ -145,10 +147,33 @@ class Cell:
 
     @property
     def warned(self) -> bool:
-        """Whether varpin says that something is not as it should be with a motion that it returns."""
+        """Whether varpin returns the motion with a warning."""
         return self.kind is Kind.DEGRADED
 
     @property
     def needless(self) -> bool:
-        """Whether it says so although no check finds anything."""
+        """Whether it warns although no check finds anything."""
         return self.warned and not self.found
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The judgement of a motion or a plan: a part of a :class:`Cell`, and its measures by name as far as they apply."""
+
+    kind: Kind
+    measures: dict[str, float] = field(default_factory=dict)
+    said: tuple[str, ...] = ()
+    found: tuple[str, ...] = ()
+    done: int = 0
+
+    @classmethod
+    def of_error(cls, error: Exception, kind: Kind, done: int = 0) -> Outcome:
+        """A refusal or a stop where the error is varpin's own; any other error is a fault of varpin's."""
+        if isinstance(error, VarpinError):
+            return cls(kind, said=(line_of(error),), done=done)
+        return cls(Kind.WRONG, found=(f"unnamed error: {type(error).__name__}: {error}",))
+
+
+def line_of(error: Exception) -> str:
+    """An error in one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"

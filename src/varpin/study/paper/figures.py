@@ -13,7 +13,7 @@ from matplotlib.ticker import NullFormatter
 from varpin.show.plots import COLORS
 from varpin.study.paper import cases
 from varpin.study.paper.cases import CASES, COARSE, COARSEST, MAIN
-from varpin.study.paper.claims import REFERENCE, Cells, Motions, cell, series, series_of_noise
+from varpin.study.paper.claims import REFERENCE, Cells, Motions, cell, main_steps, series, series_of_noise
 from varpin.study.paper.experiments import OPTIMUM, PLAIN, STOCHASTIC
 
 # Tracking errors are linear below this [rad] and logarithmic beyond: a start away from the optimum outweighs the rest a
@@ -27,8 +27,7 @@ _METHOD_COLOR = {"variational": COLORS[0], "Euler": COLORS[1], cases.FOURTH_ORDE
 
 def draw(cells: Cells, motions: Motions) -> dict[str, tuple[Figure, str]]:
     """Each figure with its caption, by the name of its file."""
-    steps = sorted({c.dt for c in cells.values() if c.setting == MAIN.key})
-    fine = steps[0]
+    fine = main_steps(cells)[0]
     return {
         "figure1": (
             _free(motions),
@@ -64,8 +63,8 @@ def _free(motions: Motions) -> Figure:
     panels = figure.subplots(1, 2, sharey=True)
     for panel, axes, method in zip("bc", panels, ("Euler", "variational"), strict=True):
         for dt, dash in ((cases.FINE, ":"), (COARSEST, "-")):
-            own = motions[method, dt]
-            axes.plot(own.t, own.theta, dash, color=_METHOD_COLOR[method], label=f"{method}, dt = {dt:g} s")
+            motion = motions[method, dt]
+            axes.plot(motion.t, motion.theta, dash, color=_METHOD_COLOR[method], label=f"{method}, dt = {dt:g} s")
         exact = motions[REFERENCE, cases.FINE].theta
         span = np.ptp(exact)
         axes.set_ylim(exact.min() - 0.4 * span, exact.max() + 0.4 * span)
@@ -88,13 +87,11 @@ def _tracking(cells: Cells, case: str, fine: float, third: Callable[[Axes, Cells
     axes[1].sharey(axes[0])
     for panel, method in zip(axes[:2], ("Euler", "variational"), strict=True):
         for dt, dash in ((fine, ":"), (COARSE, "-")):
-            own = cell(cells, MAIN, case, method, dt)
-            if own is None:
-                continue
-            error = own.q - np.array([cases.reference(t) for t in own.t])
+            plan = cell(cells, case, method, dt)
+            error = plan.q - np.array([cases.reference(t) for t in plan.t])
             for joint in range(3):
                 label = rf"$\theta_{joint + 1}$, {dt:g} s"
-                panel.plot(own.t, error[:, joint], dash, color=COLORS[joint], lw=1.0, label=label)
+                panel.plot(plan.t, error[:, joint], dash, color=COLORS[joint], lw=1.0, label=label)
         panel.set_yscale("symlog", linthresh=_SMALL_ERROR)
         panel.set(xlabel="time [s]", ylabel="tracking error [rad]", title=method)
     third(axes[2], cells, case, fine)
@@ -105,10 +102,10 @@ def _tracking(cells: Cells, case: str, fine: float, third: Callable[[Axes, Cells
 
 def _cost_over_time(axes: Axes, cells: Cells, case: str, fine: float) -> None:  # noqa: ARG001
     for method in cases.METHODS:
-        own = series(cells, MAIN, case, method)
+        plans = series(cells, MAIN, case, method)
         axes.loglog(
-            [c.seconds for c in own],
-            [c.cost + c.noise_cost for c in own],
+            [c.seconds for c in plans],
+            [c.cost + c.noise_cost for c in plans],
             "o-",
             color=_METHOD_COLOR[method],
             label=method,
@@ -120,13 +117,11 @@ def _cost_over_time(axes: Axes, cells: Cells, case: str, fine: float) -> None:  
 
 def _first_controls(axes: Axes, cells: Cells, case: str, fine: float) -> None:
     for dt, dash in ((fine, ":"), (COARSEST, "-")):
-        own = cell(cells, MAIN, case, "variational", dt)
-        if own is None:
-            continue
-        shown = own.t[:-1] <= 0.1
+        plan = cell(cells, case, "variational", dt)
+        shown = plan.t[:-1] <= 0.1
         for joint in range(3):
             axes.step(
-                own.t[:-1][shown], 1e6 * own.u[shown, joint], dash, where="post", color=COLORS[joint],
+                plan.t[:-1][shown], 1e6 * plan.u[shown, joint], dash, where="post", color=COLORS[joint],
                 label=f"$u_{joint + 1}$, {dt:g} s",
             )  # fmt: skip
     axes.set_yscale("symlog", linthresh=10.0)
@@ -135,9 +130,8 @@ def _first_controls(axes: Axes, cells: Cells, case: str, fine: float) -> None:
 
 def _first_joint(axes: Axes, cells: Cells, case: str, fine: float) -> None:
     for dt, dash in ((fine, ":"), (COARSE, "-")):
-        own = cell(cells, MAIN, case, "variational", dt)
-        if own is not None:
-            axes.plot(own.t, own.q[:, 0], dash, color=COLORS[0], label=f"dt = {dt:g} s")
+        plan = cell(cells, case, "variational", dt)
+        axes.plot(plan.t, plan.q[:, 0], dash, color=COLORS[0], label=f"dt = {dt:g} s")
     t = np.linspace(0.0, cases.DURATION, 301)
     axes.plot(t, [cases.reference(x)[0] for x in t], color="0.6", lw=1, label="reference", zorder=0)
     axes.set(xlabel="time [s]", ylabel=r"$\theta_1$ [rad]")
@@ -147,10 +141,10 @@ def _cost_over_step(cells: Cells) -> Figure:
     figure = Figure(figsize=(13, 3.6), layout="constrained")
     for axes, case in zip(figure.subplots(1, 3), CASES, strict=True):
         for method in cases.METHODS:
-            own = series(cells, MAIN, case.key, method)
+            plans = series(cells, MAIN, case.key, method)
             axes.loglog(
-                [c.dt for c in own],
-                [c.cost + c.noise_cost for c in own],
+                [c.dt for c in plans],
+                [c.cost + c.noise_cost for c in plans],
                 "s--" if method == "Euler" else "o-",
                 color=_METHOD_COLOR[method],
                 label=method,
@@ -166,14 +160,16 @@ def _truth(cells: Cells) -> Figure:
     best = min(c.true_cost for c in series(cells, MAIN, "0", OPTIMUM))
     top = 1e5 * best
     for method in (*cases.METHODS, cases.FOURTH_ORDER, OPTIMUM):
-        own = series(cells, MAIN, "0", method)
-        dts = [c.dt for c in own]
+        plans = series(cells, MAIN, "0", method)
+        dts = [c.dt for c in plans]
         label = _METHOD_NAME.get(method, "optimum over held controls")
         if method == OPTIMUM:  # a broad band: the best plans lie on it
-            axes.loglog(dts, [c.open_loop for c in own], "-", color="0.8", lw=7, zorder=0, label=label)
+            axes.loglog(dts, [c.open_loop for c in plans], "-", color="0.8", lw=7, zorder=0, label=label)
         else:
-            axes.loglog(dts, [c.open_loop for c in own], "o-", color=_METHOD_COLOR[method], label=f"{label}, open loop")
-            costs = [c.closed_loop for c in own]
+            axes.loglog(
+                dts, [c.open_loop for c in plans], "o-", color=_METHOD_COLOR[method], label=f"{label}, open loop"
+            )
+            costs = [c.closed_loop for c in plans]
             label += ", with feedback"
             if not any(cost < top for cost in costs):
                 label += ":\nruns away at every dt"
@@ -190,8 +186,8 @@ def _under_noise(cells: Cells) -> Figure:
     known, plain = (series_of_noise(cells, method) for method in (STOCHASTIC, PLAIN))
     strengths = [cases.strength_of(c.case) for c in known]
     axes.loglog(strengths, [c.cost + c.noise_cost for c in known], "-", color=COLORS[0], label="S-DDP, predicted")
-    for own, color, label in ((known, COLORS[0], "S-DDP, Monte Carlo"), (plain, COLORS[1], "DDP, Monte Carlo")):
-        finite = [c for c in own if np.isfinite(c.sampled[0])]
+    for plans, color, label in ((known, COLORS[0], "S-DDP, Monte Carlo"), (plain, COLORS[1], "DDP, Monte Carlo")):
+        finite = [c for c in plans if np.isfinite(c.sampled[0])]
         axes.errorbar(
             [cases.strength_of(c.case) for c in finite],
             [c.sampled[0] for c in finite],

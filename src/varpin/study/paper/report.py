@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import csv
 import html
 import io
 from collections.abc import Callable, Mapping, Sequence
@@ -16,6 +14,8 @@ from varpin.io.archive import atomic_file
 from varpin.study.paper.cases import CASES, FOURTH_ORDER, MAIN, METHODS, VARIATIONS
 from varpin.study.paper.claims import Cells, Claim, series
 from varpin.study.paper.experiments import OPTIMUM, SEARCH, Cell
+from varpin.support.markup import page, picture
+from varpin.support.tables import csv_text
 
 _COLUMNS: dict[str, Callable[[Cell], str]] = {
     "setting": lambda c: c.setting,
@@ -35,11 +35,7 @@ _COLUMNS: dict[str, Callable[[Cell], str]] = {
 }
 
 _STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 76rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-table { border-collapse: collapse; margin: 1rem 0; font-size: 0.85rem; }
-td, th { border: 1px solid #ccc; padding: 0.25rem 0.6rem; text-align: right; vertical-align: top; }
-td.text, th { text-align: left; }
-img { max-width: 100%; }
+body { max-width: 76rem; }
 figure { margin: 1.5rem 0; }
 .holds { background: #dff2e1; } .holds-in-part { background: #fff3d6; } .does-not-hold { background: #fbdedb; }
 .not-measured { background: #ececec; }
@@ -60,35 +56,19 @@ def write(
         figure.savefig(stream, format="png", dpi=110)
         images[name] = stream.getvalue()
         _write(folder / f"{name}.png", images[name])
-    _write(folder / "table1.csv", _csv(cells).encode())
-    _write(folder / "claims.csv", _claims_csv(claims).encode())
-    page = folder / "report.html"
+    rows = ([column(cell) for column in _COLUMNS.values()] for cell in cells.values())
+    _write(folder / "table1.csv", csv_text(_COLUMNS, rows).encode())
+    rows = ([claim.source, claim.sentence, claim.measured, claim.verdict] for claim in claims)
+    _write(folder / "claims.csv", csv_text(("source", "sentence", "measured", "verdict"), rows).encode())
+    target = folder / "report.html"
     captions = {name: caption for name, (_, caption) in figures.items()}
-    _write(page, _page(cells, claims, images, captions, quick).encode())
-    return page
+    _write(target, _page(cells, claims, images, captions, quick).encode())
+    return target
 
 
 def _write(path: Path, data: bytes) -> None:
     with atomic_file(path) as stream:
         stream.write(data)
-
-
-def _csv(cells: Cells) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    for cell in cells.values():
-        writer.writerow([column(cell) for column in _COLUMNS.values()])
-    return text.getvalue()
-
-
-def _claims_csv(claims: Sequence[Claim]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["source", "sentence", "measured", "verdict"])
-    for claim in claims:
-        writer.writerow([claim.source, claim.sentence, claim.measured, claim.verdict])
-    return text.getvalue()
 
 
 def _page(
@@ -97,15 +77,10 @@ def _page(
     settings = "".join(f"<li>{html.escape(s.title)}</li>" for s in ((MAIN,) if quick else (MAIN, *VARIATIONS)))
     noises = "".join(f"<li>Case {case.key}: {html.escape(case.title)}</li>" for case in CASES)
     figures = "".join(
-        f'<figure><img alt="{html.escape(captions[name])}" src="data:image/png;base64,'
-        f'{base64.b64encode(data).decode()}"><figcaption>{html.escape(captions[name])}</figcaption></figure>'
+        f"<figure>{picture(data, captions[name])}<figcaption>{html.escape(captions[name])}</figcaption></figure>"
         for name, data in images.items()
     )
-    return f"""<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>The paper's experiments, reproduced</title>
-<style>{_STYLE}</style></head><body>
-<h1>The paper's experiments, reproduced</h1>
-<p>varpin {__version__}{", the quick version: fewer steps, one setting" if quick else ""}.
+    body = f"""<p>varpin {__version__}{", the quick version: fewer steps, one setting" if quick else ""}.
 Stochastic differential dynamic programming on a 3-link finger that follows
 θ<sub>r</sub>(t) = [1 + 0.25 sin 4πt, 0.1 sin 2πt, 0] for 1.5 s; cost: the integral of
 10 |θ - θ<sub>r</sub>|² + 0.1 |u|², plus |θ - θ<sub>r</sub>|² at the end. Variational: the midpoint
@@ -126,9 +101,8 @@ method inside each interval: what it costs to decide only every dt, whatever the
 {"".join(_claim_row(claim) for claim in claims)}</table>
 <h2>Figures</h2>{figures}
 <h2>Table 1</h2>{_table(cells)}
-<p>Every cell, the variations too, is in table1.csv. Times are of one machine and one run.</p>
-</body></html>
-"""
+<p>Every cell, the variations too, is in table1.csv. Times are of one machine and one run.</p>"""
+    return page("The paper's experiments, reproduced", body, _STYLE)
 
 
 def _claim_row(claim: Claim) -> str:
@@ -142,8 +116,8 @@ def _table(cells: Cells) -> str:
     names = list(_COLUMNS)[1:]
     for case in (*(case.key for case in CASES), "0"):
         for method in (*METHODS, FOURTH_ORDER, OPTIMUM):
-            for own in series(cells, MAIN, case, method):
-                rows.append("".join(f"<td>{_entry(own, name)}</td>" for name in names))
+            for cell in series(cells, MAIN, case, method):
+                rows.append("".join(f"<td>{_entry(cell, name)}</td>" for name in names))
     head = "".join(f"<th>{html.escape(name)}</th>" for name in names)
     return f"<table><tr>{head}</tr>" + "".join(f"<tr>{row}</tr>" for row in rows) + "</table>"
 

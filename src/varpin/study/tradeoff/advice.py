@@ -5,7 +5,6 @@ Costs are wall times. How errors are found out is in :mod:`varpin.simulation.ref
 
 from __future__ import annotations
 
-import logging
 import math
 import sys
 import time
@@ -27,14 +26,17 @@ from varpin.support.markup import facts, table
 
 Floats = NDArray[np.float64]
 
-logger = logging.getLogger(__name__)
+# Headings of a choice's entries in a table.
+COLUMNS = ("integrator", "dt [s]", "steps", "predicted time [s]", "predicted error in q", "note")
 
-# Short runs are repeated for this long [s], at most so often, since a machine's first answers are its slowest.
+# Short runs are repeated for this long [s], at most so often: the first ones find caches cold.
 _TIMING, _REPEATS = 0.02, 5
-# Runs shorter than this are worth making to be sure [s].
+# Runs shorter than this confirm a prediction, as nobody waits for them [s].
 _CHEAP = 0.5
-# Nodes at which the midpoint integrator's largest step is looked up.
+# Nodes at which the midpoint integrator's largest step is computed: a bound by samples, for information.
 _NODES = 32
+# Part of a budget that is planned for; the rest is for the scatter of wall times.
+_PLANNED = 0.9
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,12 @@ class Choice:
     def __str__(self) -> str:
         error = f"error {self.error:.1e}" if math.isfinite(self.error) else "unknown error"
         return f"{self.integrator} at dt = {self.dt:.4g} s: {error} in {_time(self.seconds)}"
+
+    def cells(self) -> tuple[str, ...]:
+        """The entries of :data:`COLUMNS`."""
+        error = f"{self.error:.2e}" if math.isfinite(self.error) else "unknown"
+        note = "" if self.measured else "by the method's order"
+        return str(self.integrator), f"{self.dt:.4g}", str(self.steps), f"{self.seconds:.2e}", error, note
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,16 +99,8 @@ class Advice:
         return f"Advice({self.best}{'' if self.reached else ', which is not what was asked for'})"
 
     def _repr_html_(self) -> str:
-        rows = [
-            (
-                str(choice.integrator), choice.dt, choice.steps, _time(choice.seconds),
-                f"{choice.error:.2e}" if math.isfinite(choice.error) else "unknown",
-                "" if choice.measured else "by the method's order",
-            )
-            for choice in (self.best, *self.alternatives)
-        ]  # fmt: skip
-        columns = ("integrator", "dt [s]", "steps", "time", "error [rad or m]", "")
-        return facts("Advice", [("", line) for line in self.reason.splitlines()], table(columns, rows, [0]))
+        rows = [choice.cells() for choice in (self.best, *self.alternatives)]
+        return facts("Advice", [("", line) for line in self.reason.splitlines()], table(COLUMNS, rows, [0]))
 
     @property
     def integrator(self) -> Integrator:
@@ -185,8 +185,8 @@ def advise(
         choices, reached = search.for_budget(positive("budget", budget, "s"))
     bound = _largest_step(setting, methods)
     best, *others = (
-        Choice(own.integrator, setting.duration / own.steps, own.steps, own.error, own.cost, own.measured)
-        for own in choices
+        Choice(each.integrator, setting.duration / each.steps, each.steps, each.error, each.cost, each.measured)
+        for each in choices
     )
     reason = _reason(best, others, reached, bound, tolerance, budget, duration)
     return Advice(best, reached, tuple(others), bound, tolerance, budget, time.perf_counter() - begin, reason)
@@ -217,7 +217,7 @@ class _Timed(Search):
         for method in self.methods:
             # More accuracy than rounding leaves is not to be had for more steps.
             enough = method.steps_for(self.floor)
-            steps = min(_steps_within(method, 0.9 * budget), enough if enough is not None else sys.maxsize)
+            steps = min(_steps_within(method, _PLANNED * budget), enough if enough is not None else sys.maxsize)
             if not math.isfinite(method.error_at(steps)):
                 known = [s.steps for s, e in zip(method.whole, method.errors, strict=True) if np.isfinite(e)]
                 steps = max((k for k in known if method.cost_at(k) <= budget), default=0)

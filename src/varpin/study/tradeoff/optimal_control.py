@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,14 +15,12 @@ from numpy.typing import NDArray
 from varpin.control import OptimalControlProblem, Solution, solve
 from varpin.errors import FileError, InputError
 from varpin.integrators import Integrator
-from varpin.study.tradeoff.records import Record, pareto_front
+from varpin.study.tradeoff.records import pareto_front
+from varpin.study.tradeoff.runs import Progress, Run, Tradeoff, complete
 from varpin.study.tradeoff.setting import Setting, digest, fastest, integrators_of
 from varpin.support.checks import count, positive, writable
 
 Floats = NDArray[np.float64]
-Progress = Callable[[int, int], None]
-
-logger = logging.getLogger(__name__)
 
 # Options of solve that are told of a search and change nothing in it.
 _ONLOOKERS = ("callback", "progress")
@@ -47,74 +44,42 @@ HEADINGS = {
 
 
 @dataclass(frozen=True)
-class OptimalControlRun:
-    """A problem solved with an integrator at one step. Costs are NaN where that failed.
+class OptimalControlRun(Run):
+    """A problem solved with an integrator at one step, with the attributes of :class:`varpin.study.tradeoff.runs.Run`.
 
     Attributes:
-        integrator: As text.
-        options: The same with every option.
-        order: Of its error in dt.
-        dt: Time step [s].
-        steps: N.
         hold: Steps that share a control.
-        seconds: Wall time of the solver, the best of the repetitions [s].
-        spread: How far the middle one of the repetitions is above the best [s].
-        iterations: It took.
+        iterations: Of the solver.
         planned_cost: What the solver believes, without noise.
         open_loop_cost: Of the controls on the continuous system.
         closed_loop_cost: The same with the plan's feedback.
         accuracy: Relative, of these two.
-        status: How the solver ended, in a word.
-        failure: Why there is no plan; empty if there is one.
+        status: Of the solver, in a word.
     """
 
-    integrator: str
-    options: str
-    order: int
-    dt: float
-    steps: int
     hold: int
-    seconds: float
-    spread: float
     iterations: int
     planned_cost: float
     open_loop_cost: float
     closed_loop_cost: float
     accuracy: float
     status: str
-    failure: str
 
     @property
-    def survived(self) -> bool:
-        """Whether there is a plan."""
-        return not self.failure
+    def key(self) -> Hashable:
+        """Identity of the run in its record."""
+        return self.options, self.steps, self.hold
 
 
-@dataclass(frozen=True, eq=False)
-class OptimalControlTradeoff(Record):
-    """Solutions of one problem on different discretizations.
-
-    Attributes:
-        runs: In the order of the integrators, each from its largest step down.
-        robot: The robot's name.
-        duration: The horizon [s].
-        missing: Runs that an interruption left out.
-    """
+@dataclass(frozen=True, eq=False, repr=False)
+class OptimalControlTradeoff(Tradeoff):
+    """Solutions of one problem, :class:`OptimalControlRun`, with the attributes of a :class:`Tradeoff`."""
 
     _format = "varpin.optimal-control-tradeoff/2"
     _headings = HEADINGS
     _shown = ("integrator", "dt", "seconds", "planned_cost", "open_loop_cost", "closed_loop_cost", "failure")
 
     runs: tuple[OptimalControlRun, ...]
-    robot: str
-    duration: float
-    missing: int = 0
-    fingerprint: str = field(default="", repr=False)
-
-    def __repr__(self) -> str:
-        lost = sum(not run.survived for run in self.runs)
-        notes = (f", {lost} failed" if lost else "") + (f", {self.missing} missing" if self.missing else "")
-        return f"OptimalControlTradeoff({self.robot}: {len(self.runs)} runs{notes})"
 
     def pareto(self) -> tuple[OptimalControlRun, ...]:
         """The runs that no other beats in both solve time and true open-loop cost, from the fastest up.
@@ -167,27 +132,13 @@ def optimal_control_tradeoff(
         base = OptimalControlTradeoff.load(path)
         if base.fingerprint != mark:
             raise FileError(f"{path} holds runs of another problem: choose another file")
-    done = {(run.options, run.steps, run.hold): run for run in base.runs}
-    wanted = {_key(own) for own in plan}
-    kept = tuple(run for key, run in done.items() if key not in wanted)
-    finished: list[OptimalControlRun] = []
-
-    def now() -> OptimalControlTradeoff:
-        return replace(base, runs=(*kept, *finished), missing=len(plan) - len(finished))
-
-    try:
-        for own in plan:
-            run = done.get(_key(own))
-            if run is None:
-                run = _measured(own, repeats, options)
-            finished.append(run)
-            if path is not None:
-                now().save(path)
-            if progress is not None:
-                progress(len(finished), len(plan))
-    except KeyboardInterrupt:
-        logger.warning("interrupted after %d of %d runs, which are kept", len(finished), len(plan))
-    return now()
+    return complete(
+        base,
+        {(repr(each.integrator), each.steps, each.hold): each for each in plan},
+        lambda record, missing: (record, (_measured(each, repeats, options) for each in missing)),
+        path=path,
+        progress=progress,
+    )
 
 
 def _discretized(
@@ -200,10 +151,6 @@ def _discretized(
         if hold < 1 or abs(hold - ratio) > 1e-9 * ratio:
             raise InputError(f"period = {period:g} s is no multiple of dt = {dt:g} s")
     return problem.at(dt=dt, integrator=member, hold=hold)
-
-
-def _key(problem: OptimalControlProblem) -> tuple[str, int, int]:
-    return repr(problem.integrator), problem.steps, problem.hold
 
 
 def _fingerprint(problem: OptimalControlProblem, options: dict[str, Any]) -> str:
@@ -236,7 +183,7 @@ def _measured(problem: OptimalControlProblem, repeats: int, options: dict[str, A
     seconds, spread, failure = math.nan, 0.0, ""
     planned = opened = closed = accuracy = math.nan
     iterations, status = 0, ""
-    # Whatever goes wrong with one run, the others are worth having.
+    # An error of one run, whatever it is, does not stop the others.
     try:
         solution, seconds, spread = fastest(lambda: _solved(problem, options), repeats)
         truth = solution.verify()

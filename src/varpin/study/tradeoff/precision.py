@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import Executor
-from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -19,22 +17,22 @@ from varpin.ensemble import without_geometry
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.integrators import Integrator, Reference
 from varpin.mechanics.scene import Scene, require_scene
-from varpin.study.tradeoff.records import Record, pareto_front
+from varpin.study.tradeoff.records import pareto_front
+from varpin.study.tradeoff.runs import Progress, Run, Tradeoff, complete
 from varpin.study.tradeoff.setting import PARTS, Outcome, Setting, integrators_of
 from varpin.support.checks import JointValues, count, positive, writable
 from varpin.support.executors import in_order, require_executor
 
 Floats = NDArray[np.float64]
-Progress = Callable[[int, int], None]
 Quantity = Literal["q", "end", "energy", "tip"]
 
-logger = logging.getLogger(__name__)
-
-# The largest of the steps that are taken where none are named [s], and how often it is halved.
+# The largest of the steps where none are named [s], and the number of its halvings: down to 0.16 ms, from which on
+# methods of fourth order are at the rounding of an arm's motion.
 _COARSEST, _HALVINGS = 0.04, 8
-# Times at which motions are compared, at most; more if the controls change more often.
+# Times at which motions are compared, at most; more if the controls change more often. A largest error is found to a
+# few per cent on motions of some ten oscillations.
 _SAMPLES = 64
-# The looser of the reference's two tolerances, over the tighter.
+# Ratio of the reference's two tolerances: an error proportional to the tolerance differs by nine tenths of itself.
 _LOOSER = 10.0
 
 HEADINGS = {
@@ -58,17 +56,10 @@ HEADINGS = {
 
 
 @dataclass(frozen=True)
-class WorkPrecisionRun:
-    """An integrator at one step. Errors are NaN where it failed.
+class WorkPrecisionRun(Run):
+    """An integrator at one step, with the attributes of :class:`varpin.study.tradeoff.runs.Run`.
 
     Attributes:
-        integrator: As text.
-        options: The same with every option: what a resumed record knows it by.
-        order: Of its error in dt.
-        dt: Time step [s].
-        steps: N.
-        seconds: Wall time, the best of the repetitions [s].
-        spread: How far the middle one of the repetitions is above the best [s].
         error: Largest error in q over the joints and the record's times [rad or m].
         end_error: Largest error in q over the joints at the end [rad or m].
         energy_error: Largest distance from the initial energy over all nodes [J]; NaN unless energy is to stay.
@@ -77,17 +68,9 @@ class WorkPrecisionRun:
         jets: Evaluations of the whole jet.
         sweeps: Evaluations of its first derivatives alone, or of forward dynamics.
         split_steps: Steps that a guard took in parts.
-        samples: At how many evenly spaced times its motion was compared with the reference's.
-        failure: Why it did not get to the end; empty if it did.
+        samples: Number of evenly spaced times at which its motion was compared with the reference's.
     """
 
-    integrator: str
-    options: str
-    order: int
-    dt: float
-    steps: int
-    seconds: float
-    spread: float
     error: float
     end_error: float
     energy_error: float
@@ -97,22 +80,13 @@ class WorkPrecisionRun:
     sweeps: int
     split_steps: int
     samples: int
-    failure: str
-
-    @property
-    def survived(self) -> bool:
-        """Whether it got to the end."""
-        return not self.failure
 
 
-@dataclass(frozen=True, eq=False)
-class WorkPrecision(Record):
-    """Measured runs of one motion.
+@dataclass(frozen=True, eq=False, repr=False)
+class WorkPrecision(Tradeoff):
+    """Measured runs of one motion, :class:`WorkPrecisionRun`, with the attributes of a :class:`Tradeoff`.
 
     Attributes:
-        runs: In the order of the integrators, each from its largest step down.
-        robot: The robot's name.
-        duration: [s].
         reference: What errors are measured against, as text.
         reference_error: Largest distance in q from the same at a ten times looser tolerance, in twice as long
             intervals [rad or m]. It is above the reference's own error; errors below it say that, and no more. NaN
@@ -120,7 +94,6 @@ class WorkPrecision(Record):
         tip_reference_error: The same of the end effector [m].
         samples: K: errors are taken at K evenly spaced times, the end being the last. A run that was added to a saved
             record with a step that does not share these times has fewer of them.
-        missing: Runs that an interruption left out.
     """
 
     _format = "varpin.work-precision/2"
@@ -128,19 +101,13 @@ class WorkPrecision(Record):
     _shown = ("integrator", "dt", "seconds", "error", "energy_error", "tip_error", "failure")
 
     runs: tuple[WorkPrecisionRun, ...]
-    robot: str
-    duration: float
     reference: str
     reference_error: float
     tip_reference_error: float
     samples: int
-    missing: int = 0
-    fingerprint: str = field(default="", repr=False)
 
     def __repr__(self) -> str:
-        lost = sum(not run.survived for run in self.runs)
-        notes = (f", {lost} failed" if lost else "") + (f", {self.missing} missing" if self.missing else "")
-        return f"WorkPrecision({self.robot}: {len(self.runs)} runs{notes}, reference to {self.reference_error:.1e})"
+        return f"{super().__repr__()[:-1]}, reference to {self.reference_error:.1e})"
 
     def error_of(self, run: WorkPrecisionRun, quantity: Quantity = "q") -> float:
         """The error of a run, not below what the reference can tell; energy errors need no reference."""
@@ -220,37 +187,19 @@ def work_precision(
     if not isinstance(reference, Reference):
         raise InputError(f"reference must be a varpin.Reference, got {reference!r}")
     grids = _grids(setting, dts)
-    plan = {(repr(member), steps): member for member in members for steps in grids}
+    plan = {(repr(member), steps): (member, steps) for member in members for steps in grids}
     path = None if save is None else writable(save)
     known = _known(path, setting, reference)
     base = _record(setting, reference, _samples(grids, len(setting.controls))) if known is None else known
-    done = {(run.options, run.steps): run for run in base.runs}
-    kept = tuple(run for key, run in done.items() if key not in plan)
 
-    def now() -> WorkPrecision:
-        runs = [done[key] for key in plan if key in done]
-        return replace(base, runs=(*kept, *runs), missing=len(plan) - len(runs))
+    def begin(record: WorkPrecision, missing: list[tuple[Integrator, int]]) -> tuple[WorkPrecision, Generator[Run]]:
+        exact = _Exact(setting, reference, record.samples)
+        cells = [_Cell(setting, exact, member, steps, repeats) for member, steps in missing]
+        if known is None:
+            record = replace(record, reference_error=exact.error, tip_reference_error=exact.tip_error)
+        return record, ((_measure(cell) for cell in cells) if executor is None else in_order(executor, _measure, cells))
 
-    missing = [(member, key[1]) for key, member in plan.items() if key not in done]
-    try:
-        cells: list[_Cell] = []
-        if missing:
-            exact = _Exact(setting, reference, base.samples)
-            cells = [_Cell(setting, exact, member, steps, repeats) for member, steps in missing]
-            if known is None:
-                base = replace(base, reference_error=exact.error, tip_reference_error=exact.tip_error)
-        fresh = (_measure(cell) for cell in cells) if executor is None else in_order(executor, _measure, cells)
-        with closing(fresh):
-            for finished, key in enumerate(plan, 1):
-                if key not in done:
-                    done[key] = next(fresh)
-                if path is not None:
-                    now().save(path)
-                if progress is not None:
-                    progress(finished, len(plan))
-    except KeyboardInterrupt:
-        logger.warning("interrupted after %d of %d runs, which are kept", len(plan) - now().missing, len(plan))
-    return now()
+    return complete(base, plan, begin, path=path, progress=progress)
 
 
 class _Exact:
@@ -293,7 +242,7 @@ def _known(path: Path | None, setting: Setting, reference: Reference) -> WorkPre
     here, there = setting.fingerprint.split(), record.fingerprint.split()
     if len(there) != len(PARTS):
         raise FileError(f"{path} is damaged: it does not say what motion it is of")
-    other = [part for part, own, found in zip(PARTS, here, there, strict=True) if own != found]
+    other = [part for part, wanted, found in zip(PARTS, here, there, strict=True) if wanted != found]
     other += ["reference"] if record.reference != str(reference) else []
     if other:
         raise FileError(f"{path} holds runs of another motion (not the same: {', '.join(other)}): choose another file")
@@ -337,9 +286,9 @@ class _Cell:
 
 def _measure(cell: _Cell) -> WorkPrecisionRun:
     setting, exact, member, steps = cell.setting, cell.exact, cell.member, cell.steps
-    # Whatever goes wrong with one run, the others are worth having.
     samples = _samples([steps, len(exact.q) - 1], len(setting.controls))
     shared = slice(None, None, (len(exact.q) - 1) // samples)
+    # An error of one run, whatever it is, does not stop the others.
     try:
         outcome = setting.run(member, steps, samples=samples, repeats=cell.repeats)
     except Exception as reason:

@@ -193,8 +193,8 @@ def digest(part: Any) -> str:
 
 
 def _tally(segment: Segment) -> NDArray[np.int64]:
-    own = segment.statistics
-    return np.array([own.newton_iterations.sum(), own.jets.sum(), own.sweeps.sum(), own.split_steps])
+    counts = segment.statistics
+    return np.array([counts.newton_iterations.sum(), counts.jets.sum(), counts.sweeps.sum(), counts.split_steps])
 
 
 def _arrays(value: Any) -> Iterator[NDArray[Any]]:
