@@ -16,6 +16,7 @@
 #include <cstdint>
 #include <limits>
 #include <optional>
+#include <type_traits>
 #include <vector>
 
 #include "varpin/compensated.hpp"
@@ -23,6 +24,7 @@
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/nodes.hpp"
+#include "varpin/size.hpp"
 #include "varpin/stage_elimination.hpp"
 #include "varpin/tableau.hpp"
 
@@ -50,6 +52,8 @@ struct Start {
     const double* force = nullptr;   // (n) constant over the step: the controls', and the drift of the noise
 };
 
+// Of a number of joints and of stages that the compiler knows, or does not.
+template <class Size = int, class Stages = int>
 class Collocation {
   public:
     Collocation(const Mechanism& mechanism, const Tableau& tableau, Solver solver)
@@ -57,19 +61,19 @@ class Collocation {
           tableau(tableau),
           n(mechanism.dof()),
           stages(tableau.stages),
-          stage(stages, Jet<double>(mechanism.tree, false)),
+          stage(stages, Jet<double, Size>(mechanism.tree, false)),
           V(stages * n),
           Q(stages * n),
           slope(stages * n),
           acting(stages * n),
           residual(stages * n),
           delta(stages * n) {
-        for (Jet<double>& jet : stage) mechanism.couplings.fit(jet.couplings);
+        for (Jet<double, Size>& jet : stage) mechanism.couplings.fit(jet.couplings);
         if (mechanism.couplings.pushes()) {
             coupled_q.resize(entries(stages * n, n));
             coupled_v.resize(stages * n * n);
         }
-        if (stages > StageElimination::most_stages || !eliminates(mechanism, solver, stages)) {
+        if (known || stages > StageElimination::most_stages || !eliminates(mechanism, solver, stages)) {
             make_room();
             return;
         }
@@ -81,15 +85,17 @@ class Collocation {
             stage_elimination.emplace(mechanism, tableau);
         }
         eliminated_columns = solver == Solver::elimination;
-        for (const Block& block : mechanism.tree.blocks)
+        for (const Block& block : blocks_of(mechanism.tree, n))
             eliminated_columns = eliminated_columns || block.end - block.begin >= few_columns;
     }
 
+    static constexpr bool known = !std::is_same_v<Size, int>;
+
     const Mechanism& mechanism;
     const Tableau& tableau;
-    int n;
-    int stages;
-    std::vector<Jet<double>> stage;          // without matrices where there is an elimination
+    [[no_unique_address]] Size n;
+    [[no_unique_address]] Stages stages;
+    std::vector<Jet<double, Size>> stage;    // without matrices where there is an elimination
     std::optional<Elimination> elimination;  // at the iterate of the last factors; of one stage, without ties
     std::optional<StageElimination> stage_elimination;
     std::vector<double> V;                   // (s, n) stage velocities: the guess, then the root
@@ -148,7 +154,7 @@ class Collocation {
         return Outcome::solved;
     }
 
-    bool eliminated() const { return elimination || stage_elimination; }
+    bool eliminated() const { return !known && (elimination || stage_elimination); }
 
     // Factor N from the stages' jets; false where its determinant is not positive.
     bool factor(double h) {
@@ -188,7 +194,7 @@ class Collocation {
     bool factor_blocks(double h) {
         double* matrix = lu.data();
         int* rows = order.data();
-        for (const Block& block : mechanism.tree.blocks) {
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
             const int size = stages * (block.end - block.begin);
             assemble(h, block, matrix);
             if (stages == 1) {
@@ -207,7 +213,7 @@ class Collocation {
     // (2n, 2n), Jf (2n, n). Blocks alone are written into dV.
     void derivatives(double h, std::vector<double>& dV, double* Jx, double* Jf) {
         if (eliminated_columns) return eliminate_derivatives(h, dV, Jx, Jf);
-        const auto& blocks = mechanism.tree.blocks;
+        const auto& blocks = blocks_of(mechanism.tree, n);
         if (blocks.size() > 1) {
             std::fill(Jx, Jx + 4 * n * n, 0.0);
             std::fill(Jf, Jf + 2 * n * n, 0.0);
@@ -227,8 +233,7 @@ class Collocation {
 
     // x with N x = right (s, n), from what `factor` left.
     void solve_factored(const double* right, double* x) {
-        if (elimination) return elimination->solve(right, x);
-        if (stage_elimination) return stage_elimination->solve(right, x);
+        if (eliminated()) return elimination ? elimination->solve(right, x) : stage_elimination->solve(right, x);
         solve_blocks(right, x, [this](const double* matrix, int size, const int* rows, double* b, double* y) {
             if (stages == 1) {
                 solve_lu(matrix, size, {0, size}, b, y);
@@ -251,7 +256,7 @@ class Collocation {
     void solve_blocks(const double* right, double* x, const Solve& solve_block) {
         const double* matrix = lu.data();
         const int* rows = order.data();
-        for (const Block& block : mechanism.tree.blocks) {
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
             const int width = block.end - block.begin, size = stages * width;
             double *b = local.data(), *y = b + size;
             for (int i = 0; i < stages; ++i)
@@ -282,12 +287,12 @@ class Collocation {
     // For matrices and their factors.
     void make_room() {
         int size = 0, largest = 0;
-        for (const Block& block : mechanism.tree.blocks) {
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
             const int own = stages * (block.end - block.begin);
             size = entries(1, std::int64_t{size} + entries(own, own));
             largest = std::max(largest, own);
         }
-        for (Jet<double>& jet : stage) jet.make_room();
+        for (Jet<double, Size>& jet : stage) jet.make_room();
         lu.resize(size);
         order.resize(stages * n);
         change.resize(stages * largest);
@@ -302,9 +307,10 @@ class Collocation {
     }
 
     void take_over() {
-        if (elimination) elimination->take(stage[0]);
-        if (!stage_elimination) return;
-        for (int i = 0; i < stages; ++i) stage_elimination->take(i, stage[i]);
+        if constexpr (!known) {
+            if (elimination) elimination->take(stage[0]);
+            for (int i = 0; i < stages && stage_elimination; ++i) stage_elimination->take(i, stage[i]);
+        }
     }
 
     [[gnu::always_inline]] inline void move_stages(const int stages, double h, const Start& start) {
@@ -471,11 +477,10 @@ class Collocation {
 
     // The square of x (s, n) in the metric of the kinetic energy, averaged over the step.
     double kinetic_size(const double* x) {
-        if (elimination) return elimination->kinetic_size(x);
-        if (stage_elimination) return stage_elimination->kinetic_size(x);
+        if (eliminated()) return elimination ? elimination->kinetic_size(x) : stage_elimination->kinetic_size(x);
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
-            for (const Block& block : mechanism.tree.blocks)
+            for (const Block& block : blocks_of(mechanism.tree, n))
                 total += tableau.b[i] * quadratic_form(stage[i].M.data(), n, block, x + i * n);
         }
         return total;
@@ -514,7 +519,7 @@ class Collocation {
                     change_of_slope(h, columns);
                 }
                 double* out = kind == 2 ? Jf + k : Jx + kind * n + k;
-                const int stride = kind == 2 ? n : 2 * n;
+                const int stride = (kind == 2 ? 1 : 2) * n;
                 for (int r = 0; r < n; ++r) {
                     double q = 0.0, p = 0.0;
                     for (int i = 0; i < stages; ++i) {
@@ -596,7 +601,7 @@ class Collocation {
             return;
         }
         for (int i = 0; i < stages; ++i) {
-            for (const Block& block : mechanism.tree.blocks) {
+            for (const Block& block : blocks_of(mechanism.tree, n)) {
                 for (int r = block.begin; r < block.end; ++r) {
                     const JointForce<double>& element = acting[i * n + r];
                     double total = element.by_v * delta[i * n + r] + element.by_q * moved[i * n + r];

@@ -132,7 +132,7 @@ class ForwardDynamics {
         const Tree& tree = mechanism_->tree;
         std::fill(jet_.potential.begin(), jet_.potential.end(), 0.0);
         std::fill(jet_.potential_scale.begin(), jet_.potential_scale.end(), 0.0);
-        if (!articulated_) detail::clear_blocks(tree, jet_.M);
+        if (!articulated_) detail::clear_blocks(tree, jet_.dof, jet_.M);
         add_potentials(q);
         std::copy_n(q, jet_.dof, q_.data());
         std::copy_n(v, jet_.dof, v_.data());
@@ -210,7 +210,7 @@ class ForwardDynamics {
     void differentiate(const double* v, const double* a) {
         const Tree& tree = mechanism_->tree;
         const int n = jet_.dof;
-        detail::clear_blocks(tree, slopes_);
+        detail::clear_blocks(tree, n, slopes_);
         for (int i = 0; i < n; ++i) slopes_[i * n + i] = {-acting_[i].by_q - curvature_[i], -acting_[i].by_v};
         for (std::size_t k = 0; k < coupled_curvature_.size(); ++k)
             slopes_[k] += {-coupled_q_[k] - coupled_curvature_[k], -coupled_v_[k]};

@@ -45,6 +45,7 @@ struct PathState {
     std::vector<std::uint8_t> halvings;  // of each part of every step of the last `roll` that was not taken whole
 };
 
+template <class Size = int, class Stages = int>
 class VariationalStepper {
   public:
     VariationalStepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
@@ -70,9 +71,9 @@ class VariationalStepper {
     double tolerance;
     Guards guards;
     double left;  // part of each kick that comes before the step; the rest comes after it
-    Collocation step_equation;
-    EnergyGuard energy_guard;
-    int n;
+    Collocation<Size, Stages> step_equation;
+    EnergyGuard<Size> energy_guard;
+    [[no_unique_address]] Size n;
     std::vector<double> force;           // (n) constant over the step
     Effort effort;                       // of the last step
     std::vector<std::uint8_t> halvings;  // of each part of the last step; none if it was taken whole
@@ -95,7 +96,7 @@ class VariationalStepper {
 
     // Put a path at (q, v).
     bool begin(const double* q, const double* v, PathState& state) {
-        Jet<double>& jet = step_equation.stage[0];
+        Jet<double, Size>& jet = step_equation.stage[0];
         first_order(mechanism, q, v, jet);
         if (!begin_at(q, jet.Lv.data(), state)) return false;
         std::copy(v, v + n, state.v.begin());
@@ -221,7 +222,7 @@ class VariationalStepper {
 
     // One substep from where the path stands and the guess in step_equation.V; moves the path only if it is accepted.
     Outcome attempt(double h, PathState& state, bool jets_wanted) {
-        Collocation& equation = step_equation;
+        auto& equation = step_equation;
         const Outcome solved =
             equation.solve(h, {state.place.data(), state.p.data(), force.data()}, tolerance, jets_wanted, effort);
         if (solved != Outcome::solved) return solved;
@@ -245,7 +246,7 @@ class VariationalStepper {
 
     // Where the root takes the path, into `trial`, and the work on the way.
     [[gnu::always_inline]] inline void advance(const int stages, double h, const PathState& state) {
-        const Collocation& equation = step_equation;
+        const auto& equation = step_equation;
         for (int c = 0; c < n; ++c) {
             double move = 0.0, impulse = 0.0;
             trial.work[c] = trial.dissipated[c] = trial.magnitude[c] = 0.0;
@@ -272,7 +273,7 @@ class VariationalStepper {
     // end goes on, moved by what a kick has since done to the velocity, and bent by what has changed in the force.
     // Where nothing kicks, it misses by much the same from step to step.
     void extrapolate(double h, const PathState& state) {
-        const int stages = step_equation.stages;
+        const Stages stages = step_equation.stages;
         const bool smooth = state.known > 1 && mechanism.diffusion.processes == 0;
         double *change = bend.data(), *acceleration = change + n;
         bool changed = false;
