@@ -69,6 +69,7 @@ class Collocation {
           residual(stages * n),
           delta(stages * n) {
         for (Jet<double, Size>& jet : stage) mechanism.couplings.fit(jet.couplings);
+        measure_turning();
         if (mechanism.couplings.pushes()) {
             coupled_q.resize(entries(stages * n, n));
             coupled_v.resize(stages * n * n);
@@ -110,8 +111,8 @@ class Collocation {
     // The first factorization is kept at least until a second correction shows how fast it contracts, and for as long
     // as three more would do. Gives up when a correction exceeds half of the one before (natural monotonicity,
     // Deuflhard 2004), unless the residual is down at its rounding floor. A last correction is not looked at again if
-    // that contraction takes the residual below a tenth of the tolerance: slopes are then corrected to first order.
-    // Where `jets_wanted`, it ends with the jets of the root.
+    // that contraction, or after a first one what the equation bends, takes the residual below a tenth of the
+    // tolerance: slopes are then corrected to first order. Where `jets_wanted`, it ends with the jets of the root.
     Outcome solve(double h, const Start& start, double tolerance, bool jets_wanted, Effort& effort) {
         double before = infinity, worst = infinity;
         bool fresh = true;
@@ -136,6 +137,14 @@ class Collocation {
             }
             for (int k = 0; k < stages * n; ++k) V[k] += delta[k];
             ++effort.newton_iterations;
+            if (fresh && !jets_wanted) {
+                const double left = left_by_bending(h, worst);
+                if (sure * left <= tolerance) {
+                    correct_slopes(h);
+                    worst = left;
+                    break;
+                }
+            }
             fresh = false;
             if (before < infinity) {
                 const double contraction = std::sqrt(size / before);
@@ -275,14 +284,41 @@ class Collocation {
     static constexpr double stagnation = 100.0;
     // A residual that is expected this far below the tolerance need not be looked at.
     static constexpr double sure = 10.0;
+    // Largest part of its estimate that bending leaves of a residual, with room: below 1 in what has been measured.
+    static constexpr double bending = 10.0;
 
     std::vector<double> residual, delta;  // (s, n)
     std::vector<double> lu;               // the factors of each block, one after another
     std::vector<int> order;               // of their rows
     std::vector<double> change, local, columns, shift;
-    bool eliminated_columns = false;        // of derivatives
+    bool eliminated_columns = false;  // of derivatives
+    std::vector<double> turning;      // (n) how much a coordinate turns bodies; infinite, or NaN where it is still,
+                                      // where it slides them on a body that turns
     std::vector<double> element_curvature;  // (s, n) of the elements' potentials, where there is an elimination
     std::vector<double> diagonal;           // (s, s, n) of N, besides what elimination takes from the bodies
+
+    // At most what the second derivatives of r leave of a residual after the correction in `delta` with fresh factors,
+    // in its rounding units. Kinetic and potential energy bend with the angles by which bodies turn: that much of a
+    // change of the momenta, and as much again of the momenta themselves. Infinite where forces bend too.
+    double left_by_bending(double h, double before) const {
+        if (!mechanism.forces.linear() || mechanism.couplings.any()) return infinity;
+        double turn = 0.0;
+        for (int c = 0; c < n; ++c) {
+            double largest = 0.0;
+            for (int i = 0; i < stages; ++i) largest = std::max(largest, std::abs(delta[i * n + c]));
+            turn += turning[c] * largest;
+        }
+        turn *= h;
+        return bending * turn * (before + turn / rounding_unit);
+    }
+
+    void measure_turning() {
+        turning.assign(n, 0.0);
+        for (const Body& link : mechanism.tree.bodies) {
+            if (!link.prismatic) turning[link.coordinate] += std::abs(link.ratio);
+            if (link.prismatic && !link.origin) turning[link.coordinate] = infinity;
+        }
+    }
 
     // For matrices and their factors.
     void make_room() {

@@ -16,6 +16,8 @@ namespace varpin {
 
 // Where a path stands.
 struct PathState {
+    static constexpr int most_misses = 4;
+
     PathState(const Mechanism& mechanism, int stages)
         : place(mechanism.dof()),
           p(mechanism.dof()),
@@ -25,7 +27,7 @@ struct PathState {
           energies(mechanism.tree),
           center(mechanism.dof() * mechanism.diffusion.processes),
           past(stages * mechanism.dof()),
-          miss(stages * mechanism.dof()),
+          miss(most_misses * stages * mechanism.dof()),
           past_end(mechanism.dof()),
           past_force(mechanism.dof()) {}
 
@@ -37,10 +39,12 @@ struct PathState {
     Energies energies;
     std::vector<double> center;          // (n, k) of the diffusion fields, for this rollout
     std::vector<double> past;            // (s, n) stage velocities of the last whole step
-    std::vector<double> miss;            // (s, n) by how much its guess had missed them
+    std::vector<double> miss;            // (misses, s, n) by how much its guess had missed them, and backward
+                                         // differences of that over the steps before
     std::vector<double> past_end;        // (n) velocity at its end
     std::vector<double> past_force;      // (n)
-    int known = 0;                       // of the past: 0, 1, or 2 with `miss`
+    int known = 0;                       // steps of the past without a break, as far as they count
+    int trend = 0;                       // rows of `miss` that would have made the best guess of the last step
     int level = 0;                       // halvings of the last step
     std::vector<std::uint8_t> halvings;  // of each part of every step of the last `roll` that was not taken whole
 };
@@ -88,7 +92,7 @@ class VariationalStepper {
             state.momentum[i] = p[i];
         }
         diffusion_centers(mechanism, q, state.center.data());
-        state.known = state.level = 0;
+        state.known = state.level = state.trend = 0;
         if (!look_at(state)) return false;
         energy_guard.begin(at.data(), state.momentum.data(), state.v.data(), state.energies);
         return true;
@@ -271,10 +275,11 @@ class VariationalStepper {
 
     // Extrapolate the last whole step into the stage velocities. The polynomial through them and the velocity at its
     // end goes on, moved by what a kick has since done to the velocity, and bent by what has changed in the force.
-    // Where nothing kicks, it misses by much the same from step to step.
+    // Where nothing kicks, by how much it misses goes on too: by the backward differences of as high an order as would
+    // have served the last step best.
     void extrapolate(double h, const PathState& state) {
         const Stages stages = step_equation.stages;
-        const bool smooth = state.known > 1 && mechanism.diffusion.processes == 0;
+        const int trend = mechanism.diffusion.processes == 0 ? state.trend : 0;
         double *change = bend.data(), *acceleration = change + n;
         bool changed = false;
         for (int c = 0; c < n; ++c) {
@@ -294,17 +299,37 @@ class VariationalStepper {
                 total += ahead[stages] * state.past_end[c];
                 const int k = i * n + c;
                 guess[k] = total + h * tableau.c[i] * acceleration[c];
-                step_equation.V[k] = smooth ? guess[k] + state.miss[k] : guess[k];
+                double missing = 0.0;
+                for (int r = 0; r < trend; ++r) missing += state.miss[r * stages * n + k];
+                step_equation.V[k] = guess[k] + missing;
             }
         }
     }
 
     void remember(PathState& state) {
         std::copy(step_equation.V.begin(), step_equation.V.end(), state.past.begin());
-        for (std::size_t k = 0; k < guess.size(); ++k) state.miss[k] = step_equation.V[k] - guess[k];
+        if (state.known > 0) follow_misses(state);
         std::copy(state.v.begin(), state.v.end(), state.past_end.begin());
         std::copy(force.begin(), force.end(), state.past_force.begin());
-        state.known = std::min(state.known + 1, 2);
+        state.known = std::min(state.known + 1, PathState::most_misses + 1);
+    }
+
+    // The difference of order r is what r rows would have left of the miss of the last step.
+    void follow_misses(PathState& state) const {
+        constexpr int most = PathState::most_misses;
+        const int size = step_equation.stages * n, orders = std::min(state.known, most + 1);
+        double left[most + 1] = {};
+        for (int k = 0; k < size; ++k) {
+            double now = step_equation.V[k] - guess[k];
+            for (int r = 0; r < orders; ++r) {
+                left[r] += std::abs(now);
+                if (r == most) break;
+                const double then = state.miss[r * size + k];
+                state.miss[r * size + k] = now;
+                now -= then;
+            }
+        }
+        state.trend = orders == 1 ? 1 : static_cast<int>(std::min_element(left, left + orders) - left);
     }
 
     void noise_kick(double part, const double* u, const double* dw, PathState& state) {
