@@ -233,7 +233,7 @@ class Collocation {
         for (const Block& block : blocks) {
             const int width = block.end - block.begin, size = stages * width;
             right_sides(h, block, dV);
-            solve_columns(matrix, rows, block, dV);
+            solve_columns(h, matrix, rows, block, dV);
             end_derivatives(h, block, dV, Jx, Jf);
             matrix += size * size;
             rows += size;
@@ -290,7 +290,7 @@ class Collocation {
     std::vector<double> residual, delta;  // (s, n)
     std::vector<double> lu;               // the factors of each block, one after another
     std::vector<int> order;               // of their rows
-    std::vector<double> change, local, columns, shift;
+    std::vector<double> change, local, columns, gain;
     bool eliminated_columns = false;  // of derivatives
     std::vector<double> turning;      // (n) how much a coordinate turns bodies; infinite, or NaN where it is still,
                                       // where it slides them on a body that turns
@@ -649,6 +649,10 @@ class Collocation {
         }
     }
 
+    // How many of q0, p0 and f have columns to be solved for: with one stage the force acts in proportion to the
+    // momentum.
+    int kinds() const { return stages == 1 ? 2 : 3; }
+
     // dr_i in (q0, p0, f): h sum_j (abar_ij L_qq,j + f_ij F_q,j) - A_i, 1, and h sum_j f_ij F_f,j.
     void right_sides(double h, Block block, std::vector<double>& dV) const {
         for (int i = 0; i < stages; ++i) {
@@ -666,78 +670,100 @@ class Collocation {
                         total += tableau.force[i * stages + j] * coupled_q[(j * n + r) * n + c];
                     row[c] = h * total - stage[i].A[r * n + c];
                     row[n + c] = r == c ? 1.0 : 0.0;
-                    row[2 * n + c] = r == c ? h * (share + changed(i, r)) : 0.0;
+                    if (kinds() == 3) row[2 * n + c] = r == c ? h * (share + changed(i, r)) : 0.0;
                 }
             }
         }
     }
 
     // N dV = dr in place, whole rows at a time.
-    void solve_columns(const double* matrix, const int* rows, Block block, std::vector<double>& dV) {
+    void solve_columns(double h, const double* matrix, const int* rows, Block block, std::vector<double>& dV) {
         const int width = block.end - block.begin, size = stages * width;
-        columns.resize(entries(size, 3 * width));
-        // Row k of the block's own system, which stands at (stage, coordinate) in dV.
-        const auto line = [&](int k) { return &dV[((k / width) * n + block.begin + k % width) * 3 * n]; };
-        for (int k = 0; k < size; ++k) {
-            const double* from = line(stages == 1 ? k : rows[k]);
-            for (int kind = 0; kind < 3; ++kind)
-                std::copy(from + kind * n + block.begin, from + kind * n + block.end, &columns[(k * 3 + kind) * width]);
+        if (stages == 1 && width == n) {
+            solve_lu_rows(matrix, n, {0, n}, dV.data(), 2 * n, 3 * n);
+        } else {
+            const int across = kinds() * width;
+            columns.resize(entries(size, across));
+            // Row k of the block's own system, which stands at (stage, coordinate) in dV.
+            const auto line = [&](int k) { return &dV[((k / width) * n + block.begin + k % width) * 3 * n]; };
+            for (int k = 0; k < size; ++k) {
+                const double* from = line(stages == 1 ? k : rows[k]);
+                for (int kind = 0; kind < kinds(); ++kind)
+                    std::copy_n(from + kind * n + block.begin, width, &columns[k * across + kind * width]);
+            }
+            solve_lu_rows(matrix, size, {0, size}, columns.data(), across, across);
+            for (int k = 0; k < size; ++k) {
+                for (int kind = 0; kind < kinds(); ++kind)
+                    std::copy_n(&columns[k * across + kind * width], width, line(k) + kind * n + block.begin);
+            }
         }
-        solve_lu_rows(matrix, size, {0, size}, columns.data(), 3 * width, 3 * width);
-        for (int k = 0; k < size; ++k) {
-            double* to = line(k);
-            for (int kind = 0; kind < 3; ++kind)
-                std::copy_n(&columns[(k * 3 + kind) * width], width, to + kind * n + block.begin);
+        if (kinds() == 3) return;
+        for (int r = block.begin; r < block.end; ++r) {
+            double* row = &dV[r * 3 * n];
+            for (int c = block.begin; c < block.end; ++c) row[2 * n + c] = by_momentum(h, c) * row[n + c];
         }
     }
 
-    // dq1 = dq0 + h sum_i b_i dV_i,  dp1 = dp0 + h sum_i b_i ((L_qq,i + F_q,i) dQ_i + (A_i' + F_v,i) dV_i + F_f,i df).
+    // What a force on coordinate c does to the one stage, in units of what a momentum does.
+    double by_momentum(double h, int c) const { return h * (tableau.force[0] + changed(0, c)); }
+
+    // dq1 = dq0 + h sum_i b_i dV_i,  dp1 = dp0 + h F_f df + h sum_i b_i K_i dq0 + sum_j G_j dV_j, with K = L_qq + F_q
+    // and G_j = h b_j (A_j' + F_v,j) + h^2 sum_i b_i a_ij K_i.
     void end_derivatives(double h, Block block, const std::vector<double>& dV, double* Jx, double* Jf) {
-        const int width = block.end - block.begin;
-        shift.resize(entries(width, 3 * width));
-        const auto entry = [&](int r, int kind, int c) -> double& {
-            return kind == 2 ? Jf[r * n + c] : Jx[r * 2 * n + kind * n + c];
+        const int width = block.end - block.begin, size = stages * width;
+        gain.resize(size);
+        const auto curvature = [&](int i, int r, int c) {
+            double entry = stage[i].Lqq[r * n + c];
+            if (r == c) entry += acting[i * n + r].by_q;
+            if (coupled()) entry += coupled_q[(i * n + r) * n + c];
+            return entry;
         };
         for (int r = block.begin; r < block.end; ++r) {
-            for (int kind = 0; kind < 3; ++kind) {
-                for (int c = block.begin; c < block.end; ++c) {
-                    double total = 0.0;
-                    for (int i = 0; i < stages; ++i) total += tableau.b[i] * dV[(i * n + r) * 3 * n + kind * n + c];
-                    entry(r, kind, c) = h * total + (kind == 0 && r == c ? 1.0 : 0.0);
-                    entry(n + r, kind, c) = r != c ? 0.0 : kind == 1 ? 1.0 : kind == 2 ? h * passed(r) : 0.0;
+            double *q = Jx + r * 2 * n, *p = q + 2 * n * n, *qf = Jf + r * n, *pf = qf + n * n;
+            for (int c = block.begin; c < block.end; ++c) {
+                double by_q = 0.0, by_p = 0.0, by_f = 0.0, bend = 0.0;
+                for (int i = 0; i < stages; ++i) {
+                    const double* own = &dV[(i * n + r) * 3 * n + c];
+                    by_q += tableau.b[i] * own[0];
+                    by_p += tableau.b[i] * own[n];
+                    by_f += tableau.b[i] * own[2 * n];
+                    bend += tableau.b[i] * curvature(i, r, c);
+                }
+                q[c] = h * by_q + (r == c ? 1.0 : 0.0);
+                q[n + c] = h * by_p;
+                qf[c] = h * by_f;
+                p[c] = h * bend;
+                p[n + c] = pf[c] = 0.0;
+                for (int j = 0; j < stages; ++j) {
+                    double entry = tableau.b[j] * stage[j].A[c * n + r];
+                    if (r == c) entry += tableau.b[j] * acting[j * n + r].by_v;
+                    if (coupled()) entry += tableau.b[j] * coupled_v[(j * n + r) * n + c];
+                    for (int i = 0; i < stages; ++i)
+                        entry += h * tableau.b[i] * tableau.a[i * stages + j] * curvature(i, r, c);
+                    gain[j * width + c - block.begin] = -h * entry;
                 }
             }
-        }
-        for (int i = 0; i < stages; ++i) {
-            for (int r = 0; r < width; ++r) {
-                for (int kind = 0; kind < 3; ++kind) {
-                    double* row = &shift[(r * 3 + kind) * width];
-                    for (int c = 0; c < width; ++c) row[c] = kind == 0 && r == c ? 1.0 : 0.0;
-                    for (int j = 0; j < stages; ++j) {
-                        const double factor = h * tableau.a[i * stages + j];
-                        const double* from = &dV[(j * n + block.begin + r) * 3 * n + kind * n + block.begin];
-                        for (int c = 0; c < width; ++c) row[c] += factor * from[c];
-                    }
+            const auto add = [&](double* out, int kind, int across) {
+                for (int j = 0; j < stages; ++j) {
+                    const double* from = &dV[(j * n + block.begin) * 3 * n + kind * n + block.begin];
+                    subtract_rows(
+                        out + block.begin, across, 0, width, [&](int m) { return gain[j * width + m]; },
+                        [&](int m) { return from + m * 3 * n; });
                 }
+            };
+            if (width == n) {
+                add(p, 0, 2 * n);
+            } else {
+                add(p, 0, width);
+                add(p + n, 1, width);
             }
-            const double weight = h * tableau.b[i];
-            for (int r = block.begin; r < block.end; ++r) {
-                for (int m = block.begin; m < block.end; ++m) {
-                    const JointForce<double> own = m == r ? acting[i * n + r] : JointForce<double>{};
-                    double curvature = weight * (stage[i].Lqq[r * n + m] + own.by_q);
-                    double coupling = weight * (stage[i].A[m * n + r] + own.by_v);
-                    if (coupled()) {
-                        curvature += weight * coupled_q[(i * n + r) * n + m];
-                        coupling += weight * coupled_v[(i * n + r) * n + m];
-                    }
-                    for (int kind = 0; kind < 3; ++kind) {
-                        const double* __restrict dQ = &shift[((m - block.begin) * 3 + kind) * width];
-                        const double* __restrict dv = &dV[(i * n + m) * 3 * n + kind * n + block.begin];
-                        double* __restrict out = &entry(n + r, kind, block.begin);
-                        for (int c = 0; c < width; ++c) out[c] += curvature * dQ[c] + coupling * dv[c];
-                    }
-                }
+            if (kinds() == 3) {
+                add(pf, 2, width);
+            } else {
+                for (int c = block.begin; c < block.end; ++c) pf[c] = by_momentum(h, c) * p[n + c];
             }
+            p[n + r] += 1.0;
+            pf[r] += h * passed(r);
         }
     }
 };

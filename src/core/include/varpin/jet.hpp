@@ -18,6 +18,7 @@
 
 #include "varpin/dual.hpp"
 #include "varpin/size.hpp"
+#include "varpin/slopes.hpp"
 #include "varpin/spatial.hpp"
 #include "varpin/tree.hpp"
 
@@ -29,6 +30,45 @@ struct Magnitudes {
     double velocity = 0.0, turning = 0.0;  // V: linear, angular
     double momentum = 0.0, spin = 0.0;     // H: linear, angular
     double moment = 0.0;                   // m c
+};
+
+// What the axis of a body has of a force, and its rate, side by side: of doubles both at once.
+template <class T>
+struct AxisAndRate {
+    Motion<T> axis{}, rate{};
+
+    struct Both {
+        T by_axis{}, by_rate{};
+    };
+    struct Moved {
+        Force<T> by_axis{}, by_rate{};
+    };
+    Both of(const Force<T>& f) const { return {dot(axis, f), dot(rate, f)}; }
+    Moved moved(const Inertia<T>& Y) const { return {Y * axis, Y * rate}; }
+};
+template <>
+struct AxisAndRate<double> {
+    Motion<Slopes> both{};
+
+    AxisAndRate() = default;
+    AxisAndRate(const Motion<double>& axis, const Motion<double>& rate) : both(slopes(rate, axis)) {}
+
+    struct Both {
+        double by_axis, by_rate;
+    };
+    struct Moved {
+        Force<double> by_axis, by_rate;
+    };
+    Both of(const Force<double>& f) const {
+        const Slopes found = dot(both, f);
+        return {found.v(), found.q()};
+    }
+    Moved moved(const Inertia<double>& Y) const {
+        const Force<Slopes> found = Y * both;
+        const auto [l, a] = found;
+        return {{{l.x.v(), l.y.v(), l.z.v()}, {a.x.v(), a.y.v(), a.z.v()}},
+                {{l.x.q(), l.y.q(), l.z.q()}, {a.x.q(), a.y.q(), a.z.q()}}};
+    }
 };
 
 // Work arrays of a sweep, and where it leaves its results; matrices are (n, n), row by row.
@@ -43,6 +83,7 @@ struct Jet {
         Motion<T> axis{};
         Motion<T> velocity{};
         Motion<T> axis_rate{};
+        AxisAndRate<T> columns{};  // for second derivatives
         Inertia<T> inertia{};
         Force<T> momentum{};
         Magnitudes magnitude{};
@@ -199,8 +240,8 @@ void project_second(const Mechanism& mechanism, int j, Jet<T, Size>& w) {
     const auto& here = w.body[j];
     const Size n = w.dof;
     const int cj = link.coordinate;
-    const Force<T> F = here.inertia * here.axis;
-    const Force<T> B = here.inertia * here.axis_rate + cross(here.axis, here.momentum);
+    const auto [F, moved] = here.columns.moved(here.inertia);
+    const Force<T> B = moved + cross(here.axis, here.momentum);
     // F . (S_i x g) = S_i(angular) . (g x F(linear))
     const Vec3<T> turning = cross(mechanism.gravity, F.linear);
     for (int i = j; i >= 0; i = tree.bodies[i].parent) {
@@ -208,15 +249,16 @@ void project_second(const Mechanism& mechanism, int j, Jet<T, Size>& w) {
         const auto& there = w.body[i];
         const int ci = above.coordinate;
         const double ratio = above.ratio * link.ratio;
-        const T mass = ratio * dot(there.axis, F);
-        const T curvature = ratio * (dot(there.axis_rate, B) - dot(there.axis.angular, turning));
+        const auto of_F = there.columns.of(F), of_B = there.columns.of(B);
+        const T mass = ratio * of_F.by_axis;
+        const T curvature = ratio * (of_B.by_rate - dot(there.axis.angular, turning));
         w.M[ci * n + cj] += mass;
         w.Lqq[ci * n + cj] += curvature;
-        w.A[ci * n + cj] += ratio * dot(there.axis, B);
+        w.A[ci * n + cj] += ratio * of_B.by_axis;
         if (i != j) {
             w.M[cj * n + ci] += mass;
             w.Lqq[cj * n + ci] += curvature;
-            w.A[cj * n + ci] += ratio * dot(there.axis_rate, F);
+            w.A[cj * n + ci] += ratio * of_F.by_rate;
         }
     }
 }
@@ -340,6 +382,7 @@ void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T, S
         detail::move(tree, j, v, w);
         here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
         here.momentum = here.inertia * here.velocity;
+        here.columns = {here.axis, here.axis_rate};
         if constexpr (Jet<T, Size>::scaled) detail::measure(tree, j, v, w);
     }
     for (int j = bodies - 1; j >= 0; --j) {
