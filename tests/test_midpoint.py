@@ -1,6 +1,7 @@
 """The midpoint integrator against exact solutions, a plain version of itself, and what its structure promises."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -432,3 +433,45 @@ def test_without_a_guard_no_step_is_cut():
         plain = failure.trajectory
     assert (plain.statistics.substeps <= 1).all()
     assert np.isinf(plain.statistics.branch_margin).all()
+
+
+def arm_on(slider):
+    """Two joints that turn, and one that slides on them or below them."""
+    joints = [pin.JointModelRY(), pin.JointModelRY()]
+    joints.insert({"an arm": 2, "a rail": 0}[slider], pin.JointModelPX())
+    model, parent = pin.Model(), 0
+    for k, joint in enumerate(joints):
+        placement = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.5 * (k > 0)]))
+        parent = model.addJoint(parent, joint, placement, f"joint{k}")
+        body = pin.Inertia(1.0, np.array([0.05, 0.0, 0.2]), 0.02 * np.eye(3))
+        model.appendBodyToJoint(parent, body, pin.SE3.Identity())
+    return vp.load_robot(model)
+
+
+# What a correction leaves is estimated where inertia and gravity alone bend the step equation.
+UNSEEN = {
+    "chain": (lambda: vp.Scene(vp.planar_chain(3)), True),
+    "long chain, eliminated": (lambda: vp.Scene(vp.planar_chain(30)), True),
+    "springs and dampers": (lambda: vp.Scene(vp.load_robot("ur5"), damping=0.5, stiffness=2.0, rest=0.1), True),
+    "on a rail": (lambda: vp.Scene(arm_on("a rail")), True),
+    "slider on an arm": (lambda: vp.Scene(arm_on("an arm")), False),
+    "friction": (lambda: vp.Scene(vp.planar_chain(3), forces=[vp.CoulombFriction(0.1)]), False),
+}
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)], ids=str)
+@pytest.mark.parametrize("name", UNSEEN)
+def test_a_correction_that_leaves_nothing_is_not_looked_at(name, integrator):
+    """And the motion is, to rounding, that of steps each of which is looked at until it stagnates."""
+    make, unseen = UNSEEN[name]
+    scene = make()
+    rng = np.random.default_rng(5)
+    q0, v0 = rng.uniform(0.0, 0.5, scene.robot.dof), np.zeros(scene.robot.dof)
+    motion = vp.simulate(scene, q0, v0, dt=5e-4, steps=100, integrator=integrator, check=False)
+    seen = vp.simulate(scene, q0, v0, dt=5e-4, steps=100, integrator=replace(integrator, tolerance=1e-12), check=False)
+    stages = getattr(integrator, "stages", 1)
+    late = motion.statistics.sweeps[20:]
+    assert late.max() == 0 if unseen else late.min() >= stages
+    assert seen.statistics.sweeps.min() >= stages
+    for own, theirs in ((motion.q, seen.q), (motion.p, seen.p)):
+        np.testing.assert_allclose(own, theirs, rtol=0, atol=2e-13 * np.abs(theirs).max())

@@ -9,8 +9,7 @@
 #include "arrays.hpp"
 #include "registrations.hpp"
 #include "rollout_arrays.hpp"
-#include "varpin/linearization.hpp"
-#include "varpin/variational.hpp"
+#include "stepping.hpp"
 
 namespace varpin::border {
 
@@ -45,9 +44,13 @@ class VariationalRollout {
   public:
     VariationalRollout(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
                        double left, std::size_t paths, Solver solver)
-        : stepper_(std::make_shared<VariationalStepper>(mechanism, tableau, tolerance, guards, left, solver)),
+        : mechanism_(&mechanism),
+          stepping_(small_stepping(mechanism, tableau, tolerance, guards, left, solver)),
           guards_(guards),
-          states_(paths, PathState(mechanism, tableau.stages)) {}
+          states_(paths, PathState(mechanism, tableau.stages)) {
+        if (!stepping_)
+            stepping_ = std::make_shared<SteppingOf<int, int>>(mechanism, tableau, tolerance, guards, left, solver);
+    }
 
     VariationalRollout fork(const Guards& guards) const {
         VariationalRollout copy = *this;
@@ -62,13 +65,13 @@ class VariationalRollout {
         require(v, "v", {states_.size(), n});
         nb::gil_scoped_release release;
         for (std::size_t i = 0; i < states_.size(); ++i) {
-            if (!stepper_->begin(q.data() + i * n, v.data() + i * n, states_[i])) return false;
+            if (!stepping_->begin(q.data() + i * n, v.data() + i * n, states_[i])) return false;
         }
         return true;
     }
 
     void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes) {
-        const Mechanism& mechanism = stepper_->mechanism;
+        const Mechanism& mechanism = *mechanism_;
         const NodeArrays written(mechanism, nodes);
         if (written.paths() != states_.size())
             throw std::invalid_argument("there is not one row of nodes for each path");
@@ -76,17 +79,13 @@ class VariationalRollout {
         const double* dw = increments_of(mechanism, increments, written);
         const double* extra = drift_of(mechanism, drift, written);
         nb::gil_scoped_release release;
-        stepper_->guards = guards_;
-        stepper_->roll(h, given_commands.view(), dw, extra, states_, written.view());
+        stepping_->roll(guards_, h, given_commands.view(), dw, extra, states_, written.view());
     }
 
     // Add an impulse (P, n) to the momenta.
     void kick(In<2> impulse) {
         require(impulse, "impulse", {states_.size(), size()});
-        for (std::size_t i = 0; i < states_.size(); ++i) {
-            stepper_->look_at(states_[i]);
-            stepper_->kick(impulse.data() + i * size(), states_[i]);
-        }
+        for (std::size_t i = 0; i < states_.size(); ++i) stepping_->kick(impulse.data() + i * size(), states_[i]);
     }
 
     // Configurations, momenta, velocities (P, n) and energies (P).
@@ -111,11 +110,12 @@ class VariationalRollout {
     }
 
   private:
-    std::shared_ptr<VariationalStepper> stepper_;
+    const Mechanism* mechanism_;
+    std::shared_ptr<Stepping> stepping_;
     Guards guards_;
     std::vector<PathState> states_;
 
-    std::size_t size() const { return static_cast<std::size_t>(stepper_->n); }
+    std::size_t size() const { return static_cast<std::size_t>(mechanism_->dof()); }
 };
 
 // The arrays that N steps are taken again from.
@@ -187,10 +187,11 @@ std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(const Me
     require(guess, "guess", {N, stages, n});
     double *Jx = nullptr, *Jf = nullptr;
     const Out X = array_for(Jx, {N, 2 * n, 2 * n}), F = array_for(Jf, {N, 2 * n, n});
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver);
+    std::unique_ptr<Differentiation> work = small_differentiation(mechanism, tableau, tolerance, guards, solver);
+    if (!work) work = std::make_unique<DifferentiationOf<int, int>>(mechanism, tableau, tolerance, guards, solver);
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
-        return work.first(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
-                          Jx + s * 4 * n * n, Jf + s * 2 * n * n, at.past(s));
+        return work->first(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
+                           Jx + s * 4 * n * n, Jf + s * 2 * n * n, at.past(s));
     });
     return {X, F, static_cast<std::int64_t>(outcome), done};
 }

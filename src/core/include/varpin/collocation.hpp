@@ -16,6 +16,7 @@
 #include <cstdint>
 #include <limits>
 #include <optional>
+#include <type_traits>
 #include <vector>
 
 #include "varpin/compensated.hpp"
@@ -23,6 +24,7 @@
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/nodes.hpp"
+#include "varpin/size.hpp"
 #include "varpin/stage_elimination.hpp"
 #include "varpin/tableau.hpp"
 
@@ -50,6 +52,8 @@ struct Start {
     const double* force = nullptr;   // (n) constant over the step: the controls', and the drift of the noise
 };
 
+// Of a number of joints and of stages that the compiler knows, or does not.
+template <class Size = int, class Stages = int>
 class Collocation {
   public:
     Collocation(const Mechanism& mechanism, const Tableau& tableau, Solver solver)
@@ -57,19 +61,20 @@ class Collocation {
           tableau(tableau),
           n(mechanism.dof()),
           stages(tableau.stages),
-          stage(stages, Jet<double>(mechanism.tree, false)),
+          stage(stages, Jet<double, Size>(mechanism.tree, false)),
           V(stages * n),
           Q(stages * n),
           slope(stages * n),
           acting(stages * n),
           residual(stages * n),
           delta(stages * n) {
-        for (Jet<double>& jet : stage) mechanism.couplings.fit(jet.couplings);
+        for (Jet<double, Size>& jet : stage) mechanism.couplings.fit(jet.couplings);
+        measure_turning();
         if (mechanism.couplings.pushes()) {
             coupled_q.resize(entries(stages * n, n));
             coupled_v.resize(stages * n * n);
         }
-        if (stages > StageElimination::most_stages || !eliminates(mechanism, solver, stages)) {
+        if (known || stages > StageElimination::most_stages || !eliminates(mechanism, solver, stages)) {
             make_room();
             return;
         }
@@ -81,15 +86,17 @@ class Collocation {
             stage_elimination.emplace(mechanism, tableau);
         }
         eliminated_columns = solver == Solver::elimination;
-        for (const Block& block : mechanism.tree.blocks)
+        for (const Block& block : blocks_of(mechanism.tree, n))
             eliminated_columns = eliminated_columns || block.end - block.begin >= few_columns;
     }
 
+    static constexpr bool known = !std::is_same_v<Size, int>;
+
     const Mechanism& mechanism;
     const Tableau& tableau;
-    int n;
-    int stages;
-    std::vector<Jet<double>> stage;          // without matrices where there is an elimination
+    [[no_unique_address]] Size n;
+    [[no_unique_address]] Stages stages;
+    std::vector<Jet<double, Size>> stage;    // without matrices where there is an elimination
     std::optional<Elimination> elimination;  // at the iterate of the last factors; of one stage, without ties
     std::optional<StageElimination> stage_elimination;
     std::vector<double> V;                   // (s, n) stage velocities: the guess, then the root
@@ -104,8 +111,8 @@ class Collocation {
     // The first factorization is kept at least until a second correction shows how fast it contracts, and for as long
     // as three more would do. Gives up when a correction exceeds half of the one before (natural monotonicity,
     // Deuflhard 2004), unless the residual is down at its rounding floor. A last correction is not looked at again if
-    // that contraction takes the residual below a tenth of the tolerance: slopes are then corrected to first order.
-    // Where `jets_wanted`, it ends with the jets of the root.
+    // that contraction, or after a first one what the equation bends, takes the residual below a tenth of the
+    // tolerance: slopes are then corrected to first order. Where `jets_wanted`, it ends with the jets of the root.
     Outcome solve(double h, const Start& start, double tolerance, bool jets_wanted, Effort& effort) {
         double before = infinity, worst = infinity;
         bool fresh = true;
@@ -130,6 +137,14 @@ class Collocation {
             }
             for (int k = 0; k < stages * n; ++k) V[k] += delta[k];
             ++effort.newton_iterations;
+            if (fresh && !jets_wanted) {
+                const double left = left_by_bending(h, worst);
+                if (sure * left <= tolerance) {
+                    correct_slopes(h);
+                    worst = left;
+                    break;
+                }
+            }
             fresh = false;
             if (before < infinity) {
                 const double contraction = std::sqrt(size / before);
@@ -148,7 +163,7 @@ class Collocation {
         return Outcome::solved;
     }
 
-    bool eliminated() const { return elimination || stage_elimination; }
+    bool eliminated() const { return !known && (elimination || stage_elimination); }
 
     // Factor N from the stages' jets; false where its determinant is not positive.
     bool factor(double h) {
@@ -188,7 +203,7 @@ class Collocation {
     bool factor_blocks(double h) {
         double* matrix = lu.data();
         int* rows = order.data();
-        for (const Block& block : mechanism.tree.blocks) {
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
             const int size = stages * (block.end - block.begin);
             assemble(h, block, matrix);
             if (stages == 1) {
@@ -207,7 +222,7 @@ class Collocation {
     // (2n, 2n), Jf (2n, n). Blocks alone are written into dV.
     void derivatives(double h, std::vector<double>& dV, double* Jx, double* Jf) {
         if (eliminated_columns) return eliminate_derivatives(h, dV, Jx, Jf);
-        const auto& blocks = mechanism.tree.blocks;
+        const auto& blocks = blocks_of(mechanism.tree, n);
         if (blocks.size() > 1) {
             std::fill(Jx, Jx + 4 * n * n, 0.0);
             std::fill(Jf, Jf + 2 * n * n, 0.0);
@@ -218,7 +233,7 @@ class Collocation {
         for (const Block& block : blocks) {
             const int width = block.end - block.begin, size = stages * width;
             right_sides(h, block, dV);
-            solve_columns(matrix, rows, block, dV);
+            solve_columns(h, matrix, rows, block, dV);
             end_derivatives(h, block, dV, Jx, Jf);
             matrix += size * size;
             rows += size;
@@ -227,8 +242,7 @@ class Collocation {
 
     // x with N x = right (s, n), from what `factor` left.
     void solve_factored(const double* right, double* x) {
-        if (elimination) return elimination->solve(right, x);
-        if (stage_elimination) return stage_elimination->solve(right, x);
+        if (eliminated()) return elimination ? elimination->solve(right, x) : stage_elimination->solve(right, x);
         solve_blocks(right, x, [this](const double* matrix, int size, const int* rows, double* b, double* y) {
             if (stages == 1) {
                 solve_lu(matrix, size, {0, size}, b, y);
@@ -251,7 +265,7 @@ class Collocation {
     void solve_blocks(const double* right, double* x, const Solve& solve_block) {
         const double* matrix = lu.data();
         const int* rows = order.data();
-        for (const Block& block : mechanism.tree.blocks) {
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
             const int width = block.end - block.begin, size = stages * width;
             double *b = local.data(), *y = b + size;
             for (int i = 0; i < stages; ++i)
@@ -270,24 +284,51 @@ class Collocation {
     static constexpr double stagnation = 100.0;
     // A residual that is expected this far below the tolerance need not be looked at.
     static constexpr double sure = 10.0;
+    // Largest part of its estimate that bending leaves of a residual, with room: below 1 in what has been measured.
+    static constexpr double bending = 10.0;
 
     std::vector<double> residual, delta;  // (s, n)
     std::vector<double> lu;               // the factors of each block, one after another
     std::vector<int> order;               // of their rows
-    std::vector<double> change, local, columns, shift;
-    bool eliminated_columns = false;        // of derivatives
+    std::vector<double> change, local, columns, gain;
+    bool eliminated_columns = false;  // of derivatives
+    std::vector<double> turning;      // (n) how much a coordinate turns bodies; infinite, or NaN where it is still,
+                                      // where it slides them on a body that turns
     std::vector<double> element_curvature;  // (s, n) of the elements' potentials, where there is an elimination
     std::vector<double> diagonal;           // (s, s, n) of N, besides what elimination takes from the bodies
+
+    // At most what the second derivatives of r leave of a residual after the correction in `delta` with fresh factors,
+    // in its rounding units. Kinetic and potential energy bend with the angles by which bodies turn: that much of a
+    // change of the momenta, and as much again of the momenta themselves. Infinite where forces bend too.
+    double left_by_bending(double h, double before) const {
+        if (!mechanism.forces.linear() || mechanism.couplings.any()) return infinity;
+        double turn = 0.0;
+        for (int c = 0; c < n; ++c) {
+            double largest = 0.0;
+            for (int i = 0; i < stages; ++i) largest = std::max(largest, std::abs(delta[i * n + c]));
+            turn += turning[c] * largest;
+        }
+        turn *= h;
+        return bending * turn * (before + turn / rounding_unit);
+    }
+
+    void measure_turning() {
+        turning.assign(n, 0.0);
+        for (const Body& link : mechanism.tree.bodies) {
+            if (!link.prismatic) turning[link.coordinate] += std::abs(link.ratio);
+            if (link.prismatic && !link.origin) turning[link.coordinate] = infinity;
+        }
+    }
 
     // For matrices and their factors.
     void make_room() {
         int size = 0, largest = 0;
-        for (const Block& block : mechanism.tree.blocks) {
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
             const int own = stages * (block.end - block.begin);
             size = entries(1, std::int64_t{size} + entries(own, own));
             largest = std::max(largest, own);
         }
-        for (Jet<double>& jet : stage) jet.make_room();
+        for (Jet<double, Size>& jet : stage) jet.make_room();
         lu.resize(size);
         order.resize(stages * n);
         change.resize(stages * largest);
@@ -302,9 +343,10 @@ class Collocation {
     }
 
     void take_over() {
-        if (elimination) elimination->take(stage[0]);
-        if (!stage_elimination) return;
-        for (int i = 0; i < stages; ++i) stage_elimination->take(i, stage[i]);
+        if constexpr (!known) {
+            if (elimination) elimination->take(stage[0]);
+            for (int i = 0; i < stages && stage_elimination; ++i) stage_elimination->take(i, stage[i]);
+        }
     }
 
     [[gnu::always_inline]] inline void move_stages(const int stages, double h, const Start& start) {
@@ -471,11 +513,10 @@ class Collocation {
 
     // The square of x (s, n) in the metric of the kinetic energy, averaged over the step.
     double kinetic_size(const double* x) {
-        if (elimination) return elimination->kinetic_size(x);
-        if (stage_elimination) return stage_elimination->kinetic_size(x);
+        if (eliminated()) return elimination ? elimination->kinetic_size(x) : stage_elimination->kinetic_size(x);
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
-            for (const Block& block : mechanism.tree.blocks)
+            for (const Block& block : blocks_of(mechanism.tree, n))
                 total += tableau.b[i] * quadratic_form(stage[i].M.data(), n, block, x + i * n);
         }
         return total;
@@ -514,7 +555,7 @@ class Collocation {
                     change_of_slope(h, columns);
                 }
                 double* out = kind == 2 ? Jf + k : Jx + kind * n + k;
-                const int stride = kind == 2 ? n : 2 * n;
+                const int stride = (kind == 2 ? 1 : 2) * n;
                 for (int r = 0; r < n; ++r) {
                     double q = 0.0, p = 0.0;
                     for (int i = 0; i < stages; ++i) {
@@ -596,7 +637,7 @@ class Collocation {
             return;
         }
         for (int i = 0; i < stages; ++i) {
-            for (const Block& block : mechanism.tree.blocks) {
+            for (const Block& block : blocks_of(mechanism.tree, n)) {
                 for (int r = block.begin; r < block.end; ++r) {
                     const JointForce<double>& element = acting[i * n + r];
                     double total = element.by_v * delta[i * n + r] + element.by_q * moved[i * n + r];
@@ -607,6 +648,10 @@ class Collocation {
             }
         }
     }
+
+    // How many of q0, p0 and f have columns to be solved for: with one stage the force acts in proportion to the
+    // momentum.
+    int kinds() const { return stages == 1 ? 2 : 3; }
 
     // dr_i in (q0, p0, f): h sum_j (abar_ij L_qq,j + f_ij F_q,j) - A_i, 1, and h sum_j f_ij F_f,j.
     void right_sides(double h, Block block, std::vector<double>& dV) const {
@@ -625,78 +670,100 @@ class Collocation {
                         total += tableau.force[i * stages + j] * coupled_q[(j * n + r) * n + c];
                     row[c] = h * total - stage[i].A[r * n + c];
                     row[n + c] = r == c ? 1.0 : 0.0;
-                    row[2 * n + c] = r == c ? h * (share + changed(i, r)) : 0.0;
+                    if (kinds() == 3) row[2 * n + c] = r == c ? h * (share + changed(i, r)) : 0.0;
                 }
             }
         }
     }
 
     // N dV = dr in place, whole rows at a time.
-    void solve_columns(const double* matrix, const int* rows, Block block, std::vector<double>& dV) {
+    void solve_columns(double h, const double* matrix, const int* rows, Block block, std::vector<double>& dV) {
         const int width = block.end - block.begin, size = stages * width;
-        columns.resize(entries(size, 3 * width));
-        // Row k of the block's own system, which stands at (stage, coordinate) in dV.
-        const auto line = [&](int k) { return &dV[((k / width) * n + block.begin + k % width) * 3 * n]; };
-        for (int k = 0; k < size; ++k) {
-            const double* from = line(stages == 1 ? k : rows[k]);
-            for (int kind = 0; kind < 3; ++kind)
-                std::copy(from + kind * n + block.begin, from + kind * n + block.end, &columns[(k * 3 + kind) * width]);
+        if (stages == 1 && width == n) {
+            solve_lu_rows(matrix, n, {0, n}, dV.data(), 2 * n, 3 * n);
+        } else {
+            const int across = kinds() * width;
+            columns.resize(entries(size, across));
+            // Row k of the block's own system, which stands at (stage, coordinate) in dV.
+            const auto line = [&](int k) { return &dV[((k / width) * n + block.begin + k % width) * 3 * n]; };
+            for (int k = 0; k < size; ++k) {
+                const double* from = line(stages == 1 ? k : rows[k]);
+                for (int kind = 0; kind < kinds(); ++kind)
+                    std::copy_n(from + kind * n + block.begin, width, &columns[k * across + kind * width]);
+            }
+            solve_lu_rows(matrix, size, {0, size}, columns.data(), across, across);
+            for (int k = 0; k < size; ++k) {
+                for (int kind = 0; kind < kinds(); ++kind)
+                    std::copy_n(&columns[k * across + kind * width], width, line(k) + kind * n + block.begin);
+            }
         }
-        solve_lu_rows(matrix, size, {0, size}, columns.data(), 3 * width, 3 * width);
-        for (int k = 0; k < size; ++k) {
-            double* to = line(k);
-            for (int kind = 0; kind < 3; ++kind)
-                std::copy_n(&columns[(k * 3 + kind) * width], width, to + kind * n + block.begin);
+        if (kinds() == 3) return;
+        for (int r = block.begin; r < block.end; ++r) {
+            double* row = &dV[r * 3 * n];
+            for (int c = block.begin; c < block.end; ++c) row[2 * n + c] = by_momentum(h, c) * row[n + c];
         }
     }
 
-    // dq1 = dq0 + h sum_i b_i dV_i,  dp1 = dp0 + h sum_i b_i ((L_qq,i + F_q,i) dQ_i + (A_i' + F_v,i) dV_i + F_f,i df).
+    // What a force on coordinate c does to the one stage, in units of what a momentum does.
+    double by_momentum(double h, int c) const { return h * (tableau.force[0] + changed(0, c)); }
+
+    // dq1 = dq0 + h sum_i b_i dV_i,  dp1 = dp0 + h F_f df + h sum_i b_i K_i dq0 + sum_j G_j dV_j, with K = L_qq + F_q
+    // and G_j = h b_j (A_j' + F_v,j) + h^2 sum_i b_i a_ij K_i.
     void end_derivatives(double h, Block block, const std::vector<double>& dV, double* Jx, double* Jf) {
-        const int width = block.end - block.begin;
-        shift.resize(entries(width, 3 * width));
-        const auto entry = [&](int r, int kind, int c) -> double& {
-            return kind == 2 ? Jf[r * n + c] : Jx[r * 2 * n + kind * n + c];
+        const int width = block.end - block.begin, size = stages * width;
+        gain.resize(size);
+        const auto curvature = [&](int i, int r, int c) {
+            double entry = stage[i].Lqq[r * n + c];
+            if (r == c) entry += acting[i * n + r].by_q;
+            if (coupled()) entry += coupled_q[(i * n + r) * n + c];
+            return entry;
         };
         for (int r = block.begin; r < block.end; ++r) {
-            for (int kind = 0; kind < 3; ++kind) {
-                for (int c = block.begin; c < block.end; ++c) {
-                    double total = 0.0;
-                    for (int i = 0; i < stages; ++i) total += tableau.b[i] * dV[(i * n + r) * 3 * n + kind * n + c];
-                    entry(r, kind, c) = h * total + (kind == 0 && r == c ? 1.0 : 0.0);
-                    entry(n + r, kind, c) = r != c ? 0.0 : kind == 1 ? 1.0 : kind == 2 ? h * passed(r) : 0.0;
+            double *q = Jx + r * 2 * n, *p = q + 2 * n * n, *qf = Jf + r * n, *pf = qf + n * n;
+            for (int c = block.begin; c < block.end; ++c) {
+                double by_q = 0.0, by_p = 0.0, by_f = 0.0, bend = 0.0;
+                for (int i = 0; i < stages; ++i) {
+                    const double* own = &dV[(i * n + r) * 3 * n + c];
+                    by_q += tableau.b[i] * own[0];
+                    by_p += tableau.b[i] * own[n];
+                    by_f += tableau.b[i] * own[2 * n];
+                    bend += tableau.b[i] * curvature(i, r, c);
+                }
+                q[c] = h * by_q + (r == c ? 1.0 : 0.0);
+                q[n + c] = h * by_p;
+                qf[c] = h * by_f;
+                p[c] = h * bend;
+                p[n + c] = pf[c] = 0.0;
+                for (int j = 0; j < stages; ++j) {
+                    double entry = tableau.b[j] * stage[j].A[c * n + r];
+                    if (r == c) entry += tableau.b[j] * acting[j * n + r].by_v;
+                    if (coupled()) entry += tableau.b[j] * coupled_v[(j * n + r) * n + c];
+                    for (int i = 0; i < stages; ++i)
+                        entry += h * tableau.b[i] * tableau.a[i * stages + j] * curvature(i, r, c);
+                    gain[j * width + c - block.begin] = -h * entry;
                 }
             }
-        }
-        for (int i = 0; i < stages; ++i) {
-            for (int r = 0; r < width; ++r) {
-                for (int kind = 0; kind < 3; ++kind) {
-                    double* row = &shift[(r * 3 + kind) * width];
-                    for (int c = 0; c < width; ++c) row[c] = kind == 0 && r == c ? 1.0 : 0.0;
-                    for (int j = 0; j < stages; ++j) {
-                        const double factor = h * tableau.a[i * stages + j];
-                        const double* from = &dV[(j * n + block.begin + r) * 3 * n + kind * n + block.begin];
-                        for (int c = 0; c < width; ++c) row[c] += factor * from[c];
-                    }
+            const auto add = [&](double* out, int kind, int across) {
+                for (int j = 0; j < stages; ++j) {
+                    const double* from = &dV[(j * n + block.begin) * 3 * n + kind * n + block.begin];
+                    subtract_rows(
+                        out + block.begin, across, 0, width, [&](int m) { return gain[j * width + m]; },
+                        [&](int m) { return from + m * 3 * n; });
                 }
+            };
+            if (width == n) {
+                add(p, 0, 2 * n);
+            } else {
+                add(p, 0, width);
+                add(p + n, 1, width);
             }
-            const double weight = h * tableau.b[i];
-            for (int r = block.begin; r < block.end; ++r) {
-                for (int m = block.begin; m < block.end; ++m) {
-                    const JointForce<double> own = m == r ? acting[i * n + r] : JointForce<double>{};
-                    double curvature = weight * (stage[i].Lqq[r * n + m] + own.by_q);
-                    double coupling = weight * (stage[i].A[m * n + r] + own.by_v);
-                    if (coupled()) {
-                        curvature += weight * coupled_q[(i * n + r) * n + m];
-                        coupling += weight * coupled_v[(i * n + r) * n + m];
-                    }
-                    for (int kind = 0; kind < 3; ++kind) {
-                        const double* __restrict dQ = &shift[((m - block.begin) * 3 + kind) * width];
-                        const double* __restrict dv = &dV[(i * n + m) * 3 * n + kind * n + block.begin];
-                        double* __restrict out = &entry(n + r, kind, block.begin);
-                        for (int c = 0; c < width; ++c) out[c] += curvature * dQ[c] + coupling * dv[c];
-                    }
-                }
+            if (kinds() == 3) {
+                add(pf, 2, width);
+            } else {
+                for (int c = block.begin; c < block.end; ++c) pf[c] = by_momentum(h, c) * p[n + c];
             }
+            p[n + r] += 1.0;
+            pf[r] += h * passed(r);
         }
     }
 };

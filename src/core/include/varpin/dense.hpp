@@ -62,29 +62,6 @@ inline void solve_lu(const double* lu, int n, Block block, const double* b, doub
     }
 }
 
-// The X with L U X = B, B and X (size of the block, columns) row by row and in one place, all columns at once.
-// Row i of the block stands at x + (i - begin) * stride.
-inline void solve_lu_rows(const double* lu, int n, Block block, double* x, int columns, int stride) {
-    for (int i = block.begin; i < block.end; ++i) {
-        double* __restrict row = x + (i - block.begin) * stride;
-        for (int j = block.begin; j < i; ++j) {
-            const double factor = lu[i * n + j];
-            const double* __restrict other = x + (j - block.begin) * stride;
-            for (int c = 0; c < columns; ++c) row[c] -= factor * other[c];
-        }
-    }
-    for (int i = block.end - 1; i >= block.begin; --i) {
-        double* __restrict row = x + (i - block.begin) * stride;
-        for (int j = i + 1; j < block.end; ++j) {
-            const double factor = lu[i * n + j];
-            const double* __restrict other = x + (j - block.begin) * stride;
-            for (int c = 0; c < columns; ++c) row[c] -= factor * other[c];
-        }
-        const double inverse = 1.0 / lu[i * n + i];
-        for (int c = 0; c < columns; ++c) row[c] *= inverse;
-    }
-}
-
 // LU with rows exchanged; `order` (n) receives which row stands where. Returns the sign of the determinant, 0 where it
 // is not finite.
 inline int factor_lu_pivoting(double* a, int n, int* order) {
@@ -287,6 +264,20 @@ inline void subtract_product(const double* a, int rows, int inner, const double*
     }
     if (i < rows)
         subtract_rows(out, columns, 0, inner, [&](int k) { return a[k]; }, [&](int k) { return x + k * columns; });
+}
+
+// The X with L U X = B, B and X (size of the block, columns) row by row and in one place, all columns at once.
+// Row i of the block stands at x + (i - begin) * stride.
+inline void solve_lu_rows(const double* lu, int n, Block block, double* x, int columns, int stride) {
+    const auto row = [&](int i) { return x + (i - block.begin) * stride; };
+    const auto of_row = [&](int i) { return [=](int j) { return lu[i * n + j]; }; };
+    for (int i = block.begin; i < block.end; ++i) subtract_rows(row(i), columns, block.begin, i, of_row(i), row);
+    for (int i = block.end - 1; i >= block.begin; --i) {
+        double* own = row(i);
+        subtract_rows(own, columns, i + 1, block.end, of_row(i), row);
+        const double inverse = 1.0 / lu[i * n + i];
+        for (int c = 0; c < columns; ++c) own[c] *= inverse;
+    }
 }
 
 // The X with L D L' X = B, B and X (size of the block, columns) row by row and in one place, all columns at once.

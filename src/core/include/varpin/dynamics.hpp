@@ -20,35 +20,11 @@
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/pair.hpp"
+#include "varpin/slopes.hpp"
 #include "varpin/spatial.hpp"
 #include "varpin/tree.hpp"
 
 namespace varpin {
-
-// Derivatives of something in a coordinate and in its velocity, which go through the processor together.
-struct Slopes {
-    Pair both{0.0, 0.0};
-
-    Slopes() = default;
-    explicit Slopes(Pair both) : both(both) {}
-    Slopes(double q, double v) : both{q, v} {}
-
-    double q() const { return both[0]; }
-    double v() const { return both[1]; }
-};
-
-inline Slopes operator+(Slopes a, Slopes b) { return Slopes(a.both + b.both); }
-inline Slopes operator-(Slopes a, Slopes b) { return Slopes(a.both - b.both); }
-inline Slopes operator*(double s, Slopes a) { return Slopes(Pair{s, s} * a.both); }
-inline Slopes operator*(Slopes a, double s) { return s * a; }
-inline Slopes& operator+=(Slopes& a, Slopes b) { return a = a + b; }
-
-inline Vec3<Slopes> slopes(const Vec3<double>& q, const Vec3<double>& v) {
-    return {{q.x, v.x}, {q.y, v.y}, {q.z, v.z}};
-}
-inline Motion<Slopes> slopes(const Motion<double>& q, const Motion<double>& v) {
-    return {slopes(q.linear, v.linear), slopes(q.angular, v.angular)};
-}
 
 // C x = Y (x x V) + x x* H + V x* Y x. Of a body with first moment h, second moments J, velocity (u, w) and linear
 // momentum P it is
@@ -132,7 +108,7 @@ class ForwardDynamics {
         const Tree& tree = mechanism_->tree;
         std::fill(jet_.potential.begin(), jet_.potential.end(), 0.0);
         std::fill(jet_.potential_scale.begin(), jet_.potential_scale.end(), 0.0);
-        if (!articulated_) detail::clear_blocks(tree, jet_.M);
+        if (!articulated_) detail::clear_blocks(tree, jet_.dof, jet_.M);
         add_potentials(q);
         std::copy_n(q, jet_.dof, q_.data());
         std::copy_n(v, jet_.dof, v_.data());
@@ -210,7 +186,7 @@ class ForwardDynamics {
     void differentiate(const double* v, const double* a) {
         const Tree& tree = mechanism_->tree;
         const int n = jet_.dof;
-        detail::clear_blocks(tree, slopes_);
+        detail::clear_blocks(tree, n, slopes_);
         for (int i = 0; i < n; ++i) slopes_[i * n + i] = {-acting_[i].by_q - curvature_[i], -acting_[i].by_v};
         for (std::size_t k = 0; k < coupled_curvature_.size(); ++k)
             slopes_[k] += {-coupled_q_[k] - coupled_curvature_[k], -coupled_v_[k]};

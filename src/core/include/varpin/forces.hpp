@@ -61,6 +61,7 @@ struct JointSpring {
     double rest = 0.0;       // where it is slack [rad or m]
 
     static constexpr bool anchored = true;
+    static constexpr bool linear() { return true; }
 
     template <class T>
     Potential<T> potential(T q) const {
@@ -76,6 +77,7 @@ struct JointDamper {
     double damping = 0.0;  // [N m s/rad or N s/m]
 
     static constexpr bool anchored = false;
+    static constexpr bool linear() { return true; }
 
     template <class T>
     JointForce<T> force(T, T v) const {
@@ -94,6 +96,7 @@ struct CoulombFriction {
     double stribeck_velocity = 0.0;  // [rad/s or m/s]
 
     static constexpr bool anchored = false;
+    static constexpr bool linear() { return true; }
 
     template <class T>
     JointForce<T> force(T, T v) const {
@@ -126,6 +129,7 @@ struct JointStop {
     double width = 0.0;               // [rad or m]
 
     static constexpr bool anchored = true;
+    static constexpr bool linear() { return false; }
 
     template <class T>
     Potential<T> potential(T q) const {
@@ -183,6 +187,7 @@ struct PositionServo {
 
     static constexpr bool anchored = true;
     static constexpr double straight = 0.9;
+    bool linear() const { return std::isinf(effort); }
 
     template <class T>
     JointForce<T> force(T q, T v, T f) const {
@@ -205,7 +210,8 @@ struct PositionServo {
     }
 };
 
-// Every kind of element. `anchored` says that it matters where the joint stands, whole turns included.
+// Every kind of element. `anchored` says that it matters where the joint stands, whole turns included; `linear`, that
+// the force is a linear function of (q, v).
 using Element = std::variant<JointSpring, JointDamper, CoulombFriction, JointStop, PositionServo>;
 
 // The list. Elements of a kind stand together, so that a scene pays nothing for a kind that it has none of.
@@ -217,6 +223,9 @@ class Forces {
     }
 
     bool any() const { return any_; }
+
+    // Whether all forces are linear functions of (q, v).
+    bool linear() const { return linear_; }
 
     // Whether an element minds where coordinate c stands.
     bool anchors(int c) const { return c < static_cast<int>(anchored_.size()) && anchored_[c] != 0; }
@@ -263,12 +272,14 @@ class Forces {
     ByKind<Element>::type kinds_;
     std::vector<char> anchored_;
     bool any_ = false;
+    bool linear_ = true;
     bool drives_ = false;
 
     template <class Kind>
     void add(const Kind& own) {
         std::get<std::vector<Kind>>(kinds_).push_back(own);
         any_ = true;
+        linear_ = linear_ && own.linear();
         if constexpr (requires { own.force(0.0, 0.0, 0.0); }) drives_ = true;
         if (!Kind::anchored) return;
         if (!anchors(own.coordinate)) anchored_.resize(std::max<std::size_t>(anchored_.size(), own.coordinate + 1));

@@ -14,6 +14,7 @@
 #include <algorithm>
 #include <cmath>
 #include <optional>
+#include <type_traits>
 #include <vector>
 
 #include "varpin/collocation.hpp"
@@ -94,6 +95,7 @@ struct Trial {
     std::vector<double> magnitude;     // (n) of the work of all terms of the force on each coordinate [J]
 };
 
+template <class Size = int>
 class EnergyGuard {
   public:
     EnergyGuard(const Mechanism& mechanism, Solver solver, bool matrices)
@@ -109,7 +111,7 @@ class EnergyGuard {
           diagonal(n),
           part(Energies(mechanism.tree).part) {
         mechanism.couplings.fit(jet.couplings);
-        if (eliminates(mechanism.tree, solver)) {
+        if (!known && eliminates(mechanism.tree, solver)) {
             articulated.emplace(mechanism.tree);
         } else {
             jet.M.resize(entries(n, n));
@@ -124,13 +126,15 @@ class EnergyGuard {
     // v = M(q)^-1 p at a node, and the kinetic and potential energy there; false where M is not positive definite.
     // Leaves the factors of M.
     bool node(const double* q, const double* p, double* v) {
-        if (articulated) {
-            if (!articulated->at(mechanism, q, jet)) return false;
-            velocity(p, v);
-            return true;
+        if constexpr (!known) {
+            if (articulated) {
+                if (!articulated->at(mechanism, q, jet)) return false;
+                velocity(p, v);
+                return true;
+            }
         }
         mass_matrix(mechanism, q, jet);
-        for (const Block& block : mechanism.tree.blocks) {
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
             for (int i = block.begin; i < block.end; ++i)
                 std::copy(&jet.M[i * n + block.begin], &jet.M[i * n + i] + 1, &ldl[i * n + block.begin]);
             if (!factor_ldl(ldl.data(), n, block)) return false;
@@ -143,12 +147,12 @@ class EnergyGuard {
     // none of which is negative, are the coordinates' shares.
     void velocity(const double* p, double* v) {
         std::fill(kinetic.begin(), kinetic.end(), 0.0);
-        if (articulated) {
+        if (!known && articulated) {
             articulated->solve(p, v, share.data());
             for (int i = 0; i < n; ++i) kinetic[mechanism.tree.group[i]] += share[i];
             return;
         }
-        for (const Block& block : mechanism.tree.blocks) {
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
             solve_lower(ldl.data(), n, block, p, v);
             for (int i = block.begin; i < block.end; ++i) {
                 const double y = v[i];
@@ -162,8 +166,8 @@ class EnergyGuard {
 
     // x = M^-1 b.
     void solve(const double* b, double* x) {
-        if (articulated) return articulated->solve(b, x, nullptr);
-        for (const Block& block : mechanism.tree.blocks) solve_ldl(ldl.data(), n, block, b, x);
+        if (!known && articulated) return articulated->solve(b, x, nullptr);
+        for (const Block& block : blocks_of(mechanism.tree, n)) solve_ldl(ldl.data(), n, block, b, x);
     }
 
     // A fresh start at a node: no errors lie behind it.
@@ -197,7 +201,8 @@ class EnergyGuard {
     // How far the root is from the fold where branches of solutions meet: 1 as h -> 0, <= 0 where refused. The smallest
     // ratio of a pivot of M - (h/2) dF/dv + h skew (A + A') - h^2 reach (L_qq + dF/dq) / (1 - margin) to the same pivot
     // of M, all averaged over the stages with b.
-    double branch_margin(double h, const Guards& guards, Collocation& step) {
+    template <class Stages>
+    double branch_margin(double h, const Guards& guards, Collocation<Size, Stages>& step) {
         const Tableau& tableau = step.tableau;
         const double exaggerated = h * h * tableau.reach / (1.0 - guards.branch_margin);
         if (step.eliminated()) {
@@ -208,7 +213,7 @@ class EnergyGuard {
             return step.stage_elimination->least_pivot_ratio(coupling, exaggerated, diagonal.data());
         }
         double least = infinity;
-        for (const Block& block : mechanism.tree.blocks) {
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
             for (int i = block.begin; i < block.end; ++i) {
                 double *inertia = &mass[i * n], *line = &curved[i * n];
                 std::fill(inertia + block.begin, inertia + i + 1, 0.0);
@@ -216,7 +221,7 @@ class EnergyGuard {
                     detail::subtract_scaled(inertia, -tableau.b[s], &step.stage[s].M[i * n], block.begin, i + 1);
                 std::copy(inertia + block.begin, inertia + i + 1, line + block.begin);
                 for (int s = 0; s < step.stages; ++s) {
-                    const Jet<double>& own = step.stage[s];
+                    const Jet<double, Size>& own = step.stage[s];
                     detail::subtract_scaled(line, exaggerated * tableau.b[s], &own.Lqq[i * n], block.begin, i + 1);
                     if (tableau.skew == 0.0) continue;
                     const double twist = h * tableau.skew * tableau.b[s];
@@ -274,6 +279,7 @@ class EnergyGuard {
     }
 
   private:
+    static constexpr bool known = !std::is_same_v<Size, int>;
     static constexpr double fade = 1.0 / 256.0;  // by which a substep forgets how far kinetic energies have varied
     static constexpr double rounding = 1e-12;    // of the magnitudes that make up an energy or a work
     static constexpr double part_room = 4.0;     // times the limits of whole groups: the trapezoidal rule errs too
@@ -295,8 +301,8 @@ class EnergyGuard {
     };
 
     const Mechanism& mechanism;
-    int n;
-    Jet<double> jet;
+    [[no_unique_address]] Size n;
+    Jet<double, Size> jet;
     std::optional<ArticulatedBodies> articulated;
     std::vector<double> ldl;             // (n, n) factors of M, unless bodies are articulated
     std::vector<double> kinetic, moved;  // of each group [J]

@@ -17,6 +17,8 @@
 #include <vector>
 
 #include "varpin/dual.hpp"
+#include "varpin/size.hpp"
+#include "varpin/slopes.hpp"
 #include "varpin/spatial.hpp"
 #include "varpin/tree.hpp"
 
@@ -30,8 +32,47 @@ struct Magnitudes {
     double moment = 0.0;                   // m c
 };
 
-// Work arrays of a sweep, and where it leaves its results; matrices are (n, n), row by row.
+// What the axis of a body has of a force, and its rate, side by side: of doubles both at once.
 template <class T>
+struct AxisAndRate {
+    Motion<T> axis{}, rate{};
+
+    struct Both {
+        T by_axis{}, by_rate{};
+    };
+    struct Moved {
+        Force<T> by_axis{}, by_rate{};
+    };
+    Both of(const Force<T>& f) const { return {dot(axis, f), dot(rate, f)}; }
+    Moved moved(const Inertia<T>& Y) const { return {Y * axis, Y * rate}; }
+};
+template <>
+struct AxisAndRate<double> {
+    Motion<Slopes> both{};
+
+    AxisAndRate() = default;
+    AxisAndRate(const Motion<double>& axis, const Motion<double>& rate) : both(slopes(rate, axis)) {}
+
+    struct Both {
+        double by_axis, by_rate;
+    };
+    struct Moved {
+        Force<double> by_axis, by_rate;
+    };
+    Both of(const Force<double>& f) const {
+        const Slopes found = dot(both, f);
+        return {found.v(), found.q()};
+    }
+    Moved moved(const Inertia<double>& Y) const {
+        const Force<Slopes> found = Y * both;
+        const auto [l, a] = found;
+        return {{{l.x.v(), l.y.v(), l.z.v()}, {a.x.v(), a.y.v(), a.z.v()}},
+                {{l.x.q(), l.y.q(), l.z.q()}, {a.x.q(), a.y.q(), a.z.q()}}};
+    }
+};
+
+// Work arrays of a sweep, and where it leaves its results; matrices are (n, n), row by row.
+template <class T, class Size = int>
 struct Jet {
     // Only steps ask how much rounding there is in L_q, L_v and the potential.
     static constexpr bool scaled = std::is_same_v<T, double>;
@@ -42,6 +83,7 @@ struct Jet {
         Motion<T> axis{};
         Motion<T> velocity{};
         Motion<T> axis_rate{};
+        AxisAndRate<T> columns{};  // for second derivatives
         Inertia<T> inertia{};
         Force<T> momentum{};
         Magnitudes magnitude{};
@@ -65,7 +107,7 @@ struct Jet {
     }
 
     std::vector<BodyState> body;
-    int dof;
+    [[no_unique_address]] Size dof;
     T kinetic{};               // [J]
     std::vector<T> potential;  // of each group [J]
     std::vector<T> Lq, Lv, M, A, Lqq;
@@ -88,8 +130,8 @@ double norm1(const Vec3<T>& a) {
 
 // Orientation, position and axis of a body. What every sweep does for every body is told to be part of it: that takes
 // 15 % off a sweep.
-template <class T>
-[[gnu::always_inline]] inline void place(const Tree& tree, int j, const T* q, Jet<T>& w) {
+template <class T, class Size>
+[[gnu::always_inline]] inline void place(const Tree& tree, int j, const T* q, Jet<T, Size>& w) {
     using std::cos, std::sin;
     const Body& link = tree.bodies[j];
     auto& here = w.body[j];
@@ -119,8 +161,8 @@ template <class T>
 }
 
 // Velocity V of a body and the rate W of its axis.
-template <class T>
-[[gnu::always_inline]] inline void move(const Tree& tree, int j, const T* v, Jet<T>& w) {
+template <class T, class Size>
+[[gnu::always_inline]] inline void move(const Tree& tree, int j, const T* v, Jet<T, Size>& w) {
     const Body& link = tree.bodies[j];
     auto& here = w.body[j];
     const T rate = link.ratio * v[link.coordinate];
@@ -134,7 +176,8 @@ template <class T>
     here.velocity = up + rate * here.axis;
 }
 
-inline void measure(const Tree& tree, int j, const double* v, Jet<double>& w) {
+template <class Size>
+[[gnu::always_inline]] inline void measure(const Tree& tree, int j, const double* v, Jet<double, Size>& w) {
     const Body& link = tree.bodies[j];
     auto& here = w.body[j];
     const double rate = std::abs(link.ratio * v[link.coordinate]);
@@ -152,8 +195,8 @@ inline void measure(const Tree& tree, int j, const double* v, Jet<double>& w) {
 }
 
 // Gravity's potential energy of what an origin carries: of its moments, and of all masses' shift.
-template <class T>
-void add_potential(const Mechanism& mechanism, int j, const T* q, Jet<T>& w) {
+template <class T, class Size>
+void add_potential(const Mechanism& mechanism, int j, const T* q, Jet<T, Size>& w) {
     const Body& link = mechanism.tree.bodies[j];
     const auto& here = w.body[j];
     Vec3<T> shift{T(link.translation.x), T(link.translation.y), T(link.translation.z)};
@@ -161,15 +204,15 @@ void add_potential(const Mechanism& mechanism, int j, const T* q, Jet<T>& w) {
     if (link.prismatic) shift += (link.ratio * q[link.coordinate] + link.offset) * here.axis.linear;
     const int group = mechanism.tree.group[link.coordinate];
     w.potential[group] -= dot(here.inertia.mass * shift + here.inertia.moment, mechanism.gravity);
-    if constexpr (Jet<T>::scaled) {
+    if constexpr (Jet<T, Size>::scaled) {
         w.potential_scale[group] +=
             norm1(mechanism.gravity) * (here.inertia.mass * norm1(shift) + norm1(here.inertia.moment));
     }
 }
 
 // The share of what body j carries in L_q and L_v.
-template <class T>
-[[gnu::always_inline]] inline void project_first(const Mechanism& mechanism, int j, Jet<T>& w) {
+template <class T, class Size>
+[[gnu::always_inline]] inline void project_first(const Mechanism& mechanism, int j, Jet<T, Size>& w) {
     const Body& link = mechanism.tree.bodies[j];
     const auto& here = w.body[j];
     const Vec3<double>& g = mechanism.gravity;
@@ -177,7 +220,7 @@ template <class T>
     const int c = link.coordinate;
     w.Lv[c] += link.ratio * dot(here.axis, here.momentum);
     w.Lq[c] += link.ratio * (dot(here.axis_rate, here.momentum) + dot(here.axis, weight));
-    if constexpr (Jet<T>::scaled) {
+    if constexpr (Jet<T, Size>::scaled) {
         const Magnitudes& own = here.magnitude;
         const Magnitudes up = link.parent >= 0 ? w.body[link.parent].magnitude : Magnitudes{};
         const double shift = norm1(here.axis.linear), turn = norm1(here.axis.angular);
@@ -190,14 +233,15 @@ template <class T>
 }
 
 // The share of what body j carries in M, A and L_qq.
-template <class T>
-void project_second(const Mechanism& mechanism, int j, Jet<T>& w) {
+template <class T, class Size>
+void project_second(const Mechanism& mechanism, int j, Jet<T, Size>& w) {
     const Tree& tree = mechanism.tree;
     const Body& link = tree.bodies[j];
     const auto& here = w.body[j];
-    const int n = w.dof, cj = link.coordinate;
-    const Force<T> F = here.inertia * here.axis;
-    const Force<T> B = here.inertia * here.axis_rate + cross(here.axis, here.momentum);
+    const Size n = w.dof;
+    const int cj = link.coordinate;
+    const auto [F, moved] = here.columns.moved(here.inertia);
+    const Force<T> B = moved + cross(here.axis, here.momentum);
     // F . (S_i x g) = S_i(angular) . (g x F(linear))
     const Vec3<T> turning = cross(mechanism.gravity, F.linear);
     for (int i = j; i >= 0; i = tree.bodies[i].parent) {
@@ -205,25 +249,27 @@ void project_second(const Mechanism& mechanism, int j, Jet<T>& w) {
         const auto& there = w.body[i];
         const int ci = above.coordinate;
         const double ratio = above.ratio * link.ratio;
-        const T mass = ratio * dot(there.axis, F);
-        const T curvature = ratio * (dot(there.axis_rate, B) - dot(there.axis.angular, turning));
+        const auto of_F = there.columns.of(F), of_B = there.columns.of(B);
+        const T mass = ratio * of_F.by_axis;
+        const T curvature = ratio * (of_B.by_rate - dot(there.axis.angular, turning));
         w.M[ci * n + cj] += mass;
         w.Lqq[ci * n + cj] += curvature;
-        w.A[ci * n + cj] += ratio * dot(there.axis, B);
+        w.A[ci * n + cj] += ratio * of_B.by_axis;
         if (i != j) {
             w.M[cj * n + ci] += mass;
             w.Lqq[cj * n + ci] += curvature;
-            w.A[cj * n + ci] += ratio * dot(there.axis_rate, F);
+            w.A[cj * n + ci] += ratio * of_F.by_rate;
         }
     }
 }
 
 // The share of what body j carries in M alone: the composite rigid body algorithm.
-template <class T>
-void project_mass(const Tree& tree, int j, Jet<T>& w) {
+template <class T, class Size>
+void project_mass(const Tree& tree, int j, Jet<T, Size>& w) {
     const Body& link = tree.bodies[j];
     const Force<T> F = w.body[j].inertia * w.body[j].axis;
-    const int n = w.dof, cj = link.coordinate;
+    const Size n = w.dof;
+    const int cj = link.coordinate;
     for (int i = j; i >= 0; i = tree.bodies[i].parent) {
         const Body& above = tree.bodies[i];
         const T mass = above.ratio * link.ratio * dot(w.body[i].axis, F);
@@ -241,19 +287,19 @@ template <class T>
     if (second) up.second += own.second;
 }
 
-template <class T>
-[[gnu::always_inline]] inline void pass_momentum(const Body& link, int j, Jet<T>& w) {
+template <class T, class Size>
+[[gnu::always_inline]] inline void pass_momentum(const Body& link, int j, Jet<T, Size>& w) {
     auto& up = w.body[link.parent];
     up.momentum += w.body[j].momentum;
-    if constexpr (Jet<T>::scaled) {
+    if constexpr (Jet<T, Size>::scaled) {
         up.magnitude.momentum += w.body[j].magnitude.momentum;
         up.magnitude.spin += w.body[j].magnitude.spin;
         up.magnitude.moment += w.body[j].magnitude.moment;
     }
 }
 
-template <class T>
-void clear_first(Jet<T>& w) {
+template <class T, class Size>
+void clear_first(Jet<T, Size>& w) {
     std::fill(w.potential.begin(), w.potential.end(), T{});
     std::fill(w.potential_scale.begin(), w.potential_scale.end(), 0.0);
     for (int c = 0; c < w.dof; ++c) {
@@ -263,11 +309,13 @@ void clear_first(Jet<T>& w) {
 }
 
 // Zero the blocks of a matrix; outside of them nothing is ever written.
-template <class T>
-void clear_blocks(const Tree& tree, std::vector<T>& matrix) {
-    const int n = tree.dof();
-    if (tree.blocks.size() == 1) return std::fill(matrix.begin(), matrix.end(), T{});
-    for (const Block& block : tree.blocks) {
+template <class T, class Size>
+void clear_blocks(const Tree& tree, Size n, std::vector<T>& matrix) {
+    if (blocks_of(tree, n).size() == 1) {
+        std::fill_n(matrix.data(), n * n, T{});
+        return;
+    }
+    for (const Block& block : blocks_of(tree, n)) {
         for (int i = block.begin; i < block.end; ++i) {
             std::fill(matrix.begin() + i * n + block.begin, matrix.begin() + i * n + block.end, T{});
         }
@@ -275,30 +323,30 @@ void clear_blocks(const Tree& tree, std::vector<T>& matrix) {
 }
 
 // The couplings' potential energy, and its derivatives up to an order. Inlined it would slow down sweeps without any.
-template <class T>
-[[gnu::noinline]] void add_couplings(const Mechanism& mechanism, const T* q, Jet<T>& w, int order) {
+template <class T, class Size>
+[[gnu::noinline]] void add_couplings(const Mechanism& mechanism, const T* q, Jet<T, Size>& w, int order) {
     mechanism.couplings.potentials(q, w.couplings, [&](const auto& arms, const auto& own, double scale, double size) {
         const int group = mechanism.tree.group[arms.front().coordinate];
         w.potential[group] += own.energy;
-        if constexpr (Jet<T>::scaled) w.potential_scale[group] += size;
+        if constexpr (Jet<T, Size>::scaled) w.potential_scale[group] += size;
         if (order == 0) return;
         for (const Arm<T>& arm : arms) {
             w.Lq[arm.coordinate] += -dot(own.slope, arm.linear);
-            if constexpr (Jet<T>::scaled) w.Lq_scale[arm.coordinate] += scale * norm1(arm.linear);
+            if constexpr (Jet<T, Size>::scaled) w.Lq_scale[arm.coordinate] += scale * norm1(arm.linear);
         }
         if (order > 1) Couplings::subtract_curvature(arms, own, w.dof, w.Lqq.data());
     });
 }
 
 // The elements' potential energy, and its derivatives up to an order.
-template <class T>
-void add_elements(const Mechanism& mechanism, const T* q, Jet<T>& w, int order) {
+template <class T, class Size>
+void add_elements(const Mechanism& mechanism, const T* q, Jet<T, Size>& w, int order) {
     mechanism.forces.potentials(q, [&](int c, const Potential<T>& own) {
         const int group = mechanism.tree.group[c];
         w.potential[group] += own.energy;
         if (order > 0) w.Lq[c] += own.force;
         if (order > 1) w.Lqq[c * w.dof + c] += own.curvature;
-        if constexpr (Jet<T>::scaled) {
+        if constexpr (Jet<T, Size>::scaled) {
             w.potential_scale[group] += std::abs(own.energy);
             if (order > 0) w.Lq_scale[c] += own.scale;
         }
@@ -307,13 +355,13 @@ void add_elements(const Mechanism& mechanism, const T* q, Jet<T>& w, int order) 
 }
 
 // Armature's momentum, and the kinetic energy.
-template <class T>
-void add_armature(const Tree& tree, const T* v, Jet<T>& w) {
+template <class T, class Size>
+void add_armature(const Tree& tree, const T* v, Jet<T, Size>& w) {
     w.kinetic = T{};
     for (int c = 0; c < w.dof; ++c) {
         const T momentum = tree.armature[c] * v[c];
         w.Lv[c] += momentum;
-        if constexpr (Jet<T>::scaled) w.Lv_scale[c] += std::abs(momentum);
+        if constexpr (Jet<T, Size>::scaled) w.Lv_scale[c] += std::abs(momentum);
         w.kinetic += 0.5 * (v[c] * w.Lv[c]);
     }
 }
@@ -321,21 +369,23 @@ void add_armature(const Tree& tree, const T* v, Jet<T>& w) {
 }  // namespace detail
 
 // The whole jet at (q, v), left in w.
-template <class T>
-void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T>& w) {
+template <class T, class Size>
+void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T, Size>& w) {
     const Tree& tree = mechanism.tree;
+    const int bodies = bodies_of(tree, w.dof);
     detail::clear_first(w);
-    for (auto* matrix : {&w.M, &w.A, &w.Lqq}) detail::clear_blocks(tree, *matrix);
-    for (int j = 0; j < tree.size(); ++j) {
+    for (auto* matrix : {&w.M, &w.A, &w.Lqq}) detail::clear_blocks(tree, w.dof, *matrix);
+    for (int j = 0; j < bodies; ++j) {
         const Body& link = tree.bodies[j];
         auto& here = w.body[j];
         detail::place(tree, j, q, w);
         detail::move(tree, j, v, w);
         here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
         here.momentum = here.inertia * here.velocity;
-        if constexpr (Jet<T>::scaled) detail::measure(tree, j, v, w);
+        here.columns = {here.axis, here.axis_rate};
+        if constexpr (Jet<T, Size>::scaled) detail::measure(tree, j, v, w);
     }
-    for (int j = tree.size() - 1; j >= 0; --j) {
+    for (int j = bodies - 1; j >= 0; --j) {
         const Body& link = tree.bodies[j];
         detail::project_first(mechanism, j, w);
         detail::project_second(mechanism, j, w);
@@ -351,10 +401,12 @@ void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T>& 
 }
 
 // L_q, L_v and the energies at (q, v) alone. Moments of inertia stay in their bodies' axes.
-inline void first_order(const Mechanism& mechanism, const double* q, const double* v, Jet<double>& w) {
+template <class Size>
+void first_order(const Mechanism& mechanism, const double* q, const double* v, Jet<double, Size>& w) {
     const Tree& tree = mechanism.tree;
+    const int bodies = bodies_of(tree, w.dof);
     detail::clear_first(w);
-    for (int j = 0; j < tree.size(); ++j) {
+    for (int j = 0; j < bodies; ++j) {
         const Body& link = tree.bodies[j];
         auto& here = w.body[j];
         detail::place(tree, j, q, w);
@@ -368,7 +420,7 @@ inline void first_order(const Mechanism& mechanism, const double* q, const doubl
                          here.rotation * (link.inertia * (transposed(here.rotation) * spin)) + cross(center, momentum)};
         detail::measure(tree, j, v, w);
     }
-    for (int j = tree.size() - 1; j >= 0; --j) {
+    for (int j = bodies - 1; j >= 0; --j) {
         const Body& link = tree.bodies[j];
         detail::project_first(mechanism, j, w);
         if (link.parent >= 0) {
@@ -383,19 +435,21 @@ inline void first_order(const Mechanism& mechanism, const double* q, const doubl
 
 // The potential energy at q alone. `enter` sees each body placed with its inertia by itself, the first one first; then
 // `project` each with the inertia of all it carries, the last one first.
-template <class Enter, class Project>
-void inertias(const Mechanism& mechanism, const double* q, Jet<double>& w, const Enter& enter, const Project& project) {
+template <class Size, class Enter, class Project>
+void inertias(const Mechanism& mechanism, const double* q, Jet<double, Size>& w, const Enter& enter,
+              const Project& project) {
     const Tree& tree = mechanism.tree;
+    const int bodies = bodies_of(tree, w.dof);
     std::fill(w.potential.begin(), w.potential.end(), 0.0);
     std::fill(w.potential_scale.begin(), w.potential_scale.end(), 0.0);
-    for (int j = 0; j < tree.size(); ++j) {
+    for (int j = 0; j < bodies; ++j) {
         const Body& link = tree.bodies[j];
         auto& here = w.body[j];
         detail::place(tree, j, q, w);
         here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
         enter(j);
     }
-    for (int j = tree.size() - 1; j >= 0; --j) {
+    for (int j = bodies - 1; j >= 0; --j) {
         const Body& link = tree.bodies[j];
         project(j);
         if (link.parent >= 0) detail::pass_inertia(link, w.body[j].inertia, w.body[link.parent].inertia, true);
@@ -405,8 +459,9 @@ void inertias(const Mechanism& mechanism, const double* q, Jet<double>& w, const
 }
 
 // M and the potential energy at q alone.
-inline void mass_matrix(const Mechanism& mechanism, const double* q, Jet<double>& w) {
-    detail::clear_blocks(mechanism.tree, w.M);
+template <class Size>
+void mass_matrix(const Mechanism& mechanism, const double* q, Jet<double, Size>& w) {
+    detail::clear_blocks(mechanism.tree, w.dof, w.M);
     inertias(mechanism, q, w, [](int) {}, [&](int j) { detail::project_mass(mechanism.tree, j, w); });
     for (int c = 0; c < w.dof; ++c) w.M[c * w.dof + c] += mechanism.tree.armature[c];
 }

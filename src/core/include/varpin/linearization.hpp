@@ -19,6 +19,7 @@
 
 namespace varpin {
 
+template <class Size = int, class Stages = int>
 class VariationalLinearization {
   public:
     // Where guards are active, a part that they refuse is taken in halves: a step that noise kicked may need other
@@ -123,9 +124,9 @@ class VariationalLinearization {
         std::vector<double> start;  // (2n, 3n) derivatives from the start of the step to its own
     };
 
-    VariationalStepper stepper;
-    int n;
-    int stages;
+    VariationalStepper<Size, Stages> stepper;
+    [[no_unique_address]] Size n;
+    [[no_unique_address]] Stages stages;
     PathState state;
     std::vector<Place> from;  // where the last part began
     std::vector<Compensated> from_p;
@@ -196,7 +197,7 @@ class VariationalLinearization {
         from_p = state.p;
         const Outcome outcome = stepper.part(h, level, state);
         if (outcome == Outcome::solved) {
-            visit(VariationalStepper::length_of(h, level));
+            visit(stepper.length_of(h, level));
             return outcome;
         }
         if (!stepper.guards.active || level >= stepper.guards.most_halvings) return outcome;
@@ -240,7 +241,7 @@ class VariationalLinearization {
 
     // Add start' (z . d2(q1, p1)) start at the root in the stepper, its dV at hand; `start` (2n, 3n) may be null.
     void add_curvature(double h, const double* z, const double* start, double* H) {
-        const Collocation& equation = stepper.step_equation;
+        const Collocation<Size, Stages>& equation = stepper.step_equation;
         const Tableau& tableau = equation.tableau;
         const Mechanism& mechanism = stepper.mechanism;
         const int w = 3 * n;
@@ -310,7 +311,7 @@ class VariationalLinearization {
 
     // Add to `inner`, and in f to H, what stage i's gamma . F has of second derivatives, all on diagonals.
     void add_elements(double h, int i, const double* z, double* H) {
-        const Collocation& equation = stepper.step_equation;
+        const Collocation<Size, Stages>& equation = stepper.step_equation;
         const int w = 3 * n;
         for (auto* along : {&along_q, &along_v, &along_f}) {
             for (int c = 0; c < n; ++c) {
@@ -349,7 +350,7 @@ class VariationalLinearization {
 
     // Add to `inner` what stage i's gamma . F of couplings has of second derivatives, column by column of the Hessian.
     void add_couplings(double h, int i, const double* z) {
-        const Collocation& equation = stepper.step_equation;
+        const Collocation<Size, Stages>& equation = stepper.step_equation;
         const int w = 3 * n;
         for (auto* matrix : {&coupled_q, &coupled_v}) matrix->resize(n * n);
         for (int along = 0; along < 2 * n; ++along) {

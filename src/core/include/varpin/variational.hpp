@@ -16,6 +16,8 @@ namespace varpin {
 
 // Where a path stands.
 struct PathState {
+    static constexpr int most_misses = 4;
+
     PathState(const Mechanism& mechanism, int stages)
         : place(mechanism.dof()),
           p(mechanism.dof()),
@@ -25,7 +27,7 @@ struct PathState {
           energies(mechanism.tree),
           center(mechanism.dof() * mechanism.diffusion.processes),
           past(stages * mechanism.dof()),
-          miss(stages * mechanism.dof()),
+          miss(most_misses * stages * mechanism.dof()),
           past_end(mechanism.dof()),
           past_force(mechanism.dof()) {}
 
@@ -37,14 +39,17 @@ struct PathState {
     Energies energies;
     std::vector<double> center;          // (n, k) of the diffusion fields, for this rollout
     std::vector<double> past;            // (s, n) stage velocities of the last whole step
-    std::vector<double> miss;            // (s, n) by how much its guess had missed them
+    std::vector<double> miss;            // (misses, s, n) by how much its guess had missed them, and backward
+                                         // differences of that over the steps before
     std::vector<double> past_end;        // (n) velocity at its end
     std::vector<double> past_force;      // (n)
-    int known = 0;                       // of the past: 0, 1, or 2 with `miss`
+    int known = 0;                       // steps of the past without a break, as far as they count
+    int trend = 0;                       // rows of `miss` that would have made the best guess of the last step
     int level = 0;                       // halvings of the last step
     std::vector<std::uint8_t> halvings;  // of each part of every step of the last `roll` that was not taken whole
 };
 
+template <class Size = int, class Stages = int>
 class VariationalStepper {
   public:
     VariationalStepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
@@ -70,9 +75,9 @@ class VariationalStepper {
     double tolerance;
     Guards guards;
     double left;  // part of each kick that comes before the step; the rest comes after it
-    Collocation step_equation;
-    EnergyGuard energy_guard;
-    int n;
+    Collocation<Size, Stages> step_equation;
+    EnergyGuard<Size> energy_guard;
+    [[no_unique_address]] Size n;
     std::vector<double> force;           // (n) constant over the step
     Effort effort;                       // of the last step
     std::vector<std::uint8_t> halvings;  // of each part of the last step; none if it was taken whole
@@ -87,7 +92,7 @@ class VariationalStepper {
             state.momentum[i] = p[i];
         }
         diffusion_centers(mechanism, q, state.center.data());
-        state.known = state.level = 0;
+        state.known = state.level = state.trend = 0;
         if (!look_at(state)) return false;
         energy_guard.begin(at.data(), state.momentum.data(), state.v.data(), state.energies);
         return true;
@@ -95,7 +100,7 @@ class VariationalStepper {
 
     // Put a path at (q, v).
     bool begin(const double* q, const double* v, PathState& state) {
-        Jet<double>& jet = step_equation.stage[0];
+        Jet<double, Size>& jet = step_equation.stage[0];
         first_order(mechanism, q, v, jet);
         if (!begin_at(q, jet.Lv.data(), state)) return false;
         std::copy(v, v + n, state.v.begin());
@@ -221,7 +226,7 @@ class VariationalStepper {
 
     // One substep from where the path stands and the guess in step_equation.V; moves the path only if it is accepted.
     Outcome attempt(double h, PathState& state, bool jets_wanted) {
-        Collocation& equation = step_equation;
+        auto& equation = step_equation;
         const Outcome solved =
             equation.solve(h, {state.place.data(), state.p.data(), force.data()}, tolerance, jets_wanted, effort);
         if (solved != Outcome::solved) return solved;
@@ -245,7 +250,7 @@ class VariationalStepper {
 
     // Where the root takes the path, into `trial`, and the work on the way.
     [[gnu::always_inline]] inline void advance(const int stages, double h, const PathState& state) {
-        const Collocation& equation = step_equation;
+        const auto& equation = step_equation;
         for (int c = 0; c < n; ++c) {
             double move = 0.0, impulse = 0.0;
             trial.work[c] = trial.dissipated[c] = trial.magnitude[c] = 0.0;
@@ -270,10 +275,11 @@ class VariationalStepper {
 
     // Extrapolate the last whole step into the stage velocities. The polynomial through them and the velocity at its
     // end goes on, moved by what a kick has since done to the velocity, and bent by what has changed in the force.
-    // Where nothing kicks, it misses by much the same from step to step.
+    // Where nothing kicks, by how much it misses goes on too: by the backward differences of as high an order as would
+    // have served the last step best.
     void extrapolate(double h, const PathState& state) {
-        const int stages = step_equation.stages;
-        const bool smooth = state.known > 1 && mechanism.diffusion.processes == 0;
+        const Stages stages = step_equation.stages;
+        const int trend = mechanism.diffusion.processes == 0 ? state.trend : 0;
         double *change = bend.data(), *acceleration = change + n;
         bool changed = false;
         for (int c = 0; c < n; ++c) {
@@ -293,17 +299,37 @@ class VariationalStepper {
                 total += ahead[stages] * state.past_end[c];
                 const int k = i * n + c;
                 guess[k] = total + h * tableau.c[i] * acceleration[c];
-                step_equation.V[k] = smooth ? guess[k] + state.miss[k] : guess[k];
+                double missing = 0.0;
+                for (int r = 0; r < trend; ++r) missing += state.miss[r * stages * n + k];
+                step_equation.V[k] = guess[k] + missing;
             }
         }
     }
 
     void remember(PathState& state) {
         std::copy(step_equation.V.begin(), step_equation.V.end(), state.past.begin());
-        for (std::size_t k = 0; k < guess.size(); ++k) state.miss[k] = step_equation.V[k] - guess[k];
+        if (state.known > 0) follow_misses(state);
         std::copy(state.v.begin(), state.v.end(), state.past_end.begin());
         std::copy(force.begin(), force.end(), state.past_force.begin());
-        state.known = std::min(state.known + 1, 2);
+        state.known = std::min(state.known + 1, PathState::most_misses + 1);
+    }
+
+    // The difference of order r is what r rows would have left of the miss of the last step.
+    void follow_misses(PathState& state) const {
+        constexpr int most = PathState::most_misses;
+        const int size = step_equation.stages * n, orders = std::min(state.known, most + 1);
+        double left[most + 1] = {};
+        for (int k = 0; k < size; ++k) {
+            double now = step_equation.V[k] - guess[k];
+            for (int r = 0; r < orders; ++r) {
+                left[r] += std::abs(now);
+                if (r == most) break;
+                const double then = state.miss[r * size + k];
+                state.miss[r * size + k] = now;
+                now -= then;
+            }
+        }
+        state.trend = orders == 1 ? 1 : static_cast<int>(std::min_element(left, left + orders) - left);
     }
 
     void noise_kick(double part, const double* u, const double* dw, PathState& state) {

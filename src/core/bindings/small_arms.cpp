@@ -1,0 +1,48 @@
+// Steps of arms of few joints, whose number the compiler knows: for up to seven joints it is worth the room.
+#include "stepping.hpp"
+
+namespace varpin::border {
+
+namespace {
+
+// What `make(Size)` makes for the number of joints of a mechanism, if its steps are solved with one matrix.
+template <class Made, class Make>
+std::unique_ptr<Made> of_size(const Mechanism& mechanism, const Tableau& tableau, Solver solver, const Make& make) {
+    const Tree& tree = mechanism.tree;
+    const int n = mechanism.dof();
+    if (tableau.stages != 1 || tree.size() != n || tree.blocks.size() != 1) return nullptr;
+    if (eliminates(mechanism, solver) || eliminates(tree, solver)) return nullptr;
+    switch (n) {
+        case 2:
+            return make(Known<2>(n));
+        case 3:
+            return make(Known<3>(n));
+        case 4:
+            return make(Known<4>(n));
+        case 6:
+            return make(Known<6>(n));
+        case 7:
+            return make(Known<7>(n));
+        default:
+            return nullptr;
+    }
+}
+
+}  // namespace
+
+std::unique_ptr<Stepping> small_stepping(const Mechanism& mechanism, const Tableau& tableau, double tolerance,
+                                         const Guards& guards, double left, Solver solver) {
+    return of_size<Stepping>(mechanism, tableau, solver, [&]<class Size>(Size) -> std::unique_ptr<Stepping> {
+        return std::make_unique<SteppingOf<Size, Known<1>>>(mechanism, tableau, tolerance, guards, left, solver);
+    });
+}
+
+std::unique_ptr<Differentiation> small_differentiation(const Mechanism& mechanism, const Tableau& tableau,
+                                                       double tolerance, const Guards& guards, Solver solver) {
+    return of_size<Differentiation>(
+        mechanism, tableau, solver, [&]<class Size>(Size) -> std::unique_ptr<Differentiation> {
+            return std::make_unique<DifferentiationOf<Size, Known<1>>>(mechanism, tableau, tolerance, guards, solver);
+        });
+}
+
+}  // namespace varpin::border

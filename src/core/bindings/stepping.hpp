@@ -1,0 +1,68 @@
+// Steps of the variational integrators and their derivatives, whatever the compiler knows of their sizes.
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <span>
+#include <vector>
+
+#include "varpin/linearization.hpp"
+#include "varpin/variational.hpp"
+
+namespace varpin::border {
+
+struct Stepping {
+    virtual ~Stepping() = default;
+    virtual bool begin(const double* q, const double* v, PathState& state) = 0;
+    virtual void kick(const double* impulse, PathState& state) = 0;
+    virtual void roll(const Guards& guards, double h, const Commands& commands, const double* increments,
+                      const double* drift, std::vector<PathState>& states, const Nodes& nodes) = 0;
+};
+
+struct Differentiation {
+    virtual ~Differentiation() = default;
+    virtual Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
+                          std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past) = 0;
+};
+
+template <class Size, class Stages>
+struct SteppingOf final : Stepping {
+    SteppingOf(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards, double left,
+               Solver solver)
+        : own(mechanism, tableau, tolerance, guards, left, solver) {}
+
+    VariationalStepper<Size, Stages> own;
+
+    bool begin(const double* q, const double* v, PathState& state) override { return own.begin(q, v, state); }
+    void kick(const double* impulse, PathState& state) override {
+        own.look_at(state);
+        own.kick(impulse, state);
+    }
+    void roll(const Guards& guards, double h, const Commands& commands, const double* increments, const double* drift,
+              std::vector<PathState>& states, const Nodes& nodes) override {
+        own.guards = guards;
+        own.roll(h, commands, increments, drift, states, nodes);
+    }
+};
+
+template <class Size, class Stages>
+struct DifferentiationOf final : Differentiation {
+    DifferentiationOf(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
+                      Solver solver)
+        : own(mechanism, tableau, tolerance, guards, solver) {}
+
+    VariationalLinearization<Size, Stages> own;
+
+    Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
+                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past) override {
+        return own.first(h, q, p, guess, force, halvings, Jx, Jf, past);
+    }
+};
+
+// Of sizes that the compiler knows, those of arms under a method of one stage; null where there is none.
+std::unique_ptr<Stepping> small_stepping(const Mechanism& mechanism, const Tableau& tableau, double tolerance,
+                                         const Guards& guards, double left, Solver solver);
+std::unique_ptr<Differentiation> small_differentiation(const Mechanism& mechanism, const Tableau& tableau,
+                                                       double tolerance, const Guards& guards, Solver solver);
+
+}  // namespace varpin::border
