@@ -11,6 +11,7 @@
 #include "rollout_arrays.hpp"
 #include "varpin/linearization.hpp"
 #include "varpin/variational.hpp"
+#include "watched.hpp"
 
 namespace varpin::border {
 
@@ -67,7 +68,7 @@ class VariationalRollout {
         return true;
     }
 
-    void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes) {
+    void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes, HeldWatch* watch) {
         const Mechanism& mechanism = stepper_->mechanism;
         const NodeArrays written(mechanism, nodes);
         if (written.paths() != states_.size())
@@ -75,9 +76,10 @@ class VariationalRollout {
         const CommandArrays given_commands(mechanism, commands, written.paths(), written.steps());
         const double* dw = increments_of(mechanism, increments, written);
         const double* extra = drift_of(mechanism, drift, written);
+        Watch* watching = watch ? watch->of(written.paths(), written.steps()) : nullptr;
         nb::gil_scoped_release release;
         stepper_->guards = guards_;
-        stepper_->roll(h, given_commands.view(), dw, extra, states_, written.view());
+        stepper_->roll(h, given_commands.view(), dw, extra, states_, written.view(), watching);
     }
 
     // Add an impulse (P, n) to the momenta.
@@ -245,7 +247,8 @@ void register_rollouts(nb::module_& m) {
              nb::keep_alive<1, 2>())
         .def("fork", &VariationalRollout::fork, "guards"_a, nb::keep_alive<0, 1>())
         .def("begin", &VariationalRollout::begin, "q"_a, "v"_a)
-        .def("roll", &VariationalRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a)
+        .def("roll", &VariationalRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a,
+             "watch"_a.none() = nb::none())
         .def("kick", &VariationalRollout::kick, "impulse"_a)
         .def("nodes", &VariationalRollout::nodes)
         .def("halvings", &VariationalRollout::halvings, "path"_a);

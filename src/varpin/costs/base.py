@@ -223,6 +223,16 @@ class BoundSum(BoundCost):
         terms = Terms(self.points.dof, self.points.controls)
         return terms, tuple(part for part in self._flat() if not part.add_to(terms, 1.0))
 
+    @property
+    def compiled(self) -> Terms:
+        """The terms that the core evaluates."""
+        return self._sorted[0]
+
+    @property
+    def others(self) -> tuple[BoundCost, ...]:
+        """The parts that it does not."""
+        return self._sorted[1]
+
     def _flat(self) -> Iterator[BoundCost]:
         for part in self.parts:
             if isinstance(part, BoundSum):

@@ -331,10 +331,20 @@ class OptimalControlProblem(Frozen):
         however large it is.
         """
         q, v, u = trajectory.q, trajectory.v, trajectory.u
+        return self.shares_along(q, v, u, self.running.compiled.values(*self.samples(q, v, u)))
+
+    def shares_along(self, q: Floats, v: Floats, u: Floats, compiled: Floats) -> Floats:
+        """:meth:`shares` of a motion, q and v (N + 1, n) and u (N, m).
+
+        ``compiled`` are values of the running terms that the core evaluates, at all samples (N s, terms).
+        """
+        found = [compiled.ravel()]
+        if self.running.others:
+            at = self.samples(q, v, u)
+            found += [part.value(*at) for part in self.running.others]
         weight = self.dt * self.rule[0, 0]
-        end = q[-1:], v[-1:], np.zeros((1, u.shape[1]))
-        found = [weight * values.ravel() for values in self.running.shares(*self.samples(q, v, u))]
-        found += [values.ravel() for values in self.terminal.shares(*end)]
+        found = [weight * values for values in found]
+        found += [values.ravel() for values in self.terminal.shares(q[-1:], v[-1:], np.zeros((1, u.shape[1])))]
         if self.rate is not None:
             found.append(self.rate.shares(u[:: self.hold], self.period))
         return np.concatenate(found)
@@ -363,7 +373,10 @@ class OptimalControlProblem(Frozen):
 
     def expand_running(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the running costs along a motion, at their samples, in (q, v, u)."""
-        return self.running.expand(*self.samples(trajectory.q, trajectory.v, trajectory.u))
+        q, v, u = trajectory.q, trajectory.v, trajectory.u
+        if self.running.others:
+            return self.running.expand(*self.samples(q, v, u))
+        return Expansion(*self.running.compiled.core.expand_steps(self.rule, q, v, u))
 
     def expand_terminal(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""

@@ -23,21 +23,23 @@ from varpin.checks import (
     positive,
     real,
 )
+from varpin.core import Watch
 from varpin.core.arrays import Commands
 from varpin.costs import CostError
 from varpin.errors import InputError, LinearizationError
-from varpin.integrators import Integrator, Segment
+from varpin.integrators import Integrator
 from varpin.integrators.base import open_loop
 from varpin.integrators.variational import Variational
 from varpin.noise import NoiseFieldError
 from varpin.policy import LinearPolicy
 from varpin.sddp.backward import Plan, backward, noise_shares
-from varpin.sddp.descent import Stake, at_stake, rounding, spent
+from varpin.sddp.descent import Stake, at_stake, rounding
 from varpin.sddp.examination import looked_at
 from varpin.sddp.history import ITERATIONS, Iteration, SearchState, Status
 from varpin.sddp.problem import OptimalControlProblem
 from varpin.sddp.solution import Solution
-from varpin.simulation import Motions, StepFailure
+from varpin.sddp.trials import Attempt, Trials
+from varpin.simulation import StepFailure
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -69,7 +71,8 @@ _TRIALS = 10
 # nothing else has led far, and without a bound where nothing has helped; a search that stalls goes on without bounds.
 _HALVINGS, _MORE_HALVINGS = 2, 3
 _PARTS = 3
-_CUT, _DEAR = "its steps are cut into many parts", "it costs too much already"
+# A trial that costs more than any step may is given up; what rounding does to costs is far below this part of them.
+_DEARER = 1e-9
 
 
 def solve(
@@ -294,7 +297,7 @@ class _Trial:
         cut: Whether it was given up for being cut into many parts.
     """
 
-    motion: Trajectory | None = None
+    motion: Attempt | None = None
     shares: Floats | None = None
     cost: float = np.inf
     expected: float = np.inf
@@ -339,7 +342,7 @@ class _Search:
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
         self.planned: tuple[Trajectory, float, bool] | None = None  # what it is a plan for, and how it was made
-        self.motions = Motions(problem.scene, problem.integrator, problem.q0, problem.v0, problem.dt)
+        self.trials = Trials(problem)
         self.trajectory: Trajectory
         self.shares: Floats  # of the cost of the trajectory
         self.cost = np.inf
@@ -361,11 +364,12 @@ class _Search:
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {begin:g} s"
 
     def begin(self, commands: Commands) -> None:
-        trajectory, failure = self.motions.under(commands)
-        if failure is not None:
-            raise StepFailure(trajectory.steps, trajectory.t[-1], failure, trajectory)
+        attempt = self.trials.attempt(commands)
+        trajectory = attempt.trajectory()
+        if attempt.failure is not None:
+            raise StepFailure(trajectory.steps, trajectory.t[-1], attempt.failure, trajectory)
         self.trajectory = trajectory
-        self.shares = self.problem.shares(trajectory)
+        self.shares = attempt.shares()
         self.cost = float(self.shares.sum())
         if not np.isfinite(self.cost):
             raise CostError(repr(self.problem.cost), f"the cost of the first motion is {self.cost}")
@@ -604,12 +608,13 @@ class _Search:
             return _Step(0.0, 0, 0.0, 0.0)
         added = noise_shares(self.problem, self.trajectory, self.plan)
         taken, length, tried, trials = _Trial(), 0.0, None, 0
+        feedback = self._feedback(self.plan)
         left = list(self.backtracking ** np.arange(_TRIALS))
         for bounds in self._bounds():
             cut = []
             for step in left:
                 trials += 1
-                trial = self._try(float(step), added, bounds)
+                trial = self._try(float(step), feedback, added, bounds)
                 if trial.expected <= self.armijo * step * self.plan.slope:
                     taken, length = trial, float(step)
                     break
@@ -623,7 +628,7 @@ class _Search:
                 break
         hidden = 0.0
         if taken.motion is not None and taken.shares is not None:
-            self.trajectory, self.shares = taken.motion, taken.shares
+            self.trajectory, self.shares = taken.motion.trajectory(), taken.shares
             self.cost = float(taken.shares.sum())
             self.above += taken.cost
         elif tried is not None:
@@ -646,55 +651,52 @@ class _Search:
             yield _Bounds(self.cutting[halvings], parts, watched=halvings > _HALVINGS)
         yield _Bounds(integrator, np.inf, watched=True)
 
-    def _try(self, step: float, added: Floats, bounds: _Bounds) -> _Trial:
+    def _try(self, step: float, feedback: Commands, added: Floats, bounds: _Bounds) -> _Trial:
         """A motion so far along the plan, given up where it is cut to pieces or too dear already."""
-        problem, plan, here = self.problem, self.plan, self.trajectory
+        problem, plan = self.problem, self.plan
         if plan is None:
             return _Trial()
-        parts = np.cumsum(here.statistics.substeps)
         # What is to come of the cost, and what noise adds to it, is known not to be below zero.
         bounded = problem.cost.nonnegative and not (self.exact and problem.scene.processes)
         most = float(self.shares.sum() + added.sum()) + self.armijo * step * plan.slope if bounded else np.inf
-
-        def futile(done: list[Segment]) -> str | None:
-            taken = sum(int(part.statistics.substeps.sum()) for part in done)
+        parts = np.inf
+        if bounds.parts < np.inf and (bounds.watched or step < 1.0):
             # Explicit methods count no parts.
-            if taken > bounds.parts * max(1, parts[sum(len(part.u) for part in done) - 1]):
-                return _CUT
-            return _DEAR if bounded and spent(problem, done, here) > most else None
-
-        commands = self._along(step, plan)
+            parts = bounds.parts * max(1, int(self.trajectory.statistics.substeps[: self.trials.third].sum()))
+        u = self.trajectory.u[:: problem.hold] + step * plan.feedforward
+        if problem.limited:
+            u = _onto_limits(u, problem.control_limits)
         try:
-            asked = futile if bounds.watched or step < 1.0 else None
-            moved, failure = self.motions.under(commands, integrator=bounds.integrator, futile=asked)
-            if failure is not None:
+            attempt = self.trials.attempt(
+                feedback._replace(u=u), integrator=bounds.integrator, most=most + _DEARER * abs(most), parts=parts
+            )
+            if not attempt.whole:
                 # Whatever makes a step of few halvings fail, more may mend.
-                few = bounds.integrator != problem.integrator
-                return _Trial(cut=failure.reason == _CUT or (few and failure.reason != _DEAR))
-            there, noise = problem.shares(moved), noise_shares(problem, moved, plan)
+                few = attempt.failure is not None and bounds.integrator != problem.integrator
+                return _Trial(cut=few or attempt.verdict is Watch.Verdict.cut)
+            there = attempt.shares()
+            noise = noise_shares(problem, attempt.trajectory(), plan) if problem.scene.processes else added
         except _LOST as error:
             logger.info("%s: trial of length %g: %s", self.label, step, error)
             return _Trial()
         if not np.isfinite(there).all():
             return _Trial()
         cost = float((there - self.shares).sum())
-        return _Trial(moved, there, cost, cost + float((noise - added).sum()))
+        return _Trial(attempt, there, cost, cost + float((noise - added).sum()))
 
-    def _along(self, step: float, plan: Plan) -> Commands:
-        """The commands of a trial."""
+    def _feedback(self, plan: Plan) -> Commands:
+        """The commands of trials, but for the feed-forward part that theirs is on top of."""
         problem, here = self.problem, self.trajectory
-        u = here.u[:: problem.hold] + step * plan.feedforward
-        if problem.limited:
-            u = _onto_limits(u, problem.control_limits)
+        commands = _held(here.u[:: problem.hold], problem)
         if self.forward == "open":
-            return _held(u, problem)
+            return commands
         gains, reference = plan.feedback, states(problem, here)[: -1 : problem.hold]
         if plan.previous is not None:
             before = here.u[: -problem.hold : problem.hold]
             gains = np.concatenate([gains, plan.previous], axis=2)
             # The first change is from a control that is given.
             reference = np.hstack([reference, np.vstack([here.u[:1], before])])
-        return _held(u, problem)._replace(gains=gains, reference=reference)
+        return commands._replace(gains=gains, reference=np.ascontiguousarray(reference))
 
     def _last_plan(self) -> Plan | None:
         if self.plan is not None and self.planned == (self.trajectory, 0.0, self.second_order):
