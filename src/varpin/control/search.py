@@ -12,9 +12,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.control.backward import Plan, backward, noise_shares
+from varpin.control.backward import Along, Plan, backward, noise_shares
 from varpin.control.costs import CostError
-from varpin.control.descent import Stake, at_stake, rounding
+from varpin.control.descent import rounding
 from varpin.control.examination import looked_at
 from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
 from varpin.control.problem import OptimalControlProblem
@@ -343,6 +343,7 @@ class _Search:
         self.plan: Plan | None = None
         self.planned: tuple[Trajectory, float, bool] | None = None  # what it is a plan for, and how it was made
         self.trials = Trials(problem)
+        self._around: Along | None = None
         self.trajectory: Trajectory
         self.shares: Floats  # of the cost of the trajectory
         self.cost = np.inf
@@ -418,13 +419,13 @@ class _Search:
                 return Status.INDEFINITE
             self._compare_with_best(self.plan)
             if not self.history:
-                stake = self._stake(self.plan)
+                stake = self.along.stake
                 self.first = stake.free if np.isfinite(stake.free) else stake.moved
             if self._is_there(self.plan, tolerance):
                 self._note(report, started, passes)
                 self.reason = self._numbers(tolerance)
                 return Status.CONVERGED
-            ended, why = self._ended(self.plan, tolerance, last, deadline)
+            ended, why = self._ended(tolerance, last, deadline)
             if ended is Status.STALLED and self._lift():
                 continue
             if ended is not None:
@@ -469,31 +470,35 @@ class _Search:
             return 0.0
         return float(noise_shares(self.problem, self.trajectory, plan, self.steered).sum())
 
-    def _stake(self, plan: Plan) -> Stake:
-        return at_stake(self.problem, self.trajectory, plan.model)
+    @property
+    def along(self) -> Along:
+        """What passes along the motion are made from."""
+        if self._around is None or self._around.trajectory is not self.trajectory:
+            self._around = Along(self.problem, self.trajectory)
+        return self._around
 
-    def _share(self, plan: Plan, tolerance: float) -> float:
+    def _share(self, tolerance: float) -> float:
         """The tolerance on the promised decrease."""
-        return tolerance * (self._stake(plan).moved + _NOTHING * self.first)
+        return tolerance * (self.along.stake.moved + _NOTHING * self.first)
 
     def _is_there(self, plan: Plan, tolerance: float) -> bool:
         least = tolerance * _NOTHING * self.first
         if self.problem.cost.nonnegative and plan.promise > tolerance * self.cost + least:
             # Of squares no more is at stake than they cost.
             return False
-        if not self.steered.any() and self._stake(plan).free <= least:
+        if not self.steered.any() and self.along.stake.free <= least:
             # No motion at all costs less. Without costs on the controls the model may have no minimum even there.
             self.plan = self._least_regularized()[0] or plan
             return True
-        return self._keeps_no_promise_above(self._share(plan, tolerance))
+        return self._keeps_no_promise_above(self._share(tolerance))
 
-    def _ended(self, plan: Plan, tolerance: float, last: int, deadline: float) -> tuple[Status | None, str]:
+    def _ended(self, tolerance: float, last: int, deadline: float) -> tuple[Status | None, str]:
         """How a search ends that has not converged, if it does, and the reason."""
         if len(self.history) >= last:
             return self._out_of(last, deadline), ""
         if len(self.gains) > _PATIENCE:
             recent = sum(self.gains[-_PATIENCE:])
-            if recent <= self._share(plan, tolerance):
+            if recent <= self._share(tolerance):
                 return Status.STALLED, f"{_PATIENCE} iterations have lowered the expected cost by {recent:.1e}; "
         return self._out_of(last, deadline), ""
 
@@ -529,7 +534,7 @@ class _Search:
                 if plan is not None:
                     self.plan = plan
                     needed = f" under a regularization of {least:.0e}, without which it has no minimum" if least else ""
-        share = np.nan if self.plan is None else self._share(self.plan, tolerance)
+        share = np.nan if self.plan is None else self._share(tolerance)
         return f"{self._promised()}{needed}; the tolerance of {tolerance:g} times the cost at stake is {share:.1e}"
 
     def _note(self, report: Callback, started: float, passes: int, step: _Step | None = None) -> None:
@@ -584,7 +589,7 @@ class _Search:
         self.exact = self.second_order if exact is None else exact
         while True:
             passes += 1
-            self.plan = backward(self.problem, self.trajectory, self.regularization, self.exact)
+            self.plan = backward(self.problem, self.trajectory, self.regularization, self.exact, along=self.along)
             if self.plan is not None:
                 self.planned = self.trajectory, self.regularization, self.exact
                 return passes
@@ -597,7 +602,7 @@ class _Search:
         """The plan at the motion with as little regularization as leaves a minimum, and how much that is."""
         for regularization in (0.0, *10.0 ** np.arange(-6, 11, 2)):
             for exact in (True, False) if self.second_order and regularization == 0.0 else (False,):
-                plan = backward(self.problem, self.trajectory, float(regularization), exact)
+                plan = backward(self.problem, self.trajectory, float(regularization), exact, along=self.along)
                 if plan is not None:
                     return plan, float(regularization)
         return None, np.inf
