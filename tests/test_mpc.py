@@ -363,3 +363,38 @@ def test_what_plan_and_motion_have_in_common_is_told_once():
 def test_a_scene_is_no_plant():
     with pytest.raises(vp.InputError, match=r"plant must be a varpin.Plant, for example varpin.Plant\(scene\)"):
         vp.Mpc(tracking()).run(tracking().scene, duration=0.1)
+
+
+def path(t):
+    return [0.3 * np.sin(t), 0.2 * t]
+
+
+@pytest.mark.parametrize(
+    "cost",
+    [
+        vp.TrackingCost(path, 2.0) + vp.Terminal(vp.TrackingCost(path)),
+        vp.TrackingCost(np.linspace([0.0, 0.0], [1.0, 2.0], 21)) + 2.0 * vp.VelocityCost(0.1),
+        vp.CustomCost(lambda t, q, v, u: t * (q**2).sum(axis=-1)) + vp.ControlRateCost(0.1, [0.1, 0.2]),
+        vp.Terminal(vp.FramePositionCost(vp.planar_chain(2), "tip", lambda t: [t, 0.0, 1.0])),
+        vp.Terminal(vp.FrameOrientationCost(vp.planar_chain(2), "tip", np.eye(3))),
+    ],
+    ids=["path", "rows", "custom", "frame", "turn"],
+)
+def test_a_problem_at_another_time_and_state_is_that_of_its_grid(cost):
+    """Costs that no time changes are not bound again, and the values are the same to the last bit."""
+    cost = vp.ControlCost(0.1) + cost
+    scene, grid = vp.Scene(vp.planar_chain(2)), {"dt": 0.05, "steps": 20, "control_limits": (-3.0, 4.0)}
+    made = vp.OptimalControlProblem(scene, cost, [0.1, 0.2], [0.3, 0.4], t0=0.7, **grid)
+    own = vp.OptimalControlProblem(scene, cost, [1.0, 2.0], [3.0, 4.0], t0=-0.2, **grid).at(
+        q0=[0.1, 0.2], v0={"joint1": 0.3, "joint2": 0.4}, t0=0.7
+    )
+    rng = np.random.default_rng(1)
+    q, v, u = (rng.normal(size=(rows, 2)) for rows in (21, 21, 20))
+    assert own.costs(q, v, u) == made.costs(q, v, u)
+    for name in ("q0", "v0", "t0", "dt", "steps", "control_limits"):
+        np.testing.assert_array_equal(getattr(own, name), getattr(made, name))
+    assert not own.q0.flags.writeable
+    with pytest.raises(vp.InputError, match="q0"):
+        own.at(q0=[0.1])
+    with pytest.raises(vp.InputError, match="t0"):
+        own.at(t0="now")

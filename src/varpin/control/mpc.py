@@ -230,9 +230,15 @@ class Mpc:
         problem = self.problem.at(q0=q, v0=v, t0=t, before=before)
         if previous is None:
             return self._first_plan(problem)[0]
-        start = previous.shifted(min(decisions, problem.decisions - 1), before)
         # A tick has no time for a second look at its plan; the run takes one at what came of them all.
-        return replan(problem, start, tolerance=self.tolerance, max_iterations=self.iterations, time_limit=self.budget)
+        return replan(
+            problem,
+            previous,
+            min(decisions, problem.decisions - 1),
+            tolerance=self.tolerance,
+            max_iterations=self.iterations,
+            time_limit=self.budget,
+        )
 
     def _first_plan(self, problem: OptimalControlProblem) -> tuple[Solution, tuple[Finding, ...]]:
         """The plan that a run begins with, and what was found wrong with it."""

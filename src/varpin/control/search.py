@@ -194,15 +194,21 @@ def solve(
 
 
 def replan(
-    problem: OptimalControlProblem, start: LinearPolicy, *, tolerance: float, max_iterations: int, time_limit: float
+    problem: OptimalControlProblem,
+    previous: Solution,
+    decisions: int,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    time_limit: float,
 ) -> Solution:
-    """A plan from the policy of the one before, with one backward pass for each iteration: a controller's tick.
+    """A plan from the one made some ``decisions`` ago, with one backward pass for each iteration: a controller's tick.
 
     Where iterations or time end the search, gains are those that its last step followed, and are not made anew for the
-    motion that came of it. Nobody looks at the finished plan. Arguments and errors are those of :func:`solve`.
+    motion that came of it. Nobody looks at the finished plan. Other arguments, and errors, are those of :func:`solve`.
     """
     search = _Search(problem, second_order=False, anew=False)
-    search.begin(_first_commands(problem, start))
+    search.begin(_shifted_commands(problem, previous, decisions))
     try:
         status = search.run(tolerance, max_iterations, time.perf_counter() + time_limit, lambda _: None)
     except KeyboardInterrupt:
@@ -231,6 +237,37 @@ def _first_commands(problem: OptimalControlProblem, controls: JointValues | Line
     rows = as_floats("controls", controls)
     rows = finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m))
     return _held(np.broadcast_to(rows, (R, m)), problem)
+
+
+def _shifted_commands(problem: OptimalControlProblem, previous: Solution, decisions: int) -> Commands:
+    """Those of :meth:`Solution.shifted` under the problem's limits and after its control before."""
+    old, before = previous.problem, None if problem.rate is None else problem.rate.before
+    R, m = problem.decisions, problem.scene.controls
+    same = (
+        old.scene is problem.scene
+        and old.integrator == problem.integrator
+        and old.control_limits is problem.control_limits
+    )
+    if not (same and (old.dt, old.steps, old.hold) == (problem.dt, problem.steps, problem.hold)):
+        return _first_commands(problem, previous.shifted(decisions, before))
+    rows = np.minimum(np.arange(R) + decisions, R - 1)
+    u, gains, reference = previous.controls, previous.gains, states(old, previous.trajectory)[: -1 : old.hold]
+    if previous.previous_gains is not None:
+        start = None if old.rate is None else old.rate.before
+        expected = np.vstack([u[:1] if start is None else start, u[:-1]])[rows[:1]]
+        gains = np.concatenate([gains, previous.previous_gains], axis=2)
+        # What is repeated expects itself before.
+        reference = np.hstack([reference[rows], np.vstack([expected, u[rows[:-1]]])])
+    else:
+        reference = reference[rows]
+    return Commands(
+        u=u[rows],
+        gains=gains[rows],
+        reference=reference,
+        hold=problem.hold,
+        limits=problem.control_limits,
+        before=np.zeros((0, m)) if before is None else before[None].copy(),
+    )
 
 
 def _search_of(problem: OptimalControlProblem, controls: object, resume: Solution) -> SearchState:
@@ -419,8 +456,7 @@ class _Search:
                 return Status.INDEFINITE
             self._compare_with_best(self.plan)
             if not self.history:
-                stake = self.along.stake
-                self.first = stake.free if np.isfinite(stake.free) else stake.moved
+                self.first = self._at_first()
             if self._is_there(self.plan, tolerance):
                 self._note(report, started, passes)
                 self.reason = self._numbers(tolerance)
@@ -452,6 +488,14 @@ class _Search:
                 self.reason = "no step lowers the cost, whatever the regularization; "
                 self.reason += self._numbers(tolerance, afresh=True)
                 return Status.STALLED
+
+    def _at_first(self) -> float:
+        """What is at stake on the first motion."""
+        if not self.anew and self.problem.cost.nonnegative:
+            # Of squares no more is at stake than they cost, and a tick has no time to find out how much.
+            return self.cost
+        stake = self.along.stake
+        return stake.free if np.isfinite(stake.free) else stake.moved
 
     def _compare_with_best(self, plan: Plan) -> None:
         noise = self._noise(plan)
