@@ -284,6 +284,33 @@ def test_a_controller_that_cannot_keep_up_says_so(slow, told, monkeypatch):
     assert not told or f"in {slow} of 20 ticks ({1e3 * run.seconds[1:].mean():.3g} ms in the mean)" in said[0]
 
 
+@pytest.mark.parametrize(
+    ("budget", "iterations", "late"), [(0.0285, 5, 0), (0.0125, 2, 0), (0.0075, 1, 0), (0.0035, 1, 20), (0.0015, 0, 20)]
+)
+def test_a_tick_ends_within_its_budget_or_the_plan_before_acts_on(budget, iterations, late, monkeypatch):
+    """On a clock of 1 ms a look: an iteration takes five looks at it, and what is around them two or three."""
+    now = [0.0]
+
+    def clock():
+        now[0] += 1e-3
+        return now[0]
+
+    class Clock:
+        perf_counter = staticmethod(clock)
+
+    for module in (varpin.control.mpc, varpin.control.search):
+        monkeypatch.setattr(module, "time", Clock)
+    mpc = vp.Mpc(tracking(), iterations=5, tolerance=1e-300, budget=budget)
+    run = mpc.run(duration=21 * mpc.period)
+    assert run.misses == late
+    assert run.iterations[1:].max() == iterations
+    assert (run.seconds <= budget).all() == (late == 0)
+    told = [sentence for sentence in run.warnings if f"came later than the budget of {1e3 * budget:.3g} ms" in sentence]
+    assert len(told) == (late > 0)
+    assert not told or told[0].startswith("20 of 20 plans")
+    assert late == 0 or all(plan is run.plans[0] for plan in run.plans)
+
+
 def test_what_is_told_of_an_early_end_is_in_the_time_of_the_run():
     """Of joints beyond their limits, at the time from the run's start and not from the tick's."""
     calls = []

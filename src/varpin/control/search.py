@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -200,17 +201,18 @@ def replan(
     *,
     tolerance: float,
     max_iterations: int,
-    time_limit: float,
+    deadline: float,
 ) -> Solution:
     """A plan from the one made some ``decisions`` ago, with one backward pass for each iteration: a controller's tick.
 
     Where iterations or time end the search, gains are those that its last step followed, and are not made anew for the
-    motion that came of it. Nobody looks at the finished plan. Other arguments, and errors, are those of :func:`solve`.
+    motion that came of it. Nobody looks at the finished plan. No iteration begins that would end after ``deadline``, on
+    ``time.perf_counter``, if it took as long as those before. Other arguments, and errors, are those of :func:`solve`.
     """
     search = _Search(problem, second_order=False, anew=False)
     search.begin(_shifted_commands(problem, previous, decisions))
     try:
-        status = search.run(tolerance, max_iterations, time.perf_counter() + time_limit, lambda _: None)
+        status = search.run(tolerance, max_iterations, deadline, lambda _: None)
     except KeyboardInterrupt:
         status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
     return search.solution(status)
@@ -306,6 +308,15 @@ def _onto_limits(u: Floats, limits: Floats) -> Floats:
     return u
 
 
+@functools.lru_cache(maxsize=256)
+def _cut_less(integrator: Variational, halvings: int) -> Variational:
+    """An integrator, a dataclass with a guard, whose steps are halved no more often than this."""
+    guard = integrator.guard
+    if guard is None or not is_dataclass(integrator):
+        return integrator
+    return replace(integrator, guard=replace(guard, max_halvings=min(halvings, guard.max_halvings)))
+
+
 @dataclass(frozen=True)
 class _Bounds:
     """What a trial of the line search may take.
@@ -391,7 +402,6 @@ class _Search:
         self.above = 0.0  # what the trajectory costs more than the best one, without noise
         self.bounded = True  # whether trials are given up for their parts
         self.cut = False  # whether one was
-        self.cutting: dict[int, Integrator] = {}  # the integrator with fewer halvings
         self.gains: list[float] = []  # by how much each iteration lowered the least expected cost
         self.reason = ""
         self.anew = anew  # whether a plan is made for the last motion, too
@@ -439,7 +449,7 @@ class _Search:
         )
 
     def run(self, tolerance: float, max_iterations: int, deadline: float, report: Callback) -> Status:
-        last = len(self.history) + max_iterations
+        last, longest = len(self.history) + max_iterations, 0.0
         while True:
             self.state = self._state()
             started = time.perf_counter()
@@ -477,7 +487,9 @@ class _Search:
             if step.length == 0.0 and self._keeps_no_promise_above(step.hidden):
                 self.reason = f"{self._promised()}, and rounding hides {step.hidden:.1e} of the cost"
                 return Status.CONVERGED
-            ended = self._out_of(last, deadline)
+            # A tick's plan has to be there in time: none begins that would be late if it took as long as those before.
+            longest = max(longest, time.perf_counter() - started)
+            ended = self._out_of(last, deadline if self.anew else deadline - longest)
             if not self.anew and step.length > 0.0 and ended is not None:
                 self.followed = step.length
                 self.reason = f"{self._promised()} before the last step"
@@ -694,10 +706,7 @@ class _Search:
         # As many parts as a step of the motion so far has take fewer halvings of halves.
         few = max(_HALVINGS, int(self.trajectory.statistics.substeps.max()) - 1)
         for halvings, parts in ((few, _PARTS), (few + _MORE_HALVINGS, _PARTS**2)):
-            if halvings not in self.cutting:
-                own = replace(guard, max_halvings=min(halvings, guard.max_halvings))
-                self.cutting[halvings] = replace(integrator, guard=own)
-            yield _Bounds(self.cutting[halvings], parts, watched=halvings > _HALVINGS)
+            yield _Bounds(_cut_less(integrator, halvings), parts, watched=halvings > _HALVINGS)
         yield _Bounds(integrator, np.inf, watched=True)
 
     def _try(self, step: float, feedback: Commands, added: Floats, bounds: _Bounds) -> _Trial:
