@@ -5,11 +5,14 @@
 The task of examples/mpc_moving_target.py: 50 nodes of 10 ms ahead, one iteration a tick, on a plant that RungeKutta4
 integrates at a tenth of the step. Once without surprises, once under noise, and once with noise and a payload of 0.3 kg
 that the controller does not know; budget 10 ms, so that a plan that comes later does not act. Writes the table of
-``docs/control-loop.md`` between its markers. Where crocoddyl is there (see crocoddyl_reference.py), ticks of its FDDP on
-Euler's map are taken in turns with varpin's, each on its own model: one iteration from the last plan, moved on by a node.
+``docs/control-loop.md`` between its markers.
+
+In the environment of crocoddyl_reference.py instead: ticks of crocoddyl's FDDP on Euler's map in turns with varpin's, each
+on its own model, one iteration from the last plan, moved on by a node.
 """
 
 import gc
+import importlib
 import importlib.util
 import time
 from collections.abc import Callable
@@ -70,8 +73,7 @@ def row(name: str, mpc: vp.Mpc, plants: dict[str, vp.Scene], robot: vp.Robot) ->
 
 def fddp_ticks(robot: vp.Robot, mpc: vp.Mpc) -> Callable[[int], float]:
     """The ticks of crocoddyl's FDDP, one after another: what each took [s], new targets left out."""
-    import crocoddyl
-
+    crocoddyl = importlib.import_module("crocoddyl")
     n, steps, dt = robot.dof, mpc.problem.steps, mpc.problem.dt
     hold = mpc.problem.scene.holding_torque(BEGIN)
     state = crocoddyl.StateMultibody(robot.model)
@@ -131,12 +133,10 @@ def against_crocoddyl(robot: vp.Robot, controllers: dict[str, vp.Mpc], ticks: in
         seconds["FDDP"].append(fddp(k))
     theirs = np.array(seconds.pop("FDDP"))
     print(
-        f"a tick against crocoddyl's of {1e3 * theirs.min():.2f} ms at least, {1e3 * np.median(theirs):.2f} in the median"
+        f"ticks of FDDP: {1e3 * theirs.min():.2f} ms at least, {1e3 * np.median(theirs):.2f} in the median; others by it"
     )
     for name, own in seconds.items():
-        print(
-            f"  {name:18} {min(own) / theirs.min():.2f} at least, {np.median(own) / np.median(theirs):.2f} in the median"
-        )
+        print(f"  {name:18} {min(own) / theirs.min():5.2f} {np.median(own) / np.median(theirs):5.2f}")
 
 
 def main() -> None:
