@@ -7,8 +7,8 @@ integrates at a tenth of the step. Once without surprises, once under noise, and
 that the controller does not know; budget 10 ms, so that a plan that comes later does not act. Writes the table of
 ``docs/control-loop.md`` between its markers.
 
-In the environment of crocoddyl_reference.py instead: ticks of crocoddyl's FDDP on Euler's map in turns with varpin's, each
-on its own model, one iteration from the last plan, moved on by a node.
+In the environment of crocoddyl_reference.py instead: ticks of crocoddyl's FDDP on Euler's map in turns with varpin's,
+each on its own model, one iteration from the last plan, moved on by a node.
 """
 
 import gc
@@ -132,11 +132,10 @@ def against_crocoddyl(robot: vp.Robot, controllers: dict[str, vp.Mpc], ticks: in
             seconds[name].append(time.perf_counter() - begin)
         seconds["FDDP"].append(fddp(k))
     theirs = np.array(seconds.pop("FDDP"))
-    print(
-        f"ticks of FDDP: {1e3 * theirs.min():.2f} ms at least, {1e3 * np.median(theirs):.2f} in the median; others by it"
-    )
+    least, median = theirs.min(), np.median(theirs)
+    print(f"ticks of FDDP: {1e3 * least:.2f} ms at least, {1e3 * median:.2f} in the median; others as multiples")
     for name, own in seconds.items():
-        print(f"  {name:18} {min(own) / theirs.min():5.2f} {np.median(own) / np.median(theirs):5.2f}")
+        print(f"  {name:18} {min(own) / least:5.2f} {np.median(own) / median:5.2f}")
 
 
 def main() -> None:
