@@ -7,7 +7,7 @@ import pytest
 
 import varpin as vp
 from varpin import core
-from varpin.control.backward import TRUSTED, _Along, _foreseen, _Limits, _one_pass, backward
+from varpin.control.backward import TRUSTED, Along, _foreseen, _Limits, _one_pass, backward
 from varpin.control.square_root import squares_of
 from varpin.linearization import linearize_steps
 from varpin.simulation.run import simulate
@@ -180,7 +180,7 @@ def test_both_forms_agree_where_digits_are_plenty(name, foresight, regularizatio
     problem = reach(vp.planar_chain(3), 1e-2, 1.0, 10.0, **OPTIONS[name])
     controls = np.sin(np.arange(3 * problem.decisions)).reshape(-1, 3) * 0.4
     motion = vp.solve(problem, controls, max_iterations=0).trajectory
-    along, limits = _Along(problem, motion), None
+    along, limits = Along(problem, motion), None
     if problem.limited:
         expected = np.zeros((0, 9))
         if foresight:

@@ -179,7 +179,7 @@ def test_limits_that_the_optimum_does_not_touch(effort, speed):
 
 
 def around_the_nominal_states(problem, motion, second_order):
-    along = passes._Along(problem, motion)
+    along = passes.Along(problem, motion)
     curvature = None
     if second_order:
         plan, costate = passes._pass(along, 1e-3, costates=True)

@@ -284,6 +284,33 @@ def test_a_controller_that_cannot_keep_up_says_so(slow, told, monkeypatch):
     assert not told or f"in {slow} of 20 ticks ({1e3 * run.seconds[1:].mean():.3g} ms in the mean)" in said[0]
 
 
+@pytest.mark.parametrize(
+    ("budget", "iterations", "late"), [(0.0285, 5, 0), (0.0125, 2, 0), (0.0075, 1, 0), (0.0035, 1, 20), (0.0015, 0, 20)]
+)
+def test_a_tick_ends_within_its_budget_or_the_plan_before_acts_on(budget, iterations, late, monkeypatch):
+    """On a clock of 1 ms a look: an iteration takes five looks at it, and what is around them two or three."""
+    now = [0.0]
+
+    def clock():
+        now[0] += 1e-3
+        return now[0]
+
+    class Clock:
+        perf_counter = staticmethod(clock)
+
+    for module in (varpin.control.mpc, varpin.control.search):
+        monkeypatch.setattr(module, "time", Clock)
+    mpc = vp.Mpc(tracking(), iterations=5, tolerance=1e-300, budget=budget)
+    run = mpc.run(duration=21 * mpc.period)
+    assert run.misses == late
+    assert run.iterations[1:].max() == iterations
+    assert (run.seconds <= budget).all() == (late == 0)
+    told = [sentence for sentence in run.warnings if f"came later than the budget of {1e3 * budget:.3g} ms" in sentence]
+    assert len(told) == (late > 0)
+    assert not told or told[0].startswith("20 of 20 plans")
+    assert late == 0 or all(plan is run.plans[0] for plan in run.plans)
+
+
 def test_what_is_told_of_an_early_end_is_in_the_time_of_the_run():
     """Of joints beyond their limits, at the time from the run's start and not from the tick's."""
     calls = []
@@ -363,3 +390,38 @@ def test_what_plan_and_motion_have_in_common_is_told_once():
 def test_a_scene_is_no_plant():
     with pytest.raises(vp.InputError, match=r"plant must be a varpin.Plant, for example varpin.Plant\(scene\)"):
         vp.Mpc(tracking()).run(tracking().scene, duration=0.1)
+
+
+def path(t):
+    return [0.3 * np.sin(t), 0.2 * t]
+
+
+@pytest.mark.parametrize(
+    "cost",
+    [
+        vp.TrackingCost(path, 2.0) + vp.Terminal(vp.TrackingCost(path)),
+        vp.TrackingCost(np.linspace([0.0, 0.0], [1.0, 2.0], 21)) + 2.0 * vp.VelocityCost(0.1),
+        vp.CustomCost(lambda t, q, v, u: t * (q**2).sum(axis=-1)) + vp.ControlRateCost(0.1, [0.1, 0.2]),
+        vp.Terminal(vp.FramePositionCost(vp.planar_chain(2), "tip", lambda t: [t, 0.0, 1.0])),
+        vp.Terminal(vp.FrameOrientationCost(vp.planar_chain(2), "tip", np.eye(3))),
+    ],
+    ids=["path", "rows", "custom", "frame", "turn"],
+)
+def test_a_problem_at_another_time_and_state_is_that_of_its_grid(cost):
+    """Costs that no time changes are not bound again, and the values are the same to the last bit."""
+    cost = vp.ControlCost(0.1) + cost
+    scene, grid = vp.Scene(vp.planar_chain(2)), {"dt": 0.05, "steps": 20, "control_limits": (-3.0, 4.0)}
+    made = vp.OptimalControlProblem(scene, cost, [0.1, 0.2], [0.3, 0.4], t0=0.7, **grid)
+    own = vp.OptimalControlProblem(scene, cost, [1.0, 2.0], [3.0, 4.0], t0=-0.2, **grid).at(
+        q0=[0.1, 0.2], v0={"joint1": 0.3, "joint2": 0.4}, t0=0.7
+    )
+    rng = np.random.default_rng(1)
+    q, v, u = (rng.normal(size=(rows, 2)) for rows in (21, 21, 20))
+    assert own.costs(q, v, u) == made.costs(q, v, u)
+    for name in ("q0", "v0", "t0", "dt", "steps", "control_limits"):
+        np.testing.assert_array_equal(getattr(own, name), getattr(made, name))
+    assert not own.q0.flags.writeable
+    with pytest.raises(vp.InputError, match="q0"):
+        own.at(q0=[0.1])
+    with pytest.raises(vp.InputError, match="t0"):
+        own.at(t0="now")

@@ -10,9 +10,10 @@ import pytest
 import varpin as vp
 from varpin.control import search
 from varpin.control.backward import backward
-from varpin.control.descent import at_stake, spent
+from varpin.control.descent import at_stake
+from varpin.control.trials import Trials
+from varpin.core import Watch
 from varpin.integrators.base import open_loop
-from varpin.simulation.run import Motions
 
 GOAL = [0.8, -0.5]
 
@@ -271,15 +272,15 @@ def test_a_search_that_begins_at_the_optimum_ends_there(at):
 def work(monkeypatch, problem, **options):
     """A solution, and the parts that all of its motions took."""
     parts = []
-    own = type(problem.integrator).rollout_compiled
+    own = type(problem.integrator).watched
 
-    def counted(self, *args):
-        segments = own(self, *args)
-        parts.extend(int(segment.statistics.substeps.sum()) for segment in segments)
-        return segments
+    def counted(self, scene, state, commands, dt, nodes, watch):
+        found = own(self, scene, state, commands, dt, nodes, watch)
+        parts.append(int(nodes.tally[0, : nodes.done[0], 3].sum()))
+        return found
 
     with monkeypatch.context() as patch:
-        patch.setattr(type(problem.integrator), "rollout_compiled", counted)
+        patch.setattr(type(problem.integrator), "watched", counted)
         return vp.solve(problem, **options), sum(parts)
 
 
@@ -318,75 +319,81 @@ def test_bounded_searches_go_on_as_if_not_interrupted():
     assert [item.rollouts for item in parts.history] == [item.rollouts for item in whole.history]
 
 
+ARRAYS = ("q", "v", "p", "u", "energy")
+
+
 @pytest.mark.parametrize("hold", [1, 5])
 @pytest.mark.parametrize("grid", GRIDS)
-def test_motions_that_are_looked_at_on_their_way_are_the_same(grid, hold):
+def test_a_trial_is_the_motion_of_a_simulation_and_its_cost(grid, hold):
     problem = reach(vp.ControlRateCost(0.1), hold=hold, **GRIDS[grid])
     policy = vp.solve(problem, max_iterations=2).policy
-    commands = policy.commands(problem.steps, 2, 2, problem.integrator.variational)
-    motions = Motions(problem.scene, problem.integrator, problem.q0 + 0.1, problem.v0, problem.dt)
-    seen = []
-    whole, failure = motions.under(commands)
-    looked, same = motions.under(commands, futile=lambda parts: seen.append(len(parts)))
-    assert failure is same is None
-    assert seen == [1]
-    for name in ("q", "v", "p", "u", "energy"):
-        assert getattr(whole, name).tobytes() == getattr(looked, name).tobytes()
-    np.testing.assert_array_equal(whole.statistics.substeps, looked.statistics.substeps)
+    moved = problem.at(q0=problem.q0 + 0.1)
+    attempt = Trials(moved).attempt(policy.commands(problem.steps, 2, 2, problem.integrator.variational))
+    whole, motion = moved.simulate(policy), attempt.trajectory()
+    assert attempt.whole
+    for name in ARRAYS:
+        assert getattr(whole, name).tobytes() == getattr(motion, name).tobytes()
+    for name, own in vars(whole.statistics).items():
+        np.testing.assert_array_equal(own, getattr(motion.statistics, name))
+    np.testing.assert_array_equal(attempt.shares(), moved.shares(whole))
 
 
-def test_motions_that_are_futile_end():
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4(), vp.Reference()])
+def test_a_trial_ends_where_it_costs_too_much(integrator):
+    """Where the sum of its running cost passes a bound, and never in the first third."""
+    problem = reach(integrator=integrator, sampling="gauss")
+    trials, commands = Trials(problem), open_loop(np.ones((50, 2)))
+    whole = trials.attempt(commands)
+    motion = whole.trajectory()
+    running = [
+        problem.at(steps=steps).costs(motion.q[: steps + 1], motion.v[: steps + 1], motion.u[:steps])
+        - problem.terminal.value(motion.q[steps : steps + 1], motion.v[steps : steps + 1], np.zeros((1, 2)))[0]
+        for steps in range(1, 51)
+    ]
+    for steps in (5, 16, 30, 50):
+        attempt = trials.attempt(commands, most=running[steps - 1] * (1.0 - 1e-9))
+        assert attempt.verdict is Watch.Verdict.dear
+        assert attempt.trajectory().steps == max(steps, 16)
+        for name in ARRAYS:
+            kept = getattr(attempt.trajectory(), name)
+            assert kept.tobytes() == getattr(motion, name)[: len(kept)].tobytes()
+        assert not attempt.whole
+        assert steps < 16 or trials.attempt(commands, most=running[-1] * (1.0 + 1e-9)).whole
+
+
+def test_a_trial_ends_where_its_first_third_takes_too_many_parts():
     problem = reach()
-    motions = Motions(problem.scene, problem.integrator, problem.q0, problem.v0, problem.dt)
-    motion, failure = motions.under(open_loop(np.zeros((50, 2))), futile=lambda parts: "enough")
-    assert failure.reason == "enough"
-    assert motion.steps == 16
+    attempt = Trials(problem).attempt(open_loop(np.zeros((50, 2))), parts=15)
+    assert attempt.verdict is Watch.Verdict.cut
+    assert attempt.trajectory().steps == 16
+    assert Trials(problem).attempt(open_loop(np.zeros((50, 2))), parts=16).whole
 
 
 def test_trials_that_cost_too_much_already_are_given_up(monkeypatch):
-    """Those of a motion that runs off are no longer than a third of it, and the plan is the same."""
+    """Those of a motion that runs off end early, and the plan is the same."""
     lengths = []
-    own = search._Search._try
+    own = Trials.attempt
+    bounded = True
 
-    def watched(self, step, added, bounds):
-        before = self.motions.under
-
-        def under(commands, **options):
-            motion, failure = before(commands, **options)
-            lengths.append((motion.steps, None if failure is None else failure.reason))
-            return motion, failure
-
-        with monkeypatch.context() as patch:
-            patch.setattr(self.motions, "under", under)
-            return own(self, step, added, bounds)
+    def watched(self, commands, *, most=np.inf, **options):
+        attempt = own(self, commands, most=most if bounded else np.inf, **options)
+        lengths.append((attempt.trajectory().steps, attempt.verdict))
+        return attempt
 
     robot = vp.planar_chain(2)
     cost = vp.TrackingCost(GOAL, 100.0) + vp.ControlCost(1e-6)
     problem = vp.OptimalControlProblem(
         vp.Scene(robot), cost, [2.5, 2.0], [0, 0], dt=0.02, steps=50, integrator=vp.RungeKutta4(), sampling="gauss"
     )
-    monkeypatch.setattr(search._Search, "_try", watched)
+    monkeypatch.setattr(Trials, "attempt", watched)
     sol = vp.solve(problem, forward="open", max_iterations=30)
-    dear = [steps for steps, reason in lengths if reason == search._DEAR]
+    dear = [steps for steps, verdict in lengths if verdict is Watch.Verdict.dear]
     assert dear
-    assert max(dear) <= 16
-    monkeypatch.setattr(search, "spent", lambda *given: 0.0)
+    assert min(dear) == 16
+    bounded = False
     lengths.clear()
     assert_same_search(vp.solve(problem, forward="open", max_iterations=30), sol)
-    assert not [reason for _, reason in lengths if reason == search._DEAR]
-
-
-def test_what_is_spent_of_a_running_cost():
-    problem = reach(sampling="gauss")
-    motions = Motions(problem.scene, problem.integrator, problem.q0, problem.v0, problem.dt)
-    found = []
-    whole, _ = motions.under(open_loop(np.ones((50, 2))), futile=lambda parts: found.append((len(parts), list(parts))))
-    other, _ = motions.under(open_loop(np.zeros((50, 2))))
-    for (_, parts), steps in zip(found, (16,), strict=True):
-        short = problem.at(steps=steps)
-        own = short.costs(whole.q[: steps + 1], whole.v[: steps + 1], whole.u[:steps])
-        end = short.terminal.value(whole.q[steps : steps + 1], whole.v[steps : steps + 1], np.zeros((1, 2)))[0]
-        assert spent(problem, parts, other) == pytest.approx(own - end, rel=1e-12)
+    assert all(verdict is Watch.Verdict.going for _, verdict in lengths)
 
 
 def test_each_line_of_the_log_names_its_search(caplog):

@@ -81,7 +81,10 @@ class StepStatistics(Frozen):
 
     def damage(self) -> str | None:
         """What is wrong with a record of parts that no motion has, in words."""
-        counts, halvings = self.substeps[self.substeps > 1], self.halvings
+        halvings = self.halvings
+        if not halvings.size and (not self.substeps.size or self.substeps.max() <= 1):
+            return None
+        counts = self.substeps[self.substeps > 1]
         if counts.size and counts.max() > 1 << MOST_HALVINGS:
             return "statistics.substeps holds numbers of parts that no step has"
         fits = counts.sum() == halvings.size and (

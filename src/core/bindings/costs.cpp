@@ -9,6 +9,7 @@
 #include "arrays.hpp"
 #include "bodies.hpp"
 #include "registrations.hpp"
+#include "watched.hpp"
 
 namespace varpin::border {
 
@@ -105,6 +106,35 @@ std::tuple<Out, Out> expand(const CostTerms& costs, In<2> q, In<2> v, In<2> u) {
     return {gradient, hessian};
 }
 
+// The same at the samples of the steps of a motion: nodes q and v (N + 1, n), controls u (N, m).
+std::tuple<Out, Out> expand_steps(const CostTerms& costs, In<2> rule, In<2> q, In<2> v, In<2> u) {
+    const std::size_t N = u.shape(0), n = static_cast<std::size_t>(costs.dof), samples = rule.shape(0);
+    const std::size_t rows = N * samples, size = static_cast<std::size_t>(costs.size());
+    require(rule, "rule", {samples, 9});
+    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {N + 1, n});
+    require(u, "u", {N, static_cast<std::size_t>(costs.controls)});
+    const std::size_t matrices = costs.linear() ? 1 : rows;
+    double *g = nullptr, *H = nullptr;
+    const Out gradient = array_for(g, {rows, size}), hessian = array_for(H, {matrices, size, size});
+    {
+        nb::gil_scoped_release release;
+        CostSample sample(costs);
+        std::vector<double> at_q(samples * n), at_v(samples * n);
+        for (std::size_t s = 0; s < matrices; ++s) sample.add_constant_hessian(H + s * size * size);
+        for (std::size_t step = 0; step < N; ++step) {
+            sample_steps(rule.data(), samples, 1, n, q.data() + step * n, v.data() + step * n, at_q.data(),
+                         at_v.data());
+            for (std::size_t k = 0; k < samples; ++k) {
+                const std::size_t s = step * samples + k;
+                double* own = H + (matrices > 1 ? s * size * size : 0);
+                sample.expand(at_q.data() + k * n, at_v.data() + k * n, u.data() + step * u.shape(1), s, g + s * size,
+                              own);
+            }
+        }
+    }
+    return {gradient, hessian};
+}
+
 ChangeCost change_cost(const In<2>& weight, const In<2>& before, std::size_t m) {
     require(weight, "weight", {m, m});
     const bool starts = given(before, "before", {1, m});
@@ -169,7 +199,27 @@ void register_costs(nb::module_& m) {
         .def("add_center", &add_center, "links"_a)
         .def("add_term", &add_term, "subject"_a, "place"_a, "weight"_a, "target"_a, "directions"_a)
         .def("values", &values, "q"_a, "v"_a, "u"_a)
-        .def("expand", &expand, "q"_a, "v"_a, "u"_a);
+        .def("expand", &expand, "q"_a, "v"_a, "u"_a)
+        .def("expand_steps", &expand_steps, "rule"_a, "q"_a, "v"_a, "u"_a);
+    nb::class_<HeldWatch> watch(m, "Watch");
+    nb::enum_<Watch::Verdict>(watch, "Verdict")
+        .value("going", Watch::Verdict::going)
+        .value("cut", Watch::Verdict::cut)
+        .value("dear", Watch::Verdict::dear);
+    watch
+        .def(nb::init<const CostTerms&, In<2>, In<2>, In<2>, In<2>, InOut<2>>(), "costs"_a, "rule"_a, "q"_a, "v"_a,
+             "u"_a, "values"_a.noconvert(), nb::keep_alive<1, 2>())
+        .def(
+            "ask",
+            [](HeldWatch& watch, double weight, double most, std::ptrdiff_t from, double most_parts) {
+                watch.own.weight = weight;
+                watch.own.most = most;
+                watch.own.from = from;
+                watch.own.most_parts = most_parts;
+            },
+            "weight"_a, "most"_a, "after"_a, "parts"_a)
+        .def("after", &HeldWatch::after, "step"_a, "parts"_a)
+        .def_prop_ro("verdict", [](const HeldWatch& watch) { return watch.own.verdict; });
     m.def("change_values", &change_values, "weight"_a, "before"_a, "u"_a);
     m.def("expand_changes", &expand_changes, "weight"_a, "before"_a, "u"_a);
     m.def("sample_steps", &samples, "rule"_a, "q"_a, "v"_a);

@@ -12,6 +12,7 @@
 #include "arrays.hpp"
 #include "registrations.hpp"
 #include "rollout_arrays.hpp"
+#include "watched.hpp"
 
 namespace varpin::border {
 
@@ -135,15 +136,17 @@ bool first_nodes(BoundRollout& rollout, nb::handle nodes) {
     return rollout.own.first_nodes(arrays.view());
 }
 
-void roll(BoundRollout& rollout, double dt, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes) {
+void roll(BoundRollout& rollout, double dt, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes,
+          HeldWatch* watch) {
     const Mechanism& mechanism = *rollout.mechanism;
     const NodeArrays to(mechanism, nodes);
     rollout.require_paths(to);
     const CommandArrays by(mechanism, commands, to.paths(), to.steps());
     const double* dw = increments_of(mechanism, increments, to);
     const double* more = drift_of(mechanism, drift, to);
+    Watch* watching = watch ? watch->of(to.paths(), to.steps()) : nullptr;
     nb::gil_scoped_release release;
-    rollout.own.roll(dt, by.view(), dw, more, to.view());
+    rollout.own.roll(dt, by.view(), dw, more, to.view(), watching);
 }
 
 }  // namespace
@@ -172,7 +175,7 @@ void register_explicit(nb::module_& m) {
             "v", [](BoundRollout& rollout) { return rollout.view(rollout.own.v); }, nb::rv_policy::reference_internal)
         .def("copy", [](const BoundRollout& rollout) { return BoundRollout(rollout); })
         .def("first_nodes", &first_nodes, "nodes"_a)
-        .def("roll", &roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a);
+        .def("roll", &roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a, "watch"_a.none() = nb::none());
     m.def("accelerations", &accelerations, "mechanism"_a, "q"_a, "v"_a, "force"_a);
     m.def("linearize_explicit", &linearize, "mechanism"_a, "method"_a, "dt"_a, "q"_a, "v"_a, "force"_a);
 }

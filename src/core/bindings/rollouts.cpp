@@ -10,6 +10,7 @@
 #include "registrations.hpp"
 #include "rollout_arrays.hpp"
 #include "stepping.hpp"
+#include "watched.hpp"
 
 namespace varpin::border {
 
@@ -70,7 +71,7 @@ class VariationalRollout {
         return true;
     }
 
-    void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes) {
+    void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes, HeldWatch* watch) {
         const Mechanism& mechanism = *mechanism_;
         const NodeArrays written(mechanism, nodes);
         if (written.paths() != states_.size())
@@ -78,8 +79,9 @@ class VariationalRollout {
         const CommandArrays given_commands(mechanism, commands, written.paths(), written.steps());
         const double* dw = increments_of(mechanism, increments, written);
         const double* extra = drift_of(mechanism, drift, written);
+        Watch* watching = watch ? watch->of(written.paths(), written.steps()) : nullptr;
         nb::gil_scoped_release release;
-        stepping_->roll(guards_, h, given_commands.view(), dw, extra, states_, written.view());
+        stepping_->roll(guards_, h, given_commands.view(), dw, extra, states_, written.view(), watching);
     }
 
     // Add an impulse (P, n) to the momenta.
@@ -246,7 +248,8 @@ void register_rollouts(nb::module_& m) {
              nb::keep_alive<1, 2>())
         .def("fork", &VariationalRollout::fork, "guards"_a, nb::keep_alive<0, 1>())
         .def("begin", &VariationalRollout::begin, "q"_a, "v"_a)
-        .def("roll", &VariationalRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a)
+        .def("roll", &VariationalRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a,
+             "watch"_a.none() = nb::none())
         .def("kick", &VariationalRollout::kick, "impulse"_a)
         .def("nodes", &VariationalRollout::nodes)
         .def("halvings", &VariationalRollout::halvings, "path"_a);

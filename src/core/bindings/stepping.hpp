@@ -16,7 +16,7 @@ struct Stepping {
     virtual bool begin(const double* q, const double* v, PathState& state) = 0;
     virtual void kick(const double* impulse, PathState& state) = 0;
     virtual void roll(const Guards& guards, double h, const Commands& commands, const double* increments,
-                      const double* drift, std::vector<PathState>& states, const Nodes& nodes) = 0;
+                      const double* drift, std::vector<PathState>& states, const Nodes& nodes, Watch* watch) = 0;
 };
 
 struct Differentiation {
@@ -39,9 +39,9 @@ struct SteppingOf final : Stepping {
         own.kick(impulse, state);
     }
     void roll(const Guards& guards, double h, const Commands& commands, const double* increments, const double* drift,
-              std::vector<PathState>& states, const Nodes& nodes) override {
+              std::vector<PathState>& states, const Nodes& nodes, Watch* watch) override {
         own.guards = guards;
-        own.roll(h, commands, increments, drift, states, nodes);
+        own.roll(h, commands, increments, drift, states, nodes, watch);
     }
 };
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from varpin import core
 from varpin.control.costs import CostError, Expansion
-from varpin.control.descent import Model
+from varpin.control.descent import Model, Stake, at_stake
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.square_root import Squares, squares_of
 from varpin.errors import LinearizationError
@@ -131,14 +132,22 @@ def _curvature(problem: OptimalControlProblem, trajectory: Trajectory, plan: Pla
 
 
 def backward(
-    problem: OptimalControlProblem, trajectory: Trajectory, regularization: float, second_order: bool = False
+    problem: OptimalControlProblem,
+    trajectory: Trajectory,
+    regularization: float,
+    second_order: bool = False,
+    *,
+    along: Along | None = None,
 ) -> Plan | None:
     """One backward pass along a motion; None where a control has no minimum.
 
+    ``along`` is what other passes along it were made from.
+
     Raises:
+        CostError: An expansion of the cost is not finite.
         LinearizationError: A step has no derivative.
     """
-    along = _Along(problem, trajectory)
+    along = Along(problem, trajectory) if along is None else along
     if not second_order:
         return _within_limits(along, regularization, None)
     # First derivatives of the cost to go, then with them second derivatives of the dynamics (stagewise Newton).
@@ -148,7 +157,7 @@ def backward(
     return _within_limits(along, regularization, _curvature(problem, trajectory, plan, costate))
 
 
-def _within_limits(along: _Along, regularization: float, curvature: Floats | None) -> Plan | None:
+def _within_limits(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
     """The pass whose controls are kept within their limits where the linearized motion is expected.
 
     Around the nominal states alone, late decisions seem to meet their limits: each would have to do by itself what
@@ -182,7 +191,7 @@ def _within_limits(along: _Along, regularization: float, curvature: Floats | Non
     return _pass(along, regularization, curvature=curvature, limits=nominal)[0]
 
 
-def _foreseen(along: _Along, plan: Plan) -> tuple[Floats, Floats]:
+def _foreseen(along: Along, plan: Plan) -> tuple[Floats, Floats]:
     """Where the linearized motion goes under a plan whose controls are clipped to their limits.
 
     The state, and the change of the control before, before each decision (R, 2n + m), and the controls' changes (R, m).
@@ -215,16 +224,12 @@ class _Limits(NamedTuple):
     expected: Floats
 
 
-class _Along:
-    """What passes along a motion are made from; the linearization is kept where it is one block."""
+class Along:
+    """What all passes along a motion are made from; the linearization is kept where it is one block."""
 
     def __init__(self, problem: OptimalControlProblem, trajectory: Trajectory) -> None:
         self.problem, self.trajectory = problem, trajectory
         m = problem.scene.controls
-        self.running = problem.expand_running(trajectory)
-        for name, array in (("gradient", self.running.gradient), ("Hessian", self.running.hessian)):
-            if not np.isfinite(array).all():
-                raise CostError(repr(problem.cost), f"its {name} along the motion is not finite")
         self.rate, self.pull = np.zeros((0, m, m)), np.zeros((0, m))
         if problem.rate is not None:
             self.pull, self.rate = problem.rate.expand(trajectory.u[:: problem.hold], problem.period)
@@ -234,6 +239,39 @@ class _Along:
         block = max(1, _BLOCK // problem.hold) * problem.hold
         self.blocks = [(max(0, end - block), end) for end in range(problem.steps, 0, -block)][::-1]
         self.kept: tuple[Linearization, Floats] | None = None
+
+    @cached_property
+    def running(self) -> Expansion:
+        """The running cost at its samples."""
+        problem, found = self.problem, self.problem.expand_running(self.trajectory)
+        for name, array in (("gradient", found.gradient), ("Hessian", found.hessian)):
+            if not np.isfinite(array).all():
+                raise CostError(repr(problem.cost), f"its {name} along the motion is not finite")
+        return found
+
+    @cached_property
+    def stake(self) -> Stake:
+        """How much of the cost of the motion is at stake."""
+        return at_stake(self.problem, self.trajectory, self.model)
+
+    @cached_property
+    def model(self) -> Model:
+        """The quadratic model of the cost along the motion."""
+        return Model(self.running, self.terminal.cost)
+
+    @cached_property
+    def terminal(self) -> _Terminal:
+        """The terminal cost at the end of the motion."""
+        problem, q, v = self.problem, self.trajectory.q[-1:], self.trajectory.v[-1:]
+        n = problem.scene.robot.dof
+        end, x = problem.expand_terminal(self.trajectory), slice(0, 2 * n)
+        cost = Expansion(end.gradient[:1, x], end.hessian[:1, x, x])
+        g, H, D = cost.gradient[0], cost.hessian[0], np.eye(2 * n)
+        if problem.integrator.variational:
+            slopes = velocity_at_nodes(problem.scene, q, v) if self.kept is None else self.kept[1]
+            D[n:] = slopes[-1] if len(slopes) else velocity_at_nodes(problem.scene, q, v)[0]
+            g, H = D.T @ g, D.T @ H @ D
+        return _Terminal(cost, D, g, H)
 
     def linearized(self, begin: int, end: int) -> tuple[Linearization, Floats]:
         """A block of steps, and dv/dx at its nodes where they are needed."""
@@ -274,7 +312,7 @@ class _Along:
 
 
 def _pass(
-    along: _Along,
+    along: Along,
     regularization: float,
     *,
     costates: bool = False,
@@ -289,6 +327,15 @@ def _pass(
     return plain if by_roots[0] is None else by_roots
 
 
+class _Terminal(NamedTuple):
+    """The terminal cost in (q, v), d(q, v)/dx, and the cost's gradient (2n,) and Hessian (2n, 2n) in x."""
+
+    cost: Expansion
+    slopes: Floats
+    gradient: Floats
+    hessian: Floats
+
+
 class _ByRoots(NamedTuple):
     """A pass on square roots, and the costs of samples and of changes of the control as squares."""
 
@@ -298,7 +345,7 @@ class _ByRoots(NamedTuple):
 
 
 def _one_pass(
-    along: _Along,
+    along: Along,
     regularization: float,
     costates: bool,
     curvature: Floats | None,
@@ -309,7 +356,10 @@ def _one_pass(
     problem, running = along.problem, along.running
     scene = problem.scene
     n, m, k, N, R = scene.robot.dof, scene.controls, scene.processes, problem.steps, problem.decisions
-    terminal, D, by_state, by_states = _terminal(problem, along.trajectory, curvature is not None)
+    _, D, by_state, by_states = along.terminal
+    if curvature is not None and problem.integrator.variational:
+        pull = along.terminal.cost.gradient[:, n:]
+        by_states = by_states + velocity_curvature(scene, along.trajectory.q[-1:], along.trajectory.v[-1:], pull)[0]
     noisy = N if k else 0
     jumps, spread = np.empty((noisy, 2 * n, n)), np.empty((noisy, 2 * n, 2 * n))
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, 2 * n)), np.empty((R, m))
@@ -317,7 +367,10 @@ def _one_pass(
     costate = np.empty((N if costates else 0, 2 * n))
     plain, by_roots = core.BackwardPass(m, by_state, by_states), None
     if roots:
-        final, squares = squares_of(terminal.gradient, terminal.hessian), squares_of(running.gradient, running.hessian)
+        final, squares = (
+            squares_of(along.terminal.cost.gradient, along.terminal.cost.hessian),
+            squares_of(running.gradient, running.hessian),
+        )
         change = squares_of(along.pull, along.rate)
         if final is None or squares is None or change is None:
             return None, costate
@@ -362,7 +415,7 @@ def _one_pass(
         spread,
         limits.slack.size > 0,
         found.loss,
-        Model(running, terminal),
+        along.model,
     )
     return plan, costate
 
@@ -373,21 +426,3 @@ def _linearize(problem: OptimalControlProblem, part: Trajectory, begin: int) -> 
     except LinearizationError as error:
         step = begin + error.step
         raise LinearizationError(step, step * problem.dt, error.reason) from None
-
-
-def _terminal(
-    problem: OptimalControlProblem, trajectory: Trajectory, exact: bool
-) -> tuple[Expansion, Floats, Floats, Floats]:
-    """The terminal cost in (q, v), d(q, v)/dx, and the cost's gradient (2n,) and Hessian (2n, 2n) in x."""
-    n = problem.scene.robot.dof
-    end = problem.expand_terminal(trajectory)
-    x = slice(0, 2 * n)
-    gradient, hessian, D = end.gradient[:1, x], end.hessian[:1, x, x], np.eye(2 * n)
-    g, H = gradient[0], hessian[0]
-    if problem.integrator.variational:
-        D[n:] = velocity_at_nodes(problem.scene, trajectory.q[-1:], trajectory.v[-1:])[0]
-        H = D.T @ H @ D
-        if exact:
-            H = H + velocity_curvature(problem.scene, trajectory.q[-1:], trajectory.v[-1:], g[None, n:])[0]
-        g = D.T @ g
-    return Expansion(gradient, hessian), D, g, H

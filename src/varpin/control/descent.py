@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +9,6 @@ from numpy.typing import NDArray
 
 from varpin.control.costs import Expansion
 from varpin.control.problem import OptimalControlProblem
-from varpin.integrators import Segment
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -18,18 +16,6 @@ Floats = NDArray[np.float64]
 _EPS = float(np.finfo(np.float64).eps)
 # Rounding errors of costs and states, in units of the last digit: functions are evaluated and steps solved with some.
 _ROUNDED = 16.0
-
-
-def spent(problem: OptimalControlProblem, parts: Sequence[Segment], whole: Trajectory) -> float:
-    """The running cost of the beginning of a motion; the values of a ``whole`` one stand in for what is to come."""
-    done = sum(len(part.u) for part in parts)
-    q, v = (
-        np.concatenate([nodes[:1], *(getattr(part, name) for part in parts), nodes[done + 1 :]])
-        for name, nodes in (("q", whole.q), ("v", whole.v))
-    )
-    u = np.concatenate([*(part.u for part in parts), whole.u[done:]])
-    values = problem.running.value(*problem.samples(q, v, u))
-    return float(values[: done * len(problem.rule)].sum()) * problem.dt * float(problem.rule[0, 0])
 
 
 def rounding(

@@ -70,7 +70,7 @@ class MpcRun(Frozen):
         budget: For planning in a tick [s]; infinite for any.
         warnings: What looks wrong with the first plan, unless it does with the plant's motion, too; with that motion,
             as in :attr:`Trajectory.warnings`, and its velocities from tick to tick; and whether planning took longer
-            than the period in more than one tick of twenty, which depends on the machine.
+            than the period, or than the budget, in more than one tick of twenty, which depends on the machine.
     """
 
     motion: Trajectory
@@ -160,9 +160,10 @@ class Mpc:
     Other Args:
         tolerance: Of S-DDP; see :func:`varpin.solve`.
         first_iterations: In the first tick, which has no plan to start from.
-        budget: For planning in a tick [s]: no iteration begins after it, and a plan that is late is not used: the plan
-            before acts on, with its feedback. What happens then depends on the machine. Infinite, nothing depends
-            on the clock.
+        budget: For planning in a tick [s]. No iteration begins that would end after it, if it takes as long as the
+            longest one of the tick. A plan that is late all the same is not used: the plan before acts on, with its
+            feedback, ``MpcRun.late`` marks the tick, and more than one in twenty are a warning. What happens then
+            depends on the machine. Infinite, nothing depends on the clock.
     """
 
     problem: OptimalControlProblem
@@ -220,6 +221,7 @@ class Mpc:
             InputError: q or v of a wrong shape, or not finite.
             StepFailure, CostError: The motion to start from cannot be integrated, or has no cost.
         """
+        deadline = np.inf if self.budget == np.inf else time.perf_counter() + self.budget
         scene = self.problem.scene
         if before is not None:
             before = control_values("before", before, scene.control_joints, scene.controls)
@@ -230,9 +232,15 @@ class Mpc:
         problem = self.problem.at(q0=q, v0=v, t0=t, before=before)
         if previous is None:
             return self._first_plan(problem)[0]
-        start = previous.shifted(min(decisions, problem.decisions - 1), before)
         # A tick has no time for a second look at its plan; the run takes one at what came of them all.
-        return replan(problem, start, tolerance=self.tolerance, max_iterations=self.iterations, time_limit=self.budget)
+        return replan(
+            problem,
+            previous,
+            min(decisions, problem.decisions - 1),
+            tolerance=self.tolerance,
+            max_iterations=self.iterations,
+            deadline=deadline,
+        )
 
     def _first_plan(self, problem: OptimalControlProblem) -> tuple[Solution, tuple[Finding, ...]]:
         """The plan that a run begins with, and what was found wrong with it."""
@@ -317,7 +325,7 @@ class Mpc:
             raise Interrupted(_so_far(plant, parts)) from None
         motion, found = examined_in_loop(plant.scene, plant.integrator, chained(parts), plant.substeps)
         found = (*noise_forgotten(plant.scene, rng), *found, *_alternating(motion, plant.substeps))
-        found = (*found, *_behind(seconds, self.period))
+        found = (*found, *_behind(seconds, self.period), *_late(late, self.budget))
         announce(logger, plant.scene, dt, found)
         again = {(finding.kind, finding.joint) for finding in found}
         first = [finding.sentence for finding in of_plan if (finding.kind, finding.joint) not in again]
@@ -354,6 +362,18 @@ def _behind(seconds: Floats, period: float) -> tuple[Finding, ...]:
         "ahead, fewer iterations or a longer period (hold=) make it faster"
     )
     return (Finding("slow planning", sentence),)
+
+
+def _late(late: NDArray[np.bool_], budget: float) -> tuple[Finding, ...]:
+    """Says if more than a few plans came after their budget: the loop then runs on old ones."""
+    planned, missed = len(late) - 1, int(late[1:].sum())
+    if not missed > _FEW * planned:
+        return ()
+    sentence = (
+        f"{missed} of {planned} plans came later than the budget of {1e3 * budget:.3g} ms, and the feedback of an "
+        "older plan acted in their place: fewer steps ahead, fewer iterations or a larger budget give more of them time"
+    )
+    return (Finding("late plans", sentence),)
 
 
 def _alternating(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:

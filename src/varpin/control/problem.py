@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,7 +134,7 @@ class OptimalControlProblem(Frozen):
         if m == 0:
             raise InputError("the scene has no controls, so there is nothing to optimize")
         places, rule = _rule(sampling, dt)
-        times = ((np.arange(steps, dtype=np.float64)[:, None] + places) * dt).reshape(-1)
+        times = _times(places, steps, dt)
         t0 = real("t0", t0)
         points = Points(
             t0 + times, dt * steps, steps, n, m, t0, scene.robot.joint_names, scene.control_joints, scene.robot
@@ -221,6 +221,8 @@ class OptimalControlProblem(Frozen):
             steps = round(self.duration / positive("dt", dt, "s"))
             if abs(steps * dt - self.duration) > 1e-9 * self.duration:
                 raise InputError(f"the horizon of {self.duration:g} s is no multiple of dt = {dt:g} s")
+        if all(option is None for option in (dt, steps, integrator, sampling, hold)):
+            return self._moved(q0, v0, t0, before)
         return OptimalControlProblem(
             self.scene,
             self.cost if before is None else with_control_before(self.cost, before),
@@ -234,6 +236,29 @@ class OptimalControlProblem(Frozen):
             t0=self.t0 if t0 is None else t0,
             control_limits=(self.control_limits[0], self.control_limits[1]),
         )
+
+    def _moved(
+        self, q0: JointValues | None, v0: JointValues | None, t0: float | None, before: JointValues | None
+    ) -> OptimalControlProblem:
+        """The problem on the same grid: only what a state or a time can change is made anew."""
+        scene, names = self.scene, self.scene.robot.joint_names
+        own: dict[str, Any] = {}
+        for name, given in (("q0", q0), ("v0", v0)):
+            if given is not None:
+                own[name] = joint_array(name, given, names)
+                own[name].setflags(write=False)
+        if before is not None:
+            own["cost"] = with_control_before(self.cost, before)
+            own["rate"] = control_rate(own["cost"], scene.controls, scene.control_joints)
+        if t0 is not None and real("t0", t0) != self.t0:
+            own["t0"] = t0 = real("t0", t0)
+            times = t0 + _times(_rule(self.sampling, self.dt)[0], self.steps, self.dt)
+            points = replace(self.running.points, t=times, t0=t0)
+            own["running"], own["terminal"] = bind_cost(self.cost, times, points, (self.running, self.terminal))
+        moved = object.__new__(type(self))
+        # Past the dataclass, which refuses assignments.
+        vars(moved).update(vars(self) | own)
+        return moved
 
     def differs(self, other: OptimalControlProblem) -> str:
         """In words, what of two problems differs that can be told without comparing costs; empty if nothing."""
@@ -331,10 +356,20 @@ class OptimalControlProblem(Frozen):
         however large it is.
         """
         q, v, u = trajectory.q, trajectory.v, trajectory.u
+        return self.shares_along(q, v, u, self.running.compiled.values(*self.samples(q, v, u)))
+
+    def shares_along(self, q: Floats, v: Floats, u: Floats, compiled: Floats) -> Floats:
+        """:meth:`shares` of a motion, q and v (N + 1, n) and u (N, m).
+
+        ``compiled`` are values of the running terms that the core evaluates, at all samples (N s, terms).
+        """
+        found = [compiled.ravel()]
+        if self.running.others:
+            at = self.samples(q, v, u)
+            found += [part.value(*at) for part in self.running.others]
         weight = self.dt * self.rule[0, 0]
-        end = q[-1:], v[-1:], np.zeros((1, u.shape[1]))
-        found = [weight * values.ravel() for values in self.running.shares(*self.samples(q, v, u))]
-        found += [values.ravel() for values in self.terminal.shares(*end)]
+        found = [weight * values for values in found]
+        found += [values.ravel() for values in self.terminal.shares(q[-1:], v[-1:], np.zeros((1, u.shape[1])))]
         if self.rate is not None:
             found.append(self.rate.shares(u[:: self.hold], self.period))
         return np.concatenate(found)
@@ -363,7 +398,10 @@ class OptimalControlProblem(Frozen):
 
     def expand_running(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the running costs along a motion, at their samples, in (q, v, u)."""
-        return self.running.expand(*self.samples(trajectory.q, trajectory.v, trajectory.u))
+        q, v, u = trajectory.q, trajectory.v, trajectory.u
+        if self.running.others:
+            return self.running.expand(*self.samples(q, v, u))
+        return Expansion(*self.running.compiled.core.expand_steps(self.rule, q, v, u))
 
     def expand_terminal(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""
@@ -398,9 +436,25 @@ def _rule(sampling: str, dt: float) -> tuple[Floats, Floats]:
     return places, np.array(rows)
 
 
-def bind_cost(cost: Cost, times: Floats, horizon: Points) -> tuple[BoundSum, BoundSum]:
-    """The running costs at ``times`` (N,) of a horizon, and the terminal ones at its end."""
+def _times(places: Floats, steps: int, dt: float) -> Floats:
+    """Of all samples since the horizon began (N s,) [s], which are at ``places`` in each step."""
+    times: Floats = ((np.arange(steps, dtype=np.float64)[:, None] + places) * dt).reshape(-1)
+    return times
+
+
+def bind_cost(
+    cost: Cost, times: Floats, horizon: Points, known: tuple[BoundSum, BoundSum] | None = None
+) -> tuple[BoundSum, BoundSum]:
+    """The running costs at ``times`` (N,) of a horizon, and the terminal ones at its end.
+
+    ``known`` are those of another horizon on the same grid.
+    """
     at, end = (replace(horizon, t=t) for t in (times, np.array([horizon.t0 + horizon.duration])))
     terms = [term for term in cost.terms if not is_control_rate(term)]
-    running = BoundSum(tuple(term.bind(at) for term in terms if not isinstance(term, Terminal)), at)
-    return running, BoundSum(tuple(term.bind(end) for term in terms if isinstance(term, Terminal)), end)
+    sums = []
+    for place, points in enumerate((at, end)):
+        own = [term for term in terms if isinstance(term, Terminal) == bool(place)]
+        before = (None,) * len(own) if known is None else known[place].parts
+        parts = (term.bind(points) if old is None or term.timed else old for term, old in zip(own, before, strict=True))
+        sums.append(BoundSum(tuple(parts), points))
+    return sums[0], sums[1]

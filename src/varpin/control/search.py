@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -12,21 +13,23 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.control.backward import Plan, backward, noise_shares
+from varpin.control.backward import Along, Plan, backward, noise_shares
 from varpin.control.costs import CostError
-from varpin.control.descent import Stake, at_stake, rounding, spent
+from varpin.control.descent import rounding
 from varpin.control.examination import looked_at
 from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
+from varpin.control.trials import Attempt, Trials
+from varpin.core import Watch
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, LinearizationError
-from varpin.integrators import Integrator, Segment
+from varpin.integrators import Integrator
 from varpin.integrators.base import open_loop
 from varpin.integrators.variational import Variational
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.policy import LinearPolicy
-from varpin.simulation.run import Motions, StepFailure
+from varpin.simulation.run import StepFailure
 from varpin.support.checks import (
     JointValues,
     as_floats,
@@ -69,7 +72,8 @@ _TRIALS = 10
 # nothing else has led far, and without a bound where nothing has helped; a search that stalls goes on without bounds.
 _HALVINGS, _MORE_HALVINGS = 2, 3
 _PARTS = 3
-_CUT, _DEAR = "its steps are cut into many parts", "it costs too much already"
+# A trial that costs more than any step may is given up; what rounding does to costs is far below this part of them.
+_DEARER = 1e-9
 
 
 def solve(
@@ -191,17 +195,24 @@ def solve(
 
 
 def replan(
-    problem: OptimalControlProblem, start: LinearPolicy, *, tolerance: float, max_iterations: int, time_limit: float
+    problem: OptimalControlProblem,
+    previous: Solution,
+    decisions: int,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    deadline: float,
 ) -> Solution:
-    """A plan from the policy of the one before, with one backward pass for each iteration: a controller's tick.
+    """A plan from the one made some ``decisions`` ago, with one backward pass for each iteration: a controller's tick.
 
     Where iterations or time end the search, gains are those that its last step followed, and are not made anew for the
-    motion that came of it. Nobody looks at the finished plan. Arguments and errors are those of :func:`solve`.
+    motion that came of it. Nobody looks at the finished plan. No iteration begins that would end after ``deadline``, on
+    ``time.perf_counter``, if it took as long as those before. Other arguments, and errors, are those of :func:`solve`.
     """
     search = _Search(problem, second_order=False, anew=False)
-    search.begin(_first_commands(problem, start))
+    search.begin(_shifted_commands(problem, previous, decisions))
     try:
-        status = search.run(tolerance, max_iterations, time.perf_counter() + time_limit, lambda _: None)
+        status = search.run(tolerance, max_iterations, deadline, lambda _: None)
     except KeyboardInterrupt:
         status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
     return search.solution(status)
@@ -228,6 +239,37 @@ def _first_commands(problem: OptimalControlProblem, controls: JointValues | Line
     rows = as_floats("controls", controls)
     rows = finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m))
     return _held(np.broadcast_to(rows, (R, m)), problem)
+
+
+def _shifted_commands(problem: OptimalControlProblem, previous: Solution, decisions: int) -> Commands:
+    """Those of :meth:`Solution.shifted` under the problem's limits and after its control before."""
+    old, before = previous.problem, None if problem.rate is None else problem.rate.before
+    R, m = problem.decisions, problem.scene.controls
+    same = (
+        old.scene is problem.scene
+        and old.integrator == problem.integrator
+        and old.control_limits is problem.control_limits
+    )
+    if not (same and (old.dt, old.steps, old.hold) == (problem.dt, problem.steps, problem.hold)):
+        return _first_commands(problem, previous.shifted(decisions, before))
+    rows = np.minimum(np.arange(R) + decisions, R - 1)
+    u, gains, reference = previous.controls, previous.gains, states(old, previous.trajectory)[: -1 : old.hold]
+    if previous.previous_gains is not None:
+        start = None if old.rate is None else old.rate.before
+        expected = np.vstack([u[:1] if start is None else start, u[:-1]])[rows[:1]]
+        gains = np.concatenate([gains, previous.previous_gains], axis=2)
+        # What is repeated expects itself before.
+        reference = np.hstack([reference[rows], np.vstack([expected, u[rows[:-1]]])])
+    else:
+        reference = reference[rows]
+    return Commands(
+        u=u[rows],
+        gains=gains[rows],
+        reference=reference,
+        hold=problem.hold,
+        limits=problem.control_limits,
+        before=np.zeros((0, m)) if before is None else before[None].copy(),
+    )
 
 
 def _search_of(problem: OptimalControlProblem, controls: object, resume: Solution) -> SearchState:
@@ -266,6 +308,15 @@ def _onto_limits(u: Floats, limits: Floats) -> Floats:
     return u
 
 
+@functools.lru_cache(maxsize=256)
+def _cut_less(integrator: Variational, halvings: int) -> Variational:
+    """An integrator, a dataclass with a guard, whose steps are halved no more often than this."""
+    guard = integrator.guard
+    if guard is None or not is_dataclass(integrator):
+        return integrator
+    return replace(integrator, guard=replace(guard, max_halvings=min(halvings, guard.max_halvings)))
+
+
 @dataclass(frozen=True)
 class _Bounds:
     """What a trial of the line search may take.
@@ -294,7 +345,7 @@ class _Trial:
         cut: Whether it was given up for being cut into many parts.
     """
 
-    motion: Trajectory | None = None
+    motion: Attempt | None = None
     shares: Floats | None = None
     cost: float = np.inf
     expected: float = np.inf
@@ -339,7 +390,8 @@ class _Search:
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
         self.planned: tuple[Trajectory, float, bool] | None = None  # what it is a plan for, and how it was made
-        self.motions = Motions(problem.scene, problem.integrator, problem.q0, problem.v0, problem.dt)
+        self.trials = Trials(problem)
+        self._around: Along | None = None
         self.trajectory: Trajectory
         self.shares: Floats  # of the cost of the trajectory
         self.cost = np.inf
@@ -350,7 +402,6 @@ class _Search:
         self.above = 0.0  # what the trajectory costs more than the best one, without noise
         self.bounded = True  # whether trials are given up for their parts
         self.cut = False  # whether one was
-        self.cutting: dict[int, Integrator] = {}  # the integrator with fewer halvings
         self.gains: list[float] = []  # by how much each iteration lowered the least expected cost
         self.reason = ""
         self.anew = anew  # whether a plan is made for the last motion, too
@@ -361,11 +412,12 @@ class _Search:
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {begin:g} s"
 
     def begin(self, commands: Commands) -> None:
-        trajectory, failure = self.motions.under(commands)
-        if failure is not None:
-            raise StepFailure(trajectory.steps, trajectory.t[-1], failure, trajectory)
+        attempt = self.trials.attempt(commands)
+        trajectory = attempt.trajectory()
+        if attempt.failure is not None:
+            raise StepFailure(trajectory.steps, trajectory.t[-1], attempt.failure, trajectory)
         self.trajectory = trajectory
-        self.shares = self.problem.shares(trajectory)
+        self.shares = attempt.shares()
         self.cost = float(self.shares.sum())
         if not np.isfinite(self.cost):
             raise CostError(repr(self.problem.cost), f"the cost of the first motion is {self.cost}")
@@ -397,7 +449,7 @@ class _Search:
         )
 
     def run(self, tolerance: float, max_iterations: int, deadline: float, report: Callback) -> Status:
-        last = len(self.history) + max_iterations
+        last, longest = len(self.history) + max_iterations, 0.0
         while True:
             self.state = self._state()
             started = time.perf_counter()
@@ -414,13 +466,12 @@ class _Search:
                 return Status.INDEFINITE
             self._compare_with_best(self.plan)
             if not self.history:
-                stake = self._stake(self.plan)
-                self.first = stake.free if np.isfinite(stake.free) else stake.moved
+                self.first = self._at_first()
             if self._is_there(self.plan, tolerance):
                 self._note(report, started, passes)
                 self.reason = self._numbers(tolerance)
                 return Status.CONVERGED
-            ended, why = self._ended(self.plan, tolerance, last, deadline)
+            ended, why = self._ended(tolerance, last, deadline)
             if ended is Status.STALLED and self._lift():
                 continue
             if ended is not None:
@@ -436,7 +487,9 @@ class _Search:
             if step.length == 0.0 and self._keeps_no_promise_above(step.hidden):
                 self.reason = f"{self._promised()}, and rounding hides {step.hidden:.1e} of the cost"
                 return Status.CONVERGED
-            ended = self._out_of(last, deadline)
+            # A tick's plan has to be there in time: none begins that would be late if it took as long as those before.
+            longest = max(longest, time.perf_counter() - started)
+            ended = self._out_of(last, deadline if self.anew else deadline - longest)
             if not self.anew and step.length > 0.0 and ended is not None:
                 self.followed = step.length
                 self.reason = f"{self._promised()} before the last step"
@@ -447,6 +500,14 @@ class _Search:
                 self.reason = "no step lowers the cost, whatever the regularization; "
                 self.reason += self._numbers(tolerance, afresh=True)
                 return Status.STALLED
+
+    def _at_first(self) -> float:
+        """What is at stake on the first motion."""
+        if not self.anew and self.problem.cost.nonnegative:
+            # Of squares no more is at stake than they cost, and a tick has no time to find out how much.
+            return self.cost
+        stake = self.along.stake
+        return stake.free if np.isfinite(stake.free) else stake.moved
 
     def _compare_with_best(self, plan: Plan) -> None:
         noise = self._noise(plan)
@@ -465,31 +526,35 @@ class _Search:
             return 0.0
         return float(noise_shares(self.problem, self.trajectory, plan, self.steered).sum())
 
-    def _stake(self, plan: Plan) -> Stake:
-        return at_stake(self.problem, self.trajectory, plan.model)
+    @property
+    def along(self) -> Along:
+        """What passes along the motion are made from."""
+        if self._around is None or self._around.trajectory is not self.trajectory:
+            self._around = Along(self.problem, self.trajectory)
+        return self._around
 
-    def _share(self, plan: Plan, tolerance: float) -> float:
+    def _share(self, tolerance: float) -> float:
         """The tolerance on the promised decrease."""
-        return tolerance * (self._stake(plan).moved + _NOTHING * self.first)
+        return tolerance * (self.along.stake.moved + _NOTHING * self.first)
 
     def _is_there(self, plan: Plan, tolerance: float) -> bool:
         least = tolerance * _NOTHING * self.first
         if self.problem.cost.nonnegative and plan.promise > tolerance * self.cost + least:
             # Of squares no more is at stake than they cost.
             return False
-        if not self.steered.any() and self._stake(plan).free <= least:
+        if not self.steered.any() and self.along.stake.free <= least:
             # No motion at all costs less. Without costs on the controls the model may have no minimum even there.
             self.plan = self._least_regularized()[0] or plan
             return True
-        return self._keeps_no_promise_above(self._share(plan, tolerance))
+        return self._keeps_no_promise_above(self._share(tolerance))
 
-    def _ended(self, plan: Plan, tolerance: float, last: int, deadline: float) -> tuple[Status | None, str]:
+    def _ended(self, tolerance: float, last: int, deadline: float) -> tuple[Status | None, str]:
         """How a search ends that has not converged, if it does, and the reason."""
         if len(self.history) >= last:
             return self._out_of(last, deadline), ""
         if len(self.gains) > _PATIENCE:
             recent = sum(self.gains[-_PATIENCE:])
-            if recent <= self._share(plan, tolerance):
+            if recent <= self._share(tolerance):
                 return Status.STALLED, f"{_PATIENCE} iterations have lowered the expected cost by {recent:.1e}; "
         return self._out_of(last, deadline), ""
 
@@ -525,7 +590,7 @@ class _Search:
                 if plan is not None:
                     self.plan = plan
                     needed = f" under a regularization of {least:.0e}, without which it has no minimum" if least else ""
-        share = np.nan if self.plan is None else self._share(self.plan, tolerance)
+        share = np.nan if self.plan is None else self._share(tolerance)
         return f"{self._promised()}{needed}; the tolerance of {tolerance:g} times the cost at stake is {share:.1e}"
 
     def _note(self, report: Callback, started: float, passes: int, step: _Step | None = None) -> None:
@@ -580,7 +645,7 @@ class _Search:
         self.exact = self.second_order if exact is None else exact
         while True:
             passes += 1
-            self.plan = backward(self.problem, self.trajectory, self.regularization, self.exact)
+            self.plan = backward(self.problem, self.trajectory, self.regularization, self.exact, along=self.along)
             if self.plan is not None:
                 self.planned = self.trajectory, self.regularization, self.exact
                 return passes
@@ -593,7 +658,7 @@ class _Search:
         """The plan at the motion with as little regularization as leaves a minimum, and how much that is."""
         for regularization in (0.0, *10.0 ** np.arange(-6, 11, 2)):
             for exact in (True, False) if self.second_order and regularization == 0.0 else (False,):
-                plan = backward(self.problem, self.trajectory, float(regularization), exact)
+                plan = backward(self.problem, self.trajectory, float(regularization), exact, along=self.along)
                 if plan is not None:
                     return plan, float(regularization)
         return None, np.inf
@@ -604,12 +669,13 @@ class _Search:
             return _Step(0.0, 0, 0.0, 0.0)
         added = noise_shares(self.problem, self.trajectory, self.plan)
         taken, length, tried, trials = _Trial(), 0.0, None, 0
+        feedback = self._feedback(self.plan)
         left = list(self.backtracking ** np.arange(_TRIALS))
         for bounds in self._bounds():
             cut = []
             for step in left:
                 trials += 1
-                trial = self._try(float(step), added, bounds)
+                trial = self._try(float(step), feedback, added, bounds)
                 if trial.expected <= self.armijo * step * self.plan.slope:
                     taken, length = trial, float(step)
                     break
@@ -623,7 +689,7 @@ class _Search:
                 break
         hidden = 0.0
         if taken.motion is not None and taken.shares is not None:
-            self.trajectory, self.shares = taken.motion, taken.shares
+            self.trajectory, self.shares = taken.motion.trajectory(), taken.shares
             self.cost = float(taken.shares.sum())
             self.above += taken.cost
         elif tried is not None:
@@ -640,61 +706,55 @@ class _Search:
         # As many parts as a step of the motion so far has take fewer halvings of halves.
         few = max(_HALVINGS, int(self.trajectory.statistics.substeps.max()) - 1)
         for halvings, parts in ((few, _PARTS), (few + _MORE_HALVINGS, _PARTS**2)):
-            if halvings not in self.cutting:
-                own = replace(guard, max_halvings=min(halvings, guard.max_halvings))
-                self.cutting[halvings] = replace(integrator, guard=own)
-            yield _Bounds(self.cutting[halvings], parts, watched=halvings > _HALVINGS)
+            yield _Bounds(_cut_less(integrator, halvings), parts, watched=halvings > _HALVINGS)
         yield _Bounds(integrator, np.inf, watched=True)
 
-    def _try(self, step: float, added: Floats, bounds: _Bounds) -> _Trial:
+    def _try(self, step: float, feedback: Commands, added: Floats, bounds: _Bounds) -> _Trial:
         """A motion so far along the plan, given up where it is cut to pieces or too dear already."""
-        problem, plan, here = self.problem, self.plan, self.trajectory
+        problem, plan = self.problem, self.plan
         if plan is None:
             return _Trial()
-        parts = np.cumsum(here.statistics.substeps)
         # What is to come of the cost, and what noise adds to it, is known not to be below zero.
         bounded = problem.cost.nonnegative and not (self.exact and problem.scene.processes)
         most = float(self.shares.sum() + added.sum()) + self.armijo * step * plan.slope if bounded else np.inf
-
-        def futile(done: list[Segment]) -> str | None:
-            taken = sum(int(part.statistics.substeps.sum()) for part in done)
+        parts = np.inf
+        if bounds.parts < np.inf and (bounds.watched or step < 1.0):
             # Explicit methods count no parts.
-            if taken > bounds.parts * max(1, parts[sum(len(part.u) for part in done) - 1]):
-                return _CUT
-            return _DEAR if bounded and spent(problem, done, here) > most else None
-
-        commands = self._along(step, plan)
+            parts = bounds.parts * max(1, int(self.trajectory.statistics.substeps[: self.trials.third].sum()))
+        u = self.trajectory.u[:: problem.hold] + step * plan.feedforward
+        if problem.limited:
+            u = _onto_limits(u, problem.control_limits)
         try:
-            asked = futile if bounds.watched or step < 1.0 else None
-            moved, failure = self.motions.under(commands, integrator=bounds.integrator, futile=asked)
-            if failure is not None:
+            attempt = self.trials.attempt(
+                feedback._replace(u=u), integrator=bounds.integrator, most=most + _DEARER * abs(most), parts=parts
+            )
+            if not attempt.whole:
                 # Whatever makes a step of few halvings fail, more may mend.
-                few = bounds.integrator != problem.integrator
-                return _Trial(cut=failure.reason == _CUT or (few and failure.reason != _DEAR))
-            there, noise = problem.shares(moved), noise_shares(problem, moved, plan)
+                few = attempt.failure is not None and bounds.integrator != problem.integrator
+                return _Trial(cut=few or attempt.verdict is Watch.Verdict.cut)
+            there = attempt.shares()
+            noise = noise_shares(problem, attempt.trajectory(), plan) if problem.scene.processes else added
         except _LOST as error:
             logger.info("%s: trial of length %g: %s", self.label, step, error)
             return _Trial()
         if not np.isfinite(there).all():
             return _Trial()
         cost = float((there - self.shares).sum())
-        return _Trial(moved, there, cost, cost + float((noise - added).sum()))
+        return _Trial(attempt, there, cost, cost + float((noise - added).sum()))
 
-    def _along(self, step: float, plan: Plan) -> Commands:
-        """The commands of a trial."""
+    def _feedback(self, plan: Plan) -> Commands:
+        """The commands of trials, but for the feed-forward part that theirs is on top of."""
         problem, here = self.problem, self.trajectory
-        u = here.u[:: problem.hold] + step * plan.feedforward
-        if problem.limited:
-            u = _onto_limits(u, problem.control_limits)
+        commands = _held(here.u[:: problem.hold], problem)
         if self.forward == "open":
-            return _held(u, problem)
+            return commands
         gains, reference = plan.feedback, states(problem, here)[: -1 : problem.hold]
         if plan.previous is not None:
             before = here.u[: -problem.hold : problem.hold]
             gains = np.concatenate([gains, plan.previous], axis=2)
             # The first change is from a control that is given.
             reference = np.hstack([reference, np.vstack([here.u[:1], before])])
-        return _held(u, problem)._replace(gains=gains, reference=reference)
+        return commands._replace(gains=gains, reference=np.ascontiguousarray(reference))
 
     def _last_plan(self) -> Plan | None:
         if self.plan is not None and self.planned == (self.trajectory, 0.0, self.second_order):

@@ -18,6 +18,7 @@ from varpin.core._core import Squares as Squares
 from varpin.core._core import Subject as Subject
 from varpin.core._core import Tableau as Tableau
 from varpin.core._core import VariationalRollout as VariationalRollout
+from varpin.core._core import Watch as Watch
 from varpin.core._core import accelerations as accelerations
 from varpin.core._core import box_minimum as box_minimum
 from varpin.core._core import change_values as change_values

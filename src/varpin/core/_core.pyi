@@ -124,6 +124,32 @@ class Guards:
         *, active: bool, branch_margin: float, energy_balance: float, energy_budget: float, most_halvings: int
     ) -> Guards: ...
 
+class Watch:
+    """The running cost of one path while it is rolled out, and whether the motion is worth going on with."""
+
+    class Verdict(Enum):
+        going = 0
+        cut = 1
+        dear = 2
+
+    def __init__(self, costs: CostTerms, rule: Floats, q: Floats, v: Floats, u: Floats, values: Floats) -> None:
+        """Over nodes q and v (N + 1, n) and controls u (N, m) that are being written, the first node there already.
+
+        The values of the terms at the samples of the rule (s, 9) go into ``values`` (N s, terms).
+        """
+
+    def ask(self, weight: float, most: float, after: int, parts: float) -> None:
+        """End the motion where ``weight`` times its values exceed ``most``, or its first steps take too many parts.
+
+        It is looked at from ``after`` steps on, which may take ``parts`` together.
+        """
+
+    def after(self, step: int, parts: int) -> bool:
+        """Look at a step, which was taken in so many parts; False where the motion is to end there."""
+
+    @property
+    def verdict(self) -> Verdict: ...
+
 class VariationalRollout:
     """Paths of a variational integrator, and the work arrays of a step."""
 
@@ -143,8 +169,19 @@ class VariationalRollout:
     def begin(self, q: Floats, v: Floats) -> bool:
         """Put each path at its row of q and v (P, n); False where an M(q) is not positive definite."""
 
-    def roll(self, dt: float, commands: Commands, increments: Floats, drift: Floats, nodes: Nodes) -> None:
-        """Take the steps that the commands are for, and write them into the nodes; named tuples of arrays."""
+    def roll(
+        self,
+        dt: float,
+        commands: Commands,
+        increments: Floats,
+        drift: Floats,
+        nodes: Nodes,
+        watch: Watch | None = None,
+    ) -> None:
+        """Take the steps that the commands are for, and write them into the nodes; named tuples of arrays.
+
+        One path alone may be under a watch, which may end it.
+        """
 
     def kick(self, impulse: Floats) -> None:
         """Add an impulse (P, n) to the momenta."""
@@ -394,7 +431,15 @@ class ExplicitRollout:
     def first_nodes(self, nodes: Nodes) -> bool:
         """Enter where each path stands as its node 0; False where a mass matrix is not positive definite."""
 
-    def roll(self, dt: float, commands: Commands, increments: Floats, drift: Floats, nodes: Nodes) -> None:
+    def roll(
+        self,
+        dt: float,
+        commands: Commands,
+        increments: Floats,
+        drift: Floats,
+        nodes: Nodes,
+        watch: Watch | None = None,
+    ) -> None:
         """All N steps of length dt [s] of all paths.
 
         With increments of the Wiener processes (P, N, k), or (0, 0, k) for none, and a force (P, N, n) on top of that
@@ -494,6 +539,9 @@ class CostTerms:
 
     def expand(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats]:
         """Gradient (N, 2n + m) and Hessian (N or 1, 2n + m, 2n + m) of all terms, of Gauss and Newton."""
+
+    def expand_steps(self, rule: Floats, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats]:
+        """The same at the samples of the rule (s, 9) in the steps of q and v (N + 1, n) under u (N, m)."""
 
 def change_values(weight: Floats, before: Floats, u: Floats) -> Floats:
     """What the changes of controls (P, N, m) cost, weight (m, m) . (u_k - u_(k-1))^2, one by one (P, N).

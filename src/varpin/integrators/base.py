@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.core import Watch
 from varpin.core.arrays import Commands, Nodes
 from varpin.errors import InputError, SingularMassMatrix
 from varpin.mechanics.lagrangian import lagrangian_jet
@@ -144,6 +145,34 @@ class Integrator(ABC):
                 break
         return [join(segments)]
 
+    def watched(
+        self, scene: Scene, state: Any, commands: Commands, dt: float, nodes: Nodes, watch: Watch
+    ) -> tuple[Failure | None, Bytes]:
+        """:meth:`rollout` of one path without noise into ``nodes``, which ends where the ``watch`` ends it.
+
+        Returns why it failed, if it did, and the halvings of the steps that were not taken whole.
+        """
+        decisions, done = len(commands.u), 0
+        halvings = [np.zeros(0, dtype=np.uint8)]
+        # A third at a time, as the watch may end it.
+        ends = sorted({decisions // 3, 2 * decisions // 3, decisions} - {0})
+        for begin, end in zip([0, *ends], ends, strict=False):
+            block = rows(commands, begin, end, nodes.u[0, done - 1 : done] if done else None)
+            segment = self.rollout(scene, state, block, scene.silence, dt)[0]
+            own, taken = segment.statistics, slice(done, done + len(segment.u))
+            for name in _ARRAYS:
+                getattr(nodes, name)[0, taken] = getattr(segment, name)
+            nodes.tally[0, taken] = np.stack([own.newton_iterations, own.jets, own.sweeps, own.substeps], axis=1)
+            nodes.quality[0, taken] = np.stack([own.residual, own.branch_margin, own.energy_defect], axis=1)
+            for step, parts in enumerate(own.substeps.tolist()):
+                done = nodes.done[0] = taken.start + step + 1
+                if not watch.after(taken.start + step, parts):
+                    return None, np.concatenate([*halvings, own.part(0, step + 1).halvings])
+            halvings.append(own.halvings)
+            if segment.failure is not None:
+                return segment.failure, np.concatenate(halvings)
+        return None, np.concatenate(halvings)
+
     @abstractmethod
     def rollout_compiled(
         self, scene: Scene, state: Any, commands: Commands, increments: Floats, drift: Floats, dt: float
@@ -261,22 +290,8 @@ def segments_of(
     """
     segments = []
     for i, done in enumerate(nodes.done.tolist()):
-        tally, quality = nodes.tally[i], nodes.quality[i]
-        substeps = tally[:done, 3]
-        split = halvings is not None and (substeps > 1).any()
-        statistics = StepStatistics(
-            newton_iterations=tally[:done, 0],
-            jets=tally[:done, 1],
-            sweeps=tally[:done, 2],
-            substeps=substeps,
-            halvings=halvings(i) if halvings is not None and split else np.zeros(0, dtype=np.uint8),
-            residual=quality[:done, 0],
-            branch_margin=quality[:done, 1],
-            energy_defect=quality[:done, 2],
-        )
-        failure = None
-        if int(nodes.ended[i]) in reasons:
-            failure = Failure(reasons[int(nodes.ended[i])], float(quality[done, 0]))
+        parts = np.zeros(0, dtype=np.uint8) if halvings is None else parts_of(nodes, i, done, halvings)
+        statistics, failure = statistics_of(nodes, i, done, parts), failure_of(nodes, i, done, reasons)
         segments.append(
             Segment(
                 q=nodes.q[i, :done],
@@ -289,6 +304,33 @@ def segments_of(
             )
         )
     return segments
+
+
+def statistics_of(nodes: Nodes, path: int, done: int, halvings: Bytes) -> StepStatistics:
+    """What the steps of a path took, as views."""
+    tally, quality = nodes.tally[path, :done], nodes.quality[path, :done]
+    return StepStatistics(
+        newton_iterations=tally[:, 0],
+        jets=tally[:, 1],
+        sweeps=tally[:, 2],
+        substeps=tally[:, 3],
+        halvings=halvings,
+        residual=quality[:, 0],
+        branch_margin=quality[:, 1],
+        energy_defect=quality[:, 2],
+    )
+
+
+def parts_of(nodes: Nodes, path: int, done: int, halvings: Callable[[int], Bytes]) -> Bytes:
+    """The halvings of a path's steps; ``halvings`` is asked where steps were not taken whole."""
+    split = done > 0 and nodes.tally[path, :done, 3].max() > 1
+    return halvings(path) if split else np.zeros(0, dtype=np.uint8)
+
+
+def failure_of(nodes: Nodes, path: int, done: int, reasons: Mapping[int, str]) -> Failure | None:
+    """Why a path stopped before its end, if it did."""
+    ended = int(nodes.ended[path])
+    return Failure(reasons[ended], float(nodes.quality[path, done, 0])) if ended in reasons else None
 
 
 def first_nodes(q: Floats, p: Floats, v: Floats, energy: Floats, controls: int) -> list[Segment]:

@@ -9,22 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin import core
-from varpin.core import ExplicitMethod, Outcome
-from varpin.core.arrays import Commands, new_nodes
+from varpin.core import ExplicitMethod, Outcome, Watch
+from varpin.core.arrays import Commands, Nodes, new_nodes
 from varpin.errors import LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
+    Failure,
     Integrator,
     Segment,
+    contiguous,
     control_of,
     diffusion_and_drift,
     drifts,
+    failure_of,
     open_loop,
     segments_of,
     steps_of,
 )
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.trajectory import Trajectory
+from varpin.trajectory import Bytes, Trajectory
 
 Floats = NDArray[np.float64]
 
@@ -94,6 +97,15 @@ class _Explicit(Integrator):
         nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
         state.paths.roll(dt, commands, increments, drift, nodes)
         return segments_of(nodes, REASONS)
+
+    def watched(
+        self, scene: Scene, state: ExplicitRun, commands: Commands, dt: float, nodes: Nodes, watch: Watch
+    ) -> tuple[Failure | None, Bytes]:
+        """See :meth:`Integrator.watched`."""
+        if scene.noise.diffusion is None:
+            return super().watched(scene, state, commands, dt, nodes, watch)
+        state.paths.roll(dt, contiguous(commands), scene.silence, scene.no_drift, nodes, watch)
+        return failure_of(nodes, 0, int(nodes.done[0]), REASONS), np.zeros(0, dtype=np.uint8)
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, v)."""

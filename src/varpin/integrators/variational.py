@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -14,6 +15,7 @@ from varpin.core import (
     Outcome,
     Tableau,
     VariationalRollout,
+    Watch,
     variational_curvatures,
     variational_derivatives,
     variational_ends,
@@ -21,20 +23,24 @@ from varpin.core import (
 from varpin.core.arrays import Commands, Nodes, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
+    Failure,
     Integrator,
     Segment,
+    contiguous,
     control_of,
     diffusion_and_drift,
     drifts,
+    failure_of,
     first_nodes,
     open_loop,
+    parts_of,
     segments_of,
     steps_of,
     written,
 )
 from varpin.mechanics.scene import Scene
 from varpin.support.checks import count, fraction, is_one_of, positive
-from varpin.trajectory import MOST_HALVINGS, Trajectory
+from varpin.trajectory import MOST_HALVINGS, Bytes, Trajectory
 
 Floats = NDArray[np.float64]
 
@@ -176,6 +182,16 @@ class Variational(Integrator):
         """See :meth:`Integrator.rollout_compiled`."""
         return segments_of(_rolled(scene, state, commands, increments, drift, dt), REASONS, state.paths.halvings)
 
+    def watched(
+        self, scene: Scene, state: VariationalRun, commands: Commands, dt: float, nodes: Nodes, watch: Watch
+    ) -> tuple[Failure | None, Bytes]:
+        """See :meth:`Integrator.watched`."""
+        if scene.noise.diffusion is None:
+            return super().watched(scene, state, commands, dt, nodes, watch)
+        state.paths.roll(dt, contiguous(commands), scene.silence, scene.no_drift, nodes, watch)
+        done = int(nodes.done[0])
+        return failure_of(nodes, 0, done, REASONS), parts_of(nodes, 0, done, state.paths.halvings)
+
     def motions(
         self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, drift: Floats, dt: float
     ) -> tuple[Floats, Floats] | None:
@@ -279,6 +295,7 @@ class Variational(Integrator):
         """Where its stages stand in a step of unit length (s,)."""
 
 
+@functools.lru_cache(maxsize=256)
 def _of_core(asked: Guard | None, balance: float = 1.0, budget: float = 1.0) -> Guards:
     own = asked or Guard(max_halvings=0)
     return Guards.make(

@@ -368,6 +368,13 @@ class Scene(Frozen):
         none.setflags(write=False)
         return none
 
+    @cached_property
+    def no_drift(self) -> Floats:
+        """What a rollout is given that has no force on top of the controls'."""
+        none = np.zeros((0, 0, self.robot.dof))
+        none.setflags(write=False)
+        return none
+
     def holding_torque(self, q: JointValues) -> Floats:
         """The generalized forces (n,) that hold the robot at rest at ``q`` [N m or N].
 

@@ -36,7 +36,6 @@ from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
 Floats = NDArray[np.float64]
 ControlLaw = Callable[[float, Floats, Floats], JointValues]
 Progress = Callable[[int, int], None]
-Futile = Callable[[list[Segment]], str | None]
 
 logger = logging.getLogger(__name__)
 
@@ -218,41 +217,18 @@ class Motions:
         commands: Commands,
         *,
         increments: Floats | None = None,
-        integrator: Integrator | None = None,
-        futile: Futile | None = None,
     ) -> tuple[Trajectory, Failure | None]:
         """The motion, and why it stopped early, if it did; nothing is checked.
 
         Args:
             commands: For all of its steps.
             increments: Of its Wiener processes (N, k) [s^0.5]; left out, there is no noise.
-            integrator: To make it with: the one of these motions with other options, and itself if left out.
-            futile: Asked after a third of a motion, about the parts that there are; where it answers with a reason, the
-                motion ends.
         """
-        integrator = self.integrator if integrator is None else integrator
         drawn = np.zeros((0, 0, self.scene.processes)) if increments is None else increments[None]
-        state = integrator.fork(self._state)
-        decisions, begin = len(commands.u), 0
-        parts: list[Segment] = []
-        failure: Failure | None = None
-        ends = {decisions} if futile is None else {decisions // 3, decisions} - {0}
-        for end in sorted(ends):
-            block = commands if end - begin == decisions else rows(commands, begin, end, _last_control(parts))
-            now = drawn[:, begin * commands.hold : end * commands.hold]
-            parts += integrator.rollout(self.scene, state, block, now, self.dt)
-            failure, begin = parts[-1].failure, end
-            if failure is None and futile is not None and end < decisions:
-                reason = futile(parts)
-                failure = None if reason is None else Failure(reason, 0.0)
-            if failure is not None:
-                break
-        dw = None if increments is None else increments[: sum(len(part.u) for part in parts)]
-        return _trajectory(self.scene, self.integrator, self.dt, self._first, parts, dw), failure
-
-
-def _last_control(parts: list[Segment]) -> Floats | None:
-    return parts[-1].u[None, -1] if parts else None
+        state = self.integrator.fork(self._state)
+        (segment,) = self.integrator.rollout(self.scene, state, commands, drawn, self.dt)
+        dw = None if increments is None else increments[: len(segment.u)]
+        return _trajectory(self.scene, self.integrator, self.dt, self._first, [segment], dw), segment.failure
 
 
 def rollout(

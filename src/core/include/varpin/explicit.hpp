@@ -17,6 +17,7 @@
 #include "varpin/dynamics.hpp"
 #include "varpin/nodes.hpp"
 #include "varpin/policy.hpp"
+#include "varpin/watch.hpp"
 
 namespace varpin {
 
@@ -212,18 +213,21 @@ class ExplicitRollout {
     }
 
     // All steps, each of length h. Increments (P, N, k) and a drift (P, N, n) on top of the controls' force are null
-    // for none.
-    void roll(double h, const Commands& commands, const double* increments, const double* drift, const Nodes& nodes) {
+    // for none. A path alone may be under a watch, which may end it.
+    void roll(double h, const Commands& commands, const double* increments, const double* drift, const Nodes& nodes,
+              Watch* watch = nullptr) {
         for (std::int64_t i = 0; i < paths_; ++i) {
             load(i);
             nodes.done[i] = 0;
             Outcome outcome = Outcome::solved;
             bool regular = at_state();
-            for (std::int64_t s = 0; s < nodes.steps && outcome == Outcome::solved; ++s) {
+            for (std::int64_t s = 0; s < nodes.steps; ++s) {
                 const std::int64_t row = i * nodes.steps + s;
                 const double* dw = increments ? increments + row * mechanism_->diffusion.processes : nullptr;
                 outcome = step(h, commands, dw, drift ? drift + row * dof() : nullptr, regular, nodes, i, s);
-                if (outcome == Outcome::solved) nodes.done[i] = s + 1;
+                if (outcome != Outcome::solved) break;
+                nodes.done[i] = s + 1;
+                if (watch && !watch->after(s, 0)) break;
             }
             nodes.ended[i] = static_cast<std::int64_t>(outcome);
             store(i);

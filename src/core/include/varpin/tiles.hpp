@@ -6,6 +6,10 @@
 #include <cstddef>
 #include <vector>
 
+#if defined(__x86_64__) && defined(__GNUC__)
+#include <cpuid.h>
+#endif
+
 namespace varpin {
 
 constexpr int tile = 4;
@@ -27,9 +31,13 @@ class TiledMatrix {
     std::vector<double> values_;
 };
 
+enum class Part { all, upper };  // upper: the tiles on and above the diagonal
+
+namespace detail {
+
 // One tile of out += a'b, over `depth` rows.
-inline void add_tile(const double* __restrict a, int a_stride, const double* __restrict b, int b_stride, int depth,
-                     double* __restrict out, int out_stride) {
+[[gnu::always_inline]] inline void add_tile(const double* __restrict a, int a_stride, const double* __restrict b,
+                                            int b_stride, int depth, double* __restrict out, int out_stride) {
     double sum[tile][tile] = {};
     for (int l = 0; l < depth; ++l, a += a_stride, b += b_stride) {
         for (int r = 0; r < tile; ++r) {
@@ -41,16 +49,44 @@ inline void add_tile(const double* __restrict a, int a_stride, const double* __r
     }
 }
 
-enum class Part { all, upper };  // upper: the tiles on and above the diagonal
-
-// The leading `rows` rows of out += a'b, over the leading `depth` rows of a and b, for the columns that both have.
-inline void add_transposed_product(const TiledMatrix& a, const TiledMatrix& b, int depth, TiledMatrix& out, int rows,
-                                   Part part = Part::all) {
+[[gnu::always_inline]] inline void add_tiles(const TiledMatrix& a, const TiledMatrix& b, int depth, TiledMatrix& out,
+                                             int rows, Part part) {
     const int columns = std::min(b.stride(), out.stride());
     for (int i = 0; i < rows; i += tile) {
         for (int j = part == Part::upper ? i : 0; j < columns; j += tile)
             add_tile(a[0] + i, a.stride(), b[0] + j, b.stride(), depth, out[i] + j, out.stride());
     }
+}
+
+#if defined(__x86_64__) && defined(__GNUC__)
+// The same sums four at a time: no other bytes, and half the instructions.
+[[gnu::target("avx2")]] inline void add_wide_tiles(const TiledMatrix& a, const TiledMatrix& b, int depth,
+                                                   TiledMatrix& out, int rows, Part part) {
+    add_tiles(a, b, depth, out, rows, part);
+}
+
+// Whether processor and system have AVX2.
+inline bool has_wide() {
+    unsigned a = 0, b = 0, c = 0, d = 0;
+    constexpr unsigned saved = 1u << 27, avx = 1u << 28, avx2 = 1u << 5;
+    if (!__get_cpuid(1, &a, &b, &c, &d) || (c & saved) == 0 || (c & avx) == 0) return false;
+    unsigned low = 0, high = 0;
+    __asm__("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
+    if ((low & 6u) != 6u) return false;
+    return __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & avx2) != 0;
+}
+#endif
+
+}  // namespace detail
+
+// The leading `rows` rows of out += a'b, over the leading `depth` rows of a and b, for the columns that both have.
+inline void add_transposed_product(const TiledMatrix& a, const TiledMatrix& b, int depth, TiledMatrix& out, int rows,
+                                   Part part = Part::all) {
+#if defined(__x86_64__) && defined(__GNUC__)
+    static const bool wide = detail::has_wide();
+    if (wide) return detail::add_wide_tiles(a, b, depth, out, rows, part);
+#endif
+    detail::add_tiles(a, b, depth, out, rows, part);
 }
 
 // The lower triangle from the upper one.

@@ -11,6 +11,7 @@
 #include "varpin/guards.hpp"
 #include "varpin/nodes.hpp"
 #include "varpin/policy.hpp"
+#include "varpin/watch.hpp"
 
 namespace varpin {
 
@@ -175,9 +176,10 @@ class VariationalStepper {
 
     // Steps of every path from where it stands. Writes into `nodes` the node after each step, what was applied in it
     // and what it took. A path that fails stops there; nodes.ended and nodes.done say how and where. `increments` of
-    // the Wiener processes (P, N, k) and `drift`, a force besides the controls' (P, N, n), may be null.
+    // the Wiener processes (P, N, k) and `drift`, a force besides the controls' (P, N, n), may be null. A path alone
+    // may be under a watch, which may end it.
     void roll(double h, const Commands& commands, const double* increments, const double* drift,
-              std::vector<PathState>& states, const Nodes& nodes) {
+              std::vector<PathState>& states, const Nodes& nodes, Watch* watch = nullptr) {
         const std::int64_t steps = nodes.steps;
         const int m = mechanism.controls, k = mechanism.diffusion.processes;
         const bool noisy = increments != nullptr && k > 0;
@@ -202,6 +204,7 @@ class VariationalStepper {
                 if (noisy && left < 1.0) noise_kick(1.0 - left, u + s * m, dw, state);
                 record_node(nodes, row, state);
                 nodes.done[path] = s + 1;
+                if (watch && !watch->after(s, effort.substeps)) break;
             }
         }
     }

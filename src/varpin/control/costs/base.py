@@ -160,6 +160,11 @@ class Cost(Frozen, ABC):
         """Whether it is known never to be below zero: a motion that costs nothing is then an optimum."""
         return False
 
+    @property
+    def timed(self) -> bool:
+        """Whether what :meth:`bind` makes depends on the points' times, and not on their number alone."""
+        return True
+
     def __add__(self, other: Cost) -> CostSum:
         if not isinstance(other, Cost):
             return NotImplemented
@@ -202,6 +207,11 @@ class CostSum(Cost):
         """See :attr:`Cost.nonnegative`."""
         return all(part.nonnegative for part in self.parts)
 
+    @property
+    def timed(self) -> bool:
+        """See :attr:`Cost.timed`."""
+        return any(part.timed for part in self.parts)
+
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`Cost.bind`."""
         return BoundSum(tuple(part.bind(points) for part in self.parts), points)
@@ -222,6 +232,16 @@ class BoundSum(BoundCost):
         """The parts that the core evaluates, and the others."""
         terms = Terms(self.points.dof, self.points.controls)
         return terms, tuple(part for part in self._flat() if not part.add_to(terms, 1.0))
+
+    @property
+    def compiled(self) -> Terms:
+        """The terms that the core evaluates."""
+        return self._sorted[0]
+
+    @property
+    def others(self) -> tuple[BoundCost, ...]:
+        """The parts that it does not."""
+        return self._sorted[1]
 
     def _flat(self) -> Iterator[BoundCost]:
         for part in self.parts:
@@ -278,6 +298,11 @@ class Scaled(Cost):
         """See :attr:`Cost.nonnegative`."""
         return self.cost.nonnegative
 
+    @property
+    def timed(self) -> bool:
+        """See :attr:`Cost.timed`."""
+        return self.cost.timed
+
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`Cost.bind`."""
         return _BoundScaled(self.factor, self.cost.bind(points))
@@ -329,6 +354,11 @@ class Terminal(Cost):
     def nonnegative(self) -> bool:
         """See :attr:`Cost.nonnegative`."""
         return self.cost.nonnegative
+
+    @property
+    def timed(self) -> bool:
+        """See :attr:`Cost.timed`."""
+        return self.cost.timed
 
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`Cost.bind`; the points must be the one at the end."""

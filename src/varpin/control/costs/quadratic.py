@@ -52,6 +52,11 @@ class _Quadratic(Cost):
         """See :attr:`Cost.nonnegative`."""
         return True
 
+    @property
+    def timed(self) -> bool:
+        """See :attr:`Cost.timed`."""
+        return callable(self.reference) or (not isinstance(self.reference, Mapping) and np.ndim(self.reference) > 1)
+
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`Cost.bind`."""
         size = points.controls if self.block == "u" else points.dof

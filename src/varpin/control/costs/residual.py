@@ -7,6 +7,7 @@ and exact where r is zero or linear.
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +25,8 @@ class TaskCost(Cost):
     robot: Robot
     weight: Floats
     size: int
+    # Dimensions of a target, if there is one, that is constant.
+    _rank: ClassVar[int] = 1
 
     def __init__(self, robot: Robot, weight: ArrayLike) -> None:
         if not isinstance(robot, Robot):
@@ -42,6 +45,12 @@ class TaskCost(Cost):
     def nonnegative(self) -> bool:
         """See :attr:`varpin.control.costs.Cost.nonnegative`."""
         return True
+
+    @property
+    def timed(self) -> bool:
+        """See :attr:`varpin.control.costs.Cost.timed`."""
+        target = getattr(self, "target", None)
+        return target is not None and (callable(target) or np.ndim(target) > self._rank)
 
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`varpin.control.costs.Cost.bind`."""

@@ -89,6 +89,7 @@ class FrameOrientationCost(_FrameCost):
     """
 
     size = 3
+    _rank = 2
 
     def __init__(
         self, robot: Robot, frame: str, target: ArrayLike | Callable[[float], ArrayLike], weight: ArrayLike = 1.0

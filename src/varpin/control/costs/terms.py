@@ -20,29 +20,46 @@ class Terms:
     def __init__(self, dof: int, controls: int) -> None:
         self._core = CostTerms.make(dof, controls)
         self._places: dict[bytes, int] = {}
+        self._count = 0
+
+    @property
+    def core(self) -> CostTerms:
+        """For the core's own loops."""
+        return self._core
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return self._count
+
+    def _add(
+        self, subject: Subject, place: int, weight: Floats, target: Floats, directions: Integers = _NO_DIRECTIONS
+    ) -> None:
+        self._core.add_term(subject, place, weight, target, directions)
+        self._count += 1
 
     def add_entries(self, begin: int, weight: Floats, target: Floats) -> None:
         """Weight . (y - target)^2 with y the entries of z from ``begin`` on."""
-        self._core.add_term(Subject.entries, begin, weight, target, _NO_DIRECTIONS)
+        self._add(Subject.entries, begin, weight, target)
 
     def add_excess(self, begin: int, weight: Floats, lower: Floats, upper: Floats) -> None:
         """Weight . r^2 with r what the entries of z from ``begin`` on are beyond limits (r,)."""
         limits = np.concatenate([lower, upper])[None]
-        self._core.add_term(Subject.excess, begin, weight, limits, _NO_DIRECTIONS)
+        self._add(Subject.excess, begin, weight, limits)
 
     def add_frame(self, subject: Subject, frame: FrameKinematics, weight: Floats, target: Floats) -> None:
         """Weight . r^2 with r the ``subject`` of a frame beside its target; those of orientations are (N, 9)."""
-        self._core.add_term(subject, self._place_of(frame), weight, target, _NO_DIRECTIONS)
+        self._add(subject, self._place_of(frame), weight, target)
 
     def add_manipulability(self, frame: FrameKinematics, directions: Integers, weight: Floats, least: float) -> None:
         """Weight (1, 1) . (least - w)^2 where w < least, of some rows of a frame's Jacobian."""
-        self._core.add_term(Subject.manipulability, self._place_of(frame), weight, np.array([[least]]), directions)
+        self._add(Subject.manipulability, self._place_of(frame), weight, np.array([[least]]), directions)
 
     def add_center(self, links: Links, weight: Floats, target: Floats) -> None:
         """Weight . (c - target)^2 with c the bodies' centre of mass."""
         if links.key not in self._places:
             self._places[links.key] = self._core.add_center(links.core)
-        self._core.add_term(Subject.position, self._places[links.key], weight, target, _NO_DIRECTIONS)
+        self._add(Subject.position, self._places[links.key], weight, target)
 
     def _place_of(self, frame: FrameKinematics) -> int:
         # The frame of several terms is placed once.

@@ -1,0 +1,45 @@
+// A watch that keeps the arrays it looks at.
+#pragma once
+
+#include "arrays.hpp"
+#include "varpin/watch.hpp"
+
+namespace varpin::border {
+
+class HeldWatch {
+  public:
+    HeldWatch(const CostTerms& costs, In<2> rule, In<2> q, In<2> v, In<2> u, InOut<2> values)
+        : rule_(rule),
+          q_(q),
+          v_(v),
+          u_(u),
+          values_(values),
+          own(costs, rule.data(), rule.shape(0), q.data(), v.data(), u.data(), values.data()) {
+        const std::size_t N = u.shape(0), n = static_cast<std::size_t>(costs.dof);
+        require(rule, "rule", {rule.shape(0), 9});
+        require(q, "q", {N + 1, n});
+        require(v, "v", {N + 1, n});
+        require(u, "u", {N, static_cast<std::size_t>(costs.controls)});
+        require(values, "values", {N * rule.shape(0), costs.terms.size()});
+    }
+
+    // For a rollout of one path over as many steps.
+    Watch* of(std::size_t paths, std::size_t steps) {
+        if (paths != 1 || steps != u_.shape(0)) throw std::invalid_argument("a watch is for one path of as many steps");
+        return &own;
+    }
+
+    bool after(std::size_t step, std::int64_t parts) {
+        if (step >= u_.shape(0)) throw std::invalid_argument("there is no such step");
+        return own.after(static_cast<std::ptrdiff_t>(step), parts);
+    }
+
+  private:
+    In<2> rule_, q_, v_, u_;
+    InOut<2> values_;
+
+  public:
+    Watch own;
+};
+
+}  // namespace varpin::border

@@ -1,0 +1,131 @@
+"""Motions that a search tries: rolled out with their running cost, and given up where they are not worth going on with.
+
+One call of the core makes a motion, sums its cost on the way and ends it where it is cut into too many parts or costs
+more than any step of the search would accept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.problem import OptimalControlProblem
+from varpin.core import Watch
+from varpin.core.arrays import Bytes, Commands, Nodes
+from varpin.integrators import Integrator
+from varpin.integrators.base import Failure, statistics_of
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """A motion that was tried.
+
+    Attributes:
+        failure: Why it could not go on, or None.
+        verdict: Why it was given up, if it was.
+        shares: What its cost is the sum of, as :meth:`OptimalControlProblem.shares`; None where it did not end.
+    """
+
+    trials: Trials
+    nodes: tuple[Floats, Floats, Floats, Floats]  # q, v, p and energy, the first node included
+    u: Floats
+    written: Nodes
+    halvings: Bytes
+    values: Floats
+    failure: Failure | None
+    verdict: Watch.Verdict
+
+    @property
+    def whole(self) -> bool:
+        """Whether it went to its end."""
+        return self.failure is None and self.verdict is Watch.Verdict.going
+
+    def shares(self) -> Floats:
+        """What its cost is the sum of, one that is whole: as :meth:`OptimalControlProblem.shares`."""
+        q, v, _, _ = self.nodes
+        return self.trials.problem.shares_along(q, v, self.u, self.values)
+
+    def trajectory(self) -> Trajectory:
+        """Its motion, as far as it went."""
+        own, done = self.trials, int(self.written.done[0])
+        q, v, p, energy = (nodes[: done + 1] for nodes in self.nodes)
+        scene = own.problem.scene
+        return Trajectory(
+            t=own.times[: done + 1],
+            q=q,
+            v=v,
+            p=p,
+            energy=energy,
+            u=self.u[:done],
+            dw=own.silence[:done],
+            masses=own.masses,
+            dt=own.problem.dt,
+            integrator=own.text,
+            robot=scene.robot.name,
+            joint_names=scene.robot.joint_names,
+            statistics=statistics_of(self.written, 0, done, self.halvings),
+            scene_values=scene.values,
+        )
+
+
+class Trials:
+    """Motions of a problem without noise, under commands of any kind; they share their work arrays."""
+
+    def __init__(self, problem: OptimalControlProblem) -> None:
+        self.problem = problem
+        scene = problem.scene
+        self._state, (self._first,) = problem.integrator.start(scene, problem.q0[None], problem.v0[None])
+        self.times = np.arange(problem.steps + 1, dtype=np.float64) * problem.dt
+        self.silence = np.zeros((problem.steps, scene.processes))
+        self.masses = scene.robot.tree.mass.copy()
+        self.text = str(problem.integrator)
+        self._weight = problem.dt * float(problem.rule[0, 0])
+        # Early on a motion says little of its cost.
+        self._third = problem.decisions // 3 * problem.hold or problem.steps + 1
+
+    @property
+    def third(self) -> int:
+        """After how many steps a motion is looked at first."""
+        return self._third
+
+    def attempt(
+        self, commands: Commands, *, integrator: Integrator | None = None, most: float = np.inf, parts: float = np.inf
+    ) -> Attempt:
+        """The motion under commands for all of its steps.
+
+        Args:
+            commands: The commands.
+            integrator: To make it with: the problem's with other options, and itself if left out.
+            most: What it may cost before its end; looked at from a third of the motion on.
+            parts: What that third may take.
+        """
+        problem, scene = self.problem, self.problem.scene
+        N, n, m = problem.steps, scene.robot.dof, scene.controls
+        integrator = problem.integrator if integrator is None else integrator
+        q, v, p = np.empty((N + 1, n)), np.empty((N + 1, n)), np.empty((N + 1, n))
+        energy, u = np.empty(N + 1), np.empty((N, m))
+        first = self._first
+        q[0], v[0], p[0], energy[0] = first.q[0], first.v[0], first.p[0], first.energy[0]
+        nodes = Nodes(
+            q=q[None, 1:],
+            p=p[None, 1:],
+            v=v[None, 1:],
+            energy=energy[None, 1:],
+            u=u[None],
+            tally=np.zeros((1, N, 4), dtype=np.int64),
+            quality=np.zeros((1, N, 3)),
+            ended=np.zeros(1, dtype=np.int64),
+            done=np.zeros(1, dtype=np.int64),
+        )
+        terms = problem.running.compiled
+        values = np.empty((N * len(problem.rule), terms.count))
+        watch = Watch(terms.core, problem.rule, q, v, u, values)
+        watch.ask(self._weight, most, self._third, parts)
+        state = integrator.fork(self._state)
+        failure, halvings = integrator.watched(scene, state, commands, problem.dt, nodes, watch)
+        return Attempt(self, (q, v, p, energy), u, nodes, halvings, values, failure, watch.verdict)
