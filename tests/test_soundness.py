@@ -12,6 +12,8 @@ import pytest
 
 import varpin as vp
 from varpin.core import fastest_damping
+from varpin.integrators import explicit, variational
+from varpin.integrators.base import open_loop
 from varpin.model.chain import rod_chain
 from varpin.simulation import limits
 from varpin.simulation.accuracy import CLOSE, WRONG_MOTION, WRONG_POSITION, WRONG_VELOCITY, Place, places
@@ -23,6 +25,7 @@ from varpin.simulation.soundness import (
     announce,
     energy_defects,
     energy_scale,
+    examined,
     motion_error,
     resolved,
     spoken_of,
@@ -473,3 +476,61 @@ def test_parts_of_steps_are_no_reason_to_warn():
     assert motion.warnings == ()
     unchecked = vp.simulate(scene, rest, rest, dt=0.1, steps=200, integrator=vp.Gauss(4), check=False)
     assert any("parts" in sentence for sentence in unchecked.warnings)
+
+
+@pytest.fixture
+def evaluations(monkeypatch):
+    """How often dynamics were evaluated in all rollouts since the last call."""
+    made = []
+    for module in (explicit, variational):
+
+        def new(*shape, own=module.new_nodes):
+            made.append(own(*shape))
+            return made[-1]
+
+        monkeypatch.setattr(module, "new_nodes", new)
+
+    def spent():
+        total = sum(int(nodes.tally[..., 1:3].sum()) for nodes in made)
+        made.clear()
+        return total
+
+    return spent
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(4), vp.RungeKutta4()], ids=str)
+@pytest.mark.parametrize("links", [3, 7])
+def test_a_look_costs_no_more_than_its_bound(links, integrator, evaluations):
+    """Half of the motion where steps resolve it; LIMIT where they are coarse."""
+    scene, rest = vp.Scene(vp.planar_chain(links)), np.zeros(links)
+    for steps, most in ((10, COARSE), (20, COARSE), (160, 0.9)):
+        motion = vp.simulate(scene, rest, rest, dt=1.0 / steps, steps=steps, integrator=integrator, check=False)
+        own = int((motion.statistics.jets + motion.statistics.sweeps).sum())
+        evaluations()
+        examined(scene, integrator, motion)
+        assert 0 < evaluations() <= most * own
+
+
+@pytest.mark.parametrize("integrator", [*EXPLICIT, vp.Midpoint(), vp.Gauss(2), vp.Radau(3)], ids=str)
+def test_a_single_step_is_held_against_two_of_half_its_length(integrator, evaluations):
+    """Quiet and for the price of two steps where the step resolves the motion; told of where it does not."""
+    for z, right in ((1e-3, True), (1.5, False)):
+        scene, motion = oscillator(z, integrator, steps=1, check=False)
+        evaluations()
+        _, found = examined(scene, integrator, motion)
+        if right:
+            assert not found
+            assert evaluations() <= 3 * int((motion.statistics.jets + motion.statistics.sweeps).sum())
+        elif integrator.order < 4:
+            assert found
+
+
+@pytest.mark.parametrize("integrator", EXPLICIT, ids=str)
+def test_many_motions_of_an_explicit_method_at_once(integrator):
+    scene, rng = vp.Scene(vp.planar_chain(2), damping=0.1), np.random.default_rng(5)
+    q0, v0, drift = rng.normal(size=(3, 2)), rng.normal(size=(3, 2)), rng.normal(size=(3, 4, 2))
+    q, v = integrator.motions(scene, q0, v0, open_loop(np.zeros((4, 2))), drift, 0.02)
+    for i in range(3):
+        motion = vp.simulate(scene, q0[i], v0[i], dt=0.02, steps=4, controls=drift[i], integrator=integrator)
+        np.testing.assert_array_equal(q[i], motion.q[1:])
+        np.testing.assert_array_equal(v[i], motion.v[1:])

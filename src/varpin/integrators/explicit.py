@@ -95,6 +95,15 @@ class _Explicit(Integrator):
         state.paths.roll(dt, commands, increments, drift, nodes)
         return segments_of(nodes, REASONS)
 
+    def motions(
+        self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, drift: Floats, dt: float
+    ) -> tuple[Floats, Floats] | None:
+        """See :meth:`Integrator.motions`."""
+        paths, n = q0.shape
+        nodes = new_nodes(paths, steps_of(commands), n, scene.controls)
+        core.ExplicitRollout.start(scene.core, self.method, q0, v0).roll(dt, commands, scene.silence, drift, nodes)
+        return None if nodes.ended.any() else (nodes.q, nodes.v)
+
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, v)."""
         h, n = trajectory.dt, scene.robot.dof

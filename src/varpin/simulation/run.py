@@ -409,7 +409,9 @@ def simulate(
     try:
         trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
         found = (*noise_forgotten(scene, rng, increments), *wished, *found)
-        trajectory = replace(with_warnings(trajectory, found), accuracy=accuracy)
+        trajectory = with_warnings(trajectory, found)
+        if accuracy is not None:
+            trajectory = trajectory.changed(accuracy=accuracy)
     except KeyboardInterrupt:
         raise Interrupted(replace(record.trajectory(), accuracy=accuracy)) from None
     if interrupted:
