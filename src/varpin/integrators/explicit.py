@@ -18,6 +18,7 @@ from varpin.integrators.base import (
     control_of,
     diffusion_and_drift,
     drifts,
+    first_nodes,
     open_loop,
     segments_of,
     steps_of,
@@ -61,7 +62,8 @@ class _Explicit(Integrator):
         nodes = new_nodes(paths, 1, n, scene.controls)
         if not run.paths.first_nodes(nodes):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
-        return run, segments_of(nodes, REASONS)
+        first = (part[:, 0] for part in (nodes.q, nodes.p, nodes.v, nodes.energy))
+        return run, first_nodes(*first, controls=scene.controls)
 
     def fork(self, state: ExplicitRun) -> ExplicitRun:
         """See :meth:`Integrator.fork`."""

@@ -58,7 +58,7 @@ _FAR, _SHORTEST = 0.3, 1e-8
 # Places so near to each other, and within an eighth of a period, are one.
 _NEAR_BY = 4
 # Steps taken for all places at most: so many times the motion's own, parts counted, and so many.
-_WORK, _LEAST_WORK = 50, 256
+WORK, LEAST_WORK = 50, 256
 # Windows that are taken again in steps of twice the length, beside those where velocities change most; and how many
 # times the error of a window counts, for over a period it grows.
 _WINDOWS, _MARGIN = 16, 8.0
@@ -66,7 +66,7 @@ _WINDOWS, _MARGIN = 16, 8.0
 _STOPPING = Radau(3)
 # Nodes at which mass matrices, and energies of single groups, are looked at; and rates of dampers.
 _NODES, _INERTIAS = 16, 4
-# The one window of a single step.
+# The window of a motion that has one.
 _FROM_START = np.zeros(1, dtype=np.int64)
 # Velocities below this count as none [rad/s or m/s]: what rounding leaves of a robot in equilibrium.
 _STILL = 1e-9
@@ -319,7 +319,7 @@ def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
         kicked, given = _kicks(scene, trajectory)
         work, heat = _works(scene, trajectory, kicked)
         gained -= np.cumsum((work - heat + given).sum(axis=1))
-    return np.nan_to_num(gained, nan=np.inf)
+    return gained if np.isfinite(gained).all() else np.nan_to_num(gained, nan=np.inf)
 
 
 def _works(scene: Scene, trajectory: Trajectory, kicked: Floats | float = 0.0) -> tuple[Floats, Floats]:
@@ -379,7 +379,7 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
         return not damped and _halves_agree(scene, integrator, trajectory)
     other, times = _STOPPING if damped else integrator, 1 if damped and not integrator.l_stable else 2
     apart = max(pieces, 1 + steps % 2) - 1
-    begins = np.array([i * (steps - length) // max(apart, 1) for i in range(apart + 1)])
+    begins = np.array([i * (steps - length) // apart for i in range(apart + 1)]) if apart else _FROM_START
     if pieces == _WINDOWS:
         begins = np.union1d(begins, blows(v, length))
     commands, drift = open_loop(u[:length:times]), np.zeros((0, 0, scene.robot.dof))
@@ -452,7 +452,7 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     inertia = inertias(scene, trajectory.q[first])
     # Steps whose error is known to be small.
     small = np.zeros(trajectory.steps, dtype=np.bool_)
-    left = _LEAST_WORK + _WORK * int(np.maximum(substeps, 1).sum())
+    left = LEAST_WORK + WORK * int(np.maximum(substeps, 1).sum())
     # Nodes beside which one was looked from.
     seen = np.zeros(trajectory.steps + 1, dtype=np.bool_)
     worst = None
@@ -509,12 +509,13 @@ def _look(
     other: Finer,
     most: int,
 ) -> _Look | None:
-    """The error at one place, of about so many steps at most; None where none can be told."""
+    """The error at one place, by so many steps at most; None where none can be told."""
     judged = int(place.judged.max())
     taken = np.maximum(trajectory.statistics.substeps[place.step : place.step + judged], 1)
     # Where guards took steps in parts, they are as short as these.
     parts = other.parts * int(2 ** np.ceil(np.log2(taken.mean())))
-    count = min(judged, max(1, most // parts))
+    # Twice, for whether that motion can be told takes as many steps again.
+    count = min(judged, max(1, most // (2 * parts)))
     q, v = (values[place.step : place.step + count + 1] for values in (trajectory.q, trajectory.v))
     if scene.noise.diffusion is None and trajectory.dw.any():
         # Kicks that only Python knows are left out of both.
