@@ -8,7 +8,7 @@ import scipy
 from mechanisms import random_tree
 
 import varpin as vp
-from varpin.core import doubled_steps_agree, energy_turnover, fastest_damping, longest_alternation, pulls_fast
+from varpin.core import doubled_steps_agree, energy_turnover, fastest_damping, glance, longest_alternation, pulls_fast
 
 LOOKS, EVEN, LITTLE, LIGHT = 16, 1e-3, 1e-2, 1e-2
 
@@ -70,6 +70,26 @@ def test_a_pull_is_fast_where_a_mode_turns_by_a_radian(scene, motion):
         fastest = np.sqrt(np.abs(scipy.linalg.eigh(jet.Lqq, jet.Lvv, eigvals_only=True)).max())
         assert pulls_fast(scene.core, q[None], *still(q[None]), 1.001 / fastest)
         assert not pulls_fast(scene.core, q[None], *still(q[None]), 0.999 / fastest)
+
+
+def test_a_glance_at_a_record(scene, motion):
+    def seen(v=motion.v, u=motion.u, substeps=motion.statistics.substeps, dt=motion.dt):
+        return glance(scene.core, motion.q, v, u, np.ascontiguousarray(substeps), dt)
+
+    assert seen() == (np.abs(motion.v).max(), False, False, False)
+    assert seen(u=np.broadcast_to(motion.u[0], motion.u.shape).copy())[2]
+    parts = motion.statistics.substeps.copy()
+    parts[-1] = 2
+    assert seen(substeps=parts)[1]
+    ends = motion.q[[0, -1]]
+    for dt in (0.05, 0.3, 1.0):
+        assert seen(dt=dt)[3] == pulls_fast(scene.core, ends, *still(ends), dt)
+    assert seen(dt=1.0)[3]
+    v = motion.v.copy()
+    v[7, 2] = np.nan
+    assert np.isnan(seen(v=v)[0])
+    with pytest.raises(ValueError, match="substeps"):
+        seen(substeps=parts[1:])
 
 
 def test_energy_that_is_turned_over(scene, motion):

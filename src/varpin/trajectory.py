@@ -71,7 +71,7 @@ class StepStatistics(Frozen):
     @property
     def split_steps(self) -> int:
         """How many steps were taken in more than one part."""
-        return int((self.substeps > 1).sum())
+        return int(np.count_nonzero(self.substeps > 1))
 
     def part(self, begin: int, end: int) -> StepStatistics:
         """Of the steps begin .. end, as views."""

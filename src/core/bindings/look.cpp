@@ -55,6 +55,20 @@ std::tuple<double, double, Out, Out> energy_turnover(const Mechanism& mechanism,
     return {found.kinetic, found.work, array_of(found.kinetic_of.data(), {n}), array_of(found.work_of.data(), {n})};
 }
 
+std::tuple<double, bool, bool, bool> glance_at(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u,
+                                               Integers<1> substeps, double dt) {
+    const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
+    const std::size_t steps = u.shape(0);
+    if (steps == 0) throw std::invalid_argument("a motion has a step");
+    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {steps + 1, n});
+    require(u, "u", {steps, m});
+    require(substeps, "substeps", {steps});
+    nb::gil_scoped_release release;
+    const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), nullptr, u.data(), dt};
+    const Glance seen = glance(mechanism, record, substeps.data());
+    return {seen.fastest, seen.split, seen.steady, seen.pulled};
+}
+
 bool doubled_steps_agree(const Mechanism& mechanism, In<2> q, In<2> v, Integers<1> begins, std::size_t length,
                          double dt, In<3> again_q, In<3> again_v, double way, double velocity, double little,
                          double light, double even) {
@@ -88,6 +102,7 @@ void register_look(nb::module_& m) {
     m.def("longest_alternation", &alternation, "v"_a, "u"_a.none(), nb::kw_only(), "counts"_a, "idle"_a, "even"_a);
     m.def("fastest_damping", &fastest_damping_at, "mechanism"_a, "q"_a, "v"_a, "f"_a, "least"_a);
     m.def("pulls_fast", &pulls_fast_at, "mechanism"_a, "q"_a, "v"_a, "f"_a, "dt"_a);
+    m.def("glance", &glance_at, "mechanism"_a, "q"_a, "v"_a, "u"_a, "substeps"_a, "dt"_a);
     m.def("energy_turnover", &energy_turnover, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, "dt"_a, nb::kw_only(),
           "even"_a, "looks"_a);
     m.def("doubled_steps_agree", &doubled_steps_agree, "mechanism"_a, "q"_a, "v"_a, "begins"_a, "length"_a, "dt"_a,

@@ -27,6 +27,7 @@ from varpin.core._core import energy_turnover as energy_turnover
 from varpin.core._core import expand_changes as expand_changes
 from varpin.core._core import fastest_damping as fastest_damping
 from varpin.core._core import foresee as foresee
+from varpin.core._core import glance as glance
 from varpin.core._core import linearize_explicit as linearize_explicit
 from varpin.core._core import longest_alternation as longest_alternation
 from varpin.core._core import pulls_fast as pulls_fast

@@ -462,6 +462,14 @@ def fastest_damping(mechanism: Mechanism, q: Floats, v: Floats, f: Floats, least
 def pulls_fast(mechanism: Mechanism, q: Floats, v: Floats, f: Floats, dt: float) -> bool:
     """Whether springs, servos or gravity turn a mode by more than a radian over dt [s], at a row of q, v, f (K, n)."""
 
+def glance(
+    mechanism: Mechanism, q: Floats, v: Floats, u: Floats, substeps: Integers, dt: float
+) -> tuple[float, bool, bool, bool]:
+    """The largest velocity; whether steps were taken in parts, all have the same controls, and a pull is fast.
+
+    Of nodes (N + 1, n), ``dt`` [s] apart, and controls (N, m). The last is :func:`pulls_fast` over a step, at the ends.
+    """
+
 def energy_turnover(
     mechanism: Mechanism, q: Floats, v: Floats, p: Floats, u: Floats, dt: float, *, even: float, looks: int
 ) -> tuple[float, float, Floats, Floats]:

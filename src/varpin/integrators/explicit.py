@@ -21,6 +21,7 @@ from varpin.integrators.base import (
     diffusion_and_drift,
     drifts,
     failure_of,
+    first_nodes,
     open_loop,
     segments_of,
     steps_of,
@@ -64,7 +65,8 @@ class _Explicit(Integrator):
         nodes = new_nodes(paths, 1, n, scene.controls)
         if not run.paths.first_nodes(nodes):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
-        return run, segments_of(nodes, REASONS)
+        first = (part[:, 0] for part in (nodes.q, nodes.p, nodes.v, nodes.energy))
+        return run, first_nodes(*first, controls=scene.controls)
 
     def fork(self, state: ExplicitRun) -> ExplicitRun:
         """See :meth:`Integrator.fork`."""
@@ -106,6 +108,15 @@ class _Explicit(Integrator):
             return super().watched(scene, state, commands, dt, nodes, watch)
         state.paths.roll(dt, contiguous(commands), scene.silence, scene.no_drift, nodes, watch)
         return failure_of(nodes, 0, int(nodes.done[0]), REASONS), np.zeros(0, dtype=np.uint8)
+
+    def motions(
+        self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, drift: Floats, dt: float
+    ) -> tuple[Floats, Floats] | None:
+        """See :meth:`Integrator.motions`."""
+        paths, n = q0.shape
+        nodes = new_nodes(paths, steps_of(commands), n, scene.controls)
+        core.ExplicitRollout.start(scene.core, self.method, q0, v0).roll(dt, commands, scene.silence, drift, nodes)
+        return None if nodes.ended.any() else (nodes.q, nodes.v)
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, v)."""

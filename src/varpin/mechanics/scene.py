@@ -332,6 +332,11 @@ class Scene(Frozen):
         return Bounds((lower, upper), (-speed, speed), (-effort, effort))
 
     @cached_property
+    def bounded(self) -> tuple[bool, ...]:
+        """Whether any joint has bounds, of each kind in :class:`Bounds`."""
+        return tuple(bool(np.isfinite(pair).any()) for pair in self.bounds)
+
+    @cached_property
     def diffusion(self) -> Diffusion:
         """The noise's fields that the core can evaluate; without those that only Python can."""
         n, m = self.actuation.shape

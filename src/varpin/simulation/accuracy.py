@@ -6,6 +6,7 @@ knows them from exact motions.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,7 +70,7 @@ class MotionError:
     def worst(self) -> float:
         """The largest error, in units of what is wrong; NaN counts as more than anything."""
         shares = self.position / WRONG_POSITION, self.velocity / WRONG_VELOCITY, self.motion / WRONG_MOTION
-        return float(np.nan_to_num(shares, nan=np.inf).max())
+        return math.inf if any(map(math.isnan, shares)) else max(shares)
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,7 @@ class Place:
             velocity = np.where(fast <= 1e-9 * speed, 0.0, fast / speed)
             motion = position * way / way.max()
             shares = np.array([position / WRONG_POSITION, velocity / WRONG_VELOCITY, motion / WRONG_MOTION])
-        joint = int(np.argmax(np.nan_to_num(shares, nan=np.inf).max(axis=0)))
+        joint = int(np.argmax(np.where(np.isnan(shares), np.inf, shares).max(axis=0)))
         return MotionError(self.step, joint, float(position[joint]), float(velocity[joint]), float(motion[joint]))
 
 
@@ -182,8 +183,14 @@ def places(scene: Scene, trajectory: Trajectory) -> Integers:
 
 
 def between(steps: int, seen: Integers) -> Integers:
-    """More nodes to look from, evenly spread, where errors at those seen come close to what is wrong."""
-    return np.setdiff1d(np.linspace(0, steps, _BETWEEN + 2)[1:-1].astype(np.int64), seen)
+    """More nodes to look from, evenly spread, where errors at those seen come close to what is wrong.
+
+    The one in the middle first, then those in the middle of both halves, and so on.
+    """
+    nodes = np.linspace(0, steps, _BETWEEN + 2)[1:-1].astype(np.int64)
+    order = [k for part in (8, 4, 2, 1) for k in range(part, _BETWEEN + 1, 2 * part)]
+    found = nodes[np.array(order) - 1]
+    return np.array([node for node in dict.fromkeys(found.tolist()) if node not in seen], dtype=np.int64)
 
 
 def blows(v: Floats, length: int, seen: NDArray[np.bool_] | None = None) -> list[int]:
@@ -278,11 +285,14 @@ def _units(
     # Where the motion ends within a period, what came before completes it.
     begin = step - np.where(whole, 0, before)
     way, speed, change = np.empty(n), np.empty(n), np.empty(n)
-    for i in range(n):
-        nodes, so_far = (slice(first, step + span[i] + 1) for first in (begin[i], 0))
-        way[i] = max(np.ptp(trajectory.q[nodes, i]), _REST * np.ptp(trajectory.q[so_far, i]))
-        speed[i] = max(np.abs(trajectory.v[nodes, i]).max(), _REST * np.abs(trajectory.v[so_far, i]).max())
-        change[i] = changed(trajectory.v[nodes, i])
+    end = step + span + 1
+    # Joints are alike in short motions, which no joint goes to and fro in.
+    for first, last in set(zip(begin.tolist(), end.tolist(), strict=True)):
+        own = (begin == first) & (end == last)
+        q, v = trajectory.q[:last, own], trajectory.v[:last, own]
+        way[own] = np.maximum(np.ptp(q[first:], axis=0), _REST * np.ptp(q, axis=0))
+        speed[own] = np.maximum(np.abs(v[first:]).max(axis=0), _REST * np.abs(v).max(axis=0))
+        change[own] = changed(v[first:])
     way, speed = noticed(scene, way, speed, light_speed(inertia, change), trajectory.dt * span.astype(np.float64))
     tiny = np.finfo(np.float64).tiny
     return np.maximum(way, tiny), np.maximum(speed, tiny)

@@ -30,13 +30,19 @@ _NAMED = 6
 
 def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
     """Which kinds of limits a motion leaves, and for each a sentence: which joints, by how much, and when."""
+    if not any(scene.bounded):
+        return
     robot, t = scene.robot, trajectory.t
-    for kind, why, of, (least, most), beyond, units in (
-        (POSITION, "which nothing stops", _positions, scene.bounds.position, _OUTSIDE, ("rad", "m")),
-        (VELOCITY, "which nothing holds back", _velocities, scene.bounds.velocity, None, ("rad/s", "m/s")),
-        (EFFORT, "which nothing cuts off", _efforts, scene.bounds.effort, None, ("N m", "N")),
+    for bounded, (kind, why, of, (least, most), beyond, units) in zip(
+        scene.bounded,
+        (
+            (POSITION, "which nothing stops", _positions, scene.bounds.position, _OUTSIDE, ("rad", "m")),
+            (VELOCITY, "which nothing holds back", _velocities, scene.bounds.velocity, None, ("rad/s", "m/s")),
+            (EFFORT, "which nothing cuts off", _efforts, scene.bounds.effort, None, ("N m", "N")),
+        ),
+        strict=True,
     ):
-        if not (np.isfinite(least).any() or np.isfinite(most).any()):
+        if not bounded:
             continue
         values = of(scene, trajectory)
         top, bottom = values.max(axis=0, initial=-np.inf), values.min(axis=0, initial=np.inf)

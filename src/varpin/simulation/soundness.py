@@ -14,15 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.core import doubled_steps_agree, energy_turnover, fastest_damping, pulls_fast
-from varpin.errors import SingularMassMatrix
-from varpin.integrators import ExplicitEuler, Integrator, Radau, Reference
+from varpin.core import doubled_steps_agree, energy_turnover, fastest_damping, glance
+from varpin.integrators import Integrator, Radau, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import (
-    CLOSE,
     EVEN,
     FIRST,
     LIGHT,
@@ -41,7 +39,8 @@ from varpin.simulation.accuracy import (
     places,
 )
 from varpin.simulation.chatter import RUN, Alternation, alternation
-from varpin.simulation.limits import left
+from varpin.simulation.limits import left as limits_left
+from varpin.simulation.retaking import Again, Finer, finer, taken_again
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -49,13 +48,17 @@ Integers = NDArray[np.int64]
 
 # What is spoken of, as part of what is wrong: estimates are made good to some percent.
 CAUTION = 0.95
-# Estimates up to this factor from what is wrong are made good; others are beyond doubt. Those that do not settle are
-# spoken of from this part of what is wrong on. Those of a part of a period are in doubt from here on.
-_DOUBT, _UNSETTLED, _DOUBT_OF_PART = 3.0, 0.7, 0.03
-# Where estimates settle: from one halving to the next they change by less than this part; after so many at most.
-_SETTLED, _HALVINGS = 0.1, 3
-# Steps taken for that at most: so many of one joint, or so many times the motion's own.
-_LEAST_WORK, _WORK = 200_000, 2
+# Estimates from fewer steps than a period has are spoken of from this part of what is wrong on.
+_UNSETTLED = 0.7
+# An error below which nothing more is asked of a place, and from which on more places are looked at, in units of what
+# is wrong: from others than those looked at first it may be three times as large.
+_SMALL, _NEAR = 0.2, 0.35
+# How far off a motion is of which no more is needed, in units of its way. Ways that are none [rad or m].
+_FAR, _SHORTEST = 0.3, 1e-8
+# Places so near to each other, and within an eighth of a period, are one.
+_NEAR_BY = 4
+# Steps taken for all places at most: so many times the motion's own, parts counted, and so many.
+WORK, LEAST_WORK = 50, 256
 # Windows that are taken again in steps of twice the length, beside those where velocities change most; and how many
 # times the error of a window counts, for over a period it grows.
 _WINDOWS, _MARGIN = 16, 8.0
@@ -63,6 +66,8 @@ _WINDOWS, _MARGIN = 16, 8.0
 _STOPPING = Radau(3)
 # Nodes at which mass matrices, and energies of single groups, are looked at; and rates of dampers.
 _NODES, _INERTIAS = 16, 4
+# The window of a motion that has one.
+_FROM_START = np.zeros(1, dtype=np.int64)
 # Velocities below this count as none [rad/s or m/s]: what rounding leaves of a robot in equilibrium.
 _STILL = 1e-9
 
@@ -86,8 +91,9 @@ class Finding:
 def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Trajectory, tuple[Finding, ...]]:
     """A motion with its energy balance, if the integrator keeps none, and its warnings; and what was found."""
     if not integrator.variational:
-        own = replace(trajectory.statistics, energy_defect=energy_defects(scene, trajectory))
-        trajectory = replace(trajectory, statistics=own)
+        defects = energy_defects(scene, trajectory)
+        defects.setflags(write=False)
+        trajectory = trajectory.changed(statistics=trajectory.statistics.changed(energy_defect=defects))
     found = (
         *_looked_for(scene, integrator, trajectory),
         *alternating(scene, integrator, trajectory),
@@ -118,7 +124,7 @@ def _does_so_in_smaller_steps(scene: Scene, integrator: Integrator, trajectory: 
     parts = 2 * int(np.maximum(trajectory.statistics.substeps[place : place + count], 1).max())
     if isinstance(integrator, Reference) or count * parts > max(4 * FIRST, int(trajectory.statistics.substeps.sum())):
         return False
-    again = _taken_again(scene, integrator, trajectory, place, count, parts)
+    again = taken_again(scene, integrator, trajectory, place, count, parts)
     if again is None:
         return False
     own = np.diff(trajectory.v[place : place + count + 1, found.joint], n=2)
@@ -128,7 +134,7 @@ def _does_so_in_smaller_steps(scene: Scene, integrator: Integrator, trajectory: 
 def with_warnings(trajectory: Trajectory, found: Iterable[Finding]) -> Trajectory:
     """The motion with what was found as its warnings."""
     sentences = tuple(finding.sentence for finding in found)
-    return replace(trajectory, warnings=sentences) if sentences else trajectory
+    return trajectory.changed(warnings=sentences) if sentences else trajectory
 
 
 def announce(logger: logging.Logger, scene: Scene, dt: float, found: Iterable[Finding]) -> None:
@@ -157,7 +163,7 @@ def evident(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tup
 
 def _beyond_limits(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
     """Says which limits of the robot's description the motion leaves; the motion itself may be right."""
-    return tuple(Finding(kind, sentence) for kind, sentence in left(scene, trajectory))
+    return tuple(Finding(kind, sentence) for kind, sentence in limits_left(scene, trajectory))
 
 
 def _in_parts(trajectory: Trajectory) -> str:
@@ -308,11 +314,12 @@ def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
     """
     if scene.noise.diffusion is None:
         return np.zeros(trajectory.steps)
-    kicked, given = _kicks(scene, trajectory)
-    work, heat = _works(scene, trajectory, kicked)
-    given_in_all = np.cumsum((work - heat + given).sum(axis=1))
-    gained: Floats = trajectory.energy[1:] - trajectory.energy[0] - given_in_all
-    return np.nan_to_num(gained, nan=np.inf)
+    gained: Floats = trajectory.energy[1:] - trajectory.energy[0]
+    if trajectory.u.any() or trajectory.dw.any() or scene.dissipates or scene.couplings:
+        kicked, given = _kicks(scene, trajectory)
+        work, heat = _works(scene, trajectory, kicked)
+        gained -= np.cumsum((work - heat + given).sum(axis=1))
+    return gained if np.isfinite(gained).all() else np.nan_to_num(gained, nan=np.inf)
 
 
 def _works(scene: Scene, trajectory: Trajectory, kicked: Floats | float = 0.0) -> tuple[Floats, Floats]:
@@ -354,28 +361,29 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
     as long as the motion, or less; a motion of whole steps without noise can pass.
     """
     steps, q, v, u = trajectory.steps, trajectory.q, trajectory.v, trajectory.u
+    if isinstance(integrator, Reference) or not steps or trajectory.dw.any() or scene.noise.diffusion is None:
+        return False
     # Windows of like lengths, which are even.
     pieces = min(-(-steps // WINDOW), _WINDOWS)
-    length = min(WINDOW, 2 * -(-steps // (2 * pieces)), steps - steps % 2) if pieces else 0
-    if isinstance(integrator, Reference) or not length or trajectory.dw.any() or scene.noise.diffusion is None:
-        return False
-    if not np.abs(v).max() > _STILL:
+    length = min(WINDOW, 2 * -(-steps // (2 * pieces)), steps - steps % 2)
+    fastest, split, steady, pulled = glance(scene.core, q, v, u, trajectory.statistics.substeps, trajectory.dt)
+    if not fastest > _STILL:
         return True
     # Springs far faster than the step do as little in two.
-    if trajectory.statistics.split_steps or pulls_fast(
-        scene.core, *_nodes_of(scene, trajectory, [0, trajectory.steps]), trajectory.dt
-    ):
+    if split or pulled:
         return False
     # So do dampers, but not where what they stop is at rest after a step, whatever its length. Other methods are held
     # against that in steps as long as theirs.
     damped = bool(_fast_damping(scene, trajectory))
+    if steps == 1:
+        return not damped and _halves_agree(scene, integrator, trajectory)
     other, times = _STOPPING if damped else integrator, 1 if damped and not integrator.l_stable else 2
     apart = max(pieces, 1 + steps % 2) - 1
-    begins = np.array(sorted({i * (steps - length) // max(apart, 1) for i in range(apart + 1)}))
+    begins = np.array([i * (steps - length) // apart for i in range(apart + 1)]) if apart else _FROM_START
     if pieces == _WINDOWS:
         begins = np.union1d(begins, blows(v, length))
     commands, drift = open_loop(u[:length:times]), np.zeros((0, 0, scene.robot.dof))
-    if (u != u[0]).any():
+    if not steady:
         # Commands are the same for all paths; their forces need not be.
         held = u[begins[:, None] + np.arange(length)].reshape(len(begins), length // times, times, -1)
         commands, drift = open_loop(np.zeros_like(u[:length:times])), held.mean(axis=2) @ scene.actuation.T
@@ -384,14 +392,26 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
         again = np.ascontiguousarray(again[0][:, 1::2]), np.ascontiguousarray(again[1][:, 1::2])
     # How much less the error is in steps of half the length; of another method nothing is known.
     gain = (1.0 if damped else 2.0**integrator.order - 1.0) / _MARGIN
-    return again is not None and doubled_steps_agree(
+    return again is not None and _agree(scene, (q, v), begins, length, trajectory.dt, again, gain)
+
+
+def _agree(
+    scene: Scene,
+    nodes: tuple[Floats, Floats],
+    begins: Integers,
+    length: int,
+    dt: float,
+    doubled: tuple[Floats, Floats],
+    gain: float,
+) -> bool:
+    """Whether steps of twice the length make the same of windows of q and v, within so much of what is wrong."""
+    return doubled_steps_agree(
         scene.core,
-        q,
-        v,
+        *nodes,
         begins,
         length,
-        trajectory.dt,
-        *again,
+        dt,
+        *doubled,
         way=gain * WRONG_MOTION,
         velocity=gain * WRONG_VELOCITY,
         little=LITTLE,
@@ -400,47 +420,62 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
     )
 
 
+def _halves_agree(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
+    """:func:`resolved` of a single step: two of half its length make the same motion."""
+    q, v, u, half = trajectory.q, trajectory.v, trajectory.u, 0.5 * trajectory.dt
+    commands = open_loop(np.concatenate([u, u]))
+    again = integrator.motions(scene, q[:1], v[:1], commands, np.zeros((0, 0, scene.robot.dof)), half)
+    if again is None:
+        return False
+    fine = np.concatenate([q[:1], again[0][0]]), np.concatenate([v[:1], again[1][0]])
+    gain = (1.0 - 2.0**-integrator.order) / _MARGIN
+    return _agree(scene, fine, _FROM_START, 2, half, (q[None, 1:], v[None, 1:]), gain)
+
+
 def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> MotionError | None:
-    """The error of a motion, by taking parts of it again from their first nodes, in steps of half the length.
+    """The error of a motion, by taking parts of it again from their first nodes by a method of more stages.
 
     The start, the places where velocities change most and some spread over the motion are looked at, over a period of
-    each joint or what can be had of it; more places where errors come close to what is wrong. Each joint is judged in
-    units of its own motion. Where that leaves doubt whether it is wrong, steps are halved again until the estimate
-    settles. It says nothing of how errors grow over many
-    periods. None where nothing moves, and for an integrator that chooses its own steps.
+    each joint or what can be told of it; more places where errors come close to what is wrong. Each joint is judged in
+    units of its own motion. The first error that is worth a word ends the search, and so does a number of steps in
+    proportion to the motion's own. It says nothing of how errors grow over many periods. None where nothing moves, and
+    for an integrator that chooses its own steps.
     """
-    moved = np.abs(trajectory.v).max(initial=0.0)
-    if isinstance(integrator, Reference) or not trajectory.steps or not moved > _STILL:
+    if isinstance(integrator, Reference) or not trajectory.steps:
         return None
-    steps = places(scene, trajectory)
-    inertia = inertias(scene, trajectory.q[steps])
-    # Half a step is as little as a whole one to dampers that are far faster.
-    fast = trajectory.dt * _fast_damping(scene, trajectory)
-    finer = int(2 ** np.clip(np.ceil(np.log2(max(1.0, fast))), 0, 3))
-    left = max(_LEAST_WORK // scene.robot.dof, _WORK * int(trajectory.statistics.substeps.sum()))
+    substeps = trajectory.statistics.substeps
+    fastest, _, _, pulled = glance(scene.core, trajectory.q, trajectory.v, trajectory.u, substeps, trajectory.dt)
+    if not fastest > _STILL:
+        return None
+    other = finer(integrator, trajectory, damped=bool(_fast_damping(scene, trajectory)), pulled=pulled)
+    first = places(scene, trajectory)
+    inertia = inertias(scene, trajectory.q[first])
+    # Steps whose error is known to be small.
+    small = np.zeros(trajectory.steps, dtype=np.bool_)
+    left = LEAST_WORK + WORK * int(np.maximum(substeps, 1).sum())
+    # Nodes beside which one was looked from.
+    seen = np.zeros(trajectory.steps + 1, dtype=np.bool_)
     worst = None
-    for chosen in (steps, between(trajectory.steps, steps)):
-        looks = []
-        for step in chosen:
-            place = Place.at(scene, trajectory, int(step))
-            look = _look(scene, integrator, trajectory, place, inertia, finer)
-            if look is not None and look.doubtful and not look.whole:
-                whole = _look(scene, integrator, trajectory, place, inertia, finer, left)
-                look = whole or look
-                left -= 0 if whole is None else whole.work
-            if look is not None:
-                looks.append((place, look))
-        looks.sort(key=lambda pair: -pair[1].error.worst)
-        for place, look in looks:
-            error = look.error
-            if look.doubtful:
-                error, work = _settled(scene, integrator, trajectory, place, inertia, finer, look, left)
-                left -= work
-            if worst is None or error.worst > worst.worst:
-                worst = error
-            if spoken_of(error):
-                return error
-        if worst is None or worst.worst < CLOSE:
+    for chosen in (first, between(trajectory.steps, first)):
+        for step in chosen.tolist():
+            if seen[step] or (chosen is first and small[step:].all()):
+                continue
+            place = Place.at(scene, trajectory, step)
+            if chosen is first and small[step : step + int(place.judged.max())].all():
+                continue
+            look = _look(scene, integrator, trajectory, place, inertia, other, left)
+            if look is None:
+                continue
+            near = min(_NEAR_BY, int(place.judged.max()) // 8)
+            seen[max(0, step - near) : step + near + 1] = True
+            left -= look.work
+            if worst is None or look.error.worst > worst.worst:
+                worst = look.error
+            if spoken_of(look.error) or left <= 0:
+                return worst
+            if look.error.worst < _SMALL:
+                small[step : step + look.known] = True
+        if worst is None or worst.worst < _NEAR:
             break
     return worst
 
@@ -456,46 +491,13 @@ class _Look:
 
     Attributes:
         error: The error.
-        whole: Whether it is of a period, or of all that can be told of it, and not of a part that stands for it.
         known: How many steps can be told.
         work: Steps taken for it.
     """
 
     error: MotionError
-    whole: bool
     known: int
     work: int
-
-    @property
-    def doubtful(self) -> bool:
-        """Whether the error itself may be on the other side of what is wrong."""
-        low, high = (1.0 / _DOUBT, _DOUBT) if self.whole else (_DOUBT_OF_PART, np.inf)
-        return low < self.error.worst < high
-
-
-def _settled(
-    scene: Scene,
-    integrator: Integrator,
-    trajectory: Trajectory,
-    place: Place,
-    inertia: Floats,
-    finer: int,
-    look: _Look,
-    most: int,
-) -> tuple[MotionError, int]:
-    """The error at a place by ever smaller steps, over a period, and how many steps that took."""
-    spent = 0
-    for halving in range(1, _HALVINGS + 1):
-        known = look.known if look.whole else None
-        again = _look(scene, integrator, trajectory, place, inertia, finer * 2**halving, most - spent, known)
-        if again is None:
-            break
-        spent += again.work
-        change = abs(again.error.worst - look.error.worst)
-        if not again.doubtful or (look.whole and again.whole and change <= _SETTLED * again.error.worst):
-            return again.error, spent
-        look = again
-    return replace(look.error, settled=False), spent
 
 
 def _look(
@@ -504,102 +506,47 @@ def _look(
     trajectory: Trajectory,
     place: Place,
     inertia: Floats,
-    finer: int,
-    most: int | None = None,
-    known: int | None = None,
+    other: Finer,
+    most: int,
 ) -> _Look | None:
-    """The error at one place, with at most so many steps; None where steps cannot be taken again.
-
-    How many steps of the motion can be told need not be found out twice.
-    """
-    count, parts = _affordable(trajectory, place, finer, most)
-    if not parts:
-        return None
-    again = _taken_again(scene, integrator, trajectory, place.step, count, parts)
-    if again is None:
-        return None
-    steps = slice(place.step, place.step + count + 1)
-    recorded = trajectory.q[steps], trajectory.v[steps]
+    """The error at one place, by so many steps at most; None where none can be told."""
+    judged = int(place.judged.max())
+    taken = np.maximum(trajectory.statistics.substeps[place.step : place.step + judged], 1)
+    # Where guards took steps in parts, they are as short as these.
+    parts = other.parts * int(2 ** np.ceil(np.log2(taken.mean())))
+    # Twice, for whether that motion can be told takes as many steps again.
+    count = min(judged, max(1, most // (2 * parts)))
+    q, v = (values[place.step : place.step + count + 1] for values in (trajectory.q, trajectory.v))
     if scene.noise.diffusion is None and trajectory.dw.any():
         # Kicks that only Python knows are left out of both.
-        plain = _taken_again(scene, integrator, trajectory, place.step, count, parts // (2 * finer))
+        plain = taken_again(scene, integrator, trajectory, place.step, count, parts // other.parts)
         if plain is None:
             return None
-        recorded = plain
-    # The part of the error that is left with the smaller steps.
-    taken = np.maximum(trajectory.statistics.substeps[steps][:count], 1)
-    left = float(parts) ** -integrator.order / np.mean(1.0 / taken.astype(float) ** integrator.order)
-    work = count * parts
-    if known is None:
-        moved = disturbance(trajectory, place.step, count)
-        # In small steps as well: guards may take the large ones of the two in different parts.
-        other = _taken_again(scene, integrator, trajectory, place.step, count, parts, moved)
-        known = 1 if other is None else grown(again[0], other[0], moved[0])
-        work *= 2
-    known = min(known, count)
+        q, v = plain
+    again = Again(scene, other.method, trajectory, place.step, count, parts)
+    far = _FAR * float(np.ptp(q, axis=0).max())
+    # What is far off is wrong or cannot be told, and no more is needed of it.
+    while not again.ended and np.abs(again.q[again.done] - q[again.done]).max() <= far:
+        again.go_on()
+    known, work = again.done, again.done * parts
+    if not known:
+        return None
     with np.errstate(over="ignore", invalid="ignore"):
-        q, v = (np.abs(a - b)[: known + 1] / (1.0 - left) for a, b in zip(recorded, again, strict=True))
-    error = place.error(scene, trajectory, inertia, (q, v), cut=known < count)
-    return _Look(error, known < count or count >= int(place.judged.max()), known, work)
-
-
-def _affordable(trajectory: Trajectory, place: Place, finer: int, most: int | None) -> tuple[int, int]:
-    """How many steps are taken again, each in how many parts; (0, 0) for none.
-
-    These are half of what they were taken in, or that part of it again where dampers are faster.
-
-    The work is at most ``most``; if that is left out, that of some hundreds of steps or an eighth of the motion's own,
-    and then a part has to do for a period.
-    """
-    substeps = np.maximum(trajectory.statistics.substeps, 1)
-    count = int(place.judged.max())
-    if most is None:
-        length = FIRST if place.step == 0 else WINDOW
-        count, most = min(length, count), max(4 * length, int(substeps.sum()) // 8)
-    parts = 2 * finer * np.maximum.accumulate(substeps[place.step : place.step + count])
-    affordable = parts * np.arange(1, len(parts) + 1) <= most
-    if not affordable[0]:
-        return 0, 0
-    count = len(parts) if affordable.all() else int(affordable.argmin())
-    return count, int(parts[count - 1])
-
-
-def _taken_again(
-    scene: Scene,
-    integrator: Integrator,
-    trajectory: Trajectory,
-    place: int,
-    count: int,
-    parts: int,
-    moved: tuple[float, float] = (0.0, 0.0),
-) -> tuple[Floats, Floats] | None:
-    """``count`` steps from a node on, q and v of their nodes (count + 1, n); each in parts, under the same forces.
-
-    NaN from where they fail; None if the first does. ``moved`` is added to q and v at first.
-    """
-    steps = slice(place, place + count)
-    q, v = trajectory.q[place][None] + moved[0], trajectory.v[place][None] + moved[1]
-    drawn = scene.silence
-    if trajectory.dw.any() and scene.noise.diffusion is not None:
-        drawn = np.zeros((1, count * parts, trajectory.dw.shape[1]))
-        if isinstance(integrator, ExplicitEuler):
-            # Its kicks come after the step.
-            drawn[0, parts - 1 :: parts] = trajectory.dw[steps]
-        else:
-            drawn[0, ::parts] += integrator.left * trajectory.dw[steps]
-            drawn[0, parts - 1 :: parts] += (1.0 - integrator.left) * trajectory.dw[steps]
-    try:
-        state, _ = integrator.start(scene, q, v)
-    except SingularMassMatrix:
+        off = [np.abs(a - b) / (1.0 - other.left) for a, b in ((q, again.q), (v, again.v))]
+    # A part of a period stands for the whole only if no steps are left for the rest.
+    cut = known < count
+    error = place.error(scene, trajectory, inertia, (off[0][: known + 1], off[1][: known + 1]), cut=cut)
+    if not error.worst < _SMALL:
+        moved = disturbance(trajectory, place.step, known)
+        beside = Again(scene, other.method, trajectory, place.step, known, parts, moved)
+        told = 0
+        while not beside.ended and told == beside.done:
+            beside.go_on()
+            told = grown(again.q[: beside.done + 1], beside.q[: beside.done + 1], moved[0])
+        work += beside.done * parts
+        if told < known:
+            known, cut = max(1, told), True
+            error = place.error(scene, trajectory, inertia, (off[0][: known + 1], off[1][: known + 1]), cut=True)
+    if max(float(np.ptp(x[: known + 1], axis=0).max()) for x in (q, again.q)) < _SHORTEST:
         return None
-    # Impulses of noise depend on the controls, too.
-    commands = open_loop(np.repeat(trajectory.u[steps], parts, axis=0))
-    no_drift = np.zeros((0, 0, scene.robot.dof))
-    (segment,) = integrator.rollout_compiled(scene, state, commands, drawn, no_drift, trajectory.dt / parts)
-    done = len(segment.q) // parts
-    if not done:
-        return None
-    nodes = np.full((2, count + 1, q.shape[1]), np.nan)
-    for row, start, values in zip(nodes, (q, v), (segment.q, segment.v), strict=True):
-        row[0], row[1 : done + 1] = start[0], values[parts - 1 :: parts][:done]
-    return nodes[0], nodes[1]
+    return _Look(replace(error, settled=cut or count == judged), known, work)

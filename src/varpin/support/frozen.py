@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -16,6 +16,13 @@ class Frozen:
     attributes, and what tuples among them hold, keep their kind here. Views of mappings, which pickle refuses, travel
     as mappings; cached properties stay behind and are made again on use.
     """
+
+    def changed(self, **values: Any) -> Self:
+        """A copy with other attributes, of which nothing is checked."""
+        copy = object.__new__(type(self))
+        # Past the dataclass, which refuses assignments.
+        vars(copy).update(vars(self) | values)
+        return copy
 
     def __getstate__(self) -> dict[str, Any]:
         cached = {

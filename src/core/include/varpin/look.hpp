@@ -208,6 +208,33 @@ inline Turnover turnover(const Mechanism& mechanism, const Record& record, doubl
     return found;
 }
 
+// What a record says at a glance.
+struct Glance {
+    double fastest = 0.0;  // the largest velocity of all [rad/s or m/s]
+    bool split = false;    // whether a step was taken in parts
+    bool steady = true;    // whether all steps have the same controls
+    bool pulled = false;   // pulls_fast over a step, at the first node or at the last
+};
+
+// `substeps` (N) may be null for steps that are whole.
+inline Glance glance(const Mechanism& mechanism, const Record& record, const std::int64_t* substeps) {
+    const std::size_t n = mechanism.dof(), m = mechanism.controls, steps = record.steps;
+    Glance seen;
+    for (std::size_t i = 0; i < (steps + 1) * n; ++i) seen.fastest = larger(seen.fastest, std::abs(record.v[i]));
+    for (std::size_t k = 0; substeps && k < steps; ++k) seen.split = seen.split || substeps[k] > 1;
+    for (std::size_t i = m; i < steps * m; ++i) seen.steady = seen.steady && record.u[i] == record.u[i - m];
+    Inertias inertias(mechanism);
+    std::vector<double> force(n);
+    for (const std::size_t node : {std::size_t{0}, steps}) {
+        std::fill(force.begin(), force.end(), 0.0);
+        for (const Transmission& own : mechanism.actuation)
+            force[own.coordinate] += own.ratio * record.u[std::min(node, steps - 1) * m + own.control];
+        seen.pulled =
+            seen.pulled || pulls_fast(inertias, {record.q + node * n, record.v + node * n, force.data(), 1}, record.h);
+    }
+    return seen;
+}
+
 // How far a motion may be from that of other steps: errors of q in units of a joint's way, of v in units of its largest
 // velocity. What moves `little` less than others of its kind, and `light` less fast than what would have their energy,
 // is measured in these parts of theirs.

@@ -1,0 +1,124 @@
+"""Steps of a finished motion that are taken again: from their own first node, by another method or in smaller steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.errors import SingularMassMatrix
+from varpin.integrators import ExplicitEuler, Gauss, Integrator, Radau, RungeKutta4
+from varpin.integrators.base import open_loop
+from varpin.integrators.collocation import MOST_STAGES
+from varpin.mechanics.scene import Scene
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+# Steps between two looks at how far a motion has come, at first; twice as many each time.
+_FIRST = 32
+
+
+@dataclass(frozen=True)
+class Finer:
+    """What parts of a motion are taken again with.
+
+    Attributes:
+        method: The integrator.
+        parts: Its steps in one of the motion's.
+        left: The part of the motion's error that is left with it.
+    """
+
+    method: Integrator
+    parts: int
+    left: float
+
+
+def finer(integrator: Integrator, trajectory: Trajectory, *, damped: bool, pulled: bool) -> Finer:
+    """A method whose error is far below that of a motion's integrator, in steps as long.
+
+    One stage more: of modes that are far faster than the step, an odd number of stages turns round what an even one
+    leaves where it is. Radau's points where dampers are faster than the step (``damped``); an explicit method beside
+    explicit ones of first order where springs are no faster either (``pulled``).
+    """
+    stages = int(getattr(integrator, "stages", 1))
+    if trajectory.dw.any() and isinstance(integrator, ExplicitEuler):
+        # Its kicks come after the step.
+        return Finer(integrator, 2, 0.5)
+    more = stages + 1 if stages < MOST_STAGES else MOST_STAGES - 1
+    parts = 2 if stages == MOST_STAGES else 1
+    if damped or integrator.l_stable:
+        return Finer(Radau(max(3, more)), parts, 0.0)
+    if integrator.order == 1 and not (integrator.variational or pulled):
+        return Finer(RungeKutta4(), parts, 0.0)
+    return Finer(Gauss(max(2 if integrator.order <= 2 else 3, more)), parts, 0.0)
+
+
+class Again:
+    """``count`` steps of a motion from a node on, taken again piece by piece in parts, under the same forces.
+
+    Attributes:
+        q: Configurations of their nodes (count + 1, n), NaN from where none is known.
+        v: Velocities.
+        done: Steps that are known.
+        ended: Whether there are no more.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        method: Integrator,
+        trajectory: Trajectory,
+        step: int,
+        count: int,
+        parts: int,
+        moved: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        self.q, self.v = np.full((2, count + 1, scene.robot.dof), np.nan)
+        # ``moved`` is added to q and v at first.
+        self.q[0], self.v[0] = trajectory.q[step] + moved[0], trajectory.v[step] + moved[1]
+        self.done, self.ended = 0, count == 0
+        self._scene, self._method, self._trajectory, self._step = scene, method, trajectory, step
+        self._count, self._parts = count, parts
+        try:
+            self._state, _ = method.start(scene, self.q[:1].copy(), self.v[:1].copy())
+        except SingularMassMatrix:
+            self.ended = True
+
+    def go_on(self, steps: int | None = None) -> None:
+        """Take some more steps; left out, as many as there are already."""
+        scene, trajectory, method, parts, begin = self._scene, self._trajectory, self._method, self._parts, self.done
+        end = min(self._count, begin + (max(begin, _FIRST) if steps is None else steps))
+        own = slice(self._step + begin, self._step + end)
+        drawn = scene.silence
+        if trajectory.dw.any() and scene.noise.diffusion is not None:
+            drawn = np.zeros((1, (end - begin) * parts, trajectory.dw.shape[1]))
+            if isinstance(method, ExplicitEuler):
+                # Its kicks come after the step.
+                drawn[0, parts - 1 :: parts] = trajectory.dw[own]
+            else:
+                drawn[0, ::parts] += method.left * trajectory.dw[own]
+                drawn[0, parts - 1 :: parts] += (1.0 - method.left) * trajectory.dw[own]
+        # Impulses of noise depend on the controls, too.
+        commands = open_loop(np.repeat(trajectory.u[own], parts, axis=0))
+        no_drift = np.zeros((0, 0, scene.robot.dof))
+        (segment,) = method.rollout_compiled(scene, self._state, commands, drawn, no_drift, trajectory.dt / parts)
+        done = len(segment.q) // parts
+        for nodes, values in ((self.q, segment.q), (self.v, segment.v)):
+            nodes[begin + 1 : begin + done + 1] = values[parts - 1 :: parts][:done]
+        self.done += done
+        self.ended = self.done < end or end == self._count
+
+
+def taken_again(
+    scene: Scene, method: Integrator, trajectory: Trajectory, step: int, count: int, parts: int
+) -> tuple[Floats, Floats] | None:
+    """``count`` steps from a node on at once, q and v of their nodes (count + 1, n).
+
+    NaN from where they fail; None if the first does.
+    """
+    again = Again(scene, method, trajectory, step, count, parts)
+    if not again.ended:
+        again.go_on(count)
+    return (again.q, again.v) if again.done else None
