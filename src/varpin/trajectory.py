@@ -33,6 +33,8 @@ FORMAT = "varpin.trajectory/2"
 _ARRAYS = ("t", "q", "v", "p", "u", "dw", "energy", "masses")
 _TEXTS = ("version", "integrator", "robot", "joint_names", "warnings")
 _AT_A_TIME = 1_000_000  # parts of steps
+# Of constraints, in files of motions that had some.
+_FORCES, _LABELS = "constraint_forces", "constraint_labels"
 # Before the names of the scene's values in a file.
 _SCENE = "scene."
 _MOST_WORDS = 1_000_000  # bytes of what does not grow with the steps
@@ -192,6 +194,9 @@ class Trajectory(Frozen):
             before it kept them.
         accuracy: The estimated error, and what finding integrator and step took, of a motion that was asked for with a
             tolerance; None of others.
+        constraint_forces: Of a scene's constraints, the mean over each step (N, c) [N or N m]: the joints feel
+            dg/dq' times them. Where rows depend on others the forces of those that were left out are zero.
+        constraint_labels: What each of them is of (c,), in words.
     """
 
     t: Floats
@@ -211,8 +216,12 @@ class Trajectory(Frozen):
     warnings: tuple[str, ...] = ()
     scene_values: Mapping[str, Floats] = field(default_factory=lambda: MappingProxyType({}), repr=False)
     accuracy: Accuracy | None = field(default=None, repr=False)
+    constraint_forces: Floats = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    constraint_labels: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if not self.constraint_labels:
+            object.__setattr__(self, "constraint_forces", np.zeros((max(np.size(self.t) - 1, 0), 0)))
         nodes, n = np.size(self.t), len(self.joint_names)
         # Whoever reads a record relies on its shapes.
         for name, lead in {"t": nodes, "energy": nodes, "q": nodes, "v": nodes, "p": nodes}.items():
@@ -221,7 +230,8 @@ class Trajectory(Frozen):
             self._require(name, (nodes - 1, *np.shape(getattr(self, name))[1:2]))
         if nodes < 1 or self.u.ndim != 2 or self.dw.ndim != 2:
             raise InputError("a trajectory has one node or more, and controls and increments (N, ...)")
-        for name in _ARRAYS:
+        self._require("constraint_forces", (nodes - 1, len(self.constraint_labels)))
+        for name in (*_ARRAYS, "constraint_forces"):
             getattr(self, name).setflags(write=False)
         for array in vars(self.statistics).values():
             array.setflags(write=False)
@@ -251,6 +261,7 @@ class Trajectory(Frozen):
             **{name: getattr(self, name)[nodes] for name in ("t", "q", "v", "p", "energy")},
             u=self.u[steps],
             dw=self.dw[steps],
+            constraint_forces=self.constraint_forces[steps],
             statistics=self.statistics.part(begin, end),
         )
 
@@ -307,6 +318,8 @@ class Trajectory(Frozen):
         members |= {f"{_SCENE}{name}": values for name, values in self.scene_values.items()}
         if self.accuracy is not None:
             members["accuracy"] = np.array([getattr(self.accuracy, name) for name in _ACCURACY], dtype=np.float64)
+        if self.constraint_labels:
+            members[_FORCES], members[_LABELS] = self.constraint_forces, np.array(self.constraint_labels, dtype=str)
         return members | {"dt": self.dt, "joint_names": np.array(self.joint_names, dtype=str)}
 
     @classmethod
@@ -371,6 +384,7 @@ class Trajectory(Frozen):
         statistics = StepStatistics(**{x.name: members[f"statistics.{x.name}"] for x in fields(StepStatistics)})
         if damage := statistics.damage():
             raise FileError(f"{source}: {damage}")
+        forces, labels = members.get(_FORCES, np.zeros((steps, 0))), members.get(_LABELS, np.zeros(0, dtype=str))
         accuracy = None
         if "accuracy" in members:
             numbers = members["accuracy"]
@@ -390,6 +404,8 @@ class Trajectory(Frozen):
             warnings=tuple(str(sentence) for sentence in members["warnings"]),
             scene_values=MappingProxyType(kept),
             accuracy=accuracy,
+            constraint_forces=forces,
+            constraint_labels=tuple(str(label) for label in labels),
         )
 
 
@@ -406,6 +422,10 @@ def require_layout(source: Path, members: Mapping[str, NDArray[Any] | Header]) -
     shapes |= {f"statistics.{name}": (steps,) for name in STEP_NUMBERS} | {"statistics.halvings": (-1,)}
     shapes |= dict.fromkeys(_TEXTS[:3], ())
     shapes |= {"accuracy": (len(_ACCURACY),)} if "accuracy" in members else {}
+    if (_FORCES in members) != (_LABELS in members):
+        raise FileError(f"{source}: it has one of {_FORCES} and {_LABELS}, where both or none belong")
+    if _LABELS in members:
+        shapes |= {_LABELS: (-1,), _FORCES: (steps, members[_LABELS].size)}
     ends = {"gravity": (3,), "actuation": (n, -1)} | dict.fromkeys(("damping", "stiffness", "rest", "armature"), (n,))
     ends |= dict.fromkeys(("ratio", "offset"), (-1,)) | dict.fromkeys(("center", "translation"), (-1, 3))
     ends |= {"inertia": (-1, 6), "rotation": (-1, 3, 3)} | dict.fromkeys(OF_FORCES, (-1, -1))
@@ -414,12 +434,12 @@ def require_layout(source: Path, members: Mapping[str, NDArray[Any] | Header]) -
         found, kind = members[name].shape, members[name].dtype
         if len(found) != len(shape) or any(b not in (-1, a) for a, b in zip(found, shape, strict=True)):
             raise FileError(f"{source}: {name} has shape {found}, where {shape} belongs")
-        if name in _TEXTS:
+        if name in (*_TEXTS, _LABELS):
             if kind.kind != "U":
                 raise FileError(f"{source}: {name} holds {kind}, where text belongs")
         elif kind != _KINDS.get(name, "float64"):
             raise FileError(f"{source}: {name} holds {kind}, where {_KINDS.get(name, 'float64')} belongs")
-        if name in (*_TEXTS, "masses") and members[name].size * kind.itemsize > _MOST_WORDS:
+        if name in (*_TEXTS, _LABELS, "masses") and members[name].size * kind.itemsize > _MOST_WORDS:
             raise FileError(f"{source}: {name} is longer than any: {found} of {kind}")
 
 
@@ -434,7 +454,7 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
         name: np.concatenate([getattr(first, name)[:1], *(getattr(part, name)[1:] for part in parts)])
         for name in ("q", "v", "p", "energy")
     }
-    arrays |= {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("u", "dw")}
+    arrays |= {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("u", "dw", _FORCES)}
     return replace(
         first,
         t=first.t[0] + np.arange(steps + 1) * first.dt,
@@ -483,7 +503,7 @@ def require_scene_of(scene: Scene, trajectory: Trajectory) -> None:
 # What a file of a trajectory holds beside its format, and what it may hold.
 MEMBERS = frozenset(_ARRAYS) | {"dt", "version", "integrator", "robot", "joint_names", "warnings"}
 MEMBERS |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
-OPTIONAL = frozenset(_SCENE + name for name in VALUES) | {"accuracy"}
+OPTIONAL = frozenset(_SCENE + name for name in VALUES) | {"accuracy", _FORCES, _LABELS}
 
 
 def read_members(

@@ -23,7 +23,7 @@ from varpin.integrators.base import (
     steps_of,
 )
 from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.mechanics.scene import Scene
+from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -56,6 +56,7 @@ class _Explicit(Integrator):
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[ExplicitRun, list[Segment]]:
         """See :meth:`Integrator.start`."""
+        refuse_constraints(scene, str(self))
         paths, n = q0.shape
         run = ExplicitRun(core.ExplicitRollout.start(scene.core, self.method, q0, v0), q0.copy())
         nodes = new_nodes(paths, 1, n, scene.controls)
@@ -97,6 +98,7 @@ class _Explicit(Integrator):
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, v)."""
+        refuse_constraints(scene, str(self))
         h, n = trajectory.dt, scene.robot.dof
         q, v = (np.ascontiguousarray(x[:-1]) for x in (trajectory.q, trajectory.v))
         force = trajectory.u @ scene.actuation.T + drifts(scene, trajectory)
