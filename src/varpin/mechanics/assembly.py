@@ -16,13 +16,16 @@ Floats = NDArray[np.float64]
 _DEPENDENT = 1e-9
 # A row is kept if it misses by so many rounding units of the terms that cancel in it.
 _ROUNDING = 256.0 * np.finfo(np.float64).eps
-_MOST = 200
+# Most corrections of Newton's method, most trials of Levenberg's and Marquardt's, the least part of the way that is
+# followed at once, and the longest step [rad or m].
+_MOST, _MOST_TRIALS, _SHORTEST, _LONGEST = 12, 200, 1e-3, 0.5
 
 
 def assemble(scene: Scene, q: JointValues) -> Floats:
     """The configuration (n,) nearest to ``q`` that keeps a scene's constraints [rad or m].
 
-    Nearest in the metric of the kinetic energy at ``q``: as light joints move easily. It is a local search.
+    Nearest in the metric of the kinetic energy at ``q``, where light joints move more than heavy ones, among those that
+    a continuous way leads to; where that way is lost, another one that keeps them.
 
     Args:
         scene: The scene.
@@ -38,8 +41,8 @@ def assemble(scene: Scene, q: JointValues) -> Floats:
     if not scene.constraints:
         return start
     root = _root_of_mass(scene, start)
-    found = _reached(scene, start, root)
-    found = _polished(scene, _nearest(scene, start, found, root), root)
+    followed = _followed(scene, start, root)
+    found = _polished(scene, _reached(scene, start, root) if followed is None else followed, root)
     _require_kept(scene, found)
     return found
 
@@ -81,17 +84,60 @@ def _shift(g: Floats, C: Floats, root: Floats) -> Floats:
     return shift
 
 
+def _followed(scene: Scene, start: Floats, root: Floats) -> Floats | None:
+    """The nearest q, followed from ``start`` on as what constraints miss goes to zero; None where that is lost."""
+    whole, _ = _values(scene, start)
+    q, y, done, step = start, np.zeros(len(whole)), 0.0, 1.0
+    while done < 1.0:
+        ahead = min(1.0, done + step)
+        found = _nearest(scene, start, (1.0 - ahead) * whole, q, y, root)
+        if found is None:
+            step *= 0.5
+            if step < _SHORTEST:
+                return None
+            continue
+        (q, y), done, step = found, ahead, 2.0 * step
+    return q
+
+
+def _nearest(
+    scene: Scene, start: Floats, left: Floats, q: Floats, y: Floats, root: Floats
+) -> tuple[Floats, Floats] | None:
+    """Newton's method, from (q, y), on M0 (q - start) + C' y = 0, g = left; None where it does not contract."""
+    metric = np.linalg.inv(root.T @ root)
+    n, before = q.size, np.inf
+    for _ in range(_MOST):
+        g, C = _values(scene, q)
+        B = C @ root.T
+        H = np.eye(n) + root @ scene.core.constraint_curvature(q, y, np.zeros(n))[0] @ root.T
+        K = np.block([[H, B.T], [B, np.zeros((len(g), len(g)))]])
+        slope = root @ (metric @ (q - start) + C.T @ y)
+        step = np.linalg.lstsq(K, -np.append(slope, g - left), rcond=_DEPENDENT)[0]
+        way = root.T @ step[:n]
+        size = float(np.abs(way).max())
+        if not size <= min(0.5 * before, _LONGEST):
+            return None
+        q, y, before = q + way, y + step[n:], max(size, 1e-12)
+        if size < 1e-10:
+            # On the nearest branch H is positive along the constraints.
+            _, sizes, basis = np.linalg.svd(B)
+            along = basis[int((sizes > _DEPENDENT * sizes[0]).sum()) :]
+            return (q, y) if not len(along) or np.linalg.eigvalsh(along @ H @ along.T)[0] > 0.0 else None
+    return None
+
+
 def _reached(scene: Scene, q: Floats, root: Floats) -> Floats:
-    """Some configuration without g, from q on: Levenberg's and Marquardt's method."""
+    """Some q without g, or where g is least, from q on: Levenberg's and Marquardt's method."""
     g, C = _values(scene, q)
     damping = 1e-3
-    for _ in range(_MOST):
+    for _ in range(_MOST_TRIALS):
         size = float(g @ g)
         if size < 1e-24:
             break
         B = C @ root.T
         scale = float(np.square(B).sum())
-        trial = q - root.T @ (B.T @ np.linalg.solve(B @ B.T + damping * scale * np.eye(len(g)), g))
+        way = -root.T @ (B.T @ np.linalg.solve(B @ B.T + damping * scale * np.eye(len(g)), g))
+        trial = q + way * min(1.0, _LONGEST / max(float(np.abs(way).max()), 1e-300))
         g_there, C_there = _values(scene, trial)
         if float(g_there @ g_there) < size:
             q, g, C, damping = trial, g_there, C_there, max(0.1 * damping, 1e-14)
@@ -100,39 +146,6 @@ def _reached(scene: Scene, q: Floats, root: Floats) -> Floats:
             if damping > 1e12:
                 break
     return q
-
-
-def _nearest(scene: Scene, start: Floats, found: Floats, root: Floats) -> Floats:
-    """The nearest one, from one found: Newton's method on M0 (q - q0) + C' y = 0, g = 0."""
-    metric = np.linalg.inv(root.T @ root)
-    q, C = found, _values(scene, found)[1]
-    y = np.asarray(np.linalg.lstsq(C.T, -metric @ (q - start), rcond=_DEPENDENT)[0], dtype=np.float64)
-
-    def slope(q: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
-        g, C = _values(scene, q)
-        return root @ (metric @ (q - start) + C.T @ y), g, C
-
-    force, g, C = slope(q, y)
-    merit = float(force @ force + g @ g)
-    for _ in range(30):
-        H = metric + scene.core.constraint_curvature(q, y, np.zeros_like(q))[0]
-        n, c = q.size, len(g)
-        K = np.block([[root @ H @ root.T, root @ C.T], [C @ root.T, np.zeros((c, c))]])
-        step = np.linalg.lstsq(K, -np.append(force, g), rcond=1e-12)[0]
-        length = 1.0
-        while length > 1e-3:
-            trial = q + length * (root.T @ step[:n]), y + length * step[n:]
-            force_there, g_there, C_there = slope(*trial)
-            there = float(force_there @ force_there + g_there @ g_there)
-            if there < merit:
-                break
-            length *= 0.5
-        else:
-            break
-        (q, y), force, g, C, merit = trial, force_there, g_there, C_there, there
-    # A stationary point that is farther than what it began with is none to go to.
-    far, near = (float(np.linalg.norm(np.linalg.solve(root.T, x - start))) for x in (q, found))
-    return q if far <= near * (1.0 + 1e-9) else found
 
 
 def _polished(scene: Scene, q: Floats, root: Floats) -> Floats:

@@ -64,7 +64,9 @@ class Constraint(Frozen, ABC):
 
 
 def _shown(value: Any) -> str:
-    return getattr(value, "__name__", repr(value)) if callable(value) else shown(value)
+    if callable(value) or isinstance(value, int):
+        return str(getattr(value, "__name__", repr(value)))
+    return shown(value)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -17,6 +17,15 @@ from varpin.integrators import BY_NAME, Integrator, options_of
 from varpin.io.scenefile.references import Reference, read_reference
 from varpin.io.scenefile.table import ByName, SceneFileError, Table, inside, shown, suggestion
 from varpin.io.scenefile.terms import TERMS, Term
+from varpin.mechanics.constraints import (
+    Constraint,
+    Distance,
+    FrameOnFrame,
+    JointTie,
+    PointOnLine,
+    PointOnPlane,
+    PointOnPoint,
+)
 from varpin.mechanics.forces import (
     Armature,
     CoulombFriction,
@@ -58,6 +67,15 @@ FRAME_FORCES: Mapping[str, type[Force]] = {
     "frame_damper": FrameDamper,
     "frame_spring": FrameSpring,
     "frame_wrench": FrameWrench,
+}
+# Of a [[constraint]].
+CONSTRAINTS: Mapping[str, type[Constraint]] = {
+    "distance": Distance,
+    "frame_on_frame": FrameOnFrame,
+    "joint_tie": JointTie,
+    "point_on_line": PointOnLine,
+    "point_on_plane": PointOnPlane,
+    "point_on_point": PointOnPoint,
 }
 FIGURES = (".png", ".pdf", ".svg")
 
@@ -125,6 +143,19 @@ class FrameForceSpec:
 
 
 @dataclass(frozen=True, eq=False)
+class ConstraintSpec:
+    """A constraint.
+
+    Attributes:
+        constraint: What the file says.
+        table: Where it stands, for messages.
+    """
+
+    constraint: Constraint
+    table: Table
+
+
+@dataclass(frozen=True, eq=False)
 class CostSpec:
     """A term of the cost.
 
@@ -184,6 +215,7 @@ class SceneSpec:
         rest: Where springs are slack, by joint [rad or m].
         forces: Others on joints.
         frame_forces: Others on frames.
+        constraints: What the motion keeps.
         actuated: Joints that are driven; None for all.
         gear: Generalized force per control, by driven joint.
         torque_limit: By driven joint [N m or N]; ``"robot"`` for the robot description's; None for none.
@@ -213,6 +245,7 @@ class SceneSpec:
     rest: ByName
     forces: tuple[ForceSpec, ...]
     frame_forces: tuple[FrameForceSpec, ...]
+    constraints: tuple[ConstraintSpec, ...]
     actuated: tuple[str, ...] | None
     gear: ByName
     torque_limit: ByName | str | None
@@ -335,8 +368,8 @@ def _damping(root: Table) -> ByName | Literal["robot"] | None:
 
 def _scene(root: Table, path: Path, name: str) -> SceneSpec:
     root.allow(
-        *("title", "gravity", "damping", "robot", "springs", "force", "actuation", "noise", "initial", "horizon"),
-        *("integrator", "cost", "simulate", "solve", "outputs"),
+        *("title", "gravity", "damping", "robot", "springs", "force", "constraint", "actuation", "noise", "initial"),
+        *("horizon", "integrator", "cost", "simulate", "solve", "outputs"),
     )
     for required in ("robot", "horizon"):
         root.require(required, f"the table [{required}]")
@@ -378,6 +411,7 @@ def _scene(root: Table, path: Path, name: str) -> SceneSpec:
         rest=springs.by_name("rest", 0.0, unit="rad or m"),
         forces=tuple(force for force in forces if isinstance(force, ForceSpec)),
         frame_forces=tuple(force for force in forces if isinstance(force, FrameForceSpec)),
+        constraints=tuple(_constraint(table) for table in root.tables("constraint")),
         actuated=joints or None,
         gear=actuation.by_name("gear", 1.0),
         torque_limit=limit,
@@ -473,6 +507,32 @@ def _frame_force(table: Table, word: str) -> FrameForceSpec:
     table.allow("type", "a", "b", "stiffness", "rest")
     rest = _along(table, "rest", "m") if "rest" in table else 0.0
     return FrameForceSpec(FrameSpring(*ends, _along(table, "stiffness", "N/m"), rest), table)
+
+
+def _constraint(table: Table) -> ConstraintSpec:
+    word = table.choice("type", tuple(CONSTRAINTS))
+    table.allow("type", *(item.name for item in fields(CONSTRAINTS[word])))
+    own: Constraint
+    if word == "joint_tie":
+        given = {"coefficients": tuple(table.numbers("coefficients"))} if "coefficients" in table else {}
+        own = JointTie(table.text("joint"), table.text("leader"), **given)
+    elif word == "frame_on_frame":
+        pose = None
+        if "placement" in table:
+            rows = table.numbers("placement", 16)
+            pose = [list(rows[4 * k : 4 * k + 4]) for k in range(4)]
+        own = FrameOnFrame(table.text("a"), table.text("b"), pose)
+    else:
+        ends = _point(table, "a"), _point(table, "b")
+        if word == "distance":
+            own = Distance(*ends, table.number("length", unit="m", above=0.0))
+        elif word == "point_on_plane":
+            own = PointOnPlane(*ends, table.numbers("normal", 3))
+        elif word == "point_on_line":
+            own = PointOnLine(*ends, table.numbers("direction", 3))
+        else:
+            own = PointOnPoint(*ends, table.text("axes", "xyz"))
+    return ConstraintSpec(own, table)
 
 
 def _along(table: Table, name: str, unit: str) -> float | list[float]:
