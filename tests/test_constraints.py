@@ -559,3 +559,61 @@ def test_controls_of_a_law_see_the_node():
     )
     assert np.abs(motion.v[-1]).max() < 1e-3
     assert max(violations(scene, motion)) < 1e-12
+
+
+SCENE_FILE = """
+[robot]
+source = "ur5"
+[[constraint]]
+type = "point_on_point"
+a = { frame = "tool0", place = [0.0, 0.0, 0.1] }
+b = [0.3, 0.2, 0.4]
+axes = "xz"
+[[constraint]]
+type = "joint_tie"
+joint = "wrist_3_joint"
+leader = "wrist_2_joint"
+coefficients = [0.1, -2.0]
+[[constraint]]
+type = "distance"
+a = "tool0"
+b = "upper_arm_link"
+length = 0.7
+[initial]
+q = [0.1, -1.0, 1.2, 0.3, 0.4, -0.7]
+[horizon]
+dt = 2e-3
+steps = 10
+"""
+
+
+def test_scene_files_have_constraints(tmp_path):
+    path = tmp_path / "loop.toml"
+    path.write_text(SCENE_FILE)
+    constraints = [
+        vp.PointOnPoint(("tool0", [0.0, 0.0, 0.1]), [0.3, 0.2, 0.4], axes="xz"),
+        vp.JointTie("wrist_3_joint", "wrist_2_joint", [0.1, -2.0]),
+        vp.Distance("tool0", "upper_arm_link", 0.7),
+    ]
+    scene = vp.Scene(vp.load_robot("ur5"), constraints=constraints)
+    with pytest.raises(vp.InputError, match=r"q0 misses .*assemble"):
+        vp.load_scene(path).simulate()
+    q = vp.assemble(scene, [0.1, -1.0, 1.2, 0.3, 0.4, -0.7])
+    path.write_text(SCENE_FILE.replace("[0.1, -1.0, 1.2, 0.3, 0.4, -0.7]", str(q.tolist())))
+    file = vp.load_scene(path)
+    assert file.robot.dof == 6
+    assert file.scene.bound_constraints == scene.bound_constraints
+    motion = file.simulate()
+    np.testing.assert_allclose(
+        motion.q, vp.simulate(scene, q, np.zeros(6), dt=2e-3, steps=10, integrator=vp.Gauss(2)).q
+    )
+    for change, words in (
+        (("tool0", "tol0"), r"constraint\[0\].*no frame 'tol0'"),
+        (("length = 0.7", "length = -1"), r"constraint\[2\].length"),
+        (("wrist_3_joint", "wrist_4_joint"), r"constraint\[1\].*wrist_4_joint"),
+        (('"distance"', '"rod"'), r"constraint\[2\].type"),
+        (("axes", "axis"), r"constraint\[0\].axis.*unknown key"),
+    ):
+        path.write_text(SCENE_FILE.replace(*change))
+        with pytest.raises(vp.SceneFileError, match=words):
+            vp.load_scene(path)
