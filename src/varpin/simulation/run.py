@@ -399,6 +399,8 @@ def simulate(
             try:
                 (segment,) = integrator.rollout(scene, state, block, drawn, dt)
             except InputError as error:
+                if not stepwise:
+                    raise  # of a custom constraint
                 now = record.trajectory()
                 raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
             record.add(segment)
