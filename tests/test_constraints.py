@@ -652,6 +652,7 @@ def test_scene_files_have_constraints(tmp_path):
     path.write_text(SCENE_FILE.replace("[0.1, -1.0, 1.2, 0.3, 0.4, -0.7]", str(q.tolist())))
     file = vp.load_scene(path)
     assert file.robot.dof == 6
+    assert file.required.terms["constraints"] == "PointOnPoint, JointTie, Distance"
     assert file.scene.bound_constraints == scene.bound_constraints
     motion = file.simulate()
     np.testing.assert_allclose(

@@ -194,7 +194,7 @@ def _terms(layout: Layout) -> dict[str, str]:
     kinds: set[type[Force]] = {force.kind for force in layout.forces} | {type(own) for own in layout.frame_forces}
     absent = [words for words, kind in _ABSENT.items() if kind not in kinds] + ["contact"]
     loads = [f"{load.mass:g} kg at {load.frame}" for load in spec.robot.payload]
-    return {
+    terms = {
         "gravity": f"{', '.join(f'{g:g}' for g in gravity)} m/s^2" if any(gravity) else "none",
         "damping": of(layout.damping, joints),
         "springs": of(layout.stiffness, joints),
@@ -206,3 +206,6 @@ def _terms(layout: Layout) -> dict[str, str]:
         "other forces": ", ".join(word for word, kind in {**FORCES, **FRAME_FORCES}.items() if kind in kinds) or "none",
         "not modelled": f"{', '.join(absent)}; shapes are read only for a replay",
     }
+    if layout.constraints:
+        terms["constraints"] = ", ".join(dict.fromkeys(type(own).__name__ for own in layout.constraints))
+    return terms
