@@ -10,7 +10,7 @@ import pytest
 import varpin as vp
 from varpin import core
 from varpin.core.arrays import Commands, Nodes, new_nodes
-from varpin.integrators.tableau import gauss_coefficients, interpolation
+from varpin.integrators.tableau import gauss_coefficients, interpolation, lobatto_places
 
 N, P = 4, 2
 NOISE = vp.AdditiveNoise(1e-3) + vp.ControlNoise(0.1) + vp.StateNoise(0.1)
@@ -38,6 +38,7 @@ def of_mechanism(scene):
         **{name: getattr(scene, name) for name in ("gravity", "actuation")},
         "forces": scene.elements,
         "couplings": scene.couplings,
+        "constraints": scene.bound_constraints.rows,
         **dict(zip(("constant", "control", "quadratic", "centers"), fields, strict=True)),
     }
 
@@ -83,6 +84,13 @@ def roll(rollout):
 def variational(scene):
     tableau, guards = core.Tableau.make(**of_tableau()), core.Guards.make(**GUARDS)
     return core.VariationalRollout(scene.core, tableau, 0.5, guards, 0.5, P)
+
+
+def constrained(scene, *, begun=False):
+    tableau, guards = core.Tableau.make(**of_tableau()), core.Guards.make(**GUARDS)
+    rollout, n = core.ConstrainedRollout(scene.core, tableau, lobatto_places(2), 0.5, guards, P), scene.robot.dof
+    assert not begun or rollout.begin(draw(P, n), draw(P, n))
+    return rollout
 
 
 def explicit(scene, method):
@@ -154,6 +162,14 @@ def calls():
     for method in core.ExplicitMethod:
         fixed = {"mechanism": own.core, "method": method, "dt": 1e-3}
         yield f"derivatives of {method}", core.linearize_explicit, {**fixed, **many}
+    closed = vp.Scene(own.robot, constraints=vp.PointOnPoint("panda_hand", (0.3, 0.0, 0.5)))
+    yield "constraints", closed.core.constraints, {"q": draw(N, n)}
+    at = {"q": draw(n), "weights": draw(3), "v": draw(n)}
+    yield "curvature of constraints", closed.core.constraint_curvature, at
+    yield "begin under constraints", constrained(closed).begin, {"q": draw(P, n), "v": draw(P, n)}
+    yield "kick under constraints", constrained(closed, begun=True).kick, {"impulse": draw(P, n)}
+    again = {**steps(closed), "guess": guess, "places": lobatto_places(2)}
+    yield "derivatives under constraints", core.constrained_derivatives, again
     yield "rate", dynamics.rate, {"x": draw(2 * n), "force": draw(n)}
     yield "node", dynamics.node, {"x": draw(2 * n)}
     yield "links", core.Links.make, links
@@ -171,6 +187,7 @@ def calls():
 
 # Sizes that are the caller's to choose: rows of what is done one by one, a control before that may be left out.
 FREE = {("place a frame", "q", 0), ("changes", "u", 0), ("changes", "u", 1), ("expanded changes", "u", 0)}
+FREE |= {("constraints", "q", 0)}
 FREE |= {("changes", "before", 0), ("expanded changes", "before", 0)}
 
 

@@ -26,6 +26,7 @@ def python_blocks(page):
         ("replay.md", 2, ["marks.html", "pair.html", "controller.html"]),
         ("notebooks.md", 2, []),
         ("control-loop.md", 1, ["loop.html"]),
+        ("constraints.md", 1, []),
         ("textbook.md", 2, []),
         ("many-machines.md", 4, []),
     ],

@@ -71,6 +71,8 @@ def elements(scene: vp.Scene) -> str:
 
 def header(scene: vp.Scene) -> str:
     """The header's text; noise is left out, which a controller does not simulate."""
+    if scene.constraints:
+        raise SystemExit("constraints are not written here: fill Mechanism::constraints by hand")
     if scene.couplings:
         raise SystemExit("forces on frames are not written here: fill Mechanism::couplings by hand, as tests/cpp does")
     tree = scene.robot.tree

@@ -13,6 +13,7 @@ Load an arm, integrate it variationally, replay it:
 from typing import TYPE_CHECKING
 
 from varpin._version import __version__ as __version__
+from varpin.errors import AssemblyError as AssemblyError
 from varpin.errors import FileError as FileError
 from varpin.errors import InputError as InputError
 from varpin.errors import LinearizationError as LinearizationError
@@ -34,6 +35,15 @@ from varpin.integrators import Radau as Radau
 from varpin.integrators import Reference as Reference
 from varpin.integrators import RungeKutta4 as RungeKutta4
 from varpin.integrators import SemiImplicitEuler as SemiImplicitEuler
+from varpin.mechanics.assembly import assemble as assemble
+from varpin.mechanics.constraints import Constraint as Constraint
+from varpin.mechanics.constraints import CustomConstraint as CustomConstraint
+from varpin.mechanics.constraints import Distance as Distance
+from varpin.mechanics.constraints import FrameOnFrame as FrameOnFrame
+from varpin.mechanics.constraints import JointTie as JointTie
+from varpin.mechanics.constraints import PointOnLine as PointOnLine
+from varpin.mechanics.constraints import PointOnPlane as PointOnPlane
+from varpin.mechanics.constraints import PointOnPoint as PointOnPoint
 from varpin.mechanics.forces import Armature as Armature
 from varpin.mechanics.forces import CoulombFriction as CoulombFriction
 from varpin.mechanics.forces import Force as Force

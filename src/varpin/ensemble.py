@@ -21,7 +21,7 @@ from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, rows
 from varpin.mechanics.policy import LinearPolicy, OpenLoop
-from varpin.mechanics.scene import Scene, require_scene
+from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.mechanics.wiener import Children, children
 from varpin.simulation.loop_stability import examined_in_loop
 from varpin.simulation.run import Motions, commands_of
@@ -213,7 +213,7 @@ def simulate_ensemble(
         VarpinError: Every path failed, or workers get lost again and again.
         EnsembleInterrupted: Ctrl-C; holds the paths that were done. It is a KeyboardInterrupt.
     """
-    require_scene(scene)
+    refuse_constraints(require_scene(scene), "simulate_ensemble")
     dt, steps, paths = positive("dt", dt, "s"), count("steps", steps), count("paths", paths, least=1)
     _require_memory(scene, steps, paths, store=store)
     start = [_per_path(name, value, paths, scene.robot.joint_names) for name, value in (("q0", q0), ("v0", v0))]

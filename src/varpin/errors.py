@@ -99,6 +99,25 @@ class InputError(VarpinError, ValueError):
     """An argument has a wrong shape, type or value."""
 
 
+class AssemblyError(InputError):
+    """No configuration that the search comes to keeps all constraints.
+
+    Attributes:
+        constraint: The one that misses by most.
+        miss: By how much [m or rad].
+        q: Where the search ended (n,) [rad or m].
+    """
+
+    def __init__(self, constraint: str, miss: float, q: object) -> None:
+        self.constraint = constraint
+        self.miss = miss
+        self.q = q
+        super().__init__(
+            f"the constraints cannot be assembled from this q: the closest that was found misses {constraint} by "
+            f"{miss:.4g} m or rad, at q = {q}; give another q, or correct lengths and places"
+        )
+
+
 class UnknownFrame(InputError):
     """A frame name that the robot does not have.
 

@@ -34,6 +34,10 @@ class Linearization:
     O(dt)), and so at the state that a step from the trajectory's node reaches without noise, where a split kick has its
     second half. x is (q, p) for variational integrators and (q, v) for the others.
 
+    Under constraints each step is a map on all of R^2n: it begins at any (q, p), of p takes what is normal to the
+    constraints away, and ends on them. A, B and K are derivatives of that map: A has rank 2 (n - r) for r independent
+    rows, is symplectic on tangent directions of the constraints alone, and K has nothing of an impulse normal to them.
+
     Attributes:
         A: dx1/dx0 (N, 2n, 2n); symplectic where nothing is forced or damped.
         B: dx1/du (N, 2n, m).

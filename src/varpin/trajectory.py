@@ -183,6 +183,9 @@ class Trajectory(Frozen):
             before it kept them.
         accuracy: The estimated error, and what finding integrator and step took, of a motion that was asked for with a
             tolerance; None of others.
+        constraint_forces: Of a scene's constraints, the mean over each step (N, c) [N or N m]: the joints feel
+            dg/dq' times them. Where rows depend on others the forces of those that were left out are zero.
+        constraint_labels: What each of them is of (c,), in words.
     """
 
     t: Annotated[Floats, Axes("nodes", finite=True)]
@@ -204,8 +207,14 @@ class Trajectory(Frozen):
         default_factory=lambda: MappingProxyType({}), repr=False, metadata={"entry": "scene"}
     )
     accuracy: Accuracy | None = field(default=None, repr=False)
+    constraint_forces: Annotated[Floats, Axes("steps", "constraints", finite=True)] = field(
+        default_factory=lambda: np.zeros((0, 0)), repr=False
+    )
+    constraint_labels: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if not self.constraint_labels and not np.size(self.constraint_forces):
+            object.__setattr__(self, "constraint_forces", np.zeros((max(np.size(self.t) - 1, 0), 0)))
         nodes, n = np.size(self.t), len(self.joint_names)
         # Whoever reads a record relies on its shapes.
         for name, lead in {"t": nodes, "energy": nodes, "q": nodes, "v": nodes, "p": nodes}.items():
@@ -214,7 +223,8 @@ class Trajectory(Frozen):
             self._require(name, (nodes - 1, *np.shape(getattr(self, name))[1:2]))
         if nodes < 1 or self.u.ndim != 2 or self.dw.ndim != 2:
             raise InputError("a trajectory has one node or more, and controls and increments (N, ...)")
-        for name in _ARRAYS:
+        self._require("constraint_forces", (nodes - 1, len(self.constraint_labels)))
+        for name in (*_ARRAYS, "constraint_forces"):
             getattr(self, name).setflags(write=False)
         for array in vars(self.statistics).values():
             array.setflags(write=False)
@@ -244,6 +254,7 @@ class Trajectory(Frozen):
             **{name: getattr(self, name)[nodes] for name in ("t", "q", "v", "p", "energy")},
             u=self.u[steps],
             dw=self.dw[steps],
+            constraint_forces=self.constraint_forces[steps],
             statistics=self.statistics.part(begin, end),
         )
 
@@ -383,7 +394,8 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
         name: np.concatenate([getattr(first, name)[:1], *(getattr(part, name)[1:] for part in parts)])
         for name in ("q", "v", "p", "energy")
     }
-    arrays |= {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("u", "dw")}
+    of_steps = ("u", "dw", "constraint_forces")
+    arrays |= {name: np.concatenate([getattr(part, name) for part in parts]) for name in of_steps}
     return replace(
         first,
         t=first.t[0] + np.arange(steps + 1) * first.dt,

@@ -158,7 +158,9 @@ void register_explicit(nb::module_& m) {
         .value("not_finite", Outcome::not_finite)
         .value("fold", Outcome::fold)
         .value("energy", Outcome::energy)
-        .value("singular", Outcome::singular);
+        .value("singular", Outcome::singular)
+        .value("toggle", Outcome::toggle)
+        .value("assembly", Outcome::assembly);
     nb::enum_<ExplicitMethod>(m, "ExplicitMethod")
         .value("euler", ExplicitMethod::euler)
         .value("semi_implicit", ExplicitMethod::semi_implicit)

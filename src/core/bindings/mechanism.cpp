@@ -1,10 +1,12 @@
 // The mechanism and its Lagrangian jet.
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include <array>
 #include <limits>
+#include <memory>
 #include <string>
 #include <tuple>
 #include <utility>
@@ -79,12 +81,81 @@ CoupledElement coupling_of(const std::string& kind, int a, int b, const std::vec
     throw std::invalid_argument("there is no coupling of kind " + kind);
 }
 
+// Vectors that bodies carry (body, whether it is a direction, place), rows that are products (x, y, factor, constant)
+// and ties (follower, leader, coefficients), and functions (rows, of q: (g, C), of q and weights: curvature).
+using NamedVector = std::vector<std::tuple<int, bool, std::array<double, 3>>>;
+using NamedConstraints = std::tuple<std::vector<NamedVector>, std::vector<std::tuple<int, int, double, double>>,
+                                    std::vector<std::tuple<int, int, std::vector<double>>>,
+                                    std::vector<std::tuple<int, nb::object, nb::object>>>;
+
+// A Python function that is called without the interpreter's lock held.
+std::shared_ptr<nb::object> held(const nb::object& function) {
+    return {new nb::object(function), [](nb::object* own) {
+                nb::gil_scoped_acquire acquire;
+                delete own;
+            }};
+}
+
+void copy_result(const nb::handle& given, std::size_t size, double* out) {
+    const auto array = nb::cast<nb::ndarray<const double, nb::c_contig, nb::device::cpu>>(given);
+    if (array.size() != size) throw std::invalid_argument("a constraint's function returned another shape than before");
+    std::copy(array.data(), array.data() + size, out);
+}
+
+CustomRows custom_rows(int rows, const nb::object& value, const nb::object& bending, std::size_t n) {
+    const std::size_t m = static_cast<std::size_t>(rows);
+    const auto first = held(value), second = held(bending);
+    return {rows,
+            [first, n, m](const double* q, double* g, double* C) {
+                nb::gil_scoped_acquire acquire;
+                const nb::object both = (*first)(array_of(q, {n}));
+                copy_result(both[0], m, g);
+                copy_result(both[1], m * n, C);
+            },
+            [second, n, m](const double* q, const double* weights, double* curvature) {
+                nb::gil_scoped_acquire acquire;
+                copy_result((*second)(array_of(q, {n}), array_of(weights, {m})), n * n, curvature);
+            }};
+}
+
+Constraints constraints_of(const NamedConstraints& named, const std::vector<Body>& bodies, std::size_t n) {
+    const auto& [vectors, products, ties, customs] = named;
+    const auto require_below = [](int index, std::size_t count) {
+        if (index < 0 || index >= static_cast<int>(count))
+            throw std::invalid_argument("a constraint points to nothing");
+    };
+    std::vector<VectorSum> sums;
+    for (const NamedVector& parts : vectors) {
+        VectorSum sum;
+        for (const auto& [body, direction, place] : parts) {
+            require_below(body + 1, bodies.size() + 1);
+            sum.parts.push_back({body, {place[0], place[1], place[2]}, direction});
+        }
+        sums.push_back(sum);
+    }
+    std::vector<ProductRow> rows;
+    for (const auto& [x, y, factor, constant] : products) {
+        require_below(x, sums.size());
+        require_below(y, sums.size());
+        rows.push_back({x, y, factor, constant});
+    }
+    std::vector<TieRow> tied;
+    for (const auto& [follower, leader, coefficients] : ties) {
+        require_below(follower, n);
+        require_below(leader, n);
+        tied.push_back({follower, leader, coefficients});
+    }
+    std::vector<CustomRows> functions;
+    for (const auto& [count, value, bending] : customs) functions.push_back(custom_rows(count, value, bending, n));
+    return Constraints(sums, rows, tied, functions, bodies, static_cast<int>(n));
+}
+
 Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation, In<2> translation, In<1> mass,
                        In<2> center, In<2> inertia, Integers<1> coordinate, In<1> ratio, In<1> offset,
                        Integers<1> origin, Integers<1> loads, Integers<2> carried, Integers<1> periodic, In<1> armature,
                        Integers<1> group, int groups, Integers<1> ends, In<1> gravity, const Named& forces,
-                       const NamedCouplings& couplings, In<2> actuation, In<2> constant, In<3> control, In<2> quadratic,
-                       In<2> centers) {
+                       const NamedCouplings& couplings, const NamedConstraints& constraints, In<2> actuation,
+                       In<2> constant, In<3> control, In<2> quadratic, In<2> centers) {
     const std::size_t bodies = parent.shape(0), n = armature.shape(0), m = actuation.shape(1);
     const std::size_t processes = constant.shape(1);
     require(origin, "origin", {bodies});
@@ -147,6 +218,7 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
         between.push_back(coupling_of(kind, a, b, values));
     }
     out.couplings = Couplings(between, out.tree.bodies);
+    out.constraints = constraints_of(constraints, out.tree.bodies, n);
     out.controls = static_cast<int>(m);
     for (std::size_t r = 0; r < n; ++r) {
         for (std::size_t c = 0; c < m; ++c) {
@@ -289,6 +361,39 @@ std::tuple<Out, Out, Out> jets_along(const Mechanism& mechanism, In<2> q, In<2> 
     return {M, A, Lqq};
 }
 
+// g (N, m), the magnitudes of the terms that cancel in it (N, m), and C (N, m, n) at each row of q (N, n).
+std::tuple<Out, Out, Out> constraints(const Mechanism& mechanism, In<2> q) {
+    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
+    const std::size_t m = static_cast<std::size_t>(mechanism.constraints.rows());
+    require(q, "q", {rows, n});
+    double *g = nullptr, *scale = nullptr, *C = nullptr;
+    const Out G = array_for(g, {rows, m}), S = array_for(scale, {rows, m}), J = array_for(C, {rows, m, n});
+    ConstraintJet w;
+    for (std::size_t s = 0; s < rows; ++s) {
+        mechanism.constraints.at(q.data() + s * n, w);
+        std::copy(w.g.begin(), w.g.end(), g + s * m);
+        std::copy(w.scale.begin(), w.scale.end(), scale + s * m);
+        std::copy(w.C.begin(), w.C.end(), C + s * m * n);
+    }
+    return {G, S, J};
+}
+
+// weights . g_qq (n, n) and g_qq v (m, n) at q.
+std::tuple<Out, Out> constraint_curvature(const Mechanism& mechanism, In<1> q, In<1> weights, In<1> v) {
+    const std::size_t n = static_cast<std::size_t>(mechanism.dof());
+    const std::size_t m = static_cast<std::size_t>(mechanism.constraints.rows());
+    require(q, "q", {n});
+    require(v, "v", {n});
+    require(weights, "weights", {m});
+    double *H = nullptr, *bend = nullptr;
+    const Out curvature = array_for(H, {n, n}), bent = array_for(bend, {m, n});
+    ConstraintJet w;
+    mechanism.constraints.at(q.data(), w);
+    mechanism.constraints.add_curvature(weights.data(), 1.0, w, H);
+    mechanism.constraints.bend(v.data(), w, bend);
+    return {curvature, bent};
+}
+
 }  // namespace
 
 void register_mechanism(nb::module_& m) {
@@ -296,12 +401,15 @@ void register_mechanism(nb::module_& m) {
         .def_static("make", &mechanism_of, nb::kw_only(), "parent"_a, "prismatic"_a, "rotation"_a, "translation"_a,
                     "mass"_a, "center"_a, "inertia"_a, "coordinate"_a, "ratio"_a, "offset"_a, "origin"_a, "loads"_a,
                     "carried"_a, "periodic"_a, "armature"_a, "group"_a, "groups"_a, "ends"_a, "gravity"_a, "forces"_a,
-                    "couplings"_a, "actuation"_a, "constant"_a, "control"_a, "quadratic"_a, "centers"_a)
+                    "couplings"_a, "constraints"_a, "actuation"_a, "constant"_a, "control"_a, "quadratic"_a,
+                    "centers"_a)
         .def("jet", &jet, "q"_a, "v"_a)
         .def("jets", &jets, "q"_a, "v"_a)
         .def("velocity_slopes", &velocity_slopes, "q"_a, "v"_a)
         .def("forces", &forces, "q"_a, "v"_a, "f"_a)
         .def("coupled_forces", &coupled_forces, "q"_a, "v"_a)
+        .def("constraints", &constraints, "q"_a)
+        .def("constraint_curvature", &constraint_curvature, "q"_a, "weights"_a, "v"_a)
         .def("jets_along", &jets_along, "q"_a, "v"_a, "alpha"_a, "beta"_a);
 }
 

@@ -9,6 +9,7 @@ NB_MODULE(_core, m) {
     varpin::border::register_explicit(m);
     varpin::border::register_backward(m);
     varpin::border::register_rollouts(m);
+    varpin::border::register_constrained(m);
     varpin::border::register_look(m);
     varpin::border::register_costs(m);
 }

@@ -3,9 +3,11 @@
 #pragma once
 
 #include <cstdint>
+#include <span>
 #include <stdexcept>
 #include <string>
 #include <utility>
+#include <vector>
 
 #include "arrays.hpp"
 #include "varpin/nodes.hpp"
@@ -128,6 +130,64 @@ inline const double* increments_of(const Mechanism& mechanism, const In<3>& incr
 inline const double* drift_of(const Mechanism& mechanism, const In<3>& drift, const NodeArrays& nodes) {
     const auto n = static_cast<std::size_t>(mechanism.dof());
     return given(drift, "drift", {nodes.paths(), nodes.steps(), n}) ? drift.data() : nullptr;
+}
+
+// The arrays that N steps are taken again from.
+class StepsAt {
+  public:
+    StepsAt(const Mechanism& mechanism, In<2> q, In<2> p, In<2> force, Integers<1> substeps, Bytes halvings)
+        : n(static_cast<std::size_t>(mechanism.dof())),
+          N(q.shape(0)),
+          q_(q),
+          p_(p),
+          force_(force),
+          halvings_(halvings),
+          place_(N + 1, 0) {
+        for (const auto& [array, name] : {std::pair{&q, "q"}, {&p, "p"}, {&force, "force"}})
+            require(*array, name, {N, n});
+        require(substeps, "substeps", {N});
+        for (std::size_t s = 0; s < N; ++s) {
+            const std::int64_t parts = substeps(s);
+            if (parts < 1 || parts > (std::int64_t{1} << 30))
+                throw std::invalid_argument("a step has one part or more, and at most 2^30");
+            place_[s + 1] = place_[s] + (parts > 1 ? static_cast<std::size_t>(parts) : 0);
+        }
+        require(halvings, "halvings", {place_[N]});
+        for (std::size_t k = 0; k < halvings.size(); ++k) {
+            if (halvings(k) < 1 || halvings(k) > 62) throw std::invalid_argument("parts are halved 1 to 62 times");
+        }
+    }
+
+    const std::size_t n, N;
+    const double* q(std::size_t s) const { return q_.data() + s * n; }
+    const double* p(std::size_t s) const { return p_.data() + s * n; }
+    const double* force(std::size_t s) const { return force_.data() + s * n; }
+    // Of the parts of a step; none if it was taken whole.
+    std::span<const std::uint8_t> halvings(std::size_t s) const {
+        return {halvings_.data() + place_[s], place_[s + 1] - place_[s]};
+    }
+    // How many steps right before a step were taken whole, as far as they bear on its guess.
+    int past(std::size_t s) const {
+        int found = 0;
+        while (found < 8 && s > static_cast<std::size_t>(found) && place_[s - found - 1] == place_[s]) ++found;
+        return found;
+    }
+
+  private:
+    In<2> q_, p_, force_;
+    Bytes halvings_;
+    std::vector<std::size_t> place_;  // (N + 1) where the parts of a step begin
+};
+
+// How the first step that was not solved ended, and how many were done before it.
+template <class Step>
+std::pair<Outcome, std::size_t> each_step(std::size_t N, const Step& step) {
+    nb::gil_scoped_release release;
+    for (std::size_t s = 0; s < N; ++s) {
+        const Outcome outcome = step(s);
+        if (outcome != Outcome::solved) return {outcome, s};
+    }
+    return {Outcome::solved, N};
 }
 
 }  // namespace varpin::border

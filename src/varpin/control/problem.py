@@ -24,7 +24,7 @@ from varpin.errors import InputError
 from varpin.integrators import Gauss, Integrator
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy, OpenLoop
-from varpin.mechanics.scene import Scene, closest_controls, require_scene
+from varpin.mechanics.scene import Scene, closest_controls, refuse_constraints, require_scene
 from varpin.simulation.run import simulate
 from varpin.support.checks import JointValues, count, is_one_of, joint_array, named_limits, positive, real
 from varpin.support.frozen import Frozen
@@ -122,6 +122,7 @@ class OptimalControlProblem(Frozen):
             CostError: A reference that is a function fails.
         """
         n, m = require_scene(scene).robot.dof, scene.controls
+        refuse_constraints(scene, "OptimalControlProblem")
         if not isinstance(cost, Cost):
             raise InputError(f"cost must be a cost, for example varpin.TrackingCost(...), got {type(cost).__name__}")
         dt, steps, hold = positive("dt", dt, "s"), count("steps", steps, least=1), count("hold", hold, least=1)

@@ -1,6 +1,7 @@
 """The compiled core: C++ in ``src/core``, one header an idea, built when the package is."""
 
 from varpin.core._core import BackwardPass as BackwardPass
+from varpin.core._core import ConstrainedRollout as ConstrainedRollout
 from varpin.core._core import CostTerms as CostTerms
 from varpin.core._core import Elimination as Elimination
 from varpin.core._core import ExpandedSteps as ExpandedSteps
@@ -22,6 +23,7 @@ from varpin.core._core import Watch as Watch
 from varpin.core._core import accelerations as accelerations
 from varpin.core._core import box_minimum as box_minimum
 from varpin.core._core import change_values as change_values
+from varpin.core._core import constrained_derivatives as constrained_derivatives
 from varpin.core._core import doubled_steps_agree as doubled_steps_agree
 from varpin.core._core import energy_turnover as energy_turnover
 from varpin.core._core import expand_changes as expand_changes

@@ -6,7 +6,7 @@ from enum import Enum, IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.core.arrays import Commands, Nodes
+from varpin.core.arrays import Commands, ConstraintRows, Nodes
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -39,6 +39,7 @@ class Mechanism:
         gravity: Floats,
         forces: Sequence[tuple[str, int, tuple[float, ...]]],
         couplings: Sequence[tuple[str, int, int, tuple[float, ...]]],
+        constraints: ConstraintRows,
         actuation: Floats,
         constant: Floats,
         control: Floats,
@@ -52,6 +53,12 @@ class Mechanism:
 
     def jets(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
         """M and L_vq (N, n, n) at each row of q and v (N, n)."""
+
+    def constraints(self, q: Floats) -> tuple[Floats, Floats, Floats]:
+        """G (N, c), the magnitudes of the terms that cancel in it (N, c), and dg/dq (N, c, n), at rows of q (N, n)."""
+
+    def constraint_curvature(self, q: Floats, weights: Floats, v: Floats) -> tuple[Floats, Floats]:
+        """Weights . g_qq (n, n) and g_qq v (c, n) at q (n,)."""
 
     def velocity_slopes(self, q: Floats, v: Floats) -> Floats:
         """The derivative of v in (q, p) (N, n, 2n) at each row of q and v; NaN where M is not positive definite."""
@@ -191,6 +198,53 @@ class VariationalRollout:
 
     def halvings(self, path: int) -> Bytes:
         """Of each part of every step of a path in its last roll that was not taken whole, step after step."""
+
+class ConstrainedRollout:
+    """Paths of a variational integrator under constraints; as VariationalRollout."""
+
+    def __init__(
+        self, mechanism: Mechanism, tableau: Tableau, places: Floats, tolerance: float, guards: Guards, paths: int
+    ) -> None: ...
+    def fork(self, guards: Guards) -> ConstrainedRollout:
+        """The paths as they stand, to move on by themselves; work arrays are shared, so one moves at a time."""
+
+    def begin(self, q: Floats, v: Floats) -> bool:
+        """Put each path at its row of q and v (P, n); False where an M(q) is not positive definite."""
+
+    def roll(self, dt: float, commands: Commands, increments: Floats, drift: Floats, nodes: Nodes) -> None:
+        """Take the steps that the commands are for, and write them into the nodes; named tuples of arrays."""
+
+    def kick(self, impulse: Floats) -> None:
+        """Add an impulse (P, n) to the momenta; constraints absorb what is normal to them."""
+
+    def nodes(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """Configurations, momenta, velocities (P, n) and energies (P,)."""
+
+    def halvings(self, path: int) -> Bytes:
+        """Of each part of every step of a path in its last roll that was not taken whole."""
+
+    def impulses(self, path: int) -> Floats:
+        """What the constraints gave in each step of a path in its last roll (steps, c): dg/dq' times it."""
+
+    def weakest(self, path: int) -> int:
+        """The row of the constraints that depended most on the others where a path was last."""
+
+def constrained_derivatives(
+    mechanism: Mechanism,
+    tableau: Tableau,
+    places: Floats,
+    tolerance: float,
+    guards: Guards,
+    dt: float,
+    q: Floats,
+    p: Floats,
+    force: Floats,
+    substeps: Integers,
+    halvings: Bytes,
+    *,
+    guess: Floats,
+) -> tuple[Floats, Floats, int, int]:
+    """As variational_derivatives."""
 
 def variational_derivatives(
     mechanism: Mechanism,
@@ -386,6 +440,8 @@ class Outcome(IntEnum):
     fold = ...
     energy = ...
     singular = ...
+    toggle = ...
+    assembly = ...
 
 class ForwardDynamics:
     """Forward dynamics at one state after another."""

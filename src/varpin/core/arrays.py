@@ -1,5 +1,6 @@
 """Arrays by name, as the compiled core takes them: a robot's tree, controls, and what a rollout writes."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -53,6 +54,48 @@ class Coupling(NamedTuple):
     a: int  # the body that carries the one point, -1 for the world
     b: int  # that of the other
     values: tuple[float, ...]  # both places (3,) in their body's axes [m], then its numbers in order
+
+
+class Carried(NamedTuple):
+    """A vector that a body carries."""
+
+    body: int  # -1 for the world
+    direction: bool  # or a point [m]
+    place: tuple[float, float, float]  # in the body's axes, from its joint
+
+
+class Product(NamedTuple):
+    """The constraint factor X . Y - constant of two vectors, each a sum of carried ones."""
+
+    x: int  # place in the list of vectors
+    y: int
+    factor: float
+    constant: float
+
+
+class Tied(NamedTuple):
+    """The constraint q_follower - sum_k coefficients_k q_leader^k."""
+
+    follower: int
+    leader: int
+    coefficients: tuple[float, ...]
+
+
+class CustomRows(NamedTuple):
+    """Constraints by functions."""
+
+    rows: int  # r
+    value: Callable[[Floats], tuple[Floats, Floats]]  # g (r,) and C (r, n) of q (n,)
+    curvature: Callable[[Floats, Floats], Floats]  # (n, n) of q and weights (r,)
+
+
+class ConstraintRows(NamedTuple):
+    """Rows of g(q) = 0, in this order; src/core/include/varpin/constraints.hpp."""
+
+    vectors: tuple[tuple[Carried, ...], ...] = ()  # each one vector, or the first minus the second
+    products: tuple[Product, ...] = ()
+    ties: tuple[Tied, ...] = ()
+    customs: tuple[CustomRows, ...] = ()
 
 
 class Diffusion(NamedTuple):

@@ -49,6 +49,7 @@ class Segment:
         energy: (k,) [J].
         statistics: Of the k steps.
         failure: Why the step after them failed, or None.
+        impulses: Of the constraints over each step (k, c) [N s or N m s], or None where there are none.
     """
 
     q: Floats
@@ -58,12 +59,14 @@ class Segment:
     energy: Floats
     statistics: StepStatistics
     failure: Failure | None = None
+    impulses: Floats | None = None
 
     def part(self, steps: int) -> Segment:
         """The first steps, as views."""
         values = {name: getattr(self, name)[:steps] for name in _ARRAYS}
         own = {item.name: getattr(self.statistics, item.name)[:steps] for item in fields(StepStatistics)}
-        return Segment(**values, statistics=StepStatistics(**own), failure=None)
+        impulses = None if self.impulses is None else self.impulses[:steps]
+        return Segment(**values, statistics=StepStatistics(**own), failure=None, impulses=impulses)
 
 
 class Integrator(ABC):
@@ -257,7 +260,9 @@ def join(segments: Sequence[Segment]) -> Segment:
     """Segments that follow each other as one."""
     statistics = joined([segment.statistics for segment in segments])
     nodes = {name: np.concatenate([getattr(s, name) for s in segments]) for name in _ARRAYS}
-    return Segment(**nodes, statistics=statistics, failure=segments[-1].failure)
+    parts = [s.impulses for s in segments if s.impulses is not None]
+    impulses = np.concatenate(parts) if parts else None
+    return Segment(**nodes, statistics=statistics, failure=segments[-1].failure, impulses=impulses)
 
 
 def diffusion_and_drift(scene: Scene, q: Floats, v: Floats, u: Floats, start: Floats) -> tuple[Floats, Floats]:

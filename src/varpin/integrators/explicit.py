@@ -27,7 +27,7 @@ from varpin.integrators.base import (
     steps_of,
 )
 from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.mechanics.scene import Scene
+from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.trajectory import Bytes, Trajectory
 
 Floats = NDArray[np.float64]
@@ -60,13 +60,14 @@ class _Explicit(Integrator):
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[ExplicitRun, list[Segment]]:
         """See :meth:`Integrator.start`."""
+        refuse_constraints(scene, str(self))
         paths, n = q0.shape
         run = ExplicitRun(core.ExplicitRollout.start(scene.core, self.method, q0, v0), q0.copy())
         nodes = new_nodes(paths, 1, n, scene.controls)
         if not run.paths.first_nodes(nodes):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
-        first = (part[:, 0] for part in (nodes.q, nodes.p, nodes.v, nodes.energy))
-        return run, first_nodes(*first, controls=scene.controls)
+        q, p, v, energy = (part[:, 0] for part in (nodes.q, nodes.p, nodes.v, nodes.energy))
+        return run, first_nodes(q, p, v, energy, scene.controls)
 
     def fork(self, state: ExplicitRun) -> ExplicitRun:
         """See :meth:`Integrator.fork`."""
@@ -120,6 +121,7 @@ class _Explicit(Integrator):
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, v)."""
+        refuse_constraints(scene, str(self))
         h, n = trajectory.dt, scene.robot.dof
         q, v = (np.ascontiguousarray(x[:-1]) for x in (trajectory.q, trajectory.v))
         force = trajectory.u @ scene.actuation.T + drifts(scene, trajectory)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from varpin.core import Tableau
 from varpin.integrators.collocation import Collocation
-from varpin.integrators.tableau import gauss, gauss_coefficients
+from varpin.integrators.tableau import gauss, gauss_coefficients, lobatto_places
 
 Floats = NDArray[np.float64]
 
@@ -50,6 +50,9 @@ class Gauss(Collocation):
 
     def _tableau(self) -> Tableau:
         return gauss(int(self.stages))
+
+    def _constraint_places(self) -> Floats | None:
+        return lobatto_places(int(self.stages))
 
     def _times(self) -> Floats:
         return gauss_coefficients(int(self.stages))[2]

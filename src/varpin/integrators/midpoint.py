@@ -10,7 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from varpin.core import Tableau
-from varpin.integrators.tableau import midpoint
+from varpin.integrators.tableau import lobatto_places, midpoint
 from varpin.integrators.variational import Guard, Variational
 from varpin.support.checks import fraction
 
@@ -71,6 +71,9 @@ class Midpoint(Variational):
 
     def _tableau(self) -> Tableau:
         return midpoint(float(self.alpha))
+
+    def _constraint_places(self) -> Floats | None:
+        return lobatto_places(1) if self.alpha == 0.5 else None
 
     def _times(self) -> Floats:
         return np.array([float(self.alpha)])

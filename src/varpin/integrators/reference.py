@@ -14,7 +14,7 @@ from varpin.core.arrays import Commands, Nodes, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import Failure, Integrator, Segment, control_of, drifts, segments_of, steps_of
 from varpin.integrators.explicit import REASONS, accelerations
-from varpin.mechanics.scene import Scene
+from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.support.checks import positive
 from varpin.trajectory import Trajectory
 
@@ -80,6 +80,7 @@ class Reference(Integrator):
         Raises:
             InputError: The scene has noise.
         """
+        refuse_constraints(scene, str(self))
         if scene.processes:
             raise InputError(f"{self} integrates no noise: leave it out of the scene")
         paths, n = q0.shape
@@ -169,6 +170,7 @@ class Reference(Integrator):
 
         The variational equations are integrated along with the motion, under the same tolerances.
         """
+        refuse_constraints(scene, str(self))
         n, dt = scene.robot.dof, trajectory.dt
         force = trajectory.u @ scene.actuation.T + drifts(scene, trajectory)
         J = np.empty((trajectory.steps, 2 * n, 3 * n))

@@ -100,3 +100,18 @@ def midpoint(alpha: float) -> Tableau:
         skew=alpha - 0.5,
         stiffly_accurate=False,
     )
+
+
+@functools.cache
+def lobatto_places(stages: int) -> Floats:
+    """Integrals (s + 1, s) of the Lagrange polynomials on Gauss's s points from 0 to each of Lobatto's s + 1 points.
+
+    Where constraints hold within a step of unit length. They are not to be written to.
+    """
+    _, weights, points = gauss_coefficients(stages)
+    inner = np.polynomial.legendre.Legendre.basis(stages).deriv().roots().real
+    at = 0.5 * (1.0 + np.concatenate([[-1.0], inner, [1.0]]))
+    places = np.array([end * (weights @ interpolation(points, end * points)) for end in at])
+    places[-1] = weights
+    places.setflags(write=False)
+    return places

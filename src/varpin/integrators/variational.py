@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.core import (
+    ConstrainedRollout,
     Guards,
     Outcome,
     Tableau,
     VariationalRollout,
     Watch,
+    constrained_derivatives,
     variational_curvatures,
     variational_derivatives,
     variational_ends,
@@ -38,7 +40,7 @@ from varpin.integrators.base import (
     steps_of,
     written,
 )
-from varpin.mechanics.scene import Scene
+from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.support.checks import count, fraction, is_one_of, positive
 from varpin.trajectory import MOST_HALVINGS, Bytes, Trajectory
 
@@ -53,6 +55,8 @@ REASONS: dict[int, str] = {
     Outcome.fold: "the step is at a fold of the step equation's solutions (its branch margin is not positive)",
     Outcome.energy: "the energy balance of the step does not close",
     Outcome.singular: "the mass matrix at the end of the step is not positive definite",
+    Outcome.toggle: "constraints are about to depend on each other, as at a toggle point, or cease to",
+    Outcome.assembly: "the constraints turn so far that the step may end in another assembly",
 }
 
 
@@ -65,7 +69,7 @@ class VariationalRun:
         start: Configurations at which the rollout started (P, n) [rad or m].
     """
 
-    paths: VariationalRollout
+    paths: VariationalRollout | ConstrainedRollout
     start: Floats
 
 
@@ -136,6 +140,26 @@ class Variational(Integrator):
     def _tableau(self) -> Tableau:
         """Its coefficients."""
 
+    def _constraint_places(self) -> Floats | None:
+        """Integrals (s + 1, s) to the points where constraints hold, :func:`lobatto_places`; None if they cannot."""
+        return None
+
+    def _places(self, scene: Scene) -> Floats:
+        """Those points, for a scene with constraints.
+
+        Raises:
+            InputError: It cannot keep them, or the scene has noise that it cannot take with them.
+        """
+        places = self._constraint_places()
+        if places is None:
+            refuse_constraints(scene, str(self))
+            raise InputError(f"{self} keeps no constraints")
+        if scene.processes and self.left < 1.0:
+            raise InputError("kick='split' does not go with constraints: take kick='left'")
+        if scene.noise.velocity_dependent:
+            raise InputError("noise whose fields depend on the velocity does not go with constraints")
+        return places
+
     def _shares(self) -> tuple[float, float]:
         """What of the guard's energy balance and budget is asked of its steps."""
         return 1.0, 1.0
@@ -159,9 +183,15 @@ class Variational(Integrator):
         return run, first_nodes(*run.paths.nodes(), scene.controls)
 
     def _begun(self, scene: Scene, q0: Floats, v0: Floats) -> VariationalRun:
-        rollout = VariationalRollout(
-            scene.core, self._tableau(), float(self.tolerance), self._guards(), self.left, len(q0)
-        )
+        rollout: VariationalRollout | ConstrainedRollout
+        if scene.constraints:
+            rollout = ConstrainedRollout(
+                scene.core, self._tableau(), self._places(scene), float(self.tolerance), self._guards(), len(q0)
+            )
+        else:
+            rollout = VariationalRollout(
+                scene.core, self._tableau(), float(self.tolerance), self._guards(), self.left, len(q0)
+            )
         if not rollout.begin(q0, v0):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         return VariationalRun(rollout, q0.copy())
@@ -180,13 +210,16 @@ class Variational(Integrator):
         dt: float,
     ) -> list[Segment]:
         """See :meth:`Integrator.rollout_compiled`."""
-        return segments_of(_rolled(scene, state, commands, increments, drift, dt), REASONS, state.paths.halvings)
+        found = segments_of(_rolled(scene, state, commands, increments, drift, dt), REASONS, state.paths.halvings)
+        if isinstance(state.paths, ConstrainedRollout):
+            return [_constrained(scene, state.paths, i, segment) for i, segment in enumerate(found)]
+        return found
 
     def watched(
         self, scene: Scene, state: VariationalRun, commands: Commands, dt: float, nodes: Nodes, watch: Watch
     ) -> tuple[Failure | None, Bytes]:
         """See :meth:`Integrator.watched`."""
-        if scene.noise.diffusion is None:
+        if scene.noise.diffusion is None or isinstance(state.paths, ConstrainedRollout):
             return super().watched(scene, state, commands, dt, nodes, watch)
         state.paths.roll(dt, contiguous(commands), scene.silence, scene.no_drift, nodes, watch)
         done = int(nodes.done[0])
@@ -228,12 +261,17 @@ class Variational(Integrator):
         A step that was taken in parts is taken again in the same parts, and their derivatives are chained.
         """
         steps = self._steps(scene, trajectory)
-        Jx, Jf, outcome, done = variational_derivatives(**steps, guess=np.ascontiguousarray(self._guess(trajectory)))
+        guess = np.ascontiguousarray(self._guess(trajectory))
+        if scene.constraints:
+            Jx, Jf, outcome, done = constrained_derivatives(**steps, places=self._places(scene), guess=guess)
+        else:
+            Jx, Jf, outcome, done = variational_derivatives(**steps, guess=guess)
         _require_solved(trajectory, outcome, done)
         return Jx, Jf, Jx[:, :, scene.robot.dof :]
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
         """See :meth:`Integrator.contract`; steps that were taken in parts are chained as in :meth:`linearize`."""
+        refuse_constraints(scene, "second_order")
         steps = self._steps(scene, trajectory)
         H, outcome, done = variational_curvatures(
             **steps, guess=np.ascontiguousarray(self._guess(trajectory)), z=np.ascontiguousarray(z)
@@ -293,6 +331,15 @@ class Variational(Integrator):
     @abstractmethod
     def _times(self) -> Floats:
         """Where its stages stand in a step of unit length (s,)."""
+
+
+def _constrained(scene: Scene, paths: ConstrainedRollout, i: int, segment: Segment) -> Segment:
+    """With the impulses of path ``i``, and the constraint that stopped it, if one did."""
+    failure = segment.failure
+    if failure is not None and failure.reason in (REASONS[Outcome.toggle], REASONS[Outcome.assembly]):
+        label = scene.bound_constraints.labels[paths.weakest(i)]
+        failure = replace(failure, reason=f"{failure.reason}: {label}")
+    return replace(segment, impulses=paths.impulses(i)[:, scene.constraint_order], failure=failure)
 
 
 @functools.lru_cache(maxsize=256)

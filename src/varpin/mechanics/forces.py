@@ -38,11 +38,11 @@ class Force(Frozen, ABC):
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            object.__setattr__(self, item.name, _kept(item.name, getattr(self, item.name)))
+            object.__setattr__(self, item.name, kept(item.name, getattr(self, item.name)))
 
     def __repr__(self) -> str:
         own = [(item.name, getattr(self, item.name)) for item in fields(self)]
-        given = [f"{name}={_shown(value)}" for name, value in own if value is not None]
+        given = [f"{name}={shown(value)}" for name, value in own if value is not None]
         return f"{type(self).__name__}({', '.join(given)})"
 
     @abstractmethod
@@ -56,24 +56,25 @@ class Force(Frozen, ABC):
         """
 
 
-def _kept(name: str, value: Any) -> Any:
+def kept(name: str, value: Any) -> Any:
     """A parameter that no one can change any more."""
     if value is None or isinstance(value, str):
         return value
     if isinstance(value, Mapping):
         return MappingProxyType(dict(value))
     if isinstance(value, tuple | list) and len(value) == 2 and isinstance(value[0], str):
-        return value[0], _kept(name, value[1])
+        return value[0], kept(name, value[1])
     given = as_floats(name, value)
     given.setflags(write=False)
     return given
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """A parameter as text."""
     if isinstance(value, str):
         return repr(value)
     if isinstance(value, tuple):
-        return f"({', '.join(map(_shown, value))})"
+        return f"({', '.join(map(shown, value))})"
     return str(dict(value) if isinstance(value, Mapping) else value.tolist())
 
 
@@ -261,8 +262,8 @@ class FrameWrench(Force):
             raise InputError(f"axes must be 'world' or 'frame', got {self.axes!r}")
         wrench = finite_array("wrench", self.wrench, (6,))
         if not isinstance(self.frame, str | tuple):
-            raise InputError(f"frame must be a frame's name or (name, place), got {_shown(self.frame)}")
-        body, turned, place = _point("frame", self.frame, robot)
+            raise InputError(f"frame must be a frame's name or (name, place), got {shown(self.frame)}")
+        body, turned, place = point_of("frame", self.frame, robot)
         if body < 0:
             raise InputError(f"frame {self.frame!r} of robot {robot.name!r} is fixed to the base: no joint moves it")
         at = (*place.tolist(), 0.0, 0.0, 0.0)
@@ -303,7 +304,7 @@ class FrameSpring(Force):
         stiffness = _along_axes("stiffness", self.stiffness)
         rest = as_floats("rest", self.rest)
         if rest.shape not in ((), (3,)) or not np.isfinite(rest).all() or (rest.ndim == 0 and rest < 0.0):
-            raise InputError(f"rest must be a length >= 0, or finite along three axes (3,), got {_shown(rest)}")
+            raise InputError(f"rest must be a length >= 0, or finite along three axes (3,), got {shown(rest)}")
         if not stiffness.any():
             return ()
         if rest.ndim == 0 and rest > 0.0:
@@ -335,7 +336,7 @@ class FrameDamper(Force):
         return (Coupling("FrameDamper", *bodies, (*places, *damping.tolist())),) if damping.any() else ()
 
 
-def _point(name: str, point: Any, robot: Robot) -> tuple[int, Floats, Floats]:
+def point_of(name: str, point: Any, robot: Robot) -> tuple[int, Floats, Floats]:
     """The body that carries a point, -1 for the world, with the frame's rotation (3, 3) and the place (3,) on it."""
     offset: Any = (0.0, 0.0, 0.0)
     frame = point
@@ -356,7 +357,7 @@ def _point(name: str, point: Any, robot: Robot) -> tuple[int, Floats, Floats]:
 
 def _ends_of(force: FrameSpring | FrameDamper, robot: Robot) -> tuple[tuple[int, int], tuple[float, ...]]:
     """The bodies at both ends, and the places on them one after the other."""
-    (a, _, here), (b, _, there) = _point("a", force.a, robot), _point("b", force.b, robot)
+    (a, _, here), (b, _, there) = point_of("a", force.a, robot), point_of("b", force.b, robot)
     if a < 0 and b < 0:
         raise InputError(
             f"{type(force).__name__}: both ends are fixed, in the world or to the base of robot {robot.name!r}: no "
@@ -369,7 +370,7 @@ def _along_axes(name: str, value: ArrayLike) -> Floats:
     """``value``, one number or (3,), as numbers >= 0 along the axes of the world."""
     given = as_floats(name, value)
     if given.shape not in ((), (3,)) or not (np.isfinite(given).all() and (given >= 0.0).all()):
-        raise InputError(f"{name} must be >= 0, one number or along three axes (3,), got {_shown(given)}")
+        raise InputError(f"{name} must be >= 0, one number or along three axes (3,), got {shown(given)}")
     return np.array(np.broadcast_to(given, (3,)))
 
 

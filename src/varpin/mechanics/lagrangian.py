@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from varpin.errors import InputError
 from varpin.mechanics.forces import keeps_energy, of_kind
-from varpin.mechanics.scene import Scene, require_scene
+from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.model.tree import joint_axis, z_to
 from varpin.support.checks import JointValues, fraction, joint_array, positive
 from varpin.textbook import rigid_body_Lqq
@@ -222,6 +222,7 @@ def discrete_lagrangian(
         InputError: Wrong shapes, values that are not finite, dt <= 0, alpha outside [0, 1].
     """
     joints = require_scene(scene).robot.joint_names
+    refuse_constraints(scene, "discrete_lagrangian")
     q0, q1 = joint_array("q0", q0, joints), joint_array("q1", q1, joints)
     h, a = positive("dt", dt, "s"), fraction("alpha", alpha)
     jet = lagrangian_jet(scene, (1.0 - a) * q0 + a * q1, (q1 - q0) / h)

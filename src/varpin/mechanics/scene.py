@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.core import Mechanism as Core
-from varpin.core.arrays import Coupling, Diffusion, Element
+from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element
 from varpin.errors import InputError, RobotError
+from varpin.mechanics.constraints import Bound, Constraint, constraints_of, joined
 from varpin.mechanics.forces import (
     CoulombFriction,
     Force,
@@ -59,6 +60,9 @@ VALUES = {
     "FrameSpring": "springs between frames are others",
     "FrameLengthSpring": "springs between frames are others",
     "FrameDamper": "dampers between frames are others",
+    "constraints.between": "constraints between frames are others",
+    "constraints.ties": "ties of joints are others",
+    "constraints.custom": "custom constraints are others",
     "noise.constant": "the noise has another strength",
     "noise.control": "the noise has another strength",
     "noise.quadratic": "the noise has another strength",
@@ -68,7 +72,9 @@ VALUES = {
 OF_ELEMENTS = ("CoulombFriction", "JointStop", "PositionServo")
 # The same of couplings, with the bodies of both ends; entries are there only if couplings are.
 OF_COUPLINGS = ("FrameLoad", "FrameWrench", "FrameSpring", "FrameLengthSpring", "FrameDamper")
-OF_FORCES = (*OF_ELEMENTS, *OF_COUPLINGS)
+# The same of constraints.
+OF_CONSTRAINTS = ("constraints.between", "constraints.ties", "constraints.custom")
+OF_FORCES = (*OF_ELEMENTS, *OF_COUPLINGS, *OF_CONSTRAINTS)
 # So many joints are told of with numbers.
 _NAMED = 7
 _OF_JOINTS = ("damping", "stiffness", "rest", "armature")
@@ -109,6 +115,7 @@ class Scene(Frozen):
         actuation: Matrix (n, m) from controls to generalized forces [N m or N per unit of control]; of a position
             servo's control, its stiffness.
         noise: The diffusion fields of the noise models, if any.
+        constraints: What the motion keeps, g(q) = 0; see :mod:`varpin.mechanics.constraints`.
     """
 
     robot: Robot
@@ -122,6 +129,10 @@ class Scene(Frozen):
     armature: Floats = field(repr=False)
     actuation: Floats = field(repr=False)
     noise: BoundNoise = field(repr=False)
+    constraints: tuple[Constraint, ...]
+    # The same as the core takes them, and the place there of each of their rows (c,).
+    bound_constraints: Bound = field(repr=False)
+    constraint_order: NDArray[np.int64] = field(repr=False)
     # Warnings that the log of this process has had: their kind, the time step [s] and the joint, if one is named.
     announced: set[tuple[str, float, int | None]] = field(repr=False)
 
@@ -136,6 +147,7 @@ class Scene(Frozen):
         rest: JointValues = 0.0,
         actuation: ArrayLike | Sequence[str] | None = None,
         noise: Noise | Sequence[Noise] | None = None,
+        constraints: Constraint | Sequence[Constraint] = (),
     ) -> None:
         """Describe a scene.
 
@@ -155,6 +167,7 @@ class Scene(Frozen):
             rest: Where that spring is slack, the same [rad or m]; 0 for joints that are not named.
             actuation: A matrix (n, m); or the names of the m actuated joints; every joint if left out.
             noise: A noise model, several of them, or their sum; see :mod:`varpin.mechanics.noise`.
+            constraints: What the motion keeps: loops that close, gears, rods, as :class:`varpin.PointOnPoint` does.
 
         Raises:
             InputError: A wrong shape, a value that is not finite, negative damping or stiffness, a force that does not
@@ -177,7 +190,9 @@ class Scene(Frozen):
         values["actuation"] = _served(robot, _actuation(robot, actuation), values["elements"])
         _refuse_trembling_angles(noise, values["elements"], robot)
         values["noise"] = bind(noise, values["actuation"], robot.joint_names)
-        values["announced"] = set()
+        values["constraints"] = constraints_of(constraints)
+        bound, order = joined([own.bind(robot) for own in values["constraints"]])
+        values |= {"bound_constraints": bound, "constraint_order": order, "announced": set()}
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
@@ -192,6 +207,7 @@ class Scene(Frozen):
         parts = [f"gravity {self.gravity.tolist()}" if self.gravity.any() else "no gravity"]
         parts += [name for name in ("damping", "stiffness") if getattr(self, name).any()]
         parts += [name for name, _ in self._other_forces()]
+        parts += [type(own).__name__ for own in self.constraints]
         return f"Scene({self.robot.name}: {', '.join(parts)}, {self.controls} controls)"
 
     def _repr_html_(self) -> str:
@@ -209,6 +225,7 @@ class Scene(Frozen):
             ("damping [N m s/rad or N s/m]", of(self.damping)),
             ("springs [N m/rad or N/m]", of(self.stiffness)),
             *((f"{name} on", listed(acting)) for name, acting in self._other_forces()),
+            *(("constraint", repr(own)) for own in self.constraints),
             ("driven", f"{listed(driven)} by {self.controls} controls" if driven else "none"),
             ("noise", f"{self.processes} processes" if self.processes else "none"),
         ]
@@ -248,11 +265,43 @@ class Scene(Frozen):
         """Which coordinates (n,) move each other, labels from 0: the robot's groups, some joined by couplings."""
         group = self.robot.tree.group.copy()
         for own in self.couplings:
-            joined = np.unique(group[self._moved([own])])
-            group[np.isin(group, joined)] = joined[0]
+            together = np.unique(group[self._moved([own])])
+            group[np.isin(group, together)] = together[0]
+        for coordinates in self._constrained():
+            together = np.unique(group[coordinates])
+            group[np.isin(group, together)] = together[0]
         label: NDArray[np.int64] = np.unique(group, return_inverse=True)[1].astype(np.int64)
         label.setflags(write=False)
         return label
+
+    def _constrained(self) -> list[list[int]]:
+        """The coordinates of each constraint row."""
+        tree, rows = self.robot.tree, self.bound_constraints.rows
+        found = []
+        for product in rows.products:
+            parts = (*rows.vectors[product.x], *rows.vectors[product.y])
+            found.append(sorted({int(c) for part in parts for c in path_coordinates(tree, part.body)}))
+        found += [[tie.follower, tie.leader] for tie in rows.ties]
+        return found + [list(range(self.robot.dof)) for _ in rows.customs]
+
+    @property
+    def constraint_labels(self) -> tuple[str, ...]:
+        """What each row of the constraints is (c,), in words."""
+        return tuple(self.bound_constraints.labels[place] for place in self.constraint_order)
+
+    def constraint_values(self, q: JointValues) -> tuple[Floats, Floats]:
+        """g(q) (c,) [m or rad] and dg/dq (c, n) of the constraints.
+
+        Args:
+            q: Configuration, (n,) or by joint name [rad or m].
+
+        Raises:
+            InputError: A wrong shape, or a value that is not finite.
+            UnknownJoint: ``q`` names a joint that is no coordinate of the robot.
+        """
+        at = joint_array("q", q, self.robot.joint_names)
+        g, _, C = self.core.constraints(at[None])
+        return g[0, self.constraint_order], C[0, self.constraint_order]
 
     @property
     def _gear(self) -> Floats:
@@ -300,21 +349,37 @@ class Scene(Frozen):
     def core(self) -> Core:
         """The scene as the compiled core takes it; without fields that only Python can evaluate."""
         tree, fields = self.robot.tree, self.diffusion
+        own = {name: getattr(tree, name) for name in _TREE}
+        if self.constraints:
+            own |= self._of_constrained_tree()
         return Core.make(
-            **{name: getattr(tree, name) for name in _TREE},
+            **own,
             group=self.group,
             groups=int(self.group.max()) + 1,
-            ends=block_ends(self.group),
+            ends=np.array([self.robot.dof]) if self.constraints else block_ends(self.group),
             armature=self.armature,
             gravity=self.gravity,
             forces=self.elements,
             couplings=self.couplings,
+            constraints=self.bound_constraints.rows,
             actuation=self.actuation,
             constant=fields.constant,
             control=fields.control,
             quadratic=fields.quadratic,
             centers=fields.center,
         )
+
+    def _of_constrained_tree(self) -> dict[str, NDArray[np.int64]]:
+        """What of the tree is another under constraints."""
+        tree, rows = self.robot.tree, self.bound_constraints.rows
+        # Constraints do work on a light part, whose energy has no balance of its own then.
+        changed = {"loads": tree.loads[:0], "carried": tree.carried[:0]}
+        # A tie knows how often a joint went round; so may a function.
+        periodic = tree.periodic.copy()
+        periodic[[c for tie in rows.ties for c in (tie.follower, tie.leader)]] = 0
+        if rows.customs:
+            periodic[:] = 0
+        return changed | {"periodic": periodic}
 
     @cached_property
     def bounds(self) -> Bounds:
@@ -358,6 +423,7 @@ class Scene(Frozen):
         for kind in OF_COUPLINGS:
             if ends := [(each.a, each.b, *each.values) for each in self.couplings if each.kind == kind]:
                 own[kind] = np.array(ends, dtype=np.float64)
+        own |= _numbers_of(self.bound_constraints.rows)
         own |= {"rotation": tree.rotation, "translation": tree.translation}
         own |= {"ratio": tree.ratio, "offset": tree.offset}
         if self.noise.diffusion is not None:
@@ -392,6 +458,7 @@ class Scene(Frozen):
             InputError: A wrong shape, or a value that is not finite.
             UnknownJoint: ``q`` names a joint that is no coordinate of the robot.
         """
+        refuse_constraints(self, "Scene.holding_torque")
         at = joint_array("q", q, self.robot.joint_names)
         _, Lq, *_ = self.core.jet(at, np.zeros_like(at))
         wrenches = self.core.coupled_forces(at[None], np.zeros((1, at.size)))[0][0] if self.couplings else 0.0
@@ -424,6 +491,46 @@ class Scene(Frozen):
                 "N m or N that no actuator takes"
             )
         return controls
+
+
+def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
+    """The numbers of constraints by the names of :data:`VALUES`, none where there are no such rows."""
+    found: dict[str, Floats] = {}
+    if rows.products:
+        table = []
+        for product in rows.products:
+            numbers = [product.factor, product.constant]
+            for own in (rows.vectors[product.x], rows.vectors[product.y]):
+                for part in own:
+                    numbers += [part.body, float(part.direction), *part.place]
+                numbers += [-2.0, 0.0, 0.0, 0.0, 0.0] * (2 - len(own))
+            table.append(numbers)
+        found["constraints.between"] = np.array(table)
+    if rows.ties:
+        most = max(len(tie.coefficients) for tie in rows.ties)
+        found["constraints.ties"] = np.array(
+            [
+                [tie.follower, tie.leader, *tie.coefficients, *[0.0] * (most - len(tie.coefficients))]
+                for tie in rows.ties
+            ]
+        )
+    if rows.customs:
+        found["constraints.custom"] = np.array([[float(own.rows)] for own in rows.customs])
+    return found
+
+
+def refuse_constraints(scene: Scene, what: str) -> None:
+    """Refuse a scene with constraints where they would not be kept.
+
+    Raises:
+        InputError: The scene has constraints.
+    """
+    if scene.constraints:
+        names = ", ".join(dict.fromkeys(type(own).__name__ for own in scene.constraints))
+        raise InputError(
+            f"{what} does not take scenes with constraints, and this one has {names}: simulate and linearize do, with "
+            "varpin.Midpoint() or varpin.Gauss(stages)"
+        )
 
 
 def closest_controls(scene: Scene, q: Floats) -> Floats:
@@ -467,7 +574,9 @@ def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> l
         found.append(f"{VALUES[name]} in the scene")
     if values:
         found += [
-            f"{VALUES[name]} in the scene" for name in OF_COUPLINGS if name in scene.values and name not in values
+            f"{VALUES[name]} in the scene"
+            for name in (*OF_COUPLINGS, *OF_CONSTRAINTS)
+            if name in scene.values and name not in values
         ]
     return list(dict.fromkeys(found))
 

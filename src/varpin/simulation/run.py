@@ -13,8 +13,9 @@ from varpin.core.arrays import Commands
 from varpin.errors import InputError, UnknownJoint, VarpinError
 from varpin.integrators import Integrator, Midpoint, Reference, Segment, integrator_of
 from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
+from varpin.mechanics.assembly import along_constraints, assemble, missed
 from varpin.mechanics.policy import LinearPolicy, OpenLoop, takes
-from varpin.mechanics.scene import Scene, require_scene
+from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.simulation import limits
 from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstable_loop
@@ -43,6 +44,8 @@ logger = logging.getLogger(__name__)
 _CHUNK = 30_000
 # What steps where no integrator is given.
 _MIDPOINT = Midpoint()
+# What a start may miss constraints by to be moved onto them unasked, and what of that is not spoken of [rad or m].
+_CORRECTED, _UNSAID = 0.02, 1e-9
 # Parts of a motion that are kept one by one.
 _PARTS = 256
 
@@ -202,6 +205,8 @@ def _trajectory(
         joint_names=scene.robot.joint_names,
         statistics=steps.statistics,
         scene_values=scene.values,
+        constraint_forces=np.zeros((N, len(scene.constraint_order))) if steps.impulses is None else steps.impulses / dt,
+        constraint_labels=scene.constraint_labels,
     )
 
 
@@ -261,7 +266,8 @@ def simulate(
     found out and taken; or give two of ``dt``, ``steps`` and ``duration``.
 
     Main args:
-        scene: The scene.
+        scene: The scene. Where it has constraints, a start that is off them by little is moved onto them, and a
+            warning says how far.
         q0: Initial configuration, (n,) or by joint name, 0 for those not named [rad or m].
         v0: Initial velocity, the same [rad/s or m/s].
         dt: Time step [s].
@@ -304,6 +310,7 @@ def simulate(
         NoiseError: A function of a CustomNoise did; holds the trajectory so far.
         StepFailure: A step has no trustworthy solution; holds the trajectory so far.
         SingularMassMatrix: M(q0) is not positive definite.
+        AssemblyError: The scene's constraints cannot be kept next to q0.
         Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt; while a tolerance looks for its
             integrator, a plain one.
     """
@@ -316,6 +323,8 @@ def simulate(
         controls = scene.command_at(q0)
     accuracy: Accuracy | None = None
     wished: tuple[Finding, ...] = ()
+    if scene.constraints:
+        q0, v0, wished = _on_constraints(scene, q0, v0)
     if tolerance is not None:
         span = _time_of_wish(dt, steps, duration)
         chosen = _chosen(scene, q0, v0, span, tolerance, controls, integrator)
@@ -366,12 +375,14 @@ def simulate(
             try:
                 (segment,) = integrator.rollout(scene, state, block, drawn, dt)
             except InputError as error:
+                if not stepwise:
+                    raise  # of a custom constraint
                 now = record.trajectory()
                 raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
             record.add(segment)
             if segment.failure is not None:
                 node = record.trajectory()
-                if hold is not None and check:
+                if hold is not None and check and not scene.constraints:
                     # What a law has just decided is in no step yet.
                     last = node.u[:0] if law is None else block.u
                     decided = np.concatenate([node.u[: node.steps if law is None else done : hold], last])
@@ -418,6 +429,32 @@ def _times(dt: float | None, steps: int | None, duration: float | None) -> tuple
     return dt, steps
 
 
+def _on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats, tuple[Finding, ...]]:
+    """The nearest state that keeps the constraints, and by how much it is another, if that is to be said.
+
+    Raises:
+        InputError: q0 misses them by more than is corrected unasked.
+        AssemblyError: They cannot be kept next to q0.
+    """
+    label, miss = missed(scene, q0)
+    if miss > _CORRECTED:
+        raise InputError(
+            f"q0 misses {label} by {miss:.4g} m or rad: varpin.assemble(scene, q0) looks for the nearest configuration "
+            "that keeps the constraints"
+        )
+    q = assemble(scene, q0)
+    v = along_constraints(scene, q, v0)
+    moved, turned = float(np.abs(q - q0).max()), float(np.abs(v - v0).max())
+    words = []
+    if moved > _UNSAID:
+        words.append(
+            f"q0 was moved by up to {moved:.3g} rad or m onto the constraints (it missed {label} by {miss:.3g})"
+        )
+    if turned > _UNSAID * max(1.0, float(np.abs(v0).max())):
+        words.append(f"v0 was changed by up to {turned:.3g} rad/s or m/s, to what the constraints allow")
+    return q, v, (Finding("start off the constraints", "; ".join(words)),) if words else ()
+
+
 def _time_of_wish(dt: float | None, steps: int | None, duration: float | None) -> float:
     """The duration of a motion with a tolerance [s]."""
     for name, value in (("dt", dt), ("steps", steps)):
@@ -447,6 +484,7 @@ def _chosen(
         raise InputError(
             "tolerance is of single motions without noise: leave the noise out of the scene, or give dt and steps"
         )
+    refuse_constraints(scene, "simulate with a tolerance")
     if isinstance(integrator, Reference):
         raise InputError("Reference chooses its own steps: its tolerance is rtol; give it dt and steps")
     if callable(controls):
@@ -552,7 +590,7 @@ def _told(
     scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None, *, check: bool
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
     """A whole motion with what is to be said of it; ``hold`` is the period of its feedback in steps, None for none."""
-    if check:
+    if check and not scene.constraints:
         return examined_in_loop(scene, integrator, trajectory, hold)
     found = evident(scene, integrator, trajectory)
     return with_warnings(trajectory, found), found

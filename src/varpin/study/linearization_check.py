@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.integrators import Integrator, Midpoint
 from varpin.linearization import linearize
 from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.mechanics.scene import Scene, require_scene
+from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.simulation.run import simulate
 from varpin.support.checks import JointValues, finite_array, joint_array, positive
 
@@ -72,6 +72,7 @@ def check_linearization(
         InputError: Wrong shapes, or values that are not finite.
         StepFailure: A step of the differences cannot be taken; a smaller ``step`` or ``dt`` may help.
     """
+    refuse_constraints(require_scene(scene), "check_linearization")
     n, m, k = require_scene(scene).robot.dof, scene.controls, scene.processes
     q, v = joint_array("q", q, scene.robot.joint_names), joint_array("v", v, scene.robot.joint_names)
     u = np.zeros(m) if u is None else finite_array("u", u, (m,))

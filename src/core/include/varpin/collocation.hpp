@@ -261,6 +261,8 @@ class Collocation {
     }
 
   private:
+    friend class ConstrainedStepper;  // which borders the matrix with constraints
+
     template <class Solve>
     void solve_blocks(const double* right, double* x, const Solve& solve_block) {
         const double* matrix = lu.data();

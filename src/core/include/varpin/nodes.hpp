@@ -13,6 +13,8 @@ enum class Outcome : std::int64_t {
     fold = 3,        // another branch of the step equation's solutions
     energy = 4,      // the energy balance of the step does not close
     singular = 5,    // the mass matrix is not positive definite
+    toggle = 6,      // constraints are about to depend on each other, or cease to
+    assembly = 7,    // constraints turn so far in the step that it may end in another assembly
 };
 
 // Views of arrays (P, N, ...), row by row.

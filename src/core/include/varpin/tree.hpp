@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "varpin/body.hpp"
+#include "varpin/constraints.hpp"
 #include "varpin/couplings.hpp"
 #include "varpin/forces.hpp"
 #include "varpin/spatial.hpp"
@@ -76,6 +77,7 @@ struct Mechanism {
     int controls = 0;        // m
     std::vector<Transmission> actuation;
     Diffusion diffusion;
+    Constraints constraints;  // holonomic; steps that keep them are those of constrained.hpp
 
     int dof() const { return tree.dof(); }
 

@@ -50,6 +50,26 @@ struct PathState {
     std::vector<std::uint8_t> halvings;  // of each part of every step of the last `roll` that was not taken whole
 };
 
+// What a step took.
+inline void record_effort(const Effort& effort, const Nodes& nodes, std::int64_t row) {
+    std::int64_t* tally = nodes.tally + 4 * row;
+    tally[0] = effort.newton_iterations;
+    tally[1] = effort.jets;
+    tally[2] = effort.sweeps;
+    tally[3] = effort.substeps;
+    nodes.quality[3 * row] = effort.residual;
+    nodes.quality[3 * row + 1] = effort.branch_margin;
+}
+
+// The node that it led to.
+inline void record_node(const PathState& state, int n, const Nodes& nodes, std::int64_t row) {
+    std::copy(state.q.begin(), state.q.end(), nodes.q + row * n);
+    std::copy(state.momentum.begin(), state.momentum.end(), nodes.p + row * n);
+    std::copy(state.v.begin(), state.v.end(), nodes.v + row * n);
+    nodes.energy[row] = state.energies.total();
+    nodes.quality[3 * row + 2] = state.energies.defect();
+}
+
 template <class Size = int, class Stages = int>
 class VariationalStepper {
   public:
@@ -197,12 +217,12 @@ class VariationalStepper {
                 if (noisy) noise_kick(left, u + s * m, dw, state);
                 constant_force(mechanism, drift ? drift + row * n : nullptr, u + s * m, force.data());
                 const Outcome outcome = step(h, state);
-                record_effort(nodes, row);
+                record_effort(effort, nodes, row);
                 nodes.ended[path] = static_cast<std::int64_t>(outcome);
                 if (outcome != Outcome::solved) break;
                 state.halvings.insert(state.halvings.end(), halvings.begin(), halvings.end());
                 if (noisy && left < 1.0) noise_kick(1.0 - left, u + s * m, dw, state);
-                record_node(nodes, row, state);
+                record_node(state, n, nodes, row);
                 nodes.done[path] = s + 1;
                 if (watch && !watch->after(s, effort.substeps)) break;
             }
@@ -338,24 +358,6 @@ class VariationalStepper {
     void noise_kick(double part, const double* u, const double* dw, PathState& state) {
         noise_impulse(mechanism, part, state.q.data(), state.center.data(), u, dw, bend.data());
         kick(bend.data(), state);
-    }
-
-    void record_effort(const Nodes& nodes, std::int64_t row) const {
-        std::int64_t* tally = nodes.tally + 4 * row;
-        tally[0] = effort.newton_iterations;
-        tally[1] = effort.jets;
-        tally[2] = effort.sweeps;
-        tally[3] = effort.substeps;
-        nodes.quality[3 * row] = effort.residual;
-        nodes.quality[3 * row + 1] = effort.branch_margin;
-    }
-
-    void record_node(const Nodes& nodes, std::int64_t row, const PathState& state) const {
-        std::copy(state.q.begin(), state.q.end(), nodes.q + row * n);
-        std::copy(state.momentum.begin(), state.momentum.end(), nodes.p + row * n);
-        std::copy(state.v.begin(), state.v.end(), nodes.v + row * n);
-        nodes.energy[row] = state.energies.total();
-        nodes.quality[3 * row + 2] = state.energies.defect();
     }
 };
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +12,16 @@ from numpy.typing import NDArray
 from varpin.control.costs import Cost, CostSum, Terminal
 from varpin.errors import InputError, RobotError, RobotNotFound, UnknownFrame, UnknownJoint, VarpinError
 from varpin.io.scenefile.references import Timeline, constant
-from varpin.io.scenefile.spec import CostSpec, ForceSpec, FrameForceSpec, SceneSpec, degrees_for_radians
+from varpin.io.scenefile.spec import CostSpec, ForceSpec, SceneSpec, degrees_for_radians
 from varpin.io.scenefile.table import Floats, SceneFileError, Table, suggestion
 from varpin.io.scenefile.terms import Given
+from varpin.mechanics.constraints import Constraint
 from varpin.mechanics.forces import Force, PositionServo
 from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
 from varpin.mechanics.scene import Scene, closest_controls, damping_of
 from varpin.model import Robot, load_robot
+
+_OnFrames = TypeVar("_OnFrames", bound=Force | Constraint)
 
 # Times at which controls and references are compared with what stays, at most.
 _SAMPLES = 2000
@@ -64,6 +68,7 @@ class Layout:
         damping: (n,), like stiffness, rest, q0 and v0.
         forces: Others on joints.
         frame_forces: Others on frames.
+        constraints: What the motion keeps; where there are some, no joint is left out.
         actuated: Indices of the driven joints (m,).
         gear: Generalized force per control (m,).
         torque_limit: (m,) [N m or N], infinite where there is none.
@@ -80,6 +85,7 @@ class Layout:
     rest: Floats
     forces: tuple[JointForces, ...]
     frame_forces: tuple[Force, ...]
+    constraints: tuple[Constraint, ...]
     q0: Floats
     v0: Floats
     actuated: NDArray[np.int64]
@@ -126,6 +132,7 @@ class Layout:
                 for own in self.forces
             ),
             frame_forces=tuple(own for own in self.frame_forces if _has_moving_end(own, robot)),
+            constraints=self.constraints,
             q0=self.q0[keep],
             v0=self.v0[keep],
             actuated=np.array([position[int(joint)] for joint in self.actuated[driven]], dtype=np.int64),
@@ -178,6 +185,7 @@ class Layout:
             stiffness=self.stiffness,
             rest=self.rest,
             forces=[*(self._force(own) for own in self.forces), *self.frame_forces],
+            constraints=self.constraints,
             actuation=self.actuation,
             noise=[model for model in map(self._noise, self.noise) if model is not None] or None,
         )
@@ -319,7 +327,8 @@ def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
         stiffness=springs.spread("stiffness", spec.stiffness, names),
         rest=rest,
         forces=forces,
-        frame_forces=tuple(_frame_force(force, robot) for force in spec.frame_forces),
+        frame_forces=tuple(_on_frames(own.force, own.table, robot) for own in spec.frame_forces),
+        constraints=tuple(_on_frames(own.constraint, own.table, robot) for own in spec.constraints),
         q0=q0,
         v0=initial.spread("v", spec.v0, names),
         actuated=actuated,
@@ -434,16 +443,17 @@ def _force(spec: ForceSpec, robot: Robot) -> JointForces:
     return found
 
 
-def _frame_force(spec: FrameForceSpec, robot: Robot) -> Force:
+def _on_frames(own: _OnFrames, table: Table, robot: Robot) -> _OnFrames:
+    """What acts on frames itself, if it fits the robot."""
     try:
-        spec.force.bind(robot)
+        own.bind(robot)
     except UnknownFrame as error:
-        raise spec.table.error(
+        raise table.error(
             "", f"there is no frame {error.frame!r}; {suggestion(error.frame, error.frames, 'frames')}"
         ) from None
-    except InputError as error:
-        raise spec.table.error("", str(error)) from None
-    return spec.force
+    except (InputError, UnknownJoint) as error:
+        raise table.error("", str(error)) from None
+    return own
 
 
 def _has_moving_end(force: Force, robot: Robot) -> bool:

@@ -85,6 +85,8 @@ def idle_joints(layout: Layout, scene: Scene) -> Mask:
     A joint at rest that no force acts on in any configuration, and that costs nothing where it is, stays; so do its
     group and what is left out with it. Noise in proportion to controls does nothing to controls that are zero.
     """
+    if scene.constraints:
+        return np.zeros(scene.robot.dof, dtype=np.bool_)
     touched = layout.v0 != 0.0
     touched |= _pushed(layout, scene)
     touched |= _weighed(layout)
@@ -188,7 +190,7 @@ def _terms(layout: Layout) -> dict[str, str]:
     kinds: set[type[Force]] = {force.kind for force in layout.forces} | {type(own) for own in layout.frame_forces}
     absent = [words for words, kind in _ABSENT.items() if kind not in kinds] + ["contact"]
     loads = [f"{load.mass:g} kg at {load.frame}" for load in spec.robot.payload]
-    return {
+    terms = {
         "gravity": f"{', '.join(f'{g:g}' for g in gravity)} m/s^2" if any(gravity) else "none",
         "damping": of(layout.damping, joints),
         "springs": of(layout.stiffness, joints),
@@ -200,3 +202,6 @@ def _terms(layout: Layout) -> dict[str, str]:
         "other forces": ", ".join(word for word, kind in {**FORCES, **FRAME_FORCES}.items() if kind in kinds) or "none",
         "not modelled": f"{', '.join(absent)}; shapes are read only for a replay",
     }
+    if layout.constraints:
+        terms["constraints"] = ", ".join(dict.fromkeys(type(own).__name__ for own in layout.constraints))
+    return terms

@@ -15,6 +15,15 @@ from varpin.integrators import Integrator
 from varpin.io.scenefile.references import Reference
 from varpin.io.scenefile.table import ByName, SceneFileError, Table, suggestion
 from varpin.io.scenefile.terms import Term
+from varpin.mechanics.constraints import (
+    Constraint,
+    Distance,
+    FrameOnFrame,
+    JointTie,
+    PointOnLine,
+    PointOnPlane,
+    PointOnPoint,
+)
 from varpin.mechanics.forces import (
     Armature,
     CoulombFriction,
@@ -52,6 +61,15 @@ FRAME_FORCES: Mapping[str, type[Force]] = {
     "frame_spring": FrameSpring,
     "frame_wrench": FrameWrench,
 }
+# Of a [[constraint]].
+CONSTRAINTS: Mapping[str, type[Constraint]] = {
+    "distance": Distance,
+    "frame_on_frame": FrameOnFrame,
+    "joint_tie": JointTie,
+    "point_on_line": PointOnLine,
+    "point_on_plane": PointOnPlane,
+    "point_on_point": PointOnPoint,
+}
 FIGURES = (".png", ".pdf", ".svg")
 
 
@@ -80,6 +98,19 @@ class FrameForceSpec:
     """
 
     force: Force
+    table: Table
+
+
+@dataclass(frozen=True, eq=False)
+class ConstraintSpec:
+    """A constraint.
+
+    Attributes:
+        constraint: What the file says.
+        table: Where it stands, for messages.
+    """
+
+    constraint: Constraint
     table: Table
 
 
@@ -128,6 +159,7 @@ class SceneSpec:
         rest: Where springs are slack, by joint [rad or m].
         forces: Others on joints.
         frame_forces: Others on frames.
+        constraints: What the motion keeps.
         actuated: Joints that are driven; None for all.
         gear: Generalized force per control, by driven joint.
         torque_limit: By driven joint [N m or N]; ``"robot"`` for the robot description's; None for none.
@@ -157,6 +189,7 @@ class SceneSpec:
     rest: ByName
     forces: tuple[ForceSpec, ...]
     frame_forces: tuple[FrameForceSpec, ...]
+    constraints: tuple[ConstraintSpec, ...]
     actuated: tuple[str, ...] | None
     gear: ByName
     torque_limit: ByName | str | None

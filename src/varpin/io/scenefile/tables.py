@@ -32,11 +32,13 @@ from varpin.io.scenefile.keys import (
 )
 from varpin.io.scenefile.references import Reference, Sine
 from varpin.io.scenefile.spec import (
+    CONSTRAINTS,
     FIGURES,
     FORCES,
     FRAME_FORCES,
     MOST_EVALUATIONS,
     MOST_STEPS,
+    ConstraintSpec,
     CostSpec,
     ForceSpec,
     FrameForceSpec,
@@ -44,6 +46,7 @@ from varpin.io.scenefile.spec import (
 )
 from varpin.io.scenefile.table import ByName, Table, inside
 from varpin.io.scenefile.terms import TERMS, Term
+from varpin.mechanics.constraints import FrameOnFrame
 from varpin.model import Payload
 from varpin.support.checks import is_file
 
@@ -354,8 +357,23 @@ _OF_FRAMES = {
 }
 
 
-def _frame_force_keys(kind: Any) -> type[Keys]:
-    own: dict[str, Any] = {item.name: (Annotated[Any, _OF_FRAMES[item.name]], _default(item)) for item in fields(kind)}
+# What the fields of constraints take; frames of a weld and joints are names alone.
+_OF_CONSTRAINTS = {
+    "a": _POINT,
+    "b": _POINT,
+    "axes": TEXT,
+    "coefficients": numbers(),
+    "direction": numbers(3),
+    "joint": TEXT,
+    "leader": TEXT,
+    "length": number("m", above=0.0),
+    "normal": numbers(3),
+    "placement": numbers(16),
+}
+
+
+def _keys_of_fields(kind: Any, rules: Mapping[str, Rule]) -> type[Keys]:
+    own: dict[str, Any] = {item.name: (Annotated[Any, rules[item.name]], _default(item)) for item in fields(kind)}
     return create_model(kind.__name__, __base__=TypedKeys, **own)
 
 
@@ -379,7 +397,11 @@ def _cost_keys(name: str, term: Term) -> type[Keys]:
 
 
 FORCE_KEYS = {name: _force_keys(kind) for name, kind in FORCES.items()} | {
-    name: _frame_force_keys(kind) for name, kind in FRAME_FORCES.items()
+    name: _keys_of_fields(kind, _OF_FRAMES) for name, kind in FRAME_FORCES.items()
+}
+CONSTRAINT_KEYS = {
+    name: _keys_of_fields(kind, _OF_CONSTRAINTS | (dict.fromkeys("ab", TEXT) if kind is FrameOnFrame else {}))
+    for name, kind in CONSTRAINTS.items()
 }
 INTEGRATOR_KEYS = {name: _integrator_keys(kind) for name, kind in INTEGRATORS.items()}
 COST_KEYS = {name: _cost_keys(name, term) for name, term in TERMS.items()}
@@ -397,6 +419,7 @@ class SceneKeys(Keys):
     robot: RobotKeys
     springs: SpringKeys = SpringKeys()
     force: tuple[Annotated[Any, typed(FORCE_KEYS)], ...] = ()
+    constraint: tuple[Annotated[Any, typed(CONSTRAINT_KEYS)], ...] = ()
     actuation: ActuationKeys = ActuationKeys()
     noise: tuple[NoiseKeys, ...] = ()
     initial: InitialKeys = InitialKeys()
@@ -436,6 +459,7 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
         rest=keys.springs.rest,
         forces=tuple(force for force in forces if isinstance(force, ForceSpec)),
         frame_forces=tuple(force for force in forces if isinstance(force, FrameForceSpec)),
+        constraints=tuple(_constraint(root.table(f"constraint[{k}]"), own) for k, own in enumerate(keys.constraint)),
         actuated=keys.actuation.joints,
         gear=keys.actuation.gear,
         torque_limit=keys.actuation.torque_limit,
@@ -467,8 +491,18 @@ def _force(table: Table, keys: TypedKeys) -> ForceSpec | FrameForceSpec:
     return FrameForceSpec(FRAME_FORCES[keys.type](**given), table)
 
 
+def _constraint(table: Table, keys: TypedKeys) -> ConstraintSpec:
+    given = {name: _point(value) for name, value in _given(keys).items()}
+    if "placement" in given:
+        given["placement"] = [given["placement"][row : row + 4] for row in range(0, 16, 4)]
+    try:
+        return ConstraintSpec(CONSTRAINTS[keys.type](**given), table)
+    except InputError as error:
+        raise table.error("", str(error)) from None
+
+
 def _point(value: Any) -> Any:
-    """A point as forces take it."""
+    """A point as forces and constraints take it."""
     if isinstance(value, PointKeys):
         return value.frame, list(value.place)
     return list(value) if isinstance(value, tuple) else value

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from varpin.errors import InputError
 from varpin.integrators import Integrator
 from varpin.integrators.base import Segment, open_loop
-from varpin.mechanics.scene import Scene, require_scene
+from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.simulation.refinement import INTEGRATORS
 from varpin.simulation.run import held_rows
 from varpin.support.checks import JointValues, joint_array, positive
@@ -90,6 +90,7 @@ class Setting(Frozen):
             InputError: Wrong shapes or values, a scene with noise, controls that are a function.
         """
         joints = require_scene(scene).robot.joint_names
+        refuse_constraints(scene, "A study of integrators")
         if scene.processes:
             raise InputError("errors of single motions are compared here: leave the noise out of the scene")
         if callable(controls):

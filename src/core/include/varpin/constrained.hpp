@@ -1,0 +1,939 @@
+// Variational steps under holonomic constraints g(q) = 0. docs/constraints.md. Of the discrete action
+// h sum_i b_i L(Q_i, V_i) - sum_k Lam_k . g(Q~_k), with Lobatto points Q~_k = q0 + h sum_j t_kj V_j, t_kj the integral
+// of the j-th Lagrange polynomial on Gauss's points from 0 to the k-th Lobatto point:
+//
+//     L_v(Q_i, V_i) = p0 + h sum_j a_ij (L_q + F)_j - sum_{k<s} w_ik C_k' Lam_k,    w_ik = 1 - t_ki / b_i
+//     g(Q~_k) = 0 for k = 1 .. s
+//     p1 = p0 + h sum_j b_j (L_q + F)_j - sum_{k<=s} C_k' Lam_k,    C(q1) M(q1)^-1 p1 = 0
+//
+// Newton's matrix for all (V, Lam) at once is solved by pivoting. Rows of C that depend on others, in the metric of the
+// kinetic energy at the start of a substep, are left out of it: those that are kept hold them too.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <span>
+#include <vector>
+
+#include "varpin/collocation.hpp"
+#include "varpin/constraints.hpp"
+#include "varpin/guards.hpp"
+#include "varpin/variational.hpp"
+
+namespace varpin {
+
+// C at a node, its rows in the metric of the kinetic energy and in order of what each adds to those before it.
+struct ConstraintBasis {
+    ConstraintJet jet;
+    std::vector<double> ldl;   // (n, n) factors of M
+    std::vector<double> rows;  // (m, n) D^-1/2 L^-1 C', a row each
+    std::vector<double> Q;     // (r, n) an orthonormal basis of theirs
+    std::vector<double> R;     // (r, r) upper triangular: row order[k] = sum_{i<=k} R_ik Q_i
+    std::vector<double> size;  // (m) of the terms that cancel in a row
+    std::vector<int> order;    // (r) of the rows that are kept
+    double least = 1.0;        // the smallest diagonal entry of R, in units of its row
+    int weakest = 0;           // its row
+    int rank() const { return static_cast<int>(order.size()); }
+};
+
+// Where a constrained path stands besides.
+struct ConstrainedState {
+    ConstrainedState(const Mechanism& mechanism, int stages)
+        : path(mechanism, stages),
+          impulse(mechanism.constraints.rows()),
+          past_impulse(stages * mechanism.constraints.rows()) {}
+    PathState path;
+    int rank = -1;                     // of the constraints, for the whole rollout
+    int weakest = 0;                   // the constraint row that a failed step would name
+    std::vector<double> impulse;       // (m) of the last step, negative Lam added up [N s or N m s]
+    std::vector<double> past_impulse;  // (s, m) Lam of the last whole step
+    std::vector<double> impulses;      // (steps, m) of the last roll
+};
+
+class ConstrainedStepper {
+  public:
+    // `places` is t_kj (s + 1, s).
+    ConstrainedStepper(const Mechanism& mechanism, const Tableau& tableau, const std::vector<double>& places,
+                       double tolerance, const Guards& guards)
+        : mechanism(mechanism),
+          tableau(tableau),
+          tolerance(tolerance),
+          guards(guards),
+          equation(mechanism, this->tableau, Solver::dense),
+          energy_guard(mechanism, Solver::dense, true),
+          n(mechanism.dof()),
+          m(mechanism.constraints.rows()),
+          stages(tableau.stages),
+          force(n),
+          at(places),
+          weight(stages * stages),
+          trial(n),
+          mass_jet(mechanism.tree, false),
+          point(stages),
+          impulse(stages * m),
+          total(m),
+          Qk(n),
+          scaled(n),
+          row_scale(m),
+          y(n),
+          bent(n * n),
+          pushed(stages * n),
+          push_size(stages * n),
+          unit(n) {
+        mass_jet.M.resize(entries(n, n));
+        for (int i = 0; i < stages; ++i) {
+            for (int k = 0; k < stages; ++k) weight[i * stages + k] = 1.0 - at[k * stages + i] / tableau.b[i];
+        }
+    }
+    ConstrainedStepper(const ConstrainedStepper&) = delete;
+    ConstrainedStepper& operator=(const ConstrainedStepper&) = delete;
+
+    const Mechanism& mechanism;
+    const Tableau tableau;
+    double tolerance;
+    Guards guards;
+    Collocation<> equation;
+    EnergyGuard<> energy_guard;
+    int n, m, stages;
+    std::vector<double> force;           // (n) constant over the step
+    Effort effort;                       // of the last step
+    std::vector<std::uint8_t> halvings;  // of each part of the last step; none if it was taken whole
+
+    // Put a path at (q, p), p brought onto the tangent space; false where M(q) is not positive definite.
+    bool begin_at(const double* q, const double* p, ConstrainedState& state, bool project = true) {
+        PathState& path = state.path;
+        for (int i = 0; i < n; ++i) {
+            path.place[i] = {{q[i], 0.0}, 0.0};
+            unwind(i, path);
+            path.q[i] = q[i];
+            path.p[i] = {p[i], 0.0};
+            path.momentum[i] = p[i];
+        }
+        diffusion_centers(mechanism, q, path.center.data());
+        path.known = path.level = 0;
+        state.rank = -1;
+        if (!look_at(state)) return false;
+        state.rank = here.rank();
+        if (project) absorb(path);
+        for (int i = 0; i < n; ++i) unit[i] = path.place[i].place.high;
+        if (!energy_guard.node(unit.data(), path.momentum.data(), path.v.data())) return false;
+        energy_guard.begin(unit.data(), path.momentum.data(), path.v.data(), path.energies);
+        return true;
+    }
+
+    // Put a path at (q, v).
+    bool begin(const double* q, const double* v, ConstrainedState& state) {
+        Jet<double>& jet = equation.stage[0];
+        first_order(mechanism, q, v, jet);
+        const std::vector<double> p = jet.Lv;
+        return begin_at(q, p.data(), state);
+    }
+
+    // The constraints and the factors of M at a path's node.
+    bool look_at(ConstrainedState& state) {
+        for (int i = 0; i < n; ++i) unit[i] = state.path.place[i].place.high;
+        if (!find_basis(unit.data(), state.rank, here)) return false;
+        return energy_guard.node(unit.data(), state.path.momentum.data(), state.path.v.data());
+    }
+
+    // Add an impulse (n) to the momentum; constraints absorb what is normal to them.
+    void kick(const double* push, ConstrainedState& state) {
+        PathState& path = state.path;
+        for (int i = 0; i < n; ++i) {
+            path.p[i] = path.p[i].plus(push[i]);
+            path.momentum[i] = path.p[i].high;
+            unit[i] = path.place[i].place.high;
+        }
+        absorb(path);
+        energy_guard.kicked(unit.data(), path.momentum.data(), path.v.data(), path.energies);
+    }
+
+    // One whole step, in as many substeps as the guards ask for; as VariationalStepper::step.
+    Outcome step(double h, ConstrainedState& state) {
+        effort = {};
+        halvings.clear();
+        std::fill(state.impulse.begin(), state.impulse.end(), 0.0);
+        PathState& path = state.path;
+        int level = std::max(path.level - 1, 0), deepest = level;
+        bool extrapolated = level == 0 && path.known > 0;
+        std::int64_t place = 0;  // in units of h / 2^level
+        while (place < (std::int64_t{1} << level)) {
+            if (extrapolated) {
+                extrapolate(state);
+            } else {
+                guess(path);
+            }
+            const Outcome outcome = attempt(VariationalStepper<>::length_of(h, level), state);
+            if (outcome == Outcome::solved) {
+                if (level > 0) halvings.push_back(static_cast<std::uint8_t>(level));
+                ++place;
+                if (level > 0 && place % 2 == 0) {
+                    --level;
+                    place /= 2;
+                }
+            } else if (!(extrapolated && outcome != Outcome::energy)) {
+                if (level >= guards.most_halvings) return outcome;
+                ++level;
+                place *= 2;
+            }
+            deepest = std::max(deepest, level);
+            extrapolated = false;
+        }
+        path.level = deepest;
+        path.known = 0;
+        if (deepest == 0) {
+            std::copy(equation.V.begin(), equation.V.end(), path.past.begin());
+            std::copy(path.v.begin(), path.v.end(), path.past_end.begin());
+            state.past_impulse = impulse;
+            path.known = 1;
+        }
+        return Outcome::solved;
+    }
+
+    // The part of a step of length h that was halved `level` times, begun from the current velocity.
+    Outcome part(double h, int level, ConstrainedState& state) {
+        guess(state.path);
+        return attempt(VariationalStepper<>::length_of(h, level), state);
+    }
+
+    // A whole step from a guess (s, n) next to its root.
+    Outcome from_guess(double h, const double* V, ConstrainedState& state) {
+        std::copy(V, V + stages * n, equation.V.begin());
+        std::fill(impulse.begin(), impulse.end(), 0.0);
+        return attempt(h, state);
+    }
+
+    void roll(double h, const Commands& commands, const double* increments, const double* drift,
+              std::vector<ConstrainedState>& states, const Nodes& nodes) {
+        const std::int64_t steps = nodes.steps;
+        const int controls = mechanism.controls, k = mechanism.diffusion.processes;
+        const bool noisy = increments != nullptr && k > 0;
+        for (std::int64_t p = 0; p < nodes.paths; ++p) {
+            ConstrainedState& state = states[p];
+            PathState& path = state.path;
+            double* u = nodes.u + p * steps * controls;
+            path.halvings.clear();
+            state.impulses.clear();
+            nodes.done[p] = 0;
+            nodes.ended[p] = static_cast<std::int64_t>(Outcome::solved);
+            if (!look_at(state)) {
+                nodes.ended[p] = static_cast<std::int64_t>(Outcome::singular);
+                continue;
+            }
+            for (std::int64_t s = 0; s < steps; ++s) {
+                const std::int64_t row = p * steps + s;
+                const double* dw = noisy ? increments + row * k : nullptr;
+                apply_policy(commands, p, s, n, path.q.data(), path.momentum.data(), u);
+                if (noisy) {
+                    noise_impulse(mechanism, 1.0, path.q.data(), path.center.data(), u + s * controls, dw, y.data());
+                    const std::vector<double> push = y;
+                    kick(push.data(), state);
+                }
+                constant_force(mechanism, drift ? drift + row * n : nullptr, u + s * controls, force.data());
+                const Outcome outcome = step(h, state);
+                record_effort(effort, nodes, row);
+                nodes.ended[p] = static_cast<std::int64_t>(outcome);
+                if (outcome != Outcome::solved) break;
+                path.halvings.insert(path.halvings.end(), halvings.begin(), halvings.end());
+                state.impulses.insert(state.impulses.end(), state.impulse.begin(), state.impulse.end());
+                record_node(path, n, nodes, row);
+                nodes.done[p] = s + 1;
+            }
+        }
+    }
+
+    // Derivatives of the substep that was solved last, from (q0, p0) under the force f, as a map on all of R^2n: of
+    // (q1, p1) in (q0, p0), Jx (2n, 2n), and in f, Jf (2n, n). At q0 it asks for no g(q0) = 0, and p0's part across the
+    // tangent space is absorbed.
+    void derivatives(double h, const PathState& path, double* Jx, double* Jf) {
+        std::swap(here, origin);
+        const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = 3 * n;
+        assemble(h);
+        factor_lu_pivoting(saddle.data(), size, rows.data());
+        dV.resize(entries(wide, w));
+        equation.right_sides(h, {0, n}, dV);
+        bend_points();
+        columns.assign(entries(size, w), 0.0);
+        for (int i = 0; i < wide; ++i) {
+            for (int c = 0; c < w; ++c) {
+                double entry = dV[i * w + c];
+                for (int k = 0; k < stages && c < n; ++k)
+                    entry -= weight[(i / n) * stages + k] * bends[(k * n + i % n) * n + c];
+                columns[i * w + c] = scaled[i % n] * entry;
+            }
+        }
+        for (int k = 0; k < stages; ++k) {
+            for (int a = 0; a < r; ++a) {
+                const int row = here.order[a];
+                for (int c = 0; c < n; ++c)
+                    columns[(wide + k * r + a) * w + c] = -row_scale[row] * point[k].C[row * n + c] / h;
+            }
+        }
+        std::vector<double> sorted(columns.size());
+        for (int i = 0; i < size; ++i) std::copy_n(&columns[rows[i] * w], w, &sorted[i * w]);
+        solve_lu_rows(saddle.data(), size, {0, size}, sorted.data(), w, w);
+        for (int i = 0; i < wide; ++i) {
+            for (int c = 0; c < w; ++c) dV[i * w + c] = scaled[i % n] * sorted[i * w + c];
+        }
+        equation.end_derivatives(h, {0, n}, dV, Jx, Jf);
+        // Of the impulses up to the last one: C_k' dLam_k + Lam_k . g_qq dQ~_k.
+        const auto end = [&](int row, int c) -> double& {
+            return c < 2 * n ? Jx[row * 2 * n + c] : Jf[row * n + c - 2 * n];
+        };
+        std::vector<double> dQ(n);
+        for (int c = 0; c < w; ++c) {
+            for (int k = 0; k < stages; ++k) {
+                for (int i = 0; i < n; ++i) {
+                    double sum = 0.0;
+                    for (int j = 0; j < stages; ++j) sum += at[k * stages + j] * dV[(j * n + i) * w + c];
+                    dQ[i] = h * sum + (c == i ? 1.0 : 0.0);
+                }
+                for (int i = 0; i < n; ++i) {
+                    double sum = inner(&bends[(k * n + i) * n], dQ.data());
+                    for (int a = 0; a < r; ++a) {
+                        const int row = here.order[a];
+                        sum += jet_at(k).C[row * n + i] * row_scale[row] * sorted[(wide + k * r + a) * w + c];
+                    }
+                    end(n + i, c) -= sum;
+                }
+            }
+        }
+        std::swap(here, origin);
+        project_derivatives(path, end);
+    }
+
+    ConstraintBasis here, there;  // at the start of the substep that was solved last, and at its end
+    ConstraintBasis origin;       // of it, once the path has moved on
+
+  private:
+    // In units of the terms that make up a row: below, it depends on the others. Rounding leaves 1e-15.
+    static constexpr double dependent = 1e-9;
+    // Below, constraints that are independent are too near to a point where they are not.
+    static constexpr double near_toggle = 1e-5;
+    // How far C may turn within a substep, in units of itself, where guards are active.
+    static constexpr double most_turn = 0.7;
+    static constexpr double stagnation = 100.0;
+    static constexpr int most_corrections = 12;
+
+    std::vector<double> at;      // (s + 1, s) t_kj
+    std::vector<double> weight;  // (s, s) w_ik
+    Trial trial;
+    Jet<double> mass_jet;
+    std::vector<ConstraintJet> point;  // of Lobatto points 1 .. s
+    std::vector<double> impulse;       // (s, m) Lam_k, zero for rows that are left out
+    std::vector<double> total;         // (m)
+    std::vector<double> last;          // (m) Lam_s
+    std::vector<double> Qk, scaled, row_scale, y, bent, pushed, push_size, unit;
+    std::vector<double> block, saddle, right, solution;
+    std::vector<int> rows;
+    std::vector<double> null, reduced_mass, reduced;
+
+    std::vector<double> dV, columns, bends;
+
+    // Lam_k . g_qq (s, n, n) at the Lobatto points but the last.
+    void bend_points() {
+        bends.assign(entries(stages * n, n), 0.0);
+        for (int k = 0; k < stages; ++k)
+            mechanism.constraints.add_curvature(&impulse[k * m], 1.0, k == 0 ? here.jet : point[k - 1],
+                                                &bends[k * n * n]);
+    }
+
+    // The last impulse: M dv1 + C1' dLam = dp - (L_vq + Lam . g_qq) dq1, C1 dv1 = -(g_qq v1) dq1, and dp1 = M dv1 +
+    // L_vq dq1.
+    template <class End>
+    void project_derivatives(const PathState& path, const End& end) {
+        const int r = there.rank();
+        for (int i = 0; i < n; ++i) unit[i] = path.place[i].place.high;
+        Jet<double>& jet = equation.stage[0];
+        lagrangian_jet(mechanism, unit.data(), path.v.data(), jet);
+        std::vector<double> bend(m * n), curvature(n * n), z(n), along(r), dq(n), turned(n);
+        mechanism.constraints.bend(path.v.data(), there.jet, bend.data());
+        mechanism.constraints.add_curvature(last.data(), 1.0, there.jet, curvature.data());
+        for (int c = 0; c < 3 * n; ++c) {
+            for (int i = 0; i < n; ++i) dq[i] = end(i, c);
+            for (int i = 0; i < n; ++i) {
+                turned[i] = inner(&jet.A[i * n], dq.data());
+                z[i] = end(n + i, c) - turned[i] - inner(&curvature[i * n], dq.data());
+            }
+            whiten(there, z.data(), z.data());
+            for (int k = 0; k < r; ++k) {
+                double own = -inner(&bend[there.order[k] * n], dq.data());
+                for (int j = 0; j < k; ++j) own -= there.R[j * r + k] * along[j];
+                along[k] = own / there.R[k * r + k];
+            }
+            const std::vector<double> before = z;
+            for (int k = 0; k < r; ++k) {
+                const double change = along[k] - inner(&there.Q[k * n], before.data());
+                for (int i = 0; i < n; ++i) z[i] += change * there.Q[k * n + i];
+            }
+            for (int i = 0; i < n; ++i) z[i] *= std::sqrt(there.ldl[i * n + i]);
+            for (int i = n - 1; i >= 0; --i) {
+                double sum = z[i];
+                for (int j = 0; j < i; ++j) sum += there.ldl[i * n + j] * z[j];
+                end(n + i, c) = sum + turned[i];
+            }
+        }
+    }
+
+    bool unwinds(int i) const { return mechanism.tree.periodic[i] && !mechanism.forces.anchors(i); }
+    void unwind(int i, PathState& path) const {
+        if (unwinds(i)) path.place[i].unwind();
+    }
+
+    // M's factors and C at q, the `rank` rows that are farthest from depending on each other, or, for -1, all that do
+    // not. False where M is not positive definite.
+    bool find_basis(const double* q, int rank, ConstraintBasis& basis) {
+        mass_matrix(mechanism, q, mass_jet);
+        basis.ldl = mass_jet.M;
+        if (!factor_ldl(basis.ldl.data(), n, {0, n})) return false;
+        mechanism.constraints.at(q, basis.jet);
+        basis.rows.resize(m * n);
+        basis.size.resize(m);
+        // Of the terms that cancel in a row: their squares times the diagonal of M^-1.
+        std::vector<double> inverse(n), column(n);
+        for (int c = 0; c < n; ++c) {
+            std::fill(column.begin(), column.end(), 0.0);
+            column[c] = 1.0;
+            whiten(basis, column.data(), column.data());
+            for (double entry : column) inverse[c] += entry * entry;
+        }
+        for (int r = 0; r < m; ++r) {
+            whiten(basis, &basis.jet.C[r * n], &basis.rows[r * n]);
+            double size = 0.0;
+            for (int c = 0; c < n; ++c) size += basis.jet.size[r * n + c] * basis.jet.size[r * n + c] * inverse[c];
+            basis.size[r] = std::sqrt(size);
+        }
+        // Gram and Schmidt, twice, the row first that has most left in units of its size.
+        std::vector<double> rest = basis.rows;
+        std::vector<char> taken(m, 0);
+        basis.order.clear();
+        basis.Q.clear();
+        basis.least = 1.0;
+        basis.weakest = 0;
+        const int most = rank < 0 ? std::min(m, n) : rank;
+        double next = 0.0;
+        std::vector<std::vector<double>> share(m);
+        for (int k = 0; k <= most && k < m; ++k) {
+            int best = -1;
+            double farthest = 0.0;
+            for (int r = 0; r < m; ++r) {
+                if (taken[r]) continue;
+                const double own = norm(&rest[r * n]) / std::max(basis.size[r], nothing);
+                if (best < 0 || own > farthest) best = r, farthest = own;
+            }
+            if (k == most) {
+                next = farthest;
+                break;
+            }
+            if (!(farthest > dependent) && rank < 0) break;
+            basis.least = farthest;
+            basis.weakest = best;
+            taken[best] = 1;
+            const double length = norm(&rest[best * n]);
+            if (!(length > 0.0)) break;
+            basis.order.push_back(best);
+            for (int c = 0; c < n; ++c) basis.Q.push_back(rest[best * n + c] / length);
+            const double* q_k = &basis.Q[k * n];
+            for (int r = 0; r < m; ++r) {
+                if (taken[r] && r != best) continue;
+                const double along = inner(q_k, &rest[r * n]);
+                share[r].push_back(along);
+                for (int c = 0; c < n; ++c) rest[r * n + c] -= along * q_k[c];
+                if (r == best) continue;
+                for (int i = 0; i <= k; ++i) {
+                    const double again = inner(&basis.Q[i * n], &rest[r * n]);
+                    share[r][i] += again;
+                    for (int c = 0; c < n; ++c) rest[r * n + c] -= again * basis.Q[i * n + c];
+                }
+            }
+        }
+        const int found = basis.rank();
+        basis.R.assign(found * found, 0.0);
+        for (int k = 0; k < found; ++k) {
+            for (int i = 0; i <= k; ++i) basis.R[i * found + k] = share[basis.order[k]][i];
+        }
+        // Rows that were dependent are no more: the rollout began where they were by chance.
+        if (rank >= 0 && (next > 1e3 * dependent || found < rank)) basis.least = 0.0;
+        return true;
+    }
+
+    // D^-1/2 L^-1 b.
+    void whiten(const ConstraintBasis& basis, const double* b, double* x) const {
+        solve_lower(basis.ldl.data(), n, {0, n}, b, x);
+        for (int i = 0; i < n; ++i) x[i] /= std::sqrt(basis.ldl[i * n + i]);
+    }
+
+    double inner(const double* a, const double* b) const {
+        double sum = 0.0;
+        for (int i = 0; i < n; ++i) sum += a[i] * b[i];
+        return sum;
+    }
+    double norm(const double* a) const { return std::sqrt(inner(a, a)); }
+
+    // Lam (m) with C M^-1 (p - C' Lam) = 0, of the basis' rows; zero of others.
+    void find_impulse(const ConstraintBasis& basis, const double* p, double* Lam) {
+        const int r = basis.rank();
+        std::vector<double> white(n), along(r);
+        whiten(basis, p, white.data());
+        for (int k = 0; k < r; ++k) along[k] = inner(&basis.Q[k * n], white.data());
+        std::fill(Lam, Lam + m, 0.0);
+        for (int k = r - 1; k >= 0; --k) {
+            double own = along[k];
+            for (int j = k + 1; j < r; ++j) own -= basis.R[k * r + j] * Lam[basis.order[j]];
+            Lam[basis.order[k]] = own / basis.R[k * r + k];
+        }
+    }
+
+    // Take from a momentum what is normal to the constraints at the path's node, whose basis is `here`.
+    void absorb(PathState& path) {
+        for (int again = 0; again < 2; ++again) {
+            find_impulse(here, path.momentum.data(), total.data());
+            for (int c = 0; c < n; ++c) {
+                path.p[c] = path.p[c].plus(-across(here.jet, total.data(), c));
+                path.momentum[c] = path.p[c].high;
+            }
+        }
+    }
+
+    // (C' Lam)_c.
+    double across(const ConstraintJet& jet, const double* Lam, int c) const {
+        double sum = 0.0;
+        for (int r = 0; r < m; ++r) sum += jet.C[r * n + c] * Lam[r];
+        return sum;
+    }
+
+    const ConstraintJet& jet_at(int k) const { return k == 0 ? here.jet : point[k - 1]; }
+
+    void guess(const PathState& path) {
+        for (int i = 0; i < stages; ++i) std::copy(path.v.begin(), path.v.end(), equation.V.begin() + i * n);
+        std::fill(impulse.begin(), impulse.end(), 0.0);
+    }
+
+    // The polynomial through the last step's stage velocities and the velocity at its end, moved by kicks since.
+    void extrapolate(const ConstrainedState& state) {
+        const PathState& path = state.path;
+        for (int i = 0; i < stages; ++i) {
+            const double* ahead = &tableau.ahead[i * (stages + 1)];
+            for (int c = 0; c < n; ++c) {
+                double sum = path.v[c] - path.past_end[c];
+                for (int j = 0; j < stages; ++j) sum += ahead[j] * path.past[j * n + c];
+                equation.V[i * n + c] = sum + ahead[stages] * path.past_end[c];
+            }
+        }
+        impulse = state.past_impulse;
+    }
+
+    // One substep from where the path stands; moves the path only if it is accepted.
+    Outcome attempt(double h, ConstrainedState& state) {
+        PathState& path = state.path;
+        state.weakest = here.weakest;
+        if (!(here.least > near_toggle) && m > 0 && here.rank() > 0) return Outcome::toggle;
+        const Outcome solved = solve(h, path);
+        if (solved != Outcome::solved) return solved;
+        double margin = infinity;
+        if (guards.active) {
+            for (int k = 1; k <= stages; ++k) {
+                if (!(turn_to(point[k - 1]) <= most_turn)) return Outcome::assembly;
+            }
+            margin = branch_margin(h);
+            if (!(margin > 0.0)) return Outcome::fold;
+        }
+        advance(h, path);
+        for (int i = 0; i < n; ++i) unit[i] = trial.place[i].place.high;
+        if (!find_basis(unit.data(), state.rank, there)) return Outcome::singular;
+        if (!(there.least > near_toggle) && there.rank() > 0) {
+            state.weakest = there.weakest;
+            return Outcome::toggle;
+        }
+        last.assign(m, 0.0);
+        for (int again = 0; again < 2; ++again) {
+            for (int i = 0; i < n; ++i) y[i] = trial.p[i].high;
+            find_impulse(there, y.data(), total.data());
+            for (int c = 0; c < n; ++c) trial.p[c] = trial.p[c].plus(-across(there.jet, total.data(), c));
+            for (int r = 0; r < m; ++r) last[r] += total[r];
+        }
+        const Outcome outcome = energy_guard.settle(guards, tableau, path.energies, path.place, path.v, trial);
+        if (outcome != Outcome::solved) return outcome;
+        effort.branch_margin = std::min(effort.branch_margin, margin);
+        ++effort.substeps;
+        for (int r = 0; r < m; ++r) {
+            double sum = last[r];
+            for (int k = 0; k < stages; ++k) sum += impulse[k * m + r];
+            state.impulse[r] -= sum;
+        }
+        std::swap(path.place, trial.place);
+        std::swap(path.p, trial.p);
+        std::swap(origin, here);
+        here = there;
+        bool turned = false;
+        for (int i = 0; i < n; ++i) {
+            const double turns = path.place[i].turns;
+            unwind(i, path);
+            turned = turned || path.place[i].turns != turns;
+            path.q[i] = path.place[i].shown();
+        }
+        std::copy(trial.momentum.begin(), trial.momentum.end(), path.momentum.begin());
+        std::copy(trial.v.begin(), trial.v.end(), path.v.begin());
+        if (turned) return look_at(state) ? Outcome::solved : Outcome::singular;
+        return Outcome::solved;
+    }
+
+    // Newton's method on the stages and the constraints. Ends with jets of the root, and with C at all points.
+    Outcome solve(double h, const PathState& path) {
+        const Start start{path.place.data(), path.p.data(), force.data()};
+        // In units of these the matrix has entries about 1.
+        for (int c = 0; c < n; ++c) scaled[c] = 1.0 / std::sqrt(mass_diagonal(c));
+        for (int r = 0; r < m; ++r) row_scale[r] = 1.0 / std::max(norm(&here.rows[r * n]), nothing);
+        for (int r = 0; r < m; ++r) {
+            if (std::find(here.order.begin(), here.order.end(), r) != here.order.end()) continue;
+            for (int k = 0; k < stages; ++k) impulse[k * m + r] = 0.0;
+        }
+        double before = infinity, worst = infinity;
+        for (int iteration = 0; iteration < most_corrections + 1; ++iteration) {
+            equation.sweep(h, start, true, effort);
+            visit_points(h, start);
+            worst = residuals(h, start);
+            if (worst <= tolerance) break;
+            if (!(worst < infinity)) return Outcome::not_finite;
+            if (iteration == most_corrections) break;
+            assemble(h);
+            const int size = stages * (n + here.rank());
+            if (factor_lu_pivoting(saddle.data(), size, rows.data()) == 0) return Outcome::fold;
+            solve_lu_pivoting(saddle.data(), size, rows.data(), right.data(), solution.data());
+            for (int i = 0; i < stages; ++i) {
+                for (int c = 0; c < n; ++c) equation.delta[i * n + c] = scaled[c] * solution[i * n + c];
+            }
+            const double moved = equation.kinetic_size(equation.delta.data());
+            if (!(moved <= 0.25 * before)) break;
+            for (int k = 0; k < stages * n; ++k) equation.V[k] += equation.delta[k];
+            const int r = here.rank();
+            for (int k = 0; k < stages; ++k) {
+                for (int a = 0; a < r; ++a) {
+                    const int row = here.order[a];
+                    impulse[k * m + row] += row_scale[row] * solution[stages * n + k * r + a];
+                }
+            }
+            ++effort.newton_iterations;
+            before = moved;
+        }
+        if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
+        effort.residual = std::max(effort.residual, worst);
+        return Outcome::solved;
+    }
+
+    double mass_diagonal(int c) const {
+        double sum = here.ldl[c * n + c];
+        for (int j = 0; j < c; ++j) sum += here.ldl[c * n + j] * here.ldl[c * n + j] * here.ldl[j * n + j];
+        return sum;
+    }
+
+    void visit_points(double h, const Start& start) {
+        for (int k = 1; k <= stages; ++k) {
+            for (int c = 0; c < n; ++c) {
+                double sum = 0.0;
+                for (int j = 0; j < stages; ++j) sum += at[k * stages + j] * equation.V[j * n + c];
+                Qk[c] = start.place[c].place.high + (start.place[c].place.low + h * sum);
+            }
+            mechanism.constraints.at(Qk.data(), point[k - 1]);
+        }
+    }
+
+    // r of the stages into `right`, -g / h behind it; the largest in rounding units of its terms.
+    double residuals(double h, const Start& start) {
+        double worst = 0.0;
+        const int r = here.rank();
+        right.assign(stages * (n + r), 0.0);
+        solution.resize(right.size());
+        std::fill(pushed.begin(), pushed.end(), 0.0);
+        std::fill(push_size.begin(), push_size.end(), 0.0);
+        for (int k = 0; k < stages; ++k) {
+            const ConstraintJet& jet = jet_at(k);
+            for (int a = 0; a < r; ++a) {
+                const int row = here.order[a];
+                const double own = impulse[k * m + row];
+                for (int c = 0; c < n; ++c) {
+                    pushed[k * n + c] += jet.C[row * n + c] * own;
+                    push_size[k * n + c] += std::abs(jet.size[row * n + c] * own);
+                }
+            }
+        }
+        for (int i = 0; i < stages; ++i) {
+            for (int c = 0; c < n; ++c) {
+                const int k = i * n + c;
+                equation.slope[k] = equation.stage[i].Lq[c] + (start.force[c] + equation.acting[k].value);
+            }
+        }
+        for (int i = 0; i < stages; ++i) {
+            for (int c = 0; c < n; ++c) {
+                double sum = 0.0, scale = 0.0, across_rows = 0.0, across_size = 0.0;
+                for (int j = 0; j < stages; ++j) {
+                    const double a = tableau.a[i * stages + j];
+                    sum += a * equation.slope[j * n + c];
+                    scale += std::abs(a) * (equation.stage[j].Lq_scale[c] + std::abs(start.force[c]) +
+                                            equation.acting[j * n + c].scale);
+                    across_rows += weight[i * stages + j] * pushed[j * n + c];
+                    across_size += std::abs(weight[i * stages + j]) * push_size[j * n + c];
+                }
+                double error = (start.p[c].high - equation.stage[i].Lv[c]) + (start.p[c].low + (h * sum - across_rows));
+                right[i * n + c] = scaled[c] * error;
+                scale = h * scale + std::abs(start.p[c].high) + equation.stage[i].Lv_scale[c] + across_size;
+                if (scale > nothing) error = std::abs(error) / (rounding_unit * scale);
+                if (!(error <= worst)) worst = error;
+            }
+        }
+        for (int k = 1; k <= stages; ++k) {
+            for (int a = 0; a < r; ++a) {
+                const int row = here.order[a];
+                const double g = point[k - 1].g[row];
+                right[stages * n + (k - 1) * r + a] = -row_scale[row] * g / h;
+                const double error = std::abs(g) / (rounding_unit * point[k - 1].scale[row]);
+                if (!(error <= worst)) worst = error;
+            }
+        }
+        return worst;
+    }
+
+    // Newton's matrix, (V, Lam) in units of `scaled` and `row_scale`.
+    void assemble(double h) {
+        const int r = here.rank(), wide = stages * n, size = stages * (n + r);
+        write_stages(h);
+        saddle.assign(size * size, 0.0);
+        rows.resize(size);
+        for (int i = 0; i < wide; ++i) {
+            for (int j = 0; j < wide; ++j) saddle[i * size + j] = scaled[i % n] * block[i * wide + j] * scaled[j % n];
+        }
+        for (int k = 0; k < stages; ++k) {
+            for (int a = 0; a < r; ++a) {
+                const int row = here.order[a];
+                const double *behind = &jet_at(k).C[row * n], *ahead = &point[k].C[row * n];
+                const int border = wide + k * r + a;
+                for (int i = 0; i < stages; ++i) {
+                    for (int c = 0; c < n; ++c) {
+                        const double unit_entry = row_scale[row] * scaled[c];
+                        saddle[(i * n + c) * size + border] = weight[i * stages + k] * behind[c] * unit_entry;
+                        saddle[border * size + i * n + c] = at[(k + 1) * stages + i] * ahead[c] * unit_entry;
+                    }
+                }
+            }
+        }
+    }
+
+    // N with what the constraints' impulses between the ends add: w_ik h t_kj Lam_k . g_qq.
+    void write_stages(double h) {
+        const int wide = stages * n;
+        block.resize(wide * wide);
+        equation.assemble(h, {0, n}, block.data());
+        for (int k = 1; k < stages; ++k) {
+            std::fill(bent.begin(), bent.end(), 0.0);
+            mechanism.constraints.add_curvature(&impulse[k * m], h, point[k - 1], bent.data());
+            for (int i = 0; i < stages; ++i) {
+                for (int j = 0; j < stages; ++j) {
+                    const double share = weight[i * stages + k] * at[k * stages + j];
+                    for (int b = 0; b < n; ++b) {
+                        for (int c = 0; c < n; ++c) block[(i * n + b) * wide + j * n + c] += share * bent[b * n + c];
+                    }
+                }
+            }
+        }
+    }
+
+    // By how much the rows at `here` have turned on the way to another point: the distance of C0 M^-1 C1' (C0 M^-1
+    // C0')^-1 from one. Beyond one, a root may belong to another assembly.
+    double turn_to(const ConstraintJet& jet) {
+        const int r = here.rank();
+        double sum = 0.0;
+        std::vector<double> white(n), product(r * r);
+        for (int a = 0; a < r; ++a) {
+            whiten(here, &jet.C[here.order[a] * n], white.data());
+            for (int k = 0; k < r; ++k) product[k * r + a] = inner(&here.Q[k * n], white.data());
+        }
+        // X R = product, column by column.
+        for (int k = 0; k < r; ++k) {
+            for (int a = 0; a < r; ++a) {
+                double own = product[k * r + a];
+                for (int b = 0; b < a; ++b) own -= product[k * r + b] * here.R[b * r + a];
+                product[k * r + a] = own / here.R[a * r + a];
+            }
+        }
+        for (int k = 0; k < r; ++k) {
+            for (int a = 0; a < r; ++a) {
+                const double off = product[k * r + a] - (k == a ? 1.0 : 0.0);
+                sum += off * off;
+            }
+        }
+        return std::sqrt(sum);
+    }
+
+    // As EnergyGuard's, on the tangent space at the start: with a basis Z of C Z = 0, of Z'(M - h^2 reach / (1 -
+    // margin) (L_qq - Lam . g_qq / h))Z beside Z' M Z.
+    double branch_margin(double h) {
+        const int free = n - here.rank();
+        if (free == 0) return infinity;
+        find_null();
+        const double exaggerated = h * h * tableau.reach / (1.0 - guards.branch_margin);
+        std::vector<double> mass(n * n), curved(n * n);
+        for (int i = 0; i < n; ++i) {
+            for (int j = 0; j < n; ++j) {
+                for (int s = 0; s < stages; ++s) {
+                    mass[i * n + j] += tableau.b[s] * equation.stage[s].M[i * n + j];
+                    curved[i * n + j] -= exaggerated * tableau.b[s] * equation.stage[s].Lqq[i * n + j];
+                }
+                curved[i * n + j] += mass[i * n + j];
+                if (equation.coupled()) curved[i * n + j] += equation.coupled_stiffening(i, j, 0.5 * h, exaggerated);
+            }
+            curved[i * n + i] += equation.stiffening(i, 0.5 * h, exaggerated);
+        }
+        for (int k = 1; k < stages; ++k)
+            mechanism.constraints.add_curvature(&impulse[k * m], exaggerated / h, point[k - 1], curved.data());
+        reduce(mass, free, reduced_mass);
+        reduce(curved, free, reduced);
+        return least_pivot_ratio(reduced.data(), reduced_mass.data(), free, {0, free});
+    }
+
+    // A basis (free, n) of what is orthogonal to all Q in the metric of the kinetic energy.
+    void find_null() {
+        const int r = here.rank(), free = n - r;
+        null.assign(free * n, 0.0);
+        std::vector<double> candidate(n * n);
+        std::vector<char> taken(n, 0);
+        for (int i = 0; i < n; ++i) {
+            candidate[i * n + i] = 1.0;
+            orthogonalize(&candidate[i * n], here.Q, r);
+        }
+        for (int f = 0; f < free; ++f) {
+            int best = 0;
+            double longest = -1.0;
+            for (int i = 0; i < n; ++i) {
+                if (taken[i]) continue;
+                const double own = norm(&candidate[i * n]);
+                if (own > longest) best = i, longest = own;
+            }
+            taken[best] = 1;
+            double* z = &null[f * n];
+            for (int c = 0; c < n; ++c) z[c] = candidate[best * n + c] / longest;
+            for (int i = 0; i < n; ++i) {
+                if (!taken[i]) orthogonalize(&candidate[i * n], null, f + 1);
+            }
+        }
+        for (int f = 0; f < free; ++f) {
+            double* z = &null[f * n];
+            for (int c = 0; c < n; ++c) z[c] /= std::sqrt(here.ldl[c * n + c]);
+            solve_upper(here.ldl.data(), n, {0, n}, z);
+        }
+    }
+
+    void orthogonalize(double* x, const std::vector<double>& basis, int count) const {
+        for (int again = 0; again < 2; ++again) {
+            for (int k = 0; k < count; ++k) {
+                const double along = inner(x, &basis[k * n]);
+                for (int c = 0; c < n; ++c) x[c] -= along * basis[k * n + c];
+            }
+        }
+    }
+
+    void reduce(const std::vector<double>& full, int free, std::vector<double>& out) {
+        out.assign(free * free, 0.0);
+        for (int b = 0; b < free; ++b) {
+            for (int i = 0; i < n; ++i) y[i] = inner(&full[i * n], &null[b * n]);
+            for (int a = 0; a < free; ++a) out[a * free + b] = inner(&null[a * n], y.data());
+        }
+        for (int a = 0; a < free; ++a) {
+            for (int b = 0; b < a; ++b)
+                out[a * free + b] = out[b * free + a] = 0.5 * (out[a * free + b] + out[b * free + a]);
+        }
+    }
+
+    // Where the root takes the path, into `trial`, the impulse at its end apart; and the work on the way.
+    void advance(double h, const PathState& path) {
+        for (int c = 0; c < n; ++c) {
+            double move = 0.0, sum = 0.0, across_rows = 0.0;
+            trial.work[c] = trial.dissipated[c] = trial.magnitude[c] = 0.0;
+            const double distance = std::min(std::abs(path.place[c].place.high), unwinds(c) ? Place::turn : infinity);
+            for (int i = 0; i < stages; ++i) {
+                const double share = h * tableau.b[i], velocity = equation.V[i * n + c];
+                const JointForce<double>& element = equation.acting[i * n + c];
+                move += tableau.b[i] * velocity;
+                sum += tableau.b[i] * equation.slope[i * n + c];
+                across_rows += pushed[i * n + c];
+                trial.work[c] += share * (force[c] + element.value) * velocity;
+                trial.dissipated[c] += share * element.lost;
+                const double scale = equation.stage[i].Lq_scale[c] + std::abs(force[c]) + element.scale;
+                trial.magnitude[c] += share * scale * std::abs(velocity) +
+                                      tableau.b[i] * std::abs(equation.stage[i].Lq[c]) * distance +
+                                      push_size[i * n + c] * std::abs(velocity);
+            }
+            trial.place[c] = {path.place[c].place.plus(h * move), path.place[c].turns};
+            trial.p[c] = path.p[c].plus(h * sum - across_rows);
+        }
+    }
+};
+
+// Derivatives of the steps of a trajectory; as VariationalLinearization.
+class ConstrainedLinearization {
+  public:
+    ConstrainedLinearization(const Mechanism& mechanism, const Tableau& tableau, const std::vector<double>& places,
+                             double tolerance, const Guards& guards)
+        : stepper(mechanism, tableau, places, tolerance, guards),
+          n(mechanism.dof()),
+          state(mechanism, tableau.stages),
+          link(4 * n * n),
+          link_f(2 * n * n) {}
+
+    Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
+                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf) {
+        std::copy(force, force + n, stepper.force.begin());
+        if (!stepper.begin_at(q, p, state, false)) return Outcome::singular;
+        if (halvings.empty()) {
+            Outcome outcome = stepper.from_guess(h, guess, state);
+            if (outcome != Outcome::solved) outcome = stepper.part(h, 0, state);
+            if (outcome == Outcome::solved) {
+                stepper.derivatives(h, state.path, Jx, Jf);
+                return outcome;
+            }
+            if (!stepper.guards.active) return outcome;
+        }
+        std::fill(Jx, Jx + 4 * n * n, 0.0);
+        std::fill(Jf, Jf + 2 * n * n, 0.0);
+        for (int i = 0; i < 2 * n; ++i) Jx[i * 2 * n + i] = 1.0;
+        if (halvings.empty()) return part(h, 0, Jx, Jf);
+        for (const std::uint8_t level : halvings) {
+            const Outcome outcome = part(h, level, Jx, Jf);
+            if (outcome != Outcome::solved) return outcome;
+        }
+        return Outcome::solved;
+    }
+
+  private:
+    ConstrainedStepper stepper;
+    int n;
+    ConstrainedState state;
+    std::vector<double> link, link_f;
+
+    // A part, in halves where guards refuse it; its derivatives follow those before.
+    Outcome part(double h, int level, double* Jx, double* Jf) {
+        const Outcome outcome = stepper.part(h, level, state);
+        if (outcome != Outcome::solved) {
+            if (!stepper.guards.active || level >= stepper.guards.most_halvings) return outcome;
+            const Outcome half = part(h, level + 1, Jx, Jf);
+            return half == Outcome::solved ? part(h, level + 1, Jx, Jf) : half;
+        }
+        stepper.derivatives(VariationalStepper<>::length_of(h, level), state.path, link.data(), link_f.data());
+        const auto times = [&](double* right, int width) {
+            std::vector<double> product(2 * n * width);
+            for (int i = 0; i < 2 * n; ++i) {
+                for (int j = 0; j < 2 * n; ++j) {
+                    for (int c = 0; c < width; ++c)
+                        product[i * width + c] += link[i * 2 * n + j] * right[j * width + c];
+                }
+            }
+            std::copy(product.begin(), product.end(), right);
+        };
+        times(Jx, 2 * n);
+        times(Jf, n);
+        for (int i = 0; i < 2 * n * n; ++i) Jf[i] += link_f[i];
+        return Outcome::solved;
+    }
+};
+
+}  // namespace varpin

@@ -1,0 +1,336 @@
+// Holonomic constraints g(q) = 0, m rows, with all derivatives that steps ask for. docs/constraints.md.
+//
+// Rows between frames are products g = factor X . Y - constant of vectors that bodies carry: a point of a body, the
+// vector between two points, or a direction. Each moves with the joints on the way to its body: with w_i the angular
+// velocity that joint i gives to it, d2X/dq_i dq_j = w_i x dX/dq_j for i above j or j itself, so that
+//
+//     g_j  = X_j . Y + X . Y_j
+//     g_ij = X_ij . Y + X_i . Y_j + X_j . Y_i + X . Y_ij
+//
+// A row that ties a joint to another is a polynomial. Others are functions that whoever makes them gives.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <functional>
+#include <utility>
+#include <vector>
+
+#include "varpin/body.hpp"
+#include "varpin/kinematics.hpp"
+#include "varpin/spatial.hpp"
+
+namespace varpin {
+
+// A point from its body's joint [m], or a direction, in the body's axes; in the world's where there is no body, -1.
+struct CarriedVector {
+    int body = -1;
+    Vec3<double> place{};
+    bool direction = false;
+};
+
+// Sum of carried vectors, the second one taken negative.
+struct VectorSum {
+    std::vector<CarriedVector> parts;  // one or two
+};
+
+// factor X . Y - constant; x and y are places in the list of vectors.
+struct ProductRow {
+    int x = 0;
+    int y = 0;
+    double factor = 1.0;
+    double constant = 0.0;
+};
+
+// q_follower - sum_k coefficients_k q_leader^k.
+struct TieRow {
+    int follower = 0;
+    int leader = 0;
+    std::vector<double> coefficients;
+};
+
+// A function of q with several rows.
+struct CustomRows {
+    int rows = 0;
+    std::function<void(const double* q, double* g, double* C)> value;                        // g (rows), C (rows, n)
+    std::function<void(const double* q, const double* weights, double* curvature)> bending;  // (n, n)
+};
+
+// Constraints at one q.
+struct ConstraintJet {
+    std::vector<double> g;       // (m)
+    std::vector<double> scale;   // (m) of the terms that cancel in g
+    std::vector<double> C;       // (m, n)
+    std::vector<double> size;    // (m, n) of the terms that cancel in C
+    std::vector<double> at_q;    // (n)
+    std::vector<double> custom;  // (n, n)
+    // Work: of what derivatives are made.
+    struct Lever {
+        int coordinate = 0;
+        Vec3<double> turn{};   // w_i
+        Vec3<double> shift{};  // of the vector
+    };
+    std::vector<Placement> at;
+    std::vector<std::vector<Lever>> levers;  // of each part of each vector, from the root on
+    std::vector<Vec3<double>> value;         // of each vector
+    std::vector<double> reach;               // of each vector
+    std::vector<Vec3<double>> slope;         // (vectors, n)
+    std::vector<double> slope_size;          // (vectors, n)
+    std::vector<Vec3<double>> moved;         // (vectors, n)
+    std::vector<Vec3<double>> weight;        // of each vector
+};
+
+class Constraints {
+  public:
+    Constraints() = default;
+    Constraints(std::vector<VectorSum> vectors, std::vector<ProductRow> products, std::vector<TieRow> ties,
+                std::vector<CustomRows> customs, const std::vector<Body>& bodies, int dof)
+        : products_(std::move(products)), ties_(std::move(ties)), customs_(std::move(customs)), n_(dof) {
+        std::vector<int> own(bodies.size(), -1);
+        const auto take = [&](auto& self, int body) -> int {
+            if (body < 0) return -1;
+            if (own[body] < 0) {
+                Body link = bodies[body];
+                link.parent = self(self, link.parent);
+                own[body] = links_.size();
+                links_.bodies.push_back(link);
+            }
+            return own[body];
+        };
+        for (VectorSum& sum : vectors) {
+            Joined joined{std::move(sum), {}};
+            for (CarriedVector& part : joined.sum.parts) {
+                part.body = take(take, part.body);
+                std::vector<int> path;
+                for (int j = part.body; j >= 0; j = links_.bodies[j].parent) path.push_back(j);
+                std::reverse(path.begin(), path.end());
+                joined.paths.push_back(std::move(path));
+            }
+            vectors_.push_back(std::move(joined));
+        }
+        rows_ = static_cast<int>(products_.size() + ties_.size());
+        for (const CustomRows& own_rows : customs_) rows_ += own_rows.rows;
+    }
+
+    // m: products first, then ties, then functions.
+    int rows() const { return rows_; }
+
+    // g and C at q.
+    void at(const double* q, ConstraintJet& w) const {
+        fit(w);
+        std::copy(q, q + n_, w.at_q.begin());
+        place(links_, q, w.at.data());
+        std::size_t leg = 0;
+        for (std::size_t a = 0; a < vectors_.size(); ++a) move_vector(q, a, leg, w);
+        std::fill(w.C.begin(), w.C.end(), 0.0);
+        std::fill(w.size.begin(), w.size.end(), 0.0);
+        int r = 0;
+        for (const ProductRow& own : products_) {
+            const Vec3<double>&X = w.value[own.x], &Y = w.value[own.y];
+            w.g[r] = own.factor * dot(X, Y) - own.constant;
+            w.scale[r] = std::abs(own.factor) * (w.reach[own.x] * length(Y) + length(X) * w.reach[own.y]) +
+                         std::abs(own.constant);
+            const Vec3<double>*Xs = &w.slope[own.x * n_], *Ys = &w.slope[own.y * n_];
+            const double *X_size = &w.slope_size[own.x * n_], *Y_size = &w.slope_size[own.y * n_];
+            for (int c = 0; c < n_; ++c) {
+                w.C[r * n_ + c] = own.factor * (dot(Xs[c], Y) + dot(X, Ys[c]));
+                w.size[r * n_ + c] = std::abs(own.factor) * (X_size[c] * length(Y) + length(X) * Y_size[c]);
+            }
+            ++r;
+        }
+        for (const TieRow& own : ties_) {
+            const double leader = q[own.leader];
+            double total = 0.0, slope = 0.0, size = std::abs(q[own.follower]);
+            for (std::size_t k = own.coefficients.size(); k-- > 0;) {
+                slope = slope * leader + total;
+                total = total * leader + own.coefficients[k];
+                size = std::max(size, std::abs(total));
+            }
+            w.g[r] = q[own.follower] - total;
+            w.scale[r] = size;
+            w.C[r * n_ + own.follower] += 1.0;
+            w.C[r * n_ + own.leader] -= slope;
+            for (int c = 0; c < n_; ++c) w.size[r * n_ + c] = std::abs(w.C[r * n_ + c]);
+            ++r;
+        }
+        for (const CustomRows& own : customs_) {
+            own.value(q, &w.g[r], &w.C[r * n_]);
+            for (int k = r; k < r + own.rows; ++k) {
+                double size = 0.0;
+                for (int c = 0; c < n_; ++c) {
+                    w.size[k * n_ + c] = std::abs(w.C[k * n_ + c]);
+                    size += w.size[k * n_ + c] * std::max(std::abs(q[c]), 1.0);
+                }
+                w.scale[k] = size;
+            }
+            r += own.rows;
+        }
+    }
+
+    // Adds factor sum_r weights_r g_r,qq to a matrix (n, n), where `at` has been.
+    void add_curvature(const double* weights, double factor, ConstraintJet& w, double* H) const {
+        std::fill(w.weight.begin(), w.weight.end(), Vec3<double>{});
+        int r = 0;
+        for (const ProductRow& own : products_) {
+            const double scale = factor * weights[r++] * own.factor;
+            if (scale == 0.0) continue;
+            w.weight[own.x] += scale * w.value[own.y];
+            w.weight[own.y] += scale * w.value[own.x];
+            const Vec3<double>*X = &w.slope[own.x * n_], *Y = &w.slope[own.y * n_];
+            for (int i = 0; i < n_; ++i) {
+                for (int j = 0; j < n_; ++j) H[i * n_ + j] += scale * (dot(X[i], Y[j]) + dot(X[j], Y[i]));
+            }
+        }
+        std::size_t leg = 0;
+        for (std::size_t a = 0; a < vectors_.size(); ++a) {
+            for (std::size_t part = 0; part < vectors_[a].sum.parts.size(); ++part, ++leg) {
+                const auto& levers = w.levers[leg];
+                for (std::size_t i = 0; i < levers.size(); ++i) {
+                    const Vec3<double> turned = cross(w.weight[a], levers[i].turn);
+                    for (std::size_t j = i; j < levers.size(); ++j) {
+                        const double term = dot(turned, levers[j].shift);
+                        H[levers[i].coordinate * n_ + levers[j].coordinate] += term;
+                        if (i != j) H[levers[j].coordinate * n_ + levers[i].coordinate] += term;
+                    }
+                }
+            }
+        }
+        for (const TieRow& own : ties_) {
+            const double leader = w.at_q[own.leader];
+            double bend = 0.0;
+            for (std::size_t k = own.coefficients.size(); k-- > 2;)
+                bend = bend * leader + static_cast<double>(k * (k - 1)) * own.coefficients[k];
+            H[own.leader * n_ + own.leader] -= factor * weights[r++] * bend;
+        }
+        for (const CustomRows& own : customs_) {
+            own.bending(w.at_q.data(), weights + r, w.custom.data());
+            for (int i = 0; i < n_ * n_; ++i) H[i] += factor * w.custom[i];
+            r += own.rows;
+        }
+    }
+
+    // g_qq v (m, n), where `at` has been.
+    void bend(const double* v, ConstraintJet& w, double* out) const {
+        // Of each vector: sum_i X_ij v_i by j, and sum_i X_i v_i.
+        std::fill(w.moved.begin(), w.moved.end(), Vec3<double>{});
+        std::fill(w.weight.begin(), w.weight.end(), Vec3<double>{});
+        std::size_t leg = 0;
+        for (std::size_t a = 0; a < vectors_.size(); ++a) {
+            for (std::size_t part = 0; part < vectors_[a].sum.parts.size(); ++part, ++leg) {
+                const auto& levers = w.levers[leg];
+                Vec3<double> before{}, beyond{};
+                for (const auto& own : levers) {
+                    w.moved[a * n_ + own.coordinate] += cross(before, own.shift);
+                    before += v[own.coordinate] * own.turn;
+                }
+                for (std::size_t j = levers.size(); j-- > 0;) {
+                    beyond += v[levers[j].coordinate] * levers[j].shift;
+                    w.moved[a * n_ + levers[j].coordinate] += cross(levers[j].turn, beyond);
+                }
+                w.weight[a] += beyond;
+            }
+        }
+        int r = 0;
+        for (const ProductRow& own : products_) {
+            const Vec3<double>*X = &w.slope[own.x * n_], *Y = &w.slope[own.y * n_];
+            const Vec3<double>*Xm = &w.moved[own.x * n_], *Ym = &w.moved[own.y * n_];
+            for (int c = 0; c < n_; ++c) {
+                out[r * n_ + c] = own.factor * (dot(Xm[c], w.value[own.y]) + dot(w.weight[own.x], Y[c]) +
+                                                dot(X[c], w.weight[own.y]) + dot(w.value[own.x], Ym[c]));
+            }
+            ++r;
+        }
+        for (; r < rows_; ++r) {
+            // Of the others, one row at a time.
+            std::vector<double> unit(rows_), H(n_ * n_);
+            unit[r] = 1.0;
+            add_curvature(unit.data(), 1.0, w, H.data());
+            for (int c = 0; c < n_; ++c) {
+                out[r * n_ + c] = 0.0;
+                for (int i = 0; i < n_; ++i) out[r * n_ + c] += H[c * n_ + i] * v[i];
+            }
+        }
+    }
+
+  private:
+    struct Joined {
+        VectorSum sum;
+        std::vector<std::vector<int>> paths;  // of bodies, from the root to each part's
+    };
+
+    Links links_;
+    std::vector<Joined> vectors_;
+    std::vector<ProductRow> products_;
+    std::vector<TieRow> ties_;
+    std::vector<CustomRows> customs_;
+    int n_ = 0;
+    int rows_ = 0;
+
+    static double length(const Vec3<double>& a) { return std::sqrt(dot(a, a)); }
+
+    void fit(ConstraintJet& w) const {
+        if (w.at_q.size() == static_cast<std::size_t>(n_)) return;
+        std::size_t legs = 0;
+        for (const Joined& joined : vectors_) legs += joined.sum.parts.size();
+        w.g.resize(rows_);
+        w.scale.resize(rows_);
+        w.C.resize(rows_ * n_);
+        w.size.resize(rows_ * n_);
+        w.at_q.resize(n_);
+        w.custom.resize(customs_.empty() ? 0 : n_ * n_);
+        w.at.resize(links_.bodies.size());
+        w.levers.resize(legs);
+        w.value.resize(vectors_.size());
+        w.reach.resize(vectors_.size());
+        w.slope.resize(vectors_.size() * n_);
+        w.slope_size.resize(vectors_.size() * n_);
+        w.moved.resize(vectors_.size() * n_);
+        w.weight.resize(vectors_.size());
+    }
+
+    void move_vector(const double* q, std::size_t a, std::size_t& leg, ConstraintJet& w) const {
+        Vec3<double>* slope = &w.slope[a * n_];
+        double* size = &w.slope_size[a * n_];
+        std::fill(slope, slope + n_, Vec3<double>{});
+        std::fill(size, size + n_, 0.0);
+        w.value[a] = {};
+        w.reach[a] = 0.0;
+        const auto& parts = vectors_[a].sum.parts;
+        for (std::size_t part = 0; part < parts.size(); ++part, ++leg) {
+            const CarriedVector& own = parts[part];
+            const double side = part == 0 ? 1.0 : -1.0;
+            auto& levers = w.levers[leg];
+            levers.clear();
+            Vec3<double> x = own.place;
+            if (own.body >= 0) {
+                x = w.at[own.body].rotation * own.place;
+                if (!own.direction) x += w.at[own.body].position;
+            }
+            w.value[a] += side * x;
+            w.reach[a] += length(x);
+            for (int j : vectors_[a].paths[part]) {
+                const Body& link = links_.bodies[j];
+                const Vec3<double>& axis = w.at[j].rotation.z;
+                ConstraintJet::Lever lever{link.coordinate, {}, {}};
+                if (link.prismatic) {
+                    if (own.direction) continue;
+                    lever.shift = (side * link.ratio) * axis;
+                } else {
+                    const Vec3<double> arm = own.direction ? x : x - w.at[j].position;
+                    lever.turn = link.ratio * axis;
+                    lever.shift = (side * link.ratio) * cross(axis, arm);
+                }
+                slope[link.coordinate] += lever.shift;
+                const double moved = length(lever.shift);
+                size[link.coordinate] += moved;
+                // A place is known no better than the joints that lead to it.
+                w.reach[a] += moved * std::abs(q[link.coordinate]);
+                if (!own.direction) w.reach[a] += length(link.translation);
+                levers.push_back(lever);
+            }
+        }
+    }
+};
+
+}  // namespace varpin

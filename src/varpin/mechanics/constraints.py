@@ -1,0 +1,385 @@
+"""Holonomic constraints g(q) = 0: loops that close, welds, planes, lines, rods, gears, functions of one's own.
+
+    scene = vp.Scene(robot, constraints=[vp.PointOnPoint("tip", (1.0, 0.0, 0.0), axes="xz")])
+
+They hold at every node and at inner points of every step, and they are bilateral: nothing lifts off, nothing hits.
+Points are given as in :mod:`varpin.mechanics.forces`: a frame's name for its origin, a pair of that and a place in the
+frame's axes (3,) [m], or a place in the world (3,) [m].
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.core.arrays import Carried, ConstraintRows, CustomRows, Product, Tied
+from varpin.errors import InputError, UnknownJoint
+from varpin.mechanics.forces import Point, kept, point_of, shown
+from varpin.model import Robot
+from varpin.support.checks import as_floats, count, finite, finite_array, positive
+from varpin.support.frozen import Frozen
+
+Floats = NDArray[np.float64]
+_AXES = "xyz"
+
+
+class Bound(NamedTuple):
+    """A constraint on a robot, as the core takes it."""
+
+    rows: ConstraintRows
+    labels: tuple[str, ...]  # of each row
+    # Pairs of vectors whose product is positive in the assembly that is meant, and not in others that the rows allow.
+    aligned: tuple[tuple[int, int], ...] = ()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Constraint(Frozen, ABC):
+    """A holonomic constraint of one or several rows g(q) = 0."""
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not callable(value):
+                object.__setattr__(self, item.name, kept(item.name, value))
+
+    def __repr__(self) -> str:
+        own = [(item, getattr(self, item.name)) for item in fields(self)]
+        given = [f"{item.name}={_shown(value)}" for item, value in own if item.repr and value is not None]
+        return f"{type(self).__name__}({', '.join(given)})"
+
+    @abstractmethod
+    def bind(self, robot: Robot) -> Bound:
+        """The constraint on a robot.
+
+        Raises:
+            InputError: A wrong shape, or a value that is not finite or out of range; no joint moves what it ties.
+            UnknownJoint: It names a joint that is no coordinate of the robot.
+            UnknownFrame: It names a frame that the robot does not have.
+        """
+
+
+def _shown(value: Any) -> str:
+    if callable(value) or isinstance(value, int):
+        return str(getattr(value, "__name__", repr(value)))
+    return shown(value)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PointOnPoint(Constraint):
+    """Two points that stay together along some axes of the world: g = x_a - x_b, the closure of a loop.
+
+    Its forces act on a along these axes, and on b the other way [N].
+
+    Attributes:
+        a: The one point.
+        b: The other.
+        axes: Which axes: some of ``"xyz"``.
+    """
+
+    a: Point
+    b: Point
+    axes: str = "xyz"
+
+    def bind(self, robot: Robot) -> Bound:
+        """See :meth:`Constraint.bind`."""
+        axes = self.axes
+        if not (isinstance(axes, str) and axes and set(axes) <= set(_AXES) and len(set(axes)) == len(axes)):
+            raise InputError(f"axes must be some of 'xyz', each once, got {axes!r}")
+        a, b, _ = _ends(self, robot)
+        units = [((Carried(-1, True, _row(np.eye(3)[_AXES.index(axis)])),)) for axis in axes]
+        products = tuple(Product(0, 1 + k, 1.0, 0.0) for k in range(len(units)))
+        return Bound(ConstraintRows(((a, b), *units), products), tuple(f"{self!r} along {axis}" for axis in axes))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrameOnFrame(Constraint):
+    """Two frames that stay together as if welded: three rows of places and three of rotation.
+
+    Its forces act on a along the axes of the world [N], its moments about those of b [N m].
+
+    Attributes:
+        a: The one frame's name.
+        b: The other's; ``"universe"`` is the world.
+        placement: Where a stands in b's axes: (4, 4) with a rotation and a place [m]. Left out, on b itself.
+    """
+
+    a: str
+    b: str
+    placement: ArrayLike | None = None
+
+    def bind(self, robot: Robot) -> Bound:
+        """See :meth:`Constraint.bind`."""
+        for name in ("a", "b"):
+            if not isinstance(getattr(self, name), str):
+                raise InputError(f"FrameOnFrame: {name} must be a frame's name, got {shown(getattr(self, name))}")
+        pose = np.eye(4) if self.placement is None else finite_array("placement", self.placement, (4, 4))
+        R, x = pose[:3, :3], pose[:3, 3]
+        if np.abs(R.T @ R - np.eye(3)).max() > 1e-9 or np.linalg.det(R) < 0.0 or (pose[3] != (0, 0, 0, 1)).any():
+            raise InputError("placement must be a matrix (4, 4) of a rotation and a place")
+        (a, Ra, at), (b, Rb, there) = point_of("a", self.a, robot), point_of("b", self.b, robot)
+        _require_movable(self, a, b, robot)
+        own, others = Ra @ R.T, Rb
+        vectors: list[tuple[Carried, ...]] = [(Carried(a, False, _row(at)), Carried(b, False, _row(there + Rb @ x)))]
+        vectors += [(Carried(-1, True, _row(axis)),) for axis in np.eye(3)]
+        vectors += [(Carried(a, True, _row(axis)),) for axis in own.T]
+        vectors += [(Carried(b, True, _row(axis)),) for axis in others.T]
+        # d(y_a . z_b) = (w_a - w_b) . (y_a x z_b), the turn about x.
+        turns = [Product(4 + (k + 1) % 3, 7 + (k + 2) % 3, 1.0, 0.0) for k in range(3)]
+        rows = ConstraintRows(tuple(vectors), (*(Product(0, 1 + k, 1.0, 0.0) for k in range(3)), *turns))
+        labels = [f"{self!r} along {axis}" for axis in _AXES] + [f"{self!r} about {axis}" for axis in _AXES]
+        return Bound(rows, tuple(labels), tuple((4 + k, 7 + k) for k in range(3)))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PointOnPlane(Constraint):
+    """A point that stays in a plane: g = normal . (x_a - x_b). Its force acts on a along the normal [N].
+
+    Attributes:
+        a: The point.
+        b: A point of the plane, which may be carried by a frame.
+        normal: Of the plane (3,), of any length, in the axes of b's frame, or of the world.
+    """
+
+    a: Point
+    b: Point
+    normal: ArrayLike
+
+    def bind(self, robot: Robot) -> Bound:
+        """See :meth:`Constraint.bind`."""
+        a, b, turned = _ends(self, robot)
+        normal = turned @ _unit("normal", self.normal)
+        vectors = ((a, b), (Carried(b.body, True, _row(normal)),))
+        return Bound(ConstraintRows(vectors, (Product(0, 1, 1.0, 0.0),)), (f"{self!r}",))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PointOnLine(Constraint):
+    """A point that stays on a line. Its two forces act on a across the line [N].
+
+    Attributes:
+        a: The point.
+        b: A point of the line, which may be carried by a frame.
+        direction: Of the line (3,), of any length, in the axes of b's frame, or of the world.
+    """
+
+    a: Point
+    b: Point
+    direction: ArrayLike
+
+    def bind(self, robot: Robot) -> Bound:
+        """See :meth:`Constraint.bind`."""
+        a, b, turned = _ends(self, robot)
+        along = _unit("direction", self.direction)
+        first = np.cross(along, np.eye(3)[int(np.argmin(np.abs(along)))])
+        first /= np.linalg.norm(first)
+        across = [turned @ first, turned @ np.cross(along, first)]
+        vectors = ((a, b), *((Carried(b.body, True, _row(axis)),) for axis in across))
+        rows = ConstraintRows(vectors, (Product(0, 1, 1.0, 0.0), Product(0, 2, 1.0, 0.0)))
+        return Bound(rows, (f"{self!r}, first row", f"{self!r}, second row"))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Distance(Constraint):
+    """Two points at a fixed distance, as of a rigid rod: g = (d . d - length^2) / (2 length), d = x_a - x_b.
+
+    Its force acts on a away from b [N].
+
+    Attributes:
+        a: The one point.
+        b: The other.
+        length: > 0 [m].
+    """
+
+    a: Point
+    b: Point
+    length: float
+
+    def bind(self, robot: Robot) -> Bound:
+        """See :meth:`Constraint.bind`."""
+        a, b, _ = _ends(self, robot)
+        length = positive("length", _number(self.length), "m")
+        return Bound(ConstraintRows(((a, b),), (Product(0, 0, 0.5 / length, 0.5 * length),)), (f"{self!r}",))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class JointTie(Constraint):
+    """A joint tied to another: g = q_joint - (c_0 + c_1 q_leader + c_2 q_leader^2 + ...), as gears and cams are.
+
+    Its force is that on the joint [N m or N].
+
+    Attributes:
+        joint: The one joint's name.
+        leader: The other's.
+        coefficients: c (k,); (0, r) is a gear of ratio r.
+    """
+
+    joint: str
+    leader: str
+    coefficients: ArrayLike = (0.0, 1.0)
+
+    def bind(self, robot: Robot) -> Bound:
+        """See :meth:`Constraint.bind`."""
+        for name in (self.joint, self.leader):
+            if name not in robot.joint_names:
+                raise UnknownJoint(str(name), robot.joint_names, "JointTie")
+        if self.joint == self.leader:
+            raise InputError(f"JointTie ties joint {self.joint!r} to itself")
+        given = as_floats("coefficients", self.coefficients)
+        if given.ndim != 1 or not given.size:
+            raise InputError(f"coefficients must have shape (k,), got {given.shape}")
+        c = finite_array("coefficients", given, given.shape)
+        tie = Tied(robot.coordinate(self.joint), robot.coordinate(self.leader), tuple(c.tolist()))
+        return Bound(ConstraintRows(ties=(tie,)), (f"{self!r}",))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CustomConstraint(Constraint):
+    """Constraints of one's own. Its forces go with its rows: the joints feel jacobian' force.
+
+    Attributes:
+        rows: How many, r.
+        value: g, a function of q (n,) that returns (r,), in [m] or [rad].
+        jacobian: dg/dq, a function of q that returns (r, n). Forces come from it: it has to be exact.
+        curvature: sum_k w_k d2 g_k/dq2, a function of q and weights w (r,) that returns (n, n). Left out, it is taken
+            from differences of the Jacobian: linearizations are then good to about 1e-9.
+    """
+
+    rows: int
+    value: Callable[[Floats], ArrayLike]
+    jacobian: Callable[[Floats], ArrayLike]
+    curvature: Callable[[Floats, Floats], ArrayLike] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        count("rows", self.rows, least=1)
+        for name in ("value", "jacobian"):
+            if not callable(getattr(self, name)):
+                raise InputError(f"CustomConstraint: {name} must be a function of q, got {getattr(self, name)!r}")
+        if not (self.curvature is None or callable(self.curvature)):
+            raise InputError(f"CustomConstraint: curvature must be a function of q and weights, got {self.curvature!r}")
+
+    def bind(self, robot: Robot) -> Bound:
+        """See :meth:`Constraint.bind`."""
+        n, r = robot.dof, int(self.rows)
+        custom = CustomRows(r, _Values(self, n), _Curvature(self, n))
+        return Bound(ConstraintRows(customs=(custom,)), tuple(f"{self!r}, row {k}" for k in range(r)))
+
+
+@dataclass(frozen=True)
+class _Values:
+    """G and C of a custom constraint, checked."""
+
+    own: CustomConstraint
+    dof: int
+
+    def __call__(self, q: Floats) -> tuple[Floats, Floats]:
+        r = int(self.own.rows)
+        g = finite_array("the value of a CustomConstraint", self.own.value(q), (r,))
+        return g, self.jacobian(q)
+
+    def jacobian(self, q: Floats) -> Floats:
+        return finite_array("the jacobian of a CustomConstraint", self.own.jacobian(q), (int(self.own.rows), self.dof))
+
+
+@dataclass(frozen=True)
+class _Curvature:
+    """Its second derivatives, contracted."""
+
+    own: CustomConstraint
+    dof: int
+
+    def __call__(self, q: Floats, weights: Floats) -> Floats:
+        n = self.dof
+        if self.own.curvature is not None:
+            return finite_array("the curvature of a CustomConstraint", self.own.curvature(q, weights), (n, n))
+        slope = _Values(self.own, n).jacobian
+        H = np.empty((n, n))
+        for c in range(n):
+            size = 1e-3 * max(1.0, abs(q[c]))
+            step = size * np.eye(n)[c]
+            parts = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+            H[c] = sum(w * (weights @ (slope(q + k * step) - slope(q - k * step))) for k, w in parts.items()) / size
+        symmetric: Floats = 0.5 * (H + H.T)
+        return symmetric
+
+
+def constraints_of(given: Constraint | Sequence[Constraint]) -> tuple[Constraint, ...]:
+    """What a user gives as constraints.
+
+    Raises:
+        InputError: It is none of them.
+    """
+    found = (given,) if isinstance(given, Constraint) else given
+    if isinstance(found, str) or not isinstance(found, Sequence):
+        raise InputError(f"constraints must be a list of varpin's constraints, got {type(given).__name__}")
+    for own in found:
+        if not isinstance(own, Constraint):
+            raise InputError(f"constraints must be a list of varpin's constraints, got {own!r} in it")
+    return tuple(found)
+
+
+def joined(bound: Sequence[Bound]) -> tuple[Bound, NDArray[np.int64]]:
+    """All of them as one, its rows in the core's order; and where each row of the given order stands there."""
+    vectors: list[tuple[Carried, ...]] = []
+    products: list[tuple[int, Product]] = []
+    ties: list[tuple[int, Tied]] = []
+    customs: list[tuple[int, CustomRows]] = []
+    labels: list[str] = []
+    aligned: list[tuple[int, int]] = []
+    for own in bound:
+        first, rows, row = len(vectors), own.rows, len(labels)
+        vectors += rows.vectors
+        moved = [product._replace(x=product.x + first, y=product.y + first) for product in rows.products]
+        products += [(row + k, product) for k, product in enumerate(moved)]
+        ties += [(row + k, tie) for k, tie in enumerate(rows.ties)]
+        customs += [(row, custom) for custom in rows.customs]
+        labels += own.labels
+        aligned += [(x + first, y + first) for x, y in own.aligned]
+    core = [row for row, _ in products] + [row for row, _ in ties]
+    core += [row + k for row, custom in customs for k in range(custom.rows)]
+    together = ConstraintRows(
+        tuple(vectors),
+        tuple(product for _, product in products),
+        tuple(tie for _, tie in ties),
+        tuple(custom for _, custom in customs),
+    )
+    place = np.argsort(np.array(core, dtype=np.int64))
+    return Bound(together, tuple(labels[row] for row in core), tuple(aligned)), place
+
+
+def _row(values: Floats) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _number(value: Any) -> float:
+    return float(value) if np.ndim(value) == 0 else finite("length", value)
+
+
+def _unit(name: str, value: ArrayLike) -> Floats:
+    given = finite_array(name, value, (3,))
+    length = float(np.linalg.norm(given))
+    if not length > 0.0:
+        raise InputError(f"{name} must not be zero")
+    return given / length
+
+
+def _require_movable(own: Constraint, a: int, b: int, robot: Robot) -> None:
+    if a < 0 and b < 0:
+        raise InputError(
+            f"{type(own).__name__}: both ends are fixed, in the world or to the base of robot {robot.name!r}: no joint "
+            "moves one"
+        )
+    if a == b:
+        raise InputError(f"{type(own).__name__}: both ends are on one body, and no joint moves one against the other")
+
+
+def _ends(own: Any, robot: Robot) -> tuple[Carried, Carried, Floats]:
+    """The points a and b, and the rotation (3, 3) of b's frame on its body."""
+    (a, _, here), (b, turned, there) = point_of("a", own.a, robot), point_of("b", own.b, robot)
+    _require_movable(own, a, b, robot)
+    return Carried(a, False, _row(here)), Carried(b, False, _row(there)), turned

@@ -1,0 +1,670 @@
+"""Holonomic constraints: rows against differences, motions against SciPy on index-reduced equations, linearizations."""
+
+import pickle
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from mechanisms import random_rotation
+from scipy.integrate import solve_ivp
+from scipy.optimize import minimize
+
+import varpin as vp
+from varpin.core import ForwardDynamics
+from varpin.mechanics.assembly import along_constraints
+
+LOOPS = {
+    # Links of 1 m; the ground closes the loop.
+    "four-bar": (3, [vp.PointOnPoint("tip", (1.3, 0.0, 0.2), axes="xz")], [-1.5, 1.5, 1.5]),
+    "five-bar": (4, [vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="xz")], [-1.0, 1.0, 1.0, 1.0]),
+}
+
+
+WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+
+
+def central(f, x, size=1e-3):
+    """Derivative of f in each entry of x, of eighth order, along the first axis."""
+    return np.array(
+        [
+            sum(w * (f(x + k * size * d) - f(x - k * size * d)) for k, w in WEIGHTS.items()) / size
+            for d in np.eye(x.size)
+        ]
+    )
+
+
+def loop(name, **options):
+    """A scene with a loop, and a state in it."""
+    links, constraints, q = LOOPS[name]
+    scene = vp.Scene(vp.planar_chain(links), constraints=constraints, **options)
+    q = vp.assemble(scene, q)
+    return scene, q, along_constraints(scene, q, np.array([1.0, 0.0, 0.0, 2.0][:links]))
+
+
+def reference(scene, q, v, t):
+    """(q, v) at the times t, of M a + C' y = f - bias, C a = -(g_qq v) v, by DOP853."""
+    free = vp.Scene(scene.robot, forces=scene.forces, gravity=scene.gravity)
+    dynamics, n = ForwardDynamics(free.core), q.size
+
+    def rate(_, x):
+        slope, regular = dynamics.rate(x, np.zeros(n))
+        assert regular
+        (C,), M = scene.core.constraints(x[None, :n])[2], vp.lagrangian_jet(free, x[:n], x[n:]).Lvv
+        bent = scene.core.constraint_curvature(x[:n], np.zeros(len(C)), x[n:])[1] @ x[n:]
+        inverse = np.linalg.solve(M, C.T)
+        pull = np.linalg.lstsq(C @ inverse, C @ slope[n:] + bent, rcond=1e-9)[0]
+        return np.append(x[n:], slope[n:] - inverse @ pull)
+
+    solution = solve_ivp(rate, (0.0, t[-1]), np.append(q, v), method="DOP853", rtol=1e-12, atol=1e-12, t_eval=t)
+    return solution.y[:n].T, solution.y[n:].T
+
+
+def violations(scene, trajectory):
+    g, _, C = scene.core.constraints(trajectory.q)
+    return np.abs(g).max(), np.abs(np.einsum("kmn,kn->km", C, trajectory.v)).max()
+
+
+class Circle:
+    """The first two joints on an ellipse, as a custom constraint."""
+
+    def value(self, q):
+        return [q[0] ** 2 + 2.0 * q[1] ** 2 - 1.0]
+
+    def jacobian(self, q):
+        row = np.zeros((1, q.size))
+        row[0, :2] = 2.0 * q[0], 4.0 * q[1]
+        return row
+
+    def curvature(self, q, weights):
+        H = np.zeros((q.size, q.size))
+        H[0, 0], H[1, 1] = 2.0 * weights[0], 4.0 * weights[0]
+        return H
+
+
+OWN = Circle()
+POSE = np.array([[0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.2], [0.0, 0.0, 1.0, -0.3], [0.0, 0.0, 0.0, 1.0]])
+KINDS = {
+    "point on point": vp.PointOnPoint("tool0", (0.1, 0.2, 0.3)),
+    "one axis": vp.PointOnPoint(("tool0", (0.0, 0.1, 0.2)), ("forearm_link", (0.1, 0.0, 0.0)), axes="y"),
+    "weld": vp.FrameOnFrame("tool0", "universe"),
+    "weld of two": vp.FrameOnFrame("tool0", "upper_arm_link", POSE),
+    "plane": vp.PointOnPlane("tool0", (0.0, 0.0, 0.4), (1.0, 2.0, 3.0)),
+    "carried plane": vp.PointOnPlane("tool0", ("upper_arm_link", (0.1, 0.0, 0.2)), (1.0, 2.0, 3.0)),
+    "line": vp.PointOnLine("tool0", (0.1, 0.2, 0.3), (0.0, 1.0, 1.0)),
+    "carried line": vp.PointOnLine("tool0", ("upper_arm_link", (0.1, 0.0, 0.2)), (1.0, 0.0, 3.0)),
+    "rod": vp.Distance("tool0", ("upper_arm_link", (0.0, 0.1, 0.0)), 0.5),
+    "gear": vp.JointTie("elbow_joint", "shoulder_lift_joint", (0.1, -2.0)),
+    "cam": vp.JointTie("elbow_joint", "shoulder_lift_joint", (0.1, 0.5, -0.3, 0.2, 0.1)),
+    "custom": vp.CustomConstraint(1, OWN.value, OWN.jacobian, OWN.curvature),
+    "custom without curvature": vp.CustomConstraint(1, OWN.value, OWN.jacobian),
+}
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return vp.load_robot("ur5")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rows_have_the_derivatives_of_their_values(arm, kind):
+    scene = vp.Scene(arm, constraints=KINDS[kind])
+    rng = np.random.default_rng(0)
+    q, v = rng.normal(size=6), rng.normal(size=6)
+    g, C = scene.constraint_values(q)
+    assert len(g) == len(scene.constraint_labels)
+    np.testing.assert_allclose(C, central(lambda x: scene.constraint_values(x)[0], q).T, atol=1e-11)
+    weights = rng.normal(size=len(g))
+    H, bent = scene.core.constraint_curvature(q, weights, v)
+    slopes = central(lambda x: scene.core.constraints(x[None])[2][0], q)  # [k, row, c]
+    np.testing.assert_allclose(H, np.einsum("r,krc->kc", weights, slopes), atol=1e-10)
+    np.testing.assert_allclose(bent, np.einsum("krc,c->rk", slopes, v), atol=1e-10)
+
+
+def test_rows_mean_what_pinocchio_says(arm):
+    q = np.random.default_rng(1).normal(size=6)
+    model = arm.model
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    tool, upper = (data.oMf[model.getFrameId(name)] for name in ("tool0", "upper_arm_link"))
+    place = upper.act(np.array([0.1, 0.0, 0.2]))
+
+    def value(kind):
+        return vp.Scene(arm, constraints=KINDS[kind]).constraint_values(q)[0]
+
+    np.testing.assert_allclose(value("point on point"), tool.translation - (0.1, 0.2, 0.3), atol=1e-14)
+    normal = upper.rotation @ np.array([1.0, 2.0, 3.0]) / np.sqrt(14.0)
+    np.testing.assert_allclose(value("carried plane"), [normal @ (tool.translation - place)], atol=1e-14)
+    along = upper.rotation @ np.array([1.0, 0.0, 3.0]) / np.sqrt(10.0)
+    off = np.linalg.norm(np.cross(along, tool.translation - place))
+    assert np.linalg.norm(value("carried line")) == pytest.approx(off, abs=1e-14)
+    far = np.linalg.norm(tool.translation - upper.act(np.array([0.0, 0.1, 0.0])))
+    np.testing.assert_allclose(value("rod"), [(far**2 - 0.25) / 1.0], atol=1e-14)
+    # A weld in the pose that the frames have holds.
+    pose = upper.actInv(tool).homogeneous
+    np.testing.assert_allclose(
+        vp.Scene(arm, constraints=vp.FrameOnFrame("tool0", "upper_arm_link", pose)).constraint_values(q)[0],
+        0.0,
+        atol=1e-14,
+    )
+
+
+@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize(("integrator", "steps"), [(vp.Midpoint(), 40), (vp.Gauss(2), 20), (vp.Gauss(3), 5)])
+def test_loops_converge_with_the_order_of_the_integrator(name, integrator, steps):
+    steps *= 4 if name == "five-bar" and integrator.order == 6 else 1
+    scene, q, v = loop(name, damping=0.1)
+    end_q, end_v = (x[-1] for x in reference(scene, q, v, np.array([0.5])))
+    errors, order = [], integrator.order
+    for N in (steps, 2 * steps, 4 * steps):
+        motion = vp.simulate(scene, q, v, dt=0.5 / N, steps=N, integrator=integrator, check=False)
+        assert motion.statistics.split_steps == 0
+        errors.append(max(np.abs(motion.q[-1] - end_q).max(), np.abs(motion.v[-1] - end_v).max()))
+    assert np.log2(errors[0] / errors[1]) > order - 0.4
+    assert np.log2(errors[1] / errors[2]) > order - 0.4
+
+
+def test_forces_are_those_of_the_index_reduced_equations():
+    scene, q, v = loop("five-bar")
+    dt, N = 1e-3, 100
+    motion = vp.simulate(scene, q, v, dt=dt, steps=N, integrator=vp.Gauss(2))
+    middle = np.append(0.0, (np.arange(N) + 0.5) * dt)
+    qs, vs = reference(scene, q, v, middle)
+    free = vp.Scene(scene.robot)
+    for k in (0, 50, 99):
+        x = np.append(qs[k + 1], vs[k + 1])
+        a = ForwardDynamics(free.core).rate(x, np.zeros(4))[0][4:]
+        C, M = scene.constraint_values(x[:4])[1], vp.lagrangian_jet(free, x[:4], x[4:]).Lvv
+        bent = scene.core.constraint_curvature(x[:4], np.zeros(2), x[4:])[1] @ x[4:]
+        force = -np.linalg.solve(C @ np.linalg.solve(M, C.T), C @ a + bent)
+        np.testing.assert_allclose(motion.constraint_forces[k], force, atol=1e-3 * np.abs(force).max())
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)])
+def test_a_long_motion_stays_on_the_constraints_and_keeps_its_energy(integrator):
+    long_motion(integrator, 100_000)
+
+
+@pytest.mark.slow
+def test_a_million_steps_stay_on_the_constraints():
+    long_motion(vp.Midpoint(), 1_000_000)
+
+
+def long_motion(integrator, steps):
+    scene, q, v = loop("four-bar")
+    motion = vp.simulate(scene, q, v, dt=2e-3, steps=steps, integrator=integrator, check=False)
+    g, rate = violations(scene, motion)
+    assert g < 1e-12
+    assert rate < 1e-12
+    off = motion.energy - motion.energy[0]
+    first, second = off[: steps // 2], off[steps // 2 :]
+    assert abs(second.mean() - first.mean()) < 0.05 * np.abs(off).max()
+    assert np.abs(off).max() < 2e-3 * np.ptp(np.einsum("ki,ki->k", motion.p, motion.v))
+
+
+def test_a_crank_that_goes_round_keeps_its_digits():
+    # A connecting rod twice as long as the crank.
+    end = ("tip", (1.0, 0.0, 0.0))
+    scene = vp.Scene(vp.planar_chain(2), gravity=False, constraints=vp.PointOnPoint(end, (0.0, 0.0, 0.0), axes="z"))
+    q = vp.assemble(scene, [0.4, -0.6])
+    v = along_constraints(scene, q, np.array([20.0, -20.0]))
+    motion = vp.simulate(scene, q, v, dt=1e-3, steps=20_000, check=False)
+    assert np.ptp(motion.q[:, 0]) > 100.0
+    # What is shown has as many digits as the turns leave.
+    g, rate = violations(scene, motion)
+    assert g < 1e-12
+    assert rate < 1e-10
+
+
+def tangent(scene, q, v):
+    """A basis of the tangent space at (q, p)."""
+    n = q.size
+    jet = vp.lagrangian_jet(scene, q, v)
+    C = scene.constraint_values(q)[1]
+    bent = scene.core.constraint_curvature(q, np.zeros(len(C)), v)[1][scene.constraint_order]
+    inverse = np.linalg.inv(jet.Lvv)
+    rows = np.block([[C, np.zeros_like(C)], [bent - C @ inverse @ jet.Lvq, C @ inverse]])
+    _, sizes, basis = np.linalg.svd(rows)
+    return basis[int((sizes > 1e-9).sum()) :].T, n
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(3)])
+def test_linearizations_are_the_slopes_of_steps(integrator):
+    scene, q, v = loop("five-bar", damping=0.1)
+    u = np.array([1.0, -1.0, 2.0, 0.5])
+    motion = vp.simulate(scene, q, v, dt=0.02, steps=6, controls=u, integrator=integrator)
+    lin = vp.linearize(scene, motion)
+    k = 4
+    T, n = tangent(scene, motion.q[k], motion.v[k])
+    rng = np.random.default_rng(0)
+
+    def steps_of(change, control):
+        at = vp.assemble(scene, motion.q[k] + change[:n])
+        p = motion.p[k] + change[n:]
+        rate = along_constraints(scene, at, np.linalg.solve(vp.lagrangian_jet(scene, at, 0 * at).Lvv, p))
+        one = vp.simulate(scene, at, rate, dt=0.02, steps=1, controls=control, integrator=integrator, check=False)
+        return (np.append(x.q[i], x.p[i]) for x, i in ((one, 0), (one, 1)))
+
+    size = 3e-3
+    for _ in range(3):
+        way = T @ rng.normal(size=T.shape[1])
+        way /= np.abs(way).max()
+        start, end = np.zeros(2 * n), np.zeros(2 * n)
+        for i, w in WEIGHTS.items():
+            for sign in (1.0, -1.0):
+                before, after = steps_of(sign * i * size * way, u)
+                start, end = start + sign * w / size * before, end + sign * w / size * after
+        np.testing.assert_allclose(lin.A[k] @ start, end, atol=1e-8)
+    B = central(lambda x: np.array(list(steps_of(np.zeros(2 * n), x))[1]), u, 0.1)
+    np.testing.assert_allclose(lin.B[k], B.T, atol=1e-8)
+    # What is normal to the constraints does nothing.
+    C = scene.constraint_values(motion.q[k])[1]
+    assert np.abs(lin.K[k] @ C.T).max() < 1e-12
+    assert np.abs(scene.constraint_values(motion.q[k + 1])[1] @ lin.A[k, :n]).max() < 1e-12
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(3)])
+def test_linearizations_are_symplectic_along_the_constraints(integrator):
+    scene, q, v = loop("five-bar")
+    motion = vp.simulate(scene, q, v, dt=0.02, steps=6, integrator=integrator)
+    A = vp.linearize(scene, motion).A[5]
+    T, n = tangent(scene, motion.q[5], motion.v[5])
+    J = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
+    assert np.abs(T.T @ (A.T @ J @ A - J) @ T).max() < 1e-12
+    assert np.abs(A.T @ J @ A - J).max() > 0.1
+    assert np.linalg.matrix_rank(A, tol=1e-9) == 2 * (n - 2)
+
+
+def test_split_steps_are_linearized_in_their_parts():
+    scene, q, v = loop("five-bar")
+    integrator = vp.Gauss(2, guard=vp.Guard(energy_balance=1e-7))
+    motion = vp.simulate(scene, q, v, dt=0.1, steps=4, integrator=integrator, check=False)
+    assert motion.statistics.split_steps > 0
+    lin = vp.linearize(scene, motion, integrator=integrator)
+    T, n = tangent(scene, motion.q[0], motion.v[0])
+    J = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
+    assert np.abs(T.T @ (lin.A[0].T @ J @ lin.A[0] - J) @ T).max() < 1e-10
+
+
+def test_noise_across_the_constraints_is_absorbed():
+    noisy, q, v = loop("five-bar", noise=vp.AdditiveNoise(0.5))
+    motion = vp.simulate(noisy, q, v, dt=0.01, steps=100, rng=1, integrator=vp.Gauss(2))
+    assert max(violations(noisy, motion)) < 1e-12
+    # A kick along C' alone changes nothing.
+    C = noisy.constraint_values(q)[1]
+    quiet = loop("five-bar")[0]
+    along = noisy.noise.diffusion.constant
+    dw = np.zeros((1, noisy.processes))
+    dw[0] = np.linalg.lstsq(along, C.T @ [3.0, -2.0], rcond=None)[0]
+    kicked = vp.simulate(noisy, q, v, dt=0.01, steps=1, increments=dw)
+    plain = vp.simulate(quiet, q, v, dt=0.01, steps=1)
+    np.testing.assert_allclose(kicked.p[1], plain.p[1], atol=1e-12)
+    lin = vp.linearize(noisy, motion, integrator=vp.Gauss(2))
+    assert np.abs(noisy.constraint_values(motion.q[1])[1] @ lin.G[0, :4]).max() < 1e-1
+
+
+def test_moments_are_those_of_many_paths():
+    noisy, q, v = loop("five-bar", damping=0.5, noise=vp.AdditiveNoise(0.02))
+    steps, dt, integrator = 20, 0.01, vp.Midpoint()
+    quiet = vp.simulate(noisy, q, v, dt=dt, steps=steps, integrator=integrator, increments=0.0)
+    covariance = vp.propagate_moments(vp.linearize(noisy, quiet)).covariance[-1]
+    ends = []
+    for seed in range(400):
+        path = vp.simulate(noisy, q, v, dt=dt, steps=steps, integrator=integrator, rng=seed, check=False)
+        ends.append(np.append(path.q[-1], path.p[-1]) - np.append(quiet.q[-1], quiet.p[-1]))
+    found = np.cov(np.array(ends).T)
+    deviations = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), deviations, rtol=0.12, atol=1e-3 * deviations.max())
+    # There is none across the constraints.
+    C = noisy.constraint_values(quiet.q[-1])[1]
+    assert np.abs(C @ covariance[:4, :4]).max() < 1e-12
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(3)])
+def test_rows_that_depend_on_others_change_nothing(integrator):
+    scene, q, v = loop("four-bar")
+    point = np.array([1.3, 0.0, 0.2])
+    # Out of the plane nothing moves; the same loop from the other side; and in other axes.
+    twice = [
+        vp.PointOnPoint("tip", point),
+        vp.PointOnPoint(point, "tip", axes="zx"),
+        vp.PointOnPlane("tip", point, (1.0, 0.5, 1.0)),
+    ]
+    other = vp.Scene(scene.robot, constraints=twice)
+    one, two = (vp.simulate(s, q, v, dt=5e-3, steps=400, integrator=integrator) for s in (scene, other))
+    np.testing.assert_allclose(two.q, one.q, atol=1e-10)
+    assert max(violations(other, two)) < 1e-12
+    C = other.core.constraints(two.q[:1])[2][0][other.constraint_order]
+    alone = scene.constraint_values(q)[1]
+    np.testing.assert_allclose(two.constraint_forces[0] @ C, one.constraint_forces[0] @ alone, atol=0.2)
+    A, B = (vp.linearize(s, m).A for s, m in ((scene, one), (other, two)))
+    np.testing.assert_allclose(A[:5], B[:5], atol=1e-8)
+
+
+def test_a_loop_in_an_oblique_plane_has_two_rows():
+    """Of its three rows none vanishes, and each depends on the two others."""
+    turn = random_rotation(np.random.default_rng(3))
+    model, parent = pin.Model(), 0
+    for k in range(3):
+        place = pin.SE3(np.eye(3), np.array([1.0, 0.0, 0.0])) if k else pin.SE3(turn, np.zeros(3))
+        parent = model.addJoint(parent, pin.JointModelRY(), place, f"j{k}")
+        body = pin.Inertia(1.0, np.array([0.5, 0.0, 0.0]), 0.1 * np.eye(3))
+        model.appendBodyToJoint(parent, body, pin.SE3.Identity())
+    end = pin.SE3(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    model.addFrame(pin.Frame("tip", parent, 0, end, pin.FrameType.OP_FRAME))
+    robot, point = vp.load_robot(model), turn @ np.array([1.3, 0.0, 0.2])
+    rows = [vp.PointOnPlane("tip", point, turn[:, c]) for c in (0, 2)]
+    three, two = (vp.Scene(robot, constraints=own) for own in (vp.PointOnPoint("tip", point), rows))
+    q = vp.assemble(three, [-1.5, 1.5, 1.5])
+    v = along_constraints(three, q, np.ones(3))
+    one, other = (vp.simulate(s, q, v, dt=5e-3, steps=400, integrator=vp.Gauss(2)) for s in (three, two))
+    np.testing.assert_allclose(one.q, other.q, atol=1e-12)
+    assert max(violations(three, one)) < 1e-12
+
+
+def test_a_start_next_to_the_constraints_is_moved_onto_them(caplog):
+    scene, q, v = loop("five-bar")
+    off = q + 1e-3 * np.array([1.0, -1.0, 0.5, 1.0])
+    motion = vp.simulate(scene, off, [1.0, 1.0, 1.0, 1.0], dt=1e-2, steps=2)
+    assert max(violations(scene, motion)) < 1e-12
+    (said,) = motion.warnings
+    assert "q0 was moved by up to" in said
+    assert "v0 was changed by up to" in said
+    assert said in caplog.text
+    assert vp.simulate(scene, q, v, dt=1e-2, steps=2).warnings == ()
+
+
+def test_a_start_far_from_the_constraints_is_refused():
+    scene, q, _ = loop("five-bar")
+    with pytest.raises(vp.InputError, match=r"q0 misses PointOnPoint.*assemble"):
+        vp.simulate(scene, q + 0.1, 0.0 * q, dt=1e-2, steps=2)
+
+
+@pytest.mark.parametrize("off", [1e-3, 0.1, 1.0])
+def test_assembly_is_the_nearest(off):
+    scene, q, _ = loop("five-bar")
+    start = q + off * np.array([0.5, -0.3, 0.4, 0.6])
+    M = vp.lagrangian_jet(scene, start, 0 * q).Lvv
+    found = vp.assemble(scene, start)
+    assert np.abs(scene.constraint_values(found)[0]).max() < 1e-14
+
+    def distance(x):
+        return 0.5 * (x - start) @ M @ (x - start)
+
+    best = minimize(
+        distance,
+        found + 1e-3 * off,
+        constraints={"type": "eq", "fun": lambda x: scene.constraint_values(x)[0]},
+        method="SLSQP",
+        options={"ftol": 1e-14},
+    )
+    assert distance(found) <= best.fun * (1.0 + 1e-5) + 1e-15
+
+
+def test_what_cannot_be_assembled_says_by_how_much():
+    robot = vp.planar_chain(2)
+    scene = vp.Scene(
+        robot, constraints=[vp.JointTie("joint2", "joint1"), vp.PointOnPoint("tip", (2.5, 0.0, 0.0), axes="xz")]
+    )
+    with pytest.raises(vp.AssemblyError, match="misses PointOnPoint") as found:
+        vp.assemble(scene, [1.4, 0.4])
+    assert found.value.miss > 0.3
+    # Turned by half a turn a weld's rows hold too.
+    arm = vp.load_robot("ur5")
+    welded = vp.Scene(arm, constraints=vp.JointTie("wrist_3_joint", "wrist_2_joint", (0.5,)))
+    assert vp.assemble(welded, np.full(6, 0.4))[5] == pytest.approx(0.5)
+
+
+def test_a_weld_that_is_turned_round_is_none():
+    robot = vp.planar_chain(1)
+    scene = vp.Scene(robot, constraints=vp.FrameOnFrame("joint1", "universe"))
+    assert abs(np.sin(vp.assemble(scene, [0.3])[0] - vp.assemble(scene, [-0.2])[0])) < 1e-12
+    with pytest.raises(vp.AssemblyError, match="FrameOnFrame"):
+        vp.assemble(scene, [vp.assemble(scene, [0.1])[0] + 3.0])
+
+
+@pytest.mark.parametrize("ground", [1.01, 1.1])
+def test_near_a_toggle_point_steps_are_cut_and_the_assembly_is_kept(ground):
+    robot = vp.planar_chain(3)
+    scene = vp.Scene(robot, gravity=False, constraints=vp.PointOnPoint("tip", (ground, 0.0, 0.0), axes="xz"))
+    q = vp.assemble(scene, [-np.pi / 2, np.pi / 2, np.pi / 2])
+    v = along_constraints(scene, q, np.array([3.0, 0.0, 0.0]))
+    fine = vp.simulate(scene, q, v, dt=5e-4, steps=6000, integrator=vp.Gauss(3))
+    coarse = vp.simulate(scene, q, v, dt=2e-2, steps=150, integrator=vp.Gauss(2))
+    assert coarse.statistics.split_steps > 0
+    assert np.abs(coarse.energy / coarse.energy[0] - 1.0).max() < 0.01
+    np.testing.assert_allclose(coarse.q, fine.q[::40], atol=0.02)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)])
+def test_a_motion_through_a_toggle_point_stops_and_names_the_constraint(integrator):
+    scene = vp.Scene(vp.planar_chain(3), gravity=False, constraints=vp.PointOnPoint("tip", (1.0, 0.0, 0.0), axes="xz"))
+    # A parallelogram, which may become a crossed one where it is flat.
+    q = np.array([-np.pi / 2, np.pi / 2, np.pi / 2])
+    with pytest.raises(vp.StepFailure, match="PointOnPoint") as found:
+        vp.simulate(
+            scene, q, along_constraints(scene, q, np.array([3.0, 0.0, 0.0])), dt=0.01, steps=100, integrator=integrator
+        )
+    motion = found.value.trajectory
+    assert motion.t[-1] > 0.4
+    assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 1e-3
+
+
+def test_a_gear_is_a_mimic_joint(tmp_path):
+    free = vp.planar_chain(2)
+    scene = vp.Scene(free, constraints=vp.JointTie("joint2", "joint1", (0.2, -1.5)))
+    q = np.array([0.4, 0.2 - 0.6])
+    motion = vp.simulate(scene, q, [1.0, -1.5], dt=5e-3, steps=200, integrator=vp.Gauss(3))
+    np.testing.assert_allclose(motion.q[:, 1], 0.2 - 1.5 * motion.q[:, 0], atol=1e-12)
+    end, _ = reference(scene, q, np.array([1.0, -1.5]), np.array([1.0]))
+    np.testing.assert_allclose(motion.q[-1], end[-1], atol=1e-9)
+
+
+def test_a_custom_constraint_moves_as_the_reference():
+    scene = vp.Scene(vp.planar_chain(3), constraints=KINDS["custom"])
+    q = vp.assemble(scene, [0.6, 0.5, 0.3])
+    v = along_constraints(scene, q, np.array([1.0, 0.0, 0.5]))
+    motion = vp.simulate(scene, q, v, dt=1.25e-3, steps=160, integrator=vp.Gauss(3))
+    end, _ = reference(scene, q, v, np.array([0.2]))
+    np.testing.assert_allclose(motion.q[-1], end[-1], rtol=0.0, atol=1e-8)
+    # Differences in the place of its curvature change Newton's way and not the root.
+    plain = vp.Scene(scene.robot, constraints=KINDS["custom without curvature"])
+    again = vp.simulate(plain, q, v, dt=1.25e-3, steps=10, integrator=vp.Gauss(3))
+    np.testing.assert_allclose(again.q, motion.q[:11], atol=1e-13)
+    np.testing.assert_allclose(vp.linearize(plain, again).A, vp.linearize(scene, motion).A[:10], atol=1e-9)
+
+
+def test_a_custom_constraint_that_raises_is_told_of():
+    def broken(q):
+        raise RuntimeError("no value")
+
+    scene = vp.Scene(vp.planar_chain(3), constraints=vp.CustomConstraint(1, broken, OWN.jacobian))
+    with pytest.raises(RuntimeError, match="no value"):
+        vp.simulate(scene, [1.0, 0.0, 0.0], np.zeros(3), dt=1e-2, steps=5)
+
+    def late(q):
+        return OWN.value(q) if q[2] < 0.05 else [np.nan]
+
+    failing = vp.Scene(vp.planar_chain(3), constraints=vp.CustomConstraint(1, late, OWN.jacobian))
+    with pytest.raises(vp.InputError, match="value of a CustomConstraint"):
+        vp.simulate(failing, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], dt=1e-2, steps=50)
+    wrong = vp.Scene(vp.planar_chain(3), constraints=vp.CustomConstraint(2, OWN.value, OWN.jacobian))
+    with pytest.raises(vp.InputError, match="value of a CustomConstraint"):
+        wrong.constraint_values(np.zeros(3))
+
+
+WRONG = {
+    "frame": (lambda: vp.PointOnPoint("tyip", (0, 0, 0)), "no frame 'tyip'"),
+    "axes": (lambda: vp.PointOnPoint("tip", (0, 0, 0), axes="xx"), "axes must be"),
+    "shape": (lambda: vp.PointOnPoint("tip", (0, 0)), r"b must be a frame's name.*shape \(2,\)"),
+    "not finite": (lambda: vp.PointOnPoint("tip", (0, 0, np.nan)), "must be finite"),
+    "both in the world": (lambda: vp.Distance((0, 0, 0), (1, 0, 0), 1.0), "both ends are fixed"),
+    "one body": (lambda: vp.Distance("tip", ("tip", (0, 0, 1)), 1.0), "both ends are on one body"),
+    "length": (lambda: vp.Distance("tip", (0, 0, 0), 0.0), "length must be positive"),
+    "normal": (lambda: vp.PointOnPlane("tip", (0, 0, 0), (0, 0, 0)), "normal must not be zero"),
+    "joint": (lambda: vp.JointTie("joint9", "joint1"), "no joint 'joint9'"),
+    "itself": (lambda: vp.JointTie("joint1", "joint1"), "to itself"),
+    "placement": (lambda: vp.FrameOnFrame("tip", "universe", 2.0 * np.eye(4)), "placement must be"),
+    "function": (lambda: vp.CustomConstraint(1, 3.0, OWN.jacobian), "value must be a function"),
+    "word": (lambda: "weld", "list of varpin's constraints"),
+    "in a list": (lambda: ["weld"], "'weld' in it"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_wrong_constraints_are_refused(what):
+    make, words = WRONG[what]
+    with pytest.raises(vp.VarpinError, match=words):
+        vp.Scene(vp.planar_chain(3), constraints=make())
+
+
+@pytest.mark.parametrize(
+    "integrator",
+    [vp.Radau(2), vp.Midpoint(0.4), vp.RungeKutta4(), vp.SemiImplicitEuler(), vp.ExplicitEuler(), vp.Reference()],
+)
+def test_integrators_that_keep_no_constraints_refuse_them(integrator):
+    scene, q, v = loop("four-bar")
+    with pytest.raises(
+        vp.InputError, match=rf"{type(integrator).__name__}.* does not take scenes with constraints.*Gauss"
+    ):
+        vp.simulate(scene, q, v, dt=1e-2, steps=2, integrator=integrator)
+
+
+def test_what_knows_no_constraints_refuses_them():
+    scene, q, v = loop("four-bar")
+    motion = vp.simulate(scene, q, v, dt=1e-2, steps=3)
+    cost = vp.ControlCost(1.0)
+    tries = [
+        lambda: vp.second_order(scene, motion, np.ones(6)),
+        lambda: vp.simulate_ensemble(scene, q, v, dt=1e-2, steps=2, paths=3, rng=0),
+        lambda: vp.OptimalControlProblem(scene, cost, q, v, dt=1e-2, steps=3),
+        lambda: vp.Plant(scene),
+        lambda: vp.work_precision(scene, q, v, duration=0.1),
+        lambda: vp.advise(scene, q, v, duration=0.1),
+        lambda: vp.check_linearization(scene, q, v, dt=1e-2),
+        lambda: vp.discrete_lagrangian(scene, q, q, 1e-2),
+        lambda: vp.simulate(scene, q, v, duration=0.1, tolerance=1e-3),
+        lambda: scene.holding_torque(q),
+        lambda: scene.holding_controls(q),
+    ]
+    for attempt in tries:
+        with pytest.raises(vp.InputError, match="does not take scenes with constraints"):
+            attempt()
+    noisy, *_ = loop("four-bar", noise=vp.AdditiveNoise(0.1))
+    with pytest.raises(vp.InputError, match="kick='split' does not go with constraints"):
+        vp.simulate(noisy, q, v, dt=1e-2, steps=2, rng=0, integrator=vp.Midpoint(kick="split"))
+
+
+def test_motions_keep_forces_and_the_constraints_they_were_made_under(tmp_path):
+    scene, q, v = loop("five-bar")
+    motion = vp.simulate(scene, q, v, dt=1e-2, steps=7)
+    assert motion.constraint_forces.shape == (7, 2)
+    assert motion.constraint_labels == scene.constraint_labels
+    assert motion.part(2, 5).constraint_forces.shape == (3, 2)
+    read = vp.Trajectory.load(motion.save(tmp_path / "motion.npz"), scene.robot)
+    np.testing.assert_array_equal(read.constraint_forces, motion.constraint_forces)
+    assert read.constraint_labels == motion.constraint_labels
+    np.testing.assert_array_equal(vp.linearize(scene, read).A, vp.linearize(scene, motion).A)
+    other = vp.Scene(scene.robot, constraints=vp.PointOnPoint("tip", (1.6, 0.0, 0.301), axes="xz"))
+    for wrong in (other, vp.Scene(scene.robot)):
+        with pytest.raises(vp.InputError, match="constraints between frames are others"):
+            vp.linearize(wrong, motion)
+    free = vp.simulate(vp.Scene(scene.robot), q, v, dt=1e-2, steps=2)
+    assert free.constraint_forces.shape == (2, 0)
+    with pytest.raises(vp.InputError, match="constraints between frames are others"):
+        vp.linearize(scene, free)
+
+
+def test_rows_keep_the_order_they_are_given_in():
+    robot = vp.planar_chain(4)
+    given = [
+        vp.JointTie("joint2", "joint1", (0.0, 0.5)),
+        vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="z"),
+        vp.CustomConstraint(1, OWN.value, OWN.jacobian),
+        vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="x"),
+    ]
+    scene = vp.Scene(robot, constraints=given)
+    q = np.array([0.3, 0.1, 0.5, -0.2])
+    each = [vp.Scene(robot, constraints=own).constraint_values(q) for own in given]
+    g, C = scene.constraint_values(q)
+    np.testing.assert_array_equal(g, np.concatenate([own for own, _ in each]))
+    np.testing.assert_array_equal(C, np.concatenate([own for _, own in each]))
+    assert [label.partition("(")[0] for label in scene.constraint_labels] == [type(own).__name__ for own in given]
+
+
+def test_scenes_with_constraints_are_pickled():
+    scene, q, v = loop("five-bar")
+    again = pickle.loads(pickle.dumps(scene))
+    np.testing.assert_array_equal(
+        vp.simulate(again, q, v, dt=1e-2, steps=5).q, vp.simulate(scene, q, v, dt=1e-2, steps=5).q
+    )
+    assert "PointOnPoint" in repr(scene)
+    assert "PointOnPoint" in scene._repr_html_()
+
+
+def test_controls_of_a_law_see_the_node():
+    scene, q, v = loop("five-bar", damping=2.0)
+    target = vp.assemble(scene, q + 0.1)
+    motion = vp.simulate(
+        scene, q, v, dt=5e-3, steps=1000, controls=lambda t, x, rate: 200.0 * (target - x) - 10.0 * rate
+    )
+    assert np.abs(motion.v[-1]).max() < 1e-3
+    assert max(violations(scene, motion)) < 1e-12
+
+
+SCENE_FILE = """
+[robot]
+source = "ur5"
+[[constraint]]
+type = "point_on_point"
+a = { frame = "tool0", place = [0.0, 0.0, 0.1] }
+b = [0.3, 0.2, 0.4]
+axes = "xz"
+[[constraint]]
+type = "joint_tie"
+joint = "wrist_3_joint"
+leader = "wrist_2_joint"
+coefficients = [0.1, -2.0]
+[[constraint]]
+type = "distance"
+a = "tool0"
+b = "upper_arm_link"
+length = 0.7
+[initial]
+q = [0.1, -1.0, 1.2, 0.3, 0.4, -0.7]
+[horizon]
+dt = 2e-3
+steps = 10
+"""
+
+
+def test_scene_files_have_constraints(tmp_path):
+    path = tmp_path / "loop.toml"
+    path.write_text(SCENE_FILE)
+    constraints = [
+        vp.PointOnPoint(("tool0", [0.0, 0.0, 0.1]), [0.3, 0.2, 0.4], axes="xz"),
+        vp.JointTie("wrist_3_joint", "wrist_2_joint", [0.1, -2.0]),
+        vp.Distance("tool0", "upper_arm_link", 0.7),
+    ]
+    scene = vp.Scene(vp.load_robot("ur5"), constraints=constraints)
+    with pytest.raises(vp.InputError, match=r"q0 misses .*assemble"):
+        vp.load_scene(path).simulate()
+    q = vp.assemble(scene, [0.1, -1.0, 1.2, 0.3, 0.4, -0.7])
+    path.write_text(SCENE_FILE.replace("[0.1, -1.0, 1.2, 0.3, 0.4, -0.7]", str(q.tolist())))
+    file = vp.load_scene(path)
+    assert file.robot.dof == 6
+    assert file.required.terms["constraints"] == "PointOnPoint, JointTie, Distance"
+    assert file.scene.bound_constraints == scene.bound_constraints
+    motion = file.simulate()
+    np.testing.assert_allclose(
+        motion.q, vp.simulate(scene, q, np.zeros(6), dt=2e-3, steps=10, integrator=vp.Gauss(2)).q
+    )
+    for change, words in (
+        (("tool0", "tol0"), r"constraint\[0\].*no frame 'tol0'"),
+        (("length = 0.7", "length = -1"), r"constraint\[2\].length"),
+        (("wrist_3_joint", "wrist_4_joint"), r"constraint\[1\].*wrist_4_joint"),
+        (('"distance"', '"rod"'), r"constraint\[2\].type"),
+        (("axes", "axis"), r"constraint\[0\].axis.*unknown key"),
+    ):
+        path.write_text(SCENE_FILE.replace(*change))
+        with pytest.raises(vp.SceneFileError, match=words):
+            vp.load_scene(path)
