@@ -104,7 +104,7 @@ def steps(scene):
         "tolerance": 0.5,
         "guards": core.Guards.make(**GUARDS),
         "dt": 1e-3,
-        **{"q": draw(N, n), "p": 0.1 * draw(N, n), "force": draw(N, n)},
+        **{"q": draw(N, n), "p": 0.1 * draw(N, n), "force": draw(N, 1, n)},
         "substeps": np.array([1, 1, 2, 4]),
         "halvings": np.array([1, 1, 2, 2, 2, 2], dtype=np.uint8),
     }
@@ -153,7 +153,7 @@ def calls():
     yield "accelerations", core.accelerations, {"mechanism": own.core, **many}
     for method in core.ExplicitMethod:
         fixed = {"mechanism": own.core, "method": method, "dt": 1e-3}
-        yield f"derivatives of {method}", core.linearize_explicit, {**fixed, **many}
+        yield f"derivatives of {method}", core.linearize_explicit, {**fixed, **states, "force": draw(N, 1, n)}
     yield "rate", dynamics.rate, {"x": draw(2 * n), "force": draw(n)}
     yield "node", dynamics.node, {"x": draw(2 * n)}
     yield "links", core.Links.make, links
@@ -172,6 +172,8 @@ def calls():
 # Sizes that are the caller's to choose: rows of what is done one by one, a control before that may be left out.
 FREE = {("place a frame", "q", 0), ("changes", "u", 0), ("changes", "u", 1), ("expanded changes", "u", 0)}
 FREE |= {("changes", "before", 0), ("expanded changes", "before", 0)}
+# Of two stages: a force for each.
+FREE |= {(name, "force", 1) for name in ("derivatives", "curvatures", "ends")}
 
 
 @pytest.fixture(scope="module")

@@ -54,6 +54,7 @@ from varpin.noise import CustomNoise as CustomNoise
 from varpin.noise import Noise as Noise
 from varpin.noise import NoiseFieldError as NoiseFieldError
 from varpin.noise import StateNoise as StateNoise
+from varpin.policy import FirstOrderHold as FirstOrderHold
 from varpin.policy import LinearPolicy as LinearPolicy
 from varpin.policy import OpenLoop as OpenLoop
 from varpin.replay import replay as replay

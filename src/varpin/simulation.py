@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,8 +25,9 @@ from varpin.core.arrays import Commands
 from varpin.errors import InputError, UnknownJoint, VarpinError
 from varpin.integrators import Integrator, Midpoint, Reference, Segment, integrator_of
 from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
+from varpin.integrators.within import Times, changing
 from varpin.loop_stability import examined_in_loop, outgrown, unstable_loop
-from varpin.policy import LinearPolicy, OpenLoop, takes
+from varpin.policy import FirstOrderHold, LinearPolicy, OpenLoop, takes
 from varpin.refinement import INTEGRATORS, SENSIBLE
 from varpin.scene import Scene, require_scene
 from varpin.soundness import Finding, announce, evident, with_warnings
@@ -35,6 +37,8 @@ from varpin.wiener import wiener_increments
 
 Floats = NDArray[np.float64]
 ControlLaw = Callable[[float, Floats, Floats], JointValues]
+# Controls that are known before the motion, or fed back by the core.
+Controls = JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None
 Progress = Callable[[int, int], None]
 Futile = Callable[[list[Segment]], str | None]
 
@@ -165,13 +169,16 @@ class _Record:
         self._first = first
         self._joined: list[Segment] = []
         self._parts: list[Segment] = []
+        self._within: list[Floats] = []
 
-    def add(self, segment: Segment) -> None:
+    def add(self, segment: Segment, within: Floats) -> None:
         if not len(segment.q):
             return
         self.steps += len(segment.q)
         self.last = segment
         self._parts.append(segment)
+        if len(within):
+            self._within.append(within[: len(segment.q)])
         # Single steps take many times the room of their numbers.
         if len(self._parts) == _PARTS:
             self._joined.append(join(self._parts))
@@ -179,11 +186,18 @@ class _Record:
 
     def trajectory(self) -> Trajectory:
         dw = self.dw[: self.steps] if len(self.dw) else None
-        return _trajectory(self.scene, self.integrator, self.dt, self._first, [*self._joined, *self._parts], dw)
+        within = np.concatenate(self._within) if self._within else None
+        return _trajectory(self.scene, self.integrator, self.dt, self._first, [*self._joined, *self._parts], dw, within)
 
 
 def _trajectory(
-    scene: Scene, integrator: Integrator, dt: float, first: Segment, parts: list[Segment], dw: Floats | None
+    scene: Scene,
+    integrator: Integrator,
+    dt: float,
+    first: Segment,
+    parts: list[Segment],
+    dw: Floats | None,
+    within: Floats | None,
 ) -> Trajectory:
     """The motion from a first node on over parts that follow each other; no increments stand for zeros."""
     steps = join(parts) if len(parts) > 1 else parts[0] if parts else first.part(0)
@@ -203,6 +217,7 @@ def _trajectory(
         joint_names=scene.robot.joint_names,
         statistics=steps.statistics,
         scene_values=scene.values,
+        u_stages=np.zeros((N, 0, scene.controls)) if within is None else within,
     )
 
 
@@ -247,8 +262,10 @@ class Motions:
                 failure = None if reason is None else Failure(reason, 0.0)
             if failure is not None:
                 break
-        dw = None if increments is None else increments[: sum(len(part.u) for part in parts)]
-        return _trajectory(self.scene, self.integrator, self.dt, self._first, parts, dw), failure
+        done = sum(len(part.u) for part in parts)
+        dw = None if increments is None else increments[:done]
+        within = commands.within[:done] if len(commands.within) else None
+        return _trajectory(self.scene, self.integrator, self.dt, self._first, parts, dw, within), failure
 
 
 def _last_control(parts: list[Segment]) -> Floats | None:
@@ -271,7 +288,7 @@ def simulate(
     steps: int | None = None,
     duration: float | None = None,
     tolerance: float | Accuracy | None = None,
-    controls: JointValues | ControlLaw | LinearPolicy | OpenLoop | None = None,
+    controls: Controls | ControlLaw = None,
     period: int = 1,
     integrator: Integrator | None = None,
     rng: np.random.Generator | int | None = None,
@@ -295,13 +312,15 @@ def simulate(
             ``Trajectory.accuracy`` says what was taken, what error that estimates and how many steps finding out took;
             it is itself a ``tolerance``, of the same scene's next motion, which tries first what it found. Where the
             tolerance is out of reach a warning says what is reached. Rows of controls, (R, m), are then held over
-            duration / R each, a LinearPolicy needs its period in seconds, and noise and control laws are refused.
+            duration / R each, the intervals of a FirstOrderHold are as long, a LinearPolicy needs its period in
+            seconds, and noise and control laws are refused.
         controls: None for none, servos staying where they are at ``q0``; an array (N, m), one row a step; one row
             (m,) for all steps, by joint name too where each control is the force of a joint, with 0 for joints that
             are not named; a :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that
-            returns (m,), or numbers by joint name; or :class:`varpin.OpenLoop`, a function of time alone. Controls are
-            constant over each step. A law is a digital controller: it is called once where each of its periods begins,
-            with the time and the state of that node, and what it returns is held over the period.
+            returns (m,), or numbers by joint name; :class:`varpin.OpenLoop`, a function of time alone; or
+            :class:`varpin.FirstOrderHold`, linear in time between nodes. All but the last two are constant over each
+            step. A law is a digital controller: it is called once where each of its periods begins, with the time and
+            the state of that node, and what it returns is held over the period.
         period: Of a control law, in steps.
         integrator: :class:`Midpoint` with alpha = 1/2 if left out; with a tolerance, the cheapest that there is.
 
@@ -379,7 +398,7 @@ def simulate(
                 u = record.last.u[-1:] if done % period else _decision(law, record)
                 block = open_loop(u)._replace(hold=held)
             elif isinstance(controls, OpenLoop):
-                block = open_loop(_sampled(controls, record, 1 if stepwise else min(chunk, steps - done)))
+                block = _sampled(controls, record, 1 if stepwise else min(chunk, steps - done))
             elif stepwise:
                 block = _next(commands, record)
             else:
@@ -392,7 +411,7 @@ def simulate(
             except InputError as error:
                 now = record.trajectory()
                 raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
-            record.add(segment)
+            record.add(segment, block.within)
             if segment.failure is not None:
                 node = record.trajectory()
                 if hold is not None and check:
@@ -459,9 +478,9 @@ def _chosen(
     v0: Floats,
     duration: float,
     tolerance: float | Accuracy,
-    controls: JointValues | ControlLaw | LinearPolicy | OpenLoop | None,
+    controls: Controls | ControlLaw,
     integrator: Integrator | None,
-) -> tuple[Integrator, int, JointValues | LinearPolicy | OpenLoop | None, Accuracy, tuple[Finding, ...]]:
+) -> tuple[Integrator, int, Controls, Accuracy, tuple[Finding, ...]]:
     """Integrator, steps and controls for a tolerance, with the estimate and what is to be said of it."""
     earlier = tolerance if isinstance(tolerance, Accuracy) else None
     wish = positive("tolerance", tolerance.tolerance if isinstance(tolerance, Accuracy) else tolerance, "rad or m")
@@ -478,7 +497,7 @@ def _chosen(
             "steps with a law, or a varpin.LinearPolicy with a period, or a varpin.OpenLoop(f)"
         )
     members = INTEGRATORS if integrator is None else (integrator,)
-    parts, most = 1, max(member.order for member in members)
+    parts = 1
     given: Callable[[Integrator, int], Commands]
     held = np.zeros((0, 0))
     if isinstance(controls, LinearPolicy):
@@ -497,14 +516,20 @@ def _chosen(
         def given(member: Integrator, steps: int) -> Commands:
             return commands_of(scene, member, policy, steps, duration / steps)
     elif isinstance(controls, OpenLoop):
-        # Held from the middle of each step.
-        most, of_time = 2, controls
-        sampled: dict[int, Commands] = {}
+        of_time = controls
+        sampled: dict[tuple[Times, int], Commands] = {}
 
         def given(member: Integrator, steps: int) -> Commands:
-            if steps not in sampled:
-                sampled[steps] = commands_of(scene, member, of_time, steps, duration / steps)
-            return sampled[steps]
+            key = member.stage_times, steps
+            if key not in sampled:
+                sampled[key] = commands_of(scene, member, of_time, steps, duration / steps)
+            return sampled[key]
+    elif isinstance(controls, FirstOrderHold):
+        lines = controls
+        parts = len(controls.u) - 1
+
+        def given(member: Integrator, steps: int) -> Commands:
+            return commands_of(scene, member, lines.refined(steps // parts), steps, duration / steps)
     else:
         held = held_rows(scene, controls)
         parts = len(held)
@@ -512,7 +537,7 @@ def _chosen(
         def given(member: Integrator, steps: int) -> Commands:  # noqa: ARG001 - as for the others
             return open_loop(np.repeat(held, steps // parts, axis=0))
 
-    motion = Motion(scene, q0, v0, duration, parts, given, most, isinstance(controls, OpenLoop))
+    motion = Motion(scene, q0, v0, duration, parts, given, isinstance(controls, OpenLoop))
     first = None
     if earlier is not None:
         known = integrator_of(earlier.integrator)
@@ -545,7 +570,9 @@ def _chosen(
                 f"{record.integrator} at dt = {record.dt:.4g} s; {cause}",
             ),
         )
-    if not isinstance(controls, LinearPolicy | OpenLoop):
+    if isinstance(controls, FirstOrderHold):
+        controls = controls.refined(choice.steps // parts)
+    elif not isinstance(controls, LinearPolicy | OpenLoop):
         controls = np.repeat(held, choice.steps // parts, axis=0)
     return choice.integrator, choice.steps, controls, record, found
 
@@ -605,12 +632,10 @@ def _require_memory(scene: Scene, steps: int) -> None:
         raise InputError(f"steps = {steps} needs more memory than there is: {columns * 8} bytes a step") from None
 
 
-def commands_of(
-    scene: Scene, integrator: Integrator, controls: JointValues | LinearPolicy | OpenLoop | None, steps: int, dt: float
-) -> Commands:
+def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps: int, dt: float) -> Commands:
     """Controls of ``steps`` steps of ``dt`` [s] as the core takes them.
 
-    They are None, (steps, m), (m,), by joint name, a function or a policy.
+    They are None, (steps, m), (m,), by joint name, a function of time, linear between nodes or a policy.
 
     Raises:
         UnknownJoint: A name that is no driven joint's.
@@ -630,13 +655,18 @@ def commands_of(
             )
         return controls.commands(steps, scene.controls, scene.robot.dof, integrator.variational, dt)
     if isinstance(controls, OpenLoop):
-        u = np.empty((steps, scene.controls))
-        for k in range(steps):
-            u[k] = _row_at(controls, scene, dt, k)
-        return open_loop(u)
+        return _evaluated(controls, scene, integrator, dt, range(steps))
+    if isinstance(controls, FirstOrderHold):
+        if controls.u.shape != (steps + 1, scene.controls):
+            raise InputError(
+                f"FirstOrderHold: u must have shape {(steps + 1, scene.controls)}, a row for each node of the motion, "
+                f"got {controls.u.shape}"
+            )
+        return _on_lines(controls.u, integrator.stage_times)
     if callable(controls):
         raise InputError(
-            "controls must be rows, a varpin.LinearPolicy or a varpin.OpenLoop here; only simulate takes a control law"
+            "controls must be rows, a varpin.LinearPolicy, a varpin.OpenLoop or a varpin.FirstOrderHold here; only "
+            "simulate takes a control law"
         )
     return open_loop(control_rows(scene, controls, steps))
 
@@ -690,23 +720,45 @@ def _decision(law: ControlLaw, record: _Record) -> Floats:
     return _called("controls(t, q, v)", lambda: law(time, *state), record.scene, k, time, record)[None]
 
 
-def _sampled(controls: OpenLoop, record: _Record, steps: int) -> Floats:
-    """Controls (steps, m) of the next steps, or of those before the first for which the function fails."""
-    u = np.empty((steps, record.scene.controls))
-    for k in range(steps):
-        try:
-            u[k] = _row_at(controls, record.scene, record.dt, record.steps + k, record)
-        except ControlError:
-            if k == 0:
-                raise
-            return u[:k].copy()
-    return u
+def _on_lines(u: Floats, times: Times) -> Commands:
+    """Controls (N + 1, m) at nodes, linear between them, for a method with stages at ``times``."""
+    before, after = u[:-1, None], u[1:, None]
+    if not times:
+        return open_loop(0.5 * (before + after)[:, 0])
+    share = np.array(times)[:, None]
+    return changing((1.0 - share) * before + share * after, times)
 
 
-def _row_at(controls: OpenLoop, scene: Scene, dt: float, step: int, record: _Record | None = None) -> Floats:
-    """The control (m,) of one step, from its middle."""
-    time = (step + 0.5) * dt
-    return _called("OpenLoop: f(t)", lambda: controls.f(time), scene, step, time, record)
+def _sampled(controls: OpenLoop, record: _Record, steps: int) -> Commands:
+    """Controls of the next steps, or of those before the first for which the function fails."""
+    own = controls, record.scene, record.integrator, record.dt
+    try:
+        return _evaluated(*own, range(record.steps, record.steps + steps), record)
+    except ControlError as error:
+        if error.step == record.steps:
+            raise
+        return _evaluated(*own, range(record.steps, error.step), record)
+
+
+def _evaluated(
+    controls: OpenLoop,
+    scene: Scene,
+    integrator: Integrator,
+    dt: float,
+    steps: range,
+    record: _Record | None = None,
+) -> Commands:
+    """Controls of time at the stages of some steps, or from their middles for a method with one stage."""
+    times = integrator.stage_times
+    found = np.empty((len(steps), max(len(times), 1), scene.controls))
+    for k, step in enumerate(steps):
+        for i, place in enumerate(times or (0.5,)):
+            time = (step + place) * dt
+            if k > 0 and i == 0 and place == 0.0 and times[-1] == 1.0:
+                found[k, 0] = found[k - 1, -1]
+                continue
+            found[k, i] = _called("OpenLoop: f(t)", partial(controls.f, time), scene, step, time, record)
+    return changing(found, times) if times else open_loop(found[:, 0])
 
 
 def _called(

@@ -39,6 +39,7 @@ from varpin.errors import SingularMassMatrix
 from varpin.integrators import ExplicitEuler, Integrator, Radau, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
+from varpin.integrators.within import changing, in_pairs, in_parts, shares
 from varpin.lagrangian import lagrangian_jet
 from varpin.limits import left
 from varpin.scene import Scene
@@ -86,7 +87,7 @@ class Finding:
 def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Trajectory, tuple[Finding, ...]]:
     """A motion with its energy balance, if the integrator keeps none, and its warnings; and what was found."""
     if not integrator.variational:
-        own = replace(trajectory.statistics, energy_defect=energy_defects(scene, trajectory))
+        own = replace(trajectory.statistics, energy_defect=energy_defects(scene, integrator, trajectory))
         trajectory = replace(trajectory, statistics=own)
     found = (
         *_looked_for(scene, integrator, trajectory),
@@ -262,14 +263,14 @@ def _balances(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> l
     for group in range(groups):
         own = scene.group == group
         scale = float(turned[own].sum() + worked[own].sum())
-        found.append((some, _defects_of(scene, trajectory, own)[some], scale))
+        found.append((some, _defects_of(scene, integrator, trajectory, own)[some], scale))
     return found
 
 
-def _defects_of(scene: Scene, trajectory: Trajectory, own: NDArray[np.bool_]) -> Floats:
+def _defects_of(scene: Scene, integrator: Integrator, trajectory: Trajectory, own: NDArray[np.bool_]) -> Floats:
     """What the energy of some joints is off by (N + 1,) [J]; they move by themselves. Zero but at some nodes."""
     kicked, given = _kicks(scene, trajectory)
-    work, heat = _works(scene, trajectory, kicked)
+    work, heat = _works(scene, integrator, trajectory, kicked)
     gained = np.append(0.0, np.cumsum((work - heat + given)[:, own].sum(axis=1)))
     kinetic = 0.5 * (trajectory.p * trajectory.v)[:, own].sum(axis=1)
     off = np.zeros(trajectory.steps + 1)
@@ -300,7 +301,7 @@ def _turnover(scene: Scene, trajectory: Trajectory) -> tuple[float, Floats, Floa
     return min(kinetic, float(turned.sum())) + work, turned, worked
 
 
-def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
+def energy_defects(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Floats:
     """What the energy is off by after each step (N,) [J], of what no control, damper or kick accounts for.
 
     From the record alone, for integrators that keep no ledger of their own. For what dampers take, velocities are taken
@@ -309,18 +310,21 @@ def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
     if scene.noise.diffusion is None:
         return np.zeros(trajectory.steps)
     kicked, given = _kicks(scene, trajectory)
-    work, heat = _works(scene, trajectory, kicked)
+    work, heat = _works(scene, integrator, trajectory, kicked)
     given_in_all = np.cumsum((work - heat + given).sum(axis=1))
     gained: Floats = trajectory.energy[1:] - trajectory.energy[0] - given_in_all
     return np.nan_to_num(gained, nan=np.inf)
 
 
-def _works(scene: Scene, trajectory: Trajectory, kicked: Floats | float = 0.0) -> tuple[Floats, Floats]:
+def _works(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, kicked: Floats | float = 0.0
+) -> tuple[Floats, Floats]:
     """Work of the controls, and the least that the dampers can take, at each joint in each step (N, n) [J].
 
     What servos make of their controls counts among what is taken.
 
-    Controls are constant over a step, and do the work of its way. A kick of v (N, n) begins each step. Dampers take
+    Controls that are constant over a step do the work of its way; of others the rest works on velocities that the cubic
+    through both nodes has. A kick of v (N, n) begins each step. Dampers take
     least where the velocity is even, and q knows its mean: so does all other friction there.
     """
     h, before, after = trajectory.dt, trajectory.v[:-1] + kicked, trajectory.v[1:]
@@ -328,6 +332,12 @@ def _works(scene: Scene, trajectory: Trajectory, kicked: Floats | float = 0.0) -
         way = np.diff(trajectory.q, axis=0)
         force = _applied(scene, trajectory)
         work = force * way
+        if trajectory.u_stages.shape[1]:
+            c = np.array(integrator.stage_times)[:, None]
+            rest = (trajectory.u_stages - trajectory.u[:, None]) @ scene.actuation.T
+            speed = (1.0 - c) * (1.0 - 3.0 * c) * before[:, None] + c * (3.0 * c - 2.0) * after[:, None]
+            speed = speed + 6.0 * c * (1.0 - c) * (way / h)[:, None]
+            work = work + h * np.einsum("s,ksn->kn", shares(integrator.stage_times), rest * speed)
         even = (way / h) ** 2
         heat = h * np.minimum((before**2 + before * after + after**2) / 3.0, even) * scene.damping
         if scene.dissipates or scene.couplings:
@@ -379,7 +389,10 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
         # Commands are the same for all paths; their forces need not be.
         held = u[begins[:, None] + np.arange(length)].reshape(len(begins), length // times, times, -1)
         commands, drift = open_loop(np.zeros_like(u[:length:times])), held.mean(axis=2) @ scene.actuation.T
-    again = other.motions(scene, q[begins], v[begins], commands, drift, times * trajectory.dt)
+    if trajectory.u_stages.shape[1]:
+        again = _windows_under(scene, integrator, trajectory, begins, length, other, times)
+    else:
+        again = other.motions(scene, q[begins], v[begins], commands, drift, times * trajectory.dt)
     if times == 1 and again is not None:
         again = np.ascontiguousarray(again[0][:, 1::2]), np.ascontiguousarray(again[1][:, 1::2])
     # How much less the error is in steps of half the length; of another method nothing is known.
@@ -398,6 +411,30 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
         light=LIGHT,
         even=EVEN,
     )
+
+
+def _windows_under(
+    scene: Scene,
+    integrator: Integrator,
+    trajectory: Trajectory,
+    begins: Integers,
+    length: int,
+    other: Integrator,
+    times: int,
+) -> tuple[Floats, Floats] | None:
+    """Windows of a motion whose controls change within steps, by another method, or in steps of twice the length."""
+    at, own, found = other.stage_times, integrator.stage_times, []
+    for begin in begins:
+        values = trajectory.u_stages[begin : begin + length]
+        commands = changing(in_parts(values, own, 1, at) if times == 1 else in_pairs(values, own, at), at)
+        node = slice(begin, begin + 1)
+        drift = np.zeros((0, 0, scene.robot.dof))
+        again = other.motions(scene, trajectory.q[node], trajectory.v[node], commands, drift, times * trajectory.dt)
+        if again is None:
+            return None
+        found.append(again)
+    q, v = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return q, v
 
 
 def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> MotionError | None:
@@ -594,6 +631,9 @@ def _taken_again(
         return None
     # Impulses of noise depend on the controls, too.
     commands = open_loop(np.repeat(trajectory.u[steps], parts, axis=0))
+    if trajectory.u_stages.shape[1]:
+        times = integrator.stage_times
+        commands = changing(in_parts(trajectory.u_stages[steps], times, parts, times), times)
     no_drift = np.zeros((0, 0, scene.robot.dof))
     (segment,) = integrator.rollout_compiled(scene, state, commands, drawn, no_drift, trajectory.dt / parts)
     done = len(segment.q) // parts

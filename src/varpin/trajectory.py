@@ -176,7 +176,7 @@ class Trajectory(Frozen):
         q: Configurations (N + 1, n) [rad or m].
         v: Velocities (N + 1, n) [rad/s or m/s]; M(q)^-1 p for variational integrators.
         p: Momenta (N + 1, n) [N m s or N s].
-        u: Controls (N, m), constant over each step.
+        u: Controls (N, m): constant over each step, or the mean over it of those that change within it.
         dw: Wiener increments (N, k) [s^0.5]; zeros where no noise was drawn.
         energy: Kinetic and potential energy together (N + 1,) [J]; springs included.
         masses: Of the robot's bodies (b,) [kg]; they tell robots apart whose joints have the same names.
@@ -190,6 +190,9 @@ class Trajectory(Frozen):
         warnings: What varpin said of the motion, a sentence each: dt too coarse, energy off, steps taken in parts.
         scene_values: Numbers of the scene it was made in, :attr:`varpin.Scene.values`; empty in files that varpin wrote
             before it kept them.
+        u_stages: Controls (N, s, m) at the stages of each step, where they change within it
+            (:class:`varpin.OpenLoop`, :class:`varpin.FirstOrderHold`, with a method of several stages); else (N, 0, m).
+            The motion is that under the polynomial through them.
         accuracy: The estimated error, and what finding integrator and step took, of a motion that was asked for with a
             tolerance; None of others.
     """
@@ -211,6 +214,7 @@ class Trajectory(Frozen):
     warnings: tuple[str, ...] = ()
     scene_values: Mapping[str, Floats] = field(default_factory=lambda: MappingProxyType({}), repr=False)
     accuracy: Accuracy | None = field(default=None, repr=False)
+    u_stages: Floats = field(default_factory=lambda: np.zeros((0, 0, 0)), repr=False)
 
     def __post_init__(self) -> None:
         nodes, n = np.size(self.t), len(self.joint_names)
@@ -221,7 +225,10 @@ class Trajectory(Frozen):
             self._require(name, (nodes - 1, *np.shape(getattr(self, name))[1:2]))
         if nodes < 1 or self.u.ndim != 2 or self.dw.ndim != 2:
             raise InputError("a trajectory has one node or more, and controls and increments (N, ...)")
-        for name in _ARRAYS:
+        if not np.size(self.u_stages):
+            object.__setattr__(self, "u_stages", np.zeros((nodes - 1, 0, self.u.shape[1])))
+        self._require("u_stages", (nodes - 1, np.shape(self.u_stages)[1], self.u.shape[1]))
+        for name in (*_ARRAYS, "u_stages"):
             getattr(self, name).setflags(write=False)
         for array in vars(self.statistics).values():
             array.setflags(write=False)
@@ -250,6 +257,7 @@ class Trajectory(Frozen):
             self,
             **{name: getattr(self, name)[nodes] for name in ("t", "q", "v", "p", "energy")},
             u=self.u[steps],
+            u_stages=self.u_stages[steps],
             dw=self.dw[steps],
             statistics=self.statistics.part(begin, end),
         )
@@ -305,6 +313,8 @@ class Trajectory(Frozen):
         members |= {"version": self.version, "integrator": self.integrator, "robot": self.robot}
         members |= {"warnings": np.array(self.warnings, dtype=str)}
         members |= {f"{_SCENE}{name}": values for name, values in self.scene_values.items()}
+        if self.u_stages.size:
+            members["u_stages"] = self.u_stages
         if self.accuracy is not None:
             members["accuracy"] = np.array([getattr(self.accuracy, name) for name in _ACCURACY], dtype=np.float64)
         return members | {"dt": self.dt, "joint_names": np.array(self.joint_names, dtype=str)}
@@ -346,6 +356,7 @@ class Trajectory(Frozen):
         # A noise without a center of its own has NaN there, a stop of one end an infinite other one.
         endless = {"noise.center", *OF_FORCES}
         given |= {_SCENE + name: values for name, values in kept.items() if name not in endless}
+        given |= {"u_stages": members["u_stages"]} if "u_stages" in members else {}
         for name, values in given.items():
             if not np.isfinite(values).all():
                 raise FileError(f"{source}: {name} holds values that are not finite numbers")
@@ -390,6 +401,7 @@ class Trajectory(Frozen):
             warnings=tuple(str(sentence) for sentence in members["warnings"]),
             scene_values=MappingProxyType(kept),
             accuracy=accuracy,
+            **({"u_stages": members["u_stages"]} if "u_stages" in members else {}),
         )
 
 
@@ -406,6 +418,7 @@ def require_layout(source: Path, members: Mapping[str, NDArray[Any] | Header]) -
     shapes |= {f"statistics.{name}": (steps,) for name in STEP_NUMBERS} | {"statistics.halvings": (-1,)}
     shapes |= dict.fromkeys(_TEXTS[:3], ())
     shapes |= {"accuracy": (len(_ACCURACY),)} if "accuracy" in members else {}
+    shapes |= {"u_stages": (steps, -1, members["u"].shape[-1])} if "u_stages" in members else {}
     ends = {"gravity": (3,), "actuation": (n, -1)} | dict.fromkeys(("damping", "stiffness", "rest", "armature"), (n,))
     ends |= dict.fromkeys(("ratio", "offset"), (-1,)) | dict.fromkeys(("center", "translation"), (-1, 3))
     ends |= {"inertia": (-1, 6), "rotation": (-1, 3, 3)} | dict.fromkeys(OF_FORCES, (-1, -1))
@@ -434,7 +447,7 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
         name: np.concatenate([getattr(first, name)[:1], *(getattr(part, name)[1:] for part in parts)])
         for name in ("q", "v", "p", "energy")
     }
-    arrays |= {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("u", "dw")}
+    arrays |= {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("u", "u_stages", "dw")}
     return replace(
         first,
         t=first.t[0] + np.arange(steps + 1) * first.dt,
@@ -483,7 +496,7 @@ def require_scene_of(scene: Scene, trajectory: Trajectory) -> None:
 # What a file of a trajectory holds beside its format, and what it may hold.
 MEMBERS = frozenset(_ARRAYS) | {"dt", "version", "integrator", "robot", "joint_names", "warnings"}
 MEMBERS |= {f"statistics.{item.name}" for item in fields(StepStatistics)}
-OPTIONAL = frozenset(_SCENE + name for name in VALUES) | {"accuracy"}
+OPTIONAL = frozenset(_SCENE + name for name in VALUES) | {"accuracy", "u_stages"}
 
 
 def read_members(

@@ -71,15 +71,16 @@ class NodeArrays {
     IntegersInOut<1> ended, done;
 };
 
-// Commands for P paths over N steps.
+// Commands for P paths over N steps, with controls at `stages` stages of each where they change within it.
 class CommandArrays {
   public:
-    CommandArrays(const Mechanism& mechanism, nb::handle commands, std::size_t paths, std::size_t steps)
+    CommandArrays(const Mechanism& mechanism, nb::handle commands, std::size_t paths, std::size_t steps, int stages)
         : u(field<In<2>>(commands, "u")),
           gains(field<In<3>>(commands, "gains")),
           reference(field<In<2>>(commands, "reference")),
           limits(field<In<2>>(commands, "limits")),
           before(field<In<2>>(commands, "before")),
+          within(field<In<3>>(commands, "within")),
           hold(nb::cast<int>(commands.attr("hold"))) {
         const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
         const std::size_t decisions = u.shape(0), width = gains.shape(2);
@@ -94,6 +95,11 @@ class CommandArrays {
         }
         require(limits, "limits", {2, m});
         earlier = given(before, "before", {paths, m});
+        if (within.shape(0) == 0) return;
+        require(within, "within", {steps, static_cast<std::size_t>(stages), m});
+        if (feedback || hold != 1)
+            throw std::invalid_argument("controls that change within a step go with neither feedback nor a hold");
+        changing = true;
     }
 
     Commands view() const {
@@ -106,16 +112,19 @@ class CommandArrays {
                 static_cast<int>(gains.shape(2)),
                 limits.data(),
                 limits.data() + m,
-                earlier ? before.data() : nullptr};
+                earlier ? before.data() : nullptr,
+                changing ? within.data() : nullptr};
     }
 
   private:
     In<2> u;
     In<3> gains;
     In<2> reference, limits, before;
+    In<3> within;
     int hold;
     bool feedback = false;  // whether there are gains
     bool earlier = false;   // whether the controls before the first are known
+    bool changing = false;  // whether controls change within steps
 };
 
 // Increments of Wiener processes (P, N, k), or null where there are none: (0, 0, k), or k = 0.

@@ -72,7 +72,8 @@ class VariationalRollout {
         const NodeArrays written(mechanism, nodes);
         if (written.paths() != states_.size())
             throw std::invalid_argument("there is not one row of nodes for each path");
-        const CommandArrays given_commands(mechanism, commands, written.paths(), written.steps());
+        const CommandArrays given_commands(mechanism, commands, written.paths(), written.steps(),
+                                           stepper_->tableau.stages);
         const double* dw = increments_of(mechanism, increments, written);
         const double* extra = drift_of(mechanism, drift, written);
         nb::gil_scoped_release release;
@@ -121,16 +122,18 @@ class VariationalRollout {
 // The arrays that N steps are taken again from.
 class StepsAt {
   public:
-    StepsAt(const Mechanism& mechanism, In<2> q, In<2> p, In<2> force, Integers<1> substeps, Bytes halvings)
+    StepsAt(const Mechanism& mechanism, const Tableau& tableau, In<2> q, In<2> p, In<3> force, Integers<1> substeps,
+            Bytes halvings)
         : n(static_cast<std::size_t>(mechanism.dof())),
           N(q.shape(0)),
+          varies(force.shape(1) != 1),
           q_(q),
           p_(p),
           force_(force),
           halvings_(halvings),
           place_(N + 1, 0) {
-        for (const auto& [array, name] : {std::pair{&q, "q"}, {&p, "p"}, {&force, "force"}})
-            require(*array, name, {N, n});
+        for (const auto& [array, name] : {std::pair{&q, "q"}, {&p, "p"}}) require(*array, name, {N, n});
+        require(force, "force", {N, varies ? static_cast<std::size_t>(tableau.stages) : 1, n});
         require(substeps, "substeps", {N});
         for (std::size_t s = 0; s < N; ++s) {
             const std::int64_t parts = substeps(s);
@@ -145,9 +148,10 @@ class StepsAt {
     }
 
     const std::size_t n, N;
+    const bool varies;  // whether there is a force for each stage
     const double* q(std::size_t s) const { return q_.data() + s * n; }
     const double* p(std::size_t s) const { return p_.data() + s * n; }
-    const double* force(std::size_t s) const { return force_.data() + s * n; }
+    const double* force(std::size_t s) const { return force_.data() + s * force_.shape(1) * n; }
     // Of the parts of a step; none if it was taken whole.
     std::span<const std::uint8_t> halvings(std::size_t s) const {
         return {halvings_.data() + place_[s], place_[s + 1] - place_[s]};
@@ -160,7 +164,8 @@ class StepsAt {
     }
 
   private:
-    In<2> q_, p_, force_;
+    In<2> q_, p_;
+    In<3> force_;  // (N, 1, n) constant over a step, or (N, s, n)
     Bytes halvings_;
     std::vector<std::size_t> place_;  // (N + 1) where the parts of a step begin
 };
@@ -176,18 +181,19 @@ std::pair<Outcome, std::size_t> each_step(std::size_t N, const Step& step) {
     return {Outcome::solved, N};
 }
 
-// d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n) of each step; how it ended and how many were done.
-std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(const Mechanism& mechanism,
-                                                                        const Tableau& tableau, double tolerance,
-                                                                        const Guards& guards, double h, In<2> q,
-                                                                        In<2> p, In<2> force, Integers<1> substeps,
-                                                                        Bytes halvings, In<3> guess, Solver solver) {
-    const StepsAt at(mechanism, q, p, force, substeps, halvings);
+// d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n) of each step, f constant over it or a ramp up to f; how
+// it ended and how many were done.
+std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(
+    const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards, double h, In<2> q,
+    In<2> p, In<3> force, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp, Solver solver) {
+    const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
     const std::size_t N = at.N, n = at.n, stages = static_cast<std::size_t>(tableau.stages);
     require(guess, "guess", {N, stages, n});
     double *Jx = nullptr, *Jf = nullptr;
     const Out X = array_for(Jx, {N, 2 * n, 2 * n}), F = array_for(Jf, {N, 2 * n, n});
     VariationalLinearization work(mechanism, tableau, tolerance, guards, solver);
+    work.varies = at.varies;
+    work.ramp = ramp;
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
         return work.first(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
                           Jx + s * 4 * n * n, Jf + s * 2 * n * n, at.past(s));
@@ -198,15 +204,16 @@ std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(const Me
 // z . d2(q1, p1)/d(q0, p0, f)2 of each step (N, 3n, 3n), for the rows of z (N, 2n).
 std::tuple<Out, std::int64_t, std::size_t> variational_curvatures(const Mechanism& mechanism, const Tableau& tableau,
                                                                   double tolerance, const Guards& guards, double h,
-                                                                  In<2> q, In<2> p, In<2> force, Integers<1> substeps,
+                                                                  In<2> q, In<2> p, In<3> force, Integers<1> substeps,
                                                                   Bytes halvings, In<3> guess, In<2> z, Solver solver) {
-    const StepsAt at(mechanism, q, p, force, substeps, halvings);
+    const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
     const std::size_t N = at.N, n = at.n, stages = static_cast<std::size_t>(tableau.stages);
     require(guess, "guess", {N, stages, n});
     require(z, "z", {N, 2 * n});
     double* H = nullptr;
     const Out curvatures = array_for(H, {N, 3 * n, 3 * n});
     VariationalLinearization work(mechanism, tableau, tolerance, guards, solver);
+    work.varies = at.varies;
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
         return work.second(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
                            z.data() + s * 2 * n, H + s * 9 * n * n, at.past(s));
@@ -217,13 +224,14 @@ std::tuple<Out, std::int64_t, std::size_t> variational_curvatures(const Mechanis
 // Configurations and velocities (N, n) at the end of each step.
 std::tuple<Out, Out, std::int64_t, std::size_t> variational_ends(const Mechanism& mechanism, const Tableau& tableau,
                                                                  double tolerance, const Guards& guards, double h,
-                                                                 In<2> q, In<2> p, In<2> force, Integers<1> substeps,
+                                                                 In<2> q, In<2> p, In<3> force, Integers<1> substeps,
                                                                  Bytes halvings, Solver solver) {
-    const StepsAt at(mechanism, q, p, force, substeps, halvings);
+    const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
     const std::size_t N = at.N, n = at.n;
     double *q1 = nullptr, *v1 = nullptr;
     const Out Q = array_for(q1, {N, n}), V = array_for(v1, {N, n});
     VariationalLinearization work(mechanism, tableau, tolerance, guards, solver);
+    work.varies = at.varies;
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
         return work.end(h, at.q(s), at.p(s), at.force(s), at.halvings(s), q1 + s * n, v1 + s * n);
     });
@@ -250,7 +258,7 @@ void register_rollouts(nb::module_& m) {
         .def("nodes", &VariationalRollout::nodes)
         .def("halvings", &VariationalRollout::halvings, "path"_a);
     m.def("variational_derivatives", &variational_derivatives, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
-          "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a,
+          "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "ramp"_a = false,
           "solver"_a = Solver::automatic);
     m.def("variational_curvatures", &variational_curvatures, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
           "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "z"_a,

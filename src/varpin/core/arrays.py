@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
+_HELD: Floats = np.zeros((0, 0, 0))
+_HELD.setflags(write=False)
+
 
 class Tree(NamedTuple):
     """A tree of ``b`` bodies, each on one joint about or along the z axis of its own frame.
@@ -79,6 +82,8 @@ class Commands(NamedTuple):
     hold: int  # steps between two looks at the state
     limits: Floats  # (2, m) least and greatest control, infinite where there is none
     before: Floats  # (P, m) the control before the first of each path; (0, m) for what the reference has
+    # (N, s, m) at the stages of each step, of which u has the mean, without feedback and hold; empty where held
+    within: Floats = _HELD
 
 
 class Nodes(NamedTuple):

@@ -23,6 +23,15 @@ struct Tableau {
     double reach = 0.0;             // the largest Rayleigh quotient of abar a in the metric of b
     double skew = 0.0;              // alpha - 1/2 of the midpoint rule: off the middle it is of first order
     bool stiffly_accurate = false;  // ends in its last stage, and damps what friction damps faster than the step
+
+    // The Lagrange polynomial of stage j, at a place in units of the step.
+    double lagrange(int j, double at) const {
+        double value = 1.0;
+        for (int k = 0; k < stages; ++k) {
+            if (k != j) value *= (at - c[k]) / (c[j] - c[k]);
+        }
+        return value;
+    }
 };
 
 }  // namespace varpin
