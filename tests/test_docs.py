@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import varpin as vp
-from varpin.scenefile import scenes
+from varpin.io.scenefile import scenes
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
