@@ -11,11 +11,14 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
 from varpin.control.problem import default_integrator
 from varpin.errors import FileError, InputError
 from varpin.integrators import BY_NAME, Integrator, options_of
 from varpin.io.scenefile.references import Reference, read_reference
-from varpin.io.scenefile.table import ByName, SceneFileError, Table, inside, shown, suggestion
+from varpin.io.scenefile.table import ByName, Floats, SceneFileError, Table, inside, shown, suggestion
 from varpin.io.scenefile.terms import TERMS, Term
 from varpin.mechanics.forces import (
     Armature,
@@ -72,6 +75,10 @@ class RobotSpec:
         mimic: ``"tied"`` or ``"free"``.
         package_dirs: Where meshes are looked up.
         payload: What it carries.
+        base: ``"planar"``, or where its base stands (4, 4) [m]; None for the world's origin.
+        armature: Inertia of rotors by joint [kg m^2 or kg]; None for the description's own.
+        inertia: ``"file"`` or ``"meshes"``.
+        density: Of the meshes [kg/m^3].
     """
 
     source: str | Path
@@ -79,6 +86,10 @@ class RobotSpec:
     mimic: str
     package_dirs: tuple[str, ...]
     payload: tuple[Payload, ...]
+    base: Literal["planar"] | Floats | None = None
+    armature: ByName | None = None
+    inertia: Literal["file", "meshes"] = "file"
+    density: float = 1000.0
 
 
 @dataclass(frozen=True)
@@ -395,7 +406,9 @@ def _scene(root: Table, path: Path, name: str) -> SceneSpec:
 
 
 def _robot(table: Table, folder: Path) -> RobotSpec:
-    table.allow("source", "lock", "mimic", "package_dirs", "payload")
+    table.allow(
+        *("source", "lock", "mimic", "package_dirs", "payload", "base", "armature", "inertia", "density"),
+    )
     text = table.text("source")
     source: str | Path = text
     if Path(text).suffix or "/" in text or "\\" in text:
@@ -413,7 +426,25 @@ def _robot(table: Table, folder: Path) -> RobotSpec:
         mimic=table.choice("mimic", ("tied", "free"), "tied"),
         package_dirs=folders,
         payload=tuple(_payload(entry) for entry in table.tables("payload")),
+        base=_base(table),
+        armature=table.by_name("armature", least=0.0, unit="kg m^2 or kg") if "armature" in table else None,
+        inertia="meshes" if table.choice("inertia", ("file", "meshes"), "file") == "meshes" else "file",
+        density=table.number("density", 1000.0, above=0.0, unit="kg/m^3"),
     )
+
+
+def _base(table: Table) -> Literal["planar"] | Floats | None:
+    if "base" not in table:
+        return None
+    if isinstance(table.data["base"], str):
+        table.choice("base", ("planar",))
+        return "planar"
+    own = table.table("base").allow("xyz", "rpy")
+    place, angles = (own.numbers(name, 3) if name in own else (0.0, 0.0, 0.0) for name in ("xyz", "rpy"))
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
+    transform[:3, 3] = place
+    return transform
 
 
 def _payload(table: Table) -> Payload:
