@@ -38,6 +38,7 @@ def of_mechanism(scene):
         **{name: getattr(scene, name) for name in ("gravity", "actuation")},
         "forces": scene.elements,
         "couplings": scene.couplings,
+        "custom": scene.custom,
         **dict(zip(("constant", "control", "quadratic", "centers"), fields, strict=True)),
     }
 

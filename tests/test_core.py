@@ -95,6 +95,7 @@ def test_what_is_no_tree_is_refused(field, value, match):
     own |= {
         "forces": (),
         "couplings": (),
+        "custom": None,
         "actuation": np.eye(2),
         "constant": np.zeros((2, 0)),
         "control": np.zeros((2, 0, 2)),
@@ -259,7 +260,7 @@ def test_matrices_beyond_the_range_of_indices_are_refused_before_there_is_room_f
     own |= {"loads": np.zeros(0, dtype=np.int64), "carried": np.zeros((0, n), dtype=np.int64), "ends": np.array([n])}
     own |= {"actuation": np.zeros((n, 0)), "constant": np.zeros((n, 0)), "control": np.zeros((n, 0, 0))}
     own |= {"quadratic": np.zeros((n, 0)), "centers": np.zeros((n, 0))}
-    chain = Mechanism.make(**own, groups=1, gravity=np.zeros(3), forces=[], couplings=[])
+    chain = Mechanism.make(**own, groups=1, gravity=np.zeros(3), forces=[], couplings=[], custom=None)
     still = np.zeros((1, n))
     step = (vp.Midpoint()._tableau(), 0.5, vp.Midpoint()._guards())
     assert VariationalRollout(chain, *step, 1.0, 1, Solver.elimination).begin(still, still)

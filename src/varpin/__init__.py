@@ -34,6 +34,8 @@ from varpin.integrators import Radau as Radau
 from varpin.integrators import Reference as Reference
 from varpin.integrators import RungeKutta4 as RungeKutta4
 from varpin.integrators import SemiImplicitEuler as SemiImplicitEuler
+from varpin.mechanics.custom import CustomForce as CustomForce
+from varpin.mechanics.custom import CustomForceError as CustomForceError
 from varpin.mechanics.forces import Armature as Armature
 from varpin.mechanics.forces import CoulombFriction as CoulombFriction
 from varpin.mechanics.forces import Force as Force
@@ -65,6 +67,7 @@ from varpin.model import planar_chain as planar_chain
 from varpin.model import robot_names as robot_names
 from varpin.show.replay import replay as replay
 from varpin.simulation.run import ControlError as ControlError
+from varpin.simulation.run import ForceError as ForceError
 from varpin.simulation.run import Interrupted as Interrupted
 from varpin.simulation.run import NoiseError as NoiseError
 from varpin.simulation.run import StepFailure as StepFailure

@@ -1,6 +1,6 @@
 """The compiled core: src/core, bound by nanobind."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum, IntEnum
 
 import numpy as np
@@ -39,6 +39,7 @@ class Mechanism:
         gravity: Floats,
         forces: Sequence[tuple[str, int, tuple[float, ...]]],
         couplings: Sequence[tuple[str, int, int, tuple[float, ...]]],
+        custom: Callable[[Floats, Floats, bool], tuple[Floats, Floats, Floats]] | None,
         actuation: Floats,
         constant: Floats,
         control: Floats,

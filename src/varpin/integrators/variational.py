@@ -234,6 +234,8 @@ class Variational(Integrator):
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
         """See :meth:`Integrator.contract`; steps that were taken in parts are chained as in :meth:`linearize`."""
+        if scene.custom is not None:
+            raise InputError("second derivatives are not there for a scene with a CustomForce")
         steps = self._steps(scene, trajectory)
         H, outcome, done = variational_curvatures(
             **steps, guess=np.ascontiguousarray(self._guess(trajectory)), z=np.ascontiguousarray(z)

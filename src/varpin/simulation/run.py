@@ -15,6 +15,7 @@ from varpin.errors import InputError, UnknownJoint, VarpinError
 from varpin.integrators import Integrator, Midpoint, Reference, Segment, integrator_of
 from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
 from varpin.integrators.within import Times, changing
+from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop, takes
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import wiener_increments
@@ -93,6 +94,16 @@ class ControlError(_StepError):
 
 class NoiseError(_StepError):
     """A function of a custom noise raised, or returned something that is no field.
+
+    Attributes:
+        step: Index of the step it was called in.
+        time: The start of that step [s].
+        trajectory: What was computed before.
+    """
+
+
+class ForceError(_StepError):
+    """A function of a custom force raised, or returned something that is no force.
 
     Attributes:
         step: Index of the step it was called in.
@@ -345,6 +356,7 @@ def simulate(
             control drives.
         ControlError: The control function returned something unusable; holds the trajectory so far.
         NoiseError: A function of a CustomNoise did; holds the trajectory so far.
+        ForceError: A function of a CustomForce did; holds the trajectory so far.
         StepFailure: A step has no trustworthy solution; holds the trajectory so far.
         SingularMassMatrix: M(q0) is not positive definite.
         Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt; while a tolerance looks for its
@@ -387,8 +399,8 @@ def simulate(
     record = _Record(scene, integrator, dt, dw, start)
     # A sweep takes as long as the robot has joints, an elimination as their cube.
     chunk = max(1, _CHUNK // (n + n**3 // 100))
-    # One step at a time where noise calls Python functions, so that what came before one that fails is recorded.
-    stepwise = scene.noise.diffusion is None
+    # One step at a time where noise or forces call Python functions: what came before one that fails is recorded.
+    stepwise = scene.noise.diffusion is None or scene.custom is not None
     interrupted = False
     try:
         while record.steps < steps:
@@ -408,6 +420,9 @@ def simulate(
             drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
             try:
                 (segment,) = integrator.rollout(scene, state, block, drawn, dt)
+            except CustomForceError as error:
+                now = record.trajectory()
+                raise ForceError(now.steps, float(now.t[-1]), str(error), now) from error
             except InputError as error:
                 now = record.trajectory()
                 raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__

@@ -234,7 +234,9 @@ class VariationalStepper {
     }
 
     // Whether the Lagrangian does not know how often coordinate i went round.
-    bool unwinds(int i) const { return mechanism.tree.periodic[i] && !mechanism.forces.anchors(i); }
+    bool unwinds(int i) const {
+        return mechanism.tree.periodic[i] && !mechanism.forces.anchors(i) && !mechanism.couplings.has_outer();
+    }
 
     void unwind(int i, PathState& state) const {
         if (unwinds(i)) state.place[i].unwind();
