@@ -153,7 +153,7 @@ def test_where_a_mass_matrix_is_singular(method):
     at = np.array([[0.0, 1.0], [0.0, 2.0], [0.0, -0.5], [0.0, 1.0]])
     nothing = np.zeros_like(at)
     assert accelerations(scene.core, at, nothing, nothing)[-1] == 2
-    assert linearize_explicit(scene.core, method, 1e-3, at, nothing, nothing)[-1] == 2
+    assert linearize_explicit(scene.core, method, 1e-3, at, nothing, nothing[:, None])[-1] == 2
     nodes = new_nodes(4, 3, 2, 2)
     assert not ExplicitRollout.start(scene.core, method, at, nothing).first_nodes(nodes)
     ExplicitRollout.start(scene.core, method, at, nothing).roll(
