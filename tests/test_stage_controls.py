@@ -58,6 +58,37 @@ def test_torques_of_time_keep_the_order(driven, integrator):
         assert errors[-1] < 1e-11
 
 
+@pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.Gauss(3), vp.RungeKutta4()], ids=str)
+def test_goals_of_servos_keep_the_order(integrator):
+    robot, stiffness, damping = vp.planar_chain(3), 60.0, 4.0
+    scene = vp.Scene(robot, forces=vp.PositionServo(stiffness, damping))
+    model = robot.model
+    data = model.createData()
+
+    def goal(t):
+        return np.array([0.5, -0.3, 0.4]) * np.sin(np.array([6.0, 5.0, 8.0]) * t)
+
+    def rate(t, x):
+        drive = stiffness * (goal(t) - x[:3]) - damping * x[3:]
+        return np.concatenate([x[3:], pin.aba(model, data, x[:3], x[3:], drive)])
+
+    end = solve_ivp(rate, (0.0, 0.5), np.concatenate([CHAIN_Q, CHAIN_V]), "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+    errors = []
+    for steps in (100, 200):
+        motion = vp.simulate(
+            scene,
+            CHAIN_Q,
+            CHAIN_V,
+            duration=0.5,
+            steps=steps,
+            controls=vp.OpenLoop(goal),
+            integrator=integrator,
+            check=False,
+        )
+        errors.append(np.abs(motion.q[-1] - end[:3]).max())
+    assert np.log2(errors[0] / errors[1]) > integrator.order - 0.3, errors
+
+
 def test_reference_meets_its_tolerance(driven):
     scene, force, end = driven
     motion = vp.simulate(
@@ -242,6 +273,16 @@ def test_the_look_sees_coarse_steps():
     coarse = vp.simulate(scene, CHAIN_Q, CHAIN_V, steps=30, **options)
     assert any("coarse" in told or "too long" in told for told in coarse.warnings)
     assert vp.simulate(scene, CHAIN_Q, CHAIN_V, steps=800, **options).warnings == ()
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4()], ids=str)
+def test_controls_that_change_too_fast_for_the_step_are_told_of(integrator):
+    scene = vp.Scene(vp.planar_chain(3), gravity=(0.0, 0.0, 0.0), damping=5.0)
+    fast = vp.OpenLoop(lambda t: np.array([1.0, 0.5, 0.2]) * np.sin(100.0 * t + 1.0))
+    options = {"duration": 0.4, "controls": fast, "integrator": integrator}
+    coarse = vp.simulate(scene, CHAIN_Q, np.zeros(3), steps=7, **options)
+    assert any("change too fast for dt" in told for told in coarse.warnings)
+    assert vp.simulate(scene, CHAIN_Q, np.zeros(3), steps=400, **options).warnings == ()
 
 
 def test_lines_between_nodes():

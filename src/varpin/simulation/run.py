@@ -49,6 +49,8 @@ logger = logging.getLogger(__name__)
 _CHUNK = 30_000
 # What steps where no integrator is given.
 _MIDPOINT = Midpoint()
+# Steps at which a function of time is held against steps of half the length, and the share by which it may be off.
+_LOOKS, _ALIKE = 16, 0.05
 # Parts of a motion that are kept one by one.
 _PARTS = 256
 
@@ -442,6 +444,8 @@ def simulate(
         interrupted = True
     try:
         trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
+        if check and isinstance(controls, OpenLoop):
+            found = (*found, *_undersampled(controls, scene, integrator, trajectory))
         found = (*noise_forgotten(scene, rng, increments), *wished, *found)
         trajectory = replace(with_warnings(trajectory, found), accuracy=accuracy)
     except KeyboardInterrupt:
@@ -774,6 +778,34 @@ def _evaluated(
                 continue
             found[k, i] = _called("OpenLoop: f(t)", partial(controls.f, time), scene, step, time, record)
     return changing(found, times) if times else open_loop(found[:, 0])
+
+
+def _undersampled(
+    controls: OpenLoop, scene: Scene, integrator: Integrator, trajectory: Trajectory
+) -> tuple[Finding, ...]:
+    """Says if steps of half the length see another function: a record has its values at the stages alone."""
+    dt, times = trajectory.dt, integrator.stage_times
+    if not trajectory.steps:
+        return ()
+    looks = np.unique(np.linspace(0, trajectory.steps - 1, _LOOKS).astype(np.int64))
+    try:
+        halves = [_evaluated(controls, scene, integrator, 0.5 * dt, range(2 * k, 2 * k + 2)).u for k in looks.tolist()]
+    except ControlError:
+        return ()
+    mean = np.array(halves).mean(axis=1)
+    total, off = (float(np.abs(part).sum()) for part in (mean, mean - trajectory.u[looks]))
+    if not off > _ALIKE * total:
+        return ()
+    stages = f"{len(times)} stages of a step" if times else "middle of a step"
+    return (
+        Finding(
+            "fast controls",
+            f"the controls of OpenLoop change too fast for dt = {dt:g} s: their means over a step, from the {stages}, "
+            f"are off by {100.0 * off / total:.3g}% of those in half the step"
+            if total > 0.0
+            else f"the controls of OpenLoop change too fast for dt = {dt:g} s: half the step sees none of them",
+        ),
+    )
 
 
 def _called(
