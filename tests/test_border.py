@@ -39,6 +39,7 @@ def of_mechanism(scene):
         "forces": scene.elements,
         "couplings": scene.couplings,
         "constraints": scene.bound_constraints.rows,
+        "custom": scene.custom,
         **dict(zip(("constant", "control", "quadratic", "centers"), fields, strict=True)),
     }
 
@@ -112,7 +113,7 @@ def steps(scene):
         "tolerance": 0.5,
         "guards": core.Guards.make(**GUARDS),
         "dt": 1e-3,
-        **{"q": draw(N, n), "p": 0.1 * draw(N, n), "force": draw(N, n)},
+        **{"q": draw(N, n), "p": 0.1 * draw(N, n), "force": draw(N, 1, n)},
         "substeps": np.array([1, 1, 2, 4]),
         "halvings": np.array([1, 1, 2, 2, 2, 2], dtype=np.uint8),
     }
@@ -161,7 +162,7 @@ def calls():
     yield "accelerations", core.accelerations, {"mechanism": own.core, **many}
     for method in core.ExplicitMethod:
         fixed = {"mechanism": own.core, "method": method, "dt": 1e-3}
-        yield f"derivatives of {method}", core.linearize_explicit, {**fixed, **many}
+        yield f"derivatives of {method}", core.linearize_explicit, {**fixed, **states, "force": draw(N, 1, n)}
     closed = vp.Scene(own.robot, constraints=vp.PointOnPoint("panda_hand", (0.3, 0.0, 0.5)))
     yield "constraints", closed.core.constraints, {"q": draw(N, n)}
     at = {"q": draw(n), "weights": draw(3), "v": draw(n)}
@@ -189,6 +190,8 @@ def calls():
 FREE = {("place a frame", "q", 0), ("changes", "u", 0), ("changes", "u", 1), ("expanded changes", "u", 0)}
 FREE |= {("constraints", "q", 0)}
 FREE |= {("changes", "before", 0), ("expanded changes", "before", 0)}
+# Of two stages: a force for each.
+FREE |= {(name, "force", 1) for name in ("derivatives", "curvatures", "ends")}
 
 
 @pytest.fixture(scope="module")

@@ -96,6 +96,7 @@ def test_what_is_no_tree_is_refused(field, value, match):
         "forces": (),
         "couplings": (),
         "constraints": ConstraintRows(),
+        "custom": None,
         "actuation": np.eye(2),
         "constant": np.zeros((2, 0)),
         "control": np.zeros((2, 0, 2)),
@@ -153,7 +154,7 @@ def test_where_a_mass_matrix_is_singular(method):
     at = np.array([[0.0, 1.0], [0.0, 2.0], [0.0, -0.5], [0.0, 1.0]])
     nothing = np.zeros_like(at)
     assert accelerations(scene.core, at, nothing, nothing)[-1] == 2
-    assert linearize_explicit(scene.core, method, 1e-3, at, nothing, nothing)[-1] == 2
+    assert linearize_explicit(scene.core, method, 1e-3, at, nothing, nothing[:, None])[-1] == 2
     nodes = new_nodes(4, 3, 2, 2)
     assert not ExplicitRollout.start(scene.core, method, at, nothing).first_nodes(nodes)
     ExplicitRollout.start(scene.core, method, at, nothing).roll(
@@ -260,7 +261,8 @@ def test_matrices_beyond_the_range_of_indices_are_refused_before_there_is_room_f
     own |= {"loads": np.zeros(0, dtype=np.int64), "carried": np.zeros((0, n), dtype=np.int64), "ends": np.array([n])}
     own |= {"actuation": np.zeros((n, 0)), "constant": np.zeros((n, 0)), "control": np.zeros((n, 0, 0))}
     own |= {"quadratic": np.zeros((n, 0)), "centers": np.zeros((n, 0))}
-    chain = Mechanism.make(**own, groups=1, gravity=np.zeros(3), forces=[], couplings=[], constraints=ConstraintRows())
+    own |= {"forces": [], "couplings": [], "constraints": ConstraintRows(), "custom": None}
+    chain = Mechanism.make(**own, groups=1, gravity=np.zeros(3))
     still = np.zeros((1, n))
     step = (vp.Midpoint()._tableau(), 0.5, vp.Midpoint()._guards())
     assert VariationalRollout(chain, *step, 1.0, 1, Solver.elimination).begin(still, still)

@@ -260,15 +260,18 @@ def test_motions_are_those_with_matrices(robot, integrator):
     assert eliminated.quality[..., 0].max() <= 100.0
 
 
+@pytest.mark.parametrize("ramp", [False, True], ids=["shift", "ramp"])
 @pytest.mark.parametrize(("integrator", "stages"), [(vp.Midpoint(), 1), (vp.Gauss(2), 2)], ids=["midpoint", "gauss2"])
-def test_derivatives_are_those_with_matrices(robot, integrator, stages):
+def test_derivatives_are_those_with_matrices(robot, integrator, stages, ramp):
     scene, (q, v) = scene_of(robot), state_of(robot)
     p = vp.lagrangian_jet(scene, q, v).Lv
     fixed = scene.core, integrator._tableau(), float(integrator.tolerance), integrator._guards(), 1e-3
     guess = np.broadcast_to(v, (1, stages, robot.dof)).copy()
-    at = q[None], p[None], np.zeros((1, robot.dof)), np.ones(1, dtype=np.int64), np.zeros(0, dtype=np.uint8)
+    # Another force at each stage, as under controls that change within the step; and in its ramp.
+    force = np.linspace(-1e-3, 1e-3, stages * robot.dof).reshape(1, stages, robot.dof)
+    at = q[None], p[None], force, np.ones(1, dtype=np.int64), np.zeros(0, dtype=np.uint8)
     (Ax, Af, *done), (Bx, Bf, *also) = (
-        variational_derivatives(*fixed, *at, guess=guess, solver=solver)
+        variational_derivatives(*fixed, *at, guess=guess, ramp=ramp, solver=solver)
         for solver in (Solver.dense, Solver.elimination)
     )
     assert done == also == [0, 1]

@@ -253,7 +253,7 @@ def test_elimination_takes_the_steps_of_the_dense_solver(integrator):
     assert eliminated.quality[..., 1] == pytest.approx(dense.quality[..., 1], rel=1e-5)
     stages = getattr(integrator, "stages", 1)
     fixed = scene.core, integrator._tableau(), float(integrator.tolerance), integrator._guards(), 1e-3
-    at = q[None], vp.lagrangian_jet(scene, q, v).Lv[None], np.zeros((1, 5))
+    at = q[None], vp.lagrangian_jet(scene, q, v).Lv[None], np.zeros((1, 1, 5))
     whole = np.ones(1, dtype=np.int64), np.zeros(0, dtype=np.uint8)
     guess = np.broadcast_to(v, (1, stages, 5)).copy()
     (Ax, Af, *_), (Bx, Bf, *_) = (

@@ -229,7 +229,7 @@ def test_largest_step_agrees_with_differences_of_pinocchios_energy():
 def test_loaded_robot_is_taken_and_not_loaded_otherwise():
     robot = vp.planar_chain(2)
     assert inspect_robot(robot).robot is robot
-    with pytest.raises(vp.InputError, match="lock, package_dirs and mimic belong to loading"):
+    with pytest.raises(vp.InputError, match="lock, package_dirs, mimic, base and armature belong to loading"):
         inspect_robot(robot, lock={"joint1": 0.0})
 
 

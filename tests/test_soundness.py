@@ -112,7 +112,7 @@ def test_energy_balance_of_explicit_methods(integrator):
             increments=rng.reshape(steps, -1, 2).sum(axis=1),
             integrator=integrator,
         )
-        np.testing.assert_array_equal(motion.statistics.energy_defect, energy_defects(scene, motion))
+        np.testing.assert_array_equal(motion.statistics.energy_defect, energy_defects(scene, integrator, motion))
         off.append(np.abs(motion.statistics.energy_defect).max())
     # Forces, dampers and kicks account for most of what the energy does, and for all of it as dt shrinks.
     assert off[1] < 0.1 * np.abs(motion.energy - motion.energy[0]).max()

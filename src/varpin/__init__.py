@@ -44,6 +44,8 @@ from varpin.mechanics.constraints import JointTie as JointTie
 from varpin.mechanics.constraints import PointOnLine as PointOnLine
 from varpin.mechanics.constraints import PointOnPlane as PointOnPlane
 from varpin.mechanics.constraints import PointOnPoint as PointOnPoint
+from varpin.mechanics.custom import CustomForce as CustomForce
+from varpin.mechanics.custom import CustomForceError as CustomForceError
 from varpin.mechanics.forces import Armature as Armature
 from varpin.mechanics.forces import CoulombFriction as CoulombFriction
 from varpin.mechanics.forces import Force as Force
@@ -64,6 +66,7 @@ from varpin.mechanics.noise import CustomNoise as CustomNoise
 from varpin.mechanics.noise import Noise as Noise
 from varpin.mechanics.noise import NoiseFieldError as NoiseFieldError
 from varpin.mechanics.noise import StateNoise as StateNoise
+from varpin.mechanics.policy import FirstOrderHold as FirstOrderHold
 from varpin.mechanics.policy import LinearPolicy as LinearPolicy
 from varpin.mechanics.policy import OpenLoop as OpenLoop
 from varpin.mechanics.scene import Scene as Scene
@@ -74,6 +77,7 @@ from varpin.model import planar_chain as planar_chain
 from varpin.model import robot_names as robot_names
 from varpin.show.replay import replay as replay
 from varpin.simulation.run import ControlError as ControlError
+from varpin.simulation.run import ForceError as ForceError
 from varpin.simulation.run import Interrupted as Interrupted
 from varpin.simulation.run import NoiseError as NoiseError
 from varpin.simulation.run import StepFailure as StepFailure

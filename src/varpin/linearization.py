@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,7 +40,7 @@ class Linearization:
 
     Attributes:
         A: dx1/dx0 (N, 2n, 2n); symplectic where nothing is forced or damped.
-        B: dx1/du (N, 2n, m).
+        B: dx1/du (N, 2n, m), of a control that is moved by du over the whole step.
         K: What a kick does to x1 (N, 2n, n): a jump of the momentum at the start of the step, under an unchanged drift.
             It is dx1/dp0 where no diffusion field depends on the velocity. Where one does, the drift from Stratonovich
             to Ito, (1/2) sum_i (dF_i/dv) M^-1 F_i, is that of the state before the kick; dx1/dp0 has its derivative
@@ -52,6 +52,9 @@ class Linearization:
         Gu: The same in u (N, 2n, k, m).
         dt: Time step [s].
         variational: Whether x is (q, p) rather than (q, v).
+        ramp: dx1/du of a control that is moved by nothing at the step's start and by du at its end, linearly
+            (N, 2n, m), from :func:`linearize` of a motion whose controls change within steps; else None. Of controls
+            that are linear between nodes, dx1 = A dx + (B - ramp) du_k + ramp du_(k+1).
     """
 
     A: Floats
@@ -64,6 +67,7 @@ class Linearization:
     Gu: Floats
     dt: float
     variational: bool
+    ramp: Floats | None = None
 
     def __repr__(self) -> str:
         return f"Linearization({self._size()})"
@@ -111,7 +115,10 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
         LinearizationError: A step has no solution at dw = 0.
     """
     integrator = _matching(require_scene(scene), trajectory, integrator)
-    return linearize_steps(scene, trajectory, integrator, trajectory.q[0])
+    found = linearize_steps(scene, trajectory, integrator, trajectory.q[0])
+    if not trajectory.u_stages.shape[1]:
+        return found
+    return replace(found, ramp=integrator.ramps(scene, trajectory) @ scene.actuation)
 
 
 def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator, first: Floats) -> Linearization:
@@ -359,7 +366,10 @@ def _require_steps_of(scene: Scene, trajectory: Trajectory, integrator: Integrat
     for k in np.unique([*whole[spread], whole[np.argmax(change[whole])]]).tolist():
         state, _ = integrator.start(scene, trajectory.q[k : k + 1].copy(), trajectory.v[k : k + 1].copy())
         drawn = trajectory.dw[None, k : k + 1] if trajectory.dw.any() else np.zeros((0, 0, scene.processes))
-        (again,) = integrator.rollout(scene, state, open_loop(trajectory.u[k : k + 1]), drawn, trajectory.dt)
+        commands = open_loop(trajectory.u[k : k + 1])
+        if trajectory.u_stages.shape[1]:
+            commands = commands._replace(within=trajectory.u_stages[k : k + 1])
+        (again,) = integrator.rollout(scene, state, commands, drawn, trajectory.dt)
         if again.failure is not None or again.statistics.substeps[0] > 1:
             continue
         off = float(np.abs(again.v[0] - trajectory.v[k + 1]).max())

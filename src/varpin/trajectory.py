@@ -167,7 +167,7 @@ class Trajectory(Frozen):
         q: Configurations (N + 1, n) [rad or m].
         v: Velocities (N + 1, n) [rad/s or m/s]; M(q)^-1 p for variational integrators.
         p: Momenta (N + 1, n) [N m s or N s].
-        u: Controls (N, m), constant over each step.
+        u: Controls (N, m): constant over each step, or the mean over it of those that change within it.
         dw: Wiener increments (N, k) [s^0.5]; zeros where no noise was drawn.
         energy: Kinetic and potential energy together (N + 1,) [J]; springs included.
         masses: Of the robot's bodies (b,) [kg]; they tell robots apart whose joints have the same names.
@@ -181,6 +181,9 @@ class Trajectory(Frozen):
         warnings: What varpin said of the motion, a sentence each: dt too coarse, energy off, steps taken in parts.
         scene_values: Numbers of the scene it was made in, :attr:`varpin.Scene.values`; empty in files that varpin wrote
             before it kept them.
+        u_stages: Controls (N, s, m) at the stages of each step, where they change within it
+            (:class:`varpin.OpenLoop`, :class:`varpin.FirstOrderHold`, with a method of several stages); else (N, 0, m).
+            The motion is that under the polynomial through them.
         accuracy: The estimated error, and what finding integrator and step took, of a motion that was asked for with a
             tolerance; None of others.
         constraint_forces: Of a scene's constraints, the mean over each step (N, c) [N or N m]: the joints feel
@@ -211,6 +214,9 @@ class Trajectory(Frozen):
         default_factory=lambda: np.zeros((0, 0)), repr=False
     )
     constraint_labels: tuple[str, ...] = ()
+    u_stages: Annotated[Floats, Axes("steps", "stages", "controls", finite=True)] = field(
+        default_factory=lambda: np.zeros((0, 0, 0)), repr=False
+    )
 
     def __post_init__(self) -> None:
         if not self.constraint_labels and not np.size(self.constraint_forces):
@@ -224,7 +230,10 @@ class Trajectory(Frozen):
         if nodes < 1 or self.u.ndim != 2 or self.dw.ndim != 2:
             raise InputError("a trajectory has one node or more, and controls and increments (N, ...)")
         self._require("constraint_forces", (nodes - 1, len(self.constraint_labels)))
-        for name in (*_ARRAYS, "constraint_forces"):
+        if not np.size(self.u_stages):
+            object.__setattr__(self, "u_stages", np.zeros((nodes - 1, 0, self.u.shape[1])))
+        self._require("u_stages", (nodes - 1, np.shape(self.u_stages)[1], self.u.shape[1]))
+        for name in (*_ARRAYS, "constraint_forces", "u_stages"):
             getattr(self, name).setflags(write=False)
         for array in vars(self.statistics).values():
             array.setflags(write=False)
@@ -253,6 +262,7 @@ class Trajectory(Frozen):
             self,
             **{name: getattr(self, name)[nodes] for name in ("t", "q", "v", "p", "energy")},
             u=self.u[steps],
+            u_stages=self.u_stages[steps],
             dw=self.dw[steps],
             constraint_forces=self.constraint_forces[steps],
             statistics=self.statistics.part(begin, end),
@@ -394,7 +404,7 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
         name: np.concatenate([getattr(first, name)[:1], *(getattr(part, name)[1:] for part in parts)])
         for name in ("q", "v", "p", "energy")
     }
-    of_steps = ("u", "dw", "constraint_forces")
+    of_steps = ("u", "u_stages", "dw", "constraint_forces")
     arrays |= {name: np.concatenate([getattr(part, name) for part in parts]) for name in of_steps}
     return replace(
         first,

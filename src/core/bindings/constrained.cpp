@@ -55,7 +55,7 @@ class ConstrainedRollout {
         const NodeArrays written(mechanism, nodes);
         if (written.paths() != states_.size())
             throw std::invalid_argument("there is not one row of nodes for each path");
-        const CommandArrays given_commands(mechanism, commands, written.paths(), written.steps());
+        const CommandArrays given_commands(mechanism, commands, written.paths(), written.steps(), stepper_->stages);
         const double* dw = increments_of(mechanism, increments, written);
         const double* extra = drift_of(mechanism, drift, written);
         nb::gil_scoped_release release;
@@ -114,13 +114,15 @@ class ConstrainedRollout {
 // As variational_derivatives.
 std::tuple<Out, Out, std::int64_t, std::size_t> constrained_derivatives(
     const Mechanism& mechanism, const Tableau& tableau, In<2> places, double tolerance, const Guards& guards, double h,
-    In<2> q, In<2> p, In<2> force, Integers<1> substeps, Bytes halvings, In<3> guess) {
-    const StepsAt at(mechanism, q, p, force, substeps, halvings);
+    In<2> q, In<2> p, In<3> force, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp) {
+    const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
     const std::size_t N = at.N, n = at.n, stages = static_cast<std::size_t>(tableau.stages);
     require(guess, "guess", {N, stages, n});
     double *Jx = nullptr, *Jf = nullptr;
     const Out X = array_for(Jx, {N, 2 * n, 2 * n}), F = array_for(Jf, {N, 2 * n, n});
     ConstrainedLinearization work(mechanism, tableau, places_of(tableau, places), tolerance, guards);
+    work.varies = at.varies;
+    work.ramp = ramp;
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
         return work.first(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
                           Jx + s * 4 * n * n, Jf + s * 2 * n * n);
@@ -143,7 +145,8 @@ void register_constrained(nb::module_& m) {
         .def("impulses", &ConstrainedRollout::impulses, "path"_a)
         .def("weakest", &ConstrainedRollout::weakest, "path"_a);
     m.def("constrained_derivatives", &constrained_derivatives, "mechanism"_a, "tableau"_a, "places"_a, "tolerance"_a,
-          "guards"_a, "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a);
+          "guards"_a, "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a,
+          "ramp"_a = false);
 }
 
 }  // namespace varpin::border

@@ -99,23 +99,29 @@ std::tuple<Out, Out, Out, Out, std::size_t> accelerations(const Mechanism& mecha
     return {values, aq, av, af, s};
 }
 
-// Derivatives of one step from each row of q and v, in (q, v), (N, 2n, 2n), and in the force, (N, 2n, n); how many rows
-// went before one with a mass matrix that is not positive definite.
+// Derivatives of one step from each row of q and v, in (q, v), (N, 2n, 2n), and in the force, (N, 2n, n), or in one
+// that grows over the step to it as a ramp; how many rows went before one with a mass matrix that is not positive
+// definite. The force (N, r, n) is constant, r = 1, or that at each time of a stage.
 std::tuple<Out, Out, std::size_t> linearize(const Mechanism& mechanism, ExplicitMethod method, double dt, In<2> q,
-                                            In<2> v, In<2> force) {
-    require_rows(mechanism, q, v, force);
+                                            In<2> v, In<3> force, bool ramp) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
+    ExplicitStepper stepper(mechanism, method, true);
+    stepper.ramp = ramp;
+    const std::size_t places = force.shape(1);
+    require(q, "q", {rows, n});
+    require(v, "v", {rows, n});
+    if (places != 1) require(force, "force", {rows, static_cast<std::size_t>(stepper.places()), n});
+    require(force, "force", {rows, places, n});
     double *in_x = nullptr, *in_force = nullptr;
     const Out Jx = array_for(in_x, {rows, 2 * n, 2 * n}), Jf = array_for(in_force, {rows, 2 * n, n});
     std::size_t s = 0;
     {
         nb::gil_scoped_release release;
-        ExplicitStepper stepper(mechanism, method, true);
         for (; s < rows; ++s) {
             std::copy_n(q.data() + s * n, n, stepper.q.data());
             std::copy_n(v.data() + s * n, n, stepper.v.data());
             if (!stepper.dynamics.at(q.data() + s * n, v.data() + s * n)) break;
-            if (!stepper.step(dt, force.data() + s * n)) break;
+            if (!stepper.step(dt, force.data() + s * places * n, places > 1 ? static_cast<int>(n) : 0)) break;
             stepper.write_derivatives(dt, in_x + s * 4 * n * n, in_force + s * 2 * n * n);
         }
     }
@@ -141,7 +147,7 @@ void roll(BoundRollout& rollout, double dt, nb::handle commands, In<3> increment
     const Mechanism& mechanism = *rollout.mechanism;
     const NodeArrays to(mechanism, nodes);
     rollout.require_paths(to);
-    const CommandArrays by(mechanism, commands, to.paths(), to.steps());
+    const CommandArrays by(mechanism, commands, to.paths(), to.steps(), rollout.own.places());
     const double* dw = increments_of(mechanism, increments, to);
     const double* more = drift_of(mechanism, drift, to);
     Watch* watching = watch ? watch->of(to.paths(), to.steps()) : nullptr;
@@ -179,7 +185,8 @@ void register_explicit(nb::module_& m) {
         .def("first_nodes", &first_nodes, "nodes"_a)
         .def("roll", &roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a, "watch"_a.none() = nb::none());
     m.def("accelerations", &accelerations, "mechanism"_a, "q"_a, "v"_a, "force"_a);
-    m.def("linearize_explicit", &linearize, "mechanism"_a, "method"_a, "dt"_a, "q"_a, "v"_a, "force"_a);
+    m.def("linearize_explicit", &linearize, "mechanism"_a, "method"_a, "dt"_a, "q"_a, "v"_a, "force"_a,
+          "ramp"_a = false);
 }
 
 }  // namespace varpin::border

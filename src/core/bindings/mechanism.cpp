@@ -150,12 +150,31 @@ Constraints constraints_of(const NamedConstraints& named, const std::vector<Body
     return Constraints(sums, rows, tied, functions, bodies, static_cast<int>(n));
 }
 
+// A force that Python evaluates: of (q, v, whether derivatives are wanted) it returns (F, dF/dq, dF/dv), and what it
+// raises ends the call that asked.
+OuterForce outer_force_of(nb::object function, std::size_t n) {
+    return [function = std::move(function), n](const double* q, const double* v, double* F, double* by_q,
+                                               double* by_v) {
+        nb::gil_scoped_acquire acquire;
+        const auto found =
+            nb::cast<std::tuple<In<1>, In<2>, In<2>>>(function(array_of(q, {n}), array_of(v, {n}), by_q != nullptr));
+        const auto& [value, in_q, in_v] = found;
+        require(value, "F", {n});
+        std::copy_n(value.data(), n, F);
+        if (!by_q) return;
+        require(in_q, "dF/dq", {n, n});
+        require(in_v, "dF/dv", {n, n});
+        std::copy_n(in_q.data(), n * n, by_q);
+        std::copy_n(in_v.data(), n * n, by_v);
+    };
+}
+
 Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation, In<2> translation, In<1> mass,
                        In<2> center, In<2> inertia, Integers<1> coordinate, In<1> ratio, In<1> offset,
                        Integers<1> origin, Integers<1> loads, Integers<2> carried, Integers<1> periodic, In<1> armature,
                        Integers<1> group, int groups, Integers<1> ends, In<1> gravity, const Named& forces,
-                       const NamedCouplings& couplings, const NamedConstraints& constraints, In<2> actuation,
-                       In<2> constant, In<3> control, In<2> quadratic, In<2> centers) {
+                       const NamedCouplings& couplings, const NamedConstraints& constraints, nb::object custom,
+                       In<2> actuation, In<2> constant, In<3> control, In<2> quadratic, In<2> centers) {
     const std::size_t bodies = parent.shape(0), n = armature.shape(0), m = actuation.shape(1);
     const std::size_t processes = constant.shape(1);
     require(origin, "origin", {bodies});
@@ -219,6 +238,7 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
     }
     out.couplings = Couplings(between, out.tree.bodies);
     out.constraints = constraints_of(constraints, out.tree.bodies, n);
+    if (!custom.is_none()) out.couplings.take_outer(outer_force_of(std::move(custom), n));
     out.controls = static_cast<int>(m);
     for (std::size_t r = 0; r < n; ++r) {
         for (std::size_t c = 0; c < m; ++c) {
@@ -401,8 +421,8 @@ void register_mechanism(nb::module_& m) {
         .def_static("make", &mechanism_of, nb::kw_only(), "parent"_a, "prismatic"_a, "rotation"_a, "translation"_a,
                     "mass"_a, "center"_a, "inertia"_a, "coordinate"_a, "ratio"_a, "offset"_a, "origin"_a, "loads"_a,
                     "carried"_a, "periodic"_a, "armature"_a, "group"_a, "groups"_a, "ends"_a, "gravity"_a, "forces"_a,
-                    "couplings"_a, "constraints"_a, "actuation"_a, "constant"_a, "control"_a, "quadratic"_a,
-                    "centers"_a)
+                    "couplings"_a, "constraints"_a, "custom"_a.none(), "actuation"_a, "constant"_a, "control"_a,
+                    "quadratic"_a, "centers"_a)
         .def("jet", &jet, "q"_a, "v"_a)
         .def("jets", &jets, "q"_a, "v"_a)
         .def("velocity_slopes", &velocity_slopes, "q"_a, "v"_a)

@@ -12,6 +12,7 @@
 #include "arrays.hpp"
 #include "varpin/nodes.hpp"
 #include "varpin/policy.hpp"
+#include "varpin/tableau.hpp"
 
 namespace varpin::border {
 
@@ -73,15 +74,16 @@ class NodeArrays {
     IntegersInOut<1> ended, done;
 };
 
-// Commands for P paths over N steps.
+// Commands for P paths over N steps, with controls at `stages` stages of each where they change within it.
 class CommandArrays {
   public:
-    CommandArrays(const Mechanism& mechanism, nb::handle commands, std::size_t paths, std::size_t steps)
+    CommandArrays(const Mechanism& mechanism, nb::handle commands, std::size_t paths, std::size_t steps, int stages)
         : u(field<In<2>>(commands, "u")),
           gains(field<In<3>>(commands, "gains")),
           reference(field<In<2>>(commands, "reference")),
           limits(field<In<2>>(commands, "limits")),
           before(field<In<2>>(commands, "before")),
+          within(field<In<3>>(commands, "within")),
           hold(nb::cast<int>(commands.attr("hold"))) {
         const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
         const std::size_t decisions = u.shape(0), width = gains.shape(2);
@@ -96,6 +98,11 @@ class CommandArrays {
         }
         require(limits, "limits", {2, m});
         earlier = given(before, "before", {paths, m});
+        if (within.shape(0) == 0) return;
+        require(within, "within", {steps, static_cast<std::size_t>(stages), m});
+        if (feedback || hold != 1)
+            throw std::invalid_argument("controls that change within a step go with neither feedback nor a hold");
+        changing = true;
     }
 
     Commands view() const {
@@ -108,16 +115,19 @@ class CommandArrays {
                 static_cast<int>(gains.shape(2)),
                 limits.data(),
                 limits.data() + m,
-                earlier ? before.data() : nullptr};
+                earlier ? before.data() : nullptr,
+                changing ? within.data() : nullptr};
     }
 
   private:
     In<2> u;
     In<3> gains;
     In<2> reference, limits, before;
+    In<3> within;
     int hold;
     bool feedback = false;  // whether there are gains
     bool earlier = false;   // whether the controls before the first are known
+    bool changing = false;  // whether controls change within steps
 };
 
 // Increments of Wiener processes (P, N, k), or null where there are none: (0, 0, k), or k = 0.
@@ -135,16 +145,18 @@ inline const double* drift_of(const Mechanism& mechanism, const In<3>& drift, co
 // The arrays that N steps are taken again from.
 class StepsAt {
   public:
-    StepsAt(const Mechanism& mechanism, In<2> q, In<2> p, In<2> force, Integers<1> substeps, Bytes halvings)
+    StepsAt(const Mechanism& mechanism, const Tableau& tableau, In<2> q, In<2> p, In<3> force, Integers<1> substeps,
+            Bytes halvings)
         : n(static_cast<std::size_t>(mechanism.dof())),
           N(q.shape(0)),
+          varies(force.shape(1) != 1),
           q_(q),
           p_(p),
           force_(force),
           halvings_(halvings),
           place_(N + 1, 0) {
-        for (const auto& [array, name] : {std::pair{&q, "q"}, {&p, "p"}, {&force, "force"}})
-            require(*array, name, {N, n});
+        for (const auto& [array, name] : {std::pair{&q, "q"}, {&p, "p"}}) require(*array, name, {N, n});
+        require(force, "force", {N, varies ? static_cast<std::size_t>(tableau.stages) : 1, n});
         require(substeps, "substeps", {N});
         for (std::size_t s = 0; s < N; ++s) {
             const std::int64_t parts = substeps(s);
@@ -159,9 +171,10 @@ class StepsAt {
     }
 
     const std::size_t n, N;
+    const bool varies;  // whether there is a force for each stage
     const double* q(std::size_t s) const { return q_.data() + s * n; }
     const double* p(std::size_t s) const { return p_.data() + s * n; }
-    const double* force(std::size_t s) const { return force_.data() + s * n; }
+    const double* force(std::size_t s) const { return force_.data() + s * force_.shape(1) * n; }
     // Of the parts of a step; none if it was taken whole.
     std::span<const std::uint8_t> halvings(std::size_t s) const {
         return {halvings_.data() + place_[s], place_[s + 1] - place_[s]};
@@ -174,7 +187,8 @@ class StepsAt {
     }
 
   private:
-    In<2> q_, p_, force_;
+    In<2> q_, p_;
+    In<3> force_;  // (N, 1, n) constant over a step, or (N, s, n)
     Bytes halvings_;
     std::vector<std::size_t> place_;  // (N + 1) where the parts of a step begin
 };

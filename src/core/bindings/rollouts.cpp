@@ -47,6 +47,7 @@ class VariationalRollout {
         : mechanism_(&mechanism),
           stepping_(small_stepping(mechanism, tableau, tolerance, guards, left, solver)),
           guards_(guards),
+          stages_(tableau.stages),
           states_(paths, PathState(mechanism, tableau.stages)) {
         if (!stepping_)
             stepping_ = std::make_shared<SteppingOf<int, int>>(mechanism, tableau, tolerance, guards, left, solver);
@@ -75,7 +76,7 @@ class VariationalRollout {
         const NodeArrays written(mechanism, nodes);
         if (written.paths() != states_.size())
             throw std::invalid_argument("there is not one row of nodes for each path");
-        const CommandArrays given_commands(mechanism, commands, written.paths(), written.steps());
+        const CommandArrays given_commands(mechanism, commands, written.paths(), written.steps(), stages_);
         const double* dw = increments_of(mechanism, increments, written);
         const double* extra = drift_of(mechanism, drift, written);
         Watch* watching = watch ? watch->of(written.paths(), written.steps()) : nullptr;
@@ -114,18 +115,18 @@ class VariationalRollout {
     const Mechanism* mechanism_;
     std::shared_ptr<Stepping> stepping_;
     Guards guards_;
+    int stages_;
     std::vector<PathState> states_;
 
     std::size_t size() const { return static_cast<std::size_t>(mechanism_->dof()); }
 };
 
-// d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n) of each step; how it ended and how many were done.
-std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(const Mechanism& mechanism,
-                                                                        const Tableau& tableau, double tolerance,
-                                                                        const Guards& guards, double h, In<2> q,
-                                                                        In<2> p, In<2> force, Integers<1> substeps,
-                                                                        Bytes halvings, In<3> guess, Solver solver) {
-    const StepsAt at(mechanism, q, p, force, substeps, halvings);
+// d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n) of each step, f constant over it or a ramp up to f; how
+// it ended and how many were done.
+std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(
+    const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards, double h, In<2> q,
+    In<2> p, In<3> force, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp, Solver solver) {
+    const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
     const std::size_t N = at.N, n = at.n, stages = static_cast<std::size_t>(tableau.stages);
     require(guess, "guess", {N, stages, n});
     double *Jx = nullptr, *Jf = nullptr;
@@ -133,8 +134,8 @@ std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(const Me
     std::unique_ptr<Differentiation> work = small_differentiation(mechanism, tableau, tolerance, guards, solver);
     if (!work) work = std::make_unique<DifferentiationOf<int, int>>(mechanism, tableau, tolerance, guards, solver);
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
-        return work->first(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
-                           Jx + s * 4 * n * n, Jf + s * 2 * n * n, at.past(s));
+        return work->first(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.varies, ramp,
+                           at.halvings(s), Jx + s * 4 * n * n, Jf + s * 2 * n * n, at.past(s));
     });
     return {X, F, static_cast<std::int64_t>(outcome), done};
 }
@@ -142,15 +143,16 @@ std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(const Me
 // z . d2(q1, p1)/d(q0, p0, f)2 of each step (N, 3n, 3n), for the rows of z (N, 2n).
 std::tuple<Out, std::int64_t, std::size_t> variational_curvatures(const Mechanism& mechanism, const Tableau& tableau,
                                                                   double tolerance, const Guards& guards, double h,
-                                                                  In<2> q, In<2> p, In<2> force, Integers<1> substeps,
+                                                                  In<2> q, In<2> p, In<3> force, Integers<1> substeps,
                                                                   Bytes halvings, In<3> guess, In<2> z, Solver solver) {
-    const StepsAt at(mechanism, q, p, force, substeps, halvings);
+    const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
     const std::size_t N = at.N, n = at.n, stages = static_cast<std::size_t>(tableau.stages);
     require(guess, "guess", {N, stages, n});
     require(z, "z", {N, 2 * n});
     double* H = nullptr;
     const Out curvatures = array_for(H, {N, 3 * n, 3 * n});
     VariationalLinearization work(mechanism, tableau, tolerance, guards, solver);
+    work.varies = at.varies;
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
         return work.second(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
                            z.data() + s * 2 * n, H + s * 9 * n * n, at.past(s));
@@ -161,13 +163,14 @@ std::tuple<Out, std::int64_t, std::size_t> variational_curvatures(const Mechanis
 // Configurations and velocities (N, n) at the end of each step.
 std::tuple<Out, Out, std::int64_t, std::size_t> variational_ends(const Mechanism& mechanism, const Tableau& tableau,
                                                                  double tolerance, const Guards& guards, double h,
-                                                                 In<2> q, In<2> p, In<2> force, Integers<1> substeps,
+                                                                 In<2> q, In<2> p, In<3> force, Integers<1> substeps,
                                                                  Bytes halvings, Solver solver) {
-    const StepsAt at(mechanism, q, p, force, substeps, halvings);
+    const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
     const std::size_t N = at.N, n = at.n;
     double *q1 = nullptr, *v1 = nullptr;
     const Out Q = array_for(q1, {N, n}), V = array_for(v1, {N, n});
     VariationalLinearization work(mechanism, tableau, tolerance, guards, solver);
+    work.varies = at.varies;
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
         return work.end(h, at.q(s), at.p(s), at.force(s), at.halvings(s), q1 + s * n, v1 + s * n);
     });
@@ -195,7 +198,7 @@ void register_rollouts(nb::module_& m) {
         .def("nodes", &VariationalRollout::nodes)
         .def("halvings", &VariationalRollout::halvings, "path"_a);
     m.def("variational_derivatives", &variational_derivatives, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
-          "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a,
+          "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "ramp"_a = false,
           "solver"_a = Solver::automatic);
     m.def("variational_curvatures", &variational_curvatures, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
           "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "z"_a,

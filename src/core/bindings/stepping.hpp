@@ -22,7 +22,8 @@ struct Stepping {
 struct Differentiation {
     virtual ~Differentiation() = default;
     virtual Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                          std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past) = 0;
+                          bool varies, bool ramp, std::span<const std::uint8_t> halvings, double* Jx, double* Jf,
+                          int past) = 0;
 };
 
 template <class Size, class Stages>
@@ -53,8 +54,10 @@ struct DifferentiationOf final : Differentiation {
 
     VariationalLinearization<Size, Stages> own;
 
-    Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past) override {
+    Outcome first(double h, const double* q, const double* p, const double* guess, const double* force, bool varies,
+                  bool ramp, std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past) override {
+        own.varies = varies;
+        own.ramp = ramp;
         return own.first(h, q, p, guess, force, halvings, Jx, Jf, past);
     }
 };

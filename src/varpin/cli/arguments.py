@@ -9,7 +9,7 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,6 +35,10 @@ def add_robot(parser: argparse.ArgumentParser, *, optional: bool = False, scenes
     add_robot_options(parser)
 
 
+# What :func:`add_robot_options` adds.
+ROBOT_OPTIONS = ("lock", "package_dir", "base", "armature")
+
+
 def add_robot_options(parser: argparse.ArgumentParser) -> None:
     """How the robot is loaded: which joints are locked, and where its meshes are."""
     parser.add_argument(
@@ -52,6 +56,20 @@ def add_robot_options(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="where package:// paths of meshes are looked up; repeatable",
     )
+    parser.add_argument(
+        "--base", choices=("planar",), help="put the robot on a base that slides along x and y and turns"
+    )
+    add_vector(parser, "armature", "inertia of rotors that the joints feel [kg m^2 or kg]; default: the file's")
+
+
+def robot_options(request: argparse.Namespace) -> dict[str, Any]:
+    """What :func:`varpin.load_robot` takes of :func:`add_robot_options`."""
+    return {
+        "package_dirs": request.package_dir,
+        "lock": dict(request.lock),
+        "base": request.base,
+        "armature": values_of("armature", request.armature),
+    }
 
 
 def add_motion(parser: argparse.ArgumentParser) -> None:
@@ -127,7 +145,8 @@ def simulate_words(request: argparse.Namespace, integrator: Integrator, dt: floa
         words += ["--lock", *(f"{name}={_text(at)}" for name, at in request.lock)]
     for folder in request.package_dir or ():
         words += ["--package-dir", folder]
-    for option in ("q0", "v0", "damping", "stiffness", "rest", "torque"):
+    words += ["--base", request.base] if request.base is not None else []
+    for option in ("armature", "q0", "v0", "damping", "stiffness", "rest", "torque"):
         if (given := getattr(request, option)) is not None:
             words += [f"--{option}", *(_text(item) for item in given)]
     if request.gravity is False:
@@ -231,7 +250,7 @@ def _damping_of(request: argparse.Namespace, robot: Robot) -> NDArray[np.float64
 
 def motion_of(request: argparse.Namespace) -> tuple[Scene, ArrayLike, ArrayLike, NDArray[np.float64] | None]:
     """The scene, q0, v0, and the torque unless it is zero."""
-    robot = load_robot(request.robot, package_dirs=request.package_dir, lock=dict(request.lock))
+    robot = load_robot(request.robot, **robot_options(request))
     scene = Scene(
         robot,
         gravity=request.gravity,

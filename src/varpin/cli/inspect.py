@@ -9,7 +9,16 @@ import sys
 from rich.console import Console
 from rich.text import Text
 
-from varpin.cli.arguments import add_gravity, add_robot, add_vector, names_scene, scene_file, values_of
+from varpin.cli.arguments import (
+    ROBOT_OPTIONS,
+    add_gravity,
+    add_robot,
+    add_vector,
+    names_scene,
+    robot_options,
+    scene_file,
+    values_of,
+)
 from varpin.cli.console import say
 from varpin.model import build_robot, robot_names
 from varpin.show.inspection import inspect_robot
@@ -33,7 +42,7 @@ def add_inspect(parser: argparse.ArgumentParser) -> None:
 
 
 def _inspect_scene(request: argparse.Namespace) -> int:
-    file = scene_file(request, request.robot, "inspect", "lock", "package_dir", "gravity", "q", "v")
+    file = scene_file(request, request.robot, "inspect", *ROBOT_OPTIONS, "gravity", "q", "v")
     spec, required = file.spec, file.required
     table = facts(f"{spec.title} ({spec.path.name})")
     add_row(table, "robot", f"{file.robot.name}, {len(required.joints)} of {required.described} joints computed")
@@ -58,7 +67,7 @@ def _inspect_scene(request: argparse.Namespace) -> int:
 def _inspect(request: argparse.Namespace, _errors: Console) -> int:
     if names_scene(request.robot):
         return _inspect_scene(request)
-    arguments = {"package_dirs": request.package_dir, "lock": dict(request.lock), "gravity": request.gravity}
+    arguments = {**robot_options(request), "gravity": request.gravity}
     report = inspect_robot(request.robot, q=values_of("q", request.q), v=values_of("v", request.v), **arguments)
     console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
     for part in parts_of(report):

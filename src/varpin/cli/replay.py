@@ -13,7 +13,7 @@ from typing import Any
 
 from rich.console import Console
 
-from varpin.cli.arguments import add_robot_options, names_scene
+from varpin.cli.arguments import add_robot_options, names_scene, robot_options
 from varpin.cli.console import say
 from varpin.cli.outputs import Output, add_shown, replays_of, write_all
 from varpin.control import solution_trajectory
@@ -106,13 +106,15 @@ def _motion(path: Path, robot: Robot | None = None) -> Trajectory:
 def _robot(request: argparse.Namespace, motion: Trajectory) -> tuple[Robot, SceneFile | None]:
     """The robot that the motion is of, and the scene, if the robot is that of one."""
     if request.robot is not None and names_scene(request.robot):
-        if request.lock or request.package_dir:
-            raise InputError("--lock and --package-dir have no place beside a scene file, which has its own")
+        if request.lock or request.package_dir or request.base or request.armature:
+            raise InputError(
+                "--lock, --package-dir, --base and --armature have no place beside a scene file, which has its own"
+            )
         scene = load_scene(request.robot)
         return scene.robot, scene
     name = request.robot or motion.robot
     try:
-        robot = load_robot(name, package_dirs=request.package_dir, lock=dict(request.lock))
+        robot = load_robot(name, **robot_options(request))
     except RobotNotFound as error:
         if request.robot is not None:
             raise

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from varpin.cli.arguments import (
+    ROBOT_OPTIONS,
     add_integrator,
     add_motion,
     add_robot,
@@ -41,7 +42,7 @@ MOST_STEPS = 10**9
 DT = 1e-3
 # Options that a scene file leaves no room for.
 _OF_MOTIONS = (
-    *("lock", "package_dir", "dt", "tolerance", "duration", "steps", "integrator", "alpha", "stages"),
+    *(*ROBOT_OPTIONS, "dt", "tolerance", "duration", "steps", "integrator", "alpha", "stages"),
     *("q0", "v0", "gravity", "damping", "stiffness", "rest", "torque"),
 )
 

@@ -17,7 +17,7 @@ from varpin.study.tradeoff import advise, work_precision
 if TYPE_CHECKING:
     from varpin.study.extremes import Cell
 
-from varpin.cli.arguments import add_motion, add_robot, motion_of, simulate_words
+from varpin.cli.arguments import add_motion, add_robot, motion_of, robot_options, simulate_words
 from varpin.cli.console import progress_bar, say
 from varpin.cli.exits import FAULTY, INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import folder_at
@@ -182,7 +182,7 @@ def _extremes(request: argparse.Namespace, errors: Console) -> int:
 
     robot = None
     if request.robot is not None:
-        robot = load_robot(request.robot, package_dirs=request.package_dir, lock=dict(request.lock))
+        robot = load_robot(request.robot, **robot_options(request))
     folder = None if request.out is None else folder_at(request.out)
     with request.interrupts.keeping(), progress_bar(errors, 1, quiet=request.quiet, unit="cells") as progress:
         record = run(

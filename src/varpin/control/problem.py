@@ -276,7 +276,9 @@ class OptimalControlProblem(Frozen):
             if not np.array_equal(getattr(self.scene, name), getattr(other.scene, name)):
                 return f"another {name}"
         forces = [sorted([*own.elements, *own.couplings], key=repr) for own in (self.scene, other.scene)]
-        if forces[0] != forces[1]:
+        own_code = [own.custom.parts if own.custom else () for own in (self.scene, other.scene)]
+        functions = [[(part.f, part.derivatives) for part in parts] for parts in own_code]
+        if forces[0] != forces[1] or functions[0] != functions[1]:
             return "other forces"
         return ""
 

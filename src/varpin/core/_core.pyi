@@ -1,6 +1,6 @@
 """The compiled core: src/core, bound by nanobind."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum, IntEnum
 
 import numpy as np
@@ -40,6 +40,7 @@ class Mechanism:
         forces: Sequence[tuple[str, int, tuple[float, ...]]],
         couplings: Sequence[tuple[str, int, int, tuple[float, ...]]],
         constraints: ConstraintRows,
+        custom: Callable[[Floats, Floats, bool], tuple[Floats, Floats, Floats]] | None,
         actuation: Floats,
         constant: Floats,
         control: Floats,
@@ -259,9 +260,13 @@ def variational_derivatives(
     halvings: Bytes,
     *,
     guess: Floats,
+    ramp: bool = False,
     solver: Solver = Solver.automatic,
 ) -> tuple[Floats, Floats, int, int]:
     """d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n); how it ended, and how many steps were done.
+
+    ``force`` (N, 1, n) is constant over each step, or (N, s, n) that at each stage. f is constant over the step, or
+    with ``ramp`` grows from 0 at its start to f at its end.
 
     ``halvings`` are those of the parts of all steps with more ``substeps`` than one. The same parts are taken again;
     one that ``guards`` refuse, where they are active, in halves.
@@ -503,11 +508,11 @@ class ExplicitRollout:
         """
 
 def linearize_explicit(
-    mechanism: Mechanism, method: ExplicitMethod, dt: float, q: Floats, v: Floats, force: Floats
+    mechanism: Mechanism, method: ExplicitMethod, dt: float, q: Floats, v: Floats, force: Floats, ramp: bool = False
 ) -> tuple[Floats, Floats, int]:
-    """Derivatives of (q, v) after one step from each row of q, v and force (N, n).
+    """Derivatives of (q, v) after one step from each row of q and v, under a force (N, 1, n), or (N, s, n) by times.
 
-    In (q, v) (N, 2n, 2n), and in the force (N, 2n, n).
+    In (q, v) (N, 2n, 2n), and in a constant force (N, 2n, n), or with ``ramp`` in one that grows to it from 0.
 
     With them, how many rows there are before the first with a mass matrix that is not positive definite.
     """

@@ -10,6 +10,9 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
+_HELD: Floats = np.zeros((0, 0, 0))
+_HELD.setflags(write=False)
+
 
 class Tree(NamedTuple):
     """A tree of ``b`` bodies, each on one joint about or along the z axis of its own frame.
@@ -123,6 +126,8 @@ class Commands(NamedTuple):
     hold: int  # steps between two looks at the state
     limits: Floats  # (2, m) least and greatest control, infinite where there is none
     before: Floats  # (P, m) the control before the first of each path; (0, m) for what the reference has
+    # (N, s, m) at the stages of each step, of which u has the mean, without feedback and hold; empty where held
+    within: Floats = _HELD
 
 
 class Nodes(NamedTuple):

@@ -105,6 +105,14 @@ class Integrator(ABC):
         """The order of its error in dt where nothing is noisy and controls are constant over each step."""
 
     @property
+    def stage_times(self) -> tuple[float, ...]:
+        """Where in a step of unit length it looks at controls that change within it; none where it holds their mean.
+
+        A method with one stage holds the control from the middle of the step.
+        """
+        return ()
+
+    @property
     def left(self) -> float:
         """The part of a step's kick that comes before the step; the rest comes after it."""
         return 1.0
@@ -221,6 +229,15 @@ class Integrator(ABC):
             LinearizationError: A step has no solution at dw = 0.
         """
 
+    def ramps(self, scene: Scene, trajectory: Trajectory) -> Floats:
+        """Derivatives (N, 2n, n) in a force that grows over each step from 0, at its start, to it at its end.
+
+        Raises:
+            LinearizationError: A step has no solution at dw = 0.
+        """
+        # Of what is held over the step, half.
+        return 0.5 * self.linearize(scene, trajectory)[1]
+
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:  # noqa: ARG002
         """Second derivatives sum_a z_a d2 x1_a of each step at dw = 0 in (x0, f), (N, 3n, 3n), for z (N, 2n).
 
@@ -284,6 +301,14 @@ def drifts(scene: Scene, trajectory: Trajectory) -> Floats:
         return np.zeros((trajectory.steps, scene.robot.dof))
     nodes = zip(trajectory.q[:-1], trajectory.v[:-1], trajectory.u, strict=True)
     return np.array([diffusion_and_drift(scene, q, v, u, trajectory.q[0])[1] for q, v, u in nodes])
+
+
+def forces(scene: Scene, trajectory: Trajectory, drift: Floats | float = 0.0) -> Floats:
+    """Forces of the controls (N, 1, n), or (N, s, n) at stages where they change within steps, with a drift (N, n)."""
+    drift = drift[:, None] if isinstance(drift, np.ndarray) else drift
+    if trajectory.u_stages.shape[1]:
+        return np.ascontiguousarray(trajectory.u_stages @ scene.actuation.T + drift)
+    return np.ascontiguousarray((trajectory.u @ scene.actuation.T)[:, None] + drift)
 
 
 def segments_of(
@@ -378,7 +403,7 @@ def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> 
 
 def contiguous(commands: Commands) -> Commands:
     """Commands as the core takes them: rows of numbers one after another."""
-    arrays = commands.u, commands.gains, commands.reference, commands.limits
+    arrays = commands.u, commands.gains, commands.reference, commands.limits, commands.within
     if all(array.flags.c_contiguous for array in arrays):
         return commands
     return commands._replace(
@@ -386,6 +411,7 @@ def contiguous(commands: Commands) -> Commands:
         gains=np.ascontiguousarray(commands.gains),
         reference=np.ascontiguousarray(commands.reference),
         limits=np.ascontiguousarray(commands.limits),
+        within=np.ascontiguousarray(commands.within),
     )
 
 
@@ -402,4 +428,5 @@ def rows(commands: Commands, begin: int, end: int, before: Floats | None = None)
         gains=commands.gains[part],
         reference=commands.reference[part],
         before=commands.before if before is None else before.copy(),
+        within=commands.within[begin * commands.hold : end * commands.hold],
     )

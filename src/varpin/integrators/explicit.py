@@ -22,6 +22,7 @@ from varpin.integrators.base import (
     drifts,
     failure_of,
     first_nodes,
+    forces,
     open_loop,
     segments_of,
     steps_of,
@@ -90,7 +91,8 @@ class _Explicit(Integrator):
                 drift = drift + impulse / dt
             else:
                 v += np.linalg.solve(mass(scene, q), impulse)
-        (segment,) = self.rollout_compiled(scene, state, open_loop(control[None]), scene.silence, drift[None, None], dt)
+        held = open_loop(control[None])._replace(within=command.within)
+        (segment,) = self.rollout_compiled(scene, state, held, scene.silence, drift[None, None], dt)
         return segment
 
     def rollout_compiled(
@@ -122,13 +124,17 @@ class _Explicit(Integrator):
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, v)."""
         refuse_constraints(scene, str(self))
-        h, n = trajectory.dt, scene.robot.dof
+        Jx, Jf = self._derivatives(scene, trajectory)
+        return Jx, Jf, self._jump(Jx[:, :, scene.robot.dof :])
+
+    def _derivatives(self, scene: Scene, trajectory: Trajectory, *, ramp: bool = False) -> tuple[Floats, Floats]:
+        h = trajectory.dt
         q, v = (np.ascontiguousarray(x[:-1]) for x in (trajectory.q, trajectory.v))
-        force = trajectory.u @ scene.actuation.T + drifts(scene, trajectory)
-        Jx, Jf, done = core.linearize_explicit(scene.core, self.method, h, q, v, force)
+        force = forces(scene, trajectory, drifts(scene, trajectory))
+        Jx, Jf, done = core.linearize_explicit(scene.core, self.method, h, q, v, force, ramp)
         if done < len(q):
             raise LinearizationError(done, done * h, REASONS[Outcome.singular])
-        return Jx, Jf, self._jump(Jx[:, :, n:])
+        return Jx, Jf
 
     def _jump(self, in_v: Floats) -> Floats:
         """Derivatives of each step in a jump (N, 2n, n), from those in the velocity."""
@@ -180,3 +186,8 @@ class RungeKutta4(_Explicit):
 
     method: ClassVar[ExplicitMethod] = ExplicitMethod.runge_kutta
     order = 4
+    stage_times = (0.0, 0.5, 1.0)
+
+    def ramps(self, scene: Scene, trajectory: Trajectory) -> Floats:
+        """See :meth:`Integrator.ramps`."""
+        return self._derivatives(scene, trajectory, ramp=True)[1]

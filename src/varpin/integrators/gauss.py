@@ -24,11 +24,11 @@ class Gauss(Collocation):
     Solves L_v(Q_i, V_i) = p0 + dt sum_j a_ij (L_q + F)(Q_j, V_j) with Q_i = q0 + dt sum_j a_ij V_j for the stage
     velocities V_i. Of order 2 s, symmetric, and symplectic where nothing is forced; one stage is ``Midpoint()``.
 
-    Dampers and springs of the scene act at every stage and keep the order. Controls are constant over a step, and so
-    the motion under a digital controller (a control law, a :class:`varpin.LinearPolicy`) is of order 2 s. Of a control
-    that changes within the step the motion is right to second order only, whatever s, when it is sampled in the step's
-    middle (:class:`varpin.OpenLoop`), and to first order when at its start. So put viscous friction into the scene,
-    not into a control law.
+    Dampers and springs of the scene act at every stage and keep the order, and so do controls that are a function of
+    time (:class:`varpin.OpenLoop`). Other controls are constant over a step, and so the motion under a digital
+    controller (a control law, a :class:`varpin.LinearPolicy`) is of order 2 s, too. As an approximation of a law in
+    continuous time it is of first order in the law's period. So put viscous friction into the scene, not into a
+    control law.
 
     Steps are accepted or taken in parts as :class:`Midpoint` does.
 
@@ -53,6 +53,11 @@ class Gauss(Collocation):
 
     def _constraint_places(self) -> Floats | None:
         return lobatto_places(int(self.stages))
+
+    @property
+    def stage_times(self) -> tuple[float, ...]:
+        """See :attr:`Integrator.stage_times`."""
+        return tuple(self._times().tolist()) if self.stages > 1 else ()
 
     def _times(self) -> Floats:
         return gauss_coefficients(int(self.stages))[2]

@@ -12,17 +12,21 @@ from numpy.typing import NDArray
 from varpin.core import ExplicitMethod, ExplicitRollout, ForwardDynamics
 from varpin.core.arrays import Commands, Nodes, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
-from varpin.integrators.base import Failure, Integrator, Segment, control_of, drifts, segments_of, steps_of
+from varpin.integrators.base import Failure, Integrator, Segment, control_of, drifts, forces, segments_of, steps_of
 from varpin.integrators.explicit import REASONS, accelerations
+from varpin.integrators.tableau import gauss_coefficients, interpolation
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.support.checks import positive
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 Rate = Callable[[float, Floats], Floats]
+Force = Callable[[float], Floats]
 
 # SciPy raises a smaller rtol to this by itself, with a warning.
 TIGHTEST = 100.0 * float(np.finfo(np.float64).eps)
+# Points at which a control that changes within a step is taken: the polynomial through them is of order 16.
+_POINTS = 8
 # Speeds below this count as it [rad/s or m/s]: what rounding leaves of a robot in equilibrium is not to be resolved.
 _SLOWEST = 1e-3
 TOO_STEEP = "the adaptive method cannot go on: the motion runs away, or its tolerance is beyond rounding"
@@ -51,7 +55,8 @@ class _RunsAway(ArithmeticError):
 class Reference(Integrator):
     """The explicit Runge-Kutta method of order 8 by Dormand and Prince with its own step control, through SciPy.
 
-    Each step of the trajectory is integrated with as many steps inside as the tolerances take; the control is held.
+    Each step of the trajectory is integrated with as many steps inside as the tolerances take. The control is held, or
+    if it changes within the step taken as the polynomial through eight points of it.
     Its error does not depend on ``dt``. It shares no equation with the variational integrators but the robot's: it
     integrates q' = v, v' = M^-1 (f - bias). Noise is refused.
 
@@ -73,6 +78,11 @@ class Reference(Integrator):
             raise InputError(f"rtol must be from {TIGHTEST:.2g}, where rounding begins, to 0.01, got {self.rtol}")
         if self.atol is not None:
             positive("atol", self.atol, "rad or m")
+
+    @property
+    def stage_times(self) -> tuple[float, ...]:
+        """See :attr:`Integrator.stage_times`."""
+        return tuple(gauss_coefficients(_POINTS)[2].tolist())
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[ReferenceRun, list[Segment]]:
         """See :meth:`Integrator.start`.
@@ -132,7 +142,8 @@ class Reference(Integrator):
             decision, held = divmod(s, commands.hold)
             before = u[s - 1 : s] if s else commands.before[i : i + 1]
             u[s] = before[0] if held else control_of(commands, decision, state.x[i], before)
-            force = scene.actuation @ u[s] + (drift[i, s] if len(drift) else 0.0)
+            values = commands.within[s] if len(commands.within) else u[s : s + 1]
+            force = self._force(values @ scene.actuation.T + (drift[i, s] if len(drift) else 0.0), dt)
             try:
                 x, nodes.tally[i, s, 2] = self._step(state, i, force, dt)
             except _RunsAway:
@@ -145,11 +156,18 @@ class Reference(Integrator):
             nodes.done[i] = s + 1
         return None
 
-    def _step(self, state: ReferenceRun, i: int, force: Floats, dt: float) -> tuple[Floats, int]:
+    def _force(self, values: Floats, dt: float) -> Force:
+        """The force (n,) at a time from the start of a step on [s], of that at its stages, or of one for all of it."""
+        if len(values) == 1:
+            return lambda _: values[0]
+        times = np.array(self.stage_times)
+        return lambda t: interpolation(times, np.array([t / dt]))[0] @ values
+
+    def _step(self, state: ReferenceRun, i: int, force: Force, dt: float) -> tuple[Floats, int]:
         """(q, v) of path ``i`` after one step, and how many evaluations of forward dynamics it took."""
 
-        def rate(_: float, x: Floats) -> Floats:
-            slope, regular = state.dynamics.rate(x, force)
+        def rate(t: float, x: Floats) -> Floats:
+            slope, regular = state.dynamics.rate(x, force(t))
             if not (regular and np.isfinite(slope).all()):
                 raise _RunsAway
             return slope
@@ -171,32 +189,43 @@ class Reference(Integrator):
         The variational equations are integrated along with the motion, under the same tolerances.
         """
         refuse_constraints(scene, str(self))
-        n, dt = scene.robot.dof, trajectory.dt
-        force = trajectory.u @ scene.actuation.T + drifts(scene, trajectory)
-        J = np.empty((trajectory.steps, 2 * n, 3 * n))
-        for k in range(trajectory.steps):
-            try:
-                J[k] = self._derivatives(scene, np.append(trajectory.q[k], trajectory.v[k]), force[k], dt)
-            except (_RunsAway, LinearizationError):
-                raise LinearizationError(k, k * dt, TOO_STEEP) from None
+        n = scene.robot.dof
+        J = self._linearized(scene, trajectory)
         return J[:, :, : 2 * n], J[:, :, 2 * n :], J[:, :, n : 2 * n]
 
-    def _derivatives(self, scene: Scene, x: Floats, force: Floats, dt: float) -> Floats:
-        """Derivatives (2n, 3n) of one step in (q, v, force)."""
-        n = len(force)
+    def ramps(self, scene: Scene, trajectory: Trajectory) -> Floats:
+        """See :meth:`Integrator.ramps`."""
+        return self._linearized(scene, trajectory, ramp=True)[:, :, 2 * scene.robot.dof :]
 
-        def rate(_: float, y: Floats) -> Floats:
-            a, aq, av, af = accelerations(scene, y[None, :n], y[None, n : 2 * n], force[None])
+    def _linearized(self, scene: Scene, trajectory: Trajectory, *, ramp: bool = False) -> Floats:
+        """Derivatives (N, 2n, 3n) of each step in (q, v, force)."""
+        n, dt = scene.robot.dof, trajectory.dt
+        force = forces(scene, trajectory, drifts(scene, trajectory))
+        J = np.empty((trajectory.steps, 2 * n, 3 * n))
+        for k in range(trajectory.steps):
+            x = np.append(trajectory.q[k], trajectory.v[k])
+            try:
+                J[k] = self._derivatives(scene, x, self._force(force[k], dt), dt, ramp=ramp)
+            except (_RunsAway, LinearizationError):
+                raise LinearizationError(k, k * dt, TOO_STEEP) from None
+        return J
+
+    def _derivatives(self, scene: Scene, x: Floats, force: Force, dt: float, *, ramp: bool) -> Floats:
+        """Derivatives (2n, 3n) of one step in (q, v, force), the last in one that grows from 0 if it is a ramp."""
+        n = len(x) // 2
+
+        def rate(t: float, y: Floats) -> Floats:
+            a, aq, av, af = accelerations(scene, y[None, :n], y[None, n : 2 * n], force(t)[None])
             J = y[2 * n :].reshape(2 * n, 3 * n)
             bent = aq[0] @ J[:n] + av[0] @ J[n:]
-            bent[:, 2 * n :] += af[0]
+            bent[:, 2 * n :] += af[0] * (t / dt if ramp else 1.0)
             slope = np.concatenate([y[n : 2 * n], a[0], J[n:].ravel(), bent.ravel()])
             if not np.isfinite(slope).all():
                 raise _RunsAway
             return slope
 
         y = np.concatenate([x, np.eye(2 * n, 3 * n).ravel()])
-        slope = rate(0.0, y)
+        slope = rate(dt if ramp else 0.0, y)
         atol = self._atol(x, slope[: 2 * n], dt)
         # The derivative of v in q is a rate, that of q in v a time, those in the force are inverse inertias.
         blocks = np.empty((2 * n, 3 * n))

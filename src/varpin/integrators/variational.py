@@ -34,6 +34,7 @@ from varpin.integrators.base import (
     drifts,
     failure_of,
     first_nodes,
+    forces,
     open_loop,
     parts_of,
     segments_of,
@@ -246,7 +247,12 @@ class Variational(Integrator):
         if len(increment):
             state.paths.kick(self.left * (F @ increment[0, 0])[None])
         (segment,) = self.rollout_compiled(
-            scene, state, open_loop(control[None]), scene.silence, self.drift_share * drift[None, None], dt
+            scene,
+            state,
+            open_loop(control[None])._replace(within=command.within),
+            scene.silence,
+            self.drift_share * drift[None, None],
+            dt,
         )
         if len(increment) and self.left < 1.0 and segment.failure is None:
             q, p, v, _ = state.paths.nodes()
@@ -269,9 +275,21 @@ class Variational(Integrator):
         _require_solved(trajectory, outcome, done)
         return Jx, Jf, Jx[:, :, scene.robot.dof :]
 
+    def ramps(self, scene: Scene, trajectory: Trajectory) -> Floats:
+        """See :meth:`Integrator.ramps`."""
+        if not self.stage_times:
+            return super().ramps(scene, trajectory)
+        steps = self._steps(scene, trajectory)
+        guess = np.ascontiguousarray(self._guess(trajectory))
+        _, Jf, outcome, done = variational_derivatives(**steps, guess=guess, ramp=True)
+        _require_solved(trajectory, outcome, done)
+        return Jf
+
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
         """See :meth:`Integrator.contract`; steps that were taken in parts are chained as in :meth:`linearize`."""
         refuse_constraints(scene, "second_order")
+        if scene.custom is not None:
+            raise InputError("second derivatives are not there for a scene with a CustomForce")
         steps = self._steps(scene, trajectory)
         H, outcome, done = variational_curvatures(
             **steps, guess=np.ascontiguousarray(self._guess(trajectory)), z=np.ascontiguousarray(z)
@@ -293,9 +311,8 @@ class Variational(Integrator):
             damage = "statistics.substeps holds numbers of parts that no step has"
         if damage is not None:
             raise InputError(f"the trajectory is damaged: {damage}")
-        force = trajectory.u @ scene.actuation.T
-        if scene.noise.velocity_dependent:
-            force = force + self.drift_share * drifts(scene, trajectory)
+        drift = self.drift_share * drifts(scene, trajectory) if scene.noise.velocity_dependent else 0.0
+        force = forces(scene, trajectory, drift)
         arrays = {
             "q": trajectory.q[:-1],
             "p": trajectory.p[:-1],

@@ -1,4 +1,4 @@
-"""Controls that are neither rows nor a law: a torque of time alone, and feedback that the core evaluates."""
+"""Controls that are neither rows nor a law: of time alone, linear between nodes, or fed back by the core."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from varpin.support.checks import (
     is_one_of,
     named_limits,
     positive,
+    require_finite,
 )
 from varpin.support.frozen import Frozen
 
@@ -32,8 +33,13 @@ Floats = NDArray[np.float64]
 class OpenLoop:
     """Controls that are a function of time alone.
 
-    The function is evaluated once a step, in the middle of it, and held over the step: the motion is right to second
-    order, whatever the integrator. What depends on the state is a control law, a function of (t, q, v).
+    The function is evaluated at the stages of every step, once and before the motion goes on: ``Gauss(s)`` stays of
+    order 2 s, ``Radau(s)`` of 2 s - 1, Runge-Kutta's method of 4. A method with one stage holds the value from the
+    middle of the step, and stays of its own order. Parts of a step that a guard cuts take the polynomial through its
+    stages, which keeps the order too. ``Trajectory.u`` has the mean over each step, ``Trajectory.u_stages`` the values.
+    Where the function jumps within a step the order is lost there; jumps at nodes alone are for rows of controls.
+
+    What depends on the state is a control law, a function of (t, q, v).
 
     Attributes:
         f: Of the time [s]; returns the controls, (m,) or by joint name where each is the force of a joint, 0 for joints
@@ -51,6 +57,36 @@ class OpenLoop:
         if not takes(self.f, 1):
             hint = "; a law of (t, q, v) is given as it is, controls=law" if takes(self.f, 3) else ""
             raise InputError(f"OpenLoop takes a function of one argument, the time t{hint}")
+
+
+@dataclass(frozen=True, eq=False)
+class FirstOrderHold(Frozen):
+    """Controls at the nodes, linear in time between them.
+
+    Methods with several stages follow the line, and stay of their order; those with one hold its mean over the step.
+    With a tolerance the N parts are each of duration / N.
+
+    Attributes:
+        u: Controls at N + 1 nodes (N + 1, m).
+
+    Raises:
+        InputError: It is no array of two rows or more, or not finite.
+    """
+
+    u: Floats
+
+    def __post_init__(self) -> None:
+        u = require_finite("u", as_floats("u", self.u)).copy()
+        if u.ndim != 2 or len(u) < 2:
+            raise InputError(f"u must have shape (N + 1, m), a row for each node, got {u.shape}")
+        u.setflags(write=False)
+        object.__setattr__(self, "u", u)
+
+    def refined(self, parts: int) -> FirstOrderHold:
+        """The same controls with every interval cut into equal parts."""
+        share = np.arange(parts)[:, None] / parts
+        between = (1.0 - share) * self.u[:-1, None] + share * self.u[1:, None]
+        return FirstOrderHold(np.vstack([between.reshape(-1, self.u.shape[1]), self.u[-1:]]))
 
 
 def takes(function: Callable[..., object], arguments: int) -> bool:

@@ -16,6 +16,7 @@ from varpin.core import Mechanism as Core
 from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element
 from varpin.errors import InputError, RobotError
 from varpin.mechanics.constraints import Bound, Constraint, constraints_of, joined
+from varpin.mechanics.custom import CustomForce, CustomForces
 from varpin.mechanics.forces import (
     CoulombFriction,
     Force,
@@ -108,6 +109,7 @@ class Scene(Frozen):
         forces: What acts on joints and frames, ``damping`` and ``stiffness`` among it.
         elements: What of it acts on single joints, one by one, as the core takes it, armature apart.
         couplings: What of it acts on frames and between them.
+        custom: What of it is a :class:`varpin.CustomForce`, together; None for none.
         damping: Viscous damping (n,) of all dampers [N m s/rad or N s/m]: the force -damping * v.
         stiffness: Of all joint springs (n,) [N m/rad or N/m]; they are part of the potential energy.
         rest: Configuration (n,) at which the springs are slack, those of a joint taken together [rad or m].
@@ -123,6 +125,7 @@ class Scene(Frozen):
     forces: tuple[Force, ...]
     elements: tuple[Element, ...] = field(repr=False)
     couplings: tuple[Coupling, ...] = field(repr=False)
+    custom: CustomForces | None = field(repr=False)
     damping: Floats
     stiffness: Floats
     rest: Floats
@@ -237,6 +240,9 @@ class Scene(Frozen):
         for force in self.forces:
             if not isinstance(force, JointSpring | JointDamper):
                 own = acting.setdefault(type(force).__name__, {})
+                if isinstance(force, CustomForce):
+                    own |= dict.fromkeys(self.robot.joint_names)
+                    continue
                 own |= dict.fromkeys(self.robot.joint_names[c] for c in self._moved(force.bind(self.robot)))
         return [(kind, list(joints)) for kind, joints in acting.items()]
 
@@ -253,7 +259,8 @@ class Scene(Frozen):
     @property
     def dissipates(self) -> bool:
         """Whether anything turns energy into heat."""
-        return any(map(dissipates, self.elements)) or any(map(dissipates, self.couplings))
+        own = any(map(dissipates, self.elements)) or any(map(dissipates, self.couplings))
+        return own or self.custom is not None
 
     @property
     def conservative(self) -> bool:
@@ -264,6 +271,9 @@ class Scene(Frozen):
     def group(self) -> NDArray[np.int64]:
         """Which coordinates (n,) move each other, labels from 0: the robot's groups, some joined by couplings."""
         group = self.robot.tree.group.copy()
+        if self.custom is not None:
+            # Nobody knows which joints the function joins.
+            group[:] = 0
         for own in self.couplings:
             together = np.unique(group[self._moved([own])])
             group[np.isin(group, together)] = together[0]
@@ -362,6 +372,7 @@ class Scene(Frozen):
             forces=self.elements,
             couplings=self.couplings,
             constraints=self.bound_constraints.rows,
+            custom=self.custom,
             actuation=self.actuation,
             constant=fields.constant,
             control=fields.control,
@@ -461,7 +472,8 @@ class Scene(Frozen):
         refuse_constraints(self, "Scene.holding_torque")
         at = joint_array("q", q, self.robot.joint_names)
         _, Lq, *_ = self.core.jet(at, np.zeros_like(at))
-        wrenches = self.core.coupled_forces(at[None], np.zeros((1, at.size)))[0][0] if self.couplings else 0.0
+        acts = self.couplings or self.custom is not None
+        wrenches = self.core.coupled_forces(at[None], np.zeros((1, at.size)))[0][0] if acts else 0.0
         return np.asarray(-Lq - wrenches, dtype=np.float64)
 
     def holding_controls(self, q: JointValues) -> Floats:
@@ -657,6 +669,7 @@ def _forces(
         given = (JointSpring(short[1], slack), *given)
     bound = [each for force in given for each in force.bind(robot)]
     elements = [each for each in bound if isinstance(each, Element)]
+    own_code = tuple(force for force in given if isinstance(force, CustomForce))
     total = {kind: np.zeros(robot.dof) for kind in ("JointDamper", "JointSpring", "Armature")}
     for own in elements:
         if own.kind in total:
@@ -669,6 +682,7 @@ def _forces(
         "forces": given,
         "elements": tuple(own for own in elements if own.kind != "Armature"),
         "couplings": tuple(each for each in bound if isinstance(each, Coupling)),
+        "custom": CustomForces(own_code) if own_code else None,
         "damping": total["JointDamper"],
         "stiffness": total["JointSpring"],
         "rest": slack,

@@ -195,15 +195,24 @@ def joint_frames(model: pin.Model) -> list[int]:
     ]
 
 
-def rebuild(model: pin.Model, order: Sequence[int], joint_of: Callable[[int], pin.JointModel]) -> pin.Model:
+def rebuild(
+    model: pin.Model,
+    order: Sequence[int],
+    joint_of: Callable[[int], pin.JointModel],
+    root: Sequence[tuple[str, pin.JointModel]] = (),
+) -> pin.Model:
     """``model`` with its joints added again in ``order``, each as ``joint_of`` gives it.
 
-    Links, frames, limits and armature go along. The universe is not in ``order``.
+    Links, frames, limits and armature go along. The universe is not in ``order``. Joints of ``root``, by name, carry
+    one another, and the last of them what stood in the universe.
     """
     new = pin.Model()
     new.name = model.name
     new.gravity = model.gravity
     place = {0: 0}
+    for name, kind in root:
+        place[0] = new.addJoint(place[0], kind, pin.SE3.Identity(), name)
+    new.appendBodyToJoint(place[0], model.inertias[0], pin.SE3.Identity())
     for joint in order:
         source = joint_of(joint)
         place[joint] = new.addJoint(
@@ -224,6 +233,8 @@ def rebuild(model: pin.Model, order: Sequence[int], joint_of: Callable[[int], pi
     # Joint frames first: pin.buildReducedModel looks for a frame's joint among the frames before it.
     old_frames = {model.frames[index].parentJoint: index for index in joint_frames(model)}
     new_frames, frames = {0: 0}, {0: 0}
+    for joint in range(1, len(root) + 1):
+        new_frames[0] = frames[0] = new.addJointFrame(joint, new_frames[0])
     for joint in order:
         new_frames[joint] = new.addJointFrame(place[joint], new_frames[model.parents[joint]])
         if joint in old_frames:
@@ -234,7 +245,7 @@ def rebuild(model: pin.Model, order: Sequence[int], joint_of: Callable[[int], pi
                 pin.Frame(
                     frame.name,
                     place[frame.parentJoint],
-                    frames.get(frame.parentFrame, 0),
+                    frames.get(frame.parentFrame, frames[0]),
                     frame.placement,
                     frame.type,
                     pin.Inertia.Zero(),

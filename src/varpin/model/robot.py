@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.core.arrays import Tree
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint, UnknownPosture
+from varpin.model.additions import Base, on_base, with_mesh_inertias, with_rotors
 from varpin.model.inertia import faults
 from varpin.model.mimic import Tie, joint_index, rebuild, tied_model
 from varpin.model.mjcf import build_mjcf_model, build_mjcf_shapes
@@ -312,6 +313,10 @@ def load_robot(
     payload: Payload | Sequence[Payload] = (),
     xacro_args: Mapping[str, object] | None = None,
     srdf: str | os.PathLike[str] | None = None,
+    base: Base = None,
+    armature: JointValues | None = None,
+    inertia: Literal["file", "meshes"] = "file",
+    density: float = 1000.0,
 ) -> Robot:
     """Load an arm.
 
@@ -336,6 +341,13 @@ def load_robot(
         xacro_args: Arguments of a xacro file by name: ``{"prefix": "left_"}``.
         srdf: The SRDF file, or the xacro file of one, that :meth:`Robot.posture` reads; left out, the one of the file's
             name in its folder or in a folder ``srdf`` beside that, if there is one.
+        base: Where the robot's base stands in the world, a transform (4, 4) [m] or a ``pin.SE3``; or ``"planar"`` for
+            one that moves, with the joints ``base_x``, ``base_y`` [m] and ``base_turn`` [rad] before the robot's own
+            and with the mass of its first link. Left out, at the world's origin.
+        armature: Inertia of rotors that the joints feel [kg m^2 or kg], >= 0: a number for all coordinates, (n,), or by
+            joint name. It replaces what the file has; joints that are not named keep theirs.
+        inertia: ``"meshes"`` gives links of a URDF that have no mass that of their visual shapes, which must be closed.
+        density: Of those [kg/m^3].
 
     Returns:
         The robot, its geometry not yet read.
@@ -346,14 +358,19 @@ def load_robot(
             number of use. Of a URDF only what Pinocchio does not read: masses and inertias that it leaves out, and
             negative ones, are told in the log.
         UnsupportedJoint: A joint has no single axis (free-flyer, spherical, planar, screw).
-        UnknownJoint: ``lock`` names a joint that is not there.
+        UnknownJoint: ``lock`` or ``armature`` names a joint that is not there.
         UnknownFrame: A payload hangs on a frame that is not there.
         MissingDependency: A xacro file needs the package xacro (extra ``xacro``); a name needs robot_descriptions
             (extra ``descriptions``).
-        InputError: A xacro file has no argument of that name.
+        InputError: A xacro file has no argument of that name; a base or an armature that is none.
         SingularMassMatrix: A joint moves no inertia, or a negative one.
     """
-    robot, description = _built(source, package_dirs, lock, mimic, payload, xacro_args, srdf)
+    if not is_one_of(inertia, ("file", "meshes")):
+        raise InputError(f"inertia must be 'file' or 'meshes', got {inertia!r}")
+    shaped = inertia == "meshes"
+    robot, description = _built(
+        source, package_dirs, lock, mimic, payload, xacro_args, srdf, base, armature, density if shaped else None
+    )
     for remark in (*description.remarks, *faults(robot.free_model, description.inertials)):
         logger.warning("robot %r: %s", robot.name, remark)
     check_inertia(robot)
@@ -369,9 +386,11 @@ def build_robot(
     payload: Payload | Sequence[Payload] = (),
     xacro_args: Mapping[str, object] | None = None,
     srdf: str | os.PathLike[str] | None = None,
+    base: Base = None,
+    armature: JointValues | None = None,
 ) -> Robot:
     """:func:`load_robot` without its checks of inertia, for looking into faulty models."""
-    return _built(source, package_dirs, lock, mimic, payload, xacro_args, srdf)[0]
+    return _built(source, package_dirs, lock, mimic, payload, xacro_args, srdf, base, armature, None)[0]
 
 
 def _built(
@@ -382,11 +401,17 @@ def _built(
     payload: Payload | Sequence[Payload],
     xacro_args: Mapping[str, object] | None,
     srdf: str | os.PathLike[str] | None,
+    base: Base,
+    armature: JointValues | None,
+    density: float | None,
 ) -> tuple[Robot, Description]:
     """The robot, and what its source says."""
     if not is_one_of(mimic, ("tied", "free")):
         raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
     description = describe(source, package_dirs, mimic=mimic == "tied", xacro_args=xacro_args, srdf=srdf)
+    if density is not None:
+        description = with_mesh_inertias(description, density)
+    description = on_base(description, base)
     carry(description.model, (payload,) if isinstance(payload, Payload) else payload, description.name)
     names = list(description.model.names)
     if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -402,6 +427,7 @@ def _built(
     coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
     if not coordinates:
         raise RobotError(f"robot {description.name!r} has no joint that moves")
+    with_rotors(model, armature, coordinates, (*locked, *(model.names[joint] for joint in followers)))
     tree = flatten(model, ties, coordinates)
     robot = Robot(
         name=description.name,
@@ -588,7 +614,12 @@ def _on_joints(robot: Robot, full: pin.Model, visuals: pin.GeometryModel) -> pin
         name = full.names[shape.parentJoint]
         if name in index:
             shape.parentJoint = index[name]
-        elif shape.parentJoint:
+        elif not shape.parentJoint:
+            # What the file has in the world stands, or moves, with the robot's base.
+            moved = robot.free_model.frames[frame]
+            shape.placement = moved.placement * link.placement.inverse() * shape.placement
+            shape.parentJoint = moved.parentJoint
+        else:
             moved = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.FIXED_JOINT)]
             shape.placement = moved.placement * shape.placement
             shape.parentJoint = moved.parentJoint

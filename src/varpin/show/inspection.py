@@ -16,6 +16,7 @@ from varpin.integrators import Guard, largest_step
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot, build_robot, check_inertia
+from varpin.model.additions import Base
 from varpin.model.inertia import fault, principal_moments
 from varpin.model.mimic import joint_index
 from varpin.model.tree import is_unbounded, joint_axis
@@ -198,6 +199,8 @@ def inspect_robot(
     q: JointValues | None = None,
     v: JointValues | None = None,
     gravity: ArrayLike | bool = True,
+    base: Base = None,
+    armature: JointValues | None = None,
 ) -> RobotReport:
     """Look into a robot description, sound or faulty.
 
@@ -211,18 +214,22 @@ def inspect_robot(
         package_dirs: As for :func:`varpin.load_robot`.
         mimic: As for :func:`varpin.load_robot`.
         gravity: As for :class:`varpin.Scene`; the largest step depends on it.
+        base: As for :func:`varpin.load_robot`.
+        armature: As for :func:`varpin.load_robot`.
 
     Raises:
         RobotError: As for :func:`varpin.load_robot`, singular mass matrices excepted.
-        InputError: ``q`` or ``v`` has a wrong shape or is not finite; ``lock``, ``package_dirs`` or ``mimic`` is given
+        InputError: ``q`` or ``v`` has a wrong shape or is not finite; an option of loading, ``lock`` for one, is given
             with a robot that is loaded already.
     """
     if isinstance(source, Robot):
-        if lock or package_dirs or mimic != "tied":
-            raise InputError("lock, package_dirs and mimic belong to loading; the robot given is loaded already")
+        if lock or package_dirs or mimic != "tied" or base is not None or armature is not None:
+            raise InputError(
+                "lock, package_dirs, mimic, base and armature belong to loading; the robot given is loaded already"
+            )
         robot = source
     else:
-        robot = build_robot(source, package_dirs=package_dirs, lock=lock, mimic=mimic)
+        robot = build_robot(source, package_dirs=package_dirs, lock=lock, mimic=mimic, base=base, armature=armature)
     scene = Scene(robot, gravity=gravity, damping=0.0)
     configuration = joint_array("q", 0.0 if q is None else q, robot.joint_names, uniform=True)
     velocity = joint_array("v", 0.0 if v is None else v, robot.joint_names, uniform=True)

@@ -11,6 +11,7 @@ from varpin.errors import SingularMassMatrix
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Radau, RungeKutta4
 from varpin.integrators.base import open_loop
 from varpin.integrators.collocation import MOST_STAGES
+from varpin.integrators.within import Times, changing, in_parts
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
 
@@ -58,6 +59,8 @@ def finer(integrator: Integrator, trajectory: Trajectory, *, damped: bool, pulle
 class Again:
     """``count`` steps of a motion from a node on, taken again piece by piece in parts, under the same forces.
 
+    ``times`` are the stage times of the motion's own integrator, at which it has controls that change within steps.
+
     Attributes:
         q: Configurations of their nodes (count + 1, n), NaN from where none is known.
         v: Velocities.
@@ -70,6 +73,7 @@ class Again:
         scene: Scene,
         method: Integrator,
         trajectory: Trajectory,
+        times: Times,
         step: int,
         count: int,
         parts: int,
@@ -80,7 +84,7 @@ class Again:
         self.q[0], self.v[0] = trajectory.q[step] + moved[0], trajectory.v[step] + moved[1]
         self.done, self.ended = 0, count == 0
         self._scene, self._method, self._trajectory, self._step = scene, method, trajectory, step
-        self._count, self._parts = count, parts
+        self._count, self._parts, self._times = count, parts, times
         try:
             self._state, _ = method.start(scene, self.q[:1].copy(), self.v[:1].copy())
         except SingularMassMatrix:
@@ -102,6 +106,9 @@ class Again:
                 drawn[0, parts - 1 :: parts] += (1.0 - method.left) * trajectory.dw[own]
         # Impulses of noise depend on the controls, too.
         commands = open_loop(np.repeat(trajectory.u[own], parts, axis=0))
+        if trajectory.u_stages.shape[1]:
+            at = method.stage_times
+            commands = changing(in_parts(trajectory.u_stages[own], self._times, parts, at), at)
         no_drift = np.zeros((0, 0, scene.robot.dof))
         (segment,) = method.rollout_compiled(scene, self._state, commands, drawn, no_drift, trajectory.dt / parts)
         done = len(segment.q) // parts
@@ -112,13 +119,13 @@ class Again:
 
 
 def taken_again(
-    scene: Scene, method: Integrator, trajectory: Trajectory, step: int, count: int, parts: int
+    scene: Scene, method: Integrator, trajectory: Trajectory, times: Times, step: int, count: int, parts: int
 ) -> tuple[Floats, Floats] | None:
-    """``count`` steps from a node on at once, q and v of their nodes (count + 1, n).
+    """``count`` steps from a node on at once, q and v of their nodes (count + 1, n); arguments of :class:`Again`.
 
     NaN from where they fail; None if the first does.
     """
-    again = Again(scene, method, trajectory, step, count, parts)
+    again = Again(scene, method, trajectory, times, step, count, parts)
     if not again.ended:
         again.go_on(count)
     return (again.q, again.v) if again.done else None

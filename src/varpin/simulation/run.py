@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,8 +14,10 @@ from varpin.core.arrays import Commands
 from varpin.errors import InputError, UnknownJoint, VarpinError
 from varpin.integrators import Integrator, Midpoint, Reference, Segment, integrator_of
 from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
+from varpin.integrators.within import Times, changing
 from varpin.mechanics.assembly import along_constraints, assemble, missed
-from varpin.mechanics.policy import LinearPolicy, OpenLoop, takes
+from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop, takes
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.simulation import limits
@@ -36,6 +39,8 @@ from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
 
 Floats = NDArray[np.float64]
 ControlLaw = Callable[[float, Floats, Floats], JointValues]
+# Controls that are known before the motion, or fed back by the core.
+Controls = JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None
 Progress = Callable[[int, int], None]
 
 logger = logging.getLogger(__name__)
@@ -46,6 +51,8 @@ _CHUNK = 30_000
 _MIDPOINT = Midpoint()
 # What a start may miss constraints by to be moved onto them unasked, and what of that is not spoken of [rad or m].
 _CORRECTED, _UNSAID = 0.02, 1e-9
+# Steps at which a function of time is held against steps of half the length, and the share by which it may be off.
+_LOOKS, _ALIKE = 16, 0.05
 # Parts of a motion that are kept one by one.
 _PARTS = 256
 
@@ -91,6 +98,16 @@ class ControlError(_StepError):
 
 class NoiseError(_StepError):
     """A function of a custom noise raised, or returned something that is no field.
+
+    Attributes:
+        step: Index of the step it was called in.
+        time: The start of that step [s].
+        trajectory: What was computed before.
+    """
+
+
+class ForceError(_StepError):
+    """A function of a custom force raised, or returned something that is no force.
 
     Attributes:
         step: Index of the step it was called in.
@@ -167,13 +184,16 @@ class _Record:
         self._first = first
         self._joined: list[Segment] = []
         self._parts: list[Segment] = []
+        self._within: list[Floats] = []
 
-    def add(self, segment: Segment) -> None:
+    def add(self, segment: Segment, within: Floats) -> None:
         if not len(segment.q):
             return
         self.steps += len(segment.q)
         self.last = segment
         self._parts.append(segment)
+        if len(within):
+            self._within.append(within[: len(segment.q)])
         # Single steps take many times the room of their numbers.
         if len(self._parts) == _PARTS:
             self._joined.append(join(self._parts))
@@ -181,11 +201,18 @@ class _Record:
 
     def trajectory(self) -> Trajectory:
         dw = self.dw[: self.steps] if len(self.dw) else None
-        return _trajectory(self.scene, self.integrator, self.dt, self._first, [*self._joined, *self._parts], dw)
+        within = np.concatenate(self._within) if self._within else None
+        return _trajectory(self.scene, self.integrator, self.dt, self._first, [*self._joined, *self._parts], dw, within)
 
 
 def _trajectory(
-    scene: Scene, integrator: Integrator, dt: float, first: Segment, parts: list[Segment], dw: Floats | None
+    scene: Scene,
+    integrator: Integrator,
+    dt: float,
+    first: Segment,
+    parts: list[Segment],
+    dw: Floats | None,
+    within: Floats | None,
 ) -> Trajectory:
     """The motion from a first node on over parts that follow each other; no increments stand for zeros."""
     steps = join(parts) if len(parts) > 1 else parts[0] if parts else first.part(0)
@@ -207,6 +234,7 @@ def _trajectory(
         scene_values=scene.values,
         constraint_forces=np.zeros((N, len(scene.constraint_order))) if steps.impulses is None else steps.impulses / dt,
         constraint_labels=scene.constraint_labels,
+        u_stages=np.zeros((N, 0, scene.controls)) if within is None else within,
     )
 
 
@@ -232,8 +260,10 @@ class Motions:
         drawn = np.zeros((0, 0, self.scene.processes)) if increments is None else increments[None]
         state = self.integrator.fork(self._state)
         (segment,) = self.integrator.rollout(self.scene, state, commands, drawn, self.dt)
-        dw = None if increments is None else increments[: len(segment.u)]
-        return _trajectory(self.scene, self.integrator, self.dt, self._first, [segment], dw), segment.failure
+        done = len(segment.u)
+        dw = None if increments is None else increments[:done]
+        within = commands.within[:done] if len(commands.within) else None
+        return _trajectory(self.scene, self.integrator, self.dt, self._first, [segment], dw, within), segment.failure
 
 
 def rollout(
@@ -252,7 +282,7 @@ def simulate(
     steps: int | None = None,
     duration: float | None = None,
     tolerance: float | Accuracy | None = None,
-    controls: JointValues | ControlLaw | LinearPolicy | OpenLoop | None = None,
+    controls: Controls | ControlLaw = None,
     period: int = 1,
     integrator: Integrator | None = None,
     rng: np.random.Generator | int | None = None,
@@ -277,13 +307,15 @@ def simulate(
             ``Trajectory.accuracy`` says what was taken, what error that estimates and how many steps finding out took;
             it is itself a ``tolerance``, of the same scene's next motion, which tries first what it found. Where the
             tolerance is out of reach a warning says what is reached. Rows of controls, (R, m), are then held over
-            duration / R each, a LinearPolicy needs its period in seconds, and noise and control laws are refused.
+            duration / R each, the intervals of a FirstOrderHold are as long, a LinearPolicy needs its period in
+            seconds, and noise and control laws are refused.
         controls: None for none, servos staying where they are at ``q0``; an array (N, m), one row a step; one row
             (m,) for all steps, by joint name too where each control is the force of a joint, with 0 for joints that
             are not named; a :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that
-            returns (m,), or numbers by joint name; or :class:`varpin.OpenLoop`, a function of time alone. Controls are
-            constant over each step. A law is a digital controller: it is called once where each of its periods begins,
-            with the time and the state of that node, and what it returns is held over the period.
+            returns (m,), or numbers by joint name; :class:`varpin.OpenLoop`, a function of time alone; or
+            :class:`varpin.FirstOrderHold`, linear in time between nodes. All but the last two are constant over each
+            step. A law is a digital controller: it is called once where each of its periods begins, with the time and
+            the state of that node, and what it returns is held over the period.
         period: Of a control law, in steps.
         integrator: :class:`Midpoint` with alpha = 1/2 if left out; with a tolerance, the cheapest that there is.
 
@@ -308,6 +340,7 @@ def simulate(
             control drives.
         ControlError: The control function returned something unusable; holds the trajectory so far.
         NoiseError: A function of a CustomNoise did; holds the trajectory so far.
+        ForceError: A function of a CustomForce did; holds the trajectory so far.
         StepFailure: A step has no trustworthy solution; holds the trajectory so far.
         SingularMassMatrix: M(q0) is not positive definite.
         AssemblyError: The scene's constraints cannot be kept next to q0.
@@ -353,8 +386,8 @@ def simulate(
     record = _Record(scene, integrator, dt, dw, start)
     # A sweep takes as long as the robot has joints, an elimination as their cube.
     chunk = max(1, _CHUNK // (n + n**3 // 100))
-    # One step at a time where noise calls Python functions, so that what came before one that fails is recorded.
-    stepwise = scene.noise.diffusion is None
+    # One step at a time where noise or forces call Python functions: what came before one that fails is recorded.
+    stepwise = scene.noise.diffusion is None or scene.custom is not None
     interrupted = False
     try:
         while record.steps < steps:
@@ -364,7 +397,7 @@ def simulate(
                 u = record.last.u[-1:] if done % period else _decision(law, record)
                 block = open_loop(u)._replace(hold=held)
             elif isinstance(controls, OpenLoop):
-                block = open_loop(_sampled(controls, record, 1 if stepwise else min(chunk, steps - done)))
+                block = _sampled(controls, record, 1 if stepwise else min(chunk, steps - done))
             elif stepwise:
                 block = _next(commands, record)
             else:
@@ -374,12 +407,15 @@ def simulate(
             drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
             try:
                 (segment,) = integrator.rollout(scene, state, block, drawn, dt)
+            except CustomForceError as error:
+                now = record.trajectory()
+                raise ForceError(now.steps, float(now.t[-1]), str(error), now) from error
             except InputError as error:
                 if not stepwise:
                     raise  # of a custom constraint
                 now = record.trajectory()
                 raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
-            record.add(segment)
+            record.add(segment, block.within)
             if segment.failure is not None:
                 node = record.trajectory()
                 if hold is not None and check and not scene.constraints:
@@ -395,6 +431,8 @@ def simulate(
         interrupted = True
     try:
         trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
+        if check and isinstance(controls, OpenLoop):
+            found = (*found, *_undersampled(controls, scene, integrator, trajectory))
         found = (*noise_forgotten(scene, rng, increments), *wished, *found)
         trajectory = with_warnings(trajectory, found)
         if accuracy is not None:
@@ -474,9 +512,9 @@ def _chosen(
     v0: Floats,
     duration: float,
     tolerance: float | Accuracy,
-    controls: JointValues | ControlLaw | LinearPolicy | OpenLoop | None,
+    controls: Controls | ControlLaw,
     integrator: Integrator | None,
-) -> tuple[Integrator, int, JointValues | LinearPolicy | OpenLoop | None, Accuracy, tuple[Finding, ...]]:
+) -> tuple[Integrator, int, Controls, Accuracy, tuple[Finding, ...]]:
     """Integrator, steps and controls for a tolerance, with the estimate and what is to be said of it."""
     earlier = tolerance if isinstance(tolerance, Accuracy) else None
     wish = positive("tolerance", tolerance.tolerance if isinstance(tolerance, Accuracy) else tolerance, "rad or m")
@@ -494,7 +532,7 @@ def _chosen(
             "steps with a law, or a varpin.LinearPolicy with a period, or a varpin.OpenLoop(f)"
         )
     members = INTEGRATORS if integrator is None else (integrator,)
-    parts, most = 1, max(member.order for member in members)
+    parts = 1
     given: Callable[[Integrator, int], Commands]
     held = np.zeros((0, 0))
     if isinstance(controls, LinearPolicy):
@@ -513,14 +551,20 @@ def _chosen(
         def given(member: Integrator, steps: int) -> Commands:
             return commands_of(scene, member, policy, steps, duration / steps)
     elif isinstance(controls, OpenLoop):
-        # Held from the middle of each step.
-        most, of_time = 2, controls
-        sampled: dict[int, Commands] = {}
+        of_time = controls
+        sampled: dict[tuple[Times, int], Commands] = {}
 
         def given(member: Integrator, steps: int) -> Commands:
-            if steps not in sampled:
-                sampled[steps] = commands_of(scene, member, of_time, steps, duration / steps)
-            return sampled[steps]
+            key = member.stage_times, steps
+            if key not in sampled:
+                sampled[key] = commands_of(scene, member, of_time, steps, duration / steps)
+            return sampled[key]
+    elif isinstance(controls, FirstOrderHold):
+        lines = controls
+        parts = len(controls.u) - 1
+
+        def given(member: Integrator, steps: int) -> Commands:
+            return commands_of(scene, member, lines.refined(steps // parts), steps, duration / steps)
     else:
         held = held_rows(scene, controls)
         parts = len(held)
@@ -528,7 +572,7 @@ def _chosen(
         def given(member: Integrator, steps: int) -> Commands:  # noqa: ARG001 - as for the others
             return open_loop(np.repeat(held, steps // parts, axis=0))
 
-    motion = Motion(scene, q0, v0, duration, parts, given, most, isinstance(controls, OpenLoop))
+    motion = Motion(scene, q0, v0, duration, parts, given, isinstance(controls, OpenLoop))
     first = None
     if earlier is not None:
         known = integrator_of(earlier.integrator)
@@ -561,7 +605,9 @@ def _chosen(
                 f"{record.integrator} at dt = {record.dt:.4g} s; {cause}",
             ),
         )
-    if not isinstance(controls, LinearPolicy | OpenLoop):
+    if isinstance(controls, FirstOrderHold):
+        controls = controls.refined(choice.steps // parts)
+    elif not isinstance(controls, LinearPolicy | OpenLoop):
         controls = np.repeat(held, choice.steps // parts, axis=0)
     return choice.integrator, choice.steps, controls, record, found
 
@@ -621,12 +667,10 @@ def _require_memory(scene: Scene, steps: int) -> None:
         raise InputError(f"steps = {steps} needs more memory than there is: {columns * 8} bytes a step") from None
 
 
-def commands_of(
-    scene: Scene, integrator: Integrator, controls: JointValues | LinearPolicy | OpenLoop | None, steps: int, dt: float
-) -> Commands:
+def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps: int, dt: float) -> Commands:
     """Controls of ``steps`` steps of ``dt`` [s] as the core takes them.
 
-    They are None, (steps, m), (m,), by joint name, a function or a policy.
+    They are None, (steps, m), (m,), by joint name, a function of time, linear between nodes or a policy.
 
     Raises:
         UnknownJoint: A name that is no driven joint's.
@@ -646,13 +690,18 @@ def commands_of(
             )
         return controls.commands(steps, scene.controls, scene.robot.dof, integrator.variational, dt)
     if isinstance(controls, OpenLoop):
-        u = np.empty((steps, scene.controls))
-        for k in range(steps):
-            u[k] = _row_at(controls, scene, dt, k)
-        return open_loop(u)
+        return _evaluated(controls, scene, integrator, dt, range(steps))
+    if isinstance(controls, FirstOrderHold):
+        if controls.u.shape != (steps + 1, scene.controls):
+            raise InputError(
+                f"FirstOrderHold: u must have shape {(steps + 1, scene.controls)}, a row for each node of the motion, "
+                f"got {controls.u.shape}"
+            )
+        return _on_lines(controls.u, integrator.stage_times)
     if callable(controls):
         raise InputError(
-            "controls must be rows, a varpin.LinearPolicy or a varpin.OpenLoop here; only simulate takes a control law"
+            "controls must be rows, a varpin.LinearPolicy, a varpin.OpenLoop or a varpin.FirstOrderHold here; only "
+            "simulate takes a control law"
         )
     return open_loop(control_rows(scene, controls, steps))
 
@@ -706,23 +755,73 @@ def _decision(law: ControlLaw, record: _Record) -> Floats:
     return _called("controls(t, q, v)", lambda: law(time, *state), record.scene, k, time, record)[None]
 
 
-def _sampled(controls: OpenLoop, record: _Record, steps: int) -> Floats:
-    """Controls (steps, m) of the next steps, or of those before the first for which the function fails."""
-    u = np.empty((steps, record.scene.controls))
-    for k in range(steps):
-        try:
-            u[k] = _row_at(controls, record.scene, record.dt, record.steps + k, record)
-        except ControlError:
-            if k == 0:
-                raise
-            return u[:k].copy()
-    return u
+def _on_lines(u: Floats, times: Times) -> Commands:
+    """Controls (N + 1, m) at nodes, linear between them, for a method with stages at ``times``."""
+    before, after = u[:-1, None], u[1:, None]
+    if not times:
+        return open_loop(0.5 * (before + after)[:, 0])
+    share = np.array(times)[:, None]
+    return changing((1.0 - share) * before + share * after, times)
 
 
-def _row_at(controls: OpenLoop, scene: Scene, dt: float, step: int, record: _Record | None = None) -> Floats:
-    """The control (m,) of one step, from its middle."""
-    time = (step + 0.5) * dt
-    return _called("OpenLoop: f(t)", lambda: controls.f(time), scene, step, time, record)
+def _sampled(controls: OpenLoop, record: _Record, steps: int) -> Commands:
+    """Controls of the next steps, or of those before the first for which the function fails."""
+    own = controls, record.scene, record.integrator, record.dt
+    try:
+        return _evaluated(*own, range(record.steps, record.steps + steps), record)
+    except ControlError as error:
+        if error.step == record.steps:
+            raise
+        return _evaluated(*own, range(record.steps, error.step), record)
+
+
+def _evaluated(
+    controls: OpenLoop,
+    scene: Scene,
+    integrator: Integrator,
+    dt: float,
+    steps: range,
+    record: _Record | None = None,
+) -> Commands:
+    """Controls of time at the stages of some steps, or from their middles for a method with one stage."""
+    times = integrator.stage_times
+    found = np.empty((len(steps), max(len(times), 1), scene.controls))
+    for k, step in enumerate(steps):
+        for i, place in enumerate(times or (0.5,)):
+            time = (step + place) * dt
+            if k > 0 and i == 0 and place == 0.0 and times[-1] == 1.0:
+                found[k, 0] = found[k - 1, -1]
+                continue
+            found[k, i] = _called("OpenLoop: f(t)", partial(controls.f, time), scene, step, time, record)
+    return changing(found, times) if times else open_loop(found[:, 0])
+
+
+def _undersampled(
+    controls: OpenLoop, scene: Scene, integrator: Integrator, trajectory: Trajectory
+) -> tuple[Finding, ...]:
+    """Says if steps of half the length see another function: a record has its values at the stages alone."""
+    dt, times = trajectory.dt, integrator.stage_times
+    if not trajectory.steps:
+        return ()
+    looks = np.unique(np.linspace(0, trajectory.steps - 1, _LOOKS).astype(np.int64))
+    try:
+        halves = [_evaluated(controls, scene, integrator, 0.5 * dt, range(2 * k, 2 * k + 2)).u for k in looks.tolist()]
+    except ControlError:
+        return ()
+    mean = np.array(halves).mean(axis=1)
+    total, off = (float(np.abs(part).sum()) for part in (mean, mean - trajectory.u[looks]))
+    if not off > _ALIKE * total:
+        return ()
+    stages = f"{len(times)} stages of a step" if times else "middle of a step"
+    return (
+        Finding(
+            "fast controls",
+            f"the controls of OpenLoop change too fast for dt = {dt:g} s: their means over a step, from the {stages}, "
+            f"are off by {100.0 * off / total:.3g}% of those in half the step"
+            if total > 0.0
+            else f"the controls of OpenLoop change too fast for dt = {dt:g} s: half the step sees none of them",
+        ),
+    )
 
 
 def _called(

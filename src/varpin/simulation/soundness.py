@@ -18,6 +18,7 @@ from varpin.core import doubled_steps_agree, energy_turnover, fastest_damping, g
 from varpin.integrators import Integrator, Radau, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
+from varpin.integrators.within import changing, in_pairs, in_parts, shares
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import (
@@ -91,7 +92,7 @@ class Finding:
 def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Trajectory, tuple[Finding, ...]]:
     """A motion with its energy balance, if the integrator keeps none, and its warnings; and what was found."""
     if not integrator.variational:
-        defects = energy_defects(scene, trajectory)
+        defects = energy_defects(scene, integrator, trajectory)
         defects.setflags(write=False)
         trajectory = trajectory.changed(statistics=trajectory.statistics.changed(energy_defect=defects))
     found = (
@@ -124,7 +125,7 @@ def _does_so_in_smaller_steps(scene: Scene, integrator: Integrator, trajectory: 
     parts = 2 * int(np.maximum(trajectory.statistics.substeps[place : place + count], 1).max())
     if isinstance(integrator, Reference) or count * parts > max(4 * FIRST, int(trajectory.statistics.substeps.sum())):
         return False
-    again = taken_again(scene, integrator, trajectory, place, count, parts)
+    again = taken_again(scene, integrator, trajectory, integrator.stage_times, place, count, parts)
     if again is None:
         return False
     own = np.diff(trajectory.v[place : place + count + 1, found.joint], n=2)
@@ -268,14 +269,14 @@ def _balances(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> l
     for group in range(groups):
         own = scene.group == group
         scale = float(turned[own].sum() + worked[own].sum())
-        found.append((some, _defects_of(scene, trajectory, own)[some], scale))
+        found.append((some, _defects_of(scene, integrator, trajectory, own)[some], scale))
     return found
 
 
-def _defects_of(scene: Scene, trajectory: Trajectory, own: NDArray[np.bool_]) -> Floats:
+def _defects_of(scene: Scene, integrator: Integrator, trajectory: Trajectory, own: NDArray[np.bool_]) -> Floats:
     """What the energy of some joints is off by (N + 1,) [J]; they move by themselves. Zero but at some nodes."""
     kicked, given = _kicks(scene, trajectory)
-    work, heat = _works(scene, trajectory, kicked)
+    work, heat = _works(scene, integrator, trajectory, kicked)
     gained = np.append(0.0, np.cumsum((work - heat + given)[:, own].sum(axis=1)))
     kinetic = 0.5 * (trajectory.p * trajectory.v)[:, own].sum(axis=1)
     off = np.zeros(trajectory.steps + 1)
@@ -306,7 +307,7 @@ def _turnover(scene: Scene, trajectory: Trajectory) -> tuple[float, Floats, Floa
     return min(kinetic, float(turned.sum())) + work, turned, worked
 
 
-def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
+def energy_defects(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Floats:
     """What the energy is off by after each step (N,) [J], of what no control, damper or kick accounts for.
 
     From the record alone, for integrators that keep no ledger of their own. For what dampers take, velocities are taken
@@ -315,19 +316,23 @@ def energy_defects(scene: Scene, trajectory: Trajectory) -> Floats:
     if scene.noise.diffusion is None:
         return np.zeros(trajectory.steps)
     gained: Floats = trajectory.energy[1:] - trajectory.energy[0]
-    if trajectory.u.any() or trajectory.dw.any() or scene.dissipates or scene.couplings:
+    acts = scene.dissipates or scene.couplings or scene.custom is not None
+    if trajectory.u.any() or trajectory.u_stages.any() or trajectory.dw.any() or acts:
         kicked, given = _kicks(scene, trajectory)
-        work, heat = _works(scene, trajectory, kicked)
+        work, heat = _works(scene, integrator, trajectory, kicked)
         gained -= np.cumsum((work - heat + given).sum(axis=1))
     return gained if np.isfinite(gained).all() else np.nan_to_num(gained, nan=np.inf)
 
 
-def _works(scene: Scene, trajectory: Trajectory, kicked: Floats | float = 0.0) -> tuple[Floats, Floats]:
+def _works(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, kicked: Floats | float = 0.0
+) -> tuple[Floats, Floats]:
     """Work of the controls, and the least that the dampers can take, at each joint in each step (N, n) [J].
 
     What servos make of their controls counts among what is taken.
 
-    Controls are constant over a step, and do the work of its way. A kick of v (N, n) begins each step. Dampers take
+    Controls that are constant over a step do the work of its way; of others the rest works on velocities that the cubic
+    through both nodes has. A kick of v (N, n) begins each step. Dampers take
     least where the velocity is even, and q knows its mean: so does all other friction there.
     """
     h, before, after = trajectory.dt, trajectory.v[:-1] + kicked, trajectory.v[1:]
@@ -335,6 +340,12 @@ def _works(scene: Scene, trajectory: Trajectory, kicked: Floats | float = 0.0) -
         way = np.diff(trajectory.q, axis=0)
         force = _applied(scene, trajectory)
         work = force * way
+        if trajectory.u_stages.shape[1]:
+            c = np.array(integrator.stage_times)[:, None]
+            rest = (trajectory.u_stages - trajectory.u[:, None]) @ scene.actuation.T
+            speed = (1.0 - c) * (1.0 - 3.0 * c) * before[:, None] + c * (3.0 * c - 2.0) * after[:, None]
+            speed = speed + 6.0 * c * (1.0 - c) * (way / h)[:, None]
+            work = work + h * np.einsum("s,ksn->kn", shares(integrator.stage_times), rest * speed)
         even = (way / h) ** 2
         heat = h * np.minimum((before**2 + before * after + after**2) / 3.0, even) * scene.damping
         if scene.dissipates or scene.couplings:
@@ -387,7 +398,10 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
         # Commands are the same for all paths; their forces need not be.
         held = u[begins[:, None] + np.arange(length)].reshape(len(begins), length // times, times, -1)
         commands, drift = open_loop(np.zeros_like(u[:length:times])), held.mean(axis=2) @ scene.actuation.T
-    again = other.motions(scene, q[begins], v[begins], commands, drift, times * trajectory.dt)
+    if trajectory.u_stages.shape[1]:
+        again = _windows_under(scene, integrator, trajectory, begins, length, other, times)
+    else:
+        again = other.motions(scene, q[begins], v[begins], commands, drift, times * trajectory.dt)
     if times == 1 and again is not None:
         again = np.ascontiguousarray(again[0][:, 1::2]), np.ascontiguousarray(again[1][:, 1::2])
     # How much less the error is in steps of half the length; of another method nothing is known.
@@ -424,12 +438,39 @@ def _halves_agree(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
     """:func:`resolved` of a single step: two of half its length make the same motion."""
     q, v, u, half = trajectory.q, trajectory.v, trajectory.u, 0.5 * trajectory.dt
     commands = open_loop(np.concatenate([u, u]))
+    if trajectory.u_stages.shape[1]:
+        times = integrator.stage_times
+        commands = changing(in_parts(trajectory.u_stages, times, 2, times), times)
     again = integrator.motions(scene, q[:1], v[:1], commands, np.zeros((0, 0, scene.robot.dof)), half)
     if again is None:
         return False
     fine = np.concatenate([q[:1], again[0][0]]), np.concatenate([v[:1], again[1][0]])
     gain = (1.0 - 2.0**-integrator.order) / _MARGIN
     return _agree(scene, fine, _FROM_START, 2, half, (q[None, 1:], v[None, 1:]), gain)
+
+
+def _windows_under(
+    scene: Scene,
+    integrator: Integrator,
+    trajectory: Trajectory,
+    begins: Integers,
+    length: int,
+    other: Integrator,
+    times: int,
+) -> tuple[Floats, Floats] | None:
+    """Windows of a motion whose controls change within steps, by another method, or in steps of twice the length."""
+    at, own, found = other.stage_times, integrator.stage_times, []
+    for begin in begins:
+        values = trajectory.u_stages[begin : begin + length]
+        commands = changing(in_parts(values, own, 1, at) if times == 1 else in_pairs(values, own, at), at)
+        node = slice(begin, begin + 1)
+        drift = np.zeros((0, 0, scene.robot.dof))
+        again = other.motions(scene, trajectory.q[node], trajectory.v[node], commands, drift, times * trajectory.dt)
+        if again is None:
+            return None
+        found.append(again)
+    q, v = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return q, v
 
 
 def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> MotionError | None:
@@ -510,6 +551,7 @@ def _look(
     most: int,
 ) -> _Look | None:
     """The error at one place, by so many steps at most; None where none can be told."""
+    times = integrator.stage_times
     judged = int(place.judged.max())
     taken = np.maximum(trajectory.statistics.substeps[place.step : place.step + judged], 1)
     # Where guards took steps in parts, they are as short as these.
@@ -519,11 +561,11 @@ def _look(
     q, v = (values[place.step : place.step + count + 1] for values in (trajectory.q, trajectory.v))
     if scene.noise.diffusion is None and trajectory.dw.any():
         # Kicks that only Python knows are left out of both.
-        plain = taken_again(scene, integrator, trajectory, place.step, count, parts // other.parts)
+        plain = taken_again(scene, integrator, trajectory, times, place.step, count, parts // other.parts)
         if plain is None:
             return None
         q, v = plain
-    again = Again(scene, other.method, trajectory, place.step, count, parts)
+    again = Again(scene, other.method, trajectory, times, place.step, count, parts)
     far = _FAR * float(np.ptp(q, axis=0).max())
     # What is far off is wrong or cannot be told, and no more is needed of it.
     while not again.ended and np.abs(again.q[again.done] - q[again.done]).max() <= far:
@@ -538,7 +580,7 @@ def _look(
     error = place.error(scene, trajectory, inertia, (off[0][: known + 1], off[1][: known + 1]), cut=cut)
     if not error.worst < _SMALL:
         moved = disturbance(trajectory, place.step, known)
-        beside = Again(scene, other.method, trajectory, place.step, known, parts, moved)
+        beside = Again(scene, other.method, trajectory, times, place.step, known, parts, moved)
         told = 0
         while not beside.ended and told == beside.done:
             beside.go_on()

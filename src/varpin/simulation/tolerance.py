@@ -39,7 +39,7 @@ _NODES = 4096
 _PATIENCE = 50_000_000
 # A motion whose last differences shrink at least like this is taken to go on so.
 _SHRINKS, _LEFT = 0.75, 3.0
-# Controls of time are held over steps of this many times the number, too: a jump lies elsewhere in each of those.
+# Controls of time are taken at steps of this many times the number, too: a jump lies elsewhere in each of those.
 _OTHER = 1.37
 # An integrator that misses the tolerance by this factor is not worth more of its steps.
 _FAR = 30.0
@@ -56,7 +56,6 @@ class Motion:
         duration: [s].
         parts: A number that goes into all numbers of steps.
         commands: Those of an integrator for a number of steps.
-        most: The greatest order that a method can have under these commands.
         sampled: Whether the commands are samples of a function, which steps and half steps may see alike where it
             jumps between them.
     """
@@ -67,7 +66,6 @@ class Motion:
     duration: float
     parts: int
     commands: Callable[[Integrator, int], Commands]
-    most: int
     sampled: bool = False
 
 
@@ -214,7 +212,7 @@ def choose(
     runs = _Runs(motion)
 
     def of(integrator: Integrator, least: int) -> Method:
-        return Method(runs, integrator, least, motion.parts, min(integrator.order, motion.most))
+        return Method(runs, integrator, least, motion.parts, integrator.order)
 
     if first is not None and motion.duration / first[1] < runs.most:
         method = of(first[0], motion.parts)

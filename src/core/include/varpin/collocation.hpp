@@ -49,7 +49,10 @@ struct Effort {
 struct Start {
     const Place* place = nullptr;    // (n)
     const Compensated* p = nullptr;  // (n)
-    const double* force = nullptr;   // (n) constant over the step: the controls', and the drift of the noise
+    const double* force = nullptr;   // (n) the controls' and the drift of the noise, or a row (s, n) for each stage
+    int stride = 0;                  // from one row to the next; 0 where it is constant over the step
+
+    const double* force_at(int stage) const { return force + stage * stride; }
 };
 
 // Of a number of joints and of stages that the compiler knows, or does not.
@@ -66,6 +69,7 @@ class Collocation {
           Q(stages * n),
           slope(stages * n),
           acting(stages * n),
+          weight(stages, 1.0),
           residual(stages * n),
           delta(stages * n) {
         for (Jet<double, Size>& jet : stage) mechanism.couplings.fit(jet.couplings);
@@ -105,6 +109,8 @@ class Collocation {
     std::vector<JointForce<double>> acting;  // (s, n) of the elements and couplings; derivatives of elements alone
     std::vector<double> coupled_q;           // (s, n, n) dF/dq of the couplings, if there are such forces
     std::vector<double> coupled_v;           // (s, n, n) dF/dv
+    std::vector<double> weight;              // (s) of the force at each stage, in what derivatives in f are taken in
+    bool weighted = false;                   // whether any of them is not 1
 
     // Solve the step equation from the guess in V.
     //
@@ -371,15 +377,16 @@ class Collocation {
             }
         }
         if (second) take_over();
-        if (mechanism.pushes()) look_at_elements(start.force);
+        if (mechanism.pushes()) look_at_elements(start);
         (second ? effort.jets : effort.sweeps) += stages;
     }
 
-    void look_at_elements(const double* force) {
+    void look_at_elements(const Start& start) {
         for (int i = 0; i < stages; ++i) {
             double* const by_q = coupled() ? &coupled_q[i * n * n] : nullptr;
             double* const by_v = coupled() ? &coupled_v[i * n * n] : nullptr;
-            sum_forces(mechanism, &Q[i * n], &V[i * n], force, &acting[i * n], stage[i].couplings, by_q, by_v);
+            sum_forces(mechanism, &Q[i * n], &V[i * n], start.force_at(i), &acting[i * n], stage[i].couplings, by_q,
+                       by_v);
         }
         if (!eliminated()) return;
         std::fill(element_curvature.begin(), element_curvature.end(), 0.0);
@@ -423,7 +430,8 @@ class Collocation {
     [[gnu::always_inline]] inline double residuals_of(const int stages, double h, const Start& start) {
         double worst = 0.0;
         for (int i = 0; i < stages; ++i) {
-            for (int c = 0; c < n; ++c) slope[i * n + c] = stage[i].Lq[c] + (start.force[c] + acting[i * n + c].value);
+            const double* force = start.force_at(i);
+            for (int c = 0; c < n; ++c) slope[i * n + c] = stage[i].Lq[c] + (force[c] + acting[i * n + c].value);
         }
         for (int i = 0; i < stages; ++i) {
             const double* abar = &tableau.gradient[i * stages];
@@ -432,9 +440,10 @@ class Collocation {
                 double total = 0.0, scale = 0.0;
                 for (int j = 0; j < stages; ++j) {
                     const JointForce<double>& element = acting[j * n + c];
-                    total += abar[j] * stage[j].Lq[c] + f[j] * (start.force[c] + element.value);
-                    scale += std::abs(abar[j]) * stage[j].Lq_scale[c] +
-                             std::abs(f[j]) * (std::abs(start.force[c]) + element.scale);
+                    const double force = start.force_at(j)[c];
+                    total += abar[j] * stage[j].Lq[c] + f[j] * (force + element.value);
+                    scale +=
+                        std::abs(abar[j]) * stage[j].Lq_scale[c] + std::abs(f[j]) * (std::abs(force) + element.scale);
                 }
                 double error = (start.p[c].high - stage[i].Lv[c]) + (start.p[c].low + h * total);
                 residual[i * n + c] = error;
@@ -550,7 +559,8 @@ class Collocation {
         for (int k = 0; k < n; ++k) {
             for (int kind = 0; kind < 3; ++kind) {
                 // With one stage the force acts in proportion to the momentum, whose column has just been solved for.
-                const double scale = stages == 1 && kind == 2 ? h * tableau.force[0] * (1.0 + acting[k].by_f) : 1.0;
+                const double scale =
+                    stages == 1 && kind == 2 ? h * weight[0] * tableau.force[0] * (1.0 + acting[k].by_f) : 1.0;
                 if (stages > 1 || kind < 2) {
                     right_side(h, kind, k);
                     solve_factored(residual.data(), delta.data());
@@ -576,14 +586,15 @@ class Collocation {
         }
     }
 
-    // Into `residual` dr in one of q0, p0 or f: h sum_j (abar_ij L_qq,j + f_ij F_q,j) - A_i, 1, or h sum_j f_ij F_f,j.
+    // Into `residual` dr in one of q0, p0 or f: h sum_j (abar_ij L_qq,j + f_ij F_q,j) - A_i, 1, or h sum_j f_ij w_j
+    // F_f,j with the stages' weights w.
     void right_side(double h, int kind, int k) {
         std::fill(residual.begin(), residual.end(), 0.0);
         for (int i = 0; i < stages; ++i) {
             double* b = &residual[i * n];
             double share = 0.0;
             for (int j = 0; j < stages; ++j) {
-                share += tableau.force[i * stages + j];
+                share += weight[j] * tableau.force[i * stages + j];
                 if (kind > 0) continue;
                 const double* curvature = &stage[j].Lqq[k * n];
                 for (int r = 0; r < n; ++r) b[r] += h * tableau.gradient[i * stages + j] * curvature[r];
@@ -598,16 +609,17 @@ class Collocation {
         }
     }
 
-    // sum_j f_ij (F_f,j - 1): what elements make of a constant force in r_i.
+    // sum_j f_ij w_j (F_f,j - 1): what elements make of a constant force in r_i.
     double changed(int i, int c) const {
         double total = 0.0;
-        for (int j = 0; j < stages; ++j) total += tableau.force[i * stages + j] * acting[j * n + c].by_f;
+        for (int j = 0; j < stages; ++j) total += weight[j] * tableau.force[i * stages + j] * acting[j * n + c].by_f;
         return total;
     }
-    // sum_j b_j F_f,j: what of it arrives at the end.
+    // sum_j b_j w_j F_f,j: what of it arrives at the end.
     double passed(int c) const {
-        double total = 1.0;
-        for (int j = 0; j < stages; ++j) total += tableau.b[j] * acting[j * n + c].by_f;
+        double total = weighted ? 0.0 : 1.0;
+        for (int j = 0; j < stages && weighted; ++j) total += weight[j] * tableau.b[j];
+        for (int j = 0; j < stages; ++j) total += weight[j] * tableau.b[j] * acting[j * n + c].by_f;
         return total;
     }
 
@@ -655,11 +667,11 @@ class Collocation {
     // momentum.
     int kinds() const { return stages == 1 ? 2 : 3; }
 
-    // dr_i in (q0, p0, f): h sum_j (abar_ij L_qq,j + f_ij F_q,j) - A_i, 1, and h sum_j f_ij F_f,j.
+    // dr_i in (q0, p0, f): h sum_j (abar_ij L_qq,j + f_ij F_q,j) - A_i, 1, and h sum_j f_ij w_j F_f,j.
     void right_sides(double h, Block block, std::vector<double>& dV) const {
         for (int i = 0; i < stages; ++i) {
             double share = 0.0;
-            for (int j = 0; j < stages; ++j) share += tableau.force[i * stages + j];
+            for (int j = 0; j < stages; ++j) share += weight[j] * tableau.force[i * stages + j];
             for (int r = block.begin; r < block.end; ++r) {
                 double* row = &dV[(i * n + r) * 3 * n];
                 for (int c = block.begin; c < block.end; ++c) {
@@ -707,7 +719,7 @@ class Collocation {
     }
 
     // What a force on coordinate c does to the one stage, in units of what a momentum does.
-    double by_momentum(double h, int c) const { return h * (tableau.force[0] + changed(0, c)); }
+    double by_momentum(double h, int c) const { return h * (weight[0] * tableau.force[0] + changed(0, c)); }
 
     // dq1 = dq0 + h sum_i b_i dV_i,  dp1 = dp0 + h F_f df + h sum_i b_i K_i dq0 + sum_j G_j dV_j, with K = L_qq + F_q
     // and G_j = h b_j (A_j' + F_v,j) + h^2 sum_i b_i a_ij K_i.

@@ -65,7 +65,8 @@ class ConstrainedStepper {
           n(mechanism.dof()),
           m(mechanism.constraints.rows()),
           stages(tableau.stages),
-          force(n),
+          force(stages * n),
+          given(stages * n),
           at(places),
           weight(stages * stages),
           trial(n),
@@ -96,7 +97,8 @@ class ConstrainedStepper {
     Collocation<> equation;
     EnergyGuard<> energy_guard;
     int n, m, stages;
-    std::vector<double> force;           // (n) constant over the step
+    std::vector<double> force;           // (n) constant over the step; (s, n) at its stages, or those of a part of it
+    int stride = 0;                      // from one row of `force` to the next
     Effort effort;                       // of the last step
     std::vector<std::uint8_t> halvings;  // of each part of the last step; none if it was taken whole
 
@@ -149,6 +151,13 @@ class ConstrainedStepper {
         energy_guard.kicked(unit.data(), path.momentum.data(), path.v.data(), path.energies);
     }
 
+    // Take the force (n) of a step, constant over it, or (s, n) at its stages if it `varies`.
+    void take_force(const double* own, bool varies) {
+        stride = varies ? n : 0;
+        std::copy(own, own + (varies ? stages * n : n), force.begin());
+        if (varies) given = force;
+    }
+
     // One whole step, in as many substeps as the guards ask for; as VariationalStepper::step.
     Outcome step(double h, ConstrainedState& state) {
         effort = {};
@@ -164,6 +173,7 @@ class ConstrainedStepper {
             } else {
                 guess(path);
             }
+            bring_force(VariationalStepper<>::length_of(static_cast<double>(place), level), level);
             const Outcome outcome = attempt(VariationalStepper<>::length_of(h, level), state);
             if (outcome == Outcome::solved) {
                 if (level > 0) halvings.push_back(static_cast<std::uint8_t>(level));
@@ -191,8 +201,10 @@ class ConstrainedStepper {
         return Outcome::solved;
     }
 
-    // The part of a step of length h that was halved `level` times, begun from the current velocity.
-    Outcome part(double h, int level, ConstrainedState& state) {
+    // The part of a step of length h that was halved `level` times and begins at `begin` in units of the step; begun
+    // from the current velocity.
+    Outcome part(double h, int level, double begin, ConstrainedState& state) {
+        bring_force(begin, level);
         guess(state.path);
         return attempt(VariationalStepper<>::length_of(h, level), state);
     }
@@ -230,7 +242,13 @@ class ConstrainedStepper {
                     const std::vector<double> push = y;
                     kick(push.data(), state);
                 }
-                constant_force(mechanism, drift ? drift + row * n : nullptr, u + s * controls, force.data());
+                const double* extra = drift ? drift + row * n : nullptr;
+                stride = commands.within ? n : 0;
+                if (commands.within) {
+                    stage_forces(mechanism, extra, commands.within + s * stages * controls, stages, given.data());
+                } else {
+                    constant_force(mechanism, extra, u + s * controls, force.data());
+                }
                 const Outcome outcome = step(h, state);
                 record_effort(effort, nodes, row);
                 nodes.ended[p] = static_cast<std::int64_t>(outcome);
@@ -316,6 +334,7 @@ class ConstrainedStepper {
     static constexpr double stagnation = 100.0;
     static constexpr int most_corrections = 12;
 
+    std::vector<double> given;   // (s, n) force at the stages of the whole step, where it varies
     std::vector<double> at;      // (s + 1, s) t_kj
     std::vector<double> weight;  // (s, s) w_ik
     Trial trial;
@@ -581,7 +600,7 @@ class ConstrainedStepper {
 
     // Newton's method on the stages and the constraints. Ends with jets of the root, and with C at all points.
     Outcome solve(double h, const PathState& path) {
-        const Start start{path.place.data(), path.p.data(), force.data()};
+        const Start start{path.place.data(), path.p.data(), force.data(), stride};
         // In units of these the matrix has entries about 1.
         for (int c = 0; c < n; ++c) scaled[c] = 1.0 / std::sqrt(mass_diagonal(c));
         for (int r = 0; r < m; ++r) row_scale[r] = 1.0 / std::max(norm(&here.rows[r * n]), nothing);
@@ -620,6 +639,12 @@ class ConstrainedStepper {
         if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
         effort.residual = std::max(effort.residual, worst);
         return Outcome::solved;
+    }
+
+    // Where the force varies: bring it to the stages of a part of the step.
+    void bring_force(double begin, int level) {
+        if (stride == 0) return;
+        bring_to_part(tableau, n, given.data(), begin, VariationalStepper<>::length_of(1.0, level), force.data());
     }
 
     double mass_diagonal(int c) const {
@@ -661,7 +686,7 @@ class ConstrainedStepper {
         for (int i = 0; i < stages; ++i) {
             for (int c = 0; c < n; ++c) {
                 const int k = i * n + c;
-                equation.slope[k] = equation.stage[i].Lq[c] + (start.force[c] + equation.acting[k].value);
+                equation.slope[k] = equation.stage[i].Lq[c] + (start.force_at(i)[c] + equation.acting[k].value);
             }
         }
         for (int i = 0; i < stages; ++i) {
@@ -670,7 +695,7 @@ class ConstrainedStepper {
                 for (int j = 0; j < stages; ++j) {
                     const double a = tableau.a[i * stages + j];
                     sum += a * equation.slope[j * n + c];
-                    scale += std::abs(a) * (equation.stage[j].Lq_scale[c] + std::abs(start.force[c]) +
+                    scale += std::abs(a) * (equation.stage[j].Lq_scale[c] + std::abs(start.force_at(j)[c]) +
                                             equation.acting[j * n + c].scale);
                     across_rows += weight[i * stages + j] * pushed[j * n + c];
                     across_size += std::abs(weight[i * stages + j]) * push_size[j * n + c];
@@ -856,9 +881,10 @@ class ConstrainedStepper {
                 move += tableau.b[i] * velocity;
                 sum += tableau.b[i] * equation.slope[i * n + c];
                 across_rows += pushed[i * n + c];
-                trial.work[c] += share * (force[c] + element.value) * velocity;
+                const double given_force = force[i * stride + c];
+                trial.work[c] += share * (given_force + element.value) * velocity;
                 trial.dissipated[c] += share * element.lost;
-                const double scale = equation.stage[i].Lq_scale[c] + std::abs(force[c]) + element.scale;
+                const double scale = equation.stage[i].Lq_scale[c] + std::abs(given_force) + element.scale;
                 trial.magnitude[c] += share * scale * std::abs(velocity) +
                                       tableau.b[i] * std::abs(equation.stage[i].Lq[c]) * distance +
                                       push_size[i * n + c] * std::abs(velocity);
@@ -882,12 +908,13 @@ class ConstrainedLinearization {
 
     Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
                   std::span<const std::uint8_t> halvings, double* Jx, double* Jf) {
-        std::copy(force, force + n, stepper.force.begin());
+        stepper.take_force(force, varies);
         if (!stepper.begin_at(q, p, state, false)) return Outcome::singular;
         if (halvings.empty()) {
             Outcome outcome = stepper.from_guess(h, guess, state);
-            if (outcome != Outcome::solved) outcome = stepper.part(h, 0, state);
+            if (outcome != Outcome::solved) outcome = stepper.part(h, 0, 0.0, state);
             if (outcome == Outcome::solved) {
+                weigh(0.0, 1.0);
                 stepper.derivatives(h, state.path, Jx, Jf);
                 return outcome;
             }
@@ -896,13 +923,18 @@ class ConstrainedLinearization {
         std::fill(Jx, Jx + 4 * n * n, 0.0);
         std::fill(Jf, Jf + 2 * n * n, 0.0);
         for (int i = 0; i < 2 * n; ++i) Jx[i * 2 * n + i] = 1.0;
-        if (halvings.empty()) return part(h, 0, Jx, Jf);
+        if (halvings.empty()) return part(h, 0, 0.0, Jx, Jf);
+        double begin = 0.0;
         for (const std::uint8_t level : halvings) {
-            const Outcome outcome = part(h, level, Jx, Jf);
+            const Outcome outcome = part(h, level, begin, Jx, Jf);
             if (outcome != Outcome::solved) return outcome;
+            begin += VariationalStepper<>::length_of(1.0, level);
         }
         return Outcome::solved;
     }
+
+    // As of VariationalLinearization.
+    bool varies = false, ramp = false;
 
   private:
     ConstrainedStepper stepper;
@@ -910,14 +942,23 @@ class ConstrainedLinearization {
     ConstrainedState state;
     std::vector<double> link, link_f;
 
+    // The weights of the stages' forces in a part of the step, both in units of the step.
+    void weigh(double begin, double share) {
+        if (!ramp) return;
+        stepper.equation.weighted = true;
+        for (int i = 0; i < stepper.stages; ++i) stepper.equation.weight[i] = begin + share * stepper.tableau.c[i];
+    }
+
     // A part, in halves where guards refuse it; its derivatives follow those before.
-    Outcome part(double h, int level, double* Jx, double* Jf) {
-        const Outcome outcome = stepper.part(h, level, state);
+    Outcome part(double h, int level, double begin, double* Jx, double* Jf) {
+        const Outcome outcome = stepper.part(h, level, begin, state);
         if (outcome != Outcome::solved) {
             if (!stepper.guards.active || level >= stepper.guards.most_halvings) return outcome;
-            const Outcome half = part(h, level + 1, Jx, Jf);
-            return half == Outcome::solved ? part(h, level + 1, Jx, Jf) : half;
+            const Outcome half = part(h, level + 1, begin, Jx, Jf);
+            if (half != Outcome::solved) return half;
+            return part(h, level + 1, begin + VariationalStepper<>::length_of(1.0, level + 1), Jx, Jf);
         }
+        weigh(begin, VariationalStepper<>::length_of(1.0, level));
         stepper.derivatives(VariationalStepper<>::length_of(h, level), state.path, link.data(), link_f.data());
         const auto times = [&](double* right, int width) {
             std::vector<double> product(2 * n * width);

@@ -13,6 +13,8 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
+#include <functional>
+#include <stdexcept>
 #include <type_traits>
 #include <utility>
 #include <variant>
@@ -124,6 +126,10 @@ struct FrameWrench {
 
 using CoupledElement = std::variant<FrameLoad, FrameSpring, FrameLengthSpring, FrameDamper, FrameWrench>;
 
+// A force F (n) on all coordinates that code outside of the core evaluates at q and v (n), and where they are not null
+// dF/dq and dF/dv (n, n).
+using OuterForce = std::function<void(const double* q, const double* v, double* F, double* by_q, double* by_v)>;
+
 // What one joint does to one of the points.
 template <class T>
 struct Arm {
@@ -179,7 +185,14 @@ class Couplings {
         }
     }
 
-    bool any() const { return !joined_.empty(); }
+    void take_outer(OuterForce force) {
+        outer_ = std::move(force);
+        pushes_ = true;
+    }
+
+    bool any() const { return !joined_.empty() || outer_; }
+    // Whether code outside of the core has a force here, which may mind how often a joint went round.
+    bool has_outer() const { return static_cast<bool>(outer_); }
     // Whether there are forces beside those of potentials.
     bool pushes() const { return pushes_; }
 
@@ -238,6 +251,7 @@ class Couplings {
                 },
                 joined.element);
         }
+        if (outer_) add_outer(n, q, v, out, by_q, by_v);
     }
 
   private:
@@ -251,8 +265,33 @@ class Couplings {
 
     Links links_;
     std::vector<Joined> joined_;
+    OuterForce outer_;
     std::size_t most_arms_ = 0;
     bool pushes_ = false;
+
+    // Heat is what both F . v and the slope in v take.
+    template <class T>
+    [[gnu::noinline]] void add_outer(int n, const T* q, const T* v, JointForce<T>* out, T* by_q, T* by_v) const {
+        if constexpr (std::is_same_v<T, double>) {
+            const bool slopes = by_q && by_v;
+            std::vector<double> force(n), in_q(slopes ? n * n : 0), in_v(in_q.size());
+            outer_(q, v, force.data(), slopes ? in_q.data() : nullptr, slopes ? in_v.data() : nullptr);
+            double power = 0.0, damped = 0.0;
+            for (int i = 0; i < n; ++i) {
+                out[i].value += force[i];
+                out[i].scale += std::abs(force[i]);
+                power -= force[i] * v[i];
+                for (int j = 0; j < n && slopes; ++j) {
+                    by_q[i * n + j] += in_q[i * n + j];
+                    by_v[i * n + j] += in_v[i * n + j];
+                    damped -= v[i] * in_v[i * n + j] * v[j];
+                }
+            }
+            out[0].lost += std::max(0.0, std::min(power, damped));
+        } else {
+            throw std::logic_error("a force from outside of the core has no second derivatives");
+        }
+    }
 
     template <class T>
     void place_all(const T* q, CouplingRoom<T>& room) const {

@@ -234,14 +234,15 @@ class ForwardDynamics {
     static int slope_width(int size) { return size + size % 2; }
 
     // How the accelerations of one block of b coordinates change (b, 3 widths) with q, v and force, once after
-    // differentiate(): M^-1 (-tau_q, -tau_v - reach tau_q, 1) with reach = 0. Where q and v change with reach v and
-    // with other accelerations x_k (b, 3 widths) themselves, by in_q[k] x_k and in_v[k] x_k, that is added.
+    // differentiate(): M^-1 (-tau_q, -tau_v - reach tau_q, weight) with reach = 0 and weight 1. Where q and v change
+    // with reach v and with other accelerations x_k (b, 3 widths) themselves, by in_q[k] x_k and in_v[k] x_k, that is
+    // added.
     void slope(Block block, double* a, double reach, int others, const double* const* x, const double* in_q,
-               const double* in_v) {
+               const double* in_v, double weight) {
         const int n = jet_.dof, size = block.end - block.begin, width = slope_width(size), columns = 3 * width;
         for (int i = 0; i < size; ++i) {
             const Slopes* by = slopes_.data() + (block.begin + i) * n + block.begin;
-            const double own = 1.0 + acting_[block.begin + i].by_f;
+            const double own = weight * (1.0 + acting_[block.begin + i].by_f);
             double* row = a + i * columns;
             // Written in pairs, as they are read next.
             for (int j = 0; j < size; j += 2) {

@@ -26,6 +26,8 @@ enum class ExplicitMethod { euler, semi_implicit, runge_kutta };
 struct Nystroem {
     int stages = 1;
     double reach[4] = {};                           // c
+    int place[4] = {};                              // which of the different c a stage has
+    int places = 1;                                 // how many there are
     double stage_q[4][4] = {}, stage_v[4][4] = {};  // k, l
     double end_q[4] = {}, end_v[4] = {1.0};         // x, y
 };
@@ -37,6 +39,8 @@ constexpr Nystroem nystroem_of(ExplicitMethod method) {
         // The classical method of fourth order.
         of = {4,
               {0.0, 0.5, 0.5, 1.0},
+              {0, 1, 1, 2},
+              3,
               {},
               {},
               {1.0 / 6.0, 1.0 / 6.0, 1.0 / 6.0, 0.0},
@@ -73,15 +77,21 @@ class ExplicitStepper {
     std::vector<double> q, v;  // the state
     ForwardDynamics dynamics;  // at the state, when a step begins
 
-    int stages() const { return coefficients_.stages; }
+    // Whether derivatives in the force are in one that grows from 0 at the start of the step to it at its end.
+    bool ramp = false;
 
-    // From the state that `dynamics` is at; false where a mass matrix on the way is not positive definite.
-    bool step(double h, const double* force) {
+    int stages() const { return coefficients_.stages; }
+    // At how many different times of a step its stages are.
+    int places() const { return coefficients_.places; }
+
+    // From the state that `dynamics` is at, under a force (n), or with a `stride` of n one (places, n) for each time;
+    // false where a mass matrix on the way is not positive definite.
+    bool step(double h, const double* force, int stride = 0) {
         for (int i = 0; i < stages(); ++i) {
             move(h, coefficients_.reach[i], coefficients_.stage_q[i], coefficients_.stage_v[i], i, stage_q_.data(),
                  stage_v_.data());
             if (i > 0 && !dynamics.at(stage_q_.data(), stage_v_.data())) return false;
-            dynamics.acceleration(force, a_[i].data());
+            dynamics.acceleration(force + coefficients_.place[i] * stride, a_[i].data());
             if (derivatives_) differentiate(h, i);
         }
         move(h, 1.0, coefficients_.end_q, coefficients_.end_v, stages(), q.data(), v.data());
@@ -151,7 +161,8 @@ class ExplicitStepper {
             const int size = block.end - block.begin;
             const double* before[4] = {};
             for (int k = 0; k < i; ++k) before[k] = slope_[k].data() + first;
-            dynamics.slope(block, slope_[i].data() + first, h * coefficients_.reach[i], i, before, in_q, in_v);
+            dynamics.slope(block, slope_[i].data() + first, h * coefficients_.reach[i], i, before, in_q, in_v,
+                           ramp ? coefficients_.reach[i] : 1.0);
             first += 3 * size * ForwardDynamics::slope_width(size);
         }
     }
@@ -192,7 +203,7 @@ class ExplicitRollout {
           paths_(paths),
           center_(q.size() * mechanism.diffusion.processes),
           stepper_(mechanism, method, false),
-          force_(mechanism.dof()),
+          force_(stepper_.places() * mechanism.dof()),
           jump_(mechanism.dof()) {
         for (std::int64_t i = 0; i < paths; ++i) diffusion_centers(mechanism, q0 + i * mechanism.dof(), center(i));
     }
@@ -201,6 +212,7 @@ class ExplicitRollout {
 
     std::int64_t paths() const { return paths_; }
     int dof() const { return mechanism_->dof(); }
+    int places() const { return stepper_.places(); }
 
     // The node that each path starts at; false where a mass matrix is not positive definite.
     bool first_nodes(const Nodes& nodes) {
@@ -257,7 +269,8 @@ class ExplicitRollout {
         double* u = nodes.u + path * nodes.steps * m;
         apply_policy(commands, path, s, n, at_q.data(), at_v.data(), u);
         u += s * m;
-        constant_force(*mechanism_, drift, u, force_.data());
+        const int places = commands.within ? stepper_.places() : 1;
+        stage_forces(*mechanism_, drift, commands.within ? commands.within + s * places * m : u, places, force_.data());
         if (!regular) return Outcome::singular;
         const bool beside = method_ == ExplicitMethod::euler;
         if (dw) {
@@ -268,7 +281,7 @@ class ExplicitRollout {
                 at_state();
             }
         }
-        regular = stepper_.step(h, force_.data());
+        regular = stepper_.step(h, force_.data(), commands.within ? n : 0);
         if (dw && beside) add_jump();
         nodes.tally[(path * nodes.steps + s) * 4 + 2] = stepper_.stages();
         return regular ? enter_node(nodes, path, s) : Outcome::singular;

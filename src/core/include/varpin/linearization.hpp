@@ -48,7 +48,11 @@ class VariationalLinearization {
           along_v(n),
           along_f(n) {}
 
-    // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a constant force f. A step
+    // Whether each step has a force (s, n) at its stages, rather than one (n) that is constant over it; and whether
+    // derivatives in f are in a force that grows from 0 at the start of the step to f at its end.
+    bool varies = false, ramp = false;
+
+    // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a force f. A step
     // that was taken whole is solved once more from a guess (s, n) next to its root; in the rows before q, p and force
     // there are `past` others. Of another `halvings` are those of its parts: these are taken again, and their
     // derivatives are chained.
@@ -56,11 +60,15 @@ class VariationalLinearization {
                   std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past = 0) {
         if (halvings.empty() && !stepper.guards.active) {
             const Outcome outcome = root(h, q, p, guess, force, past);
-            if (outcome == Outcome::solved) stepper.step_equation.derivatives(h, dV, Jx, Jf);
+            if (outcome == Outcome::solved) {
+                weigh(0.0, 1.0);
+                stepper.step_equation.derivatives(h, dV, Jx, Jf);
+            }
             return outcome;
         }
         identity(Jx, Jf);
-        return parts(h, q, p, force, halvings, [&](double length) {
+        return parts(h, q, p, force, halvings, [&](double begin, double length) {
+            weigh(begin, length / h);
             stepper.step_equation.derivatives(length, dV, link.data(), link_f.data());
             chain(Jx, Jf);
         });
@@ -69,7 +77,7 @@ class VariationalLinearization {
     // q1 and M(q1)^-1 p1 (n) of the step of which `first` gives the derivatives.
     Outcome end(double h, const double* q, const double* p, const double* force, std::span<const std::uint8_t> halvings,
                 double* q1, double* v1) {
-        const Outcome outcome = parts(h, q, p, force, halvings, [](double) {});
+        const Outcome outcome = parts(h, q, p, force, halvings, [](double, double) {});
         if (outcome != Outcome::solved) return outcome;
         std::copy(state.q.begin(), state.q.end(), q1);
         std::copy(state.v.begin(), state.v.end(), v1);
@@ -91,14 +99,14 @@ class VariationalLinearization {
         std::vector<Substep> trail;
         std::vector<double> Jx(4 * n * n), Jf(2 * n * n), back(z, z + 2 * n), before(2 * n);
         identity(Jx.data(), Jf.data());
-        const Outcome outcome = parts(h, q, p, force, halvings, [&](double length) {
-            trail.push_back({from, from_p, stepper.step_equation.V, length, joined(Jx, Jf)});
+        const Outcome outcome = parts(h, q, p, force, halvings, [&](double begin, double length) {
+            trail.push_back({from, from_p, stepper.step_equation.V, begin, length, joined(Jx, Jf)});
             stepper.step_equation.derivatives(length, dV, link.data(), link_f.data());
             chain(Jx.data(), Jf.data());
         });
         if (outcome != Outcome::solved) return outcome;
         for (std::size_t k = trail.size(); k-- > 0;) {
-            const Outcome again = root_of(trail[k]);
+            const Outcome again = root_of(h, trail[k]);
             if (again != Outcome::solved) return again;
             stepper.step_equation.derivatives(trail[k].length, dV, link.data(), link_f.data());
             add_curvature(trail[k].length, back.data(), trail[k].start.data(), H);
@@ -120,6 +128,7 @@ class VariationalLinearization {
         std::vector<Place> place;
         std::vector<Compensated> p;
         std::vector<double> V;      // (s, n) at its root
+        double begin = 0.0;         // in units of the step
         double length = 0.0;        // [s]
         std::vector<double> start;  // (2n, 3n) derivatives from the start of the step to its own
     };
@@ -148,12 +157,12 @@ class VariationalLinearization {
         Outcome outcome = root_at(h, q, p, force);
         if (outcome == Outcome::solved) return outcome;
         if (!stepper.begin_at(q, p, state)) return Outcome::singular;
-        outcome = stepper.part(h, 0, state);
+        outcome = stepper.part(h, 0, 0.0, state);
         if (outcome == Outcome::solved || past == 0) return outcome;
         const Outcome alone = outcome;
         if (!stepper.begin_at(q - past * n, p - past * n, state)) return alone;
         for (int k = past; k >= 0; --k) {
-            std::copy(force - k * n, force - k * n + n, stepper.force.begin());
+            stepper.take_force(force - k * (varies ? stages * n : 1 * n), varies);
             if (stepper.step(h, state) != Outcome::solved) return alone;
         }
         return root_at(h, q, p, force);
@@ -166,43 +175,56 @@ class VariationalLinearization {
             stepper.unwind(i, state);
             state.p[i] = {p[i], 0.0};
         }
-        std::copy(force, force + n, stepper.force.begin());
-        return stepper.step_equation.solve(h, {state.place.data(), state.p.data(), stepper.force.data()}, loose, true,
-                                           stepper.effort);
+        stepper.take_force(force, varies);
+        return stepper.step_equation.solve(
+            h, {state.place.data(), state.p.data(), stepper.force.data(), stepper.stride}, loose, true, stepper.effort);
     }
 
-    Outcome root_of(const Substep& part) {
+    Outcome root_of(double h, const Substep& part) {
+        stepper.force_in_part(part.begin, part.length / h);
         std::copy(part.V.begin(), part.V.end(), stepper.step_equation.V.begin());
-        return stepper.step_equation.solve(part.length, {part.place.data(), part.p.data(), stepper.force.data()}, loose,
-                                           true, stepper.effort);
+        return stepper.step_equation.solve(part.length,
+                                           {part.place.data(), part.p.data(), stepper.force.data(), stepper.stride},
+                                           loose, true, stepper.effort);
     }
 
-    // Take the parts of a step again; of each that is solved `visit` is told the length, its root in the stepper.
+    // Take the parts of a step again; of each that is solved `visit` is told where it begins, in units of the step, and
+    // its length, its root in the stepper.
     template <class Visit>
     Outcome parts(double h, const double* q, const double* p, const double* force,
                   std::span<const std::uint8_t> halvings, const Visit& visit) {
-        std::copy(force, force + n, stepper.force.begin());
+        stepper.take_force(force, varies);
         if (!stepper.begin_at(q, p, state)) return Outcome::singular;
-        if (halvings.empty()) return part(h, 0, visit);
+        if (halvings.empty()) return part(h, 0, 0.0, visit);
+        double begin = 0.0;
         for (const std::uint8_t level : halvings) {
-            const Outcome outcome = part(h, level, visit);
+            const Outcome outcome = part(h, level, begin, visit);
             if (outcome != Outcome::solved) return outcome;
+            begin += VariationalStepper<>::length_of(1.0, level);
         }
         return Outcome::solved;
     }
 
     template <class Visit>
-    Outcome part(double h, int level, const Visit& visit) {
+    Outcome part(double h, int level, double begin, const Visit& visit) {
         from = state.place;
         from_p = state.p;
-        const Outcome outcome = stepper.part(h, level, state);
+        const Outcome outcome = stepper.part(h, level, begin, state);
         if (outcome == Outcome::solved) {
-            visit(stepper.length_of(h, level));
+            visit(begin, stepper.length_of(h, level));
             return outcome;
         }
         if (!stepper.guards.active || level >= stepper.guards.most_halvings) return outcome;
-        const Outcome half = part(h, level + 1, visit);
-        return half == Outcome::solved ? part(h, level + 1, visit) : half;
+        const Outcome half = part(h, level + 1, begin, visit);
+        if (half != Outcome::solved) return half;
+        return part(h, level + 1, begin + VariationalStepper<>::length_of(1.0, level + 1), visit);
+    }
+
+    // The weights of the stages' forces in a part of the step, both in units of the step.
+    void weigh(double begin, double share) {
+        if (!ramp) return;
+        stepper.step_equation.weighted = true;
+        for (int i = 0; i < stages; ++i) stepper.step_equation.weight[i] = begin + share * stepper.tableau.c[i];
     }
 
     void identity(double* Jx, double* Jf) const {
@@ -317,7 +339,7 @@ class VariationalLinearization {
             for (int c = 0; c < n; ++c) {
                 at_q[c] = {equation.Q[i * n + c], along == &along_q ? 1.0 : 0.0};
                 at_v[c] = {equation.V[i * n + c], along == &along_v ? 1.0 : 0.0};
-                at_f[c] = {stepper.force[c], along == &along_f ? 1.0 : 0.0};
+                at_f[c] = {stepper.force[i * stepper.stride + c], along == &along_f ? 1.0 : 0.0};
             }
             stepper.mechanism.forces.sum(n, at_q.data(), at_v.data(), at_f.data(), along->data());
         }

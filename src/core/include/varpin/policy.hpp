@@ -1,6 +1,6 @@
 // What drives a step from outside: controls with their feedback, and the impulses of noise.
 // docs/mathematics.md, "Noise". Controls u = u_r + gains_r (x - reference_r), r the decision; an impulse is
-// sum_i F_i(q, u) dw_i.
+// sum_i F_i(q, u) dw_i. Controls that change within a step are given at the stages of the method; u is their mean then.
 #pragma once
 
 #include <cmath>
@@ -21,6 +21,7 @@ struct Commands {
     const double* least = nullptr;      // (m) infinite where there is no limit
     const double* greatest = nullptr;   // (m)
     const double* before = nullptr;     // (P, m) the control before the first of each path, or null for the reference's
+    const double* within = nullptr;     // (N, s, m) at the stages of each step, or null where they are held over it
 };
 
 // Controls of step s of a path into row s of u (N, m). Beyond a limit a control is that limit.
@@ -58,6 +59,12 @@ inline void apply_policy(const Commands& commands, std::ptrdiff_t path, std::ptr
 inline void constant_force(const Mechanism& mechanism, const double* drift, const double* u, double* force) {
     for (int r = 0; r < mechanism.dof(); ++r) force[r] = drift ? drift[r] : 0.0;
     for (const Transmission& own : mechanism.actuation) force[own.coordinate] += own.ratio * u[own.control];
+}
+
+// The same at each of `stages` stages, whose controls are the rows of u, into the rows of force (stages, n).
+inline void stage_forces(const Mechanism& mechanism, const double* drift, const double* u, int stages, double* force) {
+    for (int i = 0; i < stages; ++i)
+        constant_force(mechanism, drift, u + i * mechanism.controls, force + i * mechanism.dof());
 }
 
 // The impulse part * sum_i F_i(q, u) dw_i.

@@ -7,6 +7,7 @@
 // Gauss and Radau IIA: a = abar = f. The midpoint rule: a = alpha, abar = 1 - alpha, f = 1/2.
 #pragma once
 
+#include <algorithm>
 #include <vector>
 
 namespace varpin {
@@ -23,6 +24,28 @@ struct Tableau {
     double reach = 0.0;             // the largest Rayleigh quotient of abar a in the metric of b
     double skew = 0.0;              // alpha - 1/2 of the midpoint rule: off the middle it is of first order
     bool stiffly_accurate = false;  // ends in its last stage, and damps what friction damps faster than the step
+
+    // The Lagrange polynomial of stage j, at a place in units of the step.
+    double lagrange(int j, double at) const {
+        double value = 1.0;
+        for (int k = 0; k < stages; ++k) {
+            if (k != j) value *= (at - c[k]) / (c[j] - c[k]);
+        }
+        return value;
+    }
 };
+
+// Rows (s, n) at the stages of the part of a step that begins at `begin` and is `share` long, both in units of the
+// step: of the polynomial through the rows `given` at the stages of the whole.
+inline void bring_to_part(const Tableau& tableau, int n, const double* given, double begin, double share, double* out) {
+    for (int i = 0; i < tableau.stages; ++i) {
+        const double at = begin + share * tableau.c[i];
+        std::fill(out + i * n, out + (i + 1) * n, 0.0);
+        for (int j = 0; j < tableau.stages; ++j) {
+            const double part = tableau.lagrange(j, at);
+            for (int c = 0; c < n; ++c) out[i * n + c] += part * given[j * n + c];
+        }
+    }
+}
 
 }  // namespace varpin

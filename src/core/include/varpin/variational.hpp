@@ -83,8 +83,9 @@ class VariationalStepper {
           step_equation(mechanism, this->tableau, solver),
           energy_guard(mechanism, solver, !step_equation.eliminated()),
           n(mechanism.dof()),
-          force(n),
+          force(step_equation.stages * n),
           trial(n),
+          given(step_equation.stages * n),
           guess(step_equation.stages * n),
           bend(2 * n),
           at(n) {}
@@ -99,7 +100,8 @@ class VariationalStepper {
     Collocation<Size, Stages> step_equation;
     EnergyGuard<Size> energy_guard;
     [[no_unique_address]] Size n;
-    std::vector<double> force;           // (n) constant over the step
+    std::vector<double> force;           // (n) constant over the step; (s, n) at its stages, or those of a part of it
+    int stride = 0;                      // from one row of `force` to the next
     Effort effort;                       // of the last step
     std::vector<std::uint8_t> halvings;  // of each part of the last step; none if it was taken whole
 
@@ -144,7 +146,20 @@ class VariationalStepper {
         energy_guard.kicked(at.data(), state.momentum.data(), state.v.data(), state.energies);
     }
 
-    // One whole step with the force in `force`, in as many substeps as the guards ask for.
+    // Take the force (n) of a step, constant over it, or (s, n) at its stages if it `varies`.
+    void take_force(const double* own, bool varies) {
+        stride = varies ? static_cast<int>(n) : 0;
+        std::copy(own, own + (varies ? step_equation.stages * n : 1 * n), force.begin());
+        if (varies) given = force;
+    }
+
+    // Where the force varies, bring it to the stages of the part of the step that begins at `begin` and is `share`
+    // long, both in units of the step: by the polynomial through the stages of the whole.
+    void force_in_part(double begin, double share) {
+        if (stride != 0) bring_to_part(tableau, n, given.data(), begin, share, force.data());
+    }
+
+    // One whole step with the force that was taken, in as many substeps as the guards ask for.
     //
     // The first attempt starts from the extrapolated past, the others from the current velocity. A failed attempt
     // halves the substep, unless only the guess may be to blame; after a success at an even place it is doubled again.
@@ -160,6 +175,7 @@ class VariationalStepper {
             } else {
                 guess_velocity(state);
             }
+            force_in_part(length_of(static_cast<double>(place), level), length_of(1.0, level));
             const Outcome outcome = attempt(length_of(h, level), state, false);
             if (outcome == Outcome::solved) {
                 if (level > 0) halvings.push_back(static_cast<std::uint8_t>(level));
@@ -185,9 +201,10 @@ class VariationalStepper {
         return Outcome::solved;
     }
 
-    // The part of a step of length h that was halved `level` times, begun as a part always is, from the current
-    // velocity. Leaves the jets of its root in step_equation.
-    Outcome part(double h, int level, PathState& state) {
+    // The part of a step of length h that was halved `level` times and begins at `begin` in units of the step; begun as
+    // a part always is, from the current velocity. Leaves the jets of its root in step_equation.
+    Outcome part(double h, int level, double begin, PathState& state) {
+        force_in_part(begin, length_of(1.0, level));
         guess_velocity(state);
         return attempt(length_of(h, level), state, true);
     }
@@ -201,7 +218,7 @@ class VariationalStepper {
     void roll(double h, const Commands& commands, const double* increments, const double* drift,
               std::vector<PathState>& states, const Nodes& nodes, Watch* watch = nullptr) {
         const std::int64_t steps = nodes.steps;
-        const int m = mechanism.controls, k = mechanism.diffusion.processes;
+        const int m = mechanism.controls, k = mechanism.diffusion.processes, stages = step_equation.stages;
         const bool noisy = increments != nullptr && k > 0;
         for (std::int64_t path = 0; path < nodes.paths; ++path) {
             PathState& state = states[path];
@@ -215,7 +232,13 @@ class VariationalStepper {
                 const double* dw = noisy ? increments + row * k : nullptr;
                 apply_policy(commands, path, s, n, state.q.data(), state.momentum.data(), u);
                 if (noisy) noise_kick(left, u + s * m, dw, state);
-                constant_force(mechanism, drift ? drift + row * n : nullptr, u + s * m, force.data());
+                stride = commands.within ? static_cast<int>(n) : 0;
+                if (commands.within) {
+                    stage_forces(mechanism, drift ? drift + row * n : nullptr, commands.within + s * stages * m, stages,
+                                 given.data());
+                } else {
+                    constant_force(mechanism, drift ? drift + row * n : nullptr, u + s * m, force.data());
+                }
                 const Outcome outcome = step(h, state);
                 record_effort(effort, nodes, row);
                 nodes.ended[path] = static_cast<std::int64_t>(outcome);
@@ -230,7 +253,9 @@ class VariationalStepper {
     }
 
     // Whether the Lagrangian does not know how often coordinate i went round.
-    bool unwinds(int i) const { return mechanism.tree.periodic[i] && !mechanism.forces.anchors(i); }
+    bool unwinds(int i) const {
+        return mechanism.tree.periodic[i] && !mechanism.forces.anchors(i) && !mechanism.couplings.has_outer();
+    }
 
     void unwind(int i, PathState& state) const {
         if (unwinds(i)) state.place[i].unwind();
@@ -238,6 +263,7 @@ class VariationalStepper {
 
   private:
     Trial trial;
+    std::vector<double> given;  // (s, n) force at the stages of the whole step, where it varies
     std::vector<double> guess;  // (s, n) what was extrapolated
     std::vector<double> bend;   // (2, n)
     std::vector<double> at;     // (n)
@@ -250,8 +276,8 @@ class VariationalStepper {
     // One substep from where the path stands and the guess in step_equation.V; moves the path only if it is accepted.
     Outcome attempt(double h, PathState& state, bool jets_wanted) {
         auto& equation = step_equation;
-        const Outcome solved =
-            equation.solve(h, {state.place.data(), state.p.data(), force.data()}, tolerance, jets_wanted, effort);
+        const Outcome solved = equation.solve(h, {state.place.data(), state.p.data(), force.data(), stride}, tolerance,
+                                              jets_wanted, effort);
         if (solved != Outcome::solved) return solved;
         const double margin = guards.active ? energy_guard.branch_margin(h, guards, equation) : infinity;
         if (!(margin > 0.0)) return Outcome::fold;
@@ -284,9 +310,10 @@ class VariationalStepper {
                 const JointForce<double>& element = equation.acting[i * n + c];
                 move += tableau.b[i] * velocity;
                 impulse += tableau.b[i] * equation.slope[i * n + c];
-                trial.work[c] += share * (force[c] + element.value) * velocity;
+                const double given_force = force[i * stride + c];
+                trial.work[c] += share * (given_force + element.value) * velocity;
                 trial.dissipated[c] += share * element.lost;
-                const double scale = equation.stage[i].Lq_scale[c] + std::abs(force[c]) + element.scale;
+                const double scale = equation.stage[i].Lq_scale[c] + std::abs(given_force) + element.scale;
                 // Beside what cancels, rounding of q moves the potential.
                 trial.magnitude[c] +=
                     share * scale * std::abs(velocity) + tableau.b[i] * std::abs(equation.stage[i].Lq[c]) * distance;
@@ -297,7 +324,7 @@ class VariationalStepper {
     }
 
     // Extrapolate the last whole step into the stage velocities. The polynomial through them and the velocity at its
-    // end goes on, moved by what a kick has since done to the velocity, and bent by what has changed in the force.
+    // end goes on, moved by what a kick has since done to the velocity, and bent by what has changed in a held force.
     // Where nothing kicks, by how much it misses goes on too: by the backward differences of as high an order as would
     // have served the last step best.
     void extrapolate(double h, const PathState& state) {
@@ -306,7 +333,7 @@ class VariationalStepper {
         double *change = bend.data(), *acceleration = change + n;
         bool changed = false;
         for (int c = 0; c < n; ++c) {
-            change[c] = force[c] - state.past_force[c];
+            change[c] = stride == 0 ? force[c] - state.past_force[c] : 0.0;
             changed = changed || change[c] != 0.0;
         }
         if (changed) {
@@ -333,7 +360,7 @@ class VariationalStepper {
         std::copy(step_equation.V.begin(), step_equation.V.end(), state.past.begin());
         if (state.known > 0) follow_misses(state);
         std::copy(state.v.begin(), state.v.end(), state.past_end.begin());
-        std::copy(force.begin(), force.end(), state.past_force.begin());
+        std::copy(force.begin(), force.begin() + n, state.past_force.begin());
         state.known = std::min(state.known + 1, PathState::most_misses + 1);
     }
 

@@ -256,6 +256,10 @@ def _load(spec: SceneSpec, held: Mapping[str, float]) -> Robot:
             lock={**own.lock, **held},
             mimic="free" if own.mimic == "free" else "tied",
             payload=own.payload,
+            base=own.base,
+            armature=own.armature,
+            inertia=own.inertia,
+            density=own.density,
         )
     except RobotNotFound as error:
         raise table.error("source", str(error)) from None

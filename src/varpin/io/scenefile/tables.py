@@ -9,7 +9,9 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Field, ValidationInfo, create_model, model_validator
+from scipy.spatial.transform import Rotation
 
 from varpin.control.problem import default_integrator
 from varpin.errors import InputError
@@ -116,6 +118,24 @@ class PayloadKeys(Keys):
             raise mistake("inertia", str(error).removeprefix("payload inertia ")) from None
 
 
+class BaseKeys(Keys):
+    """Where the base of a robot stands."""
+
+    xyz: Annotated[_THREE, numbers(3, "m")] = (0.0, 0.0, 0.0)
+    rpy: Annotated[_THREE, numbers(3, "rad")] = (0.0, 0.0, 0.0)
+
+    def transform(self) -> Any:
+        """As (4, 4)."""
+        transform = np.eye(4)
+        transform[:3, :3] = Rotation.from_euler("xyz", self.rpy).as_matrix()
+        transform[:3, 3] = self.xyz
+        return transform
+
+
+def _base_of(base: Any) -> Any:
+    return base.transform() if isinstance(base, BaseKeys) else base
+
+
 class RobotKeys(Keys):
     """[robot]."""
 
@@ -124,6 +144,13 @@ class RobotKeys(Keys):
     mimic: Annotated[str, word("tied", "free")] = "tied"
     package_dirs: Annotated[tuple[str, ...], _distinct(_checked(TEXT, _folder))] = ()
     payload: tuple[Annotated[Payload, _checked(PayloadKeys, PayloadKeys.payload)], ...] = ()
+    base: Annotated[
+        Any,
+        _checked(either('"planar", or { xyz, rpy }', text=Annotated[str, word("planar")], table=BaseKeys), _base_of),
+    ] = None
+    armature: Annotated[ByName | None, values("kg m^2 or kg", least=0.0)] = None
+    inertia: Annotated[Literal["file", "meshes"], word("file", "meshes")] = "file"
+    density: Annotated[float, number("kg/m^3", above=0.0)] = 1000.0
 
 
 class SpringKeys(Keys):

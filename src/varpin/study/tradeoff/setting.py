@@ -119,6 +119,7 @@ class Setting(Frozen):
             scene.diffusion,
             *([scene.elements, scene.armature] if scene.forces else []),
             *([scene.couplings] if scene.couplings else []),
+            *([tuple(map(repr, scene.custom.parts))] if scene.custom else []),
         )
         parts = surroundings, (self.q0, self.v0), self.controls, self.duration
         return " ".join(digest(part) for part in parts)

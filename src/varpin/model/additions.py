@@ -1,0 +1,162 @@
+"""What a robot is given beside its description: where its base stands or moves, rotors, inertias of its meshes."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.errors import InputError, RobotError, UnknownJoint
+from varpin.model.mimic import Tie, joint_index, rebuild
+from varpin.model.sources import Description, hang_shapes
+from varpin.model.urdf import build_model, build_shapes, read_urdf
+from varpin.support.checks import JointValues, as_floats, broadcast_array, finite, positive
+
+Floats = NDArray[np.float64]
+Base: TypeAlias = Literal["planar"] | ArrayLike | pin.SE3 | None
+
+# Share of its area by which a mesh may be open.
+_CLOSED = 1e-3
+PLANAR = ("base_x", "base_y", "base_turn")
+
+
+def on_base(description: Description, base: Base) -> Description:
+    """The robot on a base that stands elsewhere, (4, 4) or a pin.SE3, or moves in a plane.
+
+    Raises:
+        InputError: It is none of these, or the robot has a joint of the name of one of the base.
+    """
+    if base is None:
+        return description
+    if isinstance(base, str):
+        if base != "planar":
+            raise InputError(f"base must be 'planar', a transform (4, 4) or a pin.SE3, got {base!r}")
+        return _on_plane(description)
+    return _placed(description, _transform(base))
+
+
+def _transform(base: ArrayLike | pin.SE3) -> pin.SE3:
+    matrix = as_floats("base", base.homogeneous if isinstance(base, pin.SE3) else base)
+    if matrix.shape != (4, 4):
+        raise InputError(f"base must be 'planar', a transform (4, 4) or a pin.SE3, got shape {matrix.shape}")
+    turn = matrix[:3, :3]
+    rigid = np.isfinite(matrix).all() and np.abs(turn.T @ turn - np.eye(3)).max() < 1e-6 and np.linalg.det(turn) > 0.0
+    if not rigid or (matrix[3] != [0.0, 0.0, 0.0, 1.0]).any():
+        raise InputError("base must be a rotation and a translation, with 0 0 0 1 in its last row")
+    # Rounded figures of a rotation are made one.
+    u, _, v = np.linalg.svd(turn)
+    return pin.SE3(u @ v, matrix[:3, 3])
+
+
+def _placed(description: Description, place: pin.SE3) -> Description:
+    model = description.model.copy()
+    for joint in range(1, model.njoints):
+        if model.parents[joint] == 0:
+            model.jointPlacements[joint] = place * model.jointPlacements[joint]
+    for frame in list(model.frames)[1:]:
+        if frame.parentJoint == 0:
+            frame.placement = place * frame.placement
+    model.inertias[0] = place.act(model.inertias[0])
+    visuals = None if description.visuals is None else description.visuals.copy()
+    for shape in visuals.geometryObjects if visuals is not None else ():
+        if shape.parentJoint == 0:
+            shape.placement = place * shape.placement
+    return replace(description, model=model, visuals=visuals)
+
+
+def _on_plane(description: Description) -> Description:
+    old = description.model
+    if taken := sorted(set(PLANAR) & set(old.names)):
+        raise InputError(f"base='planar' adds joints of the names {', '.join(PLANAR)}, and the robot has {taken[0]!r}")
+    root = zip(PLANAR, (pin.JointModelPX(), pin.JointModelPY(), pin.JointModelRZ()), strict=True)
+    model = rebuild(old, range(1, old.njoints), lambda joint: old.joints[joint], tuple(root))
+    shift = len(PLANAR)
+    ties = tuple(Tie(tie.follower + shift, tie.leader + shift, tie.ratio, tie.offset) for tie in description.ties)
+    visuals = None if description.visuals is None else description.visuals.copy()
+    if visuals is not None:
+        for shape in visuals.geometryObjects:
+            shape.parentJoint += shift
+        hang_shapes(visuals, old, model)
+    return replace(description, model=model, ties=ties, visuals=visuals)
+
+
+def with_rotors(
+    model: pin.Model, armature: JointValues | None, coordinates: tuple[int, ...], others: Collection[str]
+) -> None:
+    """Put the armature of coordinates, a number, (n,) or by joint name, in the place of the model's own.
+
+    What is said of ``others``, joints that do not move any more, is passed over.
+
+    Raises:
+        UnknownJoint: A name that is no coordinate's.
+        InputError: A value is negative or not finite.
+    """
+    if armature is None:
+        return
+    names = tuple(model.names[joint] for joint in coordinates)
+    own = np.array([model.armature[model.joints[joint].idx_v] for joint in coordinates])
+    if isinstance(armature, Mapping):
+        for name, number in armature.items():
+            value = finite(f"armature[{name!r}]", number)
+            if name in names:
+                own[names.index(name)] = value
+            elif name not in others:
+                raise UnknownJoint(str(name), names, "armature")
+    else:
+        own = broadcast_array("armature", armature, len(names))
+    if (own < 0.0).any():
+        worst = int(np.argmin(own))
+        raise InputError(f"armature of joint {names[worst]!r} must be >= 0 [kg m^2 or kg], got {own[worst]:g}")
+    values = np.array(model.armature)
+    values[[model.joints[joint].idx_v for joint in coordinates]] = own
+    model.armature = values
+
+
+def _gaps(shape: pin.coal.CollisionGeometry) -> float:
+    """The sum of a mesh's directed areas as a share of its area: 0 of a closed one."""
+    if not isinstance(shape, pin.coal.BVHModelBase):
+        return 0.0
+    corners = np.asarray(shape.vertices(), dtype=float)[
+        [[triangle[k] for k in range(3)] for triangle in map(shape.tri_indices, range(shape.num_tris))]
+    ]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = float(np.linalg.norm(areas, axis=1).sum())
+    return float(np.linalg.norm(areas.sum(axis=0))) / total if total > 0.0 else 1.0
+
+
+def with_mesh_inertias(description: Description, density: float) -> Description:
+    """The robot with the inertias of their shapes, of an even density [kg/m^3], for links of a URDF that have none.
+
+    Raises:
+        InputError: It is read from no URDF, or the density is not positive.
+        RobotError: A mesh is missing, cannot be read, or bounds no volume; the message names link and file.
+    """
+    density = positive("density", density, "kg/m^3")
+    if description.urdf is None:
+        raise InputError(f"inertia='meshes' is for links of URDF files; {description.name!r} is read from none")
+    urdf = read_urdf(description.urdf, description.expanded)
+    full = build_model(urdf)
+    known = {inertial.link for inertial in description.inertials}
+    shapes = build_shapes(urdf, full, description.package_dirs, pin.coal.MeshLoader())
+    model, index = description.model.copy(), joint_index(description.model)
+    masses: dict[str, float] = {}
+    for shape in shapes.geometryObjects:
+        link = full.frames[shape.parentFrame].name
+        if link in known:
+            continue
+        volume = float(shape.geometry.computeVolume())
+        if not (np.isfinite(volume) and volume > 0.0) or _gaps(shape.geometry) > _CLOSED:
+            raise RobotError(
+                f"link {link!r}: {shape.meshPath or shape.name} bounds no volume ({volume:g} m^3): its triangles leave "
+                "gaps or face inwards; give the link an <inertial>"
+            )
+        center = np.asarray(shape.geometry.computeCOM(), dtype=float).reshape(3)
+        moments = np.asarray(shape.geometry.computeMomentofInertiaRelatedToCOM(), dtype=float)
+        body = pin.Inertia(density * volume, center, 0.5 * density * (moments + moments.T))
+        model.appendBodyToJoint(index.get(full.names[shape.parentJoint], 0), body, shape.placement)
+        masses[link] = masses.get(link, 0.0) + density * volume
+    told = ", ".join(f"{link!r} {mass:.3g} kg" for link, mass in masses.items())
+    remark = f"inertias of links without any are those of their shapes at {density:g} kg/m^3: {told}"
+    return replace(description, model=model, remarks=(*description.remarks, remark) if masses else description.remarks)

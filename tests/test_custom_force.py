@@ -1,0 +1,244 @@
+"""Forces that a user writes: against varpin's own, Pinocchio's aba, and differences."""
+
+import itertools
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+
+import varpin as vp
+
+ROBOT = vp.planar_chain(3)
+NAMES = ROBOT.joint_names
+Q0, V0 = np.array([0.3, -0.4, 0.5]), np.array([1.0, -0.5, 0.8])
+MEMBERS = [vp.Midpoint(), vp.Midpoint(0.3), vp.Gauss(2), vp.Gauss(3), vp.Radau(2), vp.RungeKutta4(), vp.ExplicitEuler()]
+D = np.array([[0.5, 0.1, 0.0], [0.1, 0.4, -0.1], [0.0, -0.1, 0.3]])
+
+
+def drag(q, v):
+    """Full in its matrices, and neither linear nor a gradient."""
+    return -D @ v * (1.0 + 0.3 * np.sin(q)) + np.array([0.5 * q[1] * q[2], -q[0], np.cos(q[0]) * v[1]])
+
+
+def slopes(q, v):
+    by_q = -np.diag(D @ v * 0.3 * np.cos(q))
+    by_q += np.array([[0.0, 0.5 * q[2], 0.5 * q[1]], [-1.0, 0.0, 0.0], [-np.sin(q[0]) * v[1], 0.0, 0.0]])
+    by_v = -(1.0 + 0.3 * np.sin(q))[:, None] * D
+    by_v[2, 1] += np.cos(q[0])
+    return by_q, by_v
+
+
+def scene(**options):
+    return vp.Scene(ROBOT, forces=vp.CustomForce(drag, slopes), **options)
+
+
+def simulate(own, **options):
+    given = {"dt": 0.01, "steps": 5, "controls": [1.0, 0.5, -0.2], "check": False}
+    return vp.simulate(own, Q0, V0, **(given | options))
+
+
+class TestSteps:
+    @pytest.mark.parametrize("integrator", MEMBERS, ids=str)
+    def test_dampers_written_as_a_function_are_dampers(self, integrator):
+        damping = np.array([0.3, 0.2, 0.1])
+        own = vp.Scene(ROBOT, forces=vp.CustomForce(lambda q, v: -damping * v))
+        one = simulate(own, integrator=integrator)
+        other = simulate(vp.Scene(ROBOT, damping=damping), integrator=integrator)
+        for name in ("q", "v", "p", "energy"):
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=0, atol=2e-12)
+        a, b = vp.linearize(own, one), vp.linearize(vp.Scene(ROBOT, damping=damping), other)
+        np.testing.assert_allclose(a.A, b.A, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(a.B, b.B, rtol=0, atol=1e-9)
+
+    @pytest.mark.parametrize(
+        ("integrator", "counts"), [(vp.Gauss(2), (50, 100)), (vp.RungeKutta4(), (50, 100))], ids=str
+    )
+    def test_the_order_is_whole(self, integrator, counts):
+        model = ROBOT.model
+        data = model.createData()
+
+        def rate(t, x):
+            return np.concatenate([x[3:], pin.aba(model, data, x[:3], x[3:], drag(x[:3], x[3:]))])
+
+        end = solve_ivp(rate, (0.0, 0.5), np.concatenate([Q0, V0]), "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+        errors = [
+            np.abs(simulate(scene(), dt=0.5 / n, steps=n, controls=None, integrator=integrator).q[-1] - end[:3]).max()
+            for n in counts
+        ]
+        assert np.log2(errors[0] / errors[1]) > 3.8, errors
+
+    def test_reference(self):
+        one = simulate(scene(), integrator=vp.Reference(1e-11), steps=2)
+        other = simulate(scene(), integrator=vp.Gauss(5), steps=2)
+        np.testing.assert_allclose(one.q, other.q, rtol=0, atol=1e-10)
+
+    def test_a_joint_that_goes_round_is_told_how_often(self):
+        seen = []
+        wheel = vp.planar_chain(1)
+
+        def wind(q, v):
+            seen.append(float(q[0]))
+            return -0.01 * q
+
+        own = vp.Scene(wheel, gravity=False, forces=vp.CustomForce(wind))
+        motion = vp.simulate(own, [0.0], [30.0], dt=0.01, steps=100, check=False)
+        assert motion.q[-1, 0] > 4.0 * np.pi
+        assert max(seen) == pytest.approx(motion.q[-1, 0], abs=0.5)
+
+    def test_with_others_and_in_parts(self):
+        """Beside friction and a spring between frames, in steps that a guard cuts."""
+        forces = [vp.CustomForce(drag, slopes), vp.CoulombFriction(0.1, width=1.0)]
+        own = vp.Scene(ROBOT, forces=forces)
+        cut = vp.Gauss(2, guard=vp.Guard(energy_balance=1e-8))
+        motion = simulate(own, integrator=cut, dt=0.02)
+        assert motion.statistics.split_steps == motion.steps
+        exact = simulate(own, integrator=vp.Reference(1e-11), dt=0.02)
+        np.testing.assert_allclose(motion.q, exact.q, rtol=0, atol=1e-6)
+
+
+class TestDerivatives:
+    @pytest.mark.parametrize("integrator", MEMBERS, ids=str)
+    def test_against_differences_of_steps(self, integrator):
+        own, n = scene(), 3
+        motion = simulate(own, integrator=integrator, steps=1)
+        lin = vp.linearize(own, motion)
+        second = motion.p[0] if integrator.variational else motion.v[0]
+        u = np.array([1.0, 0.5, -0.2])
+
+        def end(change):
+            q, other = Q0 + change[:n], second + change[n : 2 * n]
+            if integrator.variational:
+                other = np.linalg.solve(vp.lagrangian_jet(own, q, np.zeros(n)).Lvv, other)
+            step = vp.simulate(
+                own, q, other, dt=0.01, steps=1, controls=u + change[2 * n :], integrator=integrator, check=False
+            )
+            return np.concatenate([step.q[1], step.p[1] if integrator.variational else step.v[1]])
+
+        weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+        found = np.hstack([lin.A[0], lin.B[0]])
+        for c in range(3 * n):
+            e = 2e-3 * np.eye(3 * n)[c]
+            expected = sum(w * (end(k * e) - end(-k * e)) for k, w in weights.items()) / 2e-3
+            np.testing.assert_allclose(found[:, c], expected, rtol=0, atol=1e-8)
+
+    def test_of_parts(self):
+        own = scene()
+        cut = vp.Gauss(2, guard=vp.Guard(energy_balance=1e-8))
+        motion = simulate(own, integrator=cut, dt=0.02, steps=1)
+        assert motion.statistics.substeps[0] > 1
+        other = simulate(own, integrator=vp.Gauss(2, guard=None), dt=0.02 / 64, steps=64)
+        lin, fine = vp.linearize(own, motion), vp.linearize(own, other)
+        A = np.eye(6)
+        for k in range(64):
+            A = fine.A[k] @ A
+        np.testing.assert_allclose(lin.A[0], A, rtol=0, atol=1e-5)
+
+    @pytest.mark.parametrize("derivatives", ["complex", None])
+    def test_all_ways_agree(self, derivatives):
+        given, other = (vp.CustomForce(drag, how) for how in (slopes, derivatives))
+        for q, v in itertools.product(np.random.default_rng(0).normal(size=(3, 3)), repeat=2):
+            for one, two in zip(given.slopes(q, v), other.slopes(q, v), strict=True):
+                np.testing.assert_allclose(one, two, rtol=0, atol=1e-14 if derivatives else 1e-10)
+
+    def test_what_complex_steps_cannot_do_is_refused(self):
+        for f in (lambda q, v: -v * np.abs(v), lambda q, v: -np.array([float(x.real) for x in v])):
+            with pytest.raises(vp.InputError, match="complex steps do not give the derivatives"):
+                vp.Scene(ROBOT, forces=vp.CustomForce(f, "complex"))
+
+    def test_second_derivatives_are_refused(self):
+        own = scene()
+        with pytest.raises(vp.InputError, match="CustomForce"):
+            vp.second_order(own, simulate(own, integrator=vp.Gauss(2)), np.ones(6))
+
+
+class TestLedger:
+    @pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.Radau(3), vp.RungeKutta4()], ids=str)
+    def test_its_work_is_accounted_for(self, integrator):
+        off = [
+            np.abs(
+                simulate(
+                    scene(), controls=None, dt=0.5 / n, steps=n, integrator=integrator, check=True
+                ).statistics.energy_defect
+            ).max()
+            for n in (50, 100)
+        ]
+        # In the record of an explicit method forces are those at the middles of steps.
+        assert np.log2(off[0] / off[1]) > (3.5 if integrator.variational else 1.7), off
+        assert off[1] < 1e-3
+
+    def test_holding(self):
+        own = vp.Scene(ROBOT, forces=vp.CustomForce(lambda q, v: np.array([1.0, -2.0, 0.5]) + v))
+        np.testing.assert_allclose(
+            own.holding_torque(Q0), vp.Scene(ROBOT).holding_torque(Q0) - [1.0, -2.0, 0.5], atol=1e-12
+        )
+        held = vp.simulate(own, Q0, np.zeros(3), dt=0.01, steps=3, controls=own.holding_controls(Q0), check=False)
+        np.testing.assert_allclose(held.q, np.tile(Q0, (4, 1)), atol=1e-12)
+
+    def test_stiff_damping_of_radau(self):
+        """A damper far faster than the step is no error of the balance, as of varpin's own."""
+        own = vp.Scene(ROBOT, forces=vp.CustomForce(lambda q, v: -2000.0 * v, "complex"))
+        motion = simulate(own, integrator=vp.Radau(2), controls=None)
+        other = simulate(vp.Scene(ROBOT, damping=2000.0), integrator=vp.Radau(2), controls=None)
+        assert motion.statistics.split_steps == other.statistics.split_steps
+        np.testing.assert_allclose(motion.q, other.q, rtol=0, atol=1e-9)
+
+
+class TestRefused:
+    @pytest.mark.parametrize(
+        ("f", "words"),
+        [
+            (lambda q, v: np.zeros(2), "must return real numbers of shape (3,)"),
+            (lambda q, v: None, "must return real numbers of shape (3,)"),
+            (lambda q, v: 1j * v, "must return real numbers"),
+            (lambda q, v: v / 0.0 if q[0] > 0.31 else v, "is not finite at q ="),
+            (lambda q, v: 1 / 0, "raised ZeroDivisionError"),
+        ],
+    )
+    def test_what_is_no_force(self, f, words):
+        own = vp.Scene(ROBOT, forces=vp.CustomForce(f))
+        with pytest.raises(vp.ForceError) as info, np.errstate(all="ignore"):
+            simulate(own)
+        assert words in str(info.value)
+        assert "CustomForce <lambda>" in str(info.value)
+        assert info.value.trajectory.steps == info.value.step
+
+    def test_steps_before_are_kept(self):
+        def breaks(q, v):
+            if q[0] > 0.33:
+                raise RuntimeError("too far")
+            return -v
+
+        with pytest.raises(vp.ForceError, match="too far") as info:
+            simulate(vp.Scene(ROBOT, forces=vp.CustomForce(breaks)))
+        assert info.value.trajectory.steps == info.value.step > 0
+
+    def test_wrong_derivatives(self):
+        for wrong in (lambda q, v: np.eye(3), lambda q, v: (np.eye(3), np.eye(2))):
+            with pytest.raises(vp.ForceError, match="derivatives"):
+                simulate(vp.Scene(ROBOT, forces=vp.CustomForce(drag, wrong)))
+
+    def test_wrong_arguments(self):
+        with pytest.raises(vp.InputError, match="a function of"):
+            vp.CustomForce(np.zeros(3))
+        with pytest.raises(vp.InputError, match="derivatives must be"):
+            vp.CustomForce(drag, "exact")
+
+
+def test_shown():
+    assert repr(vp.CustomForce(drag, "complex")) == "CustomForce(drag, derivatives by complex steps)"
+    assert "CustomForce" in repr(scene())
+
+
+def test_ensembles_take_it():
+    own = scene(noise=vp.AdditiveNoise(0.1))
+    paths = vp.simulate_ensemble(own, Q0, V0, dt=0.01, steps=3, paths=4, rng=0, workers=2)
+    again = vp.simulate_ensemble(own, Q0, V0, dt=0.01, steps=3, paths=4, rng=0, workers=1)
+    np.testing.assert_array_equal(paths.q, again.q)
+
+
+def test_it_is_planned_with():
+    own = scene()
+    cost = vp.ControlCost(1e-2) + vp.TrackingCost(Q0, 10.0)
+    problem = vp.OptimalControlProblem(own, cost, Q0, V0, dt=0.02, steps=10)
+    assert vp.solve(problem, check=False).status is vp.Status.CONVERGED

@@ -1,0 +1,277 @@
+"""Bases that stand elsewhere or move, rotors, and inertias of meshes: what load_robot adds to a description."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import varpin as vp
+from varpin.cli import main
+from varpin.model.robot import geometry
+
+PLACE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.5, 1.1), np.array([0.4, -2.0, 0.7]))
+RNG = np.random.default_rng(5)
+
+
+def mass_and_gravity(robot, q):
+    """M and the gravity torques by Pinocchio, of the robot's own model."""
+    model = robot.free_model
+    data = model.createData()
+    M = pin.crba(model, data, q)
+    return np.triu(M) + np.triu(M, 1).T, pin.computeGeneralizedGravity(model, data, q)
+
+
+class TestPlaced:
+    @pytest.mark.parametrize(
+        "base", [PLACE, PLACE.homogeneous, PLACE.homogeneous.tolist()], ids=["SE3", "array", "list"]
+    )
+    def test_frames_and_gravity_turn_with_it(self, base):
+        there, here = vp.load_robot("ur5", base=base), vp.load_robot("ur5")
+        q = RNG.normal(size=6)
+        np.testing.assert_allclose(there.frame_positions(q), PLACE.act(here.frame_positions(q)), rtol=0, atol=1e-12)
+        # What the arm feels is gravity turned the other way.
+        turned = vp.Scene(here, gravity=PLACE.rotation.T @ [0.0, 0.0, -9.81])
+        own, other = (vp.lagrangian_jet(s, q, np.ones(6)) for s in (vp.Scene(there), turned))
+        for name in ("Lq", "Lvv", "Lqq"):
+            np.testing.assert_allclose(getattr(own, name), getattr(other, name), rtol=0, atol=1e-10)
+
+    def test_shapes_come_along(self):
+        there, here = geometry(vp.load_robot("ur5", base=PLACE)), geometry(vp.load_robot("ur5"))
+        for a, b in zip(there.geometryObjects, here.geometryObjects, strict=True):
+            expected = PLACE * b.placement if b.parentJoint == 0 else b.placement
+            np.testing.assert_allclose(a.placement.homogeneous, expected.homogeneous, atol=1e-12)
+
+    def test_of_a_model_in_memory(self):
+        model = vp.load_robot("ur5").model
+        q = RNG.normal(size=6)
+        there = vp.load_robot(model, base=PLACE)
+        np.testing.assert_allclose(
+            there.frame_positions(q), vp.load_robot("ur5", base=PLACE).frame_positions(q), atol=1e-12
+        )
+
+    @pytest.mark.parametrize(
+        ("base", "words"),
+        [
+            ("round", "base must be 'planar', a transform"),
+            (np.eye(3), "got shape (3, 3)"),
+            (2.0 * np.eye(4), "a rotation and a translation"),
+            (np.diag([1.0, 1.0, -1.0, 1.0]), "a rotation and a translation"),
+        ],
+        ids=str,
+    )
+    def test_what_is_refused(self, base, words):
+        with pytest.raises(vp.InputError) as info:
+            vp.load_robot("ur5", base=base)
+        assert words in str(info.value)
+
+
+class TestPlanar:
+    def test_it_is_the_arm_on_two_sliders_and_a_turn(self):
+        robot = vp.load_robot("ur5", base="planar")
+        assert robot.joint_names[:3] == ("base_x", "base_y", "base_turn")
+        assert robot.dof == 9
+        q = RNG.normal(size=9)
+        moved = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, q[2]), np.array([q[0], q[1], 0.0]))
+        arm = vp.load_robot("ur5", base=moved)
+        np.testing.assert_allclose(robot.frame_positions(q), arm.frame_positions(q[3:]), rtol=0, atol=1e-12)
+        M, gravity = mass_and_gravity(robot, q)
+        jet = vp.lagrangian_jet(vp.Scene(robot), q, np.zeros(9))
+        np.testing.assert_allclose(jet.Lvv, M, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(-jet.Lq, gravity, rtol=0, atol=1e-10)
+        own, _ = mass_and_gravity(arm, q[3:])
+        np.testing.assert_allclose(M[3:, 3:], own, rtol=0, atol=1e-10)
+
+    def test_the_base_has_its_link_s_mass(self):
+        robot = vp.load_robot("ur5", base="planar")
+        fixed = pin.buildModelFromUrdf(str(robot.urdf))
+        assert fixed.inertias[0].mass > 0.0
+        q = RNG.normal(size=9)
+        M, _ = mass_and_gravity(robot, q)
+        total = sum(inertia.mass for inertia in fixed.inertias)
+        np.testing.assert_allclose(np.diag(M)[:2], total, rtol=1e-12)
+
+    def test_with_mimic_joints_payload_and_lock(self):
+        load = vp.Payload("panda_hand", 1.5)
+        options = {"lock": {"panda_joint7": 0.8}, "payload": load}
+        robot, arm = vp.load_robot("panda", base="planar", **options), vp.load_robot("panda", **options)
+        assert robot.joint_names == ("base_x", "base_y", "base_turn", *arm.joint_names)
+        assert len(robot.ties) == len(arm.ties)
+        q = np.concatenate([np.zeros(3), RNG.normal(size=arm.dof) * 0.01])
+        own, other = (vp.lagrangian_jet(vp.Scene(r), x, np.zeros(r.dof)) for r, x in ((robot, q), (arm, q[3:])))
+        np.testing.assert_allclose(own.Lvv[3:, 3:], other.Lvv, rtol=0, atol=1e-10)
+        held = vp.load_robot("panda", base="planar", lock={"base_x": 0.5, "base_y": 0.0, "base_turn": 0.2})
+        assert held.dof == vp.load_robot("panda").dof
+
+    def test_shapes_of_the_base_move(self):
+        robot = vp.load_robot("ur5", base="planar")
+        joints = {shape.parentJoint for shape in geometry(robot).geometryObjects}
+        assert 0 not in joints
+        assert robot.free_model.getJointId("base_turn") in joints
+
+    def test_a_motion_keeps_its_momentum(self):
+        """Nothing holds the base: linear and angular momentum stay, but for what gravity does to neither."""
+        robot = vp.load_robot("ur5", base="planar")
+        motion = vp.simulate(
+            vp.Scene(robot), np.zeros(9), {"elbow_joint": 1.0, "base_x": 0.3}, dt=1e-3, steps=100, check=False
+        )
+        np.testing.assert_allclose(motion.p[-1, :2], motion.p[0, :2], rtol=0, atol=1e-11)
+
+    def test_a_name_that_is_taken(self):
+        with pytest.raises(vp.InputError, match="base_turn"):
+            vp.load_robot(vp.load_robot("ur5", base="planar").model, base="planar")
+
+
+class TestArmature:
+    def test_it_adds_to_the_diagonal(self):
+        plain = vp.load_robot("ur5")
+        q = RNG.normal(size=6)
+        M = vp.lagrangian_jet(vp.Scene(plain), q, np.zeros(6)).Lvv
+        for armature, added in (
+            (0.2, np.full(6, 0.2)),
+            ({"elbow_joint": 0.3}, 0.3 * np.eye(6)[2]),
+            (np.arange(6.0), np.arange(6.0)),
+        ):
+            robot = vp.load_robot("ur5", armature=armature)
+            own = vp.lagrangian_jet(vp.Scene(robot), q, np.zeros(6)).Lvv
+            np.testing.assert_allclose(own, M + np.diag(added), rtol=0, atol=1e-12)
+            np.testing.assert_allclose(mass_and_gravity(robot, q)[0], own, rtol=0, atol=1e-10)
+
+    def test_joints_that_are_not_named_keep_theirs(self):
+        plain = vp.load_robot("talos_arm")
+        first = plain.joint_names[0]
+        own = vp.load_robot("talos_arm", armature={first: 7.0})
+        assert plain.tree.armature[1:].any()
+        np.testing.assert_array_equal(own.tree.armature, [7.0, *plain.tree.armature[1:]])
+
+    def test_what_is_refused(self):
+        with pytest.raises(vp.UnknownJoint, match="elbow_joint"):
+            vp.load_robot("ur5", armature={"elbow": 1.0})
+        with pytest.raises(vp.InputError, match="'elbow_joint' must be >= 0"):
+            vp.load_robot("ur5", armature={"elbow_joint": -1.0})
+        with pytest.raises(vp.InputError, match="finite"):
+            vp.load_robot("ur5", armature=np.nan)
+
+
+LINKS = """
+<robot name="shapes">
+  <link name="base"/>
+  <joint name="first" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/></joint>
+  <link name="upper">{inertial}
+    <visual><origin xyz="0.5 0 0" rpy="0 0 0.3"/><geometry><box size="1 0.1 0.2"/></geometry></visual>
+    <visual><origin xyz="1 0 0"/><geometry><sphere radius="0.2"/></geometry></visual>
+  </link>
+  <joint name="second" type="continuous"><origin xyz="1 0 0"/><parent link="upper"/><child link="lower"/></joint>
+  <link name="lower">
+    <visual><origin xyz="0 0 0.1"/><geometry><mesh filename="{mesh}" scale="1 2 1"/></geometry></visual>
+  </link>
+</robot>
+"""
+# A box of 0.1 x 0.2 x 0.3 m in its corner.
+FACES = [
+    *((0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)),
+    *((2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)),
+]
+BOX = np.array([[x, y, z] for x in (0.0, 0.1) for y in (0.0, 0.2) for z in (0.0, 0.3)])
+
+
+def written(folder, faces=FACES, inertial=""):
+    lines = [f"v {x} {y} {z}" for x, y, z in BOX] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
+    (folder / "box.obj").write_text("\n".join(lines) + "\n")
+    path = folder / "shapes.urdf"
+    path.write_text(LINKS.format(inertial=inertial, mesh="box.obj"))
+    return path
+
+
+def box(size, center, turn=0.0):
+    a, b, c = size
+    mass = 500.0 * a * b * c
+    inertia = pin.Inertia(mass, np.zeros(3), mass / 12.0 * np.diag([b * b + c * c, a * a + c * c, a * a + b * b]))
+    return pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, turn), np.array(center)).act(inertia)
+
+
+class TestMeshInertias:
+    def test_boxes_and_balls(self, tmp_path):
+        robot = vp.load_robot(written(tmp_path), inertia="meshes", density=500.0)
+        ball = 500.0 * 4.0 / 3.0 * np.pi * 0.2**3
+        upper = box((1.0, 0.1, 0.2), (0.5, 0.0, 0.0), 0.3) + pin.Inertia(
+            ball, np.array([1.0, 0.0, 0.0]), 0.4 * ball * 0.04 * np.eye(3)
+        )
+        lower = box((0.1, 0.4, 0.3), (0.05, 0.2, 0.25))
+        for joint, expected in ((1, upper), (2, lower)):
+            own = robot.free_model.inertias[joint]
+            # Meshes are read in single precision.
+            np.testing.assert_allclose(own.matrix(), expected.matrix(), rtol=0, atol=2e-6)
+
+    def test_links_with_an_inertial_keep_it(self, tmp_path):
+        inertial = '<inertial><mass value="3"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+        robot = vp.load_robot(written(tmp_path, inertial=inertial), inertia="meshes")
+        assert robot.free_model.inertias[1].mass == 3.0
+        assert robot.free_model.inertias[2].mass == pytest.approx(1000.0 * 0.1 * 0.4 * 0.3)
+
+    def test_without_it_nothing_moves(self, tmp_path):
+        with pytest.raises(vp.SingularMassMatrix):
+            vp.load_robot(written(tmp_path))
+
+    def test_open_and_missing_meshes_are_named(self, tmp_path):
+        with pytest.raises(vp.RobotError, match=r"link 'lower'.*box\.obj bounds no volume"):
+            vp.load_robot(written(tmp_path, faces=[(c, b, a) for a, b, c in FACES]), inertia="meshes")
+        path = written(tmp_path)
+        (tmp_path / "box.obj").unlink()
+        with pytest.raises(vp.RobotError, match=r"link 'lower': box\.obj.*package_dirs"):
+            vp.load_robot(path, inertia="meshes")
+
+    def test_what_is_refused(self, tmp_path):
+        with pytest.raises(vp.InputError, match="inertia must be 'file' or 'meshes'"):
+            vp.load_robot("ur5", inertia="mesh")
+        with pytest.raises(vp.InputError, match="read from none"):
+            vp.load_robot(vp.load_robot("ur5").model, inertia="meshes")
+        with pytest.raises(vp.InputError, match="density"):
+            vp.load_robot(written(tmp_path), inertia="meshes", density=0.0)
+
+    def test_a_mesh_with_a_gap(self, tmp_path):
+        with pytest.raises(vp.RobotError, match="leave gaps"):
+            vp.load_robot(written(tmp_path, faces=FACES[2:]), inertia="meshes")
+
+
+class TestElsewhere:
+    def test_scene_files(self, tmp_path):
+        text = """
+            [robot]
+            source = "ur5"
+            base = BASE
+            armature = { elbow_joint = 0.4 }
+            [horizon]
+            dt = 0.001
+            steps = 10
+        """
+        path = tmp_path / "scene.toml"
+        path.write_text(text.replace("BASE", '"planar"'))
+        assert vp.load_scene(path).robot.joint_names[:3] == ("base_x", "base_y", "base_turn")
+        path.write_text(text.replace("BASE", "{ xyz = [0.0, 0.0, 2.0], rpy = [0.0, 0.5, 0.3] }"))
+        robot = vp.load_scene(path).robot
+        place = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.5, 0.3), np.array([0.0, 0.0, 2.0]))
+        other = vp.load_robot("ur5", base=place)
+        q = np.zeros(robot.dof)
+        np.testing.assert_allclose(robot.frame_positions(q), other.frame_positions(np.zeros(6)), atol=1e-12)
+        assert robot.tree.armature[robot.joint_names.index("elbow_joint")] == 0.4
+        path.write_text(text.replace("BASE", '"round"'))
+        with pytest.raises(vp.SceneFileError, match=r"robot\.base"):
+            vp.load_scene(path)
+
+    def test_on_the_command_line(self, tmp_path):
+        out = tmp_path / "fall.npz"
+        words = [
+            "simulate",
+            "ur5",
+            "--base",
+            "planar",
+            "--armature",
+            "elbow_joint=0.4",
+            "--steps",
+            "3",
+            "--save",
+            str(out),
+        ]
+        assert main(words) == 0
+        motion = vp.Trajectory.load(out)
+        assert motion.joint_names[:3] == ("base_x", "base_y", "base_turn")
+        assert motion.scene_values["armature"][5] == 0.4
