@@ -118,14 +118,17 @@ class Collocation {
     // as three more would do. Gives up when a correction exceeds half of the one before (natural monotonicity,
     // Deuflhard 2004), unless the residual is down at its rounding floor. A last correction is not looked at again if
     // that contraction, or after a first one what the equation bends, takes the residual below a tenth of the
-    // tolerance: slopes are then corrected to first order. Where `jets_wanted`, it ends with the jets of the root.
+    // tolerance: slopes are then corrected to first order. A guess within the tolerance is corrected too: what is
+    // extrapolated misses from step to step alike, and energy would drift. Where `jets_wanted`, it ends with the jets
+    // of the root.
     Outcome solve(double h, const Start& start, double tolerance, bool jets_wanted, Effort& effort) {
         double before = infinity, worst = infinity;
         bool fresh = true;
         for (int iteration = 0; iteration < most_corrections + 2; ++iteration) {
             sweep(h, start, fresh, effort);
             worst = residuals(h, start);
-            if (worst <= tolerance) {
+            const bool first = iteration == 0 && !jets_wanted && worst > 0.0;
+            if (worst <= tolerance && !first) {
                 if (fresh || !jets_wanted) break;
                 fresh = true;
                 continue;
@@ -145,9 +148,9 @@ class Collocation {
             ++effort.newton_iterations;
             if (fresh && !jets_wanted) {
                 const double left = left_by_bending(h, worst);
-                if (sure * left <= tolerance) {
+                if (worst <= tolerance || sure * left <= tolerance) {
                     correct_slopes(h);
-                    worst = left;
+                    worst = std::min(worst, left);
                     break;
                 }
             }

@@ -17,7 +17,8 @@ namespace varpin {
 
 // Where a path stands.
 struct PathState {
-    static constexpr int most_misses = 4;
+    // More would add up to more of their rounding.
+    static constexpr int most_misses = 3;
 
     PathState(const Mechanism& mechanism, int stages)
         : place(mechanism.dof()),
