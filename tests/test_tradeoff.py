@@ -277,21 +277,6 @@ def test_interruption_of_the_reference_loses_nothing(tmp_path, monkeypatch):
     assert vp.WorkPrecision.load(path).runs == first.runs
 
 
-def test_interruption_keeps_saved_runs_that_come_later(tmp_path):
-    """Of a measurement that begins with other integrators than the saved one."""
-    path = tmp_path / "a.npz"
-    options = {"duration": 1.0, "repeats": 1, "dts": [0.1], "save": path}
-    first = vp.work_precision(spring(), [0.7], [0.3], integrators=[vp.Midpoint()], **options)
-
-    def interrupt(done, runs):
-        raise KeyboardInterrupt
-
-    both = [vp.RungeKutta4(), vp.Midpoint()]
-    part = vp.work_precision(spring(), [0.7], [0.3], integrators=both, progress=interrupt, **options)
-    assert (len(part.runs), part.missing) == (2, 0)
-    assert part.runs[1] == first.runs[0] == vp.WorkPrecision.load(path).runs[1]
-
-
 def test_saved_record_takes_other_steps(tmp_path, monkeypatch):
     """What is there stays as it is; what is new is what it would have been, at the times that both share."""
     measured, path = count_runs(monkeypatch), tmp_path / "a.npz"
@@ -450,6 +435,25 @@ def test_a_record_knows_the_options_that_matter(problem):
     assert mark(controls=rows) != mark(controls=np.zeros((5000, 1)))
     with pytest.raises(vp.InputError, match="function cannot be told from others in a saved record"):
         mark(controls=lambda t: t)
+
+
+@pytest.mark.parametrize("kind", ["motion", "plan"])
+def test_interruption_keeps_saved_runs_that_come_later(tmp_path, problem, kind):
+    """Of a measurement that begins with other integrators than the saved one."""
+
+    def measure(members, progress=None):
+        options = {"integrators": members, "repeats": 1, "save": tmp_path / "a.npz", "progress": progress}
+        if kind == "plan":
+            return vp.optimal_control_tradeoff(problem, dts=[0.05], max_iterations=1, **options)
+        return vp.work_precision(spring(), [0.7], [0.3], duration=1.0, dts=[0.1], **options)
+
+    def interrupt(done, runs):
+        raise KeyboardInterrupt
+
+    first = measure([vp.Midpoint()])
+    part = measure([vp.RungeKutta4(), vp.Midpoint()], interrupt)
+    assert (len(part.runs), part.missing) == (2, 0)
+    assert part.runs[1] == first.runs[0] == type(part).load(tmp_path / "a.npz").runs[1]
 
 
 def test_plans_that_fail_do_not_stop_the_others(problem):
