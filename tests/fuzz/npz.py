@@ -37,8 +37,8 @@ def corpus() -> Corpus:
     def row(kind: type) -> object:
         return kind(**{item.name: values[str(item.type)] for item in fields(kind)})
 
-    precision = WorkPrecision((row(WorkPrecisionRun),) * 3, "ur5", 1.0, "Reference", 1e-12, 1e-12, 64, 1, "abc")
-    tradeoff = OptimalControlTradeoff((row(OptimalControlRun),) * 2, "ur5", 1.0, 0, "abc")
+    precision = WorkPrecision((row(WorkPrecisionRun),) * 3, "ur5", 1.0, "Reference", 1e-12, 1e-12, 64, missing=1)
+    tradeoff = OptimalControlTradeoff((row(OptimalControlRun),) * 2, "ur5", 1.0, fingerprint="abc")
     cell = Cell("main", "0", "midpoint", 0.01, 1.0, 0.0, 5, "CONVERGED", 0.1, 1.0, 1.0, 1e-6, t=np.zeros(4))
     with tempfile.TemporaryDirectory() as folder:
         task = Task(MAIN, None, "midpoint", 0.01)
