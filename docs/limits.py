@@ -22,7 +22,7 @@ import numpy as np
 import varpin as vp
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.study.extremes import PLANS, TRIALS, Cell, Kind, Record, Trial
-from varpin.study.extremes.battery import INTEGRATORS, families
+from varpin.study.extremes.battery import INTEGRATORS
 from varpin.study.extremes.exact import Exact, exact_motion
 from varpin.study.extremes.trial import LEVELS
 
@@ -84,7 +84,7 @@ def measured(cells: Sequence[Cell]) -> Iterator[str]:
         "| worst unsaid error | of |"
     )
     yield "|---" * 10 + "|"
-    for family in families(cells):
+    for family in dict.fromkeys(cell.family for cell in cells):
         members = [cell for cell in cells if cell.family == family]
         counts = [*(sum(cell.kind is kind for cell in members) for kind in Kind), sum(c.needless for c in members)]
         quiet = [cell for cell in members if cell.kind is Kind.ACCURATE and not math.isnan(cell.error)]

@@ -82,7 +82,9 @@ def objects(robot):
     advice = vp.Advice(choice, True, (other,), np.inf, 1e-5, None, 0.1, "Take <Gauss>.\nIt is enough.")
     runs = [
         vp.WorkPrecisionRun(
-            f"{NAMES[0]} {k}", "", 2, 0.01 * k, 10, 1.0 / k, 0.0, 0.1 * k, 0.1, np.nan, 0.1, 1, 1, 1, 0, 4, ""
+            integrator=f"{NAMES[0]} {k}", options="", order=2, dt=0.01 * k, steps=10, seconds=1.0 / k, spread=0.0,
+            error=0.1 * k, end_error=0.1, energy_error=np.nan, tip_error=0.1, newton_iterations=1, jets=1, sweeps=1,
+            split_steps=0, samples=4, failure="",
         )
         for k in (1, 2)
     ]  # fmt: skip

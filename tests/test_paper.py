@@ -76,6 +76,11 @@ def cells():
     return {task.name: made_up(task) for task in tasks(quick=False)}
 
 
+@pytest.fixture(scope="module")
+def figures(motions):
+    return draw({task.name: made_up(task) for task in tasks(quick=True)}, motions)
+
+
 def assert_same(a, b):
     for item in dataclasses.fields(Cell):
         np.testing.assert_array_equal(getattr(a, item.name), getattr(b, item.name), err_msg=item.name)
@@ -259,8 +264,8 @@ def test_figure_1_in_the_papers_own_start(motions):
     errors = {}
     for method in METHODS:
         motion = motions[method, COARSEST]
-        assert (motion.steps, motion.split_steps) == (75, 0)
-        errors[method] = np.abs(motion.theta - exact.q[:, 0]).max()
+        assert (motion.steps, motion.statistics.split_steps) == (75, 0)
+        errors[method] = np.abs(motion.q[:, 0] - exact.q[:, 0]).max()
     assert errors["variational"] == pytest.approx(2.2e-7, rel=0.02)
     assert errors["Euler"] == pytest.approx(2.0e-4, rel=0.02)
     assert "2.2e-07 rad" in of(assess({}, motions), "figure 1").measured
@@ -385,9 +390,8 @@ def test_series_run_from_fine_to_coarse(cells):
     assert {(cell.setting, cell.case, cell.method) for cell in own} == {("main", "0", "Euler")}
 
 
-def test_report_has_every_figure_and_every_cell(tmp_path, cells, motions):
+def test_report_has_every_figure_and_every_cell(tmp_path, cells, motions, figures):
     own = {task.name: cells[task.name] for task in tasks(quick=True)}
-    figures = draw(own, motions)
     assert list(figures) == FIGURES
     claim = Claim("nobody", "1 < 2 & <b>x</b>", "<script>alert(1)</script>", "holds in part")
     page = write(tmp_path, own, [claim, *assess(own, motions)], figures, quick=True)
@@ -419,8 +423,8 @@ def test_report_has_every_figure_and_every_cell(tmp_path, cells, motions):
     assert list(claims[0].values()) == [claim.source, claim.sentence, claim.measured, claim.verdict]
 
 
-def test_legends_cover_no_curve(cells, motions):
-    for name, (figure, _) in draw(cells, motions).items():
+def test_legends_cover_no_curve(figures):
+    for name, (figure, _) in figures.items():
         figure.draw_without_rendering()
         for axes in figure.axes:
             outside = [legend.get_window_extent() for legend in figure.legends]

@@ -207,8 +207,9 @@ class Broken(vp.Midpoint):
 def test_members_that_fail_do_not_stop_the_others():
     """Explicit Euler on a stiff spring blows up until it is no longer finite; another member raises."""
     scene = vp.Scene(vp.planar_chain(2), stiffness=1e5)
-    members = [vp.ExplicitEuler(), Broken(), vp.Midpoint()]
-    record = vp.work_precision(scene, [0.1, 0.0], [0.0, 0.0], duration=1.0, dts=[1e-3], integrators=members, repeats=1)
+    options = {"dts": [1e-3], "integrators": [vp.ExplicitEuler(), Broken(), vp.Midpoint()], "repeats": 1}
+    reference = vp.Reference(rtol=1e-6)
+    record = vp.work_precision(scene, [0.1, 0.0], [0.0, 0.0], duration=1.0, reference=reference, **options)
     blown, broken, sound = record.runs
     assert "the state is no longer finite" in blown.failure
     assert broken.failure == "ZeroDivisionError: on purpose"
@@ -221,9 +222,9 @@ def test_members_that_fail_do_not_stop_the_others():
 def count_runs(monkeypatch):
     measured, original = [], precision._measure
 
-    def counting(cell):
-        measured.append((str(cell.member), cell.steps))
-        return original(cell)
+    def counting(setting, exact, repeats, job):
+        measured.append((str(job[0]), job[1]))
+        return original(setting, exact, repeats, job)
 
     monkeypatch.setattr(precision, "_measure", counting)
     return measured
@@ -274,21 +275,6 @@ def test_interruption_of_the_reference_loses_nothing(tmp_path, monkeypatch):
     assert (set(part.runs), part.missing) == (set(first.runs), 1)
     assert part.reference_error == first.reference_error
     assert vp.WorkPrecision.load(path).runs == first.runs
-
-
-def test_interruption_keeps_saved_runs_that_come_later(tmp_path):
-    """Of a measurement that begins with other integrators than the saved one."""
-    path = tmp_path / "a.npz"
-    options = {"duration": 1.0, "repeats": 1, "dts": [0.1], "save": path}
-    first = vp.work_precision(spring(), [0.7], [0.3], integrators=[vp.Midpoint()], **options)
-
-    def interrupt(done, runs):
-        raise KeyboardInterrupt
-
-    both = [vp.RungeKutta4(), vp.Midpoint()]
-    part = vp.work_precision(spring(), [0.7], [0.3], integrators=both, progress=interrupt, **options)
-    assert (len(part.runs), part.missing) == (2, 0)
-    assert part.runs[1] == first.runs[0] == vp.WorkPrecision.load(path).runs[1]
 
 
 def test_saved_record_takes_other_steps(tmp_path, monkeypatch):
@@ -414,33 +400,22 @@ _ANOTHER_PROCESS = """
 import sys
 import numpy as np
 import varpin as vp
-from varpin.study.tradeoff import optimal_control
 
 cost = vp.TrackingCost([1.0]) + vp.ControlCost(1e-2)
-problem = vp.OptimalControlProblem(
-    vp.Scene(vp.planar_chain(1)), cost, [0.0], [0.0], dt=0.05, steps=20, integrator=vp.Midpoint(), sampling="midpoint"
-)
-if len(sys.argv) > 2:
-    def fail(*_):
-        raise SystemExit("it is there already")
-    optimal_control._measured = fail
-room = [bytearray(1000 * k) for k in range(len(sys.argv))]  # functions have other addresses
-record = vp.optimal_control_tradeoff(
+problem = vp.OptimalControlProblem(vp.Scene(vp.planar_chain(1)), cost, [0.0], [0.0], dt=0.05, steps=20)
+vp.optimal_control_tradeoff(
     problem, [vp.Midpoint()], [0.05], save=sys.argv[1], callback=lambda _: None, controls=np.zeros(1), armijo=1e-4
 )
-print(record.fingerprint)
 """
 
 
-def test_a_run_with_a_callback_goes_on_in_another_process(tmp_path):
-    command = [sys.executable, "-c", _ANOTHER_PROCESS, str(tmp_path / "a.npz")]
-    first, second = (
-        subprocess.run([*command, *extra], capture_output=True, text=True, check=False, timeout=600)
-        for extra in ([], ["again"])
-    )
-    assert first.returncode == 0, first.stderr
-    assert second.returncode == 0, second.stderr
-    assert first.stdout == second.stdout
+def test_a_run_with_a_callback_goes_on_in_another_process(tmp_path, problem, monkeypatch):
+    path = tmp_path / "a.npz"
+    subprocess.run([sys.executable, "-c", _ANOTHER_PROCESS, str(path)], check=True, timeout=600)
+    monkeypatch.setattr(optimal_control, "_measured", lambda *_: pytest.fail("it is there already"))
+    options = {"save": path, "callback": lambda _: None, "controls": np.zeros(1), "armijo": 1e-4}
+    (run,) = vp.optimal_control_tradeoff(problem, [vp.Midpoint()], [0.05], **options).runs
+    assert run == vp.OptimalControlTradeoff.load(path).runs[0]
 
 
 def test_a_record_knows_the_options_that_matter(problem):
@@ -460,6 +435,25 @@ def test_a_record_knows_the_options_that_matter(problem):
     assert mark(controls=rows) != mark(controls=np.zeros((5000, 1)))
     with pytest.raises(vp.InputError, match="function cannot be told from others in a saved record"):
         mark(controls=lambda t: t)
+
+
+@pytest.mark.parametrize("kind", ["motion", "plan"])
+def test_interruption_keeps_saved_runs_that_come_later(tmp_path, problem, kind):
+    """Of a measurement that begins with other integrators than the saved one."""
+
+    def measure(members, progress=None):
+        options = {"integrators": members, "repeats": 1, "save": tmp_path / "a.npz", "progress": progress}
+        if kind == "plan":
+            return vp.optimal_control_tradeoff(problem, dts=[0.05], max_iterations=1, **options)
+        return vp.work_precision(spring(), [0.7], [0.3], duration=1.0, dts=[0.1], **options)
+
+    def interrupt(done, runs):
+        raise KeyboardInterrupt
+
+    first = measure([vp.Midpoint()])
+    part = measure([vp.RungeKutta4(), vp.Midpoint()], interrupt)
+    assert (len(part.runs), part.missing) == (2, 0)
+    assert part.runs[1] == first.runs[0] == type(part).load(tmp_path / "a.npz").runs[1]
 
 
 def test_plans_that_fail_do_not_stop_the_others(problem):

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from varpin.io.archive import atomic_file
 from varpin.study.extremes import Cell, Kind, Record
-from varpin.study.extremes.battery import families
 from varpin.study.extremes.trial import LEVELS
 from varpin.support.checks import writable
 from varpin.support.markup import page
@@ -71,14 +70,11 @@ def headline(cell: Cell) -> str:
 
 def grid(record: Record) -> tuple[list[str], list[tuple[str, str, dict[str, Cell]]]]:
     """The integrators, and rows of a family, a trial and its cells by integrator."""
+    rows: dict[tuple[str, str], dict[str, Cell]] = {}
+    for cell in record.cells:
+        rows.setdefault((cell.family, cell.trial), {})[cell.integrator] = cell
     columns = list(dict.fromkeys(cell.integrator for cell in record.cells))
-    cells = {(cell.family, cell.trial, cell.integrator): cell for cell in record.cells}
-    rows = [
-        (family, trial, {name: cells[family, trial, name] for name in columns if (family, trial, name) in cells})
-        for family, trials in families(record.cells).items()
-        for trial in trials
-    ]
-    return columns, rows
+    return columns, [(family, trial, cells) for (family, trial), cells in rows.items()]
 
 
 def write_page(path: str | os.PathLike[str], record: Record) -> Path:

@@ -6,7 +6,7 @@ import hashlib
 import math
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -293,13 +293,3 @@ def _simulated(
         if getattr(error, "trajectory", None) is None:
             raise
         return error.trajectory, error  # type: ignore[attr-defined]
-
-
-def families(cells: Iterable[Cell]) -> dict[str, list[str]]:
-    """The trials of each family, in their order."""
-    found: dict[str, list[str]] = {}
-    for cell in cells:
-        names = found.setdefault(cell.family, [])
-        if cell.trial not in names:
-            names.append(cell.trial)
-    return found

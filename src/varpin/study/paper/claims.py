@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin.integrators import RungeKutta4
 from varpin.mechanics.scene import Scene
@@ -14,8 +14,7 @@ from varpin.simulation.run import StepFailure, simulate
 from varpin.study.paper import cases
 from varpin.study.paper.cases import CASES, COARSE, COARSEST, MAIN, METHODS, VARIATIONS, Setting
 from varpin.study.paper.experiments import OPTIMUM, PLAIN, STOCHASTIC, Cell
-
-Floats = NDArray[np.float64]
+from varpin.trajectory import Trajectory
 
 Cells = Mapping[str, Cell]
 
@@ -93,55 +92,28 @@ def main_steps(cells: Cells) -> list[float]:
     return steps
 
 
-@dataclass(frozen=True, eq=False)
-class FreeMotion:
-    """The finger without controls.
-
-    Attributes:
-        t: Times of the nodes (N + 1,) [s].
-        theta: theta_1 there [rad].
-        energy: [J].
-        momentum: p_1 [N m s], that of the whole finger about its base.
-        split_steps: Number of steps taken in parts.
-        steps: N.
-    """
-
-    t: Floats
-    theta: Floats
-    energy: Floats
-    momentum: Floats
-    split_steps: int
-    steps: int
-
-    @property
-    def drifts(self) -> tuple[float, float]:
-        """The largest changes of the energy and of the momentum, relative to their initial values."""
-        return tuple(float(np.abs(x - x[0]).max() / abs(x[0])) for x in (self.energy, self.momentum))  # type: ignore
-
-
-Motions = Mapping[tuple[str, float], FreeMotion]
+# The finger without controls, by method and step.
+Motions = Mapping[tuple[str, float], Trajectory]
 REFERENCE = "reference"
 FREE_STEPS = (cases.FINE, 0.25 * COARSEST, 0.5 * COARSEST, COARSEST)
 
 
-def free_motions() -> dict[tuple[str, float], FreeMotion]:
+def free_motions() -> dict[tuple[str, float], Trajectory]:
     """Figure 1: the finger without controls from the paper's start, by both methods at several steps.
 
     In the report's own setting, the horizontal plane, and over the whole 1.5 s; with it Runge-Kutta's motion at the
     finest step, the reference. A motion that could not be finished ends where it stopped.
     """
     scene = Scene(cases.finger(), gravity=MAIN.gravity)
-    motions = {}
+    motions: dict[tuple[str, float], Trajectory] = {}
     for method, integrator in (*METHODS.items(), (REFERENCE, RungeKutta4())):
         for dt in (cases.FINE,) if method == REFERENCE else FREE_STEPS:
             steps = round(cases.DURATION / dt)
+            options: dict[str, Any] = {"dt": dt, "steps": steps, "integrator": integrator, "check": False}
             try:
-                motion = simulate(scene, *cases.FREE_START, dt=dt, steps=steps, integrator=integrator, check=False)
+                motions[method, dt] = simulate(scene, *cases.FREE_START, **options)
             except StepFailure as error:
-                motion = error.trajectory
-            motions[method, dt] = FreeMotion(
-                motion.t, motion.q[:, 0], motion.energy, motion.p[:, 0], motion.statistics.split_steps, motion.steps
-            )
+                motions[method, dt] = error.trajectory
     return motions
 
 
@@ -297,7 +269,7 @@ def _error(motions: Motions, method: str, dt: float) -> float:
     motion, exact = motions[method, dt], motions[REFERENCE, cases.FINE]
     if motion.t[-1] < exact.t[-1] - 0.5 * dt:
         return np.inf
-    return float(np.abs(motion.theta - np.interp(motion.t, exact.t, exact.theta)).max())
+    return float(np.abs(motion.q[:, 0] - np.interp(motion.t, exact.t, exact.q[:, 0])).max())
 
 
 def _order(motions: Motions) -> Judgement:
@@ -313,7 +285,12 @@ def _order(motions: Motions) -> Judgement:
 
 
 def _conserved(motions: Motions) -> Judgement:
-    drifts = {method: motions[method, COARSEST].drifts for method in METHODS}
+    drifts = {}
+    for method in METHODS:
+        motion = motions[method, COARSEST]
+        # The momentum p_1 is that of the whole finger about its base.
+        kept = motion.energy, motion.p[:, 0]
+        drifts[method] = [float(np.abs(x - x[0]).max() / abs(x[0])) for x in kept]
     text = "; ".join(f"{method}: energy {a:.1e}, momentum {b:.1e}" for method, (a, b) in drifts.items())
     (energy, momentum), (euler, _) = drifts["variational"], drifts["Euler"]
     return (
@@ -323,11 +300,11 @@ def _conserved(motions: Motions) -> Judgement:
 
 
 def _free(motions: Motions) -> Judgement:
-    travel, rows = float(np.ptp(motions[REFERENCE, cases.FINE].theta)), []
+    travel, rows = float(np.ptp(motions[REFERENCE, cases.FINE].q[:, 0])), []
     for method in METHODS:
         fine, coarse = (_error(motions, method, dt) for dt in (cases.FINE, COARSEST))
         motion = motions[method, COARSEST]
-        split = f"{motion.split_steps} of {motion.steps} steps taken in parts"
+        split = f"{motion.statistics.split_steps} of {motion.steps} steps taken in parts"
         rows.append(f"{method}: {coarse:.2g} rad (at dt = {cases.FINE:g} s {fine:.1g} rad), {split}")
     vi, finest, euler = (
         _error(motions, *key) for key in (("variational", COARSEST), ("Euler", cases.FINE), ("Euler", COARSEST))

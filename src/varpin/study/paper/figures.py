@@ -64,8 +64,8 @@ def _free(motions: Motions) -> Figure:
     for panel, axes, method in zip("bc", panels, ("Euler", "variational"), strict=True):
         for dt, dash in ((cases.FINE, ":"), (COARSEST, "-")):
             motion = motions[method, dt]
-            axes.plot(motion.t, motion.theta, dash, color=_METHOD_COLOR[method], label=f"{method}, dt = {dt:g} s")
-        exact = motions[REFERENCE, cases.FINE].theta
+            axes.plot(motion.t, motion.q[:, 0], dash, color=_METHOD_COLOR[method], label=f"{method}, dt = {dt:g} s")
+        exact = motions[REFERENCE, cases.FINE].q[:, 0]
         span = np.ptp(exact)
         axes.set_ylim(exact.min() - 0.4 * span, exact.max() + 0.4 * span)
         axes.set(xlabel="time [s]", ylabel=r"$\theta_1$ [rad]", title=f"({panel}) {method}")

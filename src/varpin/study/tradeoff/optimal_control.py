@@ -180,19 +180,18 @@ def _solved(problem: OptimalControlProblem, options: dict[str, Any]) -> tuple[So
 
 
 def _measured(problem: OptimalControlProblem, repeats: int, options: dict[str, Any]) -> OptimalControlRun:
-    seconds, spread, failure = math.nan, 0.0, ""
-    planned = opened = closed = accuracy = math.nan
-    iterations, status = 0, ""
+    costs = {"planned_cost": math.nan, "open_loop_cost": math.nan, "closed_loop_cost": math.nan, "accuracy": math.nan}
+    seconds, spread, iterations, status, failure = math.nan, 0.0, 0, "", ""
     # An error of one run, whatever it is, does not stop the others.
     try:
-        solution, seconds, spread = fastest(lambda: _solved(problem, options), repeats)
+        solution, best, scatter = fastest(lambda: _solved(problem, options), repeats)
         truth = solution.verify()
-        planned, opened, closed = truth.planned_cost, truth.open_loop_cost, truth.closed_loop_cost
-        accuracy, iterations, status = truth.accuracy, solution.iterations, solution.status.name.lower()
+        costs = {name: getattr(truth, name) for name in costs}
+        seconds, spread, iterations, status = best, scatter, solution.iterations, solution.status.name.lower()
     except InputError:
         raise
     except Exception as error:
-        seconds, spread, failure = math.nan, 0.0, f"{type(error).__name__}: {error}"
+        failure = f"{type(error).__name__}: {error}"
     return OptimalControlRun(
         integrator=str(problem.integrator),
         options=repr(problem.integrator),
@@ -203,10 +202,7 @@ def _measured(problem: OptimalControlProblem, repeats: int, options: dict[str, A
         seconds=seconds,
         spread=spread,
         iterations=iterations,
-        planned_cost=planned,
-        open_loop_cost=opened,
-        closed_loop_cost=closed,
-        accuracy=accuracy,
         status=status,
         failure=failure,
+        **costs,
     )

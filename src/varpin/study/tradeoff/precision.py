@@ -7,6 +7,7 @@ import os
 from collections.abc import Generator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -194,10 +195,10 @@ def work_precision(
 
     def begin(record: WorkPrecision, missing: list[tuple[Integrator, int]]) -> tuple[WorkPrecision, Generator[Run]]:
         exact = _Exact(setting, reference, record.samples)
-        cells = [_Cell(setting, exact, member, steps, repeats) for member, steps in missing]
         if known is None:
             record = replace(record, reference_error=exact.error, tip_reference_error=exact.tip_error)
-        return record, ((_measure(cell) for cell in cells) if executor is None else in_order(executor, _measure, cells))
+        measure = partial(_measure, setting, exact, repeats)
+        return record, (measure(job) for job in missing) if executor is None else in_order(executor, measure, missing)
 
     return complete(base, plan, begin, path=path, progress=progress)
 
@@ -273,24 +274,13 @@ def _samples(grids: Sequence[int], rows: int) -> int:
     return rows * max(k for k in range(1, min(shared, most) + 1) if shared % k == 0)
 
 
-@dataclass(frozen=True, eq=False)
-class _Cell:
-    """A run to be measured."""
-
-    setting: Setting
-    exact: _Exact
-    member: Integrator
-    steps: int
-    repeats: int
-
-
-def _measure(cell: _Cell) -> WorkPrecisionRun:
-    setting, exact, member, steps = cell.setting, cell.exact, cell.member, cell.steps
+def _measure(setting: Setting, exact: _Exact, repeats: int, job: tuple[Integrator, int]) -> WorkPrecisionRun:
+    member, steps = job
     samples = _samples([steps, len(exact.q) - 1], len(setting.controls))
     shared = slice(None, None, (len(exact.q) - 1) // samples)
     # An error of one run, whatever it is, does not stop the others.
     try:
-        outcome = setting.run(member, steps, samples=samples, repeats=cell.repeats)
+        outcome = setting.run(member, steps, samples=samples, repeats=repeats)
     except Exception as reason:
         lost = np.full_like(exact.q[shared], np.nan)
         outcome = Outcome(lost, lost, np.nan, np.nan, 0, 0, 0, 0, f"{type(reason).__name__}: {reason}")
@@ -300,6 +290,7 @@ def _measure(cell: _Cell) -> WorkPrecisionRun:
         error, end = float(off.max()), float(off[-1].max())
         tip = _largest(setting.scene.robot.frame_positions(outcome.q) - exact.tip[shared])
         energy = outcome.energy_error if setting.conservative else math.nan
+    counted = "spread", "failure", "newton_iterations", "jets", "sweeps", "split_steps"
     return WorkPrecisionRun(
         integrator=str(member),
         options=repr(member),
@@ -307,17 +298,12 @@ def _measure(cell: _Cell) -> WorkPrecisionRun:
         dt=setting.duration / steps,
         steps=steps,
         seconds=outcome.seconds if not outcome.failure else math.nan,
-        spread=outcome.spread,
         error=error,
         end_error=end,
         energy_error=energy,
         tip_error=tip,
-        newton_iterations=outcome.newton_iterations,
-        jets=outcome.jets,
-        sweeps=outcome.sweeps,
-        split_steps=outcome.split_steps,
         samples=samples,
-        failure=outcome.failure,
+        **{name: getattr(outcome, name) for name in counted},
     )
 
 
