@@ -191,7 +191,7 @@ FREE = {("place a frame", "q", 0), ("changes", "u", 0), ("changes", "u", 1), ("e
 FREE |= {("constraints", "q", 0)}
 FREE |= {("changes", "before", 0), ("expanded changes", "before", 0)}
 # Of two stages: a force for each.
-FREE |= {(name, "force", 1) for name in ("derivatives", "curvatures", "ends")}
+FREE |= {(name, "force", 1) for name in ("derivatives", "curvatures", "ends", "derivatives under constraints")}
 
 
 @pytest.fixture(scope="module")

@@ -200,7 +200,7 @@ def test_references_error_is_seen_where_one_step_inside_is_enough():
 class Broken(vp.Midpoint):
     """Raises what nobody expects."""
 
-    def rollout_compiled(self, *_, **__):
+    def start(self, *_, **__):
         raise ZeroDivisionError("on purpose")
 
 

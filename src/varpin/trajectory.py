@@ -146,6 +146,12 @@ class Accuracy:
     search_evaluations: int
 
     @property
+    def sane(self) -> bool:
+        """Whether its numbers are finite and none is negative."""
+        numbers = np.array([self.tolerance, self.error, self.dt, self.search_steps, self.search_evaluations])
+        return bool(np.isfinite(numbers).all() and (numbers >= 0.0).all())
+
+    @property
     def met(self) -> bool:
         """Whether the estimate is within the tolerance."""
         return self.error <= self.tolerance
@@ -349,6 +355,8 @@ class Trajectory(Frozen):
             raise FileError(f"{source}: its times t are not dt = {found.dt} s apart")
         if damage := found.statistics.damage():
             raise FileError(f"{source}: {damage}")
+        if found.accuracy is not None and not found.accuracy.sane:
+            raise FileError(f"{source}: accuracy holds numbers that no accuracy has")
         if robot is not None:
             found._require_robot(source, robot)
         return found

@@ -63,7 +63,7 @@ class Attempt:
             energy=energy,
             u=self.u[:done],
             dw=own.silence[:done],
-            masses=own.masses,
+            masses=own.masses.copy(),
             dt=own.problem.dt,
             integrator=own.text,
             robot=scene.robot.name,

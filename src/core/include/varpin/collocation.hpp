@@ -269,6 +269,13 @@ class Collocation {
         });
     }
 
+    // How many of q0, p0 and f have columns to be solved for: with one stage the force acts in proportion to the
+    // momentum.
+    int kinds() const { return stages == 1 ? 2 : 3; }
+
+    // What a force on coordinate c does to the one stage, in units of what a momentum does.
+    double by_momentum(double h, int c) const { return h * (weight[0] * tableau.force[0] + changed(0, c)); }
+
   private:
     friend class ConstrainedStepper;  // which borders the matrix with constraints
 
@@ -666,10 +673,6 @@ class Collocation {
         }
     }
 
-    // How many of q0, p0 and f have columns to be solved for: with one stage the force acts in proportion to the
-    // momentum.
-    int kinds() const { return stages == 1 ? 2 : 3; }
-
     // dr_i in (q0, p0, f): h sum_j (abar_ij L_qq,j + f_ij F_q,j) - A_i, 1, and h sum_j f_ij w_j F_f,j.
     void right_sides(double h, Block block, std::vector<double>& dV) const {
         for (int i = 0; i < stages; ++i) {
@@ -720,9 +723,6 @@ class Collocation {
             for (int c = block.begin; c < block.end; ++c) row[2 * n + c] = by_momentum(h, c) * row[n + c];
         }
     }
-
-    // What a force on coordinate c does to the one stage, in units of what a momentum does.
-    double by_momentum(double h, int c) const { return h * (weight[0] * tableau.force[0] + changed(0, c)); }
 
     // dq1 = dq0 + h sum_i b_i dV_i,  dp1 = dp0 + h F_f df + h sum_i b_i K_i dq0 + sum_j G_j dV_j, with K = L_qq + F_q
     // and G_j = h b_j (A_j' + F_v,j) + h^2 sum_i b_i a_ij K_i.

@@ -271,6 +271,9 @@ class ConstrainedStepper {
         factor_lu_pivoting(saddle.data(), size, rows.data());
         dV.resize(entries(wide, w));
         equation.right_sides(h, {0, n}, dV);
+        for (int row = 0; equation.kinds() == 2 && row < n; ++row) {
+            for (int c = 0; c < n; ++c) dV[row * w + 2 * n + c] = equation.by_momentum(h, c) * dV[row * w + n + c];
+        }
         bend_points();
         columns.assign(entries(size, w), 0.0);
         for (int i = 0; i < wide; ++i) {
