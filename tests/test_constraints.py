@@ -41,13 +41,13 @@ def loop(name, **options):
     return scene, q, along_constraints(scene, q, np.array([1.0, 0.0, 0.0, 2.0][:links]))
 
 
-def reference(scene, q, v, t):
-    """(q, v) at the times t, of M a + C' y = f - bias, C a = -(g_qq v) v, by DOP853."""
+def reference(scene, q, v, t, torque=None):
+    """(q, v) at the times t, of M a + C' y = f - bias, C a = -(g_qq v) v, by DOP853; under a torque of time."""
     free = vp.Scene(scene.robot, forces=scene.forces, gravity=scene.gravity)
     dynamics, n = ForwardDynamics(free.core), q.size
 
-    def rate(_, x):
-        slope, regular = dynamics.rate(x, np.zeros(n))
+    def rate(now, x):
+        slope, regular = dynamics.rate(x, np.zeros(n) if torque is None else torque(now))
         assert regular
         (C,), M = scene.core.constraints(x[None, :n])[2], vp.lagrangian_jet(free, x[:n], x[n:]).Lvv
         bent = scene.core.constraint_curvature(x[:n], np.zeros(len(C)), x[n:])[1] @ x[n:]
@@ -161,6 +161,40 @@ def test_loops_converge_with_the_order_of_the_integrator(name, integrator, steps
         errors.append(max(np.abs(motion.q[-1] - end_q).max(), np.abs(motion.v[-1] - end_v).max()))
     assert np.log2(errors[0] / errors[1]) > order - 0.4
     assert np.log2(errors[1] / errors[2]) > order - 0.4
+
+
+def shake(t):
+    return 0.3 * np.array([np.sin(7.0 * t), np.cos(5.0 * t), np.sin(3.0 * t + 1.0)])
+
+
+@pytest.mark.parametrize(("integrator", "steps"), [(vp.Midpoint(), 40), (vp.Gauss(2), 20), (vp.Gauss(3), 8)])
+def test_torques_of_time_keep_the_order(integrator, steps):
+    scene, q, v = loop("four-bar", damping=0.1)
+    end = reference(scene, q, v, np.array([0.5]), shake)[0][-1]
+    options = {"controls": vp.OpenLoop(shake), "integrator": integrator, "check": False}
+    motions = [vp.simulate(scene, q, v, dt=0.5 / N, steps=N, **options) for N in (steps, 2 * steps)]
+    errors = [np.abs(motion.q[-1] - end).max() for motion in motions]
+    assert np.log2(errors[0] / errors[1]) > integrator.order - 0.4
+
+
+def test_parts_of_a_step_are_under_their_own_torques():
+    """Most of the stages' polynomial, and its derivatives, in steps that guards take in halves."""
+    scene, q, v = loop("four-bar", damping=0.1)
+    options = {"controls": vp.OpenLoop(shake), "check": False}
+    tight = vp.Gauss(3, guard=vp.Guard(branch_margin=0.97))
+    motion = vp.simulate(scene, q, v, dt=0.05, steps=4, integrator=tight, **options)
+    assert motion.statistics.split_steps > 0
+    end = reference(scene, q, v, np.array([0.2]), shake)[0][-1]
+    assert np.abs(motion.q[-1] - end).max() < 1e-7
+    lin = vp.linearize(scene, motion)
+
+    def moved(at):
+        held = vp.OpenLoop(lambda t: shake(t) + at[:3] + at[3:] * t / 0.05)
+        return vp.simulate(scene, q, v, dt=0.05, steps=1, integrator=tight, controls=held, check=False)
+
+    slopes = central(lambda at: np.append(moved(at).q[-1], moved(at).p[-1]), np.zeros(6), 1e-2)
+    np.testing.assert_allclose(lin.B[0], slopes[:3].T, atol=1e-8)
+    np.testing.assert_allclose(lin.ramp[0], slopes[3:].T, atol=1e-8)
 
 
 def test_forces_are_those_of_the_index_reduced_equations():

@@ -244,6 +244,7 @@ def constrained_derivatives(
     halvings: Bytes,
     *,
     guess: Floats,
+    ramp: bool = False,
 ) -> tuple[Floats, Floats, int, int]:
     """As variational_derivatives."""
 

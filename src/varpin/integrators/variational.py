@@ -266,24 +266,26 @@ class Variational(Integrator):
 
         A step that was taken in parts is taken again in the same parts, and their derivatives are chained.
         """
+        Jx, Jf = self._derivatives(scene, trajectory)
+        return Jx, Jf, Jx[:, :, scene.robot.dof :]
+
+    def _derivatives(self, scene: Scene, trajectory: Trajectory, *, ramp: bool = False) -> tuple[Floats, Floats]:
+        """Of each step in (q, p) and in a force that is constant over it, or grows from 0 to it if it is a ramp."""
         steps = self._steps(scene, trajectory)
         guess = np.ascontiguousarray(self._guess(trajectory))
         if scene.constraints:
-            Jx, Jf, outcome, done = constrained_derivatives(**steps, places=self._places(scene), guess=guess)
+            places = self._places(scene)
+            Jx, Jf, outcome, done = constrained_derivatives(**steps, places=places, guess=guess, ramp=ramp)
         else:
-            Jx, Jf, outcome, done = variational_derivatives(**steps, guess=guess)
+            Jx, Jf, outcome, done = variational_derivatives(**steps, guess=guess, ramp=ramp)
         _require_solved(trajectory, outcome, done)
-        return Jx, Jf, Jx[:, :, scene.robot.dof :]
+        return Jx, Jf
 
     def ramps(self, scene: Scene, trajectory: Trajectory) -> Floats:
         """See :meth:`Integrator.ramps`."""
         if not self.stage_times:
             return super().ramps(scene, trajectory)
-        steps = self._steps(scene, trajectory)
-        guess = np.ascontiguousarray(self._guess(trajectory))
-        _, Jf, outcome, done = variational_derivatives(**steps, guess=guess, ramp=True)
-        _require_solved(trajectory, outcome, done)
-        return Jf
+        return self._derivatives(scene, trajectory, ramp=True)[1]
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
         """See :meth:`Integrator.contract`; steps that were taken in parts are chained as in :meth:`linearize`."""
