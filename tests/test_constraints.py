@@ -178,14 +178,12 @@ def test_torques_of_time_keep_the_order(integrator, steps):
 
 
 def test_parts_of_a_step_are_under_their_own_torques():
-    """Most of the stages' polynomial, and its derivatives, in steps that guards take in halves."""
+    """Derivatives in a shift and in a ramp of the torque, of steps that guards take in halves."""
     scene, q, v = loop("four-bar", damping=0.1)
     options = {"controls": vp.OpenLoop(shake), "check": False}
-    tight = vp.Gauss(3, guard=vp.Guard(branch_margin=0.97))
+    tight = vp.Gauss(2, guard=vp.Guard(energy_balance=1e-9))
     motion = vp.simulate(scene, q, v, dt=0.05, steps=4, integrator=tight, **options)
     assert motion.statistics.split_steps > 0
-    end = reference(scene, q, v, np.array([0.2]), shake)[0][-1]
-    assert np.abs(motion.q[-1] - end).max() < 1e-7
     lin = vp.linearize(scene, motion)
 
     def moved(at):
