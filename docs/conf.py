@@ -27,6 +27,7 @@ html_theme = "furo"
 html_title = f"varpin {version}"
 html_static_path = ["_static"]
 html_css_files = ["varpin.css"]
+smartquotes = False  # they would make a dash of the two before an option
 exclude_patterns = ["build", "extensions"]
 copybutton_selector = "div:not(.output) > div.highlight pre"
 
