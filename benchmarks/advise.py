@@ -23,8 +23,8 @@ import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 import varpin as vp
-from varpin.tradeoff import INTEGRATORS
-from varpin.tradeoff.setting import Setting
+from varpin.study.tradeoff import INTEGRATORS
+from varpin.study.tradeoff.setting import Setting
 
 ROBOTS = ("finger", "ur5", "xarm7", "talos_arm", "z1", "chain2", "chain3", "chain5", "chain7")
 RATIO = 2.0**0.25

@@ -20,10 +20,10 @@ import numpy as np
 from pages import fill
 
 import varpin as vp
-from varpin import extremes
-from varpin.extremes import Kind, Record
-from varpin.robot import bundled_robots
-from varpin.robot.example_robot_data import installed
+from varpin.model import bundled_robots
+from varpin.model.example_robot_data import installed
+from varpin.study import extremes
+from varpin.study.extremes import Kind, Record
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))

@@ -19,8 +19,8 @@ from crocoddyl_reference import require_gravity
 from sddp import in_turns
 
 import varpin as vp
+from varpin.control.verification import accurate_cost
 from varpin.integrators.base import open_loop
-from varpin.sddp.verification import accurate_cost
 
 DURATION = 1.0
 TOLERANCE = 1e-6

@@ -16,8 +16,8 @@ import pinocchio as pin
 from crocoddyl_reference import PROBLEMS, Problem, require_gravity, shooting
 
 import varpin as vp
+from varpin.control.verification import accurate_cost
 from varpin.integrators.base import open_loop
-from varpin.sddp.verification import accurate_cost
 
 ROUNDS = 15
 PASSES = 3

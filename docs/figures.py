@@ -21,7 +21,7 @@ from selenium.webdriver.chrome.service import Service
 
 import varpin as vp
 from varpin import plots
-from varpin.replay.video import film_frames
+from varpin.show.replay.video import film_frames
 
 IMAGES = Path(__file__).resolve().parent / "images"
 

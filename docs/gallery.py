@@ -25,8 +25,8 @@ from scipy.interpolate import CubicSpline
 
 import varpin as vp
 from varpin import plots
-from varpin.replay.video import film_frames
-from varpin.scenefile import scenes
+from varpin.io.scenefile import scenes
+from varpin.show.replay.video import film_frames
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / "benchmarks"))

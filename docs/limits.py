@@ -20,10 +20,10 @@ from pathlib import Path
 import numpy as np
 
 import varpin as vp
-from varpin.extremes import PLANS, TRIALS, Cell, Kind, Record, Trial
-from varpin.extremes.battery import INTEGRATORS, families
-from varpin.extremes.checks import LEVELS, Exact, exact_motion
-from varpin.lagrangian import lagrangian_jet
+from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.study.extremes import PLANS, TRIALS, Cell, Kind, Record, Trial
+from varpin.study.extremes.battery import INTEGRATORS, families
+from varpin.study.extremes.checks import LEVELS, Exact, exact_motion
 
 DOCUMENT = Path(__file__).resolve().parent / "limits.md"
 sys.path.insert(0, str(DOCUMENT.parents[1] / "benchmarks"))

@@ -27,8 +27,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import varpin as vp
-from varpin.paper import cases
-from varpin.wiener import coarsen
+from varpin.mechanics.wiener import coarsen
+from varpin.study.paper import cases
 
 DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent / "benchmarks"))

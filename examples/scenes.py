@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 import varpin as vp
-from varpin.scenefile import scenes
+from varpin.io.scenefile import scenes
 
 out = Path("out")
 out.mkdir(exist_ok=True)

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 import varpin as vp
+from varpin.control.costs import BoundCost, Cost, Expansion
 from varpin.core.arrays import Diffusion
-from varpin.costs import BoundCost, Cost, Expansion
-from varpin.noise import CompiledFields, Noise
+from varpin.mechanics.noise import CompiledFields, Noise
 
 ROBOT = vp.planar_chain(2)
 SCENE = vp.Scene(ROBOT)

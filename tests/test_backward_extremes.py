@@ -7,10 +7,10 @@ import pytest
 
 import varpin as vp
 from varpin import core
+from varpin.control.backward import TRUSTED, _Along, _foreseen, _Limits, _one_pass, backward
+from varpin.control.square_root import squares_of
 from varpin.linearization import linearize_steps
-from varpin.sddp.backward import TRUSTED, _Along, _foreseen, _Limits, _one_pass, backward
-from varpin.sddp.square_root import squares_of
-from varpin.simulation import simulate
+from varpin.simulation.run import simulate
 
 INERTIAS = {"unit": np.ones(3), "finger": np.array([1e-5, 1e-6, 1e-7]), "mixed": np.array([1.0, 1e-3, 1e-6])}
 EXTREMES = (1e-9, 1.0, 1e9)

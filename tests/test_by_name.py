@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 import varpin as vp
-from varpin.replay.annotations import torque_shares
+from varpin.show.replay.annotations import torque_shares
 
 UR5 = vp.load_robot("ur5")
 NAMES = UR5.joint_names

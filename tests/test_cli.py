@@ -16,9 +16,9 @@ from rich.console import Console
 import varpin as vp
 import varpin_command
 from varpin.cli import console, exits, main
-from varpin.paper import Reproduction
-from varpin.paper.claims import Claim
-from varpin.robot import load_robot
+from varpin.model import load_robot
+from varpin.study.paper import Reproduction
+from varpin.study.paper.claims import Claim
 
 ROD = '<mass value="1"/><origin xyz="0.5 0 0"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.083" iyz="0" izz="0.083"/>'
 
@@ -464,7 +464,7 @@ def test_progress_bar_on_a_terminal_vanishes_without_hiding_warnings():
     terminal = Console(file=stream, force_terminal=True, width=80)
     with console.progress_bar(terminal, 10, quiet=False) as progress, console.logged(terminal, logging.WARNING):
         progress(5, 10)
-        logging.getLogger("varpin.simulation").warning("something [bold] happened")
+        logging.getLogger("varpin.simulation.run").warning("something [bold] happened")
     assert "varpin: warning: something [bold] happened" in stream.getvalue()
     assert "varpin" in stream.getvalue()
 
@@ -560,7 +560,7 @@ def test_paper_explains_itself(capsys):
 
 
 def test_paper_refuses_a_folder_it_cannot_make(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("varpin.paper.reproduction.fill", lambda *_, **__: pytest.fail("the work must not start"))
+    monkeypatch.setattr("varpin.study.paper.reproduction.fill", lambda *_, **__: pytest.fail("the work must not start"))
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         assert main(["paper", "--quick", "--out", str(folder)]) == 2
@@ -569,7 +569,7 @@ def test_paper_refuses_a_folder_it_cannot_make(tmp_path, capsys, monkeypatch):
 
 def test_paper_prints_its_claims_and_where_the_report_is(tmp_path, capsys, monkeypatch):
     result = Reproduction(tmp_path / "report.html", (Claim("paper", "a [b] c", "1 of 2", "holds in part"),))
-    monkeypatch.setattr("varpin.paper.reproduce", lambda folder, **_: result)
+    monkeypatch.setattr("varpin.study.paper.reproduce", lambda folder, **_: result)
     assert main(["paper", "--out", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
     assert err == ""
@@ -583,7 +583,7 @@ def test_interrupted_paper_is_status_130(tmp_path, capsys, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("varpin.paper.reproduction.fill", interrupt)
+    monkeypatch.setattr("varpin.study.paper.reproduction.fill", interrupt)
     assert main(["paper", "--quick", "--out", str(tmp_path)]) == 130
     assert error_of(capsys) == "varpin: interrupted"
 
@@ -655,7 +655,7 @@ def test_tradeoff_prints_a_table_and_goes_on_where_it_stopped(arm, tmp_path, cap
     for words in ("arm: speed against accuracy over 0.5 s", "RungeKutta4", "Midpoint", "Pareto", "good to"):
         assert words in printed
     assert sorted(path.name for path in out.iterdir()) == [f"tradeoff.{kind}" for kind in ("csv", "html", "npz", "png")]
-    monkeypatch.setattr("varpin.tradeoff.precision._measure", lambda *_: pytest.fail("it is there already"))
+    monkeypatch.setattr("varpin.study.tradeoff.precision._measure", lambda *_: pytest.fail("it is there already"))
     assert main(["tradeoff", arm, *options, "--quiet"]) == 0
     assert capsys.readouterr().out == ""
     assert main(["tradeoff", arm, *options, "--torque", "1"]) == 2
@@ -666,7 +666,7 @@ def test_tradeoff_interrupted_is_status_130(arm, capsys, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("varpin.tradeoff.precision._measure", interrupt)
+    monkeypatch.setattr("varpin.study.tradeoff.precision._measure", interrupt)
     assert main(["tradeoff", arm, "--duration", "0.5", "--dt", "0.05", "--quiet"]) == 130
     assert "interrupted after 0 of " in capsys.readouterr().err
 

@@ -10,10 +10,10 @@ import pytest
 from mechanisms import random_tree
 
 import varpin as vp
+from varpin.control.costs import BoundSum, Points, control_rate
 from varpin.core import CostTerms, Subject, sample_steps
-from varpin.costs import BoundSum, Points, control_rate
 from varpin.linearization import node_jets, velocity_at_nodes
-from varpin.robot.kinematics import frame_kinematics
+from varpin.model.kinematics import frame_kinematics
 
 N, CONTROLS = 7, 3
 

@@ -6,10 +6,10 @@ from scipy.optimize import lsq_linear
 from test_sddp import sliders
 
 import varpin as vp
+from varpin.control import backward as passes
+from varpin.control.backward import backward
 from varpin.core import box_minimum
-from varpin.robot.kinematics import frame_kinematics
-from varpin.sddp import backward as passes
-from varpin.sddp.backward import backward
+from varpin.model.kinematics import frame_kinematics
 
 
 def quadratic(rng, m, condition):

@@ -11,7 +11,7 @@ from test_sddp import SAMPLINGS, Plain, PlainCost, noise_columns, run, sliders, 
 from test_solution_files import same
 
 import varpin as vp
-from varpin.sddp.backward import _Along, _one_pass
+from varpin.control.backward import _Along, _one_pass
 
 MATRIX = np.array([[2e-2, 5e-3], [5e-3, 1e-2]])
 BEFORE = np.array([0.7, -0.3])
@@ -272,7 +272,7 @@ def random_policy(scene, steps, hold=1, before=None, limits=None):
 )
 def test_policies_feed_the_control_before_back(monkeypatch, integrator, limits, before):
     """In the core, in SciPy's integrator, and across the pieces that a long simulation is made in."""
-    monkeypatch.setattr("varpin.simulation._CHUNK", 8)
+    monkeypatch.setattr("varpin.simulation.run._CHUNK", 8)
     scene = vp.Scene(sliders(2), gravity=False, damping=0.3)
     policy = random_policy(scene, 10, 2, before, limits)
     motion = vp.simulate(scene, [0.3, -0.4], [0.5, 0.1], dt=0.05, steps=20, controls=policy, integrator=integrator)

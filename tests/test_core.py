@@ -25,7 +25,7 @@ from varpin.core import (
 )
 from varpin.core.arrays import new_nodes
 from varpin.integrators.base import open_loop
-from varpin.robot.kinematics import links
+from varpin.model.kinematics import links
 
 rng = np.random.default_rng(3)
 ROBOTS = ("finger", "ur5", "panda", "chain")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from varpin import core
-from varpin.sddp.square_root import squares_of
+from varpin.control.square_root import squares_of
 
 H = 0.1  # the step
 

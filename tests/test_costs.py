@@ -5,7 +5,7 @@ import pytest
 from test_sddp import SAMPLINGS, run, samples_of_a_step, sliders, small
 
 import varpin as vp
-from varpin.costs import Points
+from varpin.control.costs import Points
 
 N, DOF, M = 6, 3, 2
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}

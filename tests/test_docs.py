@@ -11,7 +11,7 @@ import pytest
 
 import varpin as vp
 from varpin.cli import command
-from varpin.scenefile import scenes
+from varpin.io.scenefile import scenes
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs" / "extensions"))
 import executed

@@ -9,7 +9,7 @@ import varpin as vp
 from varpin.core import Elimination, ForwardDynamics, Solver, VariationalRollout, variational_derivatives
 from varpin.core.arrays import new_nodes
 from varpin.integrators.base import open_loop
-from varpin.robot import example_robot_data
+from varpin.model import example_robot_data
 
 
 def star(branches, links, seed=0):

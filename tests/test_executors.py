@@ -16,7 +16,7 @@ from test_ensemble import ARRAYS, make_scene, run, same_statistics
 
 import varpin as vp
 import varpin.ensemble
-from varpin.executors import executing, in_order
+from varpin.support.executors import executing, in_order
 
 
 @pytest.fixture(scope="module", params=["fork", "spawn"])
@@ -169,7 +169,7 @@ def test_monte_carlo_tells_of_what_its_paths_do(caplog):
         scene, cost, [1.5, 0.0], [0.0, 0.0], dt=0.1, steps=20, integrator=vp.ExplicitEuler()
     )
     plan = vp.solve(problem, max_iterations=2)
-    with caplog.at_level(logging.WARNING, "varpin.sddp.monte_carlo"):
+    with caplog.at_level(logging.WARNING, "varpin.control.monte_carlo"):
         found = plan.monte_carlo(60, 0)
     assert any("coarse" in warning for warning in found.warnings)
 
@@ -275,7 +275,7 @@ def test_what_a_chunk_takes_is_known_beforehand(options, monkeypatch):
 
 def test_a_lost_worker_is_made_up_for(tmp_path, caplog):
     tasks = [(number, str(tmp_path / "marker")) for number in range(12)]
-    with ProcessPoolExecutor(2) as pool, caplog.at_level(logging.WARNING, "varpin.executors"):
+    with ProcessPoolExecutor(2) as pool, caplog.at_level(logging.WARNING, "varpin.support.executors"):
         assert list(in_order(pool, once_deadly, tasks)) == [number**2 for number in range(12)]
     assert "a worker was lost" in caplog.text
 
@@ -297,7 +297,7 @@ def test_a_pool_made_anew_is_like_the_one_that_broke_and_told_of_once(tmp_path, 
         ProcessPoolExecutor(
             2, multiprocessing.get_context("spawn"), initializer=prepared, initargs=(marker,), max_tasks_per_child=1
         ) as pool,
-        caplog.at_level(logging.WARNING, "varpin.executors"),
+        caplog.at_level(logging.WARNING, "varpin.support.executors"),
     ):
         results = list(in_order(pool, deadly_once, range(12)))
     assert Path(marker).exists()

@@ -12,15 +12,15 @@ import pytest
 from mechanisms import slider
 
 import varpin as vp
-from varpin import extremes
 from varpin.cli import main
-from varpin.extremes import Kind, Setup, Trial, checks
-from varpin.extremes.battery import INTEGRATORS
-from varpin.extremes.periods import period_error
-from varpin.extremes.plans import Task, attempt, changes, cost_error, part_left
-from varpin.robot.chain import rod_chain
-from varpin.soundness import Finding
-from varpin.wiener import wiener_increments
+from varpin.mechanics.wiener import wiener_increments
+from varpin.model.chain import rod_chain
+from varpin.simulation.soundness import Finding
+from varpin.study import extremes
+from varpin.study.extremes import Kind, Setup, Trial, checks
+from varpin.study.extremes.battery import INTEGRATORS
+from varpin.study.extremes.periods import period_error
+from varpin.study.extremes.plans import Task, attempt, changes, cost_error, part_left
 
 BY_NAME = {trial.name: trial for trial in (*extremes.TRIALS, *extremes.PLANS)}
 MEASURES = ("error", "joint", "velocity", "period", "energy", "momentum", "reversal", "symplecticity", "record")
@@ -244,7 +244,7 @@ def test_what_is_wrong_and_unsaid_is_silent_wrong(monkeypatch):
     assert cell.kind is Kind.WRONG
     assert "error" in cell.found[0]
     # The same error, but spoken of.
-    monkeypatch.setattr("varpin.soundness._looked_for", lambda *_: (Finding("test", "all is not well"),))
+    monkeypatch.setattr("varpin.simulation.soundness._looked_for", lambda *_: (Finding("test", "all is not well"),))
     assert run_one(lie, window=0.5).kind is Kind.DEGRADED
 
 
@@ -307,7 +307,9 @@ def test_a_plan_that_is_no_optimum_is_found(small_plan):
 
 def test_a_plan_of_nan_is_silent_wrong(monkeypatch, small_plan):
     _, solution = small_plan
-    monkeypatch.setattr("varpin.extremes.plans.solve", lambda *_, **__: dataclasses.replace(solution, cost=math.nan))
+    monkeypatch.setattr(
+        "varpin.study.extremes.plans.solve", lambda *_, **__: dataclasses.replace(solution, cost=math.nan)
+    )
     outcome = attempt(BY_NAME["10 nodes"], vp.Midpoint())
     assert outcome["kind"] is Kind.WRONG
     assert "cost off by" in outcome["found"][0]
@@ -321,9 +323,9 @@ def test_a_plan_that_whirls_with_nothing_said_is_silent_wrong(monkeypatch, small
     assert changes(solution.trajectory) <= 2
     assert changes(motion) >= 7
     whirling = dataclasses.replace(solution, trajectory=motion, cost=task.cost(motion))
-    monkeypatch.setattr("varpin.extremes.plans.solve", lambda *_, **__: whirling)
+    monkeypatch.setattr("varpin.study.extremes.plans.solve", lambda *_, **__: whirling)
     # Ten steps have no more than nine changes.
-    monkeypatch.setattr("varpin.extremes.plans._FEW", 4)
+    monkeypatch.setattr("varpin.study.extremes.plans._FEW", 4)
     outcome = attempt(BY_NAME["10 nodes"], vp.Midpoint())
     assert outcome["kind"] is Kind.WRONG
     assert any("goes up and down" in text for text in outcome["found"])
@@ -427,7 +429,7 @@ def test_every_trial_has_a_name_of_its_own(load):
 
 
 def test_the_command_writes_its_files(tmp_path, capsys, monkeypatch, load):
-    monkeypatch.setattr("varpin.extremes.battery.trials_on", lambda _: small_battery(load)[:2])
+    monkeypatch.setattr("varpin.study.extremes.battery.trials_on", lambda _: small_battery(load)[:2])
     assert main(["extremes", "finger", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert "finger at the extremes" in out
@@ -444,8 +446,8 @@ def test_the_command_fails_where_anything_is_silent_wrong(capsys, monkeypatch):
     rod = vp.Scene(rod_chain([1.0], [1.0]))
     lie = Setup(rod, np.zeros(1), np.zeros(1), exact=lambda t: np.array([-7.0 * t * t]))
     trial = Trial("a lie", "made up", lambda: lie, 1e-3, 500)
-    monkeypatch.setattr("varpin.extremes.battery.TRIALS", (trial,))
-    monkeypatch.setattr("varpin.extremes.battery.PLANS", ())
+    monkeypatch.setattr("varpin.study.extremes.battery.TRIALS", (trial,))
+    monkeypatch.setattr("varpin.study.extremes.battery.PLANS", ())
     assert main(["extremes", "--quiet"]) == 1
     assert capsys.readouterr().out.count("silent wrong: a lie, ") == len(INTEGRATORS)
 
@@ -507,7 +509,7 @@ def test_nothing_on_robots_and_trees_is_silent_wrong(benchmark, name):
 def test_needless_warnings_are_counted(monkeypatch):
     setup, _ = falling()
     assert run_one(setup, 1e-3).kind is Kind.ACCURATE
-    monkeypatch.setattr("varpin.soundness._looked_for", lambda *_: (Finding("test", "all is not well"),))
+    monkeypatch.setattr("varpin.simulation.soundness._looked_for", lambda *_: (Finding("test", "all is not well"),))
     cell = run_one(setup, 1e-3)
     assert cell.warned
     assert cell.needless

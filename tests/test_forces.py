@@ -12,7 +12,7 @@ from test_elimination import rolled
 import varpin as vp
 from varpin.core import Solver, variational_derivatives
 from varpin.core.arrays import Element
-from varpin.tradeoff.setting import digest
+from varpin.study.tradeoff.setting import digest
 
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}  # of eighth-order central differences
 INTEGRATORS = [vp.Midpoint(), vp.Midpoint(0.3), vp.Gauss(2), vp.Radau(2), vp.RungeKutta4(), vp.SemiImplicitEuler()]

@@ -13,7 +13,7 @@ from test_groups import forest
 
 import varpin as vp
 from varpin.core import Elimination, Solver
-from varpin.tradeoff.setting import Setting
+from varpin.study.tradeoff.setting import Setting
 
 INTEGRATORS = [vp.Midpoint(), vp.Midpoint(0.3), vp.Gauss(2), vp.Radau(2), vp.RungeKutta4(), vp.SemiImplicitEuler()]
 # Tip and a frame before it, or on another branch.

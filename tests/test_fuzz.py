@@ -17,10 +17,10 @@ from fuzz import npz, record, runner
 from mechanisms import INERTIAL, joint, link, mass_matrix, random_tree, write_urdf
 
 import varpin as vp
-from varpin import extremes
-from varpin.archive import read_npz
-from varpin.robot import geometry
-from varpin.robot.tree import tree_mass_matrix
+from varpin.io.archive import read_npz
+from varpin.model import geometry
+from varpin.model.tree import tree_mass_matrix
+from varpin.study import extremes
 
 # What takes some seconds each.
 INPUTS = {

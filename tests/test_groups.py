@@ -8,7 +8,7 @@ import pytest
 from mechanisms import joint, link, mimic, random_inertia, random_rotation, random_tree, write_urdf
 
 import varpin as vp
-from varpin.robot.tree import block_ends, independent_groups
+from varpin.model.tree import block_ends, independent_groups
 
 INTEGRATORS = [vp.Midpoint(), vp.Midpoint(0.3), vp.Gauss(2), vp.SemiImplicitEuler(), vp.RungeKutta4()]
 SIZES = (3, 1, 4)

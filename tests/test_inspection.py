@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import eigh
 
 import varpin as vp
-from varpin.inspection import inspect_robot
+from varpin.show.inspection import inspect_robot
 
 ROD = '<mass value="1"/><origin xyz="0.5 0 0"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.083" iyz="0" izz="0.083"/>'
 LIMIT = '<limit lower="-1" upper="2" effort="10" velocity="3"/>'

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import varpin as vp
 from varpin.integrators import BY_NAME, integrator_of, options_of
-from varpin.scenefile.spec import _INTEGRATORS
+from varpin.io.scenefile.spec import _INTEGRATORS
 
 MADE = [
     vp.Midpoint(),

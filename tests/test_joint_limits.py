@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import varpin as vp
-from varpin import limits
-from varpin.soundness import evident
+from varpin.simulation import limits
+from varpin.simulation.soundness import evident
 
 LIMIT = '<limit lower="{}" upper="{}" velocity="9" effort="9"/>'
 ROD = '<mass value="1"/><origin xyz="0.5 0 0"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.083" iyz="0" izz="0.083"/>'

@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from scipy.optimize import fsolve
 
 import varpin as vp
-from varpin.loop_stability import unstable_loop
+from varpin.simulation.loop_stability import unstable_loop
 
 INTEGRATORS = (vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4())
 

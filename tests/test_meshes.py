@@ -9,7 +9,7 @@ import pytest
 from mechanisms import INERTIAL, joint, link, write_urdf
 
 import varpin as vp
-from varpin.robot import geometry, readable_geometry
+from varpin.model import geometry, readable_geometry
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 

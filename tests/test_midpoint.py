@@ -11,7 +11,7 @@ from scipy.optimize import root
 from scipy.special import ellipj, ellipk
 
 import varpin as vp
-from varpin.robot.example_robot_data import FIXED_BASE
+from varpin.model.example_robot_data import FIXED_BASE
 
 GRAVITY = 9.81
 

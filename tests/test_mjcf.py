@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 import varpin as vp
-from varpin.robot import geometry, readable_geometry
+from varpin.model import geometry, readable_geometry
 
 MASS = '<inertial pos="0.02 0.05 0.1" mass="1.3" diaginertia="0.02 0.03 0.025" quat="0.9 0.2 0.1 0"/>'
 BOX = '<geom type="box" size="0.1 0.05 0.02" pos="0.1 0.02 0"/>'

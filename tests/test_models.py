@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 
 import varpin as vp
-from varpin.robot import bundled_robots, geometry
+from varpin.model import bundled_robots, geometry
 
 LENGTHS = (0.0431, 0.0344, 0.0270)
 RADII = (0.010, 0.008, 0.007)

@@ -7,9 +7,9 @@ import pytest
 from mechanisms import slider
 
 import varpin as vp
-import varpin.mpc
-from varpin.mpc import _decision
-from varpin.sddp import backward
+import varpin.control.mpc
+from varpin.control import backward
+from varpin.control.mpc import _decision
 
 
 def cart(steps=40, **options):
@@ -210,7 +210,7 @@ def test_a_plant_that_fails_keeps_the_motion():
 @pytest.mark.parametrize("whose", ["simulate", "replan"])
 def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whose, monkeypatch):
     """In the third tick's simulation, or in the search of the fourth."""
-    mpc, calls, real = vp.Mpc(tracking(), iterations=1), [], getattr(varpin.mpc, whose)
+    mpc, calls, real = vp.Mpc(tracking(), iterations=1), [], getattr(varpin.control.mpc, whose)
     harsh = vp.Scene(mpc.problem.scene.robot, gravity=(0, 0, -1e6))
 
     def failing(*given, **options):
@@ -222,7 +222,7 @@ def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whos
         )
 
     whole = mpc.run(duration=0.1).motion
-    monkeypatch.setattr(varpin.mpc, whose, failing)
+    monkeypatch.setattr(varpin.control.mpc, whose, failing)
     with pytest.raises(vp.StepFailure) as caught:
         mpc.run(duration=0.1)
     part = caught.value.trajectory
@@ -277,7 +277,7 @@ def test_a_controller_that_cannot_keep_up_says_so(slow, told, monkeypatch):
     class Clock:
         perf_counter = staticmethod(clock)
 
-    monkeypatch.setattr(varpin.mpc, "time", Clock)
+    monkeypatch.setattr(varpin.control.mpc, "time", Clock)
     run = vp.Mpc(cart(steps=8), iterations=1).run(duration=1.05)
     said = [sentence for sentence in run.warnings if "longer than the period of 50 ms" in sentence]
     assert bool(said) == told

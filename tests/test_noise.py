@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import varpin as vp
-from varpin.noise import bind
-from varpin.simulation import NoiseError
-from varpin.wiener import coarsen, wiener_increments
+from varpin.mechanics.noise import bind
+from varpin.mechanics.wiener import coarsen, wiener_increments
+from varpin.simulation.run import NoiseError
 
 # Three coordinates, two controls: one joint is not actuated, and a control moves two joints.
 ACTUATION = np.array([[1.0, 0.0], [0.0, 0.0], [0.5, 2.0]])

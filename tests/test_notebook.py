@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import varpin as vp
-from varpin.markup import facts, folded, listed, table
+from varpin.support.markup import facts, folded, listed, table
 
 NAMES = ("<script>alert(1)</script>", 'a" onmouseover="x', "b & <b>c</b>")
 TAGS = {"div", "b", "table", "thead", "tbody", "tr", "th", "td", "details", "summary"}

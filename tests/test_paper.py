@@ -16,12 +16,12 @@ import pytest
 from PIL import Image
 
 import varpin as vp
-from varpin.paper import cases, experiments, reproduce
-from varpin.paper.cases import CASES, COARSE, COARSEST, MAIN, METHODS, VARIATIONS
-from varpin.paper.claims import Claim, assess, free_motions, series, verdict
-from varpin.paper.experiments import OPTIMUM, PLAIN, STOCHASTIC, Cell, Store, Task, fill, run, tasks
-from varpin.paper.figures import draw
-from varpin.paper.report import write
+from varpin.study.paper import cases, experiments, reproduce
+from varpin.study.paper.cases import CASES, COARSE, COARSEST, MAIN, METHODS, VARIATIONS
+from varpin.study.paper.claims import Claim, assess, free_motions, series, verdict
+from varpin.study.paper.experiments import OPTIMUM, PLAIN, STOCHASTIC, Cell, Store, Task, fill, run, tasks
+from varpin.study.paper.figures import draw
+from varpin.study.paper.report import write
 
 FIGURES = ["figure1", "figure2", "figure3", "figure4", "figure5", "truth", "noise"]
 
@@ -161,7 +161,7 @@ def test_a_damaged_cell_is_computed_again(tmp_path, caplog, counted, damage):
     path = tmp_path / f"{task.name}.npz"
     path.write_bytes(damage(path.read_bytes()))
     counted.clear()
-    with caplog.at_level(logging.WARNING, logger="varpin.paper"):
+    with caplog.at_level(logging.WARNING, logger="varpin.study.paper"):
         found = fill(Store(tmp_path), quick=True)
     assert f"{path} cannot be read" in caplog.text
     assert counted == [task.name]

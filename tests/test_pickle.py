@@ -12,8 +12,8 @@ import pinocchio as pin
 import pytest
 
 import varpin as vp
-from varpin.robot.model import geometry
-from varpin.scenefile import scenes
+from varpin.io.scenefile import scenes
+from varpin.model.robot import geometry
 
 
 def by_pickle(x):

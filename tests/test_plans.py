@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import varpin as vp
-from varpin import limits
-from varpin.chatter import RUN, alternation, restlessness
-from varpin.scenefile import scenes
-from varpin.sddp.examination import findings, replayed
-from varpin.soundness import evident
+from varpin.control.examination import findings, replayed
+from varpin.io.scenefile import scenes
+from varpin.simulation import limits
+from varpin.simulation.chatter import RUN, alternation, restlessness
+from varpin.simulation.soundness import evident
 
 ARMS = {
     "ur5": {},
@@ -180,7 +180,7 @@ def test_ctrl_c_ends_the_look_and_not_the_plan(monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("varpin.sddp.examination.replayed", stop)
+    monkeypatch.setattr("varpin.control.examination.replayed", stop)
     plan = vp.solve(reach(vp.planar_chain(2), 3, steps=10, dt=0.05))
     assert plan.status.converged
     assert "interrupted before the plan was played again" in plan.warnings[0]

@@ -1,6 +1,7 @@
 """Figures: what is on them, and that making them leaves matplotlib's global state alone."""
 
 import io
+import subprocess
 import sys
 
 import matplotlib as mpl
@@ -238,3 +239,10 @@ def test_start_without_steps_is_drawn():
     figure, axes = plots.plot_trajectory(swing(steps=0)[1])
     figure.canvas.draw()
     assert len(axes) == 4
+
+
+def test_plotting_a_motion_imports_no_optimizer():
+    """Only figures of studies have to know studies."""
+    found = "any(name.startswith(('varpin.control', 'varpin.study')) for name in sys.modules)"
+    program = f"import sys, varpin.show.plots; sys.exit({found})"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

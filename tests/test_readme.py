@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from varpin import limits
+from varpin.simulation import limits
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", (ROOT / "README.md").read_text(encoding="utf-8"), re.M | re.S)

@@ -10,12 +10,12 @@ import pytest
 from chromium import animation, commands, picture, seek, shape_poses, visit, wait_until
 
 import varpin as vp
-from varpin.replay import page as page_module
-from varpin.replay import replay
-from varpin.replay import shapes as shape_module
-from varpin.replay import viewer as viewer_module
-from varpin.replay.picture import Picture
-from varpin.robot import geometry
+from varpin.model import geometry
+from varpin.show.replay import page as page_module
+from varpin.show.replay import replay
+from varpin.show.replay import shapes as shape_module
+from varpin.show.replay import viewer as viewer_module
+from varpin.show.replay.picture import Picture
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +245,7 @@ def test_a_single_row_shows_a_pose(browser, finger, tmp_path):
 
 def test_a_model_without_geometry_gets_a_skeleton(browser, tmp_path, caplog):
     chain = vp.planar_chain(3)
-    with caplog.at_level(logging.WARNING, logger="varpin.replay"):
+    with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
         path = replay(chain, np.zeros((2, 3)), dt=1.0, html=tmp_path / "chain.html")
     assert "robot 'chain3' comes without visual geometry; drawing a skeleton" in caplog.text
     visit(browser, path)
@@ -269,7 +269,7 @@ def test_a_missing_mesh_falls_back_with_a_warning_that_names_it(tmp_path, caplog
         </robot>"""
     )
     robot = vp.load_robot(urdf)
-    with caplog.at_level(logging.WARNING, logger="varpin.replay"):
+    with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
         path = replay(robot, [[0.0], [1.0]], dt=0.1, html=tmp_path / "arm.html")
     assert "no_such_mesh.stl" in caplog.text
     assert "drawing a skeleton of its joints and centres of mass instead" in caplog.text
@@ -304,7 +304,7 @@ def test_a_missing_mesh_costs_its_link_alone(tmp_path, caplog):
     for lock in ({}, {"second": 0.5}):
         caplog.clear()
         robot = vp.load_robot(urdf, lock=lock)
-        with caplog.at_level(logging.WARNING, logger="varpin.replay"):
+        with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
             path = replay(robot, np.zeros((2, robot.dof)), dt=0.1, html=tmp_path / "arm.html")
         assert len(caplog.records) == 1
         assert "no_such_mesh.stl" in caplog.text
@@ -322,7 +322,7 @@ def test_a_mesh_pinocchio_cannot_send_is_drawn_in_one_colour(tmp_path, caplog, m
         raise UserWarning("Texture 'skin.png' not found.")
 
     monkeypatch.setattr(shape_module.MeshcatVisualizer, "loadMeshFromFile", broken)
-    with caplog.at_level(logging.WARNING, logger="varpin.replay"):
+    with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
         path = replay(vp.load_robot("ur5"), np.zeros((1, 6)), dt=1.0, html=tmp_path / "ur5.html")
     assert "Texture 'skin.png' not found." in caplog.text
     assert "it is drawn in one colour" in caplog.text

@@ -12,9 +12,9 @@ from mechanisms import joint, link, write_urdf
 from PIL import Image
 
 import varpin as vp
-from varpin.replay import wavefront
-from varpin.replay.picture import Picture, labels
-from varpin.robot import geometry
+from varpin.model import geometry
+from varpin.show.replay import wavefront
+from varpin.show.replay.picture import Picture, labels
 
 CORNERS = [f"v {x} {y} {z}" for x in (0, 1) for y in (0, 1) for z in (0, 1)]
 CUBE = "\n".join(

@@ -9,9 +9,9 @@ from chromium import animation, commands, picture, seek, shape_poses, visit
 from scipy.spatial.transform import Rotation
 
 import varpin as vp
-from varpin.replay import replay
-from varpin.replay.annotations import references, torque_shares
-from varpin.robot import geometry
+from varpin.model import geometry
+from varpin.show.replay import replay
+from varpin.show.replay.annotations import references, torque_shares
 
 TIP = "tool0"
 
@@ -441,7 +441,7 @@ ARM = """<robot name="arm">
 def test_a_missing_mesh_costs_its_own_link_only(browser, tmp_path, caplog):
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(ARM)
-    with caplog.at_level(logging.WARNING, logger="varpin.replay"):
+    with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
         page = replay(vp.load_robot(urdf), [[0.0, 0.5]], dt=1.0, html=tmp_path / "arm.html")
     assert "no_such_mesh.stl" in caplog.text
     assert "drawing the skeleton of 'lower' instead" in caplog.text

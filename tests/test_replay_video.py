@@ -11,7 +11,7 @@ from PIL import Image, ImageSequence
 
 import varpin as vp
 from varpin.cli import main
-from varpin.replay import replay, video
+from varpin.show.replay import replay, video
 
 Q = np.linspace([0.0, 0.0], [1.2, -0.8], 11)
 

@@ -11,9 +11,9 @@ import pytest
 from mechanisms import arm, joint, link, mimic, random_inertia, random_tree, write_urdf
 
 import varpin as vp
-from varpin.robot import bundled_robots, example_robot_data, geometry
-from varpin.robot.mimic import Tie
-from varpin.robot.tree import coordinate_armature
+from varpin.model import bundled_robots, example_robot_data, geometry
+from varpin.model.mimic import Tie
+from varpin.model.tree import coordinate_armature
 
 MOVING = ("revolute", "continuous", "prismatic")
 

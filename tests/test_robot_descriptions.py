@@ -11,7 +11,7 @@ import pytest
 from mechanisms import arm
 
 import varpin as vp
-from varpin.robot import geometry
+from varpin.model import geometry
 
 PACKAGE = """
 from types import SimpleNamespace

@@ -10,7 +10,7 @@ import pytest
 from mechanisms import random_tree
 
 import varpin as vp
-from varpin.sddp.solution_file import solution_trajectory
+from varpin.control.solution_file import solution_trajectory
 
 UR5 = {"damping": 0.1, "stiffness": 2.0, "rest": 0.3, "noise": vp.AdditiveNoise(1e-3)}
 OTHERS = {

@@ -18,10 +18,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import varpin as vp
-from varpin.scenefile import scenes
-from varpin.scenefile.spec import read_scene
-from varpin.scenefile.table import Table
-from varpin.scenefile.terms import TERMS
+from varpin.io.scenefile import scenes
+from varpin.io.scenefile.spec import read_scene
+from varpin.io.scenefile.table import Table
+from varpin.io.scenefile.terms import TERMS
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -719,7 +719,7 @@ def test_bundled_scene(name, monkeypatch):
     def no_shapes(*arguments):
         raise AssertionError("geometry was read")
 
-    monkeypatch.setattr("varpin.robot.model.geometry", no_shapes)
+    monkeypatch.setattr("varpin.model.robot.geometry", no_shapes)
     monkeypatch.setattr("pinocchio.buildGeomFromUrdf", no_shapes)
     file = vp.load_scene(name)
     motion = file.simulate()

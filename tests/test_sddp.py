@@ -13,7 +13,7 @@ from mechanisms import random_inertia
 from scipy.interpolate import CubicHermiteSpline
 
 import varpin as vp
-from varpin.sddp.backward import backward, noise_shares
+from varpin.control.backward import backward, noise_shares
 
 WEIGHTS = {1: 2 / 3, 2: -1 / 12}
 SAMPLINGS = ["midpoint", "gauss", "start"]

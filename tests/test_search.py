@@ -8,11 +8,11 @@ import pinocchio as pin
 import pytest
 
 import varpin as vp
+from varpin.control import search
+from varpin.control.backward import backward
+from varpin.control.descent import at_stake, spent
 from varpin.integrators.base import open_loop
-from varpin.sddp import search
-from varpin.sddp.backward import backward
-from varpin.sddp.descent import at_stake, spent
-from varpin.simulation import Motions
+from varpin.simulation.run import Motions
 
 GOAL = [0.8, -0.5]
 
@@ -394,7 +394,7 @@ def test_each_line_of_the_log_names_its_search(caplog):
         vp.Scene(vp.load_robot("finger")), vp.TrackingCost([0.3, 0.2, 0.1]) + vp.ControlCost(1e3), np.zeros(3),
         np.zeros(3), dt=0.01, steps=5,
     )  # fmt: skip
-    with caplog.at_level(logging.INFO, "varpin.sddp.search"):
+    with caplog.at_level(logging.INFO, "varpin.control.search"):
         plans = [vp.solve(own, check=False) for own in (problem, problem.at(t0=1.5, dt=0.005))]
     lines = [f"finger, 5 steps of 0.01 s from t = 0 s: {item}" for item in plans[0].history]
     lines += [f"finger, 10 steps of 0.005 s from t = 1.5 s: {item}" for item in plans[1].history]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import varpin as vp
-from varpin.robot.chain import planar_chain
+from varpin.model.chain import planar_chain
 
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 

@@ -11,12 +11,12 @@ import pinocchio as pin
 import pytest
 
 import varpin as vp
-from varpin import limits
-from varpin.accuracy import CLOSE, WRONG_MOTION, WRONG_POSITION, WRONG_VELOCITY, Place, places
-from varpin.chatter import alternation
 from varpin.core import fastest_damping
-from varpin.robot.chain import rod_chain
-from varpin.soundness import (
+from varpin.model.chain import rod_chain
+from varpin.simulation import limits
+from varpin.simulation.accuracy import CLOSE, WRONG_MOTION, WRONG_POSITION, WRONG_VELOCITY, Place, places
+from varpin.simulation.chatter import alternation
+from varpin.simulation.soundness import (
     CAUTION,
     Finding,
     alternating,

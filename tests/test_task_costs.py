@@ -6,8 +6,8 @@ import pinocchio as pin
 import pytest
 
 import varpin as vp
-from varpin.costs import Points
-from varpin.robot.kinematics import frame_kinematics, links
+from varpin.control.costs import Points
+from varpin.model.kinematics import frame_kinematics, links
 
 N = 5
 STEP = 1e-2

@@ -12,9 +12,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import varpin as vp
-from varpin import tolerance as search
 from varpin.cli import main
 from varpin.integrators import integrator_of
+from varpin.simulation import tolerance as search
 
 REST = np.zeros(3)
 

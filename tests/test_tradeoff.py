@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import varpin as vp
-from varpin.plots import plot_optimal_control_tradeoff, plot_work_precision
-from varpin.tradeoff import INTEGRATORS, optimal_control, precision
-from varpin.tradeoff.records import pareto_front
-from varpin.tradeoff.setting import Setting
-from varpin.tradeoff_report import write_report
+from varpin.show.plots import plot_optimal_control_tradeoff, plot_work_precision
+from varpin.show.tradeoff_report import write_report
+from varpin.study.tradeoff import INTEGRATORS, optimal_control, precision
+from varpin.study.tradeoff.records import pareto_front
+from varpin.study.tradeoff.setting import Setting
 
 OMEGA = 3.0
 
@@ -414,7 +414,7 @@ _ANOTHER_PROCESS = """
 import sys
 import numpy as np
 import varpin as vp
-from varpin.tradeoff import optimal_control
+from varpin.study.tradeoff import optimal_control
 
 cost = vp.TrackingCost([1.0]) + vp.ControlCost(1e-2)
 problem = vp.OptimalControlProblem(

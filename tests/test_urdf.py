@@ -13,8 +13,8 @@ import pytest
 from mechanisms import INERTIAL, arm, joint, link, mimic, write_urdf
 
 import varpin as vp
-from varpin.robot import example_robot_data, geometry, readable_geometry
-from varpin.robot.urdf import build_model, read_urdf
+from varpin.model import example_robot_data, geometry, readable_geometry
+from varpin.model.urdf import build_model, read_urdf
 
 ROBOTS = example_robot_data.locate(example_robot_data.FIXED_BASE["ur5"]).parents[2]
 PUBLISHED = sorted(str(path.relative_to(ROBOTS)) for path in ROBOTS.rglob("*.urdf"))

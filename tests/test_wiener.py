@@ -6,7 +6,7 @@ from mechanisms import slider
 from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_lyapunov
 
 import varpin as vp
-from varpin.wiener import coarsen, refine, wiener_increments
+from varpin.mechanics.wiener import coarsen, refine, wiener_increments
 
 SPLIT = vp.Midpoint(kick="split")
 BOTH = pytest.mark.parametrize("kick", ["left", "split"])

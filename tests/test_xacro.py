@@ -12,7 +12,7 @@ import pytest
 from mechanisms import INERTIAL, arm, joint, link
 
 import varpin as vp
-from varpin.robot import geometry
+from varpin.model import geometry
 
 HEAD = '<?xml version="1.0"?>\n<robot name="made_up" xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
 BALL = '<visual><geometry><sphere radius="0.1"/></geometry></visual>'

@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.control.problem import OptimalControlProblem, bind_cost
+from varpin.control.search import states
 from varpin.errors import InputError, VarpinError
 from varpin.integrators.base import open_loop
-from varpin.lagrangian import lagrangian_jet
 from varpin.linearization import linearize_steps, velocity_at_nodes
-from varpin.policy import LinearPolicy
-from varpin.sddp.problem import OptimalControlProblem, bind_cost
-from varpin.sddp.search import states
-from varpin.simulation import StepFailure, rollout
+from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.policy import LinearPolicy
+from varpin.simulation.run import StepFailure, rollout
 from varpin.trajectory import Trajectory
 
 try:

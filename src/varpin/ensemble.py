@@ -16,20 +16,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, VarpinError
-from varpin.executors import executing, in_order
-from varpin.frozen import Frozen
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, rows
-from varpin.loop_stability import examined_in_loop
-from varpin.markup import facts, said, table
-from varpin.policy import LinearPolicy, OpenLoop
-from varpin.scene import Scene, require_scene
-from varpin.simulation import Motions, commands_of
-from varpin.soundness import Finding, announce
-from varpin.wiener import Children, children
+from varpin.mechanics.policy import LinearPolicy, OpenLoop
+from varpin.mechanics.scene import Scene, require_scene
+from varpin.mechanics.wiener import Children, children
+from varpin.simulation.loop_stability import examined_in_loop
+from varpin.simulation.run import Motions, commands_of
+from varpin.simulation.soundness import Finding, announce
+from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
+from varpin.support.executors import executing, in_order
+from varpin.support.frozen import Frozen
+from varpin.support.markup import facts, said, table
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import as_floats, finite_array
 from varpin.errors import InputError
 from varpin.integrators import Integrator, integrator_of
 from varpin.integrators.base import diffusion_and_drift, open_loop
-from varpin.markup import facts, table
-from varpin.noise import Fields
-from varpin.scene import Scene, require_scene
+from varpin.mechanics.noise import Fields
+from varpin.mechanics.scene import Scene, require_scene
+from varpin.support.checks import as_floats, finite_array
+from varpin.support.markup import facts, table
 from varpin.trajectory import Trajectory, require_motion, require_scene_of
 
 Floats = NDArray[np.float64]

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin._version import __version__
-from varpin.archive import Check, Header, read_npz
-from varpin.checks import path_like, writable
 from varpin.errors import FileError, InputError
-from varpin.frozen import Frozen
-from varpin.markup import facts, said, table
-from varpin.robot import Robot
-from varpin.scene import OF_FORCES, VALUES, Scene, differences, same
+from varpin.io.archive import Check, Header, read_npz
+from varpin.mechanics.scene import OF_FORCES, VALUES, Scene, differences, same
+from varpin.model import Robot
+from varpin.support.checks import path_like, writable
+from varpin.support.frozen import Frozen
+from varpin.support.markup import facts, said, table
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -498,7 +498,7 @@ def read_members(
 ) -> dict[str, NDArray[Any]]:
     """The ``expected`` arrays of an npz file of format ``kind``, the ``optional`` that it has, with ``others`` all.
 
-    ``most`` and ``check`` as for :func:`varpin.archive.read_npz`.
+    ``most`` and ``check`` as for :func:`varpin.io.archive.read_npz`.
 
     Raises:
         FileError: It says what is wrong with the file.

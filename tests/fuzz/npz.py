@@ -14,11 +14,11 @@ import numpy as np
 import varpin as vp
 from fuzz import archive
 from fuzz.damage import Case, damaged_json, require_finite
-from varpin.paper.cases import MAIN
-from varpin.paper.experiments import Cell, Store, Task
-from varpin.tradeoff import OptimalControlTradeoff, WorkPrecision
-from varpin.tradeoff.optimal_control import OptimalControlRun
-from varpin.tradeoff.precision import WorkPrecisionRun
+from varpin.study.paper.cases import MAIN
+from varpin.study.paper.experiments import Cell, Store, Task
+from varpin.study.tradeoff import OptimalControlTradeoff, WorkPrecision
+from varpin.study.tradeoff.optimal_control import OptimalControlRun
+from varpin.study.tradeoff.precision import WorkPrecisionRun
 
 Corpus = dict[str, list[bytes]]
 

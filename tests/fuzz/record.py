@@ -10,8 +10,9 @@ from pathlib import Path
 
 import varpin as vp
 from fuzz.damage import Case, damaged_bytes, damaged_json
-from varpin import extremes, extremes_report
-from varpin.extremes.trial import Cell, Kind
+from varpin.show import extremes_report
+from varpin.study import extremes
+from varpin.study.extremes.trial import Cell, Kind
 
 Corpus = bytes
 

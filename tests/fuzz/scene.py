@@ -16,7 +16,7 @@ import numpy as np
 
 import varpin as vp
 from fuzz.damage import WORDS, Case, Special, damaged_bytes, damaged_tree, places, require_finite
-from varpin.scenefile import scenes
+from varpin.io.scenefile import scenes
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "scenes.md"
 ROBOT = Path(__file__).resolve().parents[2] / "models" / "finger.urdf"

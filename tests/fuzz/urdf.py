@@ -12,8 +12,8 @@ from mechanisms import INERTIAL, joint, link, mimic
 
 import varpin as vp
 from fuzz.damage import NUMBERS, WORDS, Case, damaged_bytes, require_finite
-from varpin.robot import bundled_robots, geometry
-from varpin.robot.example_robot_data import FIXED_BASE, locate
+from varpin.model import bundled_robots, geometry
+from varpin.model.example_robot_data import FIXED_BASE, locate
 
 ELEMENTS = [
     INERTIAL,

@@ -14,12 +14,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.checks import JointValues, joint_array
 from varpin.errors import InputError
 from varpin.integrators import BY_NAME, Integrator, integrator_of, options_of
-from varpin.robot import Robot, load_robot
-from varpin.scene import Scene
-from varpin.scenefile import SceneFile, load_scene, scenes
+from varpin.io.scenefile import SceneFile, load_scene, scenes
+from varpin.mechanics.scene import Scene
+from varpin.model import Robot, load_robot
+from varpin.support.checks import JointValues, joint_array
 
 
 def add_robot(parser: argparse.ArgumentParser, *, optional: bool = False, scenes: bool = False) -> None:

@@ -11,10 +11,10 @@ from rich.text import Text
 
 from varpin.cli.arguments import add_gravity, add_robot, add_vector, names_scene, scene_file, values_of
 from varpin.cli.console import say
-from varpin.inspection import inspect_robot
-from varpin.inspection_tables import parts_of
-from varpin.robot import build_robot, robot_names
-from varpin.tables import WIDTH, add_row, facts, table_of
+from varpin.model import build_robot, robot_names
+from varpin.show.inspection import inspect_robot
+from varpin.show.inspection_tables import parts_of
+from varpin.support.tables import WIDTH, add_row, facts, table_of
 
 
 def add_inspect(parser: argparse.ArgumentParser) -> None:

@@ -10,14 +10,14 @@ from typing import Any
 
 from rich.console import Console
 
-from varpin.checks import positive, writable
 from varpin.cli.console import complain
 from varpin.cli.exits import INTERRUPTED, MISTAKE
 from varpin.cli.interrupts import Interrupts
 from varpin.errors import FileError, InputError, VarpinError
-from varpin.replay import check_film, replay
-from varpin.robot import Robot
-from varpin.scenefile.spec import FIGURES
+from varpin.io.scenefile.spec import FIGURES
+from varpin.model import Robot
+from varpin.show.replay import check_film, replay
+from varpin.support.checks import positive, writable
 from varpin.trajectory import Trajectory, atomic_file
 
 
@@ -114,7 +114,7 @@ def _record(path: Path) -> Output:
 
 def _figure(path: Path) -> Output:
     _require_ending("--plot", path, FIGURES)
-    from varpin.plots import plot_trajectory  # noqa: PLC0415 - matplotlib is slow to import
+    from varpin.show.plots import plot_trajectory  # noqa: PLC0415 - matplotlib is slow to import
 
     def write(robot: Robot, trajectory: Trajectory) -> None:
         figure, _ = plot_trajectory(trajectory, robot=robot)

@@ -13,17 +13,17 @@ from typing import Any
 
 from rich.console import Console
 
-from varpin.archive import read_npz
-from varpin.checks import path_like, positive
 from varpin.cli.arguments import add_robot_options, names_scene
 from varpin.cli.console import say
 from varpin.cli.outputs import Output, add_shown, replays_of, write_all
+from varpin.control import solution_trajectory
 from varpin.errors import FileError, InputError, RobotNotFound
-from varpin.replay import frame_names, replay
-from varpin.robot import Robot, load_robot
-from varpin.scenefile import SceneFile, load_scene
-from varpin.sddp import solution_trajectory
-from varpin.tables import WIDTH
+from varpin.io.archive import read_npz
+from varpin.io.scenefile import SceneFile, load_scene
+from varpin.model import Robot, load_robot
+from varpin.show.replay import frame_names, replay
+from varpin.support.checks import path_like, positive
+from varpin.support.tables import WIDTH
 from varpin.trajectory import Trajectory
 
 

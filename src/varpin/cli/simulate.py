@@ -15,7 +15,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from varpin.checks import count, positive
 from varpin.cli.arguments import (
     add_integrator,
     add_motion,
@@ -29,10 +28,11 @@ from varpin.cli.console import complain, file_size, progress_bar, say
 from varpin.cli.exits import INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import Output, add_outputs, outputs_of, write_all
 from varpin.errors import InputError
-from varpin.replay import frame_names
-from varpin.scene import Scene
-from varpin.simulation import Interrupted, StepFailure, simulate
-from varpin.tables import WIDTH, add_row, facts
+from varpin.mechanics.scene import Scene
+from varpin.show.replay import frame_names
+from varpin.simulation.run import Interrupted, StepFailure, simulate
+from varpin.support.checks import count, positive
+from varpin.support.tables import WIDTH, add_row, facts
 from varpin.trajectory import Trajectory
 
 # More steps than anyone can hold in memory, said before NumPy says it in its own words.

@@ -14,14 +14,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from varpin.checks import writable
 from varpin.cli.arguments import scene_file
 from varpin.cli.console import file_size, say
 from varpin.cli.exits import INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import add_outputs, outputs_of, write_all
-from varpin.scenefile import SceneFile
-from varpin.sddp import Solution, Status
-from varpin.tables import WIDTH, add_row, facts
+from varpin.control import Solution, Status
+from varpin.io.scenefile import SceneFile
+from varpin.support.checks import writable
+from varpin.support.tables import WIDTH, add_row, facts
 
 
 def add_solve(parser: argparse.ArgumentParser) -> None:

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.text import Text
 
-from varpin.robot import load_robot
-from varpin.tradeoff import advise, work_precision
+from varpin.model import load_robot
+from varpin.study.tradeoff import advise, work_precision
 
 if TYPE_CHECKING:
-    from varpin.extremes import Cell
+    from varpin.study.extremes import Cell
 
 from varpin.cli.arguments import add_motion, add_robot, motion_of, simulate_words
 from varpin.cli.console import progress_bar, say
 from varpin.cli.exits import FAULTY, INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import folder_at
-from varpin.tables import WIDTH, add_row, table_of
+from varpin.support.tables import WIDTH, add_row, table_of
 
 
 def add_tradeoff(parser: argparse.ArgumentParser) -> None:
@@ -50,7 +50,7 @@ def add_tradeoff(parser: argparse.ArgumentParser) -> None:
 
 
 def _tradeoff(request: argparse.Namespace, errors: Console) -> int:
-    from varpin.tradeoff_report import COLUMNS, cells, write_report  # noqa: PLC0415 - matplotlib is slow to import
+    from varpin.show.tradeoff_report import COLUMNS, cells, write_report  # noqa: PLC0415 - matplotlib is slow to import
 
     folder = None if request.out is None else folder_at(request.out)
     scene, q0, v0, torque = motion_of(request)
@@ -100,7 +100,7 @@ def add_advise(parser: argparse.ArgumentParser) -> None:
 
 
 def _advise(request: argparse.Namespace, _errors: Console) -> int:
-    from varpin.tradeoff_report import ADVICE_COLUMNS, advice_cells, write_advice  # noqa: PLC0415 - as above
+    from varpin.show.tradeoff_report import ADVICE_COLUMNS, advice_cells, write_advice  # noqa: PLC0415 - as above
 
     folder = None if request.out is None else folder_at(request.out)
     scene, q0, v0, torque = motion_of(request)
@@ -146,7 +146,7 @@ def add_paper(parser: argparse.ArgumentParser) -> None:
 
 
 def _paper(request: argparse.Namespace, errors: Console) -> int:
-    from varpin.paper import reproduce  # noqa: PLC0415  (its figures need matplotlib, which takes long to import)
+    from varpin.study.paper import reproduce  # noqa: PLC0415  (its figures need matplotlib, which takes long to import)
 
     with progress_bar(errors, 1, quiet=request.quiet, unit="cells") as report:
         result = reproduce(request.out, quick=request.quick, progress=lambda done, cells, _: report(done, cells))
@@ -176,8 +176,8 @@ def add_extremes(parser: argparse.ArgumentParser) -> None:
 
 
 def _extremes(request: argparse.Namespace, errors: Console) -> int:
-    from varpin import extremes_report as report  # noqa: PLC0415 - most commands have no use for it
-    from varpin.extremes import Kind, run  # noqa: PLC0415
+    from varpin.show import extremes_report as report  # noqa: PLC0415 - most commands have no use for it
+    from varpin.study.extremes import Kind, run  # noqa: PLC0415
 
     robot = None
     if request.robot is not None:
@@ -216,6 +216,6 @@ def _extremes(request: argparse.Namespace, errors: Console) -> int:
 
 
 def _extreme(cell: Cell | None) -> Text:
-    from varpin.extremes_report import STYLES, entry  # noqa: PLC0415
+    from varpin.show.extremes_report import STYLES, entry  # noqa: PLC0415
 
     return Text("") if cell is None else Text(entry(cell), style=STYLES[cell.kind])

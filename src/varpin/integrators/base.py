@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from varpin.core.arrays import Commands, Nodes
 from varpin.errors import InputError, SingularMassMatrix
-from varpin.lagrangian import lagrangian_jet
-from varpin.scene import Scene
+from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.scene import Scene
 from varpin.trajectory import Bytes, StepStatistics, Trajectory, joined
 
 Floats = NDArray[np.float64]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from varpin.checks import count
 from varpin.errors import InputError
 from varpin.integrators.variational import Guard, Variational
+from varpin.support.checks import count
 
 MOST_STAGES = 6
 

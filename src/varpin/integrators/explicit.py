@@ -22,8 +22,8 @@ from varpin.integrators.base import (
     segments_of,
     steps_of,
 )
-from varpin.lagrangian import lagrangian_jet
-from varpin.scene import Scene
+from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]

@@ -9,10 +9,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from varpin.checks import fraction
 from varpin.core import Tableau
 from varpin.integrators.tableau import midpoint
 from varpin.integrators.variational import Guard, Variational
+from varpin.support.checks import fraction
 
 Floats = NDArray[np.float64]
 

@@ -9,13 +9,13 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from varpin.checks import positive
 from varpin.core import ExplicitMethod, ExplicitRollout, ForwardDynamics
 from varpin.core.arrays import Commands, Nodes, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import Failure, Integrator, Segment, control_of, drifts, segments_of, steps_of
 from varpin.integrators.explicit import REASONS, accelerations
-from varpin.scene import Scene
+from varpin.mechanics.scene import Scene
+from varpin.support.checks import positive
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]

@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.checks import count, fraction, is_one_of, positive
 from varpin.core import (
     Guards,
     Outcome,
@@ -33,7 +32,8 @@ from varpin.integrators.base import (
     steps_of,
     written,
 )
-from varpin.scene import Scene
+from varpin.mechanics.scene import Scene
+from varpin.support.checks import count, fraction, is_one_of, positive
 from varpin.trajectory import MOST_HALVINGS, Trajectory
 
 Floats = NDArray[np.float64]

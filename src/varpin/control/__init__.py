@@ -1,0 +1,15 @@
+"""S-DDP: optimal control under noise by differential dynamic programming, on any integrator's linearization."""
+
+from varpin.control.examination import looked_at as looked_at
+from varpin.control.history import Iteration as Iteration
+from varpin.control.history import SearchState as SearchState
+from varpin.control.history import Status as Status
+from varpin.control.monte_carlo import MonteCarlo as MonteCarlo
+from varpin.control.monte_carlo import MonteCarloInterrupted as MonteCarloInterrupted
+from varpin.control.problem import OptimalControlProblem as OptimalControlProblem
+from varpin.control.search import replan as replan
+from varpin.control.search import solve as solve
+from varpin.control.solution import Solution as Solution
+from varpin.control.solution import Violations as Violations
+from varpin.control.solution_file import solution_trajectory as solution_trajectory
+from varpin.control.verification import Verification as Verification

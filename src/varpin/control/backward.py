@@ -1,0 +1,393 @@
+"""The backward pass along a motion: a quadratic model of the cost to go, and how to change the controls by it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin import core
+from varpin.control.costs import CostError, Expansion
+from varpin.control.descent import Model
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.square_root import Squares, squares_of
+from varpin.errors import LinearizationError
+from varpin.linearization import (
+    Linearization,
+    linearize_steps,
+    second_order_steps,
+    velocity_at_nodes,
+    velocity_curvature,
+)
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+# Nodes that are linearized at a time: their derivatives are not kept.
+_BLOCK = 2048
+
+# A pass whose Quu rounding may have changed by more than this part is made anew on square roots.
+TRUSTED = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a backward pass found: how to change the controls, and what to expect of it."""
+
+    feedforward: Floats  # (R, m)
+    feedback: Floats  # (R, m, 2n)
+    previous: Floats | None  # (R, m, m) gains on the control before, where its change costs something
+    gradient: Floats  # (R, m)
+    slope: float
+    curvature: float
+    noise: float  # cost of the noise along the motion
+    jumps: Floats  # (N, 2n, n), empty without noise
+    spread: Floats  # (N, 2n, 2n)
+    limited: bool
+    loss: float  # about the part of Quu, or of its root, that rounding may have changed
+    model: Model  # of the cost along the motion
+
+    @property
+    def promise(self) -> float:
+        """Decrease of the expected cost with a full step, by the model."""
+        # Without limits the step is the model's minimum, where the curvature takes back half of what the slope gives.
+        return -self.slope - 0.5 * self.curvature if self.limited else -0.5 * self.slope
+
+    def followed(self, length: float) -> Plan:
+        """What is left of it after a step of some length, by the model: its gains, and the rest of the way."""
+        left = 1.0 - length
+        return replace(self, feedforward=left * self.feedforward, gradient=left * self.gradient)
+
+    def free_gradient(self, problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
+        """The gradient (R, m) without what pushes controls against limits they are at: zero at an optimum."""
+        if not problem.limited:
+            return self.gradient
+        u, (lower, upper) = trajectory.u[:: problem.hold], problem.control_limits
+        held = ((u <= lower) & (self.gradient > 0.0)) | ((u >= upper) & (self.gradient < 0.0))
+        return np.where(held, 0.0, self.gradient)
+
+
+def noise_shares(
+    problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan, processes: NDArray[np.bool_] | None = None
+) -> Floats:
+    """What noise adds in each step (N,) to the cost of a motion, if it acts and costs as it did along the plan's own.
+
+    ``processes`` (k,) says which ones count, all if left out. Empty where there is no noise.
+    """
+    if problem.scene.processes == 0:
+        return np.zeros(0)
+    g = impulses(problem, trajectory, plan.jumps)
+    if processes is not None:
+        g = g[:, :, processes]
+    added: Floats = 0.5 * np.einsum("Nai,Nai->N", g, plan.spread @ g)
+    return added
+
+
+def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floats) -> Floats:
+    """What each Wiener process does to the state after each step of a motion, (N, 2n, k), for given ``jumps``."""
+    scene, n, left = problem.scene, problem.scene.robot.dof, problem.integrator.left
+    q, v, u = trajectory.q, trajectory.v, trajectory.u
+    jump = scene.noise.fields(q[:-1], v[:-1], u, problem.q0).F
+    if not problem.integrator.variational:
+        jump = velocity_at_nodes(scene, q[:-1], v[:-1])[:, :, n:] @ jump
+    g: Floats = left * (jumps @ jump)
+    if left < 1.0:
+        g[:, n:] += (1.0 - left) * scene.noise.fields(q[1:], v[1:], u, problem.q0).F
+    return g
+
+
+def _curvature(problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan, costate: Floats) -> Floats:
+    """Second derivatives (N, 2n + m, 2n + m) in (x, u) that dynamics and noise fields add to the cost to go."""
+    scene, n, h = problem.scene, problem.scene.robot.dof, problem.dt
+    N, samples, rule = problem.steps, len(problem.rule), problem.rule
+    gradient = problem.expand_running(trajectory).gradient.reshape(N, samples, -1)
+    by_q, by_v = gradient[:, :, :n], gradient[:, :, n : 2 * n]
+    # The running cost's gradient in q0, v0, q1 and v1 of each step.
+    pulls = [
+        h * np.einsum("s,Nsi->Ni", rule[:, 0] * rule[:, 1 + c], by_q)
+        + h * np.einsum("s,Nsi->Ni", rule[:, 0] * rule[:, 5 + c], by_v)
+        for c in range(4)
+    ]
+    z = costate.copy()
+    z[:, :n] += pulls[2]
+    after = bool(rule[:, [4, 8]].any())
+    if after:
+        z += np.einsum("Ni,Nix->Nx", pulls[3], velocity_at_nodes(scene, trajectory.q[1:], trajectory.v[1:]))
+    second = second_order_steps(scene, trajectory, z, problem.integrator)
+    total = np.block([[second.xx, np.swapaxes(second.ux, 1, 2)], [second.ux, second.uu]])
+    if rule[:, [2, 6]].any():
+        total[:, : 2 * n, : 2 * n] += velocity_curvature(scene, trajectory.q[:-1], trajectory.v[:-1], pulls[1])
+    if after:
+        lin = _linearize(problem, trajectory, 0)
+        J = np.concatenate([lin.A, lin.B], axis=2)
+        total += np.swapaxes(J, 1, 2) @ velocity_curvature(scene, trajectory.q[1:], trajectory.v[1:], pulls[3]) @ J
+    if scene.processes and problem.integrator.variational:
+        pull = plan.spread @ impulses(problem, trajectory, plan.jumps)
+        weight = problem.integrator.left * np.swapaxes(plan.jumps, 1, 2) @ pull
+        total[:, :n, :n] += scene.noise.curvature(weight)
+    return total
+
+
+def backward(
+    problem: OptimalControlProblem, trajectory: Trajectory, regularization: float, second_order: bool = False
+) -> Plan | None:
+    """One backward pass along a motion; None where a control has no minimum.
+
+    Raises:
+        LinearizationError: A step has no derivative.
+    """
+    along = _Along(problem, trajectory)
+    if not second_order:
+        return _within_limits(along, regularization, None)
+    # First derivatives of the cost to go, then with them second derivatives of the dynamics (stagewise Newton).
+    plan, costate = _pass(along, max(regularization, 1e-3), costates=True)
+    if plan is None:
+        return None
+    return _within_limits(along, regularization, _curvature(problem, trajectory, plan, costate))
+
+
+def _within_limits(along: _Along, regularization: float, curvature: Floats | None) -> Plan | None:
+    """The pass whose controls are kept within their limits where the linearized motion is expected.
+
+    Around the nominal states alone, late decisions seem to meet their limits: each would have to do by itself what
+    those before it are to do. So the first pass knows no limits. What its motion meets of them the next ones take into
+    account, until they meet no others. Where more and more of that changes, nominal states are what is left.
+    """
+    if not along.problem.limited:
+        return _pass(along, regularization, curvature=curvature)[0]
+    plan = _pass(along, regularization, curvature=curvature)[0]
+    held: NDArray[np.bool_] = np.zeros(along.slack[:, 0].shape, dtype=np.bool_)
+    others = held.size + 1
+    while plan is not None and others > 0:
+        expected, moves = _foreseen(along, plan)
+        if not held.any() and not ((moves <= along.slack[:, 0]) | (moves >= along.slack[:, 1])).any():
+            break
+        plan = _pass(along, regularization, curvature=curvature, limits=_Limits(along.slack, expected))[0]
+        if plan is None:
+            break
+        now = np.logical_not(plan.feedback.any(axis=2))
+        # Where motions run into limits for long, looking ahead may lead nowhere.
+        changed = int((now != held).sum())
+        if changed >= others:
+            plan = None
+        held, others = now, changed
+    if plan is not None and plan.promise > 0.0:
+        # Feed-forward parts hold together with the feedback that the others ask for: the slope is that of both.
+        slope = float((plan.gradient * _foreseen(along, plan)[1]).sum())
+        if slope < 0.0:
+            return replace(plan, slope=slope, curvature=-2.0 * (plan.promise + slope), limited=True)
+    nominal = _Limits(along.slack, np.zeros((0, along.running.gradient.shape[1])))
+    return _pass(along, regularization, curvature=curvature, limits=nominal)[0]
+
+
+def _foreseen(along: _Along, plan: Plan) -> tuple[Floats, Floats]:
+    """Where the linearized motion goes under a plan whose controls are clipped to their limits.
+
+    The state, and the change of the control before, before each decision (R, 2n + m), and the controls' changes (R, m).
+    """
+    problem, (R, m, x) = along.problem, plan.feedback.shape
+    expected, moves, state = np.empty((R, x + m)), np.empty((R, m)), np.zeros(x + m)
+    previous = np.zeros((0, m, m)) if plan.previous is None else plan.previous
+    for begin, end in along.blocks:
+        rows = slice(begin // problem.hold, end // problem.hold)
+        gains = core.Gains(
+            feedforward=plan.feedforward[rows],
+            feedback=plan.feedback[rows],
+            previous=previous[rows],
+            control_gradient=plan.gradient[rows],
+            costate=np.zeros((0, x)),
+            spread=plan.spread[begin:end],
+        )
+        steps = along.steps(begin, end, None, _Limits(along.slack, np.zeros((0, x + m))))
+        core.foresee(problem.hold, steps, gains, state, expected[rows], moves[rows])
+    return expected, moves
+
+
+class _Limits(NamedTuple):
+    """What keeps controls within their limits: their ``slack`` (R, 2, m), and the states expected (R, 2n + m).
+
+    Either may be empty: without limits, and around the nominal states.
+    """
+
+    slack: Floats
+    expected: Floats
+
+
+class _Along:
+    """What passes along a motion are made from; the linearization is kept where it is one block."""
+
+    def __init__(self, problem: OptimalControlProblem, trajectory: Trajectory) -> None:
+        self.problem, self.trajectory = problem, trajectory
+        m = problem.scene.controls
+        self.running = problem.expand_running(trajectory)
+        for name, array in (("gradient", self.running.gradient), ("Hessian", self.running.hessian)):
+            if not np.isfinite(array).all():
+                raise CostError(repr(problem.cost), f"its {name} along the motion is not finite")
+        self.rate, self.pull = np.zeros((0, m, m)), np.zeros((0, m))
+        if problem.rate is not None:
+            self.pull, self.rate = problem.rate.expand(trajectory.u[:: problem.hold], problem.period)
+        self.slack = np.zeros((0, 2, m))
+        if problem.limited:
+            self.slack = problem.control_limits - trajectory.u[:: problem.hold, None]
+        block = max(1, _BLOCK // problem.hold) * problem.hold
+        self.blocks = [(max(0, end - block), end) for end in range(problem.steps, 0, -block)][::-1]
+        self.kept: tuple[Linearization, Floats] | None = None
+
+    def linearized(self, begin: int, end: int) -> tuple[Linearization, Floats]:
+        """A block of steps, and dv/dx at its nodes where they are needed."""
+        if self.kept is not None:
+            return self.kept
+        problem, part = self.problem, self.trajectory.part(begin, end)
+        # Velocities at nodes are needed where they are sampled and x does not hold them.
+        nodes = problem.integrator.variational and bool(problem.rule[:, [2, 4, 6, 8]].any())
+        lin = _linearize(problem, part, begin)
+        n = problem.scene.robot.dof
+        velocity = velocity_at_nodes(problem.scene, part.q, part.v) if nodes else np.zeros((0, n, 2 * n))
+        if len(self.blocks) == 1:
+            self.kept = lin, velocity
+        return lin, velocity
+
+    def steps(self, begin: int, end: int, curvature: Floats | None, limits: _Limits) -> core.ExpandedSteps:
+        """A block of steps as the core takes them."""
+        problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.rule)
+        size = hessian.shape[-1]
+        rows, points = slice(begin // problem.hold, end // problem.hold), slice(begin * samples, end * samples)
+        lin, velocity = self.linearized(begin, end)
+        return core.ExpandedSteps(
+            A=lin.A,
+            B=lin.B,
+            G=lin.G,
+            Gx=lin.Gx,
+            Gu=lin.Gu,
+            rule=problem.rule,
+            gradient=self.running.gradient[points],
+            hessian=hessian[points] if len(hessian) > 1 else hessian,
+            velocity=velocity,
+            curvature=np.zeros((0, size, size)) if curvature is None else curvature[begin:end],
+            slack=limits.slack[rows],
+            expected=limits.expected[rows],
+            rate=self.rate[rows],
+            pull=self.pull[rows],
+        )
+
+
+def _pass(
+    along: _Along,
+    regularization: float,
+    *,
+    costates: bool = False,
+    curvature: Floats | None = None,
+    limits: _Limits | None = None,
+) -> tuple[Plan | None, Floats]:
+    """The pass by the plain recursion, or, where that has lost its digits and the model is convex, on square roots."""
+    plain = _one_pass(along, regularization, costates, curvature, limits, roots=False)
+    if curvature is not None or (plain[0] is not None and plain[0].loss <= TRUSTED):
+        return plain
+    by_roots = _one_pass(along, regularization, costates, None, limits, roots=True)
+    return plain if by_roots[0] is None else by_roots
+
+
+class _ByRoots(NamedTuple):
+    """A pass on square roots, and the costs of samples and of changes of the control as squares."""
+
+    run: core.RootPass
+    running: Squares
+    change: Squares
+
+
+def _one_pass(
+    along: _Along,
+    regularization: float,
+    costates: bool,
+    curvature: Floats | None,
+    limits: _Limits | None,
+    *,
+    roots: bool,
+) -> tuple[Plan | None, Floats]:
+    problem, running = along.problem, along.running
+    scene = problem.scene
+    n, m, k, N, R = scene.robot.dof, scene.controls, scene.processes, problem.steps, problem.decisions
+    terminal, D, by_state, by_states = _terminal(problem, along.trajectory, curvature is not None)
+    noisy = N if k else 0
+    jumps, spread = np.empty((noisy, 2 * n, n)), np.empty((noisy, 2 * n, 2 * n))
+    feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, 2 * n)), np.empty((R, m))
+    previous = np.empty(along.rate.shape)
+    costate = np.empty((N if costates else 0, 2 * n))
+    plain, by_roots = core.BackwardPass(m, by_state, by_states), None
+    if roots:
+        final, squares = squares_of(terminal.gradient, terminal.hessian), squares_of(running.gradient, running.hessian)
+        change = squares_of(along.pull, along.rate)
+        if final is None or squares is None or change is None:
+            return None, costate
+        by_roots = _ByRoots(core.RootPass(m, final.after(D).core, by_state), squares, change)
+    if limits is None:
+        limits = _Limits(np.zeros((0, 2, m)), np.zeros((0, 2 * n + m)))
+    samples = len(problem.rule)
+    for begin, end in reversed(along.blocks):
+        steps, points = slice(begin, end), slice(begin * samples, end * samples)
+        rows = slice(begin // problem.hold, end // problem.hold)
+        if k:
+            jumps[steps] = along.linearized(begin, end)[0].J
+        given = along.steps(begin, end, curvature, limits)
+        gains = core.Gains(
+            feedforward=feedforward[rows],
+            feedback=feedback[rows],
+            previous=previous[rows],
+            control_gradient=gradient[rows],
+            costate=costate[steps] if costates else costate,
+            spread=spread[steps],
+        )
+        how = (problem.dt, problem.hold, float(regularization))
+        if by_roots is None:
+            failed = plain.run(*how, given, gains)
+        else:
+            running_squares, change_squares = by_roots.running[points].core, by_roots.change[rows].core
+            failed = by_roots.run.run(*how, given, gains, running_squares, change_squares)
+        if failed >= 0:
+            return None, costate
+    found = plain if by_roots is None else by_roots.run
+    if not (np.isfinite(found.slope) and np.isfinite(found.curvature)):
+        return None, costate
+    plan = Plan(
+        feedforward,
+        feedback,
+        None if problem.rate is None else previous,
+        gradient,
+        found.slope,
+        found.curvature,
+        found.noise,
+        jumps,
+        spread,
+        limits.slack.size > 0,
+        found.loss,
+        Model(running, terminal),
+    )
+    return plan, costate
+
+
+def _linearize(problem: OptimalControlProblem, part: Trajectory, begin: int) -> Linearization:
+    try:
+        return linearize_steps(problem.scene, part, problem.integrator, problem.q0)
+    except LinearizationError as error:
+        step = begin + error.step
+        raise LinearizationError(step, step * problem.dt, error.reason) from None
+
+
+def _terminal(
+    problem: OptimalControlProblem, trajectory: Trajectory, exact: bool
+) -> tuple[Expansion, Floats, Floats, Floats]:
+    """The terminal cost in (q, v), d(q, v)/dx, and the cost's gradient (2n,) and Hessian (2n, 2n) in x."""
+    n = problem.scene.robot.dof
+    end = problem.expand_terminal(trajectory)
+    x = slice(0, 2 * n)
+    gradient, hessian, D = end.gradient[:1, x], end.hessian[:1, x, x], np.eye(2 * n)
+    g, H = gradient[0], hessian[0]
+    if problem.integrator.variational:
+        D[n:] = velocity_at_nodes(problem.scene, trajectory.q[-1:], trajectory.v[-1:])[0]
+        H = D.T @ H @ D
+        if exact:
+            H = H + velocity_curvature(problem.scene, trajectory.q[-1:], trajectory.v[-1:], g[None, n:])[0]
+        g = D.T @ g
+    return Expansion(gradient, hessian), D, g, H

@@ -1,0 +1,171 @@
+"""The cost of changing controls: what couples each decision to the one before."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.costs.base import BoundCost, Cost, CostSum, Points, Scaled, checked_weight, weight_matrix
+from varpin.core import change_values, expand_changes
+from varpin.errors import InputError
+from varpin.support.checks import JointValues, as_floats, control_array, finite_array, require_finite
+from varpin.support.frozen import Frozen
+
+Floats = NDArray[np.float64]
+
+
+class ControlRateCost(Cost):
+    """weight . (du/dt)^2: keep controls smooth.
+
+    Controls are constant over a period T = hold dt and jump between them. The integral of the square of their rate is
+    that of the line through them, the sum over decisions of weight . (u_k - u_(k-1))^2 / T: it means the same at every
+    ``dt`` for controls that are smooth in time, up to a part of the size of T.
+    """
+
+    weight: Floats | Mapping[str, float]
+    before: Floats | Mapping[str, float] | None
+
+    def __init__(self, weight: JointValues = 1.0, before: JointValues | None = None) -> None:
+        """Describe the cost.
+
+        Args:
+            weight: One number, (m,), by joint name where each control is the force of a joint, or a matrix (m, m),
+                positive semidefinite [cost s / control^2].
+            before: The control applied before the horizon, one number, (m,) or by joint name, from which the first
+                change counts. Left out, the first control is free.
+
+        Raises:
+            InputError: A weight that is not finite, indefinite, or neither number, vector nor square matrix; or a
+                control that is neither number nor vector, or not finite.
+        """
+        self.weight = weight if isinstance(weight, Mapping) else checked_weight("ControlRateCost", weight)
+        self.before = before if isinstance(before, Mapping) else None
+        if before is not None and not isinstance(before, Mapping):
+            start = require_finite("ControlRateCost before", as_floats("ControlRateCost before", before))
+            if start.ndim > 1:
+                raise InputError(f"ControlRateCost before must be one number or a vector, got shape {start.shape}")
+            start.setflags(write=False)
+            self.before = start
+
+    def __repr__(self) -> str:
+        start = "" if self.before is None else f", before={_shown(self.before)}"
+        return f"ControlRateCost(weight={_shown(self.weight)}{start})"
+
+    @property
+    def of_controls(self) -> bool:
+        """See :attr:`Cost.of_controls`."""
+        return True
+
+    @property
+    def nonnegative(self) -> bool:
+        """See :attr:`Cost.nonnegative`."""
+        return True
+
+    def bind(self, points: Points) -> BoundCost:  # noqa: ARG002
+        """Refuse: it is nothing at any single point in time, and a problem takes it by :func:`control_rate`.
+
+        Raises:
+            InputError: It is part of another cost than a sum.
+        """
+        raise InputError(f"{self!r} must be a term of a problem's cost, scaled or not, and no part of another")
+
+
+def _shown(values: Floats | Mapping[str, float]) -> object:
+    return dict(values) if isinstance(values, Mapping) else values.tolist()
+
+
+@dataclass(frozen=True, eq=False)
+class ControlRate(Frozen):
+    """What changes of the controls cost in all.
+
+    Attributes:
+        weight: (m, m).
+        before: The control before the horizon (m,), or None where the first one is free.
+    """
+
+    weight: Floats
+    before: Floats | None
+
+    def shares(self, u: Floats, period: float) -> Floats:
+        """What each of N controls (..., N, m) that change every ``period`` [s] costs beside the one before (..., N)."""
+        rows = np.ascontiguousarray(u).reshape(-1, *u.shape[-2:])
+        return change_values(self.weight / period, self._before, rows).reshape(u.shape[:-1])
+
+    def value(self, u: Floats, period: float) -> Floats:
+        """The cost (...) of controls (..., N, m) that change every ``period`` [s]."""
+        total: Floats = self.shares(u, period).sum(axis=-1)
+        return total
+
+    def expand(self, u: Floats, period: float) -> tuple[Floats, Floats]:
+        """Gradients (N, m) in u_k, with u_(k-1) as it is, of each change of the controls (N, m); Hessians (N, m, m)."""
+        return expand_changes(self.weight / period, self._before, np.ascontiguousarray(u))
+
+    @property
+    def _before(self) -> Floats:
+        """(1, m), or (0, m) where the first control is free."""
+        return np.zeros((0, len(self.weight))) if self.before is None else self.before[None]
+
+
+def control_rate(cost: Cost, controls: int, joints: Sequence[str] | None = None) -> ControlRate | None:
+    """All terms on the rate of controls in a cost together, for m controls; None if there is none.
+
+    Args:
+        cost: The cost.
+        controls: m.
+        joints: The joint whose force each control is; None where controls are something else.
+
+    Raises:
+        UnknownJoint: A name that is no driven joint's.
+        InputError: Weights or controls of a wrong size, or terms with different controls before.
+    """
+    terms = list(_terms(cost))
+    if not terms:
+        return None
+    name = "ControlRateCost"
+    weight = np.zeros((controls, controls))
+    for factor, term in terms:
+        own = term.weight
+        if isinstance(own, Mapping):
+            own = checked_weight(name, control_array(f"{name} weight", own, joints))
+        weight += factor * weight_matrix(name, own, controls)
+    starts: list[Floats | None] = []
+    for _, term in terms:
+        start = term.before
+        if isinstance(start, Mapping):
+            start = control_array(f"{name} before", start, joints)
+        if start is not None and start.ndim == 0:
+            start = np.full(controls, float(start))
+        starts.append(None if start is None else finite_array(f"{name} before", start, (controls,)))
+    if len({None if start is None else tuple(start.tolist()) for start in starts}) > 1:
+        raise InputError(f"{name} terms of one cost must have the same control before")
+    return ControlRate(weight, starts[0])
+
+
+def is_control_rate(term: Cost) -> bool:
+    """Whether a term is on the rate of controls, scaled or not."""
+    return any(True for _ in _terms(term))
+
+
+def with_control_before(cost: Cost, before: JointValues) -> Cost:
+    """The same cost with another control before the horizon."""
+    if isinstance(cost, ControlRateCost):
+        return ControlRateCost(cost.weight, before)
+    if isinstance(cost, Scaled):
+        return Scaled(cost.factor, with_control_before(cost.cost, before))
+    if isinstance(cost, CostSum):
+        return CostSum(tuple(with_control_before(part, before) for part in cost.parts))
+    return cost
+
+
+def _terms(cost: Cost) -> Iterator[tuple[float, ControlRateCost]]:
+    """The terms on the rate of controls, each with what it is scaled by."""
+    if isinstance(cost, ControlRateCost):
+        yield 1.0, cost
+    elif isinstance(cost, Scaled):
+        yield from ((cost.factor * factor, term) for factor, term in _terms(cost.cost))
+    elif isinstance(cost, CostSum):
+        for part in cost.parts:
+            yield from _terms(part)

@@ -1,0 +1,64 @@
+"""Costs that the core evaluates, all at once: weight . r^2 with r of z = (q, v, u), a frame or the centre of mass."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.core import CostTerms, Subject
+from varpin.model.kinematics import FrameKinematics, Links
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_NO_DIRECTIONS = np.zeros(0, dtype=np.int64)
+
+
+class Terms:
+    """Terms at the same points. Targets are (N, r), or (1, r) where they are constant."""
+
+    def __init__(self, dof: int, controls: int) -> None:
+        self._core = CostTerms.make(dof, controls)
+        self._places: dict[bytes, int] = {}
+
+    def add_entries(self, begin: int, weight: Floats, target: Floats) -> None:
+        """Weight . (y - target)^2 with y the entries of z from ``begin`` on."""
+        self._core.add_term(Subject.entries, begin, weight, target, _NO_DIRECTIONS)
+
+    def add_excess(self, begin: int, weight: Floats, lower: Floats, upper: Floats) -> None:
+        """Weight . r^2 with r what the entries of z from ``begin`` on are beyond limits (r,)."""
+        limits = np.concatenate([lower, upper])[None]
+        self._core.add_term(Subject.excess, begin, weight, limits, _NO_DIRECTIONS)
+
+    def add_frame(self, subject: Subject, frame: FrameKinematics, weight: Floats, target: Floats) -> None:
+        """Weight . r^2 with r the ``subject`` of a frame beside its target; those of orientations are (N, 9)."""
+        self._core.add_term(subject, self._place_of(frame), weight, target, _NO_DIRECTIONS)
+
+    def add_manipulability(self, frame: FrameKinematics, directions: Integers, weight: Floats, least: float) -> None:
+        """Weight (1, 1) . (least - w)^2 where w < least, of some rows of a frame's Jacobian."""
+        self._core.add_term(Subject.manipulability, self._place_of(frame), weight, np.array([[least]]), directions)
+
+    def add_center(self, links: Links, weight: Floats, target: Floats) -> None:
+        """Weight . (c - target)^2 with c the bodies' centre of mass."""
+        if links.key not in self._places:
+            self._places[links.key] = self._core.add_center(links.core)
+        self._core.add_term(Subject.position, self._places[links.key], weight, target, _NO_DIRECTIONS)
+
+    def _place_of(self, frame: FrameKinematics) -> int:
+        # The frame of several terms is placed once.
+        if frame.key not in self._places:
+            self._places[frame.key] = self._core.add_frame(frame.links.core, frame.rotation, frame.translation)
+        return self._places[frame.key]
+
+    def values(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """The value of each term (..., N, terms) at q (..., N, n), v (..., N, n) and u (..., N, m)."""
+        rows = (np.ascontiguousarray(x).reshape(-1, x.shape[-1]) for x in (q, v, u))
+        found = self._core.values(*rows)
+        return found.reshape(*q.shape[:-1], found.shape[1])
+
+    def expand(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats]:
+        """Gradient (N, 2n + m) and Hessian (N, 2n + m, 2n + m) of all terms together.
+
+        The Hessian is that of Gauss and Newton, 2 J' weight J, and (1, 2n + m, 2n + m) where it is the same everywhere.
+        """
+        return self._core.expand(q, v, u)

@@ -1,0 +1,260 @@
+"""The expected cost of a policy, by simulation."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.costs import CostSum
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.verification import excess, percent
+from varpin.ensemble import (
+    Extremes,
+    Shared,
+    Task,
+    chunks,
+    greater,
+    looked_at,
+    looked_at_here,
+    simulate_paths,
+    without_geometry,
+)
+from varpin.errors import VarpinError
+from varpin.mechanics.policy import LinearPolicy
+from varpin.mechanics.wiener import Children, children
+from varpin.simulation.loop_stability import examined_in_loop
+from varpin.simulation.run import NoiseError, StepFailure, commands_of
+from varpin.simulation.soundness import Finding, announce
+from varpin.support.checks import count
+from varpin.support.executors import executing, in_order
+from varpin.support.frozen import Frozen
+from varpin.support.markup import facts, said
+
+Floats = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class MonteCarlo:
+    """The expected cost of a policy, by simulation.
+
+    Attributes:
+        cost: Mean over the paths.
+        standard_error: Of the mean.
+        predicted: By the solver's model.
+        paths: How many were counted.
+        failures: Paths that could not be finished; they are not counted.
+        warnings: What varpin says of the paths, a sentence each, as of those of an :class:`Ensemble`.
+    """
+
+    cost: float
+    standard_error: float
+    predicted: float
+    paths: int
+    failures: int
+    warnings: tuple[str, ...] = field(default=(), repr=False)
+
+    def __repr__(self) -> str:
+        gap = f"MonteCarlo(cost {self.cost:.6g} +- {self.standard_error:.1e}, predicted {self.predicted:.6g}"
+        lost = f", {self.failures} failed" if self.failures else ""
+        return f"{gap}, {self.paths} paths{lost}{said(self.warnings)})"
+
+    def _repr_html_(self) -> str:
+        rows: list[tuple[str, object]] = [
+            ("simulated", f"{self.cost:.6e} +- {self.standard_error:.1e}"),
+            ("predicted", f"{self.predicted:.6e}"),
+            ("paths", self.paths),
+            ("ran away", self.failures),
+        ]
+        return facts("Expected cost", rows + [("warning", warning) for warning in self.warnings])
+
+    def __str__(self) -> str:
+        gap = self.cost - self.predicted
+        apart = f", {gap / self.standard_error:+.1f} standard errors" if self.standard_error > 0.0 else ""
+        lost = f"; {self.failures} more ran away and are not counted" if self.failures else ""
+        return "\n".join(
+            [
+                f"{'':16}{'expected cost':>14}",
+                f"{'simulated':16}{self.cost:14.6e} +- {self.standard_error:.1e} ({self.paths} paths{lost})",
+                f"{'predicted':16}{self.predicted:14.6e}",
+                f"{'difference':16}{gap:+14.6e} ({percent(excess(self.cost, self.predicted))}{apart})",
+                "read it so: within three standard errors (+-) the two agree; beyond, noise is too strong for the "
+                "model",
+                *(f"warning: {warning}" for warning in self.warnings),
+            ]
+        )
+
+
+class MonteCarloInterrupted(KeyboardInterrupt):
+    """Ctrl-C during :meth:`Solution.monte_carlo`.
+
+    Attributes:
+        result: Of the paths done so far; None if there are fewer than two.
+    """
+
+    def __init__(self, result: MonteCarlo | None) -> None:
+        self.result = result
+        done = 0 if result is None else result.paths + result.failures
+        super().__init__(f"interrupted after {done} paths" + ("; they are in .result" if done else ""))
+
+
+@dataclass(frozen=True, eq=False)
+class _Costs(Frozen):
+    """What came of a chunk: costs of its paths (C,), NaN where one failed, and which of them are worth a look."""
+
+    values: Floats
+    extremes: Extremes
+
+
+@dataclass(frozen=True, eq=False)
+class _Chunk(Frozen):
+    """Paths of a problem; ``task`` for those that the core can take."""
+
+    problem: OptimalControlProblem
+    task: Task
+
+
+@dataclass(frozen=True, eq=False)
+class _Alone(Frozen):
+    """A path of a problem with noise that only Python can evaluate."""
+
+    problem: OptimalControlProblem
+    policy: LinearPolicy
+    seeds: Children
+    path: int
+
+
+def monte_carlo(
+    problem: OptimalControlProblem,
+    policy: LinearPolicy,
+    predicted: float,
+    paths: int,
+    rng: np.random.Generator | int,
+    *,
+    workers: int | None,
+    executor: Executor | None,
+    progress: Callable[[int, int], None] | None,
+) -> MonteCarlo:
+    """As :meth:`Solution.monte_carlo` says, of any policy."""
+    paths = count("paths", paths, least=2)
+    costs: list[Floats] = []
+    found: tuple[Finding, ...] = ()
+    extremes: Extremes = {}
+    done, sent = 0, _sent(problem)
+    with executing(executor, workers) as pool:
+        seeds = children(rng, paths)
+        compiled = problem.scene.noise.diffusion is not None
+        q0, v0 = (np.broadcast_to(x, (paths, x.size)) for x in (sent.q0, sent.v0))
+        shared: Shared | None = None
+        if compiled:
+            commands = commands_of(sent.scene, sent.integrator, policy, sent.steps, sent.dt)
+            shared = Shared(sent.scene, sent.integrator, commands, sent.dt, sent.steps, seeds)
+        try:
+            parts: Generator[_Costs, None, None]
+            if shared is not None:
+                parts = in_order(pool, _together, _tasks(sent, shared, q0, v0))
+            elif executor is not None:
+                parts = in_order(pool, _alone, (_Alone(sent, policy, seeds, path) for path in range(paths)))
+            else:
+                # Functions of the user's need not be made for several threads.
+                parts = (_alone(_Alone(sent, policy, seeds, path)) for path in range(paths))
+            with closing(parts):
+                for part in parts:
+                    costs.append(part.values)
+                    extremes = greater(extremes, part.extremes)
+                    done += len(part.values)
+                    if progress is not None:
+                        progress(done, paths)
+            if shared is not None:
+                found = looked_at(pool, shared, q0, v0, extremes)
+            elif np.isfinite(costs[0]).all():
+                found = _look_alone(_Alone(sent, policy, seeds, 0))
+        except KeyboardInterrupt:
+            so_far = _mean(costs, predicted)
+            if so_far is None:
+                raise MonteCarloInterrupted(None) from None
+            if shared is not None:
+                found = looked_at_here(shared, q0[:done], v0[:done], extremes)
+            elif np.isfinite(costs[0]).all():
+                # Nothing after another Ctrl-C.
+                with suppress(KeyboardInterrupt):
+                    found = _look_alone(_Alone(sent, policy, seeds, 0))
+            raise MonteCarloInterrupted(_warned(so_far, (*_lost(so_far), *found))) from None
+    result = _mean(costs, predicted)
+    if result is None:
+        raise VarpinError(f"fewer than two of {paths} paths got to the end; a smaller dt may help")
+    found = (*_lost(result), *found)
+    announce(logger, problem.scene, problem.dt, found)
+    return _warned(result, found)
+
+
+def _sent(problem: OptimalControlProblem) -> OptimalControlProblem:
+    """The problem without what no path needs: shapes of the robot, and references that are sampled already."""
+    sent = copy.copy(problem)
+    vars(sent).update(scene=without_geometry(problem.scene), cost=CostSum(()))
+    return sent
+
+
+def _tasks(problem: OptimalControlProblem, shared: Shared, q0: Floats, v0: Floats) -> Iterator[_Chunk]:
+    for first, last in chunks(shared.steps, len(q0)):
+        own = Task(shared, first, q0[first:last].copy(), v0[first:last].copy(), store=True, moments=False)
+        yield _Chunk(problem, own)
+
+
+def _together(chunk: _Chunk) -> _Costs:
+    part = simulate_paths(chunk.task)
+    own = part.stored
+    return _Costs(chunk.problem.costs(own["q"], own["v"], own["u"]), part.extremes)
+
+
+def _alone(given: _Alone) -> _Costs:
+    (child,) = given.seeds.generators(given.path, given.path + 1)
+    try:
+        motion = given.problem.simulate(given.policy, rng=child)
+    except (StepFailure, NoiseError):
+        return _Costs(np.full(1, np.nan), {})
+    return _Costs(np.array([given.problem.cost_of(motion)]), {})
+
+
+def _look_alone(given: _Alone) -> tuple[Finding, ...]:
+    """What is to be said of the first path."""
+    (child,) = given.seeds.generators(given.path, given.path + 1)
+    motion = given.problem.simulate(given.policy, rng=child)
+    _, found = examined_in_loop(
+        given.problem.scene, given.problem.integrator, motion, given.policy.hold_at(given.problem.dt)
+    )
+    return tuple(Finding(finding.kind, f"path {given.path}: {finding.sentence}") for finding in found)
+
+
+def _lost(result: MonteCarlo) -> tuple[Finding, ...]:
+    """What is to be said of failures, if there are any."""
+    if not result.failures:
+        return ()
+    lost = f"{result.failures} of {result.paths + result.failures} paths could not be finished, and are not counted"
+    return (Finding("failed paths", f"{lost}; a smaller dt may help"),)
+
+
+def _warned(result: MonteCarlo, found: Sequence[Finding]) -> MonteCarlo:
+    return replace(result, warnings=tuple(finding.sentence for finding in found))
+
+
+def _mean(costs: Sequence[Floats], predicted: float) -> MonteCarlo | None:
+    values = np.concatenate([np.zeros(0), *costs])
+    good = values[np.isfinite(values)]
+    if len(good) < 2:
+        return None
+    return MonteCarlo(
+        cost=float(good.mean()),
+        standard_error=float(good.std(ddof=1) / np.sqrt(len(good))),
+        predicted=predicted,
+        paths=len(good),
+        failures=len(values) - len(good),
+    )

@@ -1,0 +1,403 @@
+"""Model predictive control: plan, apply the first decision, look where the robot is, plan again."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control import OptimalControlProblem, Solution, looked_at, replan, solve
+from varpin.control.costs import CostError
+from varpin.errors import InputError
+from varpin.integrators import Gauss, Integrator
+from varpin.integrators.base import Failure
+from varpin.mechanics.scene import Scene, require_scene
+from varpin.simulation.chatter import alternation
+from varpin.simulation.loop_stability import examined_in_loop
+from varpin.simulation.run import Interrupted, StepFailure, noise_forgotten, simulate
+from varpin.simulation.soundness import Finding, announce, evident, with_warnings
+from varpin.support.checks import JointValues, control_values, count, positive, real
+from varpin.support.frozen import Frozen
+from varpin.support.markup import facts, said
+from varpin.trajectory import Trajectory, chained
+
+Floats = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
+# Part of the ticks that may take longer than the period without a word: other programs get in the way.
+_FEW = 0.05
+
+
+@dataclass(frozen=True)
+class Plant:
+    """The robot that is controlled, simulated in place of the real one.
+
+    Attributes:
+        scene: Its scene, which need not be the one planned with: other masses, friction, noise. It takes the same
+            controls.
+        integrator: Any of varpin's; left out, one that no friction is too fast for, ``Gauss(stages=2)``.
+        substeps: Steps to a decision of the controller.
+    """
+
+    scene: Scene
+    integrator: Integrator = field(default_factory=lambda: Gauss(stages=2))
+    substeps: int = 10
+
+    def __post_init__(self) -> None:
+        require_scene(self.scene)
+        if not isinstance(self.integrator, Integrator):
+            raise InputError(f"integrator must be one of varpin's, got {self.integrator!r}")
+        count("substeps", self.substeps, least=1)
+
+
+@dataclass(frozen=True, eq=False)
+class MpcRun(Frozen):
+    """What a controller did with a plant.
+
+    Attributes:
+        motion: Of the plant, at its own steps.
+        plans: The plan of every tick, the one that acted (K,).
+        seconds: What planning took in every tick (K,) [s]; 0 in the first, whose plan is there before.
+        iterations: Of S-DDP in every tick (K,), likewise.
+        late: Ticks whose plan came after its budget (K,); the plan of the tick before acted on.
+        period: Of the ticks [s].
+        budget: For planning in a tick [s]; infinite for any.
+        warnings: What looks wrong with the first plan, unless it does with the plant's motion, too; with that motion,
+            as in :attr:`Trajectory.warnings`, and its velocities from tick to tick; and whether planning took longer
+            than the period in more than one tick of twenty, which depends on the machine.
+    """
+
+    motion: Trajectory
+    plans: tuple[Solution, ...]
+    seconds: Floats
+    iterations: NDArray[np.int64]
+    late: NDArray[np.bool_]
+    period: float
+    budget: float
+    warnings: tuple[str, ...] = ()
+
+    def planned(self, ahead: float | None = None) -> Floats:
+        """Where the plans mean to be some time later: configurations (K + 1, n) [rad or m].
+
+        Row k is what the plan that acts in tick k has for ``ahead`` seconds after the tick's beginning, the last row
+        what the last plan has so long after the run's end.
+
+        Args:
+            ahead: [s]; the horizon if left out. Beyond its horizon a plan is taken to stay at its end.
+
+        Raises:
+            InputError: ``ahead`` is negative or not finite.
+        """
+        later = self.plans[0].problem.duration if ahead is None else real("ahead", ahead)
+        if not 0.0 <= later < np.inf:
+            raise InputError(f"ahead must be >= 0 [s], got {ahead!r}")
+        begin = self.plans[0].problem.t0
+        rows = []
+        for tick, plan in enumerate([*self.plans, self.plans[-1]]):
+            motion = plan.trajectory
+            since = begin + tick * self.period + later - plan.problem.t0
+            rows.append([np.interp(since, motion.t - motion.t[0], column) for column in motion.q.T])
+        return np.array(rows)
+
+    @property
+    def misses(self) -> int:
+        """How many plans came late."""
+        return int(self.late.sum())
+
+    def __repr__(self) -> str:
+        return f"MpcRun({str(self).splitlines()[0]}{said(self.warnings)})"
+
+    @property
+    def _planning(self) -> str:
+        """What planning took, but for the first plan, which was there before."""
+        if len(self.seconds) < 2:
+            return "nothing, with the first plan there"
+        milliseconds = 1e3 * self.seconds[1:]
+        return (
+            f"{milliseconds.mean():.2f} ms in the mean, {np.quantile(milliseconds, 0.95):.2f} in 95%, "
+            f"{milliseconds.max():.2f} at most, for {self.iterations[1:].mean():.2f} iterations a tick"
+        )
+
+    @property
+    def _within(self) -> str:
+        return "no budget" if self.budget == np.inf else f"{self.misses} later than {1e3 * self.budget:.3g} ms"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ("ticks", f"{len(self.plans)} of {1e3 * self.period:.3g} ms"),
+            ("planning took", self._planning),
+            ("late", self._within),
+            ("plant", self.motion),
+            *(("warning", sentence) for sentence in self.warnings),
+        ]
+        return facts(f"Run of a controller of {self.motion.robot}", rows)
+
+    def __str__(self) -> str:
+        ticks = f"{len(self.plans)} ticks of {1e3 * self.period:.3g} ms"
+        told = f"{ticks}: planning took {self._planning}; {self._within}"
+        return "\n".join([told, *(f"warning: {sentence}" for sentence in self.warnings)])
+
+
+@dataclass(frozen=True)
+class Mpc:
+    """A controller that solves an optimal control problem anew at every decision, from the state it finds.
+
+    Each tick's search starts from the last plan, moved on by a decision, with its feedback. Times of references are
+    those of the plant: the horizon recedes. Where changes of controls cost something, each plan goes on from the
+    control that acted last.
+
+    Main args:
+        problem: The problem; its horizon, discretization, noise and limits are those of every tick, its initial state
+            and ``t0`` those of the first.
+        iterations: Of S-DDP in a tick, at most.
+
+    Other Args:
+        tolerance: Of S-DDP; see :func:`varpin.solve`.
+        first_iterations: In the first tick, which has no plan to start from.
+        budget: For planning in a tick [s]: no iteration begins after it, and a plan that is late is not used: the plan
+            before acts on, with its feedback. What happens then depends on the machine. Infinite, nothing depends
+            on the clock.
+    """
+
+    problem: OptimalControlProblem
+    iterations: int = 2
+    tolerance: float = 1e-6
+    first_iterations: int = 100
+    budget: float = np.inf
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.problem, OptimalControlProblem):
+            raise InputError(f"problem must be an OptimalControlProblem, got {type(self.problem).__name__}")
+        count("iterations", self.iterations, least=1)
+        count("first_iterations", self.first_iterations, least=1)
+        positive("tolerance", self.tolerance, "1")
+        if self.budget != np.inf:
+            positive("budget", self.budget, "s")
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ("period", f"{1e3 * self.period:.3g} ms"),
+            ("iterations", f"{self.iterations} a tick, {self.first_iterations} in the first"),
+            ("budget", "any time" if self.budget == np.inf else f"{1e3 * self.budget:.3g} ms"),
+        ]
+        return facts("Model predictive control", rows, self.problem._repr_html_())
+
+    @property
+    def period(self) -> float:
+        """Of the ticks: the time a decision holds [s]."""
+        return self.problem.dt * self.problem.hold
+
+    def plan(
+        self,
+        t: float,
+        q: JointValues,
+        v: JointValues,
+        previous: Solution | None = None,
+        decisions: int = 1,
+        before: JointValues | None = None,
+    ) -> Solution:
+        """The plan at time ``t`` [s] from configuration ``q`` (n,) and velocity ``v`` (n,).
+
+        Where it starts from another, each iteration takes one backward pass, and its gains are those that the last
+        iteration followed.
+
+        Args:
+            t: Now.
+            q: (n,) or by joint name [rad or m].
+            v: (n,) or by joint name [rad/s or m/s].
+            previous: The plan to start from; None in the first tick.
+            decisions: How many decisions ago it was made.
+            before: The control applied last, (m,) or by joint name, where changes of controls cost something. Left out,
+                what ``previous`` meant to apply, and in the first tick what the problem says.
+
+        Raises:
+            InputError: q or v of a wrong shape, or not finite.
+            StepFailure, CostError: The motion to start from cannot be integrated, or has no cost.
+        """
+        scene = self.problem.scene
+        if before is not None:
+            before = control_values("before", before, scene.control_joints, scene.controls)
+        elif self.problem.rate and previous is not None and previous.problem.rate:
+            before = previous.problem.rate.before
+            if decisions > 0:
+                before = previous.controls[min(decisions, len(previous.controls)) - 1]
+        problem = self.problem.at(q0=q, v0=v, t0=t, before=before)
+        if previous is None:
+            return self._first_plan(problem)[0]
+        start = previous.shifted(min(decisions, problem.decisions - 1), before)
+        # A tick has no time for a second look at its plan; the run takes one at what came of them all.
+        return replan(problem, start, tolerance=self.tolerance, max_iterations=self.iterations, time_limit=self.budget)
+
+    def _first_plan(self, problem: OptimalControlProblem) -> tuple[Solution, tuple[Finding, ...]]:
+        """The plan that a run begins with, and what was found wrong with it."""
+        plan = solve(problem, tolerance=self.tolerance, max_iterations=self.first_iterations, check=False)
+        return looked_at(plan)
+
+    def run(
+        self,
+        plant: Plant | None = None,
+        *,
+        duration: float,
+        rng: np.random.Generator | int | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> MpcRun:
+        """Control a simulated plant from the problem's initial state.
+
+        In each tick the plan's first decision acts, as computed from the state at its beginning. The first plan is
+        there before the clock starts.
+
+        Main args:
+            plant: None for the problem's own scene, integrated more finely.
+            duration: Of the run [s], rounded to whole ticks.
+            rng: Generator or seed of the plant's noise; without it there is none, of which a noisy plant has a warning.
+
+        Other Args:
+            progress: Called with (ticks done, ticks in all).
+
+        Raises:
+            InputError: A plant with other controls or joints.
+            StepFailure: The plant's motion, or the first motion of a search, cannot be integrated; it holds the plant's
+                motion so far. Of a search its cause is the search's own.
+            CostError: A cost of the user's fails; from the second tick on it holds the plant's motion so far.
+            Interrupted: Ctrl-C; holds the plant's motion so far.
+        """
+        problem = self.problem
+        plant = Plant(problem.scene) if plant is None else plant
+        if not isinstance(plant, Plant):
+            raise InputError(f"plant must be a varpin.Plant, for example varpin.Plant(scene), got {plant!r}")
+        joints, controls = plant.scene.robot.joint_names, plant.scene.controls
+        if joints != problem.scene.robot.joint_names or controls != problem.scene.controls:
+            raise InputError(
+                f"the plant has joints {', '.join(joints)} and {controls} controls; the problem "
+                f"{', '.join(problem.scene.robot.joint_names)} and {problem.scene.controls}"
+            )
+        if plant.scene.servo_joints != problem.scene.servo_joints:
+            raise InputError(
+                f"the plant has servos on {', '.join(plant.scene.servo_joints) or 'no joints'}; the problem on "
+                f"{', '.join(problem.scene.servo_joints) or 'no joints'}"
+            )
+        ticks = max(1, round(positive("duration", duration, "s") / self.period))
+        dt = self.period / plant.substeps
+        generator = None if rng is None else np.random.default_rng(rng)
+        q, v = problem.q0, problem.v0
+        before = None if problem.rate is None else problem.rate.before
+        (active, of_plan), age = self._first_plan(problem), 0
+        parts: list[Trajectory] = []
+        plans, seconds, iterations, late = [], np.zeros(ticks), np.zeros(ticks, dtype=np.int64), np.zeros(ticks, bool)
+        try:
+            for tick in range(ticks):
+                if tick > 0:
+                    begin = time.perf_counter()
+                    try:
+                        fresh = self.plan(problem.t0 + tick * self.period, q, v, active, age + 1, before)
+                    except StepFailure as failure:
+                        raise _unplanned(failure, _so_far(plant, parts)) from failure
+                    except CostError as error:
+                        raise CostError(error.cost, error.problem, _so_far(plant, parts)) from error
+                    seconds[tick] = time.perf_counter() - begin
+                    iterations[tick] = fresh.iterations
+                    late[tick] = seconds[tick] > self.budget
+                    active, age = (active, age + 1) if late[tick] else (fresh, 0)
+                plans.append(active)
+                u = _decision(active, age, q, v, before)
+                parts.append(_simulated(plant, dt, q, v, u, generator, parts))
+                q, v = parts[-1].q[-1], parts[-1].v[-1]
+                before = None if problem.rate is None else u
+                if progress is not None:
+                    progress(tick + 1, ticks)
+        except KeyboardInterrupt:
+            if not parts:
+                raise
+            raise Interrupted(_so_far(plant, parts)) from None
+        motion, found = examined_in_loop(plant.scene, plant.integrator, chained(parts), plant.substeps)
+        found = (*noise_forgotten(plant.scene, rng), *found, *_alternating(motion, plant.substeps))
+        found = (*found, *_behind(seconds, self.period))
+        announce(logger, plant.scene, dt, found)
+        again = {(finding.kind, finding.joint) for finding in found}
+        first = [finding.sentence for finding in of_plan if (finding.kind, finding.joint) not in again]
+        return MpcRun(
+            motion,
+            tuple(plans),
+            seconds,
+            iterations,
+            late,
+            self.period,
+            self.budget,
+            warnings=(
+                *(f"the first plan: {sentence}" for sentence in first),
+                *(finding.sentence for finding in found),
+            ),
+        )
+
+
+def _so_far(plant: Plant, parts: Sequence[Trajectory]) -> Trajectory:
+    """The plant's motion of the ticks that there are, with what is evident of it."""
+    motion = chained(parts)
+    return with_warnings(motion, evident(plant.scene, plant.integrator, motion))
+
+
+def _behind(seconds: Floats, period: float) -> tuple[Finding, ...]:
+    """Says if planning took longer than the period in more than a few ticks: on a robot that plan would be late."""
+    planned = seconds[1:]
+    slow = int((planned > period).sum())
+    if not slow > _FEW * len(planned):
+        return ()
+    sentence = (
+        f"planning took longer than the period of {1e3 * period:.3g} ms in {slow} of {len(planned)} ticks "
+        f"({1e3 * planned.mean():.3g} ms in the mean): a controller this slow cannot keep up with a robot; fewer steps "
+        "ahead, fewer iterations or a longer period (hold=) make it faster"
+    )
+    return (Finding("slow planning", sentence),)
+
+
+def _alternating(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:
+    """Says if a plant's velocities alternate from tick to tick: the controller is too fast for its period."""
+    found = None if motion.dw.any() else alternation(motion.v[::substeps])
+    if found is None:
+        return ()
+    sentence = (
+        f"under the controller the velocity of {motion.joint_names[found.joint]} alternates from tick to tick, "
+        f"{found.changes} times in a row from t = {motion.t[substeps * found.first]:.4g} s on: the feedback is too "
+        "fast for the period; a smaller dt, or a greater weight on the controls or on their changes, calms it"
+    )
+    return (Finding("alternating ticks", sentence),)
+
+
+def _decision(plan: Solution, age: int, q: Floats, v: Floats, before: Floats | None = None) -> Floats:
+    """What the plan does at its decision ``age``, with its feedback, at the state (q, v) after a control (m,)."""
+    policy, last = plan.policy_on("velocity"), len(plan.gains) - 1
+    if age > last and before is not None and policy.previous is not None:
+        # The last decision is repeated, and expects itself before.
+        before = before - policy.u[last] + policy.previous[last]
+    return policy.control(min(age, last), np.concatenate([q, v]), before)
+
+
+def _unplanned(failure: StepFailure, motion: Trajectory) -> StepFailure:
+    """The end of a run whose next plan's first motion fails; it holds the plant's motion so far."""
+    reason = f"no plan can be made from here, as step {failure.step} of its first motion fails: {failure.reason}"
+    return StepFailure(motion.steps, motion.t[-1], Failure(reason, failure.residual), motion)
+
+
+def _simulated(
+    plant: Plant,
+    dt: float,
+    q: Floats,
+    v: Floats,
+    u: Floats,
+    rng: np.random.Generator | None,
+    before: Sequence[Trajectory],
+) -> Trajectory:
+    """The plant's motion of one tick; what came before is in its failure."""
+    options: dict[str, Any] = {"dt": dt, "steps": plant.substeps, "controls": u, "integrator": plant.integrator}
+    options |= {"increments": 0.0} if rng is None or not plant.scene.processes else {"rng": rng}
+    try:
+        return simulate(plant.scene, q, v, **options, check=False)
+    except StepFailure as failure:
+        whole = _so_far(plant, [*before, failure.trajectory])
+        raise StepFailure(whole.steps, whole.t[-1], Failure(failure.reason, failure.residual), whole) from None

@@ -1,0 +1,406 @@
+"""An optimal control problem: a scene, a cost, a horizon and how it is discretized."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.costs import (
+    BoundSum,
+    ControlRate,
+    Cost,
+    Expansion,
+    Points,
+    Terminal,
+    control_rate,
+    is_control_rate,
+    with_control_before,
+)
+from varpin.core import sample_steps
+from varpin.errors import InputError
+from varpin.integrators import Gauss, Integrator
+from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.policy import LinearPolicy, OpenLoop
+from varpin.mechanics.scene import Scene, closest_controls, require_scene
+from varpin.simulation.run import simulate
+from varpin.support.checks import JointValues, count, is_one_of, joint_array, named_limits, positive, real
+from varpin.support.frozen import Frozen
+from varpin.support.markup import facts, listed
+from varpin.trajectory import Trajectory, require_motion
+
+Floats = NDArray[np.float64]
+Sampling = Literal["midpoint", "gauss", "start"]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class OptimalControlProblem(Frozen):
+    """Minimize the expected cost of a motion from (q0, v0) over the controls, each held over ``hold`` steps.
+
+    Running costs are integrals in time, sampled once a step, and references are functions of time: the problem means
+    the same at every ``dt``. Controls stay within their limits, feedback included. Costs add up, and numbers scale
+    them:
+
+        cost = vp.TrackingCost(reference, 10.0) + vp.ControlCost(0.1) + vp.Terminal(2.0 * vp.TrackingCost(goal))
+
+    ============================= ================================================================
+    ``TrackingCost(q_r, weight)`` weight . (q - q_r(t))^2
+    ``VelocityCost(weight, v_r)`` weight . (v - v_r(t))^2
+    ``ControlCost(weight, u_r)``  weight . (u - u_r(t))^2; give every control some
+    ``ControlRateCost(weight)``   weight . (du/dt)^2, which keeps controls smooth
+    ``FramePositionCost``         of a frame's place; of its ``FrameOrientationCost``,
+                                  ``FrameVelocityCost``
+    ``CenterOfMassCost``          of the robot's centre of mass
+    ``ManipulabilityCost``        keeps away from singular postures
+    ``JointLimitBarrier``         keeps joints within their limits; ``VelocityLimitBarrier``
+    ``CustomCost(function)``      a function of one's own of (t, q, v, u)
+    ``Terminal(cost)``            any of them but the control's, at the end instead of its integral
+    ============================= ================================================================
+
+    Attributes:
+        scene: The scene, its noise included.
+        cost: Running and terminal costs.
+        q0: Initial configuration (n,) [rad or m]; it may be given by joint name.
+        v0: Initial velocity (n,) [rad/s or m/s]; the same.
+        dt: Time step [s].
+        steps: N.
+        integrator: Any of varpin's; ``Gauss(stages=4)`` if left out.
+        sampling: Where running costs are taken in each step. ``"gauss"``, if left out: at its two Gauss points, the
+            motion between the nodes taken for a cubic, of fourth order. ``"midpoint"``: at
+            ((q + q')/2, (q' - q)/dt, u), of second order; it does not see velocities that alternate from node to node,
+            and the optimal ones often do. ``"start"``: at the node where it begins, a left sum as in the paper, of
+            first order.
+        hold: Steps that share one control: a digital controller's period over the integrator's step.
+        t0: When the horizon begins [s]; references that are functions of time see it.
+        control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none.
+        rate: What changes of the controls cost: ``rate.weight`` (m, m) and ``rate.before``, the control before the
+            horizon (m,) or None; None where they cost nothing.
+    """
+
+    scene: Scene
+    cost: Cost
+    q0: Floats
+    v0: Floats
+    dt: float
+    steps: int
+    integrator: Integrator
+    sampling: Sampling
+    hold: int
+    t0: float
+    control_limits: Floats
+    running: BoundSum = field(repr=False)
+    terminal: BoundSum = field(repr=False)
+    rule: Floats = field(repr=False)
+    rate: ControlRate | None = field(repr=False)
+
+    def __init__(
+        self,
+        scene: Scene,
+        cost: Cost,
+        q0: JointValues,
+        v0: JointValues,
+        *,
+        dt: float,
+        steps: int,
+        integrator: Integrator | None = None,
+        sampling: Sampling = "gauss",
+        hold: int = 1,
+        t0: float = 0.0,
+        control_limits: tuple[JointValues, JointValues] | None = None,
+    ) -> None:
+        """Describe a problem; the class says what each argument is.
+
+        ``control_limits`` are (lower, upper), each one number, (m,), or by joint name where each control is the force
+        of a joint; infinite where a control has no limit, and for joints that are not named.
+
+        Raises:
+            UnknownJoint: A name that is no joint's, or of controls no driven joint's.
+            InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
+                reference that does not fit the problem's grid, or limits that leave a control nothing.
+            CostError: A reference that is a function fails.
+        """
+        n, m = require_scene(scene).robot.dof, scene.controls
+        if not isinstance(cost, Cost):
+            raise InputError(f"cost must be a cost, for example varpin.TrackingCost(...), got {type(cost).__name__}")
+        dt, steps, hold = positive("dt", dt, "s"), count("steps", steps, least=1), count("hold", hold, least=1)
+        if steps % hold:
+            raise InputError(f"steps = {steps} is no multiple of hold = {hold}")
+        if not is_one_of(sampling, ("midpoint", "gauss", "start")):
+            raise InputError(f"sampling must be 'midpoint', 'gauss' or 'start', got {sampling!r}")
+        if integrator is not None and not isinstance(integrator, Integrator):
+            raise InputError(f"integrator must be one of varpin's, for example varpin.Gauss(4), got {integrator!r}")
+        if m == 0:
+            raise InputError("the scene has no controls, so there is nothing to optimize")
+        places, rule = _rule(sampling, dt)
+        times = ((np.arange(steps, dtype=np.float64)[:, None] + places) * dt).reshape(-1)
+        t0 = real("t0", t0)
+        points = Points(
+            t0 + times, dt * steps, steps, n, m, t0, scene.robot.joint_names, scene.control_joints, scene.robot
+        )
+        running, terminal = bind_cost(cost, t0 + times, points)
+        values = {
+            "scene": scene,
+            "cost": cost,
+            "q0": joint_array("q0", q0, scene.robot.joint_names),
+            "v0": joint_array("v0", v0, scene.robot.joint_names),
+            "dt": dt,
+            "steps": steps,
+            "integrator": default_integrator() if integrator is None else integrator,
+            "sampling": sampling,
+            "hold": hold,
+            "t0": t0,
+            "control_limits": named_limits("control_limits", control_limits, scene.control_joints, scene.controls),
+            "running": running,
+            "terminal": terminal,
+            "rule": rule,
+            "rate": control_rate(cost, m, scene.control_joints),
+        }
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        held = f", each control held over {self.hold}" if self.hold > 1 else ""
+        return f"OptimalControlProblem({self.scene!r}, {self.steps} steps of {self.dt:g} s{held}, {self.integrator})"
+
+    def _repr_html_(self) -> str:
+        limited = int(np.isfinite(self.control_limits).any(axis=0).sum())
+        rows = [
+            ("scene", self.scene),
+            ("horizon", f"{self.steps} steps of {self.dt:g} s, {self.duration:g} s from t = {self.t0:g} s"),
+            ("decisions", f"{self.decisions} of {self.scene.controls} controls, {limited} of them with limits"),
+            ("integrator", f"{self.integrator}, the cost sampled by the rule {self.sampling!r}"),
+            ("from q [rad or m]", listed(f"{x:.4g}" for x in self.q0)),
+            ("at v [rad/s or m/s]", listed(f"{x:.4g}" for x in self.v0)),
+        ]
+        return facts("Optimal control problem", rows, self.cost._repr_html_())
+
+    @property
+    def duration(self) -> float:
+        """The horizon [s]."""
+        return self.dt * self.steps
+
+    @property
+    def decisions(self) -> int:
+        """R, the number of controls to choose: steps / hold."""
+        return self.steps // self.hold
+
+    @property
+    def period(self) -> float:
+        """The time that each control holds [s]."""
+        return self.dt * self.hold
+
+    def at(
+        self,
+        *,
+        q0: JointValues | None = None,
+        v0: JointValues | None = None,
+        dt: float | None = None,
+        steps: int | None = None,
+        integrator: Integrator | None = None,
+        sampling: Sampling | None = None,
+        hold: int | None = None,
+        t0: float | None = None,
+        before: JointValues | None = None,
+    ) -> OptimalControlProblem:
+        """The same problem, discretized otherwise or from another state.
+
+        With ``dt`` alone the horizon stays, and the number of steps follows. ``before`` is the control applied before
+        the horizon, one number, (m,) or by joint name, for its :class:`ControlRateCost`.
+
+        Raises:
+            InputError: The horizon is no multiple of ``dt``, or ``before`` is given and changes of controls cost
+                nothing; or as for the problem itself.
+        """
+        if before is not None and self.rate is None:
+            raise InputError("before is the control that a ControlRateCost begins with, and the cost has none")
+        if dt is not None and steps is None:
+            steps = round(self.duration / positive("dt", dt, "s"))
+            if abs(steps * dt - self.duration) > 1e-9 * self.duration:
+                raise InputError(f"the horizon of {self.duration:g} s is no multiple of dt = {dt:g} s")
+        return OptimalControlProblem(
+            self.scene,
+            self.cost if before is None else with_control_before(self.cost, before),
+            self.q0 if q0 is None else q0,
+            self.v0 if v0 is None else v0,
+            dt=self.dt if dt is None else dt,
+            steps=self.steps if steps is None else steps,
+            integrator=self.integrator if integrator is None else integrator,
+            sampling=self.sampling if sampling is None else sampling,
+            hold=self.hold if hold is None else hold,
+            t0=self.t0 if t0 is None else t0,
+            control_limits=(self.control_limits[0], self.control_limits[1]),
+        )
+
+    def differs(self, other: OptimalControlProblem) -> str:
+        """In words, what of two problems differs that can be told without comparing costs; empty if nothing."""
+        own, its = self.scene.robot, other.scene.robot
+        if own.joint_names != its.joint_names:
+            return f"joints {', '.join(its.joint_names)}, not {', '.join(own.joint_names)}"
+        if not np.array_equal(own.tree.mass, its.tree.mass):
+            return f"links of {its.tree.mass.sum():.6g} kg, not {own.tree.mass.sum():.6g} kg"
+        for name in ("dt", "steps", "hold", "sampling", "q0", "v0", "integrator", "control_limits"):
+            mine, theirs = getattr(self, name), getattr(other, name)
+            if not np.array_equal(mine, theirs):
+                return f"{name} = {theirs}, not {mine}"
+        for name in ("gravity", "damping", "stiffness", "rest", "armature", "actuation"):
+            if not np.array_equal(getattr(self.scene, name), getattr(other.scene, name)):
+                return f"another {name}"
+        forces = [sorted([*own.elements, *own.couplings], key=repr) for own in (self.scene, other.scene)]
+        if forces[0] != forces[1]:
+            return "other forces"
+        return ""
+
+    @property
+    def limited(self) -> bool:
+        """Whether any control has a limit."""
+        return bool(np.isfinite(self.control_limits).any())
+
+    def holding_controls(self) -> Floats:
+        """The constant control (m,) that comes closest to holding the robot at q0 at rest, within its limits."""
+        u = closest_controls(self.scene, self.q0)
+        return np.asarray(np.clip(u, *self.control_limits), dtype=np.float64)
+
+    def holding_policy(self) -> LinearPolicy:
+        """Holding controls, with feedback that keeps the robot there where every joint can be driven.
+
+        The feedback is M(q0) (omega^2 (q0 - q) - 2 omega v), twice as fast as what falls or swings at q0. Without it
+        rounding alone makes an arm fall over that stands upright.
+        """
+        n, m, R = self.scene.robot.dof, self.scene.controls, self.decisions
+        jet = lagrangian_jet(self.scene, self.q0, np.zeros(n))
+        rates = np.abs(np.linalg.eigvals(np.linalg.solve(jet.Lvv, jet.Lqq)))
+        omega = 2.0 * float(np.sqrt(rates.max())) + 1.0 / self.duration
+        gains = np.zeros((R, m, 2 * n))
+        if np.linalg.matrix_rank(self.scene.actuation) == n and omega * self.dt * self.hold <= 0.25:
+            in_v = np.eye(n) if self.integrator.variational else jet.Lvv
+            gains[:] = -np.linalg.pinv(self.scene.actuation) @ np.hstack([omega**2 * jet.Lvv, 2.0 * omega * in_v])
+        u = np.tile(self.holding_controls(), (R, 1))
+        return LinearPolicy(
+            u,
+            gains,
+            np.tile(np.append(self.q0, np.zeros(n)), (R, 1)),
+            hold=self.hold,
+            on="momentum" if self.integrator.variational else "velocity",
+            limits=(self.control_limits[0], self.control_limits[1]),
+            period=self.period,
+            joints=self.scene.control_joints,
+            servos=self.scene.servo_joints,
+        )
+
+    def samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
+        """Where running costs are taken, the s samples of a step one after another.
+
+        q and v (..., N s, n) and u (..., N s, m), from q and v at the nodes (..., N + 1, n) and u (..., N, m).
+        """
+        motions = (x.reshape(-1, *x.shape[-2:]) for x in (q, v))
+        at_q, at_v = (x.reshape(*q.shape[:-2], *x.shape[-2:]) for x in sample_steps(self.rule, *motions))
+        return at_q, at_v, u if len(self.rule) == 1 else np.repeat(u, len(self.rule), axis=-2)
+
+    def costs(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """The cost (...) of motions without their noise terms: q and v (..., N + 1, n), u (..., N, m)."""
+        values = self.running.value(*self.samples(q, v, u))
+        # Every rule here weighs its samples alike.
+        running = values.sum(axis=-1) * (self.dt * self.rule[0, 0])
+        end = np.zeros((*u.shape[:-2], 1, u.shape[-1]))
+        total: Floats = running + self.terminal.value(q[..., -1:, :], v[..., -1:, :], end)[..., 0]
+        return total if self.rate is None else total + self.rate.value(u, self.period)
+
+    def cost_of(self, trajectory: Trajectory) -> float:
+        """The cost of one motion on the problem's grid.
+
+        Raises:
+            InputError: The motion is no trajectory of the problem's robot, or it has another number of steps or
+                controls, or another time step.
+        """
+        require_motion(self.scene, trajectory)
+        if trajectory.steps != self.steps or abs(trajectory.dt - self.dt) > 1e-12 * self.dt:
+            raise InputError(
+                f"the motion has {trajectory.steps} steps of {trajectory.dt:g} s; "
+                f"the problem {self.steps} of {self.dt:g} s"
+            )
+        return float(self.shares(trajectory).sum())
+
+    def shares(self, trajectory: Trajectory) -> Floats:
+        """What the cost of a motion is the sum of: one entry for each term at each sample.
+
+        Differences of two costs are sums of differences of shares. A constant in a cost leaves them as they are,
+        however large it is.
+        """
+        q, v, u = trajectory.q, trajectory.v, trajectory.u
+        weight = self.dt * self.rule[0, 0]
+        end = q[-1:], v[-1:], np.zeros((1, u.shape[1]))
+        found = [weight * values.ravel() for values in self.running.shares(*self.samples(q, v, u))]
+        found += [values.ravel() for values in self.terminal.shares(*end)]
+        if self.rate is not None:
+            found.append(self.rate.shares(u[:: self.hold], self.period))
+        return np.concatenate(found)
+
+    def simulate(
+        self, controls: JointValues | LinearPolicy | OpenLoop, *, rng: np.random.Generator | int | None = None
+    ) -> Trajectory:
+        """The motion from (q0, v0) under controls (N, m), a policy or an OpenLoop; with noise if rng is given.
+
+        Raises:
+            StepFailure: The motion cannot go on.
+            InputError: As :func:`varpin.simulate`.
+        """
+        return simulate(
+            self.scene,
+            self.q0,
+            self.v0,
+            dt=self.dt,
+            steps=self.steps,
+            controls=controls,
+            integrator=self.integrator,
+            rng=rng if self.scene.processes else None,
+            increments=0.0 if rng is None else None,
+            check=False,
+        )
+
+    def expand_running(self, trajectory: Trajectory) -> Expansion:
+        """Expansion of the running costs along a motion, at their samples, in (q, v, u)."""
+        return self.running.expand(*self.samples(trajectory.q, trajectory.v, trajectory.u))
+
+    def expand_terminal(self, trajectory: Trajectory) -> Expansion:
+        """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""
+        return self.terminal.expand(trajectory.q[-1:], trajectory.v[-1:], np.zeros((1, self.scene.controls)))
+
+
+def default_integrator() -> Gauss:
+    """What plans are made with where nothing is said, in Python and in scene files.
+
+    Two stages are of the cost's order. Light joints of an arm with friction need more: their velocities settle within a
+    fraction of a step. Four stages follow that where friction is up to ten times as fast as the step, for a third more
+    time than two.
+    """
+    return Gauss(stages=4)
+
+
+def _rule(sampling: str, dt: float) -> tuple[Floats, Floats]:
+    """Where in a step its samples are, (s,), and how they are made (s, 9).
+
+    A row is (weight, q from q0, v0, q1, v1, v from q0, v0, q1, v1).
+    """
+    if sampling == "start":
+        return np.zeros(1), np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+    if sampling == "midpoint":
+        return np.array([0.5]), np.array([[1.0, 0.5, 0.0, 0.5, 0.0, -1.0 / dt, 0.0, 1.0 / dt, 0.0]])
+    places = 0.5 + np.array([-1.0, 1.0]) * np.sqrt(3.0) / 6.0
+    rows = []
+    for s in places:
+        position = [(1 + 2 * s) * (1 - s) ** 2, dt * s * (1 - s) ** 2, s**2 * (3 - 2 * s), dt * s**2 * (s - 1)]
+        slope = 6 * s * (1 - s) / dt
+        rows.append([0.5, *position, -slope, (1 - s) * (1 - 3 * s), slope, s * (3 * s - 2)])
+    return places, np.array(rows)
+
+
+def bind_cost(cost: Cost, times: Floats, horizon: Points) -> tuple[BoundSum, BoundSum]:
+    """The running costs at ``times`` (N,) of a horizon, and the terminal ones at its end."""
+    at, end = (replace(horizon, t=t) for t in (times, np.array([horizon.t0 + horizon.duration])))
+    terms = [term for term in cost.terms if not is_control_rate(term)]
+    running = BoundSum(tuple(term.bind(at) for term in terms if not isinstance(term, Terminal)), at)
+    return running, BoundSum(tuple(term.bind(end) for term in terms if isinstance(term, Terminal)), end)

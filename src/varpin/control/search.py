@@ -1,0 +1,751 @@
+"""Stochastic differential dynamic programming on the structured linearization of any integrator."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, is_dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.backward import Plan, backward, noise_shares
+from varpin.control.costs import CostError
+from varpin.control.descent import Stake, at_stake, rounding, spent
+from varpin.control.examination import looked_at
+from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.solution import Solution
+from varpin.core.arrays import Commands
+from varpin.errors import InputError, LinearizationError
+from varpin.integrators import Integrator, Segment
+from varpin.integrators.base import open_loop
+from varpin.integrators.variational import Variational
+from varpin.mechanics.noise import NoiseFieldError
+from varpin.mechanics.policy import LinearPolicy
+from varpin.simulation.run import Motions, StepFailure
+from varpin.support.checks import (
+    JointValues,
+    as_floats,
+    control_array,
+    count,
+    finite_array,
+    fraction,
+    is_one_of,
+    positive,
+    real,
+)
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+Callback = Callable[[Iteration], None]
+Progress = Callable[[int, int], None]
+
+logger = logging.getLogger(__name__)
+
+# What a step must keep of the promised slope, and the factor between trials.
+ARMIJO, BACKTRACKING = 1e-5, 0.25
+# The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it shrinks after
+# long steps and grows after short ones.
+_GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
+_LONG, _SHORT = 0.5, 0.01
+# What a cost, a noise field or a step may raise somewhere off the motion that has been found.
+_LOST = (CostError, NoiseFieldError, LinearizationError)
+# As much as this does not hide how far an optimum is; controls that do nothing need some.
+_LITTLE = 1e-4
+# Of Quu, what rounding may change without a word.
+_LOSSY = 1e-8
+# Iterations without a decrease worth the name before a search gives up: the cost jumps where guards cut steps.
+_PATIENCE = 15
+# Where the optimum costs nothing, there is nothing to be relative to but this part of what was at stake at first.
+_NOTHING = 1e-9
+# Trials of a line search: 0.25^10 is 1e-6.
+_TRIALS = 10
+# A trial is given up where a step wants more halvings than this, or than the motion so far, and where it has taken more
+# parts in all than so many times those of the motion so far. What was given up is tried again with more of both where
+# nothing else has led far, and without a bound where nothing has helped; a search that stalls goes on without bounds.
+_HALVINGS, _MORE_HALVINGS = 2, 3
+_PARTS = 3
+_CUT, _DEAR = "its steps are cut into many parts", "it costs too much already"
+
+
+def solve(
+    problem: OptimalControlProblem,
+    controls: JointValues | LinearPolicy | Solution | None = None,
+    *,
+    tolerance: float = 1e-7,
+    max_iterations: int = ITERATIONS,
+    second_order: bool = False,
+    forward: Literal["closed", "open"] = "closed",
+    armijo: float = ARMIJO,
+    backtracking: float = BACKTRACKING,
+    regularization: float = 0.0,
+    time_limit: float = np.inf,
+    callback: Callback | None = None,
+    resume: Solution | None = None,
+    progress: Progress | None = None,
+    check: bool = True,
+) -> Solution:
+    """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
+
+    Each iteration takes the derivatives along the motion, goes back through the quadratic model of the cost to go,
+    noise terms included, and searches along the new controls for a motion of lower expected cost: the cost of the
+    motion itself, and what noise adds to it under the model.
+
+        robot = vp.load_robot("ur5")
+        cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost([0.5, -1, 1, 0, 0.5, 0], 1e3) + vp.VelocityCost(10))
+        problem = vp.OptimalControlProblem(vp.Scene(robot), cost, q0=np.zeros(6), v0=np.zeros(6), dt=0.01, steps=100)
+        plan = vp.solve(problem, callback=print)  # a line for each iteration
+        print(plan.table())
+        print(plan.verify())
+
+    Ctrl-C ends the search and returns the best motion so far, with ``status`` INTERRUPTED, as long as there is one: the
+    first motion has been integrated. ``solve(problem, plan)`` goes on from there.
+
+    Where controls have limits, each decision minimizes the model within them at the state that the linearized motion
+    will have then, and a control at a limit has no feedback (after Tassa, Mansard and Todorov, "Control-limited
+    differential dynamic programming", 2014). Limits that the motions on the way do not run into cost no iterations.
+    What noise adds is then that of the linear feedback: that noise may drive a control into its limit is not in the
+    model. ``monte_carlo`` has it.
+
+    Main args:
+        problem: What to minimize.
+        controls: To start from: None to hold the robot at q0; an array (R, m) or (m,), R the number of
+            decisions; by joint name; a :class:`LinearPolicy`; or a :class:`Solution`, whose policy then runs on this
+            problem. What leaves the problem's limits is brought within them.
+        tolerance: Stop when the decrease that the quadratic model promises is below this part of the cost at stake:
+            what the cost would lose by its own quadratic models along the motion if each state and control were free,
+            and no more than it changes by over what moves. Of squared distances that is about their value; of
+            constants, whatever their size, and of what noise adds it is nothing.
+        max_iterations: At most.
+
+    Other Args:
+        second_order: Full differential dynamic programming: second derivatives of the dynamics too, wherever they
+            leave the model convex. Converges quadratically; needs an integrator that has them (:class:`Midpoint`).
+        forward: ``"closed"``: the feedback gains act in the line search. ``"open"``: only the feed-forward part, as in
+            the paper; it diverges where the open loop is unstable over the horizon.
+        armijo: The part of the promised slope that a step must keep (the paper's alpha).
+        backtracking: Factor between the trials of the line search (the paper's beta), in (0, 1).
+        regularization: To begin with, relative to the diagonal of Quu; it grows where needed, and shrinks again.
+        time_limit: No iteration begins when this time has passed since the call [s]. What is found then depends on the
+            machine.
+        callback: Called with each :class:`Iteration`; ``callback=print`` prints the rows of :meth:`Solution.table` as
+            they come. The log has them too, at level INFO, each after the robot and the horizon that it is of.
+        progress: Called after each iteration with (iterations done, max_iterations); few searches need them all.
+        resume: A solution of this very problem, as solve returned it or as read from a file: the search goes on where
+            it stopped, for at most ``max_iterations`` more, as if it had not been interrupted. Give the other options
+            as before; ``regularization`` goes on by itself.
+        check: Look at the finished plan, whether it costs in finer steps what it promises and its velocities neither
+            alternate nor go up and down all the time, for ``Solution.warnings`` and the log. It takes as long as some
+            motions of the search.
+
+    Returns:
+        The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers, and
+        ``warnings`` what keeps a robot from following it.
+
+    Raises:
+        InputError: Controls of a wrong shape, or options out of their range.
+        NoiseFieldError: A noise field of one's own fails on the first motion.
+        StepFailure: The first motion cannot be integrated; holds what came before.
+        CostError: The cost of the first motion is not finite, or a cost of one's own fails there.
+    """
+    if not isinstance(problem, OptimalControlProblem):
+        raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
+    if not is_one_of(forward, ("closed", "open")):
+        raise InputError(f"forward must be 'closed' or 'open', got {forward!r}")
+    if not 0.0 < real("backtracking", backtracking) < 1.0:
+        raise InputError(f"backtracking must be in (0, 1), got {backtracking}")
+    if not real("regularization", regularization) >= 0.0:
+        raise InputError(f"regularization must be >= 0, got {regularization}")
+    if callback is not None and not callable(callback):
+        raise InputError(f"callback must be a function of one Iteration, got {callback!r}")
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress must be a function of (iterations done, max_iterations), got {progress!r}")
+    positive("tolerance", tolerance, "1")
+    deadline = time.perf_counter() + (np.inf if time_limit == np.inf else positive("time_limit", time_limit, "s"))
+    fraction("armijo", armijo)
+    max_iterations = count("max_iterations", max_iterations)
+
+    def report(item: Iteration) -> None:
+        if callback is not None:
+            callback(item)
+        if progress is not None:
+            # Convergence may take a last look after the last iteration.
+            progress(min(item.index + 1 - known, max_iterations), max_iterations)
+
+    search = _Search(problem, second_order, forward, armijo, backtracking, regularization)
+    if resume is None:
+        search.begin(_first_commands(problem, controls))
+    else:
+        search.resume(_search_of(problem, controls, resume))
+    known = len(search.history)
+    try:
+        status = search.run(tolerance, max_iterations, deadline, report)
+    except KeyboardInterrupt:
+        status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
+    solution = search.solution(status)
+    return looked_at(solution)[0] if check else solution
+
+
+def replan(
+    problem: OptimalControlProblem, start: LinearPolicy, *, tolerance: float, max_iterations: int, time_limit: float
+) -> Solution:
+    """A plan from the policy of the one before, with one backward pass for each iteration: a controller's tick.
+
+    Where iterations or time end the search, gains are those that its last step followed, and are not made anew for the
+    motion that came of it. Nobody looks at the finished plan. Arguments and errors are those of :func:`solve`.
+    """
+    search = _Search(problem, second_order=False, anew=False)
+    search.begin(_first_commands(problem, start))
+    try:
+        status = search.run(tolerance, max_iterations, time.perf_counter() + time_limit, lambda _: None)
+    except KeyboardInterrupt:
+        status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
+    return search.solution(status)
+
+
+def _first_commands(problem: OptimalControlProblem, controls: JointValues | LinearPolicy | Solution | None) -> Commands:
+    R, m = problem.decisions, problem.scene.controls
+    variational = problem.integrator.variational
+    if isinstance(controls, Solution):
+        controls = controls.policy_on("momentum" if variational else "velocity")
+    if controls is None:
+        controls = problem.holding_policy()
+    if isinstance(controls, LinearPolicy):
+        if (hold := controls.hold_at(problem.dt)) != problem.hold:
+            raise InputError(f"the policy holds its controls over {hold} steps, the problem {problem.hold}")
+        commands = controls.commands(problem.steps, m, problem.scene.robot.dof, variational, problem.dt)
+        narrowed = np.clip(commands.limits, *problem.control_limits)
+        narrowed.setflags(write=False)
+        if problem.rate is not None and problem.rate.before is not None:
+            commands = commands._replace(before=problem.rate.before[None].copy())
+        return commands._replace(limits=narrowed)
+    if isinstance(controls, Mapping):
+        controls = control_array("controls", controls, problem.scene.control_joints)
+    rows = as_floats("controls", controls)
+    rows = finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m))
+    return _held(np.broadcast_to(rows, (R, m)), problem)
+
+
+def _search_of(problem: OptimalControlProblem, controls: object, resume: Solution) -> SearchState:
+    if not isinstance(resume, Solution):
+        raise InputError(f"resume must be a Solution, got {type(resume).__name__}")
+    if controls is not None:
+        raise InputError("resume goes on from the solution's own controls: leave out either controls or resume")
+    if resume.search is None:
+        raise InputError("resume: the solution does not hold the state of its search; give it as controls")
+    difference = problem.differs(resume.problem)
+    if difference:
+        raise InputError(f"resume: the solution is of another problem: {difference}; give it as controls")
+    found, known = problem.cost_of(resume.search.trajectory), resume.search.cost
+    if not abs(found - known) <= 1e-9 * max(abs(found), abs(known)):
+        raise InputError(f"resume: the solution is of another cost: {known:.9g}, and here {found:.9g}")
+    return resume.search
+
+
+def _held(u: Floats, problem: OptimalControlProblem) -> Commands:
+    return open_loop(u)._replace(hold=problem.hold, limits=problem.control_limits.copy())
+
+
+def _steered(problem: OptimalControlProblem) -> NDArray[np.bool_]:
+    """Which processes (k,) the plans take into account: those of constant strength change nothing in them."""
+    fields = problem.scene.noise.diffusion
+    if fields is None or not problem.integrator.variational:
+        return np.ones(problem.scene.processes, dtype=np.bool_)
+    return np.array(fields.control.any(axis=(0, 2)) | fields.quadratic.any(axis=0), dtype=np.bool_)
+
+
+def _onto_limits(u: Floats, limits: Floats) -> Floats:
+    """Controls (R, m) that rounding keeps from a limit brought to it, so that they are known to be there."""
+    room = 8.0 * np.finfo(float).eps * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
+    for limit in limits:
+        u = np.where(np.abs(u - limit) <= room, limit, u)
+    return u
+
+
+@dataclass(frozen=True)
+class _Bounds:
+    """What a trial of the line search may take.
+
+    Attributes:
+        integrator: With the halvings that a step may take.
+        parts: Of all steps, by those of the motion so far.
+        watched: Whether even a trial of the whole step is looked at on its way. Most searches take it, and looking
+            takes time.
+    """
+
+    integrator: Integrator
+    parts: float
+    watched: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A motion that the line search tried.
+
+    Attributes:
+        motion: None where it was given up, or has no cost.
+        shares: Of its cost.
+        cost: By how much it is dearer without noise.
+        expected: By how much it is dearer with noise.
+        cut: Whether it was given up for being cut into many parts.
+    """
+
+    motion: Trajectory | None = None
+    shares: Floats | None = None
+    cost: float = np.inf
+    expected: float = np.inf
+    cut: bool = False
+
+
+@dataclass(frozen=True)
+class _Step:
+    """What a line search did.
+
+    Attributes:
+        length: Of the step taken; 0 if none was.
+        trials: How many it took.
+        decrease: Of the expected cost.
+        hidden: What rounding may do to a difference of costs; 0 where no trial has a cost.
+    """
+
+    length: float
+    trials: int
+    decrease: float
+    hidden: float
+
+
+class _Search:
+    """The motion so far, and what is known around it."""
+
+    def __init__(
+        self,
+        problem: OptimalControlProblem,
+        second_order: bool,
+        forward: str = "closed",
+        armijo: float = ARMIJO,
+        backtracking: float = BACKTRACKING,
+        regularization: float = 0.0,
+        *,
+        anew: bool = True,
+    ) -> None:
+        self.problem, self.second_order, self.forward = problem, second_order, forward
+        self.armijo, self.backtracking, self.regularization = armijo, backtracking, regularization
+        self.growth = 1.0
+        self.exact = second_order
+        self.history: list[Iteration] = []
+        self.plan: Plan | None = None
+        self.planned: tuple[Trajectory, float, bool] | None = None  # what it is a plan for, and how it was made
+        self.motions = Motions(problem.scene, problem.integrator, problem.q0, problem.v0, problem.dt)
+        self.trajectory: Trajectory
+        self.shares: Floats  # of the cost of the trajectory
+        self.cost = np.inf
+        self.first = 0.0  # what was at stake on the first motion
+        self.state: SearchState | None = None  # at the start of the last iteration, from where it can go on
+        self.best: Trajectory | None = None
+        self.best_cost = self.best_noise = np.inf
+        self.above = 0.0  # what the trajectory costs more than the best one, without noise
+        self.bounded = True  # whether trials are given up for their parts
+        self.cut = False  # whether one was
+        self.cutting: dict[int, Integrator] = {}  # the integrator with fewer halvings
+        self.gains: list[float] = []  # by how much each iteration lowered the least expected cost
+        self.reason = ""
+        self.anew = anew  # whether a plan is made for the last motion, too
+        self.followed = 0.0  # the length of the last step, if none was
+        self.steered = _steered(problem)
+        # Before each line of the log, where searches of several problems and of a controller's ticks may stand.
+        robot, begin = problem.scene.robot.name, problem.t0
+        self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {begin:g} s"
+
+    def begin(self, commands: Commands) -> None:
+        trajectory, failure = self.motions.under(commands)
+        if failure is not None:
+            raise StepFailure(trajectory.steps, trajectory.t[-1], failure, trajectory)
+        self.trajectory = trajectory
+        self.shares = self.problem.shares(trajectory)
+        self.cost = float(self.shares.sum())
+        if not np.isfinite(self.cost):
+            raise CostError(repr(self.problem.cost), f"the cost of the first motion is {self.cost}")
+
+    def resume(self, state: SearchState) -> None:
+        """Stand where ``state`` was taken."""
+        self.trajectory, self.cost, self.above, self.first = state.trajectory, state.cost, state.above, state.first
+        self.shares = self.problem.shares(state.trajectory)
+        self.gains, self.history = list(state.gains), list(state.history)
+        self.best, self.best_cost, self.best_noise = state.best, state.best_cost, state.best_noise
+        self.regularization, self.growth = state.regularization, state.growth
+        self.bounded, self.cut = state.bounded, state.cut
+
+    def _state(self) -> SearchState:
+        return SearchState(
+            trajectory=self.trajectory,
+            cost=self.cost,
+            above=self.above,
+            first=self.first,
+            best=self.best,
+            best_cost=self.best_cost,
+            best_noise=self.best_noise,
+            gains=tuple(self.gains),
+            regularization=self.regularization,
+            growth=self.growth,
+            bounded=self.bounded,
+            cut=self.cut,
+            history=tuple(self.history),
+        )
+
+    def run(self, tolerance: float, max_iterations: int, deadline: float, report: Callback) -> Status:
+        last = len(self.history) + max_iterations
+        while True:
+            self.state = self._state()
+            started = time.perf_counter()
+            try:
+                passes = self._plan()
+            except _LOST as error:
+                if not self.history:
+                    raise
+                logger.warning("%s: %s", self.label, error)
+                self.reason = str(error)
+                return Status.NOT_DIFFERENTIABLE
+            if self.plan is None:
+                self.reason = f"the regularization has reached {self.regularization:.1e} of the diagonal of Quu"
+                return Status.INDEFINITE
+            self._compare_with_best(self.plan)
+            if not self.history:
+                stake = self._stake(self.plan)
+                self.first = stake.free if np.isfinite(stake.free) else stake.moved
+            if self._is_there(self.plan, tolerance):
+                self._note(report, started, passes)
+                self.reason = self._numbers(tolerance)
+                return Status.CONVERGED
+            ended, why = self._ended(self.plan, tolerance, last, deadline)
+            if ended is Status.STALLED and self._lift():
+                continue
+            if ended is not None:
+                self._note(report, started, passes)
+                self.reason = why + self._numbers(tolerance, afresh=True)
+                return ended
+            step = self._line_search()
+            if step.length == 0.0 and self.exact:
+                passes += self._plan(exact=False)
+                more = self._line_search()
+                step = replace(more, trials=step.trials + more.trials, hidden=max(step.hidden, more.hidden))
+            self._note(report, started, passes, step)
+            if step.length == 0.0 and self._keeps_no_promise_above(step.hidden):
+                self.reason = f"{self._promised()}, and rounding hides {step.hidden:.1e} of the cost"
+                return Status.CONVERGED
+            ended = self._out_of(last, deadline)
+            if not self.anew and step.length > 0.0 and ended is not None:
+                self.followed = step.length
+                self.reason = f"{self._promised()} before the last step"
+                return ended
+            if step.length >= _LONG:
+                self._relax()
+            elif step.length <= _SHORT and not self._stiffen() and not self._lift():
+                self.reason = "no step lowers the cost, whatever the regularization; "
+                self.reason += self._numbers(tolerance, afresh=True)
+                return Status.STALLED
+
+    def _compare_with_best(self, plan: Plan) -> None:
+        noise = self._noise(plan)
+        gain = self.best_noise - self.above - noise
+        if self.best is None or gain > 0.0:
+            self.gains.append(0.0 if self.best is None else gain)
+            self.best, self.best_cost, self.best_noise, self.above = self.trajectory, self.cost, noise, 0.0
+        else:
+            self.gains.append(0.0)
+
+    def _noise(self, plan: Plan) -> float:
+        """What the noise that plans take into account adds to the cost."""
+        if self.steered.all():
+            return plan.noise
+        if not self.steered.any():
+            return 0.0
+        return float(noise_shares(self.problem, self.trajectory, plan, self.steered).sum())
+
+    def _stake(self, plan: Plan) -> Stake:
+        return at_stake(self.problem, self.trajectory, plan.model)
+
+    def _share(self, plan: Plan, tolerance: float) -> float:
+        """The tolerance on the promised decrease."""
+        return tolerance * (self._stake(plan).moved + _NOTHING * self.first)
+
+    def _is_there(self, plan: Plan, tolerance: float) -> bool:
+        least = tolerance * _NOTHING * self.first
+        if self.problem.cost.nonnegative and plan.promise > tolerance * self.cost + least:
+            # Of squares no more is at stake than they cost.
+            return False
+        if not self.steered.any() and self._stake(plan).free <= least:
+            # No motion at all costs less. Without costs on the controls the model may have no minimum even there.
+            self.plan = self._least_regularized()[0] or plan
+            return True
+        return self._keeps_no_promise_above(self._share(plan, tolerance))
+
+    def _ended(self, plan: Plan, tolerance: float, last: int, deadline: float) -> tuple[Status | None, str]:
+        """How a search ends that has not converged, if it does, and the reason."""
+        if len(self.history) >= last:
+            return self._out_of(last, deadline), ""
+        if len(self.gains) > _PATIENCE:
+            recent = sum(self.gains[-_PATIENCE:])
+            if recent <= self._share(plan, tolerance):
+                return Status.STALLED, f"{_PATIENCE} iterations have lowered the expected cost by {recent:.1e}; "
+        return self._out_of(last, deadline), ""
+
+    def _out_of(self, last: int, deadline: float) -> Status | None:
+        """Whether iterations or time end the search."""
+        if len(self.history) >= last:
+            return Status.MAX_ITERATIONS
+        return Status.OUT_OF_TIME if time.perf_counter() > deadline else None
+
+    def _keeps_no_promise_above(self, bound: float) -> bool:
+        """Whether the model promises no more than ``bound``; the plan is then one that can be trusted with that.
+
+        Regularization makes promises smaller; it must not pass for an optimum.
+        """
+        if self.plan is None or not self.plan.promise <= bound:
+            return False
+        if self.regularization > 0.0:
+            plan, least = self._least_regularized()
+            if plan is None or least > _LITTLE or not plan.promise <= bound:
+                return False
+            self.plan = plan
+        return True
+
+    def _promised(self) -> str:
+        return f"the model promises a decrease of {np.nan if self.plan is None else self.plan.promise:.1e}"
+
+    def _numbers(self, tolerance: float, *, afresh: bool = False) -> str:
+        """What the status rests on; ``afresh`` with as little regularization as the model needs."""
+        needed = ""
+        if afresh and self.regularization > 0.0:
+            with contextlib.suppress(*_LOST):
+                plan, least = self._least_regularized()
+                if plan is not None:
+                    self.plan = plan
+                    needed = f" under a regularization of {least:.0e}, without which it has no minimum" if least else ""
+        share = np.nan if self.plan is None else self._share(self.plan, tolerance)
+        return f"{self._promised()}{needed}; the tolerance of {tolerance:g} times the cost at stake is {share:.1e}"
+
+    def _note(self, report: Callback, started: float, passes: int, step: _Step | None = None) -> None:
+        if self.plan is None:
+            return
+        item = Iteration(
+            index=len(self.history),
+            cost=self.cost,
+            noise_cost=self.plan.noise,
+            promised_decrease=self.plan.promise,
+            decrease=0.0 if step is None else step.decrease,
+            step=0.0 if step is None else step.length,
+            regularization=self.regularization,
+            gradient=float(np.abs(self.plan.free_gradient(self.problem, self.trajectory)).max()),
+            backward_passes=passes,
+            rollouts=0 if step is None else step.trials,
+            seconds=time.perf_counter() - started,
+        )
+        self.history.append(item)
+        logger.info("%s: %s", self.label, item)
+        report(item)
+
+    def _relax(self) -> None:
+        self.growth = min(1.0 / _GROWTH, self.growth / _GROWTH)
+        self.regularization *= self.growth
+        if self.regularization < _LEAST:
+            self.regularization = 0.0
+
+    def _stiffen(self) -> bool:
+        self.growth = max(_GROWTH, self.growth * _GROWTH)
+        self.regularization = max(_LEAST, self.regularization * self.growth)
+        return self.regularization <= _MOST
+
+    def _lift(self) -> bool:
+        """Go on without bounds on what trials may take, if there were any and one was given up."""
+        if not (self.bounded and self.cut):
+            return False
+        logger.info(
+            "%s: no progress with trials of few parts: from here on they may take as many as they need", self.label
+        )
+        self.bounded, self.regularization, self.growth = False, 0.0, 1.0
+        # One line search without bounds, before what was gained lately is looked at again.
+        self.gains = self.gains[1 - _PATIENCE :]
+        return True
+
+    def _plan(self, *, exact: bool | None = None) -> int:
+        """A backward pass, with as much regularization as it takes; returns how many it took.
+
+        Second derivatives can make the model indefinite far from an optimum; there they are left out.
+        """
+        passes = 0
+        self.exact = self.second_order if exact is None else exact
+        while True:
+            passes += 1
+            self.plan = backward(self.problem, self.trajectory, self.regularization, self.exact)
+            if self.plan is not None:
+                self.planned = self.trajectory, self.regularization, self.exact
+                return passes
+            if self.exact:
+                self.exact = False
+            elif not self._stiffen():
+                return passes
+
+    def _least_regularized(self) -> tuple[Plan | None, float]:
+        """The plan at the motion with as little regularization as leaves a minimum, and how much that is."""
+        for regularization in (0.0, *10.0 ** np.arange(-6, 11, 2)):
+            for exact in (True, False) if self.second_order and regularization == 0.0 else (False,):
+                plan = backward(self.problem, self.trajectory, float(regularization), exact)
+                if plan is not None:
+                    return plan, float(regularization)
+        return None, np.inf
+
+    def _line_search(self) -> _Step:
+        """Move to the first motion along the plan whose expected cost is low enough."""
+        if self.plan is None:
+            return _Step(0.0, 0, 0.0, 0.0)
+        added = noise_shares(self.problem, self.trajectory, self.plan)
+        taken, length, tried, trials = _Trial(), 0.0, None, 0
+        left = list(self.backtracking ** np.arange(_TRIALS))
+        for bounds in self._bounds():
+            cut = []
+            for step in left:
+                trials += 1
+                trial = self._try(float(step), added, bounds)
+                if trial.expected <= self.armijo * step * self.plan.slope:
+                    taken, length = trial, float(step)
+                    break
+                if trial.cut:
+                    cut.append(step)
+                    self.cut = True
+                elif trial.shares is not None:
+                    tried = trial.shares
+            left = [step for step in cut if step > length]
+            if not left or length > (_SHORT if bounds.parts == _PARTS else 0.0):
+                break
+        hidden = 0.0
+        if taken.motion is not None and taken.shares is not None:
+            self.trajectory, self.shares = taken.motion, taken.shares
+            self.cost = float(taken.shares.sum())
+            self.above += taken.cost
+        elif tried is not None:
+            hidden = rounding(self.problem, self.trajectory, self.shares, tried, self.plan.model)
+        return _Step(length, trials, -taken.expected if length > 0.0 else 0.0, hidden)
+
+    def _bounds(self) -> Iterator[_Bounds]:
+        """What trials may take, one after another while nothing else helps."""
+        integrator = self.problem.integrator
+        guard = integrator.guard if isinstance(integrator, Variational) else None
+        if not (self.bounded and guard is not None and is_dataclass(integrator)):
+            yield _Bounds(integrator, np.inf, watched=False)
+            return
+        # As many parts as a step of the motion so far has take fewer halvings of halves.
+        few = max(_HALVINGS, int(self.trajectory.statistics.substeps.max()) - 1)
+        for halvings, parts in ((few, _PARTS), (few + _MORE_HALVINGS, _PARTS**2)):
+            if halvings not in self.cutting:
+                own = replace(guard, max_halvings=min(halvings, guard.max_halvings))
+                self.cutting[halvings] = replace(integrator, guard=own)
+            yield _Bounds(self.cutting[halvings], parts, watched=halvings > _HALVINGS)
+        yield _Bounds(integrator, np.inf, watched=True)
+
+    def _try(self, step: float, added: Floats, bounds: _Bounds) -> _Trial:
+        """A motion so far along the plan, given up where it is cut to pieces or too dear already."""
+        problem, plan, here = self.problem, self.plan, self.trajectory
+        if plan is None:
+            return _Trial()
+        parts = np.cumsum(here.statistics.substeps)
+        # What is to come of the cost, and what noise adds to it, is known not to be below zero.
+        bounded = problem.cost.nonnegative and not (self.exact and problem.scene.processes)
+        most = float(self.shares.sum() + added.sum()) + self.armijo * step * plan.slope if bounded else np.inf
+
+        def futile(done: list[Segment]) -> str | None:
+            taken = sum(int(part.statistics.substeps.sum()) for part in done)
+            # Explicit methods count no parts.
+            if taken > bounds.parts * max(1, parts[sum(len(part.u) for part in done) - 1]):
+                return _CUT
+            return _DEAR if bounded and spent(problem, done, here) > most else None
+
+        commands = self._along(step, plan)
+        try:
+            asked = futile if bounds.watched or step < 1.0 else None
+            moved, failure = self.motions.under(commands, integrator=bounds.integrator, futile=asked)
+            if failure is not None:
+                # Whatever makes a step of few halvings fail, more may mend.
+                few = bounds.integrator != problem.integrator
+                return _Trial(cut=failure.reason == _CUT or (few and failure.reason != _DEAR))
+            there, noise = problem.shares(moved), noise_shares(problem, moved, plan)
+        except _LOST as error:
+            logger.info("%s: trial of length %g: %s", self.label, step, error)
+            return _Trial()
+        if not np.isfinite(there).all():
+            return _Trial()
+        cost = float((there - self.shares).sum())
+        return _Trial(moved, there, cost, cost + float((noise - added).sum()))
+
+    def _along(self, step: float, plan: Plan) -> Commands:
+        """The commands of a trial."""
+        problem, here = self.problem, self.trajectory
+        u = here.u[:: problem.hold] + step * plan.feedforward
+        if problem.limited:
+            u = _onto_limits(u, problem.control_limits)
+        if self.forward == "open":
+            return _held(u, problem)
+        gains, reference = plan.feedback, states(problem, here)[: -1 : problem.hold]
+        if plan.previous is not None:
+            before = here.u[: -problem.hold : problem.hold]
+            gains = np.concatenate([gains, plan.previous], axis=2)
+            # The first change is from a control that is given.
+            reference = np.hstack([reference, np.vstack([here.u[:1], before])])
+        return _held(u, problem)._replace(gains=gains, reference=reference)
+
+    def _last_plan(self) -> Plan | None:
+        if self.plan is not None and self.planned == (self.trajectory, 0.0, self.second_order):
+            return self.plan
+        try:
+            return self._least_regularized()[0]
+        except _LOST:
+            return None
+
+    def solution(self, status: Status) -> Solution:
+        problem, plan = self.problem, self.plan
+        if plan is not None and self.followed > 0.0:
+            plan = plan.followed(self.followed)
+        elif status is not Status.CONVERGED:
+            # With noise the fixed point of the search is not the minimum of the expected cost, and the last motion not
+            # always the best; nor does the last plan belong to it, or hold without its regularization.
+            plan = self._last_plan()
+            above = np.inf if plan is None else self.above + self._noise(plan) - self.best_noise
+            if self.best is not None and self.best is not self.trajectory and not above <= 0.0:
+                self.trajectory, self.cost = self.best, self.best_cost
+                plan = self._last_plan()
+        reason = self.reason
+        if plan is not None and plan.loss > _LOSSY:
+            lost = f"rounding may have changed Quu by {plan.loss:.0e} of itself: weights or inertias are too far apart"
+            logger.warning("%s: the gains cannot be trusted: %s", self.label, lost)
+            reason = f"{reason}; {lost}"
+        R, m, n = problem.decisions, problem.scene.controls, problem.scene.robot.dof
+        return Solution(
+            problem=problem,
+            trajectory=self.trajectory,
+            gains=np.zeros((R, m, 2 * n)) if plan is None else plan.feedback,
+            previous_gains=_previous_gains(problem, plan),
+            feedforward=np.zeros((R, m)) if plan is None else plan.feedforward,
+            gradient=np.full((R, m), np.nan) if plan is None else plan.gradient,
+            cost=self.cost,
+            noise_cost=(np.nan if problem.scene.processes else 0.0) if plan is None else plan.noise,
+            status=status,
+            reason=reason,
+            history=tuple(self.history),
+            search=self.state,
+        )
+
+
+def _previous_gains(problem: OptimalControlProblem, plan: Plan | None) -> Floats | None:
+    if problem.rate is None:
+        return None
+    m = problem.scene.controls
+    return np.zeros((problem.decisions, m, m)) if plan is None else plan.previous
+
+
+def states(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
+    """X (N + 1, 2n): (q, p) or (q, v)."""
+    second = trajectory.p if problem.integrator.variational else trajectory.v
+    return np.hstack([trajectory.q, second])

@@ -1,0 +1,358 @@
+"""What a solver returns, and what there is to be done with it: feedback, verification, Monte Carlo."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.costs import barriers_of
+from varpin.control.history import Iteration, SearchState, Status
+from varpin.control.monte_carlo import MonteCarlo, monte_carlo
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.solution_file import read, write
+from varpin.control.verification import Verification, verify
+from varpin.errors import InputError
+from varpin.linearization import velocity_at_nodes
+from varpin.mechanics.policy import LinearPolicy
+from varpin.support.checks import JointValues, count, is_one_of, positive
+from varpin.support.frozen import Frozen
+from varpin.support.markup import facts, folded, listed, said, table
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Violations:
+    """How far a motion goes beyond limits, at its nodes: the most for each joint or control, zero where it does not.
+
+    Attributes:
+        position: Beyond the limits of the robot's joints, or of a narrower :class:`varpin.JointLimitBarrier` in the
+            cost (n,) [rad or m].
+        velocity: Likewise (n,) [rad/s or m/s].
+        control: Beyond the problem's control limits (m,).
+    """
+
+    position: Floats
+    velocity: Floats
+    control: Floats
+
+    @property
+    def any(self) -> bool:
+        """Whether there is one at all."""
+        return bool(any(part.any() for part in (self.position, self.velocity, self.control)))
+
+    def __repr__(self) -> str:
+        parts = {"position": self.position, "velocity": self.velocity, "control": self.control}
+        beyond = [f"{name} by up to {part.max():.3g}" for name, part in parts.items() if part.any()]
+        return f"Violations({', '.join(beyond) or 'none'})"
+
+
+@dataclass(frozen=True, eq=False)
+class Solution(Frozen):
+    """The best motion a solver found, with the policy around it.
+
+    ``print(plan.table())`` shows a row for each iteration, then how the search ended and why:
+
+    ========== =====================================================================================
+    iter       Its number, from 0.
+    cost       Of the motion it ended with, without noise.
+    noise cost What noise adds to the cost of the motion it began with, by the solver's model.
+    promise    The decrease of the expected cost that the quadratic model promises for a full step.
+    decrease   What the step taken brought; near the promise where the model is good.
+    grad       Largest entry of the expected cost's gradient in the controls.
+    reg        Regularization, relative to the diagonal of Quu; 0 where the model needs none.
+    step       Length of the step taken, in (0, 1]; 0 where none was, as at the end.
+    rolls      Motions that the line search tried.
+    ========== =====================================================================================
+
+    ``print(plan.verify())`` tells what the plan costs on the continuous robot, ``print(plan.monte_carlo(200, rng=0))``
+    what it costs under the scene's noise.
+
+    Attributes:
+        problem: What was solved.
+        trajectory: The motion without noise.
+        gains: Feedback (R, m, 2n) on x = (q, p) or (q, v), for each of R decisions.
+        previous_gains: Feedback (R, m, m) on the control of the decision before, where its changes cost something
+            (:class:`ControlRateCost`): u_k + gains_k (x - x_k) + previous_gains_k (u_before - u_(k-1)). Else None.
+        feedforward: The change of the controls (R, m) that the last backward pass asked for; zero at an optimum.
+        gradient: Of the expected cost in the controls (R, m), under the solver's model of the noise. At an optimum it
+            is zero but where it pushes a control against its limit.
+        cost: Of the motion without noise.
+        noise_cost: What noise adds to it, by the solver's model.
+        status: How the solver ended.
+        reason: With which numbers.
+        history: One entry for each iteration.
+        search: From where :func:`varpin.solve` can go on, with ``resume``.
+        warnings: What looks wrong with the plan, in sentences that say what to change: it costs more than planned when
+            its steps are taken in quarters, its velocities alternate or go up and down all the time, its energy balance
+            does not close.
+    """
+
+    problem: OptimalControlProblem
+    trajectory: Trajectory
+    gains: Floats
+    feedforward: Floats
+    gradient: Floats
+    cost: float
+    noise_cost: float
+    status: Status
+    reason: str
+    history: tuple[Iteration, ...]
+    search: SearchState | None = None
+    previous_gains: Floats | None = None
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for array in (self.gains, self.feedforward, self.gradient, self.previous_gains):
+            if array is not None:
+                array.setflags(write=False)
+
+    @property
+    def expected_cost(self) -> float:
+        """Cost of the motion and what noise adds to it, by the solver's model."""
+        return self.cost + self.noise_cost
+
+    @property
+    def controls(self) -> Floats:
+        """One row for each decision (R, m)."""
+        return self.trajectory.u[:: self.problem.hold]
+
+    @property
+    def iterations(self) -> int:
+        """Steps that were taken or tried."""
+        return sum(item.rollouts > 0 for item in self.history)
+
+    @property
+    def violations(self) -> Violations:
+        """What the motion does beyond the limits of joints, whether the cost knows them or not, and of controls."""
+        robot, motion, speed = self.problem.scene.robot, self.trajectory, self.problem.scene.robot.velocity_limit
+        joints, speeds = barriers_of(self.problem.cost)
+        return Violations(
+            position=_beyond(motion.q, [robot.position_limits, *(term.limits for term in joints)]),
+            velocity=_beyond(motion.v, [(-speed, speed), *(term.limits for term in speeds)]),
+            control=_beyond(motion.u, [self.problem.control_limits]),
+        )
+
+    @property
+    def policy(self) -> LinearPolicy:
+        """Controls with feedback, on the x of the problem's integrator."""
+        return self.policy_on("momentum" if self.problem.integrator.variational else "velocity")
+
+    def __repr__(self) -> str:
+        noise = f" + {self.noise_cost:.4g} by noise" if self.noise_cost else ""
+        ended = f"{self.iterations} iterations, {self.status.value}{said(self.warnings)}"
+        return f"Solution(cost {self.cost:.6g}{noise}, {ended})"
+
+    def __str__(self) -> str:
+        return "\n".join([repr(self), *(f"warning: {sentence}" for sentence in self.warnings)])
+
+    def _repr_html_(self) -> str:
+        problem, beyond, motion = self.problem, self.violations, self.trajectory
+        rows: list[tuple[str, object]] = [
+            ("status", self.status.value),
+            ("why", self.reason),
+            ("cost", f"{self.cost:.6g}" + (f", and {self.noise_cost:.4g} by noise" if self.noise_cost else "")),
+            ("iterations", f"{self.iterations} in {sum(item.seconds for item in self.history):.3g} s"),
+            ("horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}"),
+        ]
+        if self.history:
+            rows.insert(4, ("gradient", f"{self.history[-1].gradient:.2e} at most in the end"))
+        names = problem.scene.robot.joint_names
+        for what, unit, part in (("position", "rad or m", beyond.position), ("velocity", "1/s", beyond.velocity)):
+            over = [f"{name} {value:.3g}" for name, value in zip(names, part, strict=True) if value]
+            if over:
+                rows.append((f"{what} beyond limits [{unit}]", listed(over)))
+        if beyond.control.any():
+            rows.append(("controls beyond limits", f"{beyond.control.max():.3g} at most"))
+        rows += [("warning", warning) for warning in self.warnings]
+        most = np.abs(motion.u).max(axis=0, initial=0.0)
+        rows.append(("largest controls", listed(f"{value:.4g}" for value in most)))
+        columns = ("", "cost", "noise cost", "promise", "decrease", "gradient", "regularization", "step", "rollouts")
+        history = [
+            (x.index, f"{x.cost:.6e}", *map(float, (x.noise_cost, x.promised_decrease, x.decrease, x.gradient)),
+             x.regularization, x.step, x.rollouts)
+            for x in self.history
+        ]  # fmt: skip
+        return facts(f"Plan for {problem.scene.robot.name}", rows, folded("iterations", table(columns, history)))
+
+    def table(self) -> str:
+        """The iterations, one row each, and how and why they ended; :class:`Solution` explains the columns."""
+        warned = (f"warning: {sentence}" for sentence in self.warnings)
+        return "\n".join([Iteration.HEADER, *map(str, self.history), *warned, self.status.value, f"({self.reason})"])
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the solution as a compressed npz file without pickle; returns its path.
+
+        The problem is not in it: :meth:`load` takes it. All that a search needs to go on is.
+
+        Raises:
+            FileError: The path cannot be written.
+        """
+        return write(path, {item.name: getattr(self, item.name) for item in fields(self)})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], problem: OptimalControlProblem) -> Solution:
+        """Read a solution of ``problem`` that :meth:`save` wrote.
+
+        Raises:
+            FileError: The file is missing, truncated, no npz, written by something else, holds pickled objects, arrays
+                that do not fit together or are not finite, or is of another problem.
+        """
+        if not isinstance(problem, OptimalControlProblem):
+            raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
+        return cls(**read(path, problem))
+
+    def shifted(self, decisions: int, before: JointValues | None = None) -> LinearPolicy:
+        """The policy from a later decision on, its last row repeated: what to start the next horizon with.
+
+        ``before`` is the control, (m,) or by joint name, that has acted before that decision; left out, the plan's own.
+
+        Raises:
+            InputError: Not from 0 to R - 1, or a control of a wrong shape.
+        """
+        if not 0 <= count("decisions", decisions) < len(self.gains):
+            raise InputError(f"decisions must be from 0 to {len(self.gains) - 1}, got {decisions}")
+        own = self.policy
+        rows = np.minimum(np.arange(len(self.gains)) + decisions, len(self.gains) - 1)
+        u, previous_gains, previous = own.u[rows], None, None
+        if own.previous_gains is not None and own.previous is not None:
+            # What is repeated expects itself before.
+            previous_gains, previous = own.previous_gains[rows], np.vstack([own.previous[rows[:1]], u[:-1]])
+        return LinearPolicy(
+            u,
+            own.gains[rows],
+            own.reference[rows],
+            own.hold,
+            own.on,
+            (own.limits[0], own.limits[1]),
+            previous_gains=previous_gains,
+            previous=previous,
+            before=before,
+            period=own.period,
+            joints=own.joints,
+            servos=own.servos,
+        )
+
+    def policy_on(self, x: Literal["momentum", "velocity"], substeps: int = 1) -> LinearPolicy:
+        """The policy on (q, p) or on (q, v), each control held over ``substeps`` times as many steps.
+
+        A simulation finds out itself over how many steps of its dt a control is held.
+
+        Where x is not that of the problem's integrator, dp = L_vq dq + M dv turns the gains around, to first order.
+
+        Raises:
+            InputError: ``x`` is neither "momentum" nor "velocity".
+        """
+        if not is_one_of(x, ("momentum", "velocity")):
+            raise InputError(f"x must be 'momentum' or 'velocity', got {x!r}")
+        gains, trajectory, hold = self.gains, self.trajectory, self.problem.hold
+        rows, n = slice(0, -1, hold), self.problem.scene.robot.dof
+        if self.problem.integrator.variational != (x == "momentum"):
+            rates = velocity_at_nodes(self.problem.scene, trajectory.q[rows], trajectory.v[rows])
+            by_q, by_p = rates[:, :, :n], rates[:, :, n:]
+            second = gains[:, :, n:]
+            if x == "velocity":
+                second = second @ np.linalg.inv(by_p)
+                gains = np.concatenate([gains[:, :, :n] - second @ by_q, second], axis=2)
+            else:
+                gains = np.concatenate([gains[:, :, :n] + second @ by_q, second @ by_p], axis=2)
+        nodes = trajectory.p if x == "momentum" else trajectory.v
+        reference = np.hstack([trajectory.q[rows], nodes[rows]])
+        limits, rate = self.problem.control_limits, self.problem.rate
+        return LinearPolicy(
+            self.controls,
+            gains,
+            reference,
+            hold * substeps,
+            x,
+            (limits[0], limits[1]),
+            previous_gains=self.previous_gains,
+            before=None if rate is None else rate.before,
+            period=self.problem.period,
+            joints=self.problem.scene.control_joints,
+            servos=self.problem.scene.servo_joints,
+        )
+
+    def verify(
+        self, *, tolerance: float = 1e-10, max_substeps: int = 1024, progress: Callable[[int, int], None] | None = None
+    ) -> Verification:
+        """Replay the plan through an accurate integration of the continuous system: classical Runge-Kutta, Simpson.
+
+        Main args:
+            tolerance: On the relative change of the cost when the substeps are doubled.
+            max_substeps: Of one step of the plan; where they do not reach the tolerance, ``accuracy`` says so.
+
+        Other Args:
+            progress: Called before each doubling with (substeps, max_substeps).
+        """
+        positive("tolerance", tolerance, "1")
+        count("max_substeps", max_substeps, least=2)
+        return verify(
+            self.problem,
+            self.trajectory,
+            self.cost,
+            lambda substeps: self.policy_on("velocity", substeps),
+            status=self.status,
+            tolerance=tolerance,
+            max_substeps=max_substeps,
+            progress=progress,
+        )
+
+    def monte_carlo(
+        self,
+        paths: int,
+        rng: np.random.Generator | int,
+        *,
+        feedback: bool = True,
+        workers: int | None = None,
+        executor: Executor | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> MonteCarlo:
+        """Expected cost of the policy under the scene's noise, with the problem's own integrator and step.
+
+        Path i draws its noise from the i-th child of ``rng``: the same bytes for any number of workers, threads,
+        processes or machines of one kind. Only costs come back from them. Noise that only Python can evaluate
+        (:class:`varpin.CustomNoise`) is simulated path by path, which is slow, and without ``executor`` one after
+        another.
+
+        Main args:
+            paths: How many.
+            rng: Seed or generator.
+            feedback: Without, the controls alone.
+
+        Other Args:
+            workers: Threads; as many as there are cores if left out.
+            executor: Any ``concurrent.futures.Executor`` instead of threads; see :func:`varpin.simulate_ensemble`.
+            progress: Called now and then with (paths done, paths in all).
+
+        Raises:
+            InputError: Wrong arguments.
+            VarpinError: Every path failed, or workers get lost again and again.
+            MonteCarloInterrupted: Ctrl-C; holds the result of the paths done. It is a KeyboardInterrupt.
+        """
+        policy = self.policy if feedback else self.policy.without_feedback()
+        return monte_carlo(
+            self.problem,
+            policy,
+            self.expected_cost,
+            paths,
+            rng,
+            workers=workers,
+            executor=executor,
+            progress=progress,
+        )
+
+
+def _beyond(y: Floats, limits: Sequence[tuple[Floats, Floats] | Floats]) -> Floats:
+    """The most that each column of y (N, k) is outside any of some limits."""
+    excess = [np.maximum(y - upper, lower - y).max(axis=0) for lower, upper in limits]
+    most: Floats = np.maximum(0.0, np.max(excess, axis=0))
+    return most

@@ -1,0 +1,212 @@
+"""A plan held against an accurate integration of the continuous system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.costs import BoundSum
+from varpin.control.history import Status
+from varpin.control.problem import OptimalControlProblem, bind_cost
+from varpin.core.arrays import Commands
+from varpin.integrators import Integrator, RungeKutta4
+from varpin.integrators.base import open_loop
+from varpin.mechanics.policy import LinearPolicy
+from varpin.simulation.run import rollout
+from varpin.support.markup import facts, table
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+_READING = (
+    "where feedback loses some percent, the plan holds; where it loses much, dt is too coarse (controls alone also "
+    "lose much where a motion is unstable)"
+)
+
+
+@dataclass(frozen=True)
+class Verification:
+    """A plan held against an accurate integration of the continuous system.
+
+    Costs are integrals over the continuous motion, without noise; NaN where that motion runs away.
+
+    Attributes:
+        planned_cost: The solver's own.
+        open_loop_cost: Of the plan's controls alone.
+        closed_loop_cost: With the plan's feedback, at the plan's own rate.
+        open_loop_gap: Distance of the end from the plan's, in q, open loop [rad or m].
+        closed_loop_gap: The same with feedback.
+        defect: Largest distance in q of an accurately integrated step from the plan's [rad or m].
+        substeps: Of the accurate integration, in one step of the plan.
+        accuracy: Relative change over the last doubling of the substeps, of the cost that changed more.
+        status: How the search for the plan ended.
+    """
+
+    planned_cost: float
+    open_loop_cost: float
+    closed_loop_cost: float
+    open_loop_gap: float
+    closed_loop_gap: float
+    defect: float
+    substeps: int
+    accuracy: float
+    status: Status = Status.CONVERGED
+
+    @property
+    def open_loop_loss(self) -> float:
+        """What the controls alone cost above the plan, relative to the plan's cost; NaN where they run away."""
+        return excess(self.open_loop_cost, self.planned_cost)
+
+    @property
+    def closed_loop_loss(self) -> float:
+        """The same with feedback."""
+        return excess(self.closed_loop_cost, self.planned_cost)
+
+    @property
+    def _rows(self) -> list[tuple[str, float, str, str]]:
+        return [
+            ("planned", self.planned_cost, "", ""),
+            ("controls alone", self.open_loop_cost, percent(self.open_loop_loss), f"{self.open_loop_gap:.2e}"),
+            ("with feedback", self.closed_loop_cost, percent(self.closed_loop_loss), f"{self.closed_loop_gap:.2e}"),
+        ]
+
+    def _repr_html_(self) -> str:
+        shown = [row if np.isfinite(row[1]) else (row[0], "runs away", "", "") for row in self._rows]
+        head = ("", "cost", "loss", "end off by [rad or m]")
+        said = [
+            ("how to read it", _READING),
+            ("a step is off by", f"{self.defect:.2e} rad or m"),
+            *([] if self.status.converged else [("the plan is unfinished", self.status.value)]),
+        ]
+        return facts("Verification on the continuous system", said, table(head, shown))
+
+    def __str__(self) -> str:
+        lines = [f"{'':16}{'cost':>14}{'loss':>12}  end off by [rad or m]"]
+        for name, cost, loss, gap in self._rows:
+            shown = (f"{cost:14.6e}{loss:>12}  {gap}" if np.isfinite(cost) else f"{'runs away':>14}").rstrip()
+            lines.append(f"{name:16}{shown}")
+        good = f"{self.accuracy:.0e}" if np.isfinite(self.accuracy) else "nothing: no motion stays"
+        return "\n".join(
+            [
+                *lines,
+                f"a step is off by {self.defect:.2e} rad or m at most; costs are good to {good} of themselves "
+                f"({self.substeps} substeps a step)",
+                f"read it so: {_READING}",
+                *([] if self.status.converged else [f"the plan is unfinished, {self.status.value}"]),
+            ]
+        )
+
+
+def excess(cost: float, base: float) -> float:
+    """How far a cost is above another one, relative to it; infinite above nothing."""
+    if cost == base:
+        return 0.0
+    return (cost - base) / abs(base) if base != 0.0 else float(np.copysign(np.inf, cost - base))
+
+
+def percent(part: float) -> str:
+    """A part of something in words: in percent, or as a multiple where it is large."""
+    if abs(part) >= 1e4:
+        return f"{part:+.1e} x"
+    return f"{100.0 * part:+.2f} %" if abs(part) < 1.0 else f"{100.0 * part:+.0f} %"
+
+
+def verify(
+    problem: OptimalControlProblem,
+    plan: Trajectory,
+    planned_cost: float,
+    policy: Callable[[int], LinearPolicy],
+    *,
+    status: Status,
+    tolerance: float,
+    max_substeps: int,
+    progress: Callable[[int, int], None] | None,
+) -> Verification:
+    """Hold a plan, and its policy on (q, v) for a number of substeps, against accurate integrations.
+
+    The substeps double until neither cost changes by more than ``tolerance`` of itself.
+    """
+    substeps, before = 2, (np.nan, np.nan)
+    blind = open_loop(plan.u[:: problem.hold])
+    while True:
+        if progress is not None:
+            progress(substeps, max_substeps)
+        costs = _fine_costs(problem, substeps)
+        opened = accurate_cost(problem, blind._replace(hold=problem.hold * substeps), substeps, costs)
+        fed = policy(substeps)
+        feedback = fed.commands(
+            problem.steps * substeps, problem.scene.controls, problem.scene.robot.dof, variational=False
+        )
+        closed = accurate_cost(problem, feedback, substeps, costs)
+        changes = [
+            abs(now[0] - then) / max(abs(now[0]), 1e-300)
+            for now, then in zip((opened, closed), before, strict=True)
+            if np.isfinite(now[0]) and np.isfinite(then)
+        ]
+        before = opened[0], closed[0]
+        accuracy = max(changes, default=np.inf)
+        if accuracy <= tolerance or substeps >= max_substeps:
+            break
+        substeps *= 2
+    end = plan.q[-1]
+    return Verification(
+        planned_cost=planned_cost,
+        open_loop_cost=opened[0],
+        closed_loop_cost=closed[0],
+        open_loop_gap=float(np.abs(opened[1] - end).max()),
+        closed_loop_gap=float(np.abs(closed[1] - end).max()),
+        defect=_defect(problem, plan, substeps),
+        substeps=substeps,
+        accuracy=accuracy,
+        status=status,
+    )
+
+
+def _fine_costs(problem: OptimalControlProblem, substeps: int) -> tuple[BoundSum, BoundSum]:
+    """Running and terminal costs at the nodes of a finer grid."""
+    times = np.arange(problem.steps * substeps + 1, dtype=np.float64) * (problem.dt / substeps)
+    return bind_cost(problem.cost, problem.t0 + times, problem.running.points)
+
+
+def accurate_cost(
+    problem: OptimalControlProblem,
+    commands: Commands,
+    substeps: int,
+    costs: tuple[BoundSum, BoundSum] | None = None,
+    integrator: Integrator | None = None,
+) -> tuple[float, Floats]:
+    """True cost under given commands, and the end configuration; NaN where the motion runs away.
+
+    In ``substeps`` steps, an even number, of the integrator, :class:`RungeKutta4` if left out, for each of the plan's.
+    """
+    scene, h = problem.scene, problem.dt / substeps
+    n, m = scene.robot.dof, scene.controls
+    motion, failure = rollout(scene, integrator or RungeKutta4(), problem.q0, problem.v0, commands, h)
+    if failure is not None:
+        return np.nan, np.full(n, np.nan)
+    running, terminal = _fine_costs(problem, substeps) if costs is None else costs
+    # Simpson's rule within each step of the plan: the control jumps between steps.
+    after = running.value(motion.q, motion.v, np.vstack([motion.u, motion.u[-1:]]))
+    before = running.value(motion.q, motion.v, np.vstack([motion.u[:1], motion.u]))
+    integral = h / 3.0 * (after[:-1:2] + 4.0 * after[1::2] + before[2::2]).sum()
+    end = terminal.value(motion.q[-1:], motion.v[-1:], np.zeros((1, m)))[0]
+    smooth = 0.0 if problem.rate is None else problem.rate.value(motion.u, problem.period)
+    return float(integral + end + smooth), motion.q[-1]
+
+
+def _defect(problem: OptimalControlProblem, trajectory: Trajectory, substeps: int) -> float:
+    """Largest distance in q between the plan's steps and accurate ones from the same nodes."""
+    scene, h, n = problem.scene, problem.dt / substeps, problem.scene.robot.dof
+    integrator = RungeKutta4()
+    state, _ = integrator.start(scene, trajectory.q[:-1].copy(), trajectory.v[:-1].copy())
+    # Every step is a path of its own, with its own control handed over as a force.
+    commands = open_loop(np.zeros((1, scene.controls)))._replace(hold=substeps)
+    force = trajectory.u @ scene.actuation.T
+    forces = np.ascontiguousarray(np.broadcast_to(force[:, None], (trajectory.steps, substeps, n)))
+    segments = integrator.rollout_compiled(scene, state, commands, np.zeros((0, 0, scene.processes)), forces, h)
+    lost = np.full(n, np.nan)
+    ends = np.array([segment.q[-1] if segment.failure is None else lost for segment in segments])
+    return float(np.abs(ends - trajectory.q[1:]).max())

@@ -1,0 +1,482 @@
+"""A scene file held against its robot: every list and table as one number for each joint or control."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.costs import Cost, CostSum, Terminal
+from varpin.errors import InputError, RobotError, RobotNotFound, UnknownFrame, UnknownJoint, VarpinError
+from varpin.io.scenefile.references import Timeline, constant
+from varpin.io.scenefile.spec import CostSpec, ForceSpec, FrameForceSpec, SceneSpec, degrees_for_radians
+from varpin.io.scenefile.table import Floats, SceneFileError, Table, suggestion
+from varpin.io.scenefile.terms import Given
+from varpin.mechanics.forces import Force, PositionServo
+from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
+from varpin.mechanics.scene import Scene, closest_controls, damping_of
+from varpin.model import Robot, load_robot
+
+# Times at which it is looked whether a reference ever leaves a place.
+_LOOKS = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Noises:
+    """Intensities of a noise model, by joint (n,) or, of control noise, by control (m,)."""
+
+    kind: str
+    intensity: Floats
+    center: Floats | None
+
+
+@dataclass(frozen=True, eq=False)
+class JointForces:
+    """A force on joints, its attributes by joint (n,)."""
+
+    kind: type[Force]
+    values: Mapping[str, Floats]
+
+    def force(self) -> Force:
+        """As a scene takes it."""
+        return self.kind(**self.values)
+
+
+@dataclass(frozen=True, eq=False)
+class CostTerm:
+    """A term of the cost on the whole robot: weights (c,) and target of its components."""
+
+    spec: CostSpec
+    weight: Floats
+    target: Timeline | None
+    hold: Floats | None
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """A scene on a robot, whole or without some of its joints.
+
+    Attributes:
+        spec: The file.
+        robot: The robot.
+        damping: (n,), like stiffness, rest, q0 and v0.
+        forces: Others on joints.
+        frame_forces: Others on frames.
+        actuated: Indices of the driven joints (m,).
+        gear: Generalized force per control (m,).
+        torque_limit: (m,) [N m or N], infinite where there is none.
+        noise: Models.
+        costs: Terms.
+        controls: Of a simulation, over time; None for none, ``"hold"`` for holding ones.
+        held: Joints that are left out, and where [rad or m].
+    """
+
+    spec: SceneSpec
+    robot: Robot
+    damping: Floats
+    stiffness: Floats
+    rest: Floats
+    forces: tuple[JointForces, ...]
+    frame_forces: tuple[Force, ...]
+    q0: Floats
+    v0: Floats
+    actuated: NDArray[np.int64]
+    gear: Floats
+    torque_limit: Floats
+    noise: tuple[Noises, ...]
+    costs: tuple[CostTerm, ...]
+    controls: Timeline | str | None
+    held: Mapping[str, float]
+
+    def without(self, joints: Sequence[str]) -> Layout:
+        """The same scene with ``joints`` locked where they start, and only what is about the others.
+
+        What is about a frame or the whole robot stays, as long as it can move.
+        """
+        if not joints:
+            return self
+        own = self.robot.joint_names
+        held = {**self.held, **{name: float(self.q0[own.index(name)]) for name in joints}}
+        robot = _load(self.spec, held)
+        keep = np.array([own.index(name) for name in robot.joint_names], dtype=np.int64)
+        driven = np.flatnonzero(np.isin(self.actuated, keep))
+        position = {int(joint): place for place, joint in enumerate(keep)}
+        costs = []
+        for term in self.costs:
+            space = term.spec.term.space
+            if space == "frame" and not joints_of_frame(robot, term.spec.frame).any():
+                continue
+            index = driven if space == "u" else keep
+            costs.append(_part(term, index) if term.spec.term.of_joints else term)
+        noise = []
+        for model in self.noise:
+            index = driven if model.kind == "control" else keep
+            center = None if model.center is None else model.center[keep]
+            noise.append(Noises(model.kind, model.intensity[index], center))
+        return Layout(
+            spec=self.spec,
+            robot=robot,
+            damping=self.damping[keep],
+            stiffness=self.stiffness[keep],
+            rest=self.rest[keep],
+            forces=tuple(
+                JointForces(own.kind, {name: values[keep] for name, values in own.values.items()})
+                for own in self.forces
+            ),
+            frame_forces=tuple(own for own in self.frame_forces if _has_moving_end(own, robot)),
+            q0=self.q0[keep],
+            v0=self.v0[keep],
+            actuated=np.array([position[int(joint)] for joint in self.actuated[driven]], dtype=np.int64),
+            gear=self.gear[driven],
+            torque_limit=self.torque_limit[driven],
+            noise=tuple(noise),
+            costs=tuple(costs),
+            controls=self.controls.columns(driven.tolist()) if isinstance(self.controls, Timeline) else self.controls,
+            held=held,
+        )
+
+    @property
+    def served(self) -> NDArray[np.bool_]:
+        """Which joints (n,) have a servo: their control is a position."""
+        servos = [own.values["stiffness"] > 0.0 for own in self.forces if own.kind is PositionServo]
+        return np.asarray(np.any([np.zeros(self.robot.dof, dtype=np.bool_), *servos], axis=0))
+
+    @property
+    def control_limit(self) -> Floats:
+        """Of controls (m,), infinite where there is none: of positions none, the torque limit is their servo's."""
+        return np.where(self.served[self.actuated], np.inf, self.torque_limit / np.abs(self.gear))
+
+    def _force(self, own: JointForces) -> Force:
+        """As a scene takes it. A torque limit bounds the effort of a servo."""
+        if own.kind is not PositionServo:
+            return own.force()
+        limit = np.full(self.robot.dof, np.inf)
+        limit[self.actuated] = self.torque_limit
+        effort = own.values.get("effort", np.full(self.robot.dof, np.inf))
+        return JointForces(own.kind, {**own.values, "effort": np.minimum(effort, limit)}).force()
+
+    @property
+    def actuation(self) -> Floats:
+        """Matrix (n, m) from controls to generalized forces."""
+        matrix = np.zeros((self.robot.dof, len(self.actuated)))
+        matrix[self.actuated, np.arange(len(self.actuated))] = self.gear
+        return matrix
+
+    @property
+    def driven(self) -> tuple[str, ...]:
+        """Names of the driven joints."""
+        return tuple(self.robot.joint_names[joint] for joint in self.actuated)
+
+    def scene(self) -> Scene:
+        """The scene as an object."""
+        return Scene(
+            self.robot,
+            gravity=self.spec.gravity,
+            damping=self.damping,
+            stiffness=self.stiffness,
+            rest=self.rest,
+            forces=[*(self._force(own) for own in self.forces), *self.frame_forces],
+            actuation=self.actuation,
+            noise=[model for model in map(self._noise, self.noise) if model is not None] or None,
+        )
+
+    def _noise(self, model: Noises) -> Noise | None:
+        """Only the processes that do something."""
+        act = np.flatnonzero(model.intensity)
+        if not len(act):
+            return None
+        n, m = self.robot.dof, len(self.actuated)
+        if model.kind == "state":
+            return StateNoise(model.intensity, model.center)
+        if model.kind == "additive":
+            fields = np.zeros((n, len(act)))
+            fields[act, np.arange(len(act))] = model.intensity[act]
+            return AdditiveNoise(fields)
+        by_control = np.zeros((n, len(act), m))
+        by_control[:, np.arange(len(act)), act] = (self.actuation * model.intensity)[:, act]
+        return ControlNoise(by_control)
+
+    def cost(self, scene: Scene) -> Cost:
+        """The cost as an object."""
+        terms = []
+        for term in self.costs:
+            spec, target = term.spec, term.target
+            if term.hold is not None:
+                target = constant(holding_controls(scene, term.hold))
+            if not term.weight.any() or (spec.term.limits and not np.isfinite(spec.term.limits(self.robot)).any()):
+                continue
+            given = Given(self.robot, term.weight, target, spec.frame, spec.numbers, spec.words)
+            try:
+                made = spec.term.make(given)
+            except VarpinError as error:
+                raise spec.table.error("", str(error)) from None
+            terms.append(Terminal(made) if spec.terminal else made)
+        return CostSum(tuple(terms))
+
+
+def _part(term: CostTerm, index: NDArray[np.int64]) -> CostTerm:
+    target = None if term.target is None else term.target.columns(index.tolist())
+    return CostTerm(term.spec, term.weight[index], target, None if term.hold is None else term.hold[index])
+
+
+def holding_controls(scene: Scene, q: Floats) -> Floats:
+    """The controls (m,) that come closest to holding the robot at q at rest."""
+    return closest_controls(scene, q)
+
+
+def joints_of_frame(robot: Robot, frame: str) -> NDArray[np.bool_]:
+    """Which coordinates (n,) move a frame; all False if there is no such frame."""
+    model, moved = robot.free_model, np.zeros(robot.dof, dtype=np.bool_)
+    if model.existFrame(frame):
+        for joint in model.supports[model.frames[model.getFrameId(frame)].parentJoint]:
+            if joint > 0:
+                moved[robot.tree.coordinate[joint - 1]] = True
+    return moved
+
+
+def _load(spec: SceneSpec, held: Mapping[str, float]) -> Robot:
+    own, table = spec.robot, spec.root.table("robot")
+    for joint, value in own.lock.items():
+        if degrees_for_radians(value):
+            raise table.error(f"lock.{joint}", f"{value:g} looks like degrees: positions are in rad or m")
+    try:
+        return load_robot(
+            own.source,
+            package_dirs=own.package_dirs,
+            lock={**own.lock, **held},
+            mimic="free" if own.mimic == "free" else "tied",
+            payload=own.payload,
+        )
+    except RobotNotFound as error:
+        raise table.error("source", str(error)) from None
+    except UnknownJoint as error:
+        raise table.error(
+            f"lock.{error.joint}", f"there is no such joint; {suggestion(error.joint, error.joints, 'joints')}"
+        ) from None
+    except UnknownFrame as error:
+        index = [load.frame for load in own.payload].index(error.frame)
+        raise table.error(
+            f"payload[{index}].frame",
+            f"there is no frame {error.frame!r}; {suggestion(error.frame, error.frames, 'frames')}",
+        ) from None
+    except (RobotError, InputError) as error:
+        raise table.error("", str(error)) from None
+
+
+def lay_out(spec: SceneSpec) -> Layout:
+    """Load the robot and hold the scene against it.
+
+    Raises:
+        SceneFileError: Names, lengths or values that do not fit it.
+    """
+    robot = _load(spec, {})
+    try:
+        return _on_robot(spec, robot)
+    except SceneFileError as error:
+        name = error.key.rpartition(".")[2]
+        if name not in robot.locked:
+            raise
+        raise SceneFileError(error.source, error.key, f"the joint is locked at {robot.locked[name]}") from None
+
+
+def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
+    names, root = robot.joint_names, spec.root
+    springs, initial, actuation = root.table("springs"), root.table("initial"), root.table("actuation")
+    rest = springs.spread("rest", spec.rest, names)
+    q0 = initial.spread("q", spec.q0, names)
+    for table, name, values in ((springs, "rest", rest), (initial, "q", q0)):
+        _refuse_degrees(table, name, values, robot)
+    if spec.actuated is not None:
+        for index, joint in enumerate(spec.actuated):
+            if joint not in names:
+                raise actuation.error(
+                    f"joints[{index}]", f"there is no joint {joint!r}; {suggestion(joint, names, 'joints')}"
+                )
+    if spec.damping is None or isinstance(spec.damping, str):
+        damping = damping_of(robot, spec.damping)
+    else:
+        damping = root.spread("damping", spec.damping, names)
+    driven = names if spec.actuated is None else spec.actuated
+    gear = actuation.spread("gear", spec.gear, driven, "driven joint")
+    if not gear.all():
+        raise actuation.error("gear", f"must not be 0, and is for {driven[int(np.argmin(np.abs(gear)))]!r}")
+    actuated = np.array([names.index(joint) for joint in driven], dtype=np.int64)
+    forces = tuple(_force(force, robot) for force in spec.forces)
+    _require_own_controls(spec, forces, names, actuated, gear)
+    limit = _torque_limit(spec, robot, actuated, driven)
+    controls = spec.controls
+    timeline: Timeline | str | None
+    if controls is None or isinstance(controls, str):
+        timeline = controls
+    else:
+        timeline = controls.timeline(driven, spec.duration, "driven joint")
+    layout = Layout(
+        spec=spec,
+        robot=robot,
+        damping=damping,
+        stiffness=springs.spread("stiffness", spec.stiffness, names),
+        rest=rest,
+        forces=forces,
+        frame_forces=tuple(_frame_force(force, robot) for force in spec.frame_forces),
+        q0=q0,
+        v0=initial.spread("v", spec.v0, names),
+        actuated=actuated,
+        gear=gear,
+        torque_limit=limit,
+        noise=tuple(_noises(spec, names, driven)),
+        costs=tuple(_term(term, robot, driven, q0, spec.duration) for term in spec.costs),
+        controls=timeline,
+        held={},
+    )
+    _require_controls(layout)
+    return layout
+
+
+def _require_own_controls(
+    spec: SceneSpec,
+    forces: Sequence[JointForces],
+    names: Sequence[str],
+    actuated: NDArray[np.int64],
+    gear: Floats,
+) -> None:
+    """Refuse servos on joints that no control is the position of."""
+    seen: set[int] = set()
+    for force, own in zip(spec.forces, forces, strict=True):
+        if own.kind is not PositionServo:
+            continue
+        for joint in np.flatnonzero(own.values["stiffness"]).tolist():
+            name = names[joint]
+            if joint in seen:
+                raise force.table.error("stiffness", f"joint {name!r} has a servo already")
+            seen.add(joint)
+            if joint not in actuated:
+                raise force.table.error("stiffness", f"joint {name!r} is not driven: [actuation] joints leaves it out")
+            if gear[actuated == joint] != 1.0:
+                raise spec.root.table("actuation").error(
+                    "gear", f"must be 1 for {name!r}, whose control is the position of its servo"
+                )
+
+
+def _require_controls(layout: Layout) -> None:
+    """Refuse controls of a simulation beyond their limits, degrees for positions, and noise in proportion to those."""
+    spec, served = layout.spec, layout.served[layout.actuated]
+    for table, model in zip(spec.root.tables("noise"), layout.noise, strict=True):
+        if model.kind == "control" and (served & (model.intensity != 0.0)).any():
+            joint = layout.driven[int(np.argmax(served & (model.intensity != 0.0)))]
+            raise table.error(
+                "intensity", f"is in proportion to forces, and the control of {joint!r} is the position of its servo"
+            )
+    if not isinstance(layout.controls, Timeline):
+        return
+    table = spec.root.table("simulate")
+    given = layout.controls.at(_times(spec))
+    for joint, column in zip(layout.actuated[served].tolist(), given.T[served], strict=True):
+        worst = float(column[np.argmax(np.abs(column))])
+        if not layout.robot.slides[joint] and degrees_for_radians(worst):
+            name = layout.robot.joint_names[joint]
+            raise table.error("controls", f"{worst:g} of {name!r} looks like degrees: positions of servos are in rad")
+    force, limit = np.abs(given * layout.gear), np.where(served, np.inf, layout.torque_limit)
+    if (force > limit * (1.0 + 1e-9)).any():
+        worst_joint = int(np.argmax((force - limit).max(axis=0)))
+        raise table.error(
+            "controls",
+            f"of {layout.driven[worst_joint]!r} reach {force[:, worst_joint].max():g} N m or N; torque_limit is "
+            f"{limit[worst_joint]:g}",
+        )
+
+
+def _times(spec: SceneSpec) -> Floats:
+    return np.linspace(0.0, spec.duration, min(spec.steps, _LOOKS) + 1)
+
+
+def _refuse_degrees(table: Table, name: str, values: Floats, robot: Robot) -> None:
+    slides = np.zeros(robot.dof, dtype=np.bool_)
+    slides[robot.tree.coordinate[robot.tree.prismatic != 0]] = True
+    for joint, value, slide in zip(robot.joint_names, values.tolist(), slides.tolist(), strict=True):
+        if not slide and degrees_for_radians(value):
+            raise table.error(name, f"{value:g} of {joint!r} looks like degrees: angles are in rad")
+
+
+def _torque_limit(spec: SceneSpec, robot: Robot, actuated: NDArray[np.int64], driven: Sequence[str]) -> Floats:
+    table = spec.root.table("actuation")
+    if spec.torque_limit is None:
+        return np.full(len(driven), np.inf)
+    if isinstance(spec.torque_limit, str):
+        limit = robot.effort_limit[actuated]
+        if not np.isfinite(limit).all():
+            joint = driven[int(np.argmax(~np.isfinite(limit)))]
+            raise table.error("torque_limit", f"the robot description gives {joint!r} none: write numbers [N m or N]")
+        return limit
+    limit = table.spread("torque_limit", spec.torque_limit, driven, "driven joint")
+    if not (limit > 0.0).all():
+        joint = driven[int(np.argmax(~(limit > 0.0)))]
+        raise table.error(
+            "torque_limit", f"must be > 0 [N m or N], and is {limit[driven.index(joint)]:g} for {joint!r}"
+        )
+    return limit
+
+
+def _force(spec: ForceSpec, robot: Robot) -> JointForces:
+    absent = {"lower": -np.inf, "upper": np.inf, "effort": np.inf}
+    values = {
+        name: spec.table.spread(name, value, robot.joint_names, absent=absent.get(name, 0.0))
+        for name, value in spec.values.items()
+    }
+    found = JointForces(spec.kind, values)
+    try:
+        found.force().bind(robot)
+    except InputError as error:
+        raise spec.table.error("", str(error)) from None
+    return found
+
+
+def _frame_force(spec: FrameForceSpec, robot: Robot) -> Force:
+    try:
+        spec.force.bind(robot)
+    except UnknownFrame as error:
+        raise spec.table.error(
+            "", f"there is no frame {error.frame!r}; {suggestion(error.frame, error.frames, 'frames')}"
+        ) from None
+    except InputError as error:
+        raise spec.table.error("", str(error)) from None
+    return spec.force
+
+
+def _has_moving_end(force: Force, robot: Robot) -> bool:
+    """Whether a joint that is left moves what a force acts on."""
+    points = [getattr(force, name) for name in ("frame", "a", "b") if hasattr(force, name)]
+    frames = [point if isinstance(point, str) else point[0] for point in points if isinstance(point, str | tuple)]
+    return any(joints_of_frame(robot, frame).any() for frame in frames)
+
+
+def _noises(spec: SceneSpec, names: Sequence[str], driven: Sequence[str]) -> list[Noises]:
+    found = []
+    for table, model in zip(spec.root.tables("noise"), spec.noise, strict=True):
+        whose, what = (driven, "driven joint") if model.kind == "control" else (names, "joint")
+        center = None if model.center is None else table.spread("center", model.center, names)
+        found.append(Noises(model.kind, table.spread("intensity", model.intensity, whose, what), center))
+    return found
+
+
+def _term(spec: CostSpec, robot: Robot, driven: Sequence[str], q0: Floats, duration: float) -> CostTerm:
+    table, term = spec.table, spec.term
+    if term.frame and not robot.free_model.existFrame(spec.frame):
+        names = [frame.name for frame in robot.free_model.frames]
+        raise table.error("frame", f"there is no frame {spec.frame!r}; {suggestion(spec.frame, names, 'frames')}")
+    if term.limits and not np.isfinite(term.limits(robot)).any():
+        raise table.error("type", f"robot {robot.name!r} has no such limits")
+    joints, what = (tuple(driven), "driven joint") if term.space == "u" else (robot.joint_names, "joint")
+    axes, kind = (joints, what) if term.of_joints else (term.axes, "axis")
+    weight = table.spread("weight", spec.weight, axes, kind)
+    target = None
+    if spec.reference is not None:
+        components, kind = (joints, what) if term.of_joints else (term.components, "component")
+        target = spec.reference.timeline(components, duration, kind)
+        if term.space == "q" and target.constant and term.reference is not None:
+            _refuse_degrees(table, term.reference, target(0.0), robot)
+    hold = None
+    if spec.hold is not None:
+        hold = table.spread("hold", spec.hold, robot.joint_names) if spec.hold != () else q0
+    return CostTerm(spec, weight, target, hold)

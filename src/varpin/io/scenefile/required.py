@@ -1,0 +1,206 @@
+"""What of a scene has to be computed, and what does not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.io.scenefile.layout import CostTerm, Layout, holding_controls, joints_of_frame
+from varpin.io.scenefile.references import Timeline
+from varpin.io.scenefile.spec import FORCES, FRAME_FORCES
+from varpin.io.scenefile.table import Floats
+from varpin.mechanics.forces import CoulombFriction, Force, JointStop
+from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.scene import Scene
+from varpin.support.markup import facts, listed
+
+Mask = NDArray[np.bool_]
+# What a scene has if it asks for it.
+_ABSENT: Mapping[str, type[Force]] = {"stops at joint limits": JointStop, "dry friction": CoulombFriction}
+# Times at which it is looked whether a reference ever leaves a place.
+_LOOKS = 2000
+
+
+@dataclass(frozen=True)
+class Required:
+    """What a scene has to have computed, and what was left out of it.
+
+    Attributes:
+        joints: What is computed.
+        locked: Joints that the scene locks, and where [rad or m]: their links are part of others.
+        idle: Joints that nothing touches, and where they stay.
+        parts: The joints that are computed, in groups that share nothing; solve plans each by itself.
+        coupled: What keeps groups together although they share no inertia; empty if nothing does.
+        terms: What may act, and in what words it does or does not.
+    """
+
+    joints: tuple[str, ...]
+    locked: Mapping[str, float | tuple[float, ...]]
+    idle: Mapping[str, float]
+    parts: tuple[tuple[str, ...], ...]
+    coupled: str
+    terms: Mapping[str, str]
+
+    @property
+    def described(self) -> int:
+        """Moving joints of the robot as it is described."""
+        return len(self.joints) + len(self.locked) + len(self.idle)
+
+    @property
+    def saved(self) -> float:
+        """The part of the linear algebra of a plan that is saved, by counting: it grows with the cube of joints."""
+        return 1.0 - sum(len(part) ** 3 for part in self.parts) / self.described**3
+
+    def _repr_html_(self) -> str:
+        rows: list[tuple[str, object]] = [
+            ("computed", f"{len(self.joints)} of {self.described}: {listed(self.joints)}")
+        ]
+        for title, joints in (("locked", self.locked), ("nothing touches", self.idle)):
+            if joints:
+                rows.append((title, listed(f"{joint} at {at}" for joint, at in joints.items())))
+        if len(self.parts) > 1:
+            rows.append(("planned apart", "; ".join(listed(part) for part in self.parts)))
+        if self.coupled:
+            rows.append(("planned together", self.coupled))
+        rows += [*self.terms.items(), ("saved", f"{100 * self.saved:.0f}% of a plan's linear algebra, by counting")]
+        return facts("What is computed", rows)
+
+    def __str__(self) -> str:
+        lines = [f"joints: {len(self.joints)} of {self.described} computed: {', '.join(self.joints)}"]
+        for title, joints in (("locked", self.locked), ("nothing touches", self.idle)):
+            if joints:
+                lines.append(f"{title}: {', '.join(joints)}")
+        if len(self.parts) > 1:
+            lines.append(f"planned apart: {'; '.join(', '.join(part) for part in self.parts)}")
+        if self.coupled:
+            lines.append(f"planned together: {self.coupled}")
+        lines += [f"{name}: {words}" for name, words in self.terms.items()]
+        return "\n".join([*lines, f"saved: {100 * self.saved:.0f}% of the linear algebra of a plan, by counting"])
+
+
+def idle_joints(layout: Layout, scene: Scene) -> Mask:
+    """Which joints (n,) stay where they are whatever is computed: no force and no cost touches their group.
+
+    A joint at rest that no force acts on in any configuration, and that costs nothing where it is, stays; so do its
+    group and what is left out with it. Noise in proportion to controls does nothing to controls that are zero.
+    """
+    touched = layout.v0 != 0.0
+    touched |= _pushed(layout, scene)
+    touched |= _weighed(layout)
+    t = np.linspace(0.0, layout.spec.duration, min(layout.spec.steps, _LOOKS) + 1)
+    for model in layout.noise:
+        if model.kind != "control":
+            touched |= model.intensity != 0.0
+    if isinstance(layout.controls, Timeline):
+        commands = layout.controls.at(t)
+    else:
+        commands = (holding_controls(scene, layout.q0) if layout.controls == "hold" else np.zeros(scene.controls))[None]
+    touched[layout.actuated] |= (commands != _resting(layout)).any(axis=0)
+    for term in layout.costs:
+        touched |= _costs(term, layout, scene, t)
+    group = scene.group
+    busy = np.isin(group, group[touched])
+    # Where nothing happens at all, all of it is the scene.
+    return ~busy if busy.any() else np.zeros_like(busy)
+
+
+def _resting(layout: Layout) -> Floats:
+    """Controls (m,) that do nothing where the joints start: no force, or the place where a servo's joint stands."""
+    return np.where(layout.served, layout.q0, 0.0)[layout.actuated]
+
+
+def _pushed(layout: Layout, scene: Scene) -> Mask:
+    """Which joints springs, stops and what acts on frames push at where they start."""
+    floating = Scene(layout.robot, gravity=False, forces=scene.forces, actuation=layout.actuation)
+    return np.asarray(floating.holding_torque(layout.q0) != 0.0)
+
+
+def _weighed(layout: Layout) -> Mask:
+    """Which joints gravity pulls at, in some configuration."""
+    robot = layout.robot
+    if layout.spec.gravity is False:
+        return np.zeros(robot.dof, dtype=np.bool_)
+    bare = Scene(robot, gravity=layout.spec.gravity, damping=0.0)
+    rng = np.random.default_rng(0)
+    places = [layout.q0, *rng.uniform(-2.0, 2.0, (3, robot.dof))]
+    pull = np.abs([lagrangian_jet(bare, q, np.zeros(robot.dof), backend="pinocchio").Lq for q in places]).max(axis=0)
+    return np.asarray(pull > 1e-12 * pull.max(initial=0.0))
+
+
+def _costs(term: CostTerm, layout: Layout, scene: Scene, t: Floats) -> Mask:
+    """Which joints a term of the cost would move, or charges where they are."""
+    touched = np.zeros(layout.robot.dof, dtype=np.bool_)
+    space = term.spec.term.space
+    if space == "frame":
+        return joints_of_frame(layout.robot, term.spec.frame)
+    if space == "robot":
+        return ~touched
+    rest = {"q": layout.q0, "v": np.zeros(layout.robot.dof), "u": _resting(layout)}[space]
+    if term.spec.term.limits is not None:
+        lower, upper = term.spec.term.limits(layout.robot)
+        margin = term.spec.numbers["margin"]
+        return np.asarray((term.weight != 0.0) & ((rest > upper - margin) | (rest < lower + margin)))
+    if term.hold is not None:
+        wanted = holding_controls(scene, term.hold)[None]
+    else:
+        wanted = rest[None] if term.target is None else term.target.at(t)
+    moves = ((wanted != rest) & (term.weight != 0.0)).any(axis=0)
+    touched[layout.actuated if space == "u" else slice(None)] |= moves
+    return touched
+
+
+def requirements(layout: Layout, whole: Layout, idle: Sequence[str], scene: Scene) -> Required:
+    """The report on what ``layout``, the ``scene``, has left of ``whole``."""
+    names, group = layout.robot.joint_names, scene.group
+    parts = [tuple(name for name, g in zip(names, group, strict=True) if g == label) for label in np.unique(group)]
+    together = ", ".join(
+        sorted({term.spec.table.data["type"] for term in layout.costs if term.spec.term.space == "robot"})
+    )
+    if together or len(parts) == 1:
+        coupled = f"the cost has a term on the whole robot ({together})" if together and len(parts) > 1 else ""
+        parts = [names]
+    else:
+        coupled = ""
+    position = whole.robot.joint_names
+    return Required(
+        joints=names,
+        locked=whole.robot.locked,
+        idle={name: float(whole.q0[position.index(name)]) for name in idle},
+        parts=tuple(parts),
+        coupled=coupled,
+        terms=_terms(layout),
+    )
+
+
+def _terms(layout: Layout) -> dict[str, str]:
+    spec = layout.spec
+    gravity = spec.gravity if isinstance(spec.gravity, tuple) else (0.0, 0.0, -9.81 if spec.gravity else 0.0)
+    joints = layout.robot.joint_names
+
+    def of(values: Floats, names: Sequence[str]) -> str:
+        acting = [name for name, value in zip(names, values, strict=True) if value]
+        if len(acting) == len(names):
+            return "on every joint"
+        return f"on {', '.join(acting)}" if acting else "none"
+
+    noise = [f"{model.kind} ({np.count_nonzero(model.intensity)} processes)" for model in layout.noise]
+    limited = np.isfinite(layout.torque_limit)
+    costs = [term.spec.table.data["type"] + (" at the end" if term.spec.terminal else "") for term in layout.costs]
+    kinds: set[type[Force]] = {force.kind for force in layout.forces} | {type(own) for own in layout.frame_forces}
+    absent = [words for words, kind in _ABSENT.items() if kind not in kinds] + ["contact"]
+    loads = [f"{load.mass:g} kg at {load.frame}" for load in spec.robot.payload]
+    return {
+        "gravity": f"{', '.join(f'{g:g}' for g in gravity)} m/s^2" if any(gravity) else "none",
+        "damping": of(layout.damping, joints),
+        "springs": of(layout.stiffness, joints),
+        "payload": ", ".join(loads) or "none",
+        "noise": ", ".join(noise) or "none",
+        "driven": ", ".join(layout.driven) or "none",
+        "torque limits": of(limited.astype(float), layout.driven),
+        "cost": ", ".join(costs) or "none",
+        "other forces": ", ".join(word for word, kind in {**FORCES, **FRAME_FORCES}.items() if kind in kinds) or "none",
+        "not modelled": f"{', '.join(absent)}; shapes are read only for a replay",
+    }

@@ -1,0 +1,254 @@
+"""A scene file ready for work: the robot, the scene, the problem, and what it leaves out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from varpin.control import OptimalControlProblem, Solution, solve
+from varpin.control.costs import CostError
+from varpin.errors import InputError
+from varpin.io.scenefile.layout import Layout, holding_controls, lay_out
+from varpin.io.scenefile.references import Timeline
+from varpin.io.scenefile.required import Required, idle_joints, requirements
+from varpin.io.scenefile.shown import marks_of
+from varpin.io.scenefile.spec import SceneSpec, find_scene, read_scene
+from varpin.io.scenefile.table import Floats
+from varpin.mechanics.policy import LinearPolicy
+from varpin.mechanics.scene import Scene
+from varpin.model import Robot
+from varpin.simulation.run import simulate
+from varpin.support.markup import facts
+from varpin.trajectory import Trajectory
+
+# Setting a part up takes as long as this much linear algebra, in cubes of joints times steps, measured.
+_SETUP = 200_000
+
+
+@dataclass(frozen=True, eq=False)
+class SceneFile:
+    """A scene file on its robot, without the joints that nothing touches.
+
+    Attributes:
+        spec: What the file says.
+        required: What is computed, what is not, and why.
+        scene: Robot and surroundings.
+        q0: Initial configuration (n,) [rad or m].
+        v0: Initial velocity (n,) [rad/s or m/s].
+    """
+
+    spec: SceneSpec
+    required: Required
+    scene: Scene
+    q0: Floats
+    v0: Floats
+    _layout: Layout = field(repr=False)
+
+    def __repr__(self) -> str:
+        return f"SceneFile({self.spec.name}: {self.spec.title})"
+
+    def _repr_html_(self) -> str:
+        spec = self.spec
+        rows = [
+            ("file", spec.path.name),
+            ("robot", self.robot),
+            ("horizon", f"{spec.steps} steps of {spec.dt:g} s, {spec.integrator}"),
+        ]
+        return facts(spec.title, rows, self.required._repr_html_())
+
+    @property
+    def robot(self) -> Robot:
+        """The robot that is computed."""
+        return self.scene.robot
+
+    @cached_property
+    def problem(self) -> OptimalControlProblem:
+        """The optimal control problem of the file.
+
+        Raises:
+            SceneFileError: The file has no cost, or one that does not fit.
+        """
+        return self._problem(self._layout, self.scene)
+
+    def _problem(self, layout: Layout, scene: Scene) -> OptimalControlProblem:
+        spec = self.spec
+        if not spec.costs:
+            raise spec.root.error("cost", "is missing; a scene to solve has a [[cost]] at least")
+        most = layout.control_limit
+        try:
+            return OptimalControlProblem(
+                scene,
+                layout.cost(scene),
+                layout.q0,
+                layout.v0,
+                dt=spec.dt,
+                steps=spec.steps,
+                integrator=spec.integrator,
+                sampling=spec.sampling,  # type: ignore[arg-type]
+                hold=spec.hold,
+                control_limits=(-most, most),
+            )
+        except (InputError, CostError) as error:
+            raise spec.root.error("cost", str(error)) from None
+
+    def controls(self) -> Floats | None:
+        """Controls of a simulation, (N, m) or (m,), or None for none."""
+        given = self._layout.controls
+        if given is None:
+            return None
+        if isinstance(given, Timeline):
+            return given.at((np.arange(self.spec.steps, dtype=np.float64) + 0.5) * self.spec.dt)
+        return holding_controls(self.scene, self.q0)
+
+    def simulate(self, *, progress: Callable[[int, int], None] | None = None) -> Trajectory:
+        """The motion under the controls of ``[simulate]``, with noise if it gives a seed.
+
+        Raises:
+            StepFailure, Interrupted: As :func:`varpin.simulate`.
+        """
+        spec = self.spec
+        return simulate(
+            self.scene,
+            self.q0,
+            self.v0,
+            dt=spec.dt,
+            steps=spec.steps,
+            controls=self.controls(),
+            integrator=spec.integrator,
+            rng=spec.seed,
+            progress=progress,
+        )
+
+    def solve(
+        self,
+        controls: LinearPolicy | Solution | Floats | None = None,
+        *,
+        resume: Solution | None = None,
+        apart: bool | None = None,
+        **options: Any,
+    ) -> Solution:
+        """The optimal motion, by :func:`varpin.solve` with the options of ``[solve]``.
+
+        Groups of joints that share nothing are planned each by itself, and then held against the whole once.
+
+        Args:
+            controls: To start from, as for :func:`varpin.solve`.
+            resume: A solution to go on from.
+            apart: Whether to plan groups apart; where it pays if left out. With ``controls`` or ``resume`` never.
+            **options: Of :func:`varpin.solve`, instead of the file's.
+        """
+        given = {**self.spec.options, **options}
+        if controls is None and resume is None and (self._pays_apart() if apart is None else apart):
+            controls = self._planned_apart(given)
+        return solve(self.problem, controls, resume=resume, **given)
+
+    def _pays_apart(self) -> bool:
+        """Whether what planning apart saves in linear algebra is more than what it takes to set the parts up."""
+        parts = self.required.parts
+        saved = self.robot.dof**3 - sum(len(part) ** 3 for part in parts)
+        return len(parts) > 1 and self.spec.steps * saved > _SETUP * len(parts)
+
+    def marks(self, duration: float | None = None) -> dict[str, Any]:
+        """What :func:`varpin.replay` can mark of the task, as its options: ``replay(robot, motion, **scene.marks())``.
+
+        Targets and paths of the frames that the cost is about, with their traces; of a reference of joints, the robot
+        that follows it as a ghost.
+
+        Args:
+            duration: Of the motion that is shown [s]; the horizon if left out.
+        """
+        return marks_of(self._layout, self.spec.duration if duration is None else duration)
+
+    def load_solution(self, path: str | Path) -> Solution:
+        """Read a solution of this scene that :meth:`Solution.save` wrote; see :meth:`Solution.load`."""
+        return Solution.load(path, self.problem)
+
+    @cached_property
+    def _parts(self) -> tuple[tuple[Layout, OptimalControlProblem], ...]:
+        """Each group of joints by itself; none where a group has nothing that drives it, or costs nothing."""
+        names, parts = self.robot.joint_names, []
+        for part in self.required.parts:
+            layout = self._layout.without([name for name in names if name not in part])
+            if not layout.driven or not layout.costs:
+                return ()
+            parts.append((layout, self._problem(layout, layout.scene())))
+        return tuple(parts)
+
+    def _planned_apart(self, options: dict[str, Any]) -> LinearPolicy | None:
+        """The policies of all groups of joints side by side; None where they cannot be planned apart."""
+        if not self._parts:
+            return None
+        problem, driven = self.problem, self._layout.driven
+        names, n, m, R = self.robot.joint_names, self.robot.dof, self.scene.controls, problem.decisions
+        u, gains, reference = np.zeros((R, m)), np.zeros((R, m, 2 * n)), np.zeros((R, 2 * n))
+        for layout, part in self._parts:
+            plan = solve(part, **options, check=False).policy
+            rows = np.array([driven.index(name) for name in layout.driven])
+            own = np.array([names.index(name) for name in layout.robot.joint_names])
+            x = np.concatenate([own, n + own])
+            u[:, rows], reference[:, x] = plan.u, plan.reference
+            gains[:, rows[:, None], x] = plan.gains
+        return LinearPolicy(u, gains, reference, hold=plan.hold, on=plan.on, period=plan.period)
+
+    def saving(self, *, steps: int = 200, repeats: int = 5) -> float:
+        """How many times as long a step takes with all joints that the file does not lock, measured.
+
+        Raises:
+            StepFailure: As :func:`varpin.simulate`.
+        """
+        whole = load_scene(self.spec.path, required_only=False)
+        least = {}
+        for name, scene, q0, v0 in (
+            ("required", self.scene, self.q0, self.v0),
+            ("whole", whole.scene, whole.q0, whole.v0),
+        ):
+            times = []
+            for _ in range(repeats + 1):
+                begin = time.perf_counter()
+                simulate(scene, q0, v0, dt=self.spec.dt, steps=steps, integrator=self.spec.integrator)
+                times.append(time.perf_counter() - begin)
+            least[name] = min(times[1:])
+        return least["whole"] / least["required"]
+
+
+def load_scene(source: str | Path, *, required_only: bool = True) -> SceneFile:
+    """Load a scene file.
+
+    Main args:
+        source: Path of a TOML file, or the name of a scene that comes with varpin (``"finger_tracking"``).
+
+    Other Args:
+        required_only: Leave out joints that nothing touches. The answer for the others is the same.
+
+    Raises:
+        FileError: There is no such file, or it cannot be read.
+        SceneFileError: A mistake in it: the key, what was given and what is allowed.
+    """
+    path = find_scene(source)
+    spec = read_scene(path)
+    whole = lay_out(spec)
+    scene = whole.scene()
+    idle: Sequence[str] = ()
+    if required_only:
+        stays = idle_joints(whole, scene)
+        idle = [name for name, out in zip(whole.robot.joint_names, stays, strict=True) if out]
+    layout = whole.without(idle)
+    scene = scene if layout is whole else layout.scene()
+    file = SceneFile(
+        spec=spec,
+        required=requirements(layout, whole, idle, scene),
+        scene=scene,
+        q0=layout.q0,
+        v0=layout.v0,
+        _layout=layout,
+    )
+    if spec.costs:
+        # So that every mistake in the file is said now.
+        file.problem  # noqa: B018
+    return file

@@ -1,0 +1,1 @@
+"""Discrete mechanics: the Lagrangian, forces, noise, controls, the scene that holds them."""

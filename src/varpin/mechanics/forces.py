@@ -1,0 +1,477 @@
+"""Forces on joints and on frames: springs, dampers, friction, stops, rotors, servos, wrenches; any number in a scene.
+
+    scene = vp.Scene(robot, forces=[vp.CoulombFriction(0.5), vp.JointStop(stiffness=1e3, damping=5.0)])
+
+Every integrator and every derivative knows them: steps, linearizations of first and second order, energies and the part
+of them that turns into heat. Parameters of forces on joints are one number for every joint, (n,), or numbers by joint
+name; joints that are not named have none. Forces on frames act at points: a frame's name for its origin, a pair of that
+and a place in the frame's axes (3,) [m], or, where there is another end, a place in the world (3,) [m].
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from types import MappingProxyType
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.core.arrays import Coupling, Element
+from varpin.errors import InputError, UnknownJoint
+from varpin.model import Robot
+from varpin.model.tree import place_of_frame
+from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array
+from varpin.support.frozen import Frozen
+
+Floats = NDArray[np.float64]
+# A frame's origin, a place in its axes, or a place in the world.
+FramePoint: TypeAlias = str | tuple[str, ArrayLike]
+Point: TypeAlias = FramePoint | ArrayLike
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Force(Frozen, ABC):
+    """A force that acts on joints one by one, or on frames."""
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            object.__setattr__(self, item.name, _kept(item.name, getattr(self, item.name)))
+
+    def __repr__(self) -> str:
+        own = [(item.name, getattr(self, item.name)) for item in fields(self)]
+        given = [f"{name}={_shown(value)}" for name, value in own if value is not None]
+        return f"{type(self).__name__}({', '.join(given)})"
+
+    @abstractmethod
+    def bind(self, robot: Robot) -> tuple[Element | Coupling, ...]:
+        """The force on a robot, as the core takes it: one element for each joint that it acts on, or couplings.
+
+        Raises:
+            InputError: A wrong shape, or a value that is not finite or out of range.
+            UnknownJoint: It names a joint that is no coordinate of the robot.
+            UnknownFrame: It names a frame that the robot does not have.
+        """
+
+
+def _kept(name: str, value: Any) -> Any:
+    """A parameter that no one can change any more."""
+    if value is None or isinstance(value, str):
+        return value
+    if isinstance(value, Mapping):
+        return MappingProxyType(dict(value))
+    if isinstance(value, tuple | list) and len(value) == 2 and isinstance(value[0], str):
+        return value[0], _kept(name, value[1])
+    given = as_floats(name, value)
+    given.setflags(write=False)
+    return given
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, str):
+        return repr(value)
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_shown, value))})"
+    return str(dict(value) if isinstance(value, Mapping) else value.tolist())
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class JointSpring(Force):
+    """Linear springs, part of the potential energy: the force -stiffness * (q - rest).
+
+    Attributes:
+        stiffness: >= 0 [N m/rad or N/m].
+        rest: Where they are slack [rad or m].
+    """
+
+    stiffness: JointValues
+    rest: JointValues = 0.0
+
+    def bind(self, robot: Robot) -> tuple[Element, ...]:
+        """See :meth:`Force.bind`."""
+        stiffness = not_negative("stiffness", self.stiffness, robot)
+        rest = joint_array("rest", self.rest, robot.joint_names, uniform=True)
+        return tuple(_elements("JointSpring", stiffness > 0.0, stiffness, rest))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class JointDamper(Force):
+    """Viscous damping: the force -damping * v.
+
+    Attributes:
+        damping: >= 0 [N m s/rad or N s/m].
+    """
+
+    damping: JointValues
+
+    def bind(self, robot: Robot) -> tuple[Element, ...]:
+        """See :meth:`Force.bind`."""
+        damping = not_negative("damping", self.damping, robot)
+        return tuple(_elements("JointDamper", damping > 0.0, damping))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Armature(Force):
+    """Inertia of rotors, seen at the joints: gear ratio squared times the rotor's own. It adds to the robot's armature.
+
+    Attributes:
+        inertia: >= 0 [kg m^2 or kg].
+    """
+
+    inertia: JointValues
+
+    def bind(self, robot: Robot) -> tuple[Element, ...]:
+        """See :meth:`Force.bind`."""
+        inertia = not_negative("inertia", self.inertia, robot)
+        return tuple(_elements("Armature", inertia > 0.0, inertia))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CoulombFriction(Force):
+    """Dry friction, smooth in the velocity: the force -g(v) tanh(v / width).
+
+    g is ``level``; or, with ``breakaway``, level + (breakaway - level) exp(-(v / stribeck_velocity)^2). Nothing sticks
+    for good: under a load of half the level a joint creeps by about half the width.
+
+    Attributes:
+        level: Friction of a joint that moves, >= 0 [N m or N].
+        width: Velocity at which it is 76 % of itself, > 0 [rad/s or m/s].
+        breakaway: Friction of a joint that hardly moves, >= level [N m or N]; ``level`` if left out.
+        stribeck_velocity: At which 37 % of the difference are left, > 0 [rad/s or m/s].
+    """
+
+    level: JointValues
+    width: JointValues = 0.01
+    breakaway: JointValues | None = None
+    stribeck_velocity: JointValues | None = None
+
+    def bind(self, robot: Robot) -> tuple[Element, ...]:
+        """See :meth:`Force.bind`."""
+        if (self.breakaway is None) != (self.stribeck_velocity is None):
+            raise InputError("breakaway and stribeck_velocity belong together: give both or neither")
+        level = not_negative("level", self.level, robot)
+        breakaway, fading = level, np.ones_like(level)
+        acts = level > 0.0
+        if self.breakaway is not None and self.stribeck_velocity is not None:
+            breakaway = not_negative("breakaway", self.breakaway, robot)
+            acts |= breakaway > 0.0
+            _refuse("breakaway", breakaway, acts & (breakaway < level), "must be at least the level")
+            fading = _positive("stribeck_velocity", self.stribeck_velocity, robot, acts)
+        width = _positive("width", self.width, robot, acts)
+        return tuple(_elements("CoulombFriction", acts, level, width, breakaway, fading))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class JointStop(Force):
+    """A spring and a damper beyond the ends of a joint's way, part of the potential energy and of the losses.
+
+    Stiffness and damping rise smoothly from 0 to the whole over the first ``width`` beyond an end, so that forces have
+    continuous derivatives.
+
+    Attributes:
+        stiffness: >= 0 [N m/rad or N/m].
+        damping: >= 0 [N m s/rad or N s/m].
+        lower: Lower end [rad or m], -inf for none; the robot's own position limit if left out.
+        upper: Upper end [rad or m], inf for none; the robot's own position limit if left out.
+        width: > 0 [rad or m].
+    """
+
+    stiffness: JointValues
+    damping: JointValues = 0.0
+    lower: JointValues | None = None
+    upper: JointValues | None = None
+    width: JointValues = 0.01
+
+    def bind(self, robot: Robot) -> tuple[Element, ...]:
+        """See :meth:`Force.bind`."""
+        stiffness = not_negative("stiffness", self.stiffness, robot)
+        damping = not_negative("damping", self.damping, robot)
+        own_lower, own_upper = robot.position_limits
+        lower = own_lower if self.lower is None else _ends("lower", self.lower, robot, -np.inf)
+        upper = own_upper if self.upper is None else _ends("upper", self.upper, robot, np.inf)
+        asked = (stiffness > 0.0) | (damping > 0.0)
+        acts = asked & (np.isfinite(lower) | np.isfinite(upper))
+        endless = [name for name, wanted, has in zip(robot.joint_names, asked, acts, strict=True) if wanted and not has]
+        # One number for all leaves joints without limits alone, as those that turn for ever.
+        if endless and (isinstance(self.stiffness, Mapping) or not acts.any()):
+            raise InputError(
+                f"JointStop: {robot.name} has no position limits for {', '.join(map(repr, endless))}: give lower= and "
+                "upper="
+            )
+        if (crossed := acts & ~(lower < upper)).any():
+            c = int(np.argmax(crossed))
+            raise InputError(
+                f"JointStop: the lower end of joint {robot.joint_names[c]!r}, {lower[c]:g}, is not below its upper "
+                f"end, {upper[c]:g}"
+            )
+        width = _positive("width", self.width, robot, acts)
+        return tuple(_elements("JointStop", acts, lower, upper, stiffness, damping, width))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PositionServo(Force):
+    """Position servos: the control of a joint is the position it is to go to [rad or m], and no force.
+
+    The drive's force is S(stiffness * (u - q) - damping * v) at every instant of a step, not only where it begins, so
+    implicit integrators take servos of any stiffness. S is the identity up to 0.9 of the effort limit and bends
+    smoothly to the limit at 1.1. The energy of a motion is that of the robot, without its servos'.
+
+    Attributes:
+        stiffness: >= 0 [N m/rad or N/m]; joints with 0 have no servo.
+        damping: >= 0 [N m s/rad or N s/m].
+        effort: Largest force, > 0 [N m or N]; inf for no limit.
+    """
+
+    stiffness: JointValues
+    damping: JointValues = 0.0
+    effort: JointValues = np.inf
+
+    def bind(self, robot: Robot) -> tuple[Element, ...]:
+        """See :meth:`Force.bind`."""
+        stiffness = not_negative("stiffness", self.stiffness, robot)
+        damping = not_negative("damping", self.damping, robot)
+        effort = _ends("effort", self.effort, robot, np.inf)
+        acts = stiffness > 0.0
+        _refuse("effort", effort, acts & ~(effort > 0.0), "must be > 0")
+        return tuple(_elements("PositionServo", acts, stiffness, damping, effort))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrameWrench(Force):
+    """A constant wrench at a frame. The joints feel J(q)' w.
+
+    A force that is constant in the world is part of the potential energy, -force . x; a moment, or a wrench that turns
+    with the frame, is not, and does work.
+
+    Attributes:
+        frame: Where it acts: a frame's name, or (name, place in the frame's axes).
+        wrench: Force [N] and moment about that place [N m] (6,), linear part first.
+        axes: ``"world"``, or ``"frame"`` for a wrench that turns with the frame.
+    """
+
+    frame: FramePoint
+    wrench: ArrayLike
+    axes: Literal["world", "frame"] = "world"
+
+    def bind(self, robot: Robot) -> tuple[Coupling, ...]:
+        """See :meth:`Force.bind`."""
+        if not is_one_of(self.axes, ("world", "frame")):
+            raise InputError(f"axes must be 'world' or 'frame', got {self.axes!r}")
+        wrench = finite_array("wrench", self.wrench, (6,))
+        if not isinstance(self.frame, str | tuple):
+            raise InputError(f"frame must be a frame's name or (name, place), got {_shown(self.frame)}")
+        body, turned, place = _point("frame", self.frame, robot)
+        if body < 0:
+            raise InputError(f"frame {self.frame!r} of robot {robot.name!r} is fixed to the base: no joint moves it")
+        at = (*place.tolist(), 0.0, 0.0, 0.0)
+        force, moment = wrench[:3], wrench[3:]
+        if self.axes == "frame":
+            numbers = (*(turned @ force).tolist(), *(turned @ moment).tolist(), 1.0)
+            return (Coupling("FrameWrench", body, -1, (*at, *numbers)),) if wrench.any() else ()
+        found = []
+        if force.any():
+            found.append(Coupling("FrameLoad", body, -1, (*at, *force.tolist())))
+        if moment.any():
+            found.append(Coupling("FrameWrench", body, -1, (*at, 0.0, 0.0, 0.0, *moment.tolist(), 0.0)))
+        return tuple(found)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrameSpring(Force):
+    """A linear spring between two points, part of the potential energy.
+
+    With d = x_a - x_b in world axes the energy is 1/2 sum of stiffness (d - rest)^2 over the axes; with a number > 0
+    for ``rest``, 1/2 stiffness (``|d|`` - rest)^2, whose force has no direction at d = 0, and is none there.
+
+    Attributes:
+        a: The one end: a frame's name, (name, place in the frame's axes), or a place in the world (3,) [m].
+        b: The other end.
+        stiffness: >= 0, one number or along each axis of the world (3,) [N/m].
+        rest: Where it is slack: d in world axes (3,), or a length >= 0 [m].
+    """
+
+    a: Point
+    b: Point
+    stiffness: ArrayLike
+    rest: ArrayLike = 0.0
+
+    def bind(self, robot: Robot) -> tuple[Coupling, ...]:
+        """See :meth:`Force.bind`."""
+        bodies, places = _ends_of(self, robot)
+        stiffness = _along_axes("stiffness", self.stiffness)
+        rest = as_floats("rest", self.rest)
+        if rest.shape not in ((), (3,)) or not np.isfinite(rest).all() or (rest.ndim == 0 and rest < 0.0):
+            raise InputError(f"rest must be a length >= 0, or finite along three axes (3,), got {_shown(rest)}")
+        if not stiffness.any():
+            return ()
+        if rest.ndim == 0 and rest > 0.0:
+            if np.ndim(self.stiffness):
+                raise InputError("a spring with a length at rest has one stiffness, and not one along each axis")
+            return (Coupling("FrameLengthSpring", *bodies, (*places, float(stiffness[0]), float(rest))),)
+        slack = np.broadcast_to(rest, (3,))
+        return (Coupling("FrameSpring", *bodies, (*places, *stiffness.tolist(), *slack.tolist())),)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrameDamper(Force):
+    """A viscous damper between two points: the force -damping (v_a - v_b) on a, and its opposite on b.
+
+    Attributes:
+        a: The one end, as of :class:`FrameSpring`.
+        b: The other end.
+        damping: >= 0, one number or along each axis of the world (3,) [N s/m].
+    """
+
+    a: Point
+    b: Point
+    damping: ArrayLike
+
+    def bind(self, robot: Robot) -> tuple[Coupling, ...]:
+        """See :meth:`Force.bind`."""
+        bodies, places = _ends_of(self, robot)
+        damping = _along_axes("damping", self.damping)
+        return (Coupling("FrameDamper", *bodies, (*places, *damping.tolist())),) if damping.any() else ()
+
+
+def _point(name: str, point: Any, robot: Robot) -> tuple[int, Floats, Floats]:
+    """The body that carries a point, -1 for the world, with the frame's rotation (3, 3) and the place (3,) on it."""
+    offset: Any = (0.0, 0.0, 0.0)
+    frame = point
+    if isinstance(point, tuple) and len(point) == 2:
+        frame, offset = point
+    if not isinstance(frame, str):
+        shape = np.shape(point)
+        if shape != (3,):
+            raise InputError(
+                f"{name} must be a frame's name, (name, place in the frame (3,)) or a place in the world (3,), got "
+                f"shape {shape}"
+            )
+        return -1, np.eye(3), finite_array(name, point, (3,))
+    place = finite_array(f"{name}, the place in frame {frame!r},", offset, (3,))
+    body, turned, at = place_of_frame(robot.free_model, frame, robot.name)
+    return body, turned, at + turned @ place
+
+
+def _ends_of(force: FrameSpring | FrameDamper, robot: Robot) -> tuple[tuple[int, int], tuple[float, ...]]:
+    """The bodies at both ends, and the places on them one after the other."""
+    (a, _, here), (b, _, there) = _point("a", force.a, robot), _point("b", force.b, robot)
+    if a < 0 and b < 0:
+        raise InputError(
+            f"{type(force).__name__}: both ends are fixed, in the world or to the base of robot {robot.name!r}: no "
+            "joint moves one"
+        )
+    return (a, b), (*here.tolist(), *there.tolist())
+
+
+def _along_axes(name: str, value: ArrayLike) -> Floats:
+    """``value``, one number or (3,), as numbers >= 0 along the axes of the world."""
+    given = as_floats(name, value)
+    if given.shape not in ((), (3,)) or not (np.isfinite(given).all() and (given >= 0.0).all()):
+        raise InputError(f"{name} must be >= 0, one number or along three axes (3,), got {_shown(given)}")
+    return np.array(np.broadcast_to(given, (3,)))
+
+
+def of_kind(elements: Iterable[Element], kind: str) -> tuple[Element, ...]:
+    """The elements of one kind."""
+    return tuple(own for own in elements if own.kind == kind)
+
+
+def drive_force(servo: Element, q: Floats, v: Floats, force: Floats) -> Floats:
+    """What a servo's drive does to its joint (K,) [N m or N], S of :class:`PositionServo`.
+
+    Args:
+        servo: A ``PositionServo``.
+        q: The joint's positions (K,) [rad or m].
+        v: Its velocities (K,) [rad/s or m/s].
+        force: Stiffness times command (K,) [N m or N].
+    """
+    stiffness, damping, effort = servo.values
+    wanted = force - stiffness * q - damping * v
+    if not np.isfinite(effort):
+        return wanted
+    over = np.clip(np.abs(wanted) / effort - 0.9, 0.0, 0.2)
+    bent: Floats = np.sign(wanted) * effort * (np.minimum(np.abs(wanted) / effort, 0.9) + over - 2.5 * over**2)
+    return bent
+
+
+def drive_forces(elements: Iterable[Element], q: Floats, v: Floats, force: Floats) -> Floats:
+    """The forces (K, n) that drives make of the controls' constant forces (K, n), at q and v (K, n) [N m or N]."""
+    driven = force.copy()
+    for own in of_kind(elements, "PositionServo"):
+        c = own.coordinate
+        driven[:, c] = drive_force(own, q[:, c], v[:, c], force[:, c])
+    return driven
+
+
+def dissipates(element: Element | Coupling) -> bool:
+    """Whether an element or a coupling turns energy into heat."""
+    if element.kind == "JointStop":
+        return element.values[3] > 0.0
+    return element.kind in ("JointDamper", "CoulombFriction", "PositionServo", "FrameDamper")
+
+
+def keeps_energy(coupling: Coupling) -> bool:
+    """Whether a coupling is part of the potential energy."""
+    return coupling.kind in ("FrameLoad", "FrameSpring", "FrameLengthSpring")
+
+
+def forces_of(given: Force | Sequence[Force]) -> tuple[Force, ...]:
+    """What a user gives as forces.
+
+    Raises:
+        InputError: It is none of them.
+    """
+    forces = (given,) if isinstance(given, Force) else given
+    if isinstance(forces, str) or not isinstance(forces, Sequence):
+        raise InputError(f"forces must be a list of varpin's forces, got {type(given).__name__}")
+    for force in forces:
+        if not isinstance(force, Force):
+            raise InputError(f"forces must be a list of varpin's forces, got {force!r} in it")
+    return tuple(forces)
+
+
+def not_negative(name: str, value: JointValues, robot: Robot) -> Floats:
+    """``value`` as numbers >= 0 for each joint (n,).
+
+    Raises:
+        InputError: As :func:`varpin.support.checks.joint_array`, or a number is negative.
+    """
+    values = joint_array(name, value, robot.joint_names, uniform=True)
+    return _refuse(name, values, values < 0.0, "must be >= 0")
+
+
+def _positive(name: str, value: JointValues, robot: Robot, needed: NDArray[np.bool_]) -> Floats:
+    """``value`` for each joint (n,), > 0 where it is needed."""
+    values = joint_array(name, value, robot.joint_names, uniform=True)
+    return _refuse(name, values, needed & ~(values > 0.0), "must be > 0")
+
+
+def _ends(name: str, value: JointValues, robot: Robot, absent: float) -> Floats:
+    """Ends of a way for each joint (n,), ``absent`` for those that have none."""
+    joints = robot.joint_names
+    if isinstance(value, Mapping):
+        values = np.full(len(joints), absent)
+        for joint, number in value.items():
+            if joint not in joints:
+                raise UnknownJoint(str(joint), joints, name)
+            values[joints.index(joint)] = as_floats(f"{name}[{joint!r}]", number)
+    else:
+        given = as_floats(name, value)
+        if given.shape not in ((), (len(joints),)):
+            raise InputError(f"{name} must be one number or have shape ({len(joints)},), got {given.shape}")
+        values = np.array(np.broadcast_to(given, (len(joints),)))
+    return _refuse(name, values, np.isnan(values) | (values == -absent), f"must be a number, or {absent} for none")
+
+
+def _refuse(name: str, values: Floats, wrong: NDArray[np.bool_], what: str) -> Floats:
+    if wrong.any():
+        c = int(np.argmax(wrong))
+        raise InputError(f"{name}[{c}] is {values[c]}; it {what}")
+    return values
+
+
+def _elements(kind: str, acts: NDArray[np.bool_], *columns: Floats) -> Iterator[Element]:
+    for c in np.flatnonzero(acts):
+        yield Element(kind, int(c), tuple(float(column[c]) for column in columns))

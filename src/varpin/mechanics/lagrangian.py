@@ -1,0 +1,239 @@
+"""The Lagrangian L(q, v) = 1/2 v' M(q) v - V(q) of a scene, its derivatives, and the discrete Lagrangian's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from varpin.errors import InputError
+from varpin.mechanics.forces import keeps_energy, of_kind
+from varpin.mechanics.scene import Scene, require_scene
+from varpin.model.tree import joint_axis, z_to
+from varpin.support.checks import JointValues, fraction, joint_array, positive
+from varpin.textbook import rigid_body_Lqq
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LagrangianJet:
+    """A Lagrangian and its derivatives up to second order at one (q, v).
+
+    Attributes:
+        L: Lagrangian [J].
+        Lq: dL/dq (n,) [N m or N].
+        Lv: dL/dv = M v (n,), the momentum [N m s or N s].
+        Lqq: d2L/dq2 (n, n), symmetric.
+        Lvq: d2L/dv dq (n, n): ``Lvq[i, j]`` = d Lv[i] / d q[j]; its transpose is d Lq / dv.
+        Lvv: d2L/dv2 = M (n, n), symmetric, armature included.
+    """
+
+    L: float
+    Lq: Floats
+    Lv: Floats
+    Lqq: Floats
+    Lvq: Floats
+    Lvv: Floats
+
+    def __repr__(self) -> str:
+        return f"LagrangianJet({len(self.Lq)} joints, L = {self.L:.6g} J)"
+
+
+def lagrangian_jet(
+    scene: Scene, q: JointValues, v: JointValues, *, backend: Literal["compiled", "pinocchio"] = "compiled"
+) -> LagrangianJet:
+    """L and all its derivatives up to second order; gravity, springs and armature of the scene included.
+
+    Args:
+        scene: The scene.
+        q: Configuration, (n,) or by joint name [rad or m].
+        v: Velocity, (n,) or by joint name [rad/s or m/s].
+        backend: ``"compiled"`` takes one sweep over the tree (see ``docs/mathematics.md``); ``"pinocchio"`` puts
+            the same together from Pinocchio's algorithms, slowly, as a reference.
+
+    Raises:
+        InputError: Wrong shapes, values that are not finite, or an unknown backend.
+    """
+    joints = require_scene(scene).robot.joint_names
+    q, v = joint_array("q", q, joints), joint_array("v", v, joints)
+    if backend == "compiled":
+        return _compiled(scene, q, v)
+    if backend == "pinocchio":
+        return _from_pinocchio(scene, q, v)
+    raise InputError(f"backend must be 'compiled' or 'pinocchio', got {backend!r}")
+
+
+def _compiled(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
+    return LagrangianJet(*scene.core.jet(q, v))
+
+
+def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
+    robot = scene.robot
+    model = robot.free_model.copy()
+    model.gravity = pin.Motion(scene.gravity, np.zeros(3))
+    data = model.createData()
+    full_q, full_v = robot.free_positions(q), robot.free_velocities(v)
+    # Columns of G: how the free joints move with each coordinate. Mimic joints make it more than a permutation.
+    G = robot.free_velocities(np.eye(robot.dof)).T
+
+    own_armature = model.armature.copy()
+    model.armature = np.zeros(model.nv)
+    M = pin.crba(model, data, full_q).copy()
+    M = np.triu(M) + np.triu(M, 1).T
+    pin.computeRNEADerivatives(model, data, full_q, np.zeros(model.nv), full_v)
+    A = data.dtau_dq.copy()
+    A -= pin.computeGeneralizedGravityDerivatives(model, data, full_q)
+    C = pin.computeCoriolisMatrix(model, data, full_q, full_v).copy()
+    gravity = pin.computeGeneralizedGravity(model, data, full_q).copy()
+    M += np.diag(own_armature)
+    added = np.diag(scene.armature - robot.tree.armature)
+    energy, force, curvature = _stops(scene, q)
+
+    deflection = q - scene.rest
+    Lvv = G.T @ M @ G + added
+    Lq = G.T @ (C.T @ full_v - gravity) - scene.stiffness * deflection + force
+    Lqq = G.T @ rigid_body_Lqq(model, full_q, full_v) @ G - np.diag(scene.stiffness) + np.diag(curvature)
+    potential = pin.computePotentialEnergy(model, data, full_q) + energy
+    springs = of_kind(scene.elements, "JointSpring")
+    potential += sum(0.5 * own.values[0] * (q[own.coordinate] - own.values[1]) ** 2 for own in springs)
+    held, pull, bend = _coupled(scene, model, full_q, G)
+    potential, Lq, Lqq = potential + held, Lq - pull, Lqq - bend
+    return LagrangianJet(float(0.5 * v @ Lvv @ v - potential), Lq, Lvv @ v, Lqq, G.T @ A @ G, Lvv)
+
+
+def _coupled(scene: Scene, model: pin.Model, full_q: Floats, G: Floats) -> tuple[float, Floats, Floats]:
+    """The energy V of all couplings that have one, with dV/dq (n,) and d2V/dq2 (n, n)."""
+    n = G.shape[1]
+    data = model.createData()
+    pin.forwardKinematics(model, data, full_q)
+    energy, slope, curvature = 0.0, np.zeros(n), np.zeros((n, n))
+    for own in scene.couplings:
+        if not keeps_energy(own):
+            continue
+        d, J, H = np.zeros(3), np.zeros((3, n)), np.zeros((n, 3, n))
+        numbers = np.array(own.values)
+        for side, body, place in ((1.0, own.a, numbers[:3]), (-1.0, own.b, numbers[3:6])):
+            if body < 0:
+                d += side * place
+                continue
+            joint = body + 1
+            point = pin.SE3(np.eye(3), z_to(joint_axis(model, joint)[1]) @ place)
+            here = data.oMi[joint] * point
+            d += side * here.translation
+            for i, rates in enumerate(G.T):
+                pin.computeForwardKinematicsDerivatives(model, data, full_q, rates, np.zeros(model.nv))
+                by_q, by_v = pin.getFrameVelocityDerivatives(model, data, joint, point, pin.LOCAL)
+                moved = by_v[:3] @ rates
+                J[:, i] += side * here.rotation @ moved
+                # What turns the frame turns its velocity.
+                H[i] += side * here.rotation @ (by_q[:3] + np.cross(by_v[3:].T, moved).T) @ G
+        own_energy, force, stiff = _between(own.kind, numbers[6:], d)
+        energy += own_energy
+        slope += J.T @ force
+        curvature += J.T @ stiff @ J + np.einsum("irj,r->ij", H, force)
+    return energy, slope, curvature
+
+
+def _between(kind: str, numbers: Floats, d: Floats) -> tuple[float, Floats, Floats]:
+    """The energy V of a coupling and its derivatives (3,) and (3, 3) in d = x_a - x_b."""
+    if kind == "FrameLoad":
+        return float(-numbers @ d), -numbers, np.zeros((3, 3))
+    if kind == "FrameSpring":
+        stiffness, stretch = numbers[:3], d - numbers[3:]
+        return float(0.5 * stiffness @ stretch**2), stiffness * stretch, np.diag(stiffness)
+    (stiffness, length), far = numbers, float(np.linalg.norm(d))
+    if far == 0.0:
+        return float(0.5 * stiffness * length**2), np.zeros(3), np.zeros((3, 3))
+    e, stretch = d / far, far - length
+    along = np.outer(e, e)
+    return (
+        float(0.5 * stiffness * stretch**2),
+        stiffness * stretch * e,
+        stiffness * (along + stretch / far * (np.eye(3) - along)),
+    )
+
+
+def _stops(scene: Scene, q: Floats) -> tuple[float, Floats, Floats]:
+    """The energy V of all joint stops, with -dV/dq and -d2V/dq2 (n,)."""
+    energy, force, curvature = 0.0, np.zeros_like(q), np.zeros_like(q)
+    # The integrals of s(y) = 3 y^2 - 2 y^3 over the first width, and the first and second of them at its end.
+    rise = np.polynomial.Polynomial([0.0, 0.0, 3.0, -2.0])
+    once, twice = rise.integ(), rise.integ(2)
+    for own in scene.elements:
+        if own.kind != "JointStop":
+            continue
+        lower, upper, stiffness, _, width = own.values
+        c = own.coordinate
+        side = 1.0 if q[c] > upper else -1.0
+        y = max(q[c] - upper, lower - q[c], 0.0) / width
+        past, y = max(y - 1.0, 0.0), min(y, 1.0)
+        energy += stiffness * width**2 * float(twice(y) + once(y) * past + 0.5 * past**2)
+        force[c] -= side * stiffness * width * float(once(y) + past)
+        curvature[c] -= stiffness * float(rise(y))
+    return energy, force, curvature
+
+
+@dataclass(frozen=True, eq=False)
+class DiscreteLagrangian:
+    """The discrete Lagrangian of one step and its slot derivatives.
+
+    Attributes:
+        Ld: Discrete Lagrangian [J s].
+        D1: Derivative in q0 (n,); -D1 is the momentum at the start of the step.
+        D2: Derivative in q1 (n,), the momentum at its end [N m s or N s].
+        D1D1: Second derivative in q0 (n, n), symmetric.
+        D2D1: Derivative of D1 in q1 (n, n).
+        D1D2: Derivative of D2 in q0 (n, n), the transpose of D2D1.
+        D2D2: Second derivative in q1 (n, n), symmetric.
+    """
+
+    Ld: float
+    D1: Floats
+    D2: Floats
+    D1D1: Floats
+    D2D1: Floats
+    D1D2: Floats
+    D2D2: Floats
+
+    def __repr__(self) -> str:
+        return f"DiscreteLagrangian({len(self.D1)} joints, Ld = {self.Ld:.6g} J s)"
+
+
+def discrete_lagrangian(
+    scene: Scene, q0: JointValues, q1: JointValues, dt: float, *, alpha: float = 0.5
+) -> DiscreteLagrangian:
+    """L_d(q0, q1) = dt L((1 - alpha) q0 + alpha q1, (q1 - q0) / dt) and its slot derivatives.
+
+    The generalized midpoint rule (Marsden and West 2001, Johnson and Murphey 2009). Friction and controls are no
+    part of it.
+
+    Args:
+        scene: The scene.
+        q0: Configuration at the start, (n,) or by joint name [rad or m].
+        q1: Configuration at the end, (n,) or by joint name [rad or m].
+        dt: Time step [s].
+        alpha: Where between q0 and q1 the Lagrangian is taken, in [0, 1]; 1/2 is of second order.
+
+    Raises:
+        InputError: Wrong shapes, values that are not finite, dt <= 0, alpha outside [0, 1].
+    """
+    joints = require_scene(scene).robot.joint_names
+    q0, q1 = joint_array("q0", q0, joints), joint_array("q1", q1, joints)
+    h, a = positive("dt", dt, "s"), fraction("alpha", alpha)
+    jet = lagrangian_jet(scene, (1.0 - a) * q0 + a * q1, (q1 - q0) / h)
+    b = 1.0 - a
+    Lqv = jet.Lvq.T
+    D2D1 = h * a * b * jet.Lqq + b * Lqv - a * jet.Lvq - jet.Lvv / h
+    return DiscreteLagrangian(
+        Ld=h * jet.L,
+        D1=h * b * jet.Lq - jet.Lv,
+        D2=h * a * jet.Lq + jet.Lv,
+        D1D1=h * b * b * jet.Lqq - b * (Lqv + jet.Lvq) + jet.Lvv / h,
+        D2D1=D2D1,
+        D1D2=D2D1.T.copy(),
+        D2D2=h * a * a * jet.Lqq + a * (Lqv + jet.Lvq) + jet.Lvv / h,
+    )

@@ -1,0 +1,481 @@
+"""Noise models: diffusion fields F_i(q, v, u), one for each of k independent Wiener processes.
+
+In the equations of motion they add the generalized force sum_i F_i o dw_i / dt (Stratonovich). Models add up:
+``AdditiveNoise(1e-3) + ControlNoise(0.1)`` has the processes of both, independent of each other.
+
+Motions follow the paths of the noise with strong order 1 in the time step: the error of a path halves with it. Where a
+field depends on the velocity (:class:`CustomNoise` alone can) the strong order is 1/2.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.core.arrays import Diffusion
+from varpin.errors import InputError
+from varpin.support.checks import (
+    JointValues,
+    as_floats,
+    broadcast_array,
+    count,
+    finite_array,
+    joint_array,
+    require_finite,
+)
+from varpin.support.frozen import Frozen
+
+Floats = NDArray[np.float64]
+
+
+class NoiseFieldError(InputError):
+    """A function of a custom noise raised, or returned something that is no field."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """Diffusion fields and their derivatives at N points.
+
+    Attributes:
+        F: (N, n, k) generalized force per square root of time [N m s^0.5 or N s^0.5].
+        Fq: dF/dq (N, n, k, n).
+        Fv: dF/dv (N, n, k, n), or None where no field depends on the velocity.
+        Fu: dF/du (N, n, k, m).
+    """
+
+    F: Floats
+    Fq: Floats
+    Fv: Floats | None
+    Fu: Floats
+
+
+class Noise(ABC):
+    """A diffusion model. Whoever adds one provides ``bind``, which fits it to a robot."""
+
+    def named(self, joints: Sequence[str]) -> Noise:  # noqa: ARG002
+        """The model with numbers in the order of ``joints`` where it has them by the joints' names.
+
+        Raises:
+            UnknownJoint: A name that is no joint's.
+        """
+        return self
+
+    @abstractmethod
+    def bind(self, actuation: Floats) -> BoundNoise:
+        """The model on a robot of n coordinates and m controls, with its actuation matrix (n, m).
+
+        Raises:
+            InputError: Its parameters do not fit the robot.
+        """
+
+    def __add__(self, other: Noise) -> NoiseSum:
+        if not isinstance(other, Noise):
+            return NotImplemented
+        return NoiseSum((*_terms(self), *_terms(other)))
+
+
+class BoundNoise(Frozen, ABC):
+    """A noise model on a robot."""
+
+    @property
+    @abstractmethod
+    def processes(self) -> int:
+        """k, the number of Wiener processes."""
+
+    @property
+    def velocity_dependent(self) -> bool:
+        """Whether a field depends on the velocity, so that Stratonovich and Ito differ."""
+        return False
+
+    @property
+    def diffusion(self) -> Diffusion | None:
+        """The form that the core evaluates, or None for fields in Python."""
+        return None
+
+    def curvature(self, weight: Floats) -> Floats:
+        """Second derivatives of sum_i weight_i . F_i in q (N, n, n), for weights (N, n, k), as far as they are known.
+
+        Only what a field of one's own would have to provide is missing: there it is taken for zero.
+        """
+        return np.zeros((len(weight), weight.shape[1], weight.shape[1]))
+
+    @abstractmethod
+    def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:
+        """F and its derivatives at q (N, n), v (N, n), u (N, m); ``start`` (n,) is q at the start of the motion."""
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledFields(BoundNoise):
+    """Fields of the form that the core evaluates: constant, linear in u, quadratic in q."""
+
+    arrays: Diffusion
+
+    @property
+    def diffusion(self) -> Diffusion:
+        """See :attr:`BoundNoise.diffusion`."""
+        return self.arrays
+
+    @property
+    def processes(self) -> int:
+        """See :attr:`BoundNoise.processes`."""
+        return int(self.arrays.constant.shape[1])
+
+    def curvature(self, weight: Floats) -> Floats:
+        """See :meth:`BoundNoise.curvature`."""
+        second: Floats = 2.0 * (self.arrays.quadratic * weight).sum(axis=2)
+        return second[:, :, None] * np.eye(second.shape[1])
+
+    def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:  # noqa: ARG002
+        """See :meth:`BoundNoise.fields`."""
+        own = self.arrays
+        n, k = own.constant.shape
+        offset = q[:, :, None] - np.where(np.isnan(own.center), start[:, None], own.center)
+        F = own.constant + np.einsum("ikm,Nm->Nik", own.control, u) + own.quadratic * offset**2
+        Fq = np.zeros((len(q), n, k, n))
+        Fq[:, np.arange(n), :, np.arange(n)] = np.moveaxis(2.0 * own.quadratic * offset, 1, 0)
+        return Fields(F, Fq, None, np.broadcast_to(own.control, (len(q), *own.control.shape)))
+
+
+@dataclass(frozen=True, eq=False)
+class CompositeFields(BoundNoise):
+    """The processes of several bound models, side by side."""
+
+    parts: tuple[BoundNoise, ...]
+
+    @property
+    def processes(self) -> int:
+        """See :attr:`BoundNoise.processes`."""
+        return sum(part.processes for part in self.parts)
+
+    @property
+    def velocity_dependent(self) -> bool:
+        """See :attr:`BoundNoise.velocity_dependent`."""
+        return any(part.velocity_dependent for part in self.parts)
+
+    @property
+    def diffusion(self) -> Diffusion | None:
+        """One set of arrays, where every part has them."""
+        own = [part.diffusion for part in self.parts]
+        if any(fields is None for fields in own):
+            return None
+        columns = zip(*(fields for fields in own if fields is not None), strict=True)
+        return Diffusion(*(np.concatenate(arrays, axis=1) for arrays in columns))
+
+    def curvature(self, weight: Floats) -> Floats:
+        """See :meth:`BoundNoise.curvature`."""
+        ends = np.cumsum([part.processes for part in self.parts])
+        columns = np.split(weight, ends[:-1], axis=2)
+        total: Floats = sum(
+            (part.curvature(own) for part, own in zip(self.parts, columns, strict=True)),
+            np.zeros((len(weight), weight.shape[1], weight.shape[1])),
+        )
+        return total
+
+    def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:
+        """See :meth:`BoundNoise.fields`."""
+        parts = [part.fields(q, v, u, start) for part in self.parts]
+        Fv = None
+        if any(part.Fv is not None for part in parts):
+            Fv = np.concatenate([np.zeros_like(part.Fq) if part.Fv is None else part.Fv for part in parts], axis=2)
+        return Fields(
+            np.concatenate([part.F for part in parts], axis=2),
+            np.concatenate([part.Fq for part in parts], axis=2),
+            Fv,
+            np.concatenate([part.Fu for part in parts], axis=2),
+        )
+
+
+def _compiled(
+    n: int,
+    m: int,
+    k: int,
+    *,
+    constant: Floats | None = None,
+    control: Floats | None = None,
+    quadratic: Floats | None = None,
+    center: Floats | None = None,
+) -> CompiledFields:
+    return CompiledFields(
+        Diffusion(
+            np.zeros((n, k)) if constant is None else np.ascontiguousarray(constant),
+            np.zeros((n, k, m)) if control is None else np.ascontiguousarray(control),
+            np.zeros((n, k)) if quadratic is None else np.ascontiguousarray(quadratic),
+            np.zeros((n, k)) if center is None else np.ascontiguousarray(center),
+        )
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class AdditiveNoise(Noise):
+    """Forces of constant strength: F constant.
+
+    Attributes:
+        intensity: One number C for F_i = C e_i; (n,), or by joint name, for F_i = C_i e_i; or the matrix F (n, k)
+            itself [N m s^0.5 or N s^0.5].
+    """
+
+    intensity: JointValues
+
+    def named(self, joints: Sequence[str]) -> Noise:
+        """See :meth:`Noise.named`."""
+        return _named(self, joints, "intensity")
+
+    def bind(self, actuation: Floats) -> CompiledFields:
+        """See :meth:`Noise.bind`."""
+        n, m = actuation.shape
+        values = require_finite("AdditiveNoise intensity", as_floats("AdditiveNoise intensity", self.intensity))
+        if values.ndim == 2:
+            F = finite_array("AdditiveNoise intensity", values, (n, values.shape[1]))
+        else:
+            F = np.diag(broadcast_array("AdditiveNoise intensity", values, n))
+        return _compiled(n, m, F.shape[1], constant=F)
+
+
+@dataclass(frozen=True, eq=False)
+class ControlNoise(Noise):
+    """Forces in proportion to the controls: F_i = C_i b_i u_i, b_i the i-th column of the actuation matrix.
+
+    Attributes:
+        intensity: One number or (m,) [s^0.5]; or an array (n, k, m) with F_i = sum_j intensity[:, i, j] u_j.
+    """
+
+    intensity: ArrayLike
+
+    def bind(self, actuation: Floats) -> CompiledFields:
+        """See :meth:`Noise.bind`."""
+        n, m = actuation.shape
+        values = require_finite("ControlNoise intensity", as_floats("ControlNoise intensity", self.intensity))
+        if values.ndim == 3:
+            field = finite_array("ControlNoise intensity", values, (n, values.shape[1], m))
+        else:
+            strength = broadcast_array("ControlNoise intensity", values, m)
+            field = np.zeros((n, m, m))
+            field[:, np.arange(m), np.arange(m)] = actuation * strength
+        return _compiled(n, m, field.shape[1], control=field)
+
+
+@dataclass(frozen=True, eq=False)
+class StateNoise(Noise):
+    """Forces that grow with the distance from a posture: F_i = C_i e_i (q_i - center_i)^2.
+
+    Attributes:
+        intensity: One number, (n,) or by joint name [N m s^0.5 / rad^2 or N s^0.5 / m^2].
+        center: One number, (n,) or by joint name [rad or m]; the configuration at which the motion starts if None.
+    """
+
+    intensity: JointValues
+    center: JointValues | None = None
+
+    def named(self, joints: Sequence[str]) -> Noise:
+        """See :meth:`Noise.named`."""
+        return _named(self, joints, "intensity", "center")
+
+    def bind(self, actuation: Floats) -> CompiledFields:
+        """See :meth:`Noise.bind`."""
+        n, m = actuation.shape
+        strength = np.diag(broadcast_array("StateNoise intensity", self.intensity, n))
+        center = np.full(n, np.nan) if self.center is None else broadcast_array("StateNoise center", self.center, n)
+        return _compiled(n, m, n, quadratic=strength, center=np.repeat(center[:, None], n, axis=1))
+
+
+Field = Callable[[Floats, Floats, Floats], ArrayLike]
+
+
+@dataclass(frozen=True, eq=False)
+class CustomNoise(Noise):
+    """A diffusion field of your own, in Python. Motions with it are stepped in Python, not compiled.
+
+    Attributes:
+        field: Function of (q (n,), v (n,), u (m,)) that returns F (n, k) [N m s^0.5 or N s^0.5].
+        processes: k.
+        dq: The same for dF/dq (n, k, n); None where F does not depend on q.
+        dv: dF/dv (n, k, n); None where F does not depend on v. With it the drift (1/2) sum_i (dF_i/dv) M^-1 F_i
+            takes the Stratonovich equation to the Ito one that is stepped, with strong order 1/2 instead of 1.
+        du: dF/du (n, k, m); None where F does not depend on u.
+        check: Hold the derivatives against differences when the noise is given to a scene.
+    """
+
+    field: Field
+    processes: int
+    dq: Field | None = None
+    dv: Field | None = None
+    du: Field | None = None
+    check: bool = False
+
+    def bind(self, actuation: Floats) -> CustomFields:
+        """See :meth:`Noise.bind`."""
+        count("CustomNoise processes", self.processes)
+        for name in ("field", "dq", "dv", "du"):
+            value = getattr(self, name)
+            if not callable(value) and (value is not None or name == "field"):
+                raise InputError(f"CustomNoise {name} must be a function of (q, v, u), got {value!r}")
+        bound = CustomFields(self, *actuation.shape)
+        if self.check:
+            bound.check()
+        return bound
+
+
+@dataclass(frozen=True, eq=False)
+class CustomFields(BoundNoise):
+    """A :class:`CustomNoise` on a robot."""
+
+    noise: CustomNoise
+    n: int
+    m: int
+
+    @property
+    def processes(self) -> int:
+        """See :attr:`BoundNoise.processes`."""
+        return self.noise.processes
+
+    @property
+    def velocity_dependent(self) -> bool:
+        """See :attr:`BoundNoise.velocity_dependent`."""
+        return self.noise.dv is not None
+
+    def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:  # noqa: ARG002
+        """See :meth:`BoundNoise.fields`.
+
+        Raises:
+            InputError: A function raised, or returned something that is no field.
+        """
+        shape = (self.n, self.processes)
+        # Copies: a field that writes into its arguments must not reach the state of a motion.
+        points = list(zip(q.copy(), v.copy(), u.copy(), strict=True))
+        noise = self.noise
+        return Fields(
+            self._evaluate("field", noise.field, points, shape),
+            self._evaluate("dq", noise.dq, points, (*shape, self.n)),
+            None if noise.dv is None else self._evaluate("dv", noise.dv, points, (*shape, self.n)),
+            self._evaluate("du", noise.du, points, (*shape, self.m)),
+        )
+
+    def _evaluate(
+        self, name: str, function: Field | None, points: Sequence[tuple[Floats, Floats, Floats]], shape: tuple[int, ...]
+    ) -> Floats:
+        if function is None:
+            return np.zeros((len(points), *shape))
+        return np.array([self._call(f"CustomNoise {name}(q, v, u)", function, point, shape) for point in points])
+
+    @staticmethod
+    def _call(name: str, function: Field, point: tuple[Floats, Floats, Floats], shape: tuple[int, ...]) -> Floats:
+        try:
+            value = function(*point)
+        except Exception as error:
+            raise NoiseFieldError(f"{name} raised {error!r}") from error
+        try:
+            return finite_array(name, value, shape)
+        except InputError as error:
+            raise NoiseFieldError(str(error)) from None
+
+    def check(self) -> None:
+        """Hold the derivatives against central differences at three seeded random points.
+
+        Raises:
+            InputError: A derivative is off; the message says which, where and by how much.
+        """
+        rng = np.random.default_rng(0)
+        for _ in range(3):
+            point = [rng.normal(size=(1, size)) for size in (self.n, self.n, self.m)]
+            fields = self.fields(point[0], point[1], point[2], point[0][0])
+            given = {
+                "dq": fields.Fq,
+                "dv": np.zeros_like(fields.Fq) if fields.Fv is None else fields.Fv,
+                "du": fields.Fu,
+            }
+            for slot, (name, derivative) in enumerate(given.items()):
+                for j in range(point[slot].shape[1]):
+                    difference = self._difference(point, slot, j)
+                    error = np.abs(derivative[0, :, :, j] - difference).max()
+                    if error > 1e-6 * max(1.0, np.abs(difference).max()):
+                        raise InputError(
+                            f"CustomNoise {name}(q, v, u)[:, :, {j}] differs from central differences of the field by "
+                            f"{error:.3g} at q = {point[0][0]}, v = {point[1][0]}, u = {point[2][0]}"
+                        )
+
+    def _difference(self, point: list[Floats], slot: int, j: int) -> Floats:
+        """dF/d(point[slot][j]) (n, k) by differences of fourth order."""
+        total = np.zeros((self.n, self.processes))
+        for shift, weight in ((1e-3, 8.0), (-1e-3, -8.0), (2e-3, -1.0), (-2e-3, 1.0)):
+            moved = [x.copy() for x in point]
+            moved[slot][0, j] += shift
+            total += (
+                weight
+                * self._evaluate("field", self.noise.field, [(moved[0][0], moved[1][0], moved[2][0])], total.shape)[0]
+            )
+        return total / 12e-3
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseSum(Noise):
+    """Several models at once, their processes independent of each other."""
+
+    terms: tuple[Noise, ...]
+
+    def named(self, joints: Sequence[str]) -> Noise:
+        """See :meth:`Noise.named`."""
+        return NoiseSum(tuple(term.named(joints) for term in self.terms))
+
+    def bind(self, actuation: Floats) -> BoundNoise:
+        """See :meth:`Noise.bind`."""
+        return CompositeFields(tuple(term.bind(actuation) for term in self.terms))
+
+
+_Model = TypeVar("_Model", "AdditiveNoise", "StateNoise")
+
+
+def _named(noise: _Model, joints: Sequence[str], *names: str) -> _Model:
+    """A model with arrays where it has numbers by joint name."""
+    given = {name: getattr(noise, name) for name in names}
+    by_name = {
+        name: joint_array(f"{type(noise).__name__} {name}", value, joints)
+        for name, value in given.items()
+        if isinstance(value, Mapping)
+    }
+    return replace(noise, **by_name) if by_name else noise
+
+
+def _terms(noise: Noise) -> tuple[Noise, ...]:
+    return noise.terms if isinstance(noise, NoiseSum) else (noise,)
+
+
+def _sound(model: Noise, bound: BoundNoise, n: int, m: int) -> BoundNoise:
+    """What a model's own ``bind`` gave, if the core can take it."""
+    name = type(model).__name__
+    if not isinstance(bound, BoundNoise):
+        raise InputError(f"bind of {name} must return a BoundNoise, got {type(bound).__name__}")
+    k = count(f"processes of {name}", bound.processes)
+    if bound.diffusion is not None:
+        shapes = ((n, k), (n, k, m), (n, k), (n, k))
+        for field, array, shape in zip(Diffusion._fields, bound.diffusion, shapes, strict=True):
+            if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
+                raise InputError(f"the diffusion of {name} has a field {field!r} that is no float64 array {shape}")
+            # NaN in a center stands for the start of the motion.
+            if not (np.isfinite(array).all() or field == "center"):
+                raise InputError(f"the diffusion of {name} has a field {field!r} that is not finite")
+    return bound
+
+
+def bind(noise: Noise | Sequence[Noise] | None, actuation: Floats, joints: Sequence[str] | None = None) -> BoundNoise:
+    """None, a model or several, on a robot with this actuation matrix (n, m) and joints of these names.
+
+    Raises:
+        UnknownJoint: A model names a joint that is none of them.
+        InputError: Something else than a noise model, or parameters that do not fit.
+    """
+    if noise is None or (isinstance(noise, Sequence) and not noise):
+        n, m = actuation.shape
+        return _compiled(n, m, 0)
+    models: Sequence[Noise] = [noise] if isinstance(noise, Noise) or not isinstance(noise, Sequence) else noise
+    bound = []
+    for model in models:
+        if not isinstance(model, Noise):
+            raise InputError(f"noise must be a varpin noise model or several of them, got {type(model).__name__}")
+        known = model if joints is None else model.named(joints)
+        bound.append(_sound(known, known.bind(actuation), *actuation.shape))
+    return bound[0] if len(bound) == 1 else CompositeFields(tuple(bound))

@@ -1,0 +1,153 @@
+"""Wiener increments: drawn from a seed, given, refined to half the step or summed to twice."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.errors import InputError
+from varpin.support.checks import as_floats, count, finite_array, positive, require_finite
+
+Floats = NDArray[np.float64]
+
+# Seeds that are made at a time.
+_AT_ONCE = 10_000
+
+
+def wiener_increments(
+    processes: int,
+    dt: float,
+    steps: int,
+    rng: np.random.Generator | int | None = None,
+    increments: ArrayLike | None = None,
+) -> Floats:
+    """Increments of k independent Wiener processes over N steps.
+
+    Args:
+        processes: k.
+        dt: Time step [s].
+        steps: N.
+        rng: Generator or seed; each increment is drawn from N(0, dt).
+        increments: The increments themselves, (N, k) [s^0.5], to be checked only; 0 for none.
+
+    Returns:
+        (N, k) [s^0.5], or (0, k) with neither ``rng`` nor ``increments``, or without processes: none.
+
+    Raises:
+        InputError: Both are given, a wrong shape, or values that are not finite.
+    """
+    if increments is not None:
+        if rng is not None:
+            raise InputError("give rng, to draw the Wiener increments, or increments, to use yours; not both")
+        if np.ndim(increments) == 0 and as_floats("increments", increments) == 0.0:
+            return np.zeros((0, processes))
+        return finite_array("increments", increments, (steps, processes))
+    if rng is None or processes == 0:
+        return np.zeros((0, processes))
+    deviation = math.sqrt(positive("dt", dt, "s"))
+    return generator(rng).normal(scale=deviation, size=(steps, processes))
+
+
+def generator(rng: np.random.Generator | int | None) -> np.random.Generator:
+    """``rng`` itself, or a generator seeded with it.
+
+    Raises:
+        InputError: Neither a generator nor a seed.
+    """
+    try:
+        return np.random.default_rng(rng)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"rng must be a numpy Generator or a seed, an integer >= 0, got {rng!r}: {error}") from None
+
+
+@dataclass(frozen=True)
+class Children:
+    """The children of a generator, each made where it is needed: bytes that travel, instead of a million generators.
+
+    Attributes:
+        kind: Of their bit generators.
+        entropy: Of the parent's seed.
+        spawn_key: Of the parent's seed.
+        pool_size: Of the parent's seed.
+        before: How many children the parent had.
+    """
+
+    kind: type[np.random.BitGenerator]
+    entropy: int | Sequence[int] | None
+    spawn_key: tuple[int, ...]
+    pool_size: int
+    before: int
+
+    def generators(self, first: int, last: int) -> list[np.random.Generator]:
+        """The children first .. last, as ``Generator.spawn`` makes them."""
+        return [
+            np.random.Generator(
+                self.kind(
+                    np.random.SeedSequence(
+                        self.entropy, spawn_key=(*self.spawn_key, self.before + i), pool_size=self.pool_size
+                    )
+                )
+            )
+            for i in range(first, last)
+        ]
+
+
+def children(rng: np.random.Generator | int, number: int) -> Children:
+    """So many children of ``rng``; a generator has had them then.
+
+    Raises:
+        InputError: Neither a generator nor a seed, or a generator that cannot have children.
+    """
+    parent = generator(rng).bit_generator
+    seed = parent.seed_seq
+    if not isinstance(seed, np.random.SeedSequence):
+        raise InputError(f"rng must be seeded by a numpy SeedSequence, to have a child for each path; got {seed!r}")
+    own = Children(type(parent), seed.entropy, tuple(seed.spawn_key), seed.pool_size, seed.n_children_spawned)
+    if isinstance(rng, np.random.Generator):
+        for first in range(0, number, _AT_ONCE):
+            seed.spawn(min(_AT_ONCE, number - first))
+    return own
+
+
+def coarsen(increments: ArrayLike, factor: int = 2) -> Floats:
+    """The same Brownian path at ``factor`` times the step: sums of increments, (N, k) to (N / factor, k).
+
+    Raises:
+        InputError: N is no multiple of ``factor``, or the increments are not finite or no such array.
+    """
+    values = _rows(increments)
+    steps, processes = values.shape
+    if steps % count("factor", factor, least=1):
+        raise InputError(f"{steps} increments cannot be summed by {factor}: the number must be a multiple of it")
+    total: Floats = values.reshape(steps // factor, factor, processes).sum(axis=1)
+    return total
+
+
+def refine(increments: ArrayLike, dt: float, rng: np.random.Generator | int) -> Floats:
+    """The same Brownian path at half the step, by Brownian bridge: (N, k) to (2 N, k).
+
+    The path's middle, given its ends, is normal with mean half the increment and variance dt / 4.
+
+    Args:
+        increments: Over steps of ``dt`` (N, k) [s^0.5].
+        dt: Their time step [s].
+        rng: Of the bridges.
+
+    Raises:
+        InputError: dt <= 0, or the increments are not finite or no such array.
+    """
+    half = 0.5 * _rows(increments)
+    deviation = 0.5 * math.sqrt(positive("dt", dt, "s"))
+    bridge = generator(rng).normal(scale=deviation, size=half.shape)
+    return np.stack([half + bridge, half - bridge], axis=1).reshape((2 * len(half), half.shape[1]))
+
+
+def _rows(increments: ArrayLike) -> Floats:
+    values = require_finite("increments", as_floats("increments", increments))
+    if values.ndim != 2:
+        raise InputError(f"increments must have shape (N, k), got {values.shape}")
+    return values

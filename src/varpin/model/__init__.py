@@ -1,0 +1,14 @@
+"""Robots: found, parsed, locked and laid out as the flat tree that the core runs on."""
+
+from varpin.model.chain import planar_chain as planar_chain
+from varpin.model.payload import Payload as Payload
+from varpin.model.robot import Robot as Robot
+from varpin.model.robot import build_robot as build_robot
+from varpin.model.robot import check_inertia as check_inertia
+from varpin.model.robot import geometry as geometry
+from varpin.model.robot import load_robot as load_robot
+from varpin.model.robot import readable_geometry as readable_geometry
+from varpin.model.sources import bundled_robots as bundled_robots
+from varpin.model.sources import models_dir as models_dir
+from varpin.model.sources import robot_names as robot_names
+from varpin.model.tree import require_sound as require_sound

@@ -1,0 +1,73 @@
+"""Planar chains of rods, the test bench of the field."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from varpin.errors import InputError
+from varpin.model.robot import Robot, load_robot
+from varpin.support.checks import count, finite_array, positive
+
+
+def planar_chain(links: int, *, length: float = 1.0, mass: float = 1.0) -> Robot:
+    """A chain of uniform slender rods on parallel revolute joints, in the vertical x-z plane.
+
+    At q = 0 it lies stretched out along x; with gravity along -z it falls. Angles are relative to the link before
+    and turn about +y, so positive angles point down.
+
+    Args:
+        links: Number of links and joints.
+        length: Of each link [m].
+        mass: Of each link [kg]; the rod's inertia is m l^2 / 12 about its middle.
+
+    Raises:
+        InputError: ``links`` < 1, or ``length`` or ``mass`` not positive and finite.
+    """
+    links = count("links", links, 1)
+    length, mass = positive("length", length, "m"), positive("mass", mass, "kg")
+    return rod_chain([length] * links, [mass] * links)
+
+
+def rod_chain(
+    lengths: Sequence[float],
+    masses: Sequence[float],
+    *,
+    base: Sequence[float] = (0.0, 0.0, 0.0),
+    armature: float = 0.0,
+    rail: float | None = None,
+) -> Robot:
+    """A chain like :func:`planar_chain` of unequal rods, some of them without length or mass.
+
+    Args:
+        lengths: Of the links [m], >= 0.
+        masses: Of the links [kg], >= 0.
+        base: Where the first joint is (3,) [m].
+        armature: Of every joint [kg m^2 or kg].
+        rail: Mass of a carriage that slides along x and carries the first joint [kg]; none if left out.
+
+    Raises:
+        InputError: A value is negative or not finite, or there are not as many masses as lengths, one at least.
+        SingularMassMatrix: A joint moves nothing.
+    """
+    links = count("number of lengths", len(lengths), 1)
+    sizes, weights = finite_array("lengths", lengths, (links,)), finite_array("masses", masses, (links,))
+    if (sizes < 0.0).any() or (weights < 0.0).any():
+        raise InputError("lengths and masses must be >= 0")
+    model = pin.Model()
+    model.name = f"chain{links}"
+    place = pin.SE3(np.eye(3), finite_array("base", base, (3,)))
+    joint = 0
+    if rail is not None:
+        joint = model.addJoint(joint, pin.JointModelPX(), place, "rail")
+        model.appendBodyToJoint(joint, pin.Inertia(rail, np.zeros(3), np.zeros((3, 3))), pin.SE3.Identity())
+        place = pin.SE3.Identity()
+    for k, (length, mass) in enumerate(zip(sizes, weights, strict=True)):
+        across = mass * length**2 / 12.0
+        rod = pin.Inertia(mass, np.array([0.5 * length, 0.0, 0.0]), np.diag([0.0, across, across]))
+        joint = model.addJoint(joint, pin.JointModelRY(), place, f"joint{k + 1}")
+        model.appendBodyToJoint(joint, rod, pin.SE3.Identity())
+        place = pin.SE3(np.eye(3), np.array([length, 0.0, 0.0]))
+    model.armature = np.full(model.nv, armature)
+    model.addFrame(pin.Frame("tip", joint, 0, place, pin.FrameType.OP_FRAME))
+    return load_robot(model)

@@ -1,0 +1,130 @@
+"""Where a frame is and what carries it, at many configurations at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.core import Links as Core
+from varpin.core.arrays import Tree
+from varpin.errors import InputError
+from varpin.model.robot import Robot
+from varpin.model.tree import frame_on_body
+from varpin.support.frozen import Frozen
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Links(Frozen):
+    """Some bodies of a robot's tree with all their ancestors, each on one joint.
+
+    Attributes:
+        parent: Index among these bodies (c,), -1 at a root; parents come first.
+        prismatic: 1 for a prismatic joint, 0 for a revolute one (c,).
+        rotation: Of the joint's frame in its parent's at joint position 0 (c, 3, 3).
+        translation: The same (c, 3) [m].
+        coordinate: Which one moves the joint (c,), among all n.
+        ratio: Of the joint's position to the coordinate (c,).
+        offset: The joint's position where the coordinate is 0 (c,) [rad or m].
+        mass: Of each body (c,) [kg].
+        center: Its centre of mass in its own frame (c, 3) [m].
+        dof: n.
+    """
+
+    parent: Integers
+    prismatic: Integers
+    rotation: Floats
+    translation: Floats
+    coordinate: Integers
+    ratio: Floats
+    offset: Floats
+    mass: Floats
+    center: Floats
+    dof: int
+
+    @cached_property
+    def core(self) -> Core:
+        """The same for the compiled core."""
+        return Core.make(**{name: getattr(self, name) for name in _BODY}, dof=self.dof)
+
+    @cached_property
+    def key(self) -> bytes:
+        """The same for bodies that are the same."""
+        return b"".join(getattr(self, name).tobytes() for name in _BODY)
+
+
+_BODY = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio", "offset", "mass", "center")
+
+
+def links(tree: Tree, body: int | None = None) -> Links:
+    """The bodies from the root to one of them, or all of them."""
+    if body is None:
+        members = np.arange(tree.parent.size)
+    else:
+        path = [body]
+        while tree.parent[path[-1]] >= 0:
+            path.append(int(tree.parent[path[-1]]))
+        members = np.array(path[::-1])
+    index = {int(b): k for k, b in enumerate(members)}
+    parent = np.array([index.get(int(tree.parent[b]), -1) for b in members], dtype=np.int64)
+    return Links(parent, **{name: getattr(tree, name)[members] for name in _BODY[1:]}, dof=tree.armature.size)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameKinematics(Frozen):
+    """A frame of a robot. Made by :func:`frame_kinematics`.
+
+    Attributes:
+        frame: Its name.
+        links: The bodies from the root to the one that carries it.
+        rotation: Its orientation in that body (3, 3).
+        translation: Its place there (3,) [m].
+    """
+
+    frame: str
+    links: Links
+    rotation: Floats
+    translation: Floats
+
+    @cached_property
+    def key(self) -> bytes:
+        """The same for frames that are the same."""
+        return self.links.key + self.rotation.tobytes() + self.translation.tobytes()
+
+    def placements(self, q: Floats) -> tuple[Floats, Floats]:
+        """World rotations (N, 3, 3) and positions (N, 3) [m] at q (N, n)."""
+        return self._placed(q, jacobian=False)[:2]
+
+    def jacobians(self, q: Floats) -> tuple[Floats, Floats, Floats]:
+        """:meth:`placements`, and the frame's Jacobian (N, 6, n): linear over angular velocity in world axes, in v."""
+        return self._placed(q, jacobian=True)
+
+    def _placed(self, q: Floats, *, jacobian: bool) -> tuple[Floats, Floats, Floats]:
+        return self.links.core.place_frame(self.rotation, self.translation, np.ascontiguousarray(q), jacobian)
+
+
+def frame_kinematics(robot: Robot, frame: str) -> FrameKinematics:
+    """A frame by its name.
+
+    Raises:
+        UnknownFrame: The robot has no such frame.
+        InputError: No joint moves it.
+    """
+    body, rotation, translation = frame_on_body(robot.free_model, frame, robot.name)
+    return FrameKinematics(frame, links(robot.tree, body), rotation, translation)
+
+
+def mass_carriers(robot: Robot) -> Links:
+    """The links that joints move, all of them, whose centre of mass a cost may be of.
+
+    Raises:
+        InputError: They have no mass.
+    """
+    if not robot.tree.mass.sum() > 0.0:
+        raise InputError(f"the links of robot {robot.name!r} have no mass, so no centre of it")
+    return links(robot.tree)

@@ -1,0 +1,255 @@
+"""Mimic joints: which joint follows which, and Pinocchio models with and without the tie.
+
+Pinocchio computes no RNEA derivatives on a model with mimic joints, so varpin keeps the model in which every
+joint stands on its own beside the one in which followers are tied to their leaders.
+"""
+
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from varpin.errors import RobotError
+from varpin.model.urdf import Mimic
+
+logger = logging.getLogger(__name__)
+
+# What a model has one number of for each degree of freedom.
+JOINT_PARAMETERS = (
+    "lowerVelocityLimit",
+    "upperVelocityLimit",
+    "lowerEffortLimit",
+    "upperEffortLimit",
+    "lowerDryFrictionLimit",
+    "upperDryFrictionLimit",
+    "armature",
+    "rotorInertia",
+    "rotorGearRatio",
+    "damping",
+)
+
+
+@dataclass(frozen=True)
+class Tie:
+    """Joint ``follower`` stands at ratio * (position of joint ``leader``) + offset. Joints by Pinocchio index."""
+
+    follower: int
+    leader: int
+    ratio: float
+    offset: float
+
+
+def joint_index(model: pin.Model) -> dict[str, int]:
+    """Index of each joint by name, the universe left out."""
+    return {name: i for i, name in enumerate(model.names) if i > 0}
+
+
+def ties_of(mimics: Mapping[str, Mimic], model: pin.Model) -> tuple[Tie, ...]:
+    """The ties that a URDF's mimic elements ask for.
+
+    A follower whose leader is not in the robot stays free, with a warning in the log: some published models
+    name leaders that do not exist. A leader that is itself a follower is followed to its own leader.
+
+    Raises:
+        RobotError: Joints follow each other in a loop.
+    """
+    index = joint_index(model)
+    ties: dict[int, Tie] = {}
+    for name, mimic in mimics.items():
+        if name not in index:
+            continue
+        if mimic.leader not in index:
+            logger.warning(
+                "joint %r mimics %r, which is not a moving joint of the robot: it stays free", name, mimic.leader
+            )
+            continue
+        ties[index[name]] = Tie(index[name], index[mimic.leader], mimic.ratio, mimic.offset)
+    return tuple(_to_the_end(tie, ties, model) for tie in ties.values())
+
+
+def _to_the_end(tie: Tie, ties: dict[int, Tie], model: pin.Model) -> Tie:
+    """The tie to the free joint at the end of a chain of leaders."""
+    for _ in range(len(ties) + 1):
+        if tie.leader not in ties:
+            _require_usable(tie, model)
+            return tie
+        after = ties[tie.leader]
+        tie = Tie(tie.follower, after.leader, tie.ratio * after.ratio, tie.ratio * after.offset + tie.offset)
+    raise RobotError(f"joint {model.names[tie.follower]!r} mimics itself through a loop of mimic joints")
+
+
+def _require_usable(tie: Tie, model: pin.Model) -> None:
+    """Refuse a tie that takes inertias, which count by the square of its ratio, beyond floating-point numbers."""
+    if math.isfinite(tie.ratio * tie.ratio) and math.isfinite(tie.offset):
+        return
+    raise RobotError(
+        f"joint {model.names[tie.follower]!r} mimics {model.names[tie.leader]!r} with multiplier {tie.ratio:g} and "
+        f"offset {tie.offset:g}: the offset must be finite, and the multiplier's square, by which inertia counts"
+    )
+
+
+def tied_model(model: pin.Model, ties: Sequence[Tie]) -> pin.Model:
+    """``model`` with its followers as Pinocchio mimic joints.
+
+    Raises:
+        RobotError: A leader comes after its follower, which Pinocchio cannot express.
+    """
+    for tie in ties:
+        model = pin.transformJointIntoMimic(model, tie.leader, tie.follower, tie.ratio, tie.offset)
+    return model
+
+
+def depth_first(model: pin.Model, ties: Sequence[Tie]) -> list[int]:
+    """The joints in an order that Pinocchio's algorithms can take: every subtree together, leaders before followers.
+
+    It is the order they have wherever that will do.
+
+    Raises:
+        RobotError: A follower carries its own leader, or branches follow each other crosswise.
+    """
+    parents = list(model.parents)
+
+    def ancestors(joint: int) -> list[int]:
+        path = [joint]
+        while path[-1] > 0:
+            path.append(parents[path[-1]])
+        return path
+
+    before: dict[int, set[int]] = {}
+    for tie in ties:
+        leaders, followers = ancestors(tie.leader), ancestors(tie.follower)
+        if tie.follower in leaders:
+            raise RobotError(
+                f"joint {model.names[tie.follower]!r} carries the joint it mimics, {model.names[tie.leader]!r}: "
+                "Pinocchio cannot tie them; load with mimic='free' and lock one of them"
+            )
+        if tie.leader in followers:
+            continue
+        fork = next(joint for joint in leaders if joint in followers)
+        first, then = leaders[leaders.index(fork) - 1], followers[followers.index(fork) - 1]
+        before.setdefault(then, set()).add(first)
+
+    children: list[list[int]] = [[] for _ in parents]
+    for joint in range(1, model.njoints):
+        children[parents[joint]].append(joint)
+    order, stack = [], [0]
+    while stack:
+        order.append(joint := stack.pop())
+        waiting, visits = children[joint], []
+        while waiting:
+            ready = [child for child in waiting if not before.get(child, set()) & set(waiting)]
+            if not ready:
+                raise RobotError(f"mimic joints below {model.names[joint]!r} follow each other across branches")
+            waiting.remove(ready[0])
+            visits.append(ready[0])
+        stack.extend(reversed(visits))
+    return order[1:]
+
+
+def reordered(model: pin.Model, ties: Sequence[Tie], order: Sequence[int]) -> tuple[pin.Model, tuple[Tie, ...]]:
+    """``model`` and ``ties`` with the joints in another order."""
+    place = {joint: k + 1 for k, joint in enumerate(order)}
+    moved = tuple(Tie(place[tie.follower], place[tie.leader], tie.ratio, tie.offset) for tie in ties)
+    return rebuild(model, order, lambda joint: model.joints[joint]), moved
+
+
+def untied_model(model: pin.Model) -> tuple[pin.Model, tuple[Tie, ...]]:
+    """A model without mimic joints, and the ties that ``model`` had."""
+    ties = []
+    mimics = [j for j in range(1, model.njoints) if model.joints[j].nv == 0 and "Mimic" in model.joints[j].shortname()]
+    if not mimics:
+        return model, ()
+    leaders = dict(zip(model.mimicking_joints, model.mimicked_joints, strict=True))
+
+    def free_joint(joint: int) -> pin.JointModel:
+        if joint not in mimics:
+            return model.joints[joint]
+        follower = model.joints[joint].extract()
+        if follower.scaling == 0.0:
+            raise RobotError(
+                f"joint {model.names[joint]!r} mimics {model.names[leaders[joint]]!r} with multiplier 0, and Pinocchio "
+                "then keeps no axis of it: make it a fixed joint, or load the URDF file by path"
+            )
+        data = model.joints[joint].createData()
+        model.joints[joint].calc(data, pin.neutral(model))
+        subspace = np.asarray(data.S, dtype=float).reshape(6)
+        slides = bool(subspace[:3].any())
+        axis = (subspace[:3] if slides else subspace[3:]) / follower.scaling
+        tie = Tie(joint, leaders[joint], float(follower.scaling), float(follower.offset))
+        _require_usable(tie, model)
+        ties.append(tie)
+        return pin.JointModelPrismaticUnaligned(axis) if slides else pin.JointModelRevoluteUnaligned(axis)
+
+    return rebuild(model, range(1, model.njoints), free_joint), tuple(ties)
+
+
+def joint_frames(model: pin.Model) -> list[int]:
+    """Indices of the frames that are joints' own."""
+    return [
+        index
+        for index, frame in enumerate(model.frames)
+        if frame.parentJoint and frame.type == pin.FrameType.JOINT and frame.name == model.names[frame.parentJoint]
+    ]
+
+
+def rebuild(model: pin.Model, order: Sequence[int], joint_of: Callable[[int], pin.JointModel]) -> pin.Model:
+    """``model`` with its joints added again in ``order``, each as ``joint_of`` gives it.
+
+    Links, frames, limits and armature go along. The universe is not in ``order``.
+    """
+    new = pin.Model()
+    new.name = model.name
+    new.gravity = model.gravity
+    place = {0: 0}
+    for joint in order:
+        source = joint_of(joint)
+        place[joint] = new.addJoint(
+            place[model.parents[joint]], source, model.jointPlacements[joint], model.names[joint]
+        )
+        new.appendBodyToJoint(place[joint], model.inertias[joint], pin.SE3.Identity())
+        old, copy = model.joints[joint], new.joints[place[joint]]
+        if old.nq == copy.nq:
+            for limits in ("lowerPositionLimit", "upperPositionLimit"):
+                getattr(new, limits)[copy.idx_q : copy.idx_q + copy.nq] = getattr(model, limits)[
+                    old.idx_q : old.idx_q + old.nq
+                ]
+        if old.nv == copy.nv:
+            for limits in JOINT_PARAMETERS:
+                getattr(new, limits)[copy.idx_v : copy.idx_v + copy.nv] = getattr(model, limits)[
+                    old.idx_v : old.idx_v + old.nv
+                ]
+    # Joint frames first: pin.buildReducedModel looks for a frame's joint among the frames before it.
+    old_frames = {model.frames[index].parentJoint: index for index in joint_frames(model)}
+    new_frames, frames = {0: 0}, {0: 0}
+    for joint in order:
+        new_frames[joint] = new.addJointFrame(place[joint], new_frames[model.parents[joint]])
+        if joint in old_frames:
+            frames[old_frames[joint]] = new_frames[joint]
+    for index, frame in enumerate(model.frames):
+        if index not in frames:
+            frames[index] = new.addFrame(
+                pin.Frame(
+                    frame.name,
+                    place[frame.parentJoint],
+                    frames.get(frame.parentFrame, 0),
+                    frame.placement,
+                    frame.type,
+                    pin.Inertia.Zero(),
+                ),
+                False,
+            )
+    repair_velocity_limits(new)
+    return new
+
+
+def repair_velocity_limits(model: pin.Model) -> None:
+    """Put -upper for a lower velocity limit above the upper one.
+
+    Pinocchio's addJoint sets the lower one to the largest double of the wrong sign, and its buildReducedModel then
+    refuses the model.
+    """
+    lower, upper = np.array(model.lowerVelocityLimit), np.array(model.upperVelocityLimit)
+    model.lowerVelocityLimit = np.where(lower > upper, -upper, lower)

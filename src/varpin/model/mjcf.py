@@ -1,0 +1,382 @@
+"""Reading an MJCF file: Pinocchio's parser makes the model, of a text in which nothing is left that it reads otherwise.
+
+Pinocchio drops the place of a body that hangs on the world without a joint, reads no second body on the world, no
+``<include>`` and not every default, and has the joints of a body with several as one. So the file is written out plain
+before: includes in their place, defaults at each element, rotations as quaternions, one joint a body.
+"""
+
+import logging
+import tempfile
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+from xml.parsers import expat
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from varpin.errors import RobotError
+from varpin.model.urdf import captured_stderr, decoded, parsed
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+# What makes bodies of others, and would have to be carried out here.
+_MACROS = {"attach", "composite", "flexcomp", "replicate"}
+# A frame is as good as a body without joint or mass.
+_BODIES = {"body", "frame"}
+_IN_FRAMES = {"body", "camera", "frame", "light", "site"}
+# How many numbers belong to an attribute that the model depends on.
+_SIZES = {
+    "armature": (1,), "axis": (3,), "density": (1,), "diaginertia": (3,), "frictionloss": (1,), "fromto": (6,),
+    "fullinertia": (6,), "mass": (1,), "pos": (3,), "quat": (4,), "range": (2,), "ref": (1,), "size": (1, 2, 3),
+    "xyaxes": (6,), "zaxis": (3,),
+}  # fmt: skip
+_ROTATIONS = ("quat", "euler", "axisangle", "xyaxes", "zaxis")
+# What acts on a robot beside its inertia, joint dampers and dry friction.
+_LEFT_OUT = {"equality": "equality constraints", "tendon": "tendons", "deformable": "deformable bodies"}
+
+
+@dataclass(frozen=True, eq=False)
+class Mjcf:
+    """An MJCF file, read by :func:`read_mjcf`.
+
+    Attributes:
+        path: Of the file.
+        dynamics: What Pinocchio makes a model of, as text.
+        looks: What Pinocchio makes shapes of, as text; its meshes are absolute paths.
+        remarks: What the model leaves out, in words.
+    """
+
+    path: Path
+    dynamics: str = field(repr=False)
+    looks: str = field(repr=False)
+    remarks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Reader:
+    """What holds for a whole file."""
+
+    path: Path
+    compiler: Mapping[str, str]
+    classes: Mapping[str, Mapping[str, Mapping[str, str]]]
+    left_out: Counter[str]
+
+    @property
+    def angle_unit(self) -> float:
+        """An angle of 1 in the file [rad]."""
+        return 1.0 if self.compiler.get("angle") == "radian" else np.pi / 180.0
+
+    def fault(self, what: str) -> RobotError:
+        return RobotError(f"{self.path}: {what}")
+
+    def numbers(self, element: ET.Element, key: str, sizes: tuple[int, ...]) -> NDArray[np.float64]:
+        try:
+            values = np.array([float(word) for word in element.get(key, "").split()])
+        except ValueError:
+            values = np.array([np.nan])
+        if len(values) not in sizes or not np.isfinite(values).all():
+            name = element.get("name", "")
+            size = " or ".join(map(str, sizes))
+            raise self.fault(f"<{element.tag}> {name!r}: its {key} is {element.get(key)!r}, no {size} finite number(s)")
+        return values
+
+    def resolved(self, element: ET.Element, childclass: str) -> ET.Element:
+        """A copy of an element without its children, its defaults written out."""
+        name = element.get("class", childclass)
+        if name not in self.classes:
+            raise self.fault(f"<{element.tag}> {element.get('name', '')!r}: there is no default class {name!r}")
+        own = self.turned(element)
+        given = self.classes[name].get(element.tag, {})
+        if any(key in own for key in _ROTATIONS):
+            given = {key: value for key, value in given.items() if key not in _ROTATIONS}
+        return ET.Element(element.tag, {**given, **own})
+
+    def turned(self, element: ET.Element) -> dict[str, str]:
+        """The attributes of an element, its rotation in a form that Pinocchio reads as MuJoCo does."""
+        own = {key: value for key, value in element.items() if key not in ("class", "childclass")}
+        for key in own:
+            if element.tag in ("body", "frame", "geom", "inertial", "joint") and key in _SIZES:
+                self.numbers(element, key, _SIZES[key])
+        unit = self.angle_unit
+        if "axisangle" in own:
+            *axis, angle = self.numbers(element, "axisangle", (4,))
+            length = np.linalg.norm(axis)
+            if length == 0.0:
+                raise self.fault(f"<{element.tag}> {element.get('name', '')!r}: the axis of its axisangle is 0")
+            del own["axisangle"]
+            own["quat"] = _quaternion(pin.AngleAxis(unit * angle, np.array(axis) / length).matrix())
+        elif "euler" in own:
+            sequence = self.compiler.get("eulerseq", "xyz")
+            if len(sequence) != 3 or set(sequence.lower()) - set("xyz"):
+                raise self.fault(f"eulerseq is {sequence!r}, where three of x, y and z belong")
+            rotation = np.eye(3)
+            for letter, angle in zip(sequence, self.numbers(element, "euler", (3,)), strict=True):
+                turn = pin.AngleAxis(unit * angle, np.eye(3)["xyz".index(letter.lower())]).matrix()
+                rotation = rotation @ turn if letter.islower() else turn @ rotation
+            del own["euler"]
+            own["quat"] = _quaternion(rotation)
+        return own
+
+
+def is_mjcf(path: Path) -> bool:
+    """Whether a file is one by its root element; only ``.xml`` and ``.mjcf`` files are looked into."""
+    return path.suffix in (".xml", ".mjcf") and root_tag(path) == "mujoco"
+
+
+def root_tag(path: Path) -> str:
+    """The root element of a file; empty if the file is no well-formed XML.
+
+    Raises:
+        FileError: The file cannot be read.
+    """
+    try:
+        return parsed(decoded(path)[0]).tag
+    except expat.ExpatError:
+        return ""
+
+
+def read_mjcf(path: Path) -> Mjcf:
+    """Read an MJCF file.
+
+    Raises:
+        FileError: The file, or one that it includes, cannot be read.
+        RobotError: It is no MJCF, or has what Pinocchio cannot read.
+    """
+    root = _included(path, path.parent, ())
+    compiler = {key: value for part in root.findall("compiler") for key, value in part.items()}
+    reader = _Reader(path, compiler, {}, Counter())
+    reader = _Reader(path, compiler, _classes(root, reader), reader.left_out)
+    if "settotalmass" in compiler:
+        raise reader.fault("its masses are scaled by settotalmass, which Pinocchio does not read")
+    reader.left_out["least masses and inertias"] += int(bool({"boundmass", "boundinertia"} & set(compiler)))
+    reader.left_out["balancing of inertias"] += int(compiler.get("balanceinertia") == "true")
+    for part in root.iter():
+        if part.tag in _MACROS:
+            raise reader.fault(f"it has <{part.tag}>, which Pinocchio does not read: write its bodies out")
+        other = [child.tag for child in part if part.tag == "frame" and child.tag not in _IN_FRAMES]
+        if other:
+            raise reader.fault(f"it has a <{other[0]}> in a <frame>: varpin reads those around bodies and sites")
+    for tag, what in _LEFT_OUT.items():
+        reader.left_out[what] += sum(len(part) for part in root.findall(tag))
+    texts = []
+    try:
+        for dynamics in (True, False):
+            plain = ET.Element("mujoco", {"model": root.get("model", path.stem)})
+            ET.SubElement(plain, "compiler", {"angle": "radian", "autolimits": compiler.get("autolimits", "true")})
+            if not dynamics:
+                plain.append(_assets(root, reader))
+            world = ET.SubElement(plain, "worldbody")
+            # Pinocchio takes the first body for the world, and reads no other.
+            stand = ET.SubElement(world, "body", {"name": "world"})
+            for part in root.iterfind("worldbody/*"):
+                if part.tag in _BODIES:
+                    stand.append(_body(part, "main", reader, moving=False, dynamics=dynamics))
+                elif part.tag == "site" or (part.tag == "geom" and not dynamics):
+                    stand.append(reader.resolved(part, "main"))
+            keys = ET.SubElement(plain, "keyframe")
+            keys.extend(part for part in root.iterfind("keyframe/key") if part.get("qpos") and part.get("name"))
+            texts.append(ET.tostring(plain, encoding="unicode"))
+    except RecursionError:
+        raise reader.fault("its bodies are nested too deep") from None
+    found = [f"{what} ({count})" for what, count in reader.left_out.items() if count]
+    remarks = (f"{path} has {', '.join(found)}, which the model leaves out",) if found else ()
+    return Mjcf(path, texts[0], texts[1], remarks)
+
+
+def build_mjcf_model(path: Path, text: str) -> pin.Model:
+    """Pinocchio's model of a file.
+
+    Args:
+        path: Of the file.
+        text: Its dynamics, or its looks, whose joints are the same and whose masses are not.
+
+    Raises:
+        RobotError: Pinocchio cannot read it.
+    """
+    return _read(path, text, pin.buildModelFromMJCF)
+
+
+def build_mjcf_shapes(path: Path, looks: str, model: pin.Model) -> pin.GeometryModel:
+    """The visual geometry of a file, as Pinocchio reads it.
+
+    Args:
+        path: Of the file.
+        looks: As in :class:`Mjcf`.
+        model: From :func:`build_mjcf_model`.
+
+    Raises:
+        RobotError: A mesh is missing or cannot be read; the message names it.
+    """
+    root = parsed(looks)
+    files = {part.get("name", ""): part.get("file", "") for part in root.iterfind("asset/mesh")}
+    absent = {name: file for name, file in files.items() if file and not Path(file).is_file()}
+    lacking = {
+        body.get("name", ""): ", ".join(absent[mesh] for geom in geoms if (mesh := geom.get("mesh", "")) in absent)
+        for body in root.iter("body")
+        if (geoms := body.findall("geom"))
+    }
+    if told := "; ".join(f"link {name!r}: {what}" for name, what in lacking.items() if what):
+        raise RobotError(f"meshes of {path} are not there: {told}")
+    return _read(path, looks, lambda file: pin.buildGeomFromMJCF(model, file, pin.GeometryType.VISUAL))
+
+
+def _read(path: Path, text: str, read: Callable[[str], T]) -> T:
+    """What Pinocchio's parser, which takes files alone, makes of a text."""
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder, "plain.xml")
+        plain.write_text(text, encoding="utf-8")
+        with captured_stderr() as complaints:
+            try:
+                result = read(str(plain))
+            except (ValueError, RuntimeError, IndexError) as error:
+                detail = "; ".join(complaints()) or " ".join(str(error).rpartition("message:")[2].split())
+                raise RobotError(f"{path} is no MJCF that Pinocchio can read: {detail}") from None
+            for line in complaints():
+                logger.warning("%s: %s", path, line)
+    return result
+
+
+def _included(path: Path, folder: Path, above: tuple[Path, ...]) -> ET.Element:
+    """The root element of a file, with those of the files that it includes in their places."""
+    if path in above:
+        raise RobotError(f"{path} includes itself")
+    try:
+        root = parsed(decoded(path)[0])
+    except expat.ExpatError as error:
+        raise RobotError(f"{path} is not an MJCF: it is not well-formed XML: {error}") from None
+    if root.tag not in ("mujoco", "mujocoinclude"):
+        raise RobotError(f"{path} is not an MJCF: its root element is <{root.tag}>, not <mujoco>")
+    for parent in root.iter():
+        parts = list(parent)
+        for index in reversed([k for k, part in enumerate(parts) if part.tag == "include"]):
+            file = folder / parts[index].get("file", "")
+            parent[index : index + 1] = list(_included(file, folder, (*above, path)))
+    return root
+
+
+def _classes(root: ET.Element, reader: _Reader) -> dict[str, dict[str, dict[str, str]]]:
+    """The attributes of each default class by tag, those of the classes around it included."""
+    classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
+
+    def read(element: ET.Element, name: str, around: Mapping[str, Mapping[str, str]]) -> None:
+        own = {tag: dict(values) for tag, values in around.items()}
+        for part in element:
+            if part.tag != "default":
+                own.setdefault(part.tag, {}).update(reader.turned(part))
+        classes[name] = own
+        for part in element.findall("default"):
+            read(part, part.get("class", ""), own)
+
+    for top in root.findall("default"):
+        read(top, "main", classes["main"])
+        classes[top.get("class", "main")] = classes["main"]
+    return classes
+
+
+def _assets(root: ET.Element, reader: _Reader) -> ET.Element:
+    assets = ET.Element("asset")
+    folders = {
+        tag: reader.path.parent / reader.compiler.get(key, reader.compiler.get("assetdir", ""))
+        for tag, key in (("mesh", "meshdir"), ("texture", "texturedir"))
+    }
+    for part in root.iterfind("asset/*"):
+        if part.tag in ("mesh", "texture", "material"):
+            plain = reader.resolved(part, "main")
+            if plain.get("file"):
+                plain.set("name", plain.get("name", Path(plain.get("file", "")).stem))
+                plain.set("file", str(folders[part.tag] / plain.get("file", "")))
+            assets.append(plain)
+    return assets
+
+
+def _body(body: ET.Element, childclass: str, reader: _Reader, *, moving: bool, dynamics: bool) -> ET.Element:
+    """A body written out plain; several joints as a chain of bodies, the last of which is the body itself."""
+    childclass = body.get("childclass", childclass)
+    whole = reader.turned(body)
+    if dynamics and "gravcomp" in whole and reader.numbers(body, "gravcomp", (1,)).any():
+        reader.left_out["gravity compensation"] += 1
+    name = whole.pop("name", "")
+    top = last = ET.Element("body", whole)
+    joints = [_joint(part, childclass, reader, dynamics) for part in body if part.tag in ("joint", "freejoint")]
+    for k, joint in enumerate(joints):
+        last.append(joint)
+        if k < len(joints) - 1:
+            last.set("name", f"{name}:{joint.get('name', k)}")
+            last = ET.SubElement(last, "body")
+    if name:
+        last.set("name", name)
+    moving = moving or bool(joints)
+    # Lists, as an error in a generator would come out as a TypeError.
+    last.extend([reader.resolved(part, childclass) for part in body.findall("site")])
+    if not dynamics:
+        last.extend([reader.resolved(part, childclass) for part in body.findall("geom")])
+    elif moving:
+        last.extend(_masses(body, name, childclass, reader))
+    parts = [part for part in body if part.tag in _BODIES]
+    last.extend([_body(part, childclass, reader, moving=moving, dynamics=dynamics) for part in parts])
+    return top
+
+
+def _joint(joint: ET.Element, childclass: str, reader: _Reader, dynamics: bool) -> ET.Element:
+    plain = reader.resolved(joint, childclass)
+    if plain.get("limited") == "false":
+        plain.attrib.pop("range", None)
+    # Pinocchio takes the range of a slide for degrees, too, and the position of reference off every range.
+    unit = 1.0 if plain.get("type") == "slide" else reader.angle_unit
+    ref = np.zeros(1)
+    if "ref" in plain.attrib:
+        ref = unit * reader.numbers(plain, "ref", (1,))
+        plain.set("ref", repr(float(ref[0])))
+    if "range" in plain.attrib:
+        numbers = unit * reader.numbers(plain, "range", (2,)) + ref
+        plain.set("range", " ".join(repr(float(number)) for number in numbers))
+    # Linear coefficients, and from MuJoCo 4 on those of higher powers.
+    stiffness, damping = (
+        reader.numbers(plain, key, (1, 2, 3)) if key in plain.attrib else np.zeros(1)
+        for key in ("stiffness", "damping")
+    )
+    plain.set("damping", repr(float(damping[0])))
+    if dynamics:
+        reader.left_out["joint springs"] += int(stiffness.any())
+        reader.left_out["nonlinear joint dampers"] += int(damping[1:].any())
+    return plain
+
+
+def _masses(body: ET.Element, name: str, childclass: str, reader: _Reader) -> list[ET.Element]:
+    """The inertia of a body that moves, or the shapes that it follows from."""
+    inertial, from_shapes = body.find("inertial"), reader.compiler.get("inertiafromgeom", "auto")
+    lowest, highest = reader.numbers(
+        ET.Element("compiler", {"inertiagrouprange": "0 5", **reader.compiler}), "inertiagrouprange", (2,)
+    )
+    geoms = [reader.resolved(geom, childclass) for geom in body.findall("geom")]
+    for plain in geoms:
+        plain.attrib = {"density": "1000", "group": "0", **plain.attrib}
+    geoms = [plain for plain in geoms if lowest <= reader.numbers(plain, "group", (1,)) <= highest]
+    if inertial is not None and not (from_shapes == "true" and geoms):
+        if "mass" not in inertial.attrib or not {"diaginertia", "fullinertia"} & set(inertial.attrib):
+            raise reader.fault(f"body {name!r}: its <inertial> has no mass, or neither diaginertia nor fullinertia")
+        return [ET.Element("inertial", reader.turned(inertial))]
+    shapes = []
+    for plain in geoms if from_shapes != "false" else ():
+        if reader.numbers(plain, "mass" if "mass" in plain.attrib else "density", (1,)) == 0.0:
+            continue
+        if plain.get("mesh") or plain.get("type") in ("mesh", "sdf", "hfield"):
+            raise reader.fault(
+                f"body {name!r} has no <inertial>, and its mass follows from a mesh, which Pinocchio takes otherwise "
+                "than MuJoCo: give it an <inertial>, from body_mass, body_ipos, body_iquat and body_inertia of MuJoCo"
+            )
+        shapes.append(plain)
+    return shapes
+
+
+def _quaternion(rotation: NDArray[np.float64]) -> str:
+    """(w, x, y, z) of a rotation matrix, as text."""
+    q = pin.Quaternion(rotation)
+    return " ".join(map(repr, (float(q.w), float(q.x), float(q.y), float(q.z))))

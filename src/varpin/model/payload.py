@@ -1,0 +1,82 @@
+"""Loads that a robot carries, as part of the link they hang on."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.errors import InputError, UnknownFrame
+from varpin.support.checks import as_floats, finite_array, real, require_finite
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Payload:
+    """A rigid body fastened to a frame of the robot.
+
+    Attributes:
+        frame: Name of the frame.
+        mass: [kg], > 0.
+        center: Its centre of mass (3,) in the frame [m].
+        inertia: About its centre of mass, in the frame's axes [kg m^2]: 0 for a point mass, (3,) principal moments
+            along the axes, or (3, 3).
+    """
+
+    frame: str
+    mass: float
+    center: ArrayLike = (0.0, 0.0, 0.0)
+    inertia: ArrayLike = 0.0
+
+    def __post_init__(self) -> None:
+        mass = real("payload mass", self.mass)
+        if not (np.isfinite(mass) and mass > 0.0):
+            raise InputError(f"payload mass must be positive and finite [kg], got {self.mass}")
+        finite_array("payload center", self.center, (3,))
+        self.moments()
+
+    def moments(self) -> Floats:
+        """The inertia as a matrix (3, 3).
+
+        Raises:
+            InputError: It is no inertia of a rigid body: not symmetric, negative, or against the triangle inequality.
+        """
+        given = require_finite("payload inertia", as_floats("payload inertia", self.inertia))
+        if given.shape not in ((), (3,), (3, 3)) or (given.ndim == 0 and given != 0.0):
+            raise InputError(
+                "payload inertia must be 0, three principal moments or a matrix (3, 3), got "
+                + (f"{given:g}" if given.ndim == 0 else f"shape {given.shape}")
+            )
+        matrix = given * np.eye(3) if given.ndim < 2 else given
+        size = float(np.abs(matrix).max())
+        if np.abs(matrix - matrix.T).max() > 1e-9 * size:
+            raise InputError("payload inertia must be symmetric")
+        moments = np.linalg.eigvalsh(matrix)
+        if moments[0] < -1e-9 * size or moments[0] + moments[1] < moments[2] - 1e-3 * size:
+            raise InputError(
+                "payload inertia is of no rigid body: principal moments must be >= 0, and none larger than the other "
+                f"two together, got {', '.join(f'{moment:g}' for moment in moments)}"
+            )
+        return np.asarray(matrix)
+
+
+def carry(model: pin.Model, payload: Sequence[Payload], robot: str) -> None:
+    """Add loads to the links of ``model`` that they hang on.
+
+    Raises:
+        UnknownFrame: The model has no such frame.
+        InputError: The frame does not move.
+    """
+    for load in payload:
+        if not isinstance(load, Payload):
+            raise InputError(f"payload must be of varpin.Payload, got {type(load).__name__}")
+        names = [frame.name for frame in model.frames]
+        if load.frame not in names:
+            raise UnknownFrame(load.frame, names, robot)
+        frame = model.frames[names.index(load.frame)]
+        if frame.parentJoint == 0:
+            raise InputError(f"payload of robot {robot!r}: frame {load.frame!r} is part of the base, which carries it")
+        body = pin.Inertia(float(load.mass), np.array(load.center, dtype=float), load.moments())
+        model.appendBodyToJoint(frame.parentJoint, body, frame.placement)

@@ -1,0 +1,626 @@
+"""The robot: a Pinocchio model, its generalized coordinates, and the tree that the core runs on."""
+
+import logging
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.core.arrays import Tree
+from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint, UnknownPosture
+from varpin.model.inertia import faults
+from varpin.model.mimic import Tie, joint_index, rebuild, tied_model
+from varpin.model.mjcf import build_mjcf_model, build_mjcf_shapes
+from varpin.model.payload import Payload, carry
+from varpin.model.sources import Description, describe, hang_shapes
+from varpin.model.srdf import Posture, of_joints
+from varpin.model.tree import (
+    flatten,
+    frame_index,
+    frame_on_body,
+    is_unbounded,
+    joint_axis,
+    place_on_body,
+    to_pinocchio,
+    tree_mass_matrix,
+)
+from varpin.model.urdf import build_model, build_shapes, missing_meshes, read_urdf, tell_missing
+from varpin.support.checks import JointValues, as_floats, is_one_of, joint_array, require_finite
+from varpin.support.frozen import Frozen
+from varpin.support.markup import facts, listed, table
+
+Floats = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Robot(Frozen):
+    """An arm in generalized coordinates. Made by :func:`load_robot`.
+
+    The n coordinates are the positions of the joints that are neither locked, fixed nor mimicking, in
+    Pinocchio's order: an angle [rad] for a revolute or continuous joint, a displacement [m] for a prismatic one.
+
+    Attributes:
+        name: Where it came from, in a word.
+        model: The Pinocchio model, mimic joints tied to their leaders; ``model.nv == dof``. A continuous joint
+            takes two entries of Pinocchio's configuration: see :meth:`configuration`.
+        joint_names: The joints that are coordinates, in order.
+        free_model: The same with mimic joints on their own, on which Pinocchio computes every derivative.
+        ties: The mimic joints, by index in ``free_model``.
+        tree: Flat arrays for the core.
+        locked: Joints that were locked, and where.
+        urdf: The URDF or xacro file the robot was read from, or None.
+        expanded: The URDF that a xacro file stands for, or what the shapes of an MJCF file are made of.
+        mjcf: The MJCF file the robot was read from, or None.
+        package_dirs: Where its meshes are looked up.
+        visuals: Geometry that came with a RobotWrapper, locked like the model, or None.
+        group_states: What :meth:`posture` reads.
+    """
+
+    name: str
+    model: pin.Model
+    joint_names: tuple[str, ...]
+    free_model: pin.Model = field(repr=False)
+    ties: tuple[Tie, ...] = field(repr=False)
+    tree: Tree = field(repr=False)
+    locked: Mapping[str, float | tuple[float, ...]] = field(default_factory=lambda: MappingProxyType({}))
+    urdf: Path | None = None
+    expanded: str | None = field(default=None, repr=False)
+    mjcf: Path | None = None
+    package_dirs: tuple[str, ...] = field(default=(), repr=False)
+    visuals: pin.GeometryModel | None = field(default=None, repr=False)
+    group_states: tuple[Posture, ...] = field(default=(), repr=False)
+
+    def __repr__(self) -> str:
+        held = f", {len(self.locked)} locked" if self.locked else ""
+        return f"Robot({self.name}: {', '.join(self.joint_names)}{held})"
+
+    def _repr_html_(self) -> str:
+        lower, upper = self.position_limits
+        columns = zip(self.joint_names, lower, upper, self.velocity_limit, self.effort_limit, strict=True)
+        rows: list[tuple[str, object]] = [
+            ("joints that move", self.dof),
+            ("mass that moves [kg]", float(self.tree.mass.sum())),
+        ]
+        if self.locked:
+            rows.append(("locked", listed(self.locked)))
+        if self.ties:
+            rows.append(("tied to others", listed(self.free_model.names[tie.follower] for tie in self.ties)))
+        rows.append(("end effector", self.end_effector))
+        head = ("joint", "lower [rad or m]", "upper", "velocity [1/s]", "torque [N m or N]")
+        return facts(f"Robot {self.name}", rows, table(head, [(name, *map(float, row)) for name, *row in columns]))
+
+    @property
+    def dof(self) -> int:
+        """n, the number of generalized coordinates."""
+        return len(self.joint_names)
+
+    def coordinate(self, joint: str) -> int:
+        """Index of a joint among the coordinates.
+
+        Raises:
+            UnknownJoint: The robot has no such coordinate.
+        """
+        if joint not in self.joint_names:
+            raise UnknownJoint(joint, self.joint_names, f"robot {self.name!r}")
+        return self.joint_names.index(joint)
+
+    @property
+    def postures(self) -> tuple[str, ...]:
+        """Names of the postures that :meth:`posture` knows."""
+        return tuple(dict.fromkeys(state.name for state in self.group_states))
+
+    def posture(self, name: str, *, group: str | None = None, others: JointValues = 0.0) -> Floats:
+        """A posture of the robot's SRDF file (its ``group_state``), or a reference configuration of its model.
+
+        Joints of the posture that are no coordinates here (locked, mimicking, or of a part that the robot has not) are
+        passed over.
+
+        Main args:
+            name: Of the posture: ``"home"``.
+
+        Other Args:
+            group: The group of joints whose posture is meant, where several have one of that name; left out, the
+                postures of all of them together.
+            others: Positions of the joints of which the posture says nothing: a number, (n,), or by joint name
+                [rad or m].
+
+        Returns:
+            Configuration (n,) [rad or m].
+
+        Raises:
+            UnknownPosture: There is none of that name; the message lists the names.
+            InputError: There is none of that group, or groups put a joint in two places.
+            UnknownJoint: ``others`` names a joint that is not there.
+        """
+        q = joint_array("others", others, self.joint_names, uniform=True)
+        found = [state for state in self.group_states if state.name == name]
+        if not found:
+            raise UnknownPosture(name, self.postures, self.name)
+        groups = ", ".join(state.group for state in found)
+        if group is not None and not (found := [state for state in found if state.group == group]):
+            raise InputError(f"posture {name!r} is one of the groups {groups}; there is none of group {group!r}")
+        placed: dict[str, float] = {}
+        for joint, position in (entry for state in found for entry in state.positions):
+            if joint in self.joint_names:
+                if placed.setdefault(joint, position) != position:
+                    raise InputError(
+                        f"the postures {name!r} put joint {joint!r} in two places: give group=, of {groups}"
+                    )
+                q[self.coordinate(joint)] = position
+        return q
+
+    def configuration(self, q: ArrayLike) -> Floats:
+        """``q`` (..., n) as Pinocchio configurations (..., model.nq) of ``model``.
+
+        Raises:
+            InputError: The last dimension of ``q`` is not n.
+        """
+        q = as_floats("q", q)
+        if q.shape[-1:] != (self.dof,):
+            raise InputError(f"q must have shape (..., {self.dof}), got {q.shape}")
+        return self._spread(self.model, q)
+
+    def free_positions(self, q: ArrayLike) -> Floats:
+        """``q`` (..., n) as configurations (..., free_model.nq) of ``free_model``."""
+        q = np.asarray(q, dtype=float)
+        positions = q[..., self.tree.coordinate] * self.tree.ratio + self.tree.offset
+        return to_pinocchio(self.free_model, positions)
+
+    def free_velocities(self, v: ArrayLike) -> Floats:
+        """``v`` (..., n) as velocities (..., free_model.nv) of ``free_model``: linear in v."""
+        return np.asarray(v, dtype=float)[..., self.tree.coordinate] * self.tree.ratio
+
+    @property
+    def end_effector(self) -> str:
+        """Name of the last frame on the joint that has the most joints before it; the last of such joints."""
+        depths = [len(path) for path in self.free_model.supports]
+        last = max(range(self.free_model.njoints), key=lambda j: (depths[j], j))
+        return str([frame.name for frame in self.free_model.frames if frame.parentJoint == last][-1])
+
+    def frame_positions(self, q: ArrayLike, frame: str | None = None) -> Floats:
+        """Positions [m] in the world of a frame, or of :attr:`end_effector`: (N, 3) at ``q`` (N, n), (3,) at one (n,).
+
+        Raises:
+            InputError: ``q`` is neither (N, n) nor (n,), or there is no such frame.
+        """
+        q = as_floats("q", q)
+        if q.ndim not in (1, 2) or q.shape[-1] != self.dof:
+            raise InputError(f"q must have shape (N, {self.dof}) or ({self.dof},), got {q.shape}")
+        name = self.end_effector if frame is None else frame
+        found = self.free_model.frames[frame_index(self.free_model, name, self.name)]
+        rows = np.atleast_2d(q)
+        if found.parentJoint == 0:
+            positions = np.tile(found.placement.translation, (len(rows), 1))
+        else:
+            body, _, place = frame_on_body(self.free_model, name, self.name)
+            positions = place_on_body(self.tree, rows, body, place)
+        return np.asarray(positions.reshape(*q.shape[:-1], 3), dtype=np.float64)
+
+    @property
+    def unbounded(self) -> NDArray[np.bool_]:
+        """Which coordinates (n,) are angles without limits."""
+        index = joint_index(self.model)
+        slides = np.array([joint_axis(self.model, index[name])[0] for name in self.joint_names])
+        lower, upper = self.position_limits
+        return ~slides & np.isinf(lower) & np.isinf(upper)
+
+    @cached_property
+    def position_limits(self) -> tuple[Floats, Floats]:
+        """Lower and upper bounds (n,), (n,) [rad or m]; infinite where there are none.
+
+        Where both are 0, which is how a URDF has it that gives none, there are none; to hold a joint still, lock it.
+        """
+        lower, upper = np.full(self.dof, -np.inf), np.full(self.dof, np.inf)
+        joints, lowest, highest = self.model.joints, self.model.lowerPositionLimit, self.model.upperPositionLimit
+        for c, name in enumerate(self.joint_names):
+            joint = joints[self.model.getJointId(name)]
+            if joint.nq == 1:
+                lower[c], upper[c] = lowest[joint.idx_q], highest[joint.idx_q]
+        # Pinocchio writes the absence of a limit as the largest double, a URDF as 0 and 0.
+        none = (lower == 0.0) & (upper == 0.0)
+        lower[none | (lower <= -1e300)], upper[none | (upper >= 1e300)] = -np.inf, np.inf
+        for limit in (lower, upper):
+            limit.setflags(write=False)
+        return lower, upper
+
+    @cached_property
+    def velocity_limit(self) -> Floats:
+        """Bound (n,) [rad/s or m/s]; infinite where there is none, or one of 0."""
+        return self._limit("velocityLimit")
+
+    @cached_property
+    def effort_limit(self) -> Floats:
+        """Bound (n,) [N m or N]; infinite where there is none, or one of 0."""
+        return self._limit("effortLimit")
+
+    @property
+    def damping(self) -> Floats:
+        """Viscous damping that the description gives (n,) [N m s/rad or N s/m]; ``Scene(damping="robot")`` takes it.
+
+        With that of mimic joints, which their leaders move.
+        """
+        return self._felt(self.free_model.damping, self.tree.ratio**2)
+
+    @cached_property
+    def slides(self) -> NDArray[np.bool_]:
+        """Which coordinates make a body slide (n,), the follower of a mimic joint too."""
+        sliding = np.zeros(self.dof, dtype=bool)
+        sliding[self.tree.coordinate[self.tree.prismatic > 0]] = True
+        sliding.setflags(write=False)
+        return sliding
+
+    def built_like(self, other: "Robot") -> bool:
+        """Whether another robot's joints lie as this one's do, but for rounding; masses may differ."""
+        own, its = self.tree, other.tree
+        if self is other or own is its:
+            return True
+        exact = ("parent", "prismatic", "coordinate")
+        near = ("rotation", "translation", "ratio", "offset")
+        return all(np.array_equal(getattr(own, name), getattr(its, name)) for name in exact) and all(
+            np.allclose(getattr(own, name), getattr(its, name), rtol=1e-6, atol=1e-9) for name in near
+        )
+
+    @property
+    def friction(self) -> Floats:
+        """Dry friction that the description gives (n,) [N m or N]; ``CoulombFriction(robot.friction)`` takes it."""
+        return self._felt(self.free_model.friction, np.abs(self.tree.ratio))
+
+    def _felt(self, values: ArrayLike, weights: Floats) -> Floats:
+        """What the coordinates (n,) feel of what the joints of ``free_model`` have, each with its weight."""
+        felt = np.bincount(self.tree.coordinate, np.asarray(values, dtype=float) * weights, minlength=self.dof)
+        return np.asarray(felt, dtype=np.float64)
+
+    def _limit(self, attribute: str) -> Floats:
+        index = joint_index(self.model)
+        values = np.asarray(getattr(self.model, attribute), dtype=float)
+        limit = np.array([values[self.model.joints[index[name]].idx_v] for name in self.joint_names])
+        # Pinocchio writes the absence of a limit as the largest double or as infinity, a URDF as 0.
+        limit = np.where((limit >= 1e300) | ~(limit > 0.0), np.inf, limit)
+        limit.setflags(write=False)
+        return limit
+
+    def _spread(self, model: pin.Model, q: Floats) -> Floats:
+        configuration = np.empty((*q.shape[:-1], model.nq))
+        index = joint_index(model)
+        for c, name in enumerate(self.joint_names):
+            joint = model.joints[index[name]]
+            if joint.nq == 2:
+                configuration[..., joint.idx_q], configuration[..., joint.idx_q + 1] = (
+                    np.cos(q[..., c]),
+                    np.sin(q[..., c]),
+                )
+            else:
+                configuration[..., joint.idx_q] = q[..., c]
+        return configuration
+
+
+def load_robot(
+    source: "str | os.PathLike[str] | pin.Model | pin.RobotWrapper",
+    *,
+    package_dirs: Sequence[str | os.PathLike[str]] | None = None,
+    lock: Mapping[str, ArrayLike] | None = None,
+    mimic: Literal["tied", "free"] = "tied",
+    payload: Payload | Sequence[Payload] = (),
+    xacro_args: Mapping[str, object] | None = None,
+    srdf: str | os.PathLike[str] | None = None,
+) -> Robot:
+    """Load an arm.
+
+    Any URDF that Pinocchio reads will do. What a file leaves out, and inertias that no body can have, are told in the
+    log with the link and its numbers.
+
+    Main args:
+        source: Path of a URDF file, of a xacro file (``arm.urdf.xacro``) that stands for one, or of an MJCF file
+            (``arm.xml``); name of a bundled robot (``"finger"``); name of a fixed-base robot of example-robot-data
+            (``"ur5"``); name of a robot of the package robot_descriptions (``"iiwa14_description"``), which downloads
+            it on first use; a ``pin.Model``; or a ``RobotWrapper``. :func:`varpin.robot_names` lists the names that
+            need no download.
+        lock: Joints to hold still, by name, and where: ``{"panda_finger_joint1": 0.02}`` [rad or m]. They are
+            removed before anything is computed. A joint that is not one-axis (a free-flyer, say) takes its
+            Pinocchio configuration.
+
+    Other Args:
+        package_dirs: Where ``package://`` mesh paths, and ``$(find package)`` in xacro files, are looked up. The
+            file's own folder, and those beside the ROS packages that it lies in, are always searched.
+        mimic: ``"tied"`` moves a mimic joint with its leader; ``"free"`` makes it a coordinate of its own.
+        payload: What the robot carries; it becomes part of the links that it hangs on.
+        xacro_args: Arguments of a xacro file by name: ``{"prefix": "left_"}``.
+        srdf: The SRDF file, or the xacro file of one, that :meth:`Robot.posture` reads; left out, the one of the file's
+            name in its folder or in a folder ``srdf`` beside that, if there is one.
+
+    Returns:
+        The robot, its geometry not yet read.
+
+    Raises:
+        RobotNotFound: No such file or name; close matches are listed.
+        RobotError: The file is not a URDF, its XML is broken, or a mass, an inertia or a mimic multiplier is no
+            number of use. Of a URDF only what Pinocchio does not read: masses and inertias that it leaves out, and
+            negative ones, are told in the log.
+        UnsupportedJoint: A joint has no single axis (free-flyer, spherical, planar, screw).
+        UnknownJoint: ``lock`` names a joint that is not there.
+        UnknownFrame: A payload hangs on a frame that is not there.
+        MissingDependency: A xacro file needs the package xacro (extra ``xacro``); a name needs robot_descriptions
+            (extra ``descriptions``).
+        InputError: A xacro file has no argument of that name.
+        SingularMassMatrix: A joint moves no inertia, or a negative one.
+    """
+    robot, description = _built(source, package_dirs, lock, mimic, payload, xacro_args, srdf)
+    for remark in (*description.remarks, *faults(robot.free_model, description.inertials)):
+        logger.warning("robot %r: %s", robot.name, remark)
+    check_inertia(robot)
+    return robot
+
+
+def build_robot(
+    source: object,
+    *,
+    package_dirs: Sequence[str | os.PathLike[str]] | None = None,
+    lock: Mapping[str, ArrayLike] | None = None,
+    mimic: Literal["tied", "free"] = "tied",
+    payload: Payload | Sequence[Payload] = (),
+    xacro_args: Mapping[str, object] | None = None,
+    srdf: str | os.PathLike[str] | None = None,
+) -> Robot:
+    """:func:`load_robot` without its checks of inertia, for looking into faulty models."""
+    return _built(source, package_dirs, lock, mimic, payload, xacro_args, srdf)[0]
+
+
+def _built(
+    source: object,
+    package_dirs: Sequence[str | os.PathLike[str]] | None,
+    lock: Mapping[str, ArrayLike] | None,
+    mimic: Literal["tied", "free"],
+    payload: Payload | Sequence[Payload],
+    xacro_args: Mapping[str, object] | None,
+    srdf: str | os.PathLike[str] | None,
+) -> tuple[Robot, Description]:
+    """The robot, and what its source says."""
+    if not is_one_of(mimic, ("tied", "free")):
+        raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
+    description = describe(source, package_dirs, mimic=mimic == "tied", xacro_args=xacro_args, srdf=srdf)
+    carry(description.model, (payload,) if isinstance(payload, Payload) else payload, description.name)
+    names = list(description.model.names)
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise RobotError(f"robot {description.name!r} has several joints named {', '.join(map(repr, twice))}")
+    if mimic == "free":
+        description = replace(description, ties=())
+    model, ties, visuals, locked = _lock(description, lock)
+    unwound = _unwound(model, ties)
+    if visuals is not None:
+        hang_shapes(visuals, model, unwound)
+    model = unwound
+    followers = {tie.follower for tie in ties}
+    coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
+    if not coordinates:
+        raise RobotError(f"robot {description.name!r} has no joint that moves")
+    tree = flatten(model, ties, coordinates)
+    robot = Robot(
+        name=description.name,
+        model=tied_model(model, ties),
+        joint_names=tuple(model.names[joint] for joint in coordinates),
+        free_model=model,
+        ties=ties,
+        tree=tree,
+        locked=MappingProxyType(locked),
+        urdf=description.urdf,
+        expanded=description.expanded,
+        mjcf=description.mjcf,
+        package_dirs=description.package_dirs,
+        visuals=visuals,
+        group_states=of_joints(description.postures, description.model.names),
+    )
+    return robot, description
+
+
+def _lock(
+    description: Description, lock: Mapping[str, ArrayLike] | None
+) -> tuple[pin.Model, tuple[Tie, ...], pin.GeometryModel | None, dict[str, float | tuple[float, ...]]]:
+    """Remove the locked joints, and the followers of locked leaders, from model, ties and geometry."""
+    model, visuals = description.model, description.visuals
+    index = joint_index(model)
+    leaders = {tie.follower: tie for tie in description.ties}
+    if not isinstance(lock or {}, Mapping):
+        raise InputError(f"lock must map joint names to positions, as in {{'elbow': 0.5}}, got {lock!r}")
+    reference = pin.neutral(model)
+    locked: dict[str, float | tuple[float, ...]] = {}
+    positions: dict[int, Floats] = {}
+    for name, value in (lock or {}).items():
+        if name not in index:
+            raise UnknownJoint(str(name), index, f"lock of robot {description.name!r}")
+        joint = index[name]
+        if joint in leaders:
+            leader = model.names[leaders[joint].leader]
+            raise InputError(f"lock: joint {name!r} mimics {leader!r}; lock {leader!r}, and it is locked along")
+        positions[joint] = _locked_position(model, joint, value)
+        locked[name] = float(positions[joint][0]) if positions[joint].size == 1 else tuple(positions[joint].tolist())
+    for tie in description.ties:
+        if tie.leader in positions:
+            positions[tie.follower] = tie.ratio * positions[tie.leader] + tie.offset
+            locked[model.names[tie.follower]] = float(positions[tie.follower][0])
+    if not positions:
+        return model, description.ties, visuals, {}
+    for joint, position in positions.items():
+        kind = model.joints[joint]
+        if is_unbounded(model, joint):
+            reference[kind.idx_q : kind.idx_q + 2] = np.cos(position[0]), np.sin(position[0])
+        else:
+            reference[kind.idx_q : kind.idx_q + kind.nq] = position
+    joints = sorted(positions)
+    if visuals is None:
+        reduced = pin.buildReducedModel(model, joints, reference)
+    else:
+        reduced, visuals = pin.buildReducedModel(model, visuals, joints, reference)
+        hang_shapes(visuals, reduced, reduced)
+    reduced.gravity = model.gravity
+    left = joint_index(reduced)
+    ties = tuple(
+        Tie(left[model.names[tie.follower]], left[model.names[tie.leader]], tie.ratio, tie.offset)
+        for tie in description.ties
+        if tie.follower not in positions
+    )
+    return reduced, ties, visuals, locked
+
+
+def _unwound(model: pin.Model, ties: tuple[Tie, ...]) -> pin.Model:
+    """``model`` with the continuous joints among leaders and followers as plain revolute ones without limits.
+
+    A (cos, sin) pair forgets whole turns, which a gear does not; and Pinocchio ties no such joint to one of another
+    kind.
+    """
+    geared = {joint for tie in ties for joint in (tie.leader, tie.follower) if is_unbounded(model, joint)}
+    if not geared:
+        return model
+
+    def joint_of(joint: int) -> pin.JointModel:
+        if joint in geared:
+            return pin.JointModelRevoluteUnaligned(joint_axis(model, joint)[1])
+        return model.joints[joint]
+
+    return rebuild(model, range(1, model.njoints), joint_of)
+
+
+def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
+    kind, name = model.joints[joint], f"lock[{model.names[joint]!r}]"
+    size = 1 if kind.nv == 1 else kind.nq
+    position = np.atleast_1d(as_floats(name, value))
+    if position.shape != (size,):
+        raise InputError(f"{name} must have {size} value(s), got shape {position.shape}")
+    require_finite(name, position)
+    if kind.nv > 1:
+        reference = pin.neutral(model)
+        reference[kind.idx_q : kind.idx_q + kind.nq] = position
+        if not pin.isNormalized(model, reference, 1e-6):
+            raise InputError(
+                f"{name} must be a configuration of a {kind.shortname()}, its quaternion or (cos, sin) of "
+                f"length 1, got {position}"
+            )
+        position = pin.normalize(model, reference)[kind.idx_q : kind.idx_q + kind.nq]
+    return position
+
+
+def geometry(robot: Robot) -> pin.GeometryModel:
+    """The robot's visual geometry, read from its meshes now; empty where the source gives none.
+
+    Raises:
+        RobotError: A mesh is missing or cannot be read; the message names it.
+    """
+    if robot.visuals is not None:
+        return robot.visuals
+    if robot.mjcf is not None and robot.expanded is not None:
+        full = build_mjcf_model(robot.mjcf, robot.expanded)
+        return _on_joints(robot, full, build_mjcf_shapes(robot.mjcf, robot.expanded, full))
+    if robot.urdf is None:
+        return pin.GeometryModel()
+    urdf = read_urdf(robot.urdf, robot.expanded)
+    full = build_model(urdf)
+    return _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, pin.coal.MeshLoader()))
+
+
+def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[int, str]]]:
+    """What there is of :func:`geometry`, link by link.
+
+    Returns:
+        The shapes of the links that can be read; and by name of each other link, its joint in ``free_model`` and what
+        is wrong with it: of meshes that are not there, all of them together.
+    """
+    if robot.mjcf is not None:
+        try:
+            return geometry(robot), {}
+        except RobotError as error:
+            faulty = str(error)
+        return pin.GeometryModel(), {frame.name: (frame.parentJoint, faulty) for frame in _links(robot.free_model)}
+    if robot.visuals is not None or robot.urdf is None:
+        return geometry(robot), {}
+    urdf = read_urdf(robot.urdf, robot.expanded)
+    full = build_model(urdf)
+    # Reads no mesh twice.
+    loader = pin.coal.CachedMeshLoader()
+    try:
+        return _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, loader)), {}
+    except RobotError as error:
+        problem = str(error)
+    found, missing = pin.GeometryModel(), {}
+    absent = missing_meshes(urdf, robot.package_dirs)
+    told = tell_missing(urdf, absent, robot.package_dirs)
+    for link in urdf.elements("link"):
+        name = link.get("name", "")
+        if link.find("visual") is None:
+            continue
+        try:
+            part = _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, loader, name))
+        except RobotError as error:
+            frame = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.BODY)]
+            missing[name] = frame.parentJoint, told if name in absent else str(error)
+        else:
+            for shape in part.geometryObjects:
+                found.addGeometryObject(shape)
+    if urdf.root is None:
+        missing = {frame.name: (frame.parentJoint, problem) for frame in _links(robot.free_model)}
+    return found, missing
+
+
+def _links(model: pin.Model) -> list[pin.Frame]:
+    return [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
+
+
+def _on_joints(robot: Robot, full: pin.Model, visuals: pin.GeometryModel) -> pin.GeometryModel:
+    """The shapes of a robot's file on the joints of the robot.
+
+    Args:
+        robot: Some of its joints may be locked, or in another order than in the file.
+        full: Its URDF's model, nothing locked.
+        visuals: Shapes on ``full``.
+    """
+    # By name, and locked joints through their frame.
+    index = joint_index(robot.free_model)
+    for shape in visuals.geometryObjects:
+        link = full.frames[shape.parentFrame]
+        frame = robot.free_model.getFrameId(link.name, link.type)
+        name = full.names[shape.parentJoint]
+        if name in index:
+            shape.parentJoint = index[name]
+        elif shape.parentJoint:
+            moved = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.FIXED_JOINT)]
+            shape.placement = moved.placement * shape.placement
+            shape.parentJoint = moved.parentJoint
+        shape.parentFrame = frame
+    return visuals
+
+
+def check_inertia(robot: Robot) -> None:
+    """Refuse a robot whose mass matrix is singular at rest or at a few seeded random configurations.
+
+    Raises:
+        SingularMassMatrix: Naming the joints whose motion carries no inertia.
+        RobotError: It is not finite.
+    """
+    rng = np.random.default_rng(0)
+    for q in [np.zeros(robot.dof), *rng.uniform(-np.pi, np.pi, (3, robot.dof))]:
+        with np.errstate(all="ignore"):
+            M = tree_mass_matrix(robot.tree, q)
+        if not np.isfinite(M).all():
+            raise RobotError(
+                f"the mass matrix of robot {robot.name!r} is not finite at q = {q}: masses, inertias, distances or "
+                "mimic multipliers are beyond the range of floating-point numbers"
+            )
+        own = np.diag(M)
+        if not (own > 0.0).all():
+            negative = bool((own < 0.0).any())
+            wrong = own < 0.0 if negative else own == 0.0
+            raise SingularMassMatrix(np.array(robot.joint_names)[wrong].tolist(), q, negative=negative)
+        scale = np.sqrt(own)
+        values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
+        rounding = robot.dof * np.finfo(float).eps
+        if values[0] <= rounding:
+            worst = np.abs(vectors[:, 0])
+            moving = [name for name, x in zip(robot.joint_names, worst, strict=True) if x >= 0.5 * worst.max()]
+            raise SingularMassMatrix(moving, q, negative=bool(values[0] < -rounding))

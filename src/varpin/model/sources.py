@@ -1,0 +1,340 @@
+"""From what a user names to a Pinocchio model: files, bundled robots, example-robot-data, models in memory."""
+
+import logging
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from varpin.errors import FileError, InputError, RobotError, RobotNotFound
+from varpin.model import example_robot_data, robot_descriptions
+from varpin.model.mimic import (
+    JOINT_PARAMETERS,
+    Tie,
+    depth_first,
+    joint_frames,
+    reordered,
+    repair_velocity_limits,
+    ties_of,
+    untied_model,
+)
+from varpin.model.mjcf import build_mjcf_model, is_mjcf, read_mjcf, root_tag
+from varpin.model.srdf import Posture, beside, read_postures, reference_postures
+from varpin.model.urdf import Inertial, Mimic, build_model, read_urdf
+from varpin.model.xacro import enclosing_packages, expand, is_xacro, plain_name
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Description:
+    """A robot as its source describes it, before anything is locked.
+
+    Attributes:
+        name: Of the file, the bundled robot or the model.
+        model: Every joint on its own.
+        ties: Mimic joints.
+        urdf: The URDF or xacro file, if there is one.
+        expanded: The URDF that a xacro file stands for, or what the shapes of an MJCF file are made of.
+        mjcf: The MJCF file, if there is one.
+        package_dirs: Where ``package://`` paths are looked up.
+        visuals: Geometry handed over with a RobotWrapper.
+        inertials: Of the links in a URDF, which the model has merged into bodies.
+        remarks: What the source leaves out, in words.
+        postures: Of the joints of ``model``.
+    """
+
+    name: str
+    model: pin.Model
+    ties: tuple[Tie, ...] = ()
+    urdf: Path | None = None
+    expanded: str | None = field(default=None, repr=False)
+    mjcf: Path | None = None
+    package_dirs: tuple[str, ...] = ()
+    visuals: pin.GeometryModel | None = None
+    inertials: tuple[Inertial, ...] = ()
+    remarks: tuple[str, ...] = ()
+    postures: tuple[Posture, ...] = ()
+
+
+def models_dir() -> Path:
+    """The folder of the bundled robots: in the wheel, or at the top of a source tree."""
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "models", package.parents[1] / "models"):
+        if (folder / "SOURCES.md").is_file():
+            return folder
+    raise FileError(f"varpin's bundled models are missing beside {package}")
+
+
+def bundled_robots() -> dict[str, Path]:
+    """The robots that come with varpin, by name."""
+    return {path.stem: path for path in sorted(models_dir().glob("*.urdf"))}
+
+
+def robot_names() -> tuple[str, ...]:
+    """The names that :func:`varpin.load_robot` takes: varpin's own robots, then those of example-robot-data.
+
+    Of example-robot-data, the fixed-base robots that the installed version holds; none where it is not installed.
+    """
+    return (*bundled_robots(), *example_robot_data.installed())
+
+
+def describe(
+    source: object,
+    package_dirs: Sequence[str | os.PathLike[str]] | None,
+    *,
+    mimic: bool,
+    xacro_args: Mapping[str, object] | None = None,
+    srdf: str | os.PathLike[str] | None = None,
+) -> Description:
+    """Find and parse ``source``; see :func:`varpin.load_robot`."""
+    folders = _folders(package_dirs)
+    if xacro_args is not None and not isinstance(xacro_args, Mapping):
+        raise InputError(f"xacro_args must be a mapping of names to values, got {xacro_args!r}")
+    description = _found(source, folders, xacro_args or {}, mimic=mimic)
+    if xacro_args and (description.urdf is None or description.expanded is None):
+        raise InputError(f"xacro_args are given, but {description.name!r} is read from no xacro file")
+    if srdf is None:
+        return description
+    if not isinstance(srdf, str | os.PathLike):
+        raise InputError(f"srdf must be the path of a file, got {type(srdf).__name__}")
+    return replace(description, postures=_postures(Path(srdf).expanduser(), folders, xacro_args or {}))
+
+
+def _found(source: object, folders: tuple[str, ...], xacro_args: Mapping[str, object], *, mimic: bool) -> Description:
+    if isinstance(source, pin.Model):
+        return _of_model(source, source.name or "model", None)
+    if isinstance(source, pin.RobotWrapper):
+        return _of_model(source.model, source.model.name or "robot", source.visual_model)
+    if not isinstance(source, str | os.PathLike):
+        raise InputError(
+            "source must be a URDF path, a robot's name, a pin.Model or a pin.RobotWrapper, "
+            f"got {type(source).__name__}"
+        )
+    text = os.fspath(source)
+    path = Path(text).expanduser()
+    is_path = isinstance(source, os.PathLike) or path.suffix or os.sep in text
+    if is_path and _is_file(path):
+        return _of_file(path.resolve(), plain_name(path), folders, xacro_args, mimic=mimic)
+    bundled = bundled_robots()
+    if text in bundled:
+        return _of_urdf(bundled[text], text, folders, mimic=mimic)
+    if text in example_robot_data.FIXED_BASE:
+        return _of_example(text, folders, mimic=mimic)
+    if text in example_robot_data.FLOATING_BASE:
+        raise RobotError(
+            f"{text!r} stands on a free-flyer in example-robot-data, and varpin models fixed bases; "
+            "to pin its base to the world, load its URDF file by path"
+        )
+    downloadable = robot_descriptions.names()
+    if text in downloadable or (not downloadable and not is_path and text.endswith(robot_descriptions.SUFFIX)):
+        return _of_downloaded(text, folders, xacro_args, mimic=mimic)
+    if is_path and path.is_dir():
+        raise RobotError(f"{path} is a folder, not a URDF file; it holds {_urdf_files(path)}")
+    note = "" if path.suffix not in (".urdf", ".xacro") else f" (looked in {path.absolute().parent})"
+    raise RobotNotFound(text, [*bundled, *example_robot_data.installed(), *downloadable], note)
+
+
+def _folders(package_dirs: Sequence[str | os.PathLike[str]] | str | os.PathLike[str] | None) -> tuple[str, ...]:
+    if isinstance(package_dirs, str | os.PathLike):
+        package_dirs = [package_dirs]
+    try:
+        return tuple(str(Path(folder).expanduser()) for folder in package_dirs or ())
+    except (TypeError, RuntimeError):
+        raise InputError(f"package_dirs must be a list of folders, got {package_dirs!r}") from None
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError as error:
+        raise FileError(f"cannot read the URDF file: {error.strerror}: {str(path)[:80]!r}") from None
+
+
+def _urdf_files(folder: Path) -> str:
+    return ", ".join(sorted(file.name for file in folder.glob("*.urdf"))) or "no URDF file"
+
+
+def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) -> Description:
+    _check_model(model, name)
+    # Copies: what the user does to the model afterwards must not reach the robot.
+    free, ties = untied_model(model.copy())
+    shapes = visuals.copy() if visuals is not None else None
+    for shape in shapes.geometryObjects if shapes is not None else ():
+        if shape.parentJoint >= free.njoints:
+            raise RobotError(f"shape {shape.name!r} hangs on joint {shape.parentJoint}, which model {name!r} has not")
+    order = depth_first(free, ties)
+    in_order = order == sorted(order)
+    if not (in_order and _has_joint_frames(free)):
+        free, ties = reordered(free, ties, order)
+        for shape in shapes.geometryObjects if shapes is not None else ():
+            shape.parentJoint = [0, *order].index(shape.parentJoint)
+    if not in_order:
+        # Pinocchio lets joints be added in any order, and then computes another mass matrix without a word.
+        logger.warning(
+            "the joints of model %r were not added subtree by subtree, as Pinocchio's algorithms need: reordered to %s",
+            name,
+            ", ".join(list(free.names)[1:]),
+        )
+    repair_velocity_limits(free)
+    if shapes is not None:
+        hang_shapes(shapes, model, free)
+    return Description(name, free, ties, visuals=shapes, postures=reference_postures(model))
+
+
+def _check_model(model: pin.Model, name: str) -> None:
+    """Refuse a model whose parts do not fit together: Pinocchio's algorithms do not look, and end the process.
+
+    Raises:
+        RobotError: Naming the part.
+    """
+    n, nq, nv = model.njoints, model.nq, model.nv
+    sizes = dict.fromkeys(("joints", "names", "parents", "inertias", "jointPlacements"), n)
+    sizes |= dict.fromkeys(("lowerPositionLimit", "upperPositionLimit"), nq)
+    sizes |= dict.fromkeys(JOINT_PARAMETERS, nv)
+    for part, size in sizes.items():
+        if (found := len(getattr(model, part))) != size:
+            raise RobotError(f"model {name!r} is damaged: its {part} has {found} entries, where {size} belong")
+    q, v = 0, 0
+    for joint in range(1, n):
+        kind, parent = model.joints[joint], model.parents[joint]
+        if parent >= joint:
+            raise RobotError(f"model {name!r} is damaged: joint {model.names[joint]!r} comes before its parent")
+        # A mimic joint has no coordinates of its own and stands at its leader's.
+        if kind.id != joint or (kind.nv and (kind.idx_q, kind.idx_v) != (q, v)) or kind.idx_v >= nv:
+            raise RobotError(f"model {name!r} is damaged: joint {model.names[joint]!r} is not at the place it has")
+        q, v = q + kind.nq, v + kind.nv
+    if (q, v) != (nq, nv):
+        raise RobotError(f"model {name!r} is damaged: its joints have {q} and {v} coordinates, not nq and nv")
+    for frame in model.frames:
+        if frame.parentJoint >= n or frame.parentFrame >= model.nframes:
+            raise RobotError(f"model {name!r} is damaged: frame {frame.name!r} hangs on what is not there")
+
+
+def _has_joint_frames(model: pin.Model) -> bool:
+    """Whether every joint has its frame, and it comes before what hangs on it, as pin.buildReducedModel needs.
+
+    It reads beyond its arrays where one is missing.
+    """
+    frame_of = {model.frames[index].parentJoint: index for index in joint_frames(model)}
+    if len(frame_of) < model.njoints - 1:
+        return False
+    return all(frame_of.get(frame.parentJoint, 0) <= index for index, frame in enumerate(model.frames))
+
+
+def hang_shapes(shapes: pin.GeometryModel, old: pin.Model, new: pin.Model) -> None:
+    """Hang shapes from the frames of ``old`` on those of ``new``, and where there is none on their joint's."""
+    for shape in shapes.geometryObjects:
+        frame = new.nframes
+        if shape.parentFrame < old.nframes:
+            link = old.frames[shape.parentFrame]
+            frame = new.getFrameId(link.name, link.type)
+        if frame >= new.nframes:
+            frame = new.getFrameId(new.names[shape.parentJoint], pin.FrameType.JOINT) if shape.parentJoint else 0
+        shape.parentFrame = frame
+
+
+def _of_example(name: str, folders: tuple[str, ...], *, mimic: bool) -> Description:
+    urdf = example_robot_data.locate(example_robot_data.FIXED_BASE[name])
+    folders = (*folders, str(example_robot_data.package_dir(urdf)))
+    description = _of_urdf(urdf, name, folders, mimic=mimic)
+    if name in example_robot_data.ROTORS:
+        model = description.model
+        pin.loadRotorParameters(model, str(example_robot_data.locate(example_robot_data.ROTORS[name])), False)
+        model.armature = np.asarray(model.rotorInertia) * np.asarray(model.rotorGearRatio) ** 2
+    return description
+
+
+def _of_downloaded(name: str, folders: tuple[str, ...], arguments: Mapping[str, object], *, mimic: bool) -> Description:
+    found = robot_descriptions.download(name)
+    folders = (*folders, *found.package_dirs)
+    own = {**found.xacro_args, **arguments}
+    description = _of_file(found.path, name, folders, own, found.packages, mimic=mimic)
+    if found.srdf is None:
+        return description
+    postures = _postures(found.srdf, folders, {**found.srdf_args, **arguments}, found.packages)
+    return replace(description, postures=postures)
+
+
+def _of_file(
+    path: Path,
+    name: str,
+    folders: tuple[str, ...],
+    arguments: Mapping[str, object],
+    packages: Mapping[str, str] | None = None,
+    *,
+    mimic: bool,
+) -> Description:
+    if is_xacro(path):
+        text = expand(path, arguments, _places(path, folders), packages)
+        return _of_urdf(path, name, folders, mimic=mimic, expanded=text)
+    if is_mjcf(path):
+        return _of_mjcf(path, name)
+    if path.suffix == ".sdf" or (path.suffix in (".xml", ".world") and root_tag(path) == "sdf"):
+        raise RobotError(
+            f"{path} is an SDF file, which Pinocchio's package on PyPI cannot read; convert it to a URDF or an MJCF"
+        )
+    return _of_urdf(path, name, folders, mimic=mimic)
+
+
+def _of_mjcf(path: Path, name: str) -> Description:
+    mjcf = read_mjcf(path)
+    description = _of_model(build_mjcf_model(path, mjcf.dynamics), name, None)
+    return replace(description, mjcf=path, expanded=mjcf.looks, remarks=mjcf.remarks)
+
+
+def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:
+    """Where the packages of a file are looked up: where the user says, beside the packages it lies in, beside it."""
+    around = (str(package.parent) for package in enclosing_packages(path).values())
+    return tuple(dict.fromkeys((*folders, *around, str(path.parent))))
+
+
+def _of_urdf(
+    path: Path, name: str, folders: tuple[str, ...], *, mimic: bool, expanded: str | None = None
+) -> Description:
+    urdf = read_urdf(path, expanded)
+    model, mimics, remarks = build_model(urdf), urdf.mimics, urdf.remarks
+    if urdf.root is None:
+        remarks = (*remarks, f"{urdf.fault}; varpin has it as Pinocchio's parser, which is more lenient, reads it")
+        mimics = _mimics_of(build_model(urdf, mimic=True))
+    ties: tuple[Tie, ...] = ()
+    if mimic:
+        ties = ties_of(mimics, model)
+        order = depth_first(model, ties)
+        if order != sorted(order):
+            model, ties = reordered(model, ties, order)
+    postures: tuple[Posture, ...] = ()
+    if srdf := beside(path, "" if urdf.root is None else urdf.root.get("name", "")):
+        try:
+            postures = read_postures(srdf)
+        except (RobotError, FileError) as error:
+            # Nobody has asked for it.
+            remarks = (*remarks, f"{error}; the robot has no postures")
+    return Description(
+        name=name,
+        model=model,
+        ties=ties,
+        urdf=path,
+        expanded=expanded,
+        package_dirs=_places(path, folders),
+        inertials=urdf.inertials,
+        remarks=remarks,
+        postures=postures,
+    )
+
+
+def _postures(
+    path: Path, folders: tuple[str, ...], arguments: Mapping[str, object], packages: Mapping[str, str] | None = None
+) -> tuple[Posture, ...]:
+    """The postures in an SRDF file, or in the xacro file of one; the robot's arguments need not be the file's."""
+    text = expand(path, arguments, _places(path, folders), packages, strict=False) if is_xacro(path) else None
+    return read_postures(path, text)
+
+
+def _mimics_of(model: pin.Model) -> dict[str, Mimic]:
+    """The mimic joints of a model by name."""
+    free, ties = untied_model(model)
+    return {free.names[tie.follower]: Mimic(free.names[tie.leader], tie.ratio, tie.offset) for tie in ties}

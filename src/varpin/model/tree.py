@@ -1,0 +1,433 @@
+"""From a Pinocchio model to flat arrays: every joint turned so that it moves about or along its own z axis."""
+
+import math
+
+import numpy as np
+import pinocchio as pin
+import scipy
+from numpy.typing import NDArray
+
+from varpin.core.arrays import Tree
+from varpin.errors import InputError, RobotError, UnknownFrame, UnsupportedJoint
+from varpin.model.mimic import Tie
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+def joint_axis(model: pin.Model, joint: int) -> tuple[bool, Floats]:
+    """Whether a one-axis joint is prismatic, and its unit axis (3,) in the joint's frame.
+
+    Raises:
+        UnsupportedJoint: The joint has another number of degrees of freedom, screws, or is a composite with a
+            placement of its own.
+        RobotError: Its axis is zero or no unit vector.
+    """
+    kind = model.joints[joint]
+    name = model.names[joint]
+    if kind.nv != 1 or kind.nq > 2:
+        raise UnsupportedJoint(name, kind.shortname(), kind.nq)
+    data = kind.createData()
+    kind.calc(data, pin.neutral(model))
+    subspace = np.asarray(data.S, dtype=float).reshape(6)
+    linear, angular = subspace[:3], subspace[3:]
+    at_zero = pin.SE3(data.M)
+    if (linear.any() and angular.any()) or not at_zero.isIdentity(1e-12):
+        raise UnsupportedJoint(name, kind.shortname(), kind.nq)
+    axis = angular if angular.any() else linear
+    if not (np.isfinite(axis).all() and axis.any()):
+        raise RobotError(f"joint {name!r} has no axis: its direction is zero or not finite")
+    # Pinocchio makes unit vectors of axes, but not of those whose squares are beyond floating point.
+    length = float(np.linalg.norm(axis))
+    if abs(length - 1.0) > 1e-6:
+        raise RobotError(f"joint {name!r} has an axis of length {length:g}, which Pinocchio makes no unit vector of")
+    return bool(linear.any()), axis / length
+
+
+def is_unbounded(model: pin.Model, joint: int) -> bool:
+    """Whether Pinocchio keeps the joint's angle as a (cos, sin) pair."""
+    return bool(model.joints[joint].nv == 1 and model.joints[joint].nq == 2)
+
+
+def z_to(axis: Floats) -> Floats:
+    """A rotation matrix (3, 3) whose third column is ``axis``, exact for the coordinate axes."""
+    a, b, c = (float(part) for part in axis)
+    # Across the coordinate axis that is farthest from this one.
+    x = [(0.0, -c, b), (c, 0.0, -a), (-b, a, 0.0)][int(np.argmin(np.abs(axis)))]
+    u, v, w = (part / math.hypot(*x) for part in x)
+    return np.array([[u, b * w - c * v, a], [v, c * u - a * w, b], [w, a * v - b * u, c]])
+
+
+def _is_rigid(placement: pin.SE3) -> bool:
+    R = placement.rotation
+    if not np.isfinite(placement.homogeneous).all():
+        return False
+    return bool(np.abs(R.T @ R - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0.0)
+
+
+def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...]) -> Tree:
+    """The tree of a model whose joints all have one axis.
+
+    Args:
+        model: Every joint on its own, mimic or not.
+        ties: Which joints follow which.
+        coordinates: Indices of the joints that are generalized coordinates, in their order.
+
+    Raises:
+        UnsupportedJoint: A joint has no single axis.
+        RobotError: A link's mass, centre or inertia is NaN or infinite, or a joint's placement is no rotation and
+            translation.
+    """
+    bodies = model.njoints - 1
+    tied = {tie.follower: tie for tie in ties}
+    index = {joint: c for c, joint in enumerate(coordinates)}
+    turn = [np.eye(3)]
+    prismatic = np.zeros(bodies, dtype=np.int64)
+    rotation = np.zeros((bodies, 3, 3))
+    translation = np.zeros((bodies, 3))
+    mass = np.zeros(bodies)
+    center = np.zeros((bodies, 3))
+    inertia = np.zeros((bodies, 6))
+    coordinate = np.zeros(bodies, dtype=np.int64)
+    ratio = np.ones(bodies)
+    offset = np.zeros(bodies)
+    for body in range(bodies):
+        joint = body + 1
+        slides, axis = joint_axis(model, joint)
+        turn.append(z_to(axis))
+        before = turn[model.parents[joint]]
+        placement = model.jointPlacements[joint]
+        if not _is_rigid(placement):
+            raise RobotError(f"the placement of joint {model.names[joint]!r} is no finite rotation and translation")
+        prismatic[body] = slides
+        rotation[body] = before.T @ placement.rotation @ turn[joint]
+        translation[body] = before.T @ placement.translation
+        link = model.inertias[joint]
+        if not (np.isfinite(link.mass) and np.isfinite(link.lever).all() and np.isfinite(link.inertia).all()):
+            raise RobotError(f"the link moved by joint {model.names[joint]!r} has a mass or inertia that is not finite")
+        mass[body] = link.mass
+        center[body] = turn[joint].T @ link.lever
+        about_center = turn[joint].T @ link.inertia @ turn[joint]
+        inertia[body] = about_center[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]
+        if joint in tied:
+            tie = tied[joint]
+            coordinate[body], ratio[body], offset[body] = index[tie.leader], tie.ratio, tie.offset
+        else:
+            coordinate[body] = index[joint]
+    parent = np.array([model.parents[j] - 1 for j in range(1, model.njoints)], dtype=np.int64)
+    group = independent_groups(parent, coordinate, len(coordinates))
+    loads, carried = light_parts(parent, coordinate, prismatic, translation, mass, center, inertia, len(coordinates))
+    return Tree(
+        parent=parent,
+        prismatic=prismatic,
+        rotation=rotation,
+        translation=translation,
+        mass=mass,
+        center=center,
+        inertia=inertia,
+        coordinate=coordinate,
+        ratio=ratio,
+        offset=offset,
+        origin=origins(parent, prismatic),
+        loads=loads,
+        carried=carried,
+        periodic=periodic_coordinates(coordinate, prismatic, ratio, len(coordinates)),
+        armature=coordinate_armature(model, ties, coordinates),
+        group=group,
+        groups=int(group.max()) + 1,
+        ends=block_ends(group),
+    )
+
+
+def frame_index(model: pin.Model, frame: str, robot: str) -> int:
+    """Index of a frame by its name.
+
+    Raises:
+        UnknownFrame: There is none.
+    """
+    names = [item.name for item in model.frames]
+    if not isinstance(frame, str) or frame not in names:
+        raise UnknownFrame(str(frame), names, robot)
+    return names.index(frame)
+
+
+def frame_on_body(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats, Floats]:
+    """The body of the flat tree that carries a frame, and the frame's rotation (3, 3) and place (3,) in it.
+
+    Raises:
+        UnknownFrame: There is no such frame.
+        InputError: It is fixed to the base, and no joint moves it.
+    """
+    found = model.frames[frame_index(model, frame, robot)]
+    joint = found.parentJoint
+    if joint == 0:
+        raise InputError(f"frame {frame!r} of robot {robot!r} is fixed to the base: no joint moves it")
+    turn = z_to(joint_axis(model, joint)[1])
+    return joint - 1, turn.T @ found.placement.rotation, turn.T @ found.placement.translation
+
+
+def place_of_frame(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats, Floats]:
+    """As :func:`frame_on_body`; of a frame that is fixed to the base -1, and where it stands in the world.
+
+    Raises:
+        UnknownFrame: There is no such frame.
+    """
+    found = model.frames[frame_index(model, frame, robot)]
+    if found.parentJoint == 0:
+        return -1, found.placement.rotation.copy(), found.placement.translation.copy()
+    return frame_on_body(model, frame, robot)
+
+
+def coordinate_armature(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...]) -> Floats:
+    """Armature (n,) seen by each coordinate: its own and its followers', by the square of their ratios."""
+    own = np.asarray(model.armature, dtype=float)
+    armature = np.array([own[model.joints[joint].idx_v] for joint in coordinates])
+    for tie in ties:
+        armature[coordinates.index(tie.leader)] += tie.ratio * tie.ratio * float(own[model.joints[tie.follower].idx_v])
+    if not (np.isfinite(armature).all() and (armature >= 0.0).all()):
+        raise RobotError(f"armature must be finite and >= 0, got {armature}")
+    return armature
+
+
+def to_pinocchio(model: pin.Model, positions: Floats) -> Floats:
+    """Joint positions (..., k), one a joint, as configurations (..., model.nq) of a model without mimic joints.
+
+    A continuous joint's angle becomes Pinocchio's (cos, sin).
+    """
+    configuration = np.empty((*positions.shape[:-1], model.nq))
+    for k, joint in enumerate(model.joints[1:]):
+        if joint.nq == 2:
+            configuration[..., joint.idx_q] = np.cos(positions[..., k])
+            configuration[..., joint.idx_q + 1] = np.sin(positions[..., k])
+        else:
+            configuration[..., joint.idx_q] = positions[..., k]
+    return configuration
+
+
+def origins(parent: Integers, prismatic: Integers) -> Integers:
+    """Which bodies (b,) have no joint above them that turns: 1 or 0."""
+    origin = np.ones(len(parent), dtype=np.int64)
+    for body, above in enumerate(parent):
+        if above >= 0:
+            origin[body] = origin[above] and prismatic[above]
+    return origin
+
+
+# A part is light if it has less than this part of the inertia about a joint above it.
+LIGHT = 0.005
+
+
+def ancestors(parent: Integers) -> NDArray[np.bool_]:
+    """Which bodies are on the way from the root to each (b, b), itself included: [j, a] for a on the way to j."""
+    on_way = np.eye(len(parent), dtype=bool)
+    for body, above in enumerate(parent):
+        if above >= 0:
+            on_way[body] |= on_way[above]
+    return on_way
+
+
+def light_parts(
+    parent: Integers,
+    coordinate: Integers,
+    prismatic: Integers,
+    translation: Floats,
+    mass: Floats,
+    center: Floats,
+    inertia: Floats,
+    dof: int,
+) -> tuple[Integers, Integers]:
+    """Parts whose energy would be lost in that of what carries them.
+
+    Inertias are compared with all joints stretched out, which is a bound for both.
+
+    Args:
+        parent: Of each body (b,), -1 at a root.
+        coordinate: Of each body (b,).
+        prismatic: 1 where the joint of a body slides (b,).
+        translation: Of each joint in its parent's frame (b, 3) [m].
+        mass: Of each body (b,) [kg].
+        center: Of mass in each body's frame (b, 3) [m].
+        inertia: Of each body about its centre (b, 6) [kg m^2].
+        dof: n.
+
+    Returns:
+        The bodies with which they begin (l,), and which coordinates move with each (l, n): 1 or 0.
+    """
+    bodies = len(parent)
+    on_way = ancestors(parent)
+    way = np.zeros(bodies)  # along the offsets between joints, from the root
+    for b in range(bodies):
+        way[b] = np.linalg.norm(translation[b]) + (way[parent[b]] if parent[b] >= 0 else 0.0)
+    # [a, b]: inertia of body b about the joint of its ancestor a.
+    with np.errstate(over="ignore", invalid="ignore"):
+        reach = np.linalg.norm(center, axis=1) + way - way[:, None]
+        slides = prismatic[:, None] == 1
+        about = mass * np.where(slides, 1.0, reach**2)
+        about += np.where(slides, 0.0, inertia[:, [0, 2, 5]].sum(axis=1) / 2.0)
+        about[~on_way.T] = 0.0
+        # [a, j]: of all that joint j carries.
+        carries = about @ on_way
+        light = carries < LIGHT * np.diag(carries)[:, None]
+    carrier = np.full(bodies, -1)  # the light part a body is in
+    loads, rows = [], []
+    movers = np.zeros((bodies, dof))
+    movers[np.arange(bodies), coordinate] = 1.0
+    moved = on_way.T.astype(float) @ movers  # [j, c]: how many bodies that joint j carries coordinate c moves
+    elsewhere = movers.sum(axis=0) - moved
+    for j in range(bodies):
+        if parent[j] < 0:
+            continue
+        carrier[j] = carrier[parent[j]]
+        if ((moved[j] > 0) & (elsewhere[j] > 0)).any():  # a mimic joint elsewhere moves along
+            continue
+        above = np.flatnonzero(on_way[j])[:-1]
+        if light[above[carrier[above] == carrier[j]], j].any():
+            carrier[j] = j
+            loads.append(j)
+            rows.append(moved[j] > 0)
+    shape = (len(loads), dof)
+    return np.array(loads, dtype=np.int64), np.array(rows, dtype=np.int64).reshape(shape)
+
+
+def periodic_coordinates(coordinate: Integers, prismatic: Integers, ratio: Floats, dof: int) -> Integers:
+    """Which coordinates (n,) bring every joint they move back by a whole turn: 1 or 0."""
+    periodic = np.ones(dof, dtype=np.int64)
+    periodic[coordinate[(prismatic == 1) | (ratio != np.rint(ratio))]] = 0
+    return periodic
+
+
+def require_sound(tree: Tree) -> None:
+    """Refuse arrays that do not fit each other or point beyond their ends.
+
+    :func:`flatten` makes none; a tree that was changed afterwards may be one.
+
+    Raises:
+        RobotError: Naming the array.
+    """
+    b, n = np.size(tree.parent), np.size(tree.armature)
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
+        ("parent", "prismatic", "mass", "coordinate", "ratio", "origin"), (b,)
+    )
+    shapes |= {"offset": (b,), "rotation": (b, 3, 3), "translation": (b, 3), "center": (b, 3), "inertia": (b, 6)}
+    shapes |= {"armature": (n,), "group": (n,), "periodic": (n,)}
+    shapes |= {"loads": (np.size(tree.loads),), "carried": (np.size(tree.loads), n)}
+    whole = ("parent", "prismatic", "coordinate", "group", "origin", "periodic", "loads", "carried")
+    for name, shape in shapes.items():
+        array = getattr(tree, name)
+        kind = np.int64 if name in whole else np.float64
+        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != kind:
+            raise RobotError(f"the robot's tree is damaged: its {name} is no array {shape} of {np.dtype(kind)}")
+        if kind is np.float64 and not np.isfinite(array).all():
+            raise RobotError(f"the robot's tree is damaged: its {name} is not finite")
+    # (name, lowest, beyond the highest)
+    for name, low, high in (
+        ("parent", -1, np.arange(b)),
+        ("coordinate", 0, n),
+        ("group", 0, min(n, tree.groups)),
+        ("loads", 0, b),
+    ):
+        values = getattr(tree, name)
+        if ((values < low) | (values >= high)).any():
+            raise RobotError(f"the robot's tree is damaged: its {name} points to what is not there")
+    known = block_ends(tree.group)
+    if not isinstance(tree.ends, np.ndarray) or tree.ends.dtype != np.int64 or not np.array_equal(tree.ends, known):
+        raise RobotError("the robot's tree is damaged: its blocks do not end where groups do")
+
+
+def tree_mass_matrix(tree: Tree, q: Floats) -> Floats:
+    """M(q) (n, n), armature included: M_ij = S_i . Y_j S_j for an ancestor i of j, or j itself; see jet.hpp.
+
+    In plain NumPy and n^2 memory, where Pinocchio's data take n^3.
+    """
+    bodies = tree.parent.size
+    rotation, position = np.empty((bodies, 3, 3)), np.empty((bodies, 3))
+    for j, s in enumerate(tree.ratio * q[tree.coordinate] + tree.offset):
+        up = tree.parent[j]
+        R, p = (rotation[up], position[up]) if up >= 0 else (np.eye(3), np.zeros(3))
+        rotation[j], position[j] = R @ tree.rotation[j], p + R @ tree.translation[j]
+        if tree.prismatic[j]:
+            position[j] += s * rotation[j, :, 2]
+        else:
+            rotation[j] = rotation[j] @ _turn(s)
+    turns = (tree.prismatic == 0)[:, None]
+    z = rotation[:, :, 2]
+    axis = np.hstack([np.where(turns, np.cross(position, z), z), np.where(turns, z, 0.0)])
+    center = position + np.einsum("bij,bj->bi", rotation, tree.center)
+    lever = np.zeros((bodies, 3, 3))  # across a centre of mass
+    lever[:, [2, 0, 1], [1, 2, 0]] = center
+    lever -= lever.transpose(0, 2, 1)
+    own = tree.inertia[:, [[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
+    m = tree.mass[:, None, None]
+    inertia = np.empty((bodies, 6, 6))
+    inertia[:, :3, :3], inertia[:, :3, 3:], inertia[:, 3:, :3] = m * np.eye(3), -m * lever, m * lever
+    inertia[:, 3:, 3:] = rotation @ own @ rotation.transpose(0, 2, 1) - m * lever @ lever
+    for j in range(bodies - 1, -1, -1):
+        if tree.parent[j] >= 0:
+            inertia[tree.parent[j]] += inertia[j]
+    dual = np.einsum("bij,bj->bi", inertia, axis)
+    M = np.where(ancestors(tree.parent), dual @ axis.T, 0.0)
+    M += np.tril(M, -1).T
+    G = np.zeros((bodies, tree.armature.size))
+    G[np.arange(bodies), tree.coordinate] = tree.ratio
+    return np.asarray(G.T @ M @ G + np.diag(tree.armature))
+
+
+def _turn(angle: float) -> Floats:
+    """Rotation (3, 3) about z."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def place_on_body(tree: Tree, q: Floats, body: int, place: Floats) -> Floats:
+    """Where a place (3,) on a body is in the world (N, 3) [m], at configurations q (N, n)."""
+    at = q[:, tree.coordinate] * tree.ratio + tree.offset
+    point = np.broadcast_to(place, (len(q), 3))
+    while body >= 0:
+        if tree.prismatic[body]:
+            point = point + np.stack([np.zeros(len(q)), np.zeros(len(q)), at[:, body]], axis=1)
+        else:
+            c, s = np.cos(at[:, body]), np.sin(at[:, body])
+            x, y, z = point.T
+            point = np.stack([c * x - s * y, s * x + c * y, z], axis=1)
+        point = point @ tree.rotation[body].T + tree.translation[body]
+        body = int(tree.parent[body])
+    return point
+
+
+def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Integers:
+    """Which coordinates (n,) move each other: labels from 0 of the groups that inertia or mimic joints tie together.
+
+    Args:
+        parent: Of each body (b,), -1 at a root.
+        coordinate: Of each body (b,).
+        dof: n.
+    """
+    tied = parent >= 0
+    links = scipy.sparse.coo_array(
+        (np.ones(tied.sum()), (coordinate[tied], coordinate[parent[tied]])), shape=(dof, dof)
+    )
+    _, label = scipy.sparse.csgraph.connected_components(links, directed=False)
+    return np.asarray(label, dtype=np.int64)
+
+
+def path_coordinates(tree: Tree, body: int) -> Integers:
+    """The coordinates that move a body; none move the world, -1."""
+    found = []
+    while body >= 0:
+        found.append(int(tree.coordinate[body]))
+        body = int(tree.parent[body])
+    return np.array(found, dtype=np.int64)
+
+
+def block_ends(group: Integers) -> Integers:
+    """Where runs of coordinates end that hold whole groups (c,).
+
+    Mostly each group is one run; groups whose coordinates take turns share one.
+
+    Args:
+        group: Of each coordinate (n,), from :func:`independent_groups`.
+    """
+    n = group.size
+    last = np.zeros(n, dtype=np.int64)
+    np.maximum.at(last, group, np.arange(n))
+    return np.flatnonzero(np.maximum.accumulate(last[group]) == np.arange(n)) + 1

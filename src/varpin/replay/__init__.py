@@ -1,5 +1,0 @@
-"""Motions shown in meshcat: as one HTML file that plays by itself, as a film, or in a live window."""
-
-from varpin.replay.annotations import frame_names as frame_names
-from varpin.replay.motion import replay as replay
-from varpin.replay.video import check_film as check_film

@@ -1,0 +1,1 @@
+"""Pictures: replays in meshcat, figures, tables of a robot."""

@@ -1,0 +1,526 @@
+"""What a robot description holds, and what looks wrong in it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.errors import InputError, RobotError, SingularMassMatrix
+from varpin.integrators import Guard, largest_step
+from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.scene import Scene
+from varpin.model import Robot, build_robot, check_inertia
+from varpin.model.inertia import fault, principal_moments
+from varpin.model.mimic import joint_index
+from varpin.model.tree import is_unbounded, joint_axis
+from varpin.model.urdf import Urdf, read_urdf
+from varpin.show.inspection_tables import parts_of
+from varpin.support.checks import JointValues, joint_array
+from varpin.support.frozen import Frozen
+from varpin.support.markup import facts, folded, said, table
+from varpin.support.tables import plain
+
+Floats = NDArray[np.float64]
+Kind = Literal["revolute", "prismatic", "continuous", "mimic"]
+FrameKind = Literal["link", "joint", "fixed joint", "frame"]
+
+# The largest step is no limit beyond this [s].
+_ANY_STEP = 100.0
+# Beyond what any of example-robot-data's arms shows: masses there differ by up to 320 between neighbours, principal
+# moments by 2e5, and M scaled to a unit diagonal has a condition number of up to 830.
+MASS_RATIO = 1e3
+INERTIA_RATIO = 1e6
+CONDITION = 1e6
+# Lengths of a link's inertia in units of the arm's reach, and [m] where there is no reach to compare with.
+LENGTH_RATIO = 2.0
+LENGTH = 10.0
+# [kg/m^3] of osmium, the densest element.
+DENSITY = 22_600.0
+
+
+@dataclass(frozen=True, eq=False)
+class JointReport(Frozen):
+    """A joint that moves.
+
+    Attributes:
+        name: Its name.
+        kind: Revolute, prismatic, continuous (revolute without end stops) or mimic.
+        axis: Unit axis (3,) in the joint's own frame.
+        unit: Of its position, rad or m.
+        lower: Lower position limit [rad or m], -inf if none.
+        upper: Upper position limit [rad or m], inf if none.
+        velocity: Velocity limit [rad/s or m/s], inf if none.
+        effort: Effort limit [N m or N], inf if none.
+        follows: For a mimic joint, what it does: its leader, ratio and offset in words; else empty.
+    """
+
+    name: str
+    kind: Kind
+    axis: Floats
+    unit: Literal["rad", "m"]
+    lower: float
+    upper: float
+    velocity: float
+    effort: float
+    follows: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class LinkReport(Frozen):
+    """A link with mass or inertia; for a model in memory, a joint's links taken together.
+
+    Attributes:
+        name: Its name.
+        joint: The joint that moves it, or empty for a link of the base.
+        mass: [kg].
+        center: Centre of mass (3,) in the link's frame [m].
+        inertia: (3, 3) about the centre of mass [kg m^2].
+        moments: Principal moments of inertia (3,), ascending [kg m^2].
+    """
+
+    name: str
+    joint: str
+    mass: float
+    center: Floats
+    inertia: Floats
+    moments: Floats
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """A frame, whose name costs, traces and payloads take.
+
+    Attributes:
+        name: Its name.
+        kind: A link's, a joint's, a fixed joint's, or one by itself.
+        parent: The link or frame that it is attached to, or empty for the world.
+        joint: The joint that moves it, or empty if it is fixed to the base.
+    """
+
+    name: str
+    kind: FrameKind
+    parent: str
+    joint: str
+
+
+@dataclass(frozen=True, eq=False)
+class RobotReport(Frozen):
+    """A robot as its description has it, and what looks wrong; ``print`` shows all of it in tables.
+
+    Attributes:
+        robot: The robot, possibly one that :func:`varpin.load_robot` refuses.
+        joints: Every joint that moves, mimic joints included, in Pinocchio's order.
+        links: Every link with mass or inertia.
+        frames: Every frame by whose name varpin finds it, in Pinocchio's order.
+        locked: Joints held still, and where [rad or m].
+        total_mass: Of everything that moves [kg].
+        q: The configuration looked at (n,) [rad or m].
+        v: The velocity there (n,) [rad/s or m/s].
+        condition: Condition number of M(q); it mixes units if there are prismatic joints. Infinite if singular.
+        scaled_condition: Condition number of M(q) with rows and columns scaled to a unit diagonal, which depends
+            on no unit. Infinite if singular.
+        largest_step: Largest dt [s] whose step the midpoint integrator's branch guard accepts around (q, v); infinite
+            where no direction is unstable, None where M is singular. It says nothing about accuracy.
+        branch_margin: The guard's margin, for which ``largest_step`` holds.
+        warnings: What looks wrong, in words that name the joint or link.
+    """
+
+    robot: Robot = field(repr=False)
+    joints: tuple[JointReport, ...]
+    links: tuple[LinkReport, ...]
+    frames: tuple[FrameReport, ...]
+    locked: Mapping[str, float | tuple[float, ...]]
+    total_mass: float
+    q: Floats
+    v: Floats
+    condition: float
+    scaled_condition: float
+    largest_step: float | None
+    branch_margin: float
+    warnings: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        return (
+            f"RobotReport({self.robot.name}: {len(self.joints)} joints, {len(self.links)} links{said(self.warnings)})"
+        )
+
+    def __str__(self) -> str:
+        return plain(parts_of(self))
+
+    @property
+    def step_in_words(self) -> str:
+        """The largest step the guard accepts around (q, v)."""
+        if self.largest_step is None:
+            return "undefined: the mass matrix is singular"
+        # A description's own rounding, a frame turned by 1.5708, makes directions unstable that are not.
+        step = "any: nothing is unstable" if self.largest_step > _ANY_STEP else f"{self.largest_step:.3g} s"
+        return f"{step} at this q, {'at rest' if not self.v.any() else 'and this v'}"
+
+    def _repr_html_(self) -> str:
+        rows: list[tuple[str, object]] = [
+            ("mass that moves [kg]", self.total_mass),
+            ("condition of M(q)", f"{self.condition:.3g}; {self.scaled_condition:.3g} with a unit diagonal"),
+            ("largest step the guard accepts", self.step_in_words),
+            *(("warning", warning) for warning in self.warnings),
+        ]
+        joints = [
+            (j.name, f"mimic: {j.follows}" if j.follows else j.kind, j.lower, j.upper, j.velocity, j.effort)
+            for j in self.joints
+        ]
+        links = [(x.name, x.joint or "the base", x.mass, "  ".join(f"{m:.3g}" for m in x.moments)) for x in self.links]
+        return facts(
+            f"Robot {self.robot.name}, looked into",
+            rows,
+            table(("joint", "kind", "lower [rad or m]", "upper", "velocity [1/s]", "effort [N m or N]"), joints),
+            folded("links", table(("link", "moved by", "mass [kg]", "principal moments [kg m^2]"), links)),
+            folded(
+                "frames",
+                table(
+                    ("frame", "what it is", "on", "moved by"),
+                    [(x.name, x.kind, x.parent or "the world", x.joint or "the base") for x in self.frames],
+                ),
+            ),
+        )
+
+
+def inspect_robot(
+    source: object,
+    *,
+    package_dirs: Sequence[str | os.PathLike[str]] | None = None,
+    lock: Mapping[str, ArrayLike] | None = None,
+    mimic: Literal["tied", "free"] = "tied",
+    q: JointValues | None = None,
+    v: JointValues | None = None,
+    gravity: ArrayLike | bool = True,
+) -> RobotReport:
+    """Look into a robot description, sound or faulty.
+
+    Main args:
+        source: What :func:`varpin.load_robot` takes, or a robot it made.
+        lock: Joints to hold still, as for :func:`varpin.load_robot`.
+        q: Configuration to look at, one number, (n,) or by joint name [rad or m]; 0 if left out.
+        v: Velocity there, the same [rad/s or m/s]; 0 if left out.
+
+    Other Args:
+        package_dirs: As for :func:`varpin.load_robot`.
+        mimic: As for :func:`varpin.load_robot`.
+        gravity: As for :class:`varpin.Scene`; the largest step depends on it.
+
+    Raises:
+        RobotError: As for :func:`varpin.load_robot`, singular mass matrices excepted.
+        InputError: ``q`` or ``v`` has a wrong shape or is not finite; ``lock``, ``package_dirs`` or ``mimic`` is given
+            with a robot that is loaded already.
+    """
+    if isinstance(source, Robot):
+        if lock or package_dirs or mimic != "tied":
+            raise InputError("lock, package_dirs and mimic belong to loading; the robot given is loaded already")
+        robot = source
+    else:
+        robot = build_robot(source, package_dirs=package_dirs, lock=lock, mimic=mimic)
+    scene = Scene(robot, gravity=gravity, damping=0.0)
+    configuration = joint_array("q", 0.0 if q is None else q, robot.joint_names, uniform=True)
+    velocity = joint_array("v", 0.0 if v is None else v, robot.joint_names, uniform=True)
+    with np.errstate(all="ignore"):
+        jet = lagrangian_jet(scene, configuration, velocity, backend="pinocchio")
+    if not all(np.isfinite(array).all() for array in (jet.Lvv, jet.Lqq)):
+        raise RobotError(
+            f"robot {robot.name!r} cannot be looked into: its mass matrix or its derivatives are not finite"
+        )
+    margin = Guard().branch_margin
+    condition, scaled = _condition_numbers(jet.Lvv)
+    urdf = None if robot.urdf is None else read_urdf(robot.urdf, robot.expanded)
+    joints, links = _joints(robot), _links(robot, urdf)
+    warnings = [
+        *(() if urdf is None else urdf.remarks),
+        *_mass_warnings(robot),
+        *_inertia_warnings(robot, links),
+        *_ratio_warnings(robot),
+        *_matrix_warnings(robot, scaled),
+        *_limit_warnings(joints, robot, None if q is None else configuration),
+        *_mimic_warnings(robot, urdf, joints, tied=mimic == "tied"),
+        *_damping_warnings(robot),
+        *(f"joint {name!r} is locked at {_position(at)}" for name, at in robot.locked.items()),
+    ]
+    return RobotReport(
+        robot=robot,
+        joints=joints,
+        links=links,
+        frames=_frames(robot),
+        locked=robot.locked,
+        total_mass=float(robot.tree.mass.sum()),
+        q=configuration,
+        v=velocity,
+        condition=condition,
+        scaled_condition=scaled,
+        largest_step=largest_step(jet.Lvv, jet.Lqq, margin) if np.isfinite(scaled) else None,
+        branch_margin=margin,
+        warnings=tuple(warnings),
+    )
+
+
+def _condition_numbers(M: Floats) -> tuple[float, float]:
+    """Condition number of M, and of M with a unit diagonal; both infinite where M is singular in double precision."""
+    if not (np.diag(M) > 0.0).all():
+        return np.inf, np.inf
+    scale = np.sqrt(np.diag(M))
+    scaled = np.linalg.eigvalsh(M / np.outer(scale, scale))
+    if scaled[0] <= len(M) * np.finfo(float).eps:
+        return np.inf, np.inf
+    return float(np.linalg.cond(M)), float(scaled[-1] / scaled[0])
+
+
+def _joints(robot: Robot) -> tuple[JointReport, ...]:
+    model = robot.free_model
+    ties = {tie.follower: tie for tie in robot.ties}
+    reports = []
+    for joint in range(1, model.njoints):
+        slides, axis = joint_axis(model, joint)
+        kind: Kind = "prismatic" if slides else "revolute"
+        follows = ""
+        lower, upper = -np.inf, np.inf
+        entry = model.joints[joint]
+        if is_unbounded(model, joint):
+            kind = "continuous"
+        else:
+            lower, upper = model.lowerPositionLimit[entry.idx_q], model.upperPositionLimit[entry.idx_q]
+        if joint in ties:
+            kind, tie = "mimic", ties[joint]
+            follows = f"{tie.ratio:g} * {model.names[tie.leader]}" + (f" {tie.offset:+g}" if tie.offset else "")
+        reports.append(
+            JointReport(
+                name=model.names[joint],
+                kind=kind,
+                axis=axis,
+                unit="m" if slides else "rad",
+                lower=_limit(lower),
+                upper=_limit(upper),
+                velocity=_limit(model.velocityLimit[entry.idx_v]),
+                effort=_limit(model.effortLimit[entry.idx_v]),
+                follows=follows,
+            )
+        )
+    return tuple(reports)
+
+
+def _limit(value: float) -> float:
+    """A limit, infinite where Pinocchio writes its absence as the largest double."""
+    return float(np.copysign(np.inf, value)) if abs(value) >= 1e300 else float(value)
+
+
+def _links(robot: Robot, urdf: Urdf | None) -> tuple[LinkReport, ...]:
+    if urdf is None or urdf.root is None:
+        bodies = range(1, robot.free_model.njoints)
+        return tuple(_body(robot, joint) for joint in bodies)
+    # Pinocchio merges links on fixed joints into one body, in which a faulty inertia can hide.
+    model = robot.free_model
+    joints = {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
+    return tuple(
+        LinkReport(
+            name=link.link,
+            joint=model.names[joints[link.link]] if joints[link.link] else "",
+            mass=link.mass,
+            center=link.center,
+            inertia=link.inertia,
+            moments=principal_moments(link.inertia),
+        )
+        for link in urdf.inertials
+        if link.link in joints
+    )
+
+
+_KINDS: dict[pin.FrameType, FrameKind] = {
+    pin.FrameType.BODY: "link",
+    pin.FrameType.JOINT: "joint",
+    pin.FrameType.FIXED_JOINT: "fixed joint",
+}
+
+
+def _frames(robot: Robot) -> tuple[FrameReport, ...]:
+    model, reports = robot.free_model, {}
+    for index, frame in enumerate(model.frames):
+        # The first is the world itself; of frames of one name varpin finds the first.
+        if index == 0 or frame.name in reports:
+            continue
+        kind: FrameKind = _KINDS.get(frame.type, "frame")
+        joint = model.names[frame.parentJoint] if frame.parentJoint else ""
+        on = model.frames[frame.parentFrame].name if frame.parentFrame else ""
+        # A frame that was added by hand may name no parent but the world, and yet move with a joint.
+        reports[frame.name] = FrameReport(frame.name, kind, on or ("" if kind == "joint" else joint), joint)
+    return tuple(reports.values())
+
+
+def _body(robot: Robot, joint: int) -> LinkReport:
+    body, inertia = robot.free_model.inertias[joint], np.array(robot.free_model.inertias[joint].inertia)
+    return LinkReport(
+        name=_body_name(robot, joint),
+        joint=robot.free_model.names[joint],
+        mass=float(body.mass),
+        center=np.array(body.lever),
+        inertia=inertia,
+        moments=np.linalg.eigvalsh(inertia),
+    )
+
+
+def _body_name(robot: Robot, joint: int) -> str:
+    """The first link on a joint, or the joint's own name if the model names no links."""
+    for frame in robot.free_model.frames:
+        if frame.parentJoint == joint and frame.type == pin.FrameType.BODY:
+            return str(frame.name)
+    return str(robot.free_model.names[joint])
+
+
+def _mass_warnings(robot: Robot) -> Iterator[str]:
+    for body, mass in enumerate(robot.tree.mass):
+        if mass == 0.0:
+            name, joint = _body_name(robot, body + 1), robot.free_model.names[body + 1]
+            carries = "only what it carries gives the joint inertia"
+            if body not in robot.tree.parent:
+                carries = "and it carries nothing"
+            yield f"link {name!r} is massless, yet joint {joint!r} moves it; {carries}"
+        elif not np.array(robot.free_model.inertias[body + 1].inertia).any():
+            name = _body_name(robot, body + 1)
+            yield f"link {name!r} has a mass of {mass:g} kg and no rotational inertia: a point mass"
+
+
+def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[str]:
+    length = LENGTH_RATIO * _reach(robot) or LENGTH
+    for link in links:
+        if not link.joint or not link.inertia.any():
+            continue
+        if said := fault(link.name, link.mass, link.moments):
+            yield said
+        elif link.mass > 0.0:
+            # A ball has the least inertia of all bodies of a given mass and density.
+            moments = ", ".join(f"{moment:.3g}" for moment in link.moments)
+            radius = (3.0 * link.mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
+            gyration = float(np.sqrt(link.moments[-1] / link.mass))
+            if link.moments.sum() < 1.2 * link.mass * radius**2:
+                yield (
+                    f"link {link.name!r} has an implausibly small inertia: {link.mass:g} kg with principal moments "
+                    f"{moments} kg m^2 would be denser than osmium"
+                )
+            elif gyration > length:
+                yield (
+                    f"link {link.name!r} has an implausibly large inertia: its radius of gyration is {gyration:.3g} m, "
+                    f"{_against_reach(robot)}"
+                )
+    for link in links:
+        away = float(np.linalg.norm(link.center))
+        if link.joint and away > length:
+            yield (
+                f"link {link.name!r} has its centre of mass {away:.3g} m away from its frame, {_against_reach(robot)}; "
+                "are these millimetres?"
+            )
+
+
+def _reach(robot: Robot) -> float:
+    """The longest way from a root of the tree to a joint, along the offsets between joints [m]."""
+    way = np.zeros(len(robot.tree.parent))
+    for body, parent in enumerate(robot.tree.parent):
+        if parent >= 0:
+            way[body] = way[parent] + np.linalg.norm(robot.tree.translation[body])
+    return float(way.max())
+
+
+def _against_reach(robot: Robot) -> str:
+    reach = _reach(robot)
+    return f"where the arm's joints span {reach:.3g} m" if reach > 0.0 else "longer than any arm"
+
+
+def _ratio_warnings(robot: Robot) -> Iterator[str]:
+    tree = robot.tree
+    moments = [np.linalg.eigvalsh(np.array(body.inertia))[-1] for body in list(robot.free_model.inertias)[1:]]
+    for body, parent in enumerate(tree.parent):
+        if parent < 0:
+            continue
+        pair = f"{_body_name(robot, int(parent) + 1)!r} and {_body_name(robot, body + 1)!r}"
+        for what, unit, values, most in (
+            ("masses", "kg", tree.mass, MASS_RATIO),
+            ("moments of inertia", "kg m^2", moments, INERTIA_RATIO),
+        ):
+            light, heavy = sorted((values[parent], values[body]))
+            if light > 0.0 and heavy > most * light:
+                yield (
+                    f"the {what} of neighbouring links {pair} differ by a factor of {heavy / light:.1g}: "
+                    f"{values[parent]:.3g} and {values[body]:.3g} {unit}"
+                )
+
+
+def _matrix_warnings(robot: Robot, scaled: float) -> Iterator[str]:
+    try:
+        check_inertia(robot)
+    except SingularMassMatrix as error:
+        yield str(error)
+        return
+    if scaled > CONDITION:
+        yield (
+            f"the mass matrix is ill-conditioned: with a unit diagonal its condition number is {scaled:.1e}, so "
+            f"accelerations lose {int(np.log10(scaled))} digits"
+        )
+
+
+def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | None) -> Iterator[str]:
+    bounded = [joint for joint in joints if joint.kind in ("revolute", "prismatic")]
+    moved = [joint for joint in joints if joint.kind != "mimic"]
+    missing = {
+        "position": [joint.name for joint in bounded if np.isinf(joint.lower) or np.isinf(joint.upper)],
+        "velocity": [joint.name for joint in moved if np.isinf(joint.velocity) or joint.velocity == 0.0],
+        "effort": [joint.name for joint in moved if np.isinf(joint.effort) or joint.effort == 0.0],
+    }
+    for what, names in missing.items():
+        if names:
+            yield f"no {what} limit, or one of 0: {', '.join(map(repr, names))}"
+    for joint in bounded:
+        if joint.lower == joint.upper == 0.0:
+            yield (
+                f"joint {joint.name!r} has limits 0 and 0, as if none were given: they are taken for none; "
+                "lock a joint that is not to move"
+            )
+        elif joint.lower >= joint.upper:
+            yield f"joint {joint.name!r} has no room to move: limits {joint.lower:g} and {joint.upper:g} {joint.unit}"
+    if q is not None:
+        for name, at, low, high in zip(robot.joint_names, q, *robot.position_limits, strict=True):
+            if low < high and not low <= at <= high:
+                yield f"q puts joint {name!r} at {at:g}, outside its limits {low:g} and {high:g}"
+
+
+def _mimic_warnings(robot: Robot, urdf: Urdf | None, joints: Sequence[JointReport], *, tied: bool) -> Iterator[str]:
+    for joint in joints:
+        if joint.follows:
+            yield f"mimic joint {joint.name!r} is tied to its leader, as {joint.follows}; it is no coordinate"
+    if urdf is None:
+        return
+    index = joint_index(robot.free_model)
+    moving = {joint.get("name") for joint in urdf.elements("joint") if joint.get("type") not in (None, "fixed")}
+    for name, mimic in urdf.mimics.items():
+        if name not in index:
+            continue
+        if mimic.leader not in moving:
+            yield f"joint {name!r} mimics {mimic.leader!r}, which is not a moving joint of the robot: it stays free"
+        elif not tied:
+            yield f"joint {name!r} mimics {mimic.leader!r}, but was asked to be free"
+
+
+def _damping_warnings(robot: Robot) -> Iterator[str]:
+    for what, values, unit, means in (
+        ("damping", robot.damping, "N m s/rad or N s/m", "which a scene takes as damping='robot', or as numbers"),
+        (
+            "dry friction",
+            robot.friction,
+            "N m or N",
+            "which a scene takes as forces=[varpin.CoulombFriction(robot.friction)]",
+        ),
+    ):
+        given = ", ".join(f"{name!r} {value:g}" for name, value in zip(robot.joint_names, values, strict=True) if value)
+        if given:
+            yield f"the description gives joint {what} [{unit}], {means}: {given}"
+
+
+def _position(value: float | tuple[float, ...]) -> str:
+    return f"{value:g}" if isinstance(value, float) else f"({', '.join(f'{x:g}' for x in value)})"

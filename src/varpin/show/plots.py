@@ -1,0 +1,425 @@
+"""Figures of trajectories, and of speed against accuracy.
+
+Figures are made without pyplot: nothing is shown, registered or configured globally. Save one with
+``figure.savefig("motion.png")``; a notebook displays it as the value of a cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import cycle, islice
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from numpy.typing import NDArray
+
+from varpin.errors import InputError
+from varpin.model import Robot
+from varpin.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    # Plotting a joint needs no optimizer.
+    from varpin.study.tradeoff import Advice, OptimalControlTradeoff, WorkPrecision
+    from varpin.study.tradeoff.precision import Quantity
+
+Floats = NDArray[np.float64]
+
+# Okabe and Ito's palette for colour-blind readers, without its yellow, which is faint on white.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+DASHES = ("-", "--", ":", "-.")
+# More rows than this make the legend two columns wide.
+_LEGEND_ROWS = 20
+# Points a line is drawn with at most; between them its extremes are kept.
+_POINTS = 8000
+
+
+def plot_joints(
+    trajectory: Trajectory, axes: Axes | None = None, *, robot: Robot | None = None
+) -> tuple[Figure | SubFigure, Axes]:
+    """Joint positions over time.
+
+    Args:
+        trajectory: The motion.
+        axes: Where to draw; a new figure if left out.
+        robot: The robot of the motion. With it joints are labelled in their own units, rad or m.
+
+    Returns:
+        The figure and its axes.
+
+    Raises:
+        InputError: ``robot`` has other joints than the trajectory.
+    """
+    return _plot_nodes(trajectory, trajectory.q, "position", ("rad", "m"), axes, robot)
+
+
+def plot_velocities(
+    trajectory: Trajectory, axes: Axes | None = None, *, robot: Robot | None = None
+) -> tuple[Figure | SubFigure, Axes]:
+    """Joint velocities over time; arguments as for :func:`plot_joints`."""
+    return _plot_nodes(trajectory, trajectory.v, "velocity", ("rad/s", "m/s"), axes, robot)
+
+
+def plot_controls(
+    trajectory: Trajectory,
+    axes: Axes | None = None,
+    *,
+    robot: Robot | None = None,
+    labels: Sequence[str] | None = None,
+) -> tuple[Figure | SubFigure, Axes]:
+    """Controls over time, as the steps they are; those of position servos as commanded positions [rad or m].
+
+    Args:
+        trajectory: The motion.
+        axes: Where to draw; a new figure if left out.
+        robot: The robot of the motion. With it the controls of joints are labelled in N m or N.
+        labels: Names of the m controls. Left out, they are named after the joints if there are as many, which is
+            right where every joint is actuated, and u1, u2, ... if not.
+
+    Returns:
+        The figure and its axes.
+
+    Raises:
+        InputError: ``labels`` are not m, or ``robot`` has other joints than the trajectory.
+    """
+    controls = trajectory.u.shape[1]
+    if labels is not None and len(labels) != controls:
+        raise InputError(f"labels must be {controls}, one a control, got {len(labels)}")
+    slides = _slides(trajectory, robot)
+    figure, axes = _axes(axes)
+    joints = _served(trajectory)
+    served = [joint is not None for joint in joints]
+    what = "control"
+    if labels is None and controls == len(trajectory.joint_names) and not any(served):
+        names, unit = _labels(trajectory.joint_names, ("N m", "N"), slides)
+    elif controls and all(served):
+        what, own = "commanded position", np.array([joint for joint in joints if joint is not None])
+        plain = [trajectory.joint_names[joint] for joint in own] if labels is None else labels
+        names, unit = _labels(plain, ("rad", "m"), None if slides is None else slides[own])
+    else:
+        every = labels is None and controls == len(trajectory.joint_names)
+        plain = trajectory.joint_names if every else (labels or [f"u{i + 1}" for i in range(controls)])
+        names = [
+            name if joint is None else f"{name}, commanded position [{_position_unit(joint, slides)}]"
+            for name, joint in zip(plain, joints, strict=True)
+        ]
+        unit = "units of each"
+    for row, name, style in zip(trajectory.u.T, names, _styles(controls), strict=True):
+        edges, values = _thin_steps(trajectory.t, row)
+        axes.step(edges, values, where="post", label=name, **style)
+    _finish(axes, trajectory, f"{what} [{unit}]", controls)
+    return figure, axes
+
+
+def plot_energy_error(
+    trajectory: Trajectory, axes: Axes | None = None, *, relative: bool = False
+) -> tuple[Figure | SubFigure, Axes]:
+    """Energy over time, less the initial energy: an error where nothing drives or damps the robot.
+
+    Args:
+        trajectory: The motion.
+        axes: Where to draw; a new figure if left out.
+        relative: Divide by the initial energy, instead of plotting joules. The zero of the potential energy is at the
+            world's origin, so this figure depends on where the robot stands.
+
+    Returns:
+        The figure and its axes.
+
+    Raises:
+        InputError: ``relative`` where the initial energy is 0.
+    """
+    start = trajectory.energy[0]
+    if relative and start == 0.0:
+        raise InputError("the initial energy is 0 J, so nothing is relative to it: plot with relative=False")
+    figure, axes = _axes(axes)
+    change = (trajectory.energy - start) / (abs(start) if relative else 1.0)
+    label = "(E(t) - E(0)) / |E(0)| [1]" if relative else "E(t) - E(0) [J]"
+    axes.axhline(0.0, color="0.75", linewidth=0.8, zorder=1)
+    axes.plot(*_thin(trajectory.t, change), label="energy", color=COLORS[0], linewidth=1.2)
+    _finish(axes, trajectory, label, 1)
+    return figure, axes
+
+
+def plot_trajectory(
+    trajectory: Trajectory,
+    axes: Sequence[Axes] | NDArray[Any] | None = None,
+    *,
+    robot: Robot | None = None,
+    labels: Sequence[str] | None = None,
+) -> tuple[Figure | SubFigure, NDArray[Any]]:
+    """An overview: positions, velocities, controls and energy, one above the other.
+
+    Args:
+        trajectory: The motion.
+        axes: Four axes to draw on; a new figure if left out.
+        robot: As for :func:`plot_joints`.
+        labels: Names of the controls, as for :func:`plot_controls`.
+
+    Returns:
+        The figure and its axes (4,).
+
+    Raises:
+        InputError: ``axes`` are not four, or as for the single figures.
+    """
+    if axes is None:
+        new = Figure(figsize=(9.0, 10.0), layout="constrained")
+        panels = new.subplots(4, 1, sharex=True)
+        new.suptitle(f"{trajectory.robot}: {trajectory.integrator}, dt = {trajectory.dt:g} s", fontsize="large")
+    else:
+        panels = np.asarray(axes, dtype=object).ravel()
+        if panels.size != 4:
+            raise InputError(f"axes must be 4 (positions, velocities, controls, energy), got {panels.size}")
+    plot_joints(trajectory, panels[0], robot=robot)
+    plot_velocities(trajectory, panels[1], robot=robot)
+    plot_controls(trajectory, panels[2], robot=robot, labels=labels)
+    plot_energy_error(trajectory, panels[3])
+    # The same joints have the same colours in all panels, so one legend serves them.
+    handles, names = panels[0].get_legend_handles_labels()
+    mixed = len({joint is None for joint in _served(trajectory)}) > 1
+    for panel in panels[1:3]:
+        same = len(panel.get_legend_handles_labels()[1]) == len(names) and not (panel is panels[2] and mixed)
+        if panel.get_legend() is not None and (panel is panels[1] or (same and labels is None)):
+            panel.get_legend().remove()
+    if axes is None and panels[0].get_legend() is not None:
+        # The figure's legend takes its room beside all panels; that of one panel would push the others apart.
+        panels[0].get_legend().remove()
+        new.legend(handles, names, loc="outside right upper", frameon=False, fontsize="small")
+    for panel in panels[:3]:
+        panel.set_xlabel("")
+    if axes is None:
+        new.align_ylabels()
+    return panels[0].figure, panels
+
+
+def plot_work_precision(
+    record: WorkPrecision, axes: Axes | None = None, *, quantity: Quantity = "q"
+) -> tuple[Figure | SubFigure, Axes]:
+    """Error over wall time, one line an integrator, one point a step; the Pareto front is ringed and joined.
+
+    Errors that the reference cannot tell from zero stand on the grey line that marks its own.
+
+    Args:
+        record: From :func:`varpin.work_precision`.
+        axes: Where to draw; a new figure if left out.
+        quantity: ``"q"``, the largest error in q over the motion; ``"end"``, at its end; ``"energy"``, for a motion
+            that keeps its energy; ``"tip"``, of the end effector.
+
+    Returns:
+        The figure and its axes.
+
+    Raises:
+        InputError: Another ``quantity``, or no run has such an error.
+    """
+    labels = {
+        "q": "largest error in q [rad or m]",
+        "end": "error in q at the end [rad or m]",
+        "energy": "largest energy error [J]",
+        "tip": "largest error of the end effector [m]",
+    }
+    points = [(run.integrator, run.seconds, record.error_of(run, quantity)) for run in record.runs]
+    front = [(run.seconds, record.error_of(run, quantity)) for run in record.pareto(quantity)]
+    figure, axes = _plot_trade(points, front, axes)
+    axes.set_yscale("log")
+    floor = {"q": record.reference_error, "end": record.reference_error, "tip": record.tip_reference_error}
+    if floor.get(quantity, 0.0) > 0.0:
+        axes.axhline(floor[quantity], color="0.6", linewidth=0.8, linestyle="--", zorder=1)
+    axes.set_xlabel(f"wall time for {record.duration:g} s [s]")
+    axes.set_ylabel(labels[quantity])
+    return figure, axes
+
+
+def plot_advice(advice: Advice, axes: Axes | None = None) -> tuple[Figure | SubFigure, Axes]:
+    """Predicted error over predicted time of the advised choice, ringed, and of the best of every other method.
+
+    A grey line is the tolerance or the budget that was asked for.
+
+    Args:
+        advice: From :func:`varpin.advise`.
+        axes: Where to draw; a new figure if left out.
+
+    Returns:
+        The figure and its axes.
+
+    Raises:
+        InputError: No choice has a known error.
+    """
+    points = [
+        (f"{choice.integrator}, {choice.dt:.3g} s", choice.seconds, choice.error)
+        for choice in (advice.best, *advice.alternatives)
+        if np.isfinite(choice.error) and choice.error > 0.0
+    ]
+    best = [(seconds, error) for _, seconds, error in points[:1]]
+    figure, axes = _plot_trade(points, best, axes, "advised" if np.isfinite(advice.error) else "the most accurate")
+    axes.set_yscale("log")
+    if advice.tolerance is not None:
+        axes.axhline(advice.tolerance, color="0.6", linewidth=0.8, linestyle="--", zorder=1)
+    if advice.budget is not None:
+        axes.axvline(advice.budget, color="0.6", linewidth=0.8, linestyle="--", zorder=1)
+    axes.set_xlabel("predicted wall time [s]")
+    axes.set_ylabel("predicted error in q at the end [rad or m]")
+    return figure, axes
+
+
+def plot_optimal_control_tradeoff(
+    record: OptimalControlTradeoff, axes: Axes | None = None
+) -> tuple[Figure | SubFigure, Axes]:
+    """True cost of the plans over the time it took to find them, with the Pareto front; arguments as above.
+
+    Raises:
+        InputError: No run has a true cost.
+    """
+    points = [(run.integrator, run.seconds, run.open_loop_cost) for run in record.runs]
+    figure, axes = _plot_trade(points, [(run.seconds, run.open_loop_cost) for run in record.pareto()], axes)
+    axes.set_xlabel("solve time [s]")
+    axes.set_ylabel("true cost of the controls")
+    return figure, axes
+
+
+def _plot_trade(
+    points: Sequence[tuple[str, float, float]],
+    front: Sequence[tuple[float, float]],
+    axes: Axes | None,
+    front_name: str = "Pareto front",
+) -> tuple[Figure | SubFigure, Axes]:
+    """Points (integrator, seconds, value) as one line an integrator, and a front, over logarithmic time."""
+    if not front:
+        raise InputError("no run has such a value, so there is nothing to plot")
+    figure, axes = _axes(axes)
+    names = list(dict.fromkeys(name for name, _, _ in points))
+    for name, style in zip(names, _styles(len(names)), strict=True):
+        own = [(seconds, value) for label, seconds, value in points if label == name]
+        axes.plot(*zip(*own, strict=True), label=name, marker="o", markersize=4, **style)
+    axes.plot(
+        *zip(*front, strict=True),
+        label=front_name,
+        color="0.3",
+        linewidth=0.8,
+        marker="o",
+        markersize=9,
+        markerfacecolor="none",
+        zorder=1,
+    )
+    axes.set_xscale("log")
+    axes.grid(visible=True, color="0.92", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize="small")
+    return figure, axes
+
+
+def _plot_nodes(
+    trajectory: Trajectory,
+    values: Floats,
+    what: str,
+    units: tuple[str, str],
+    axes: Axes | None,
+    robot: Robot | None,
+) -> tuple[Figure | SubFigure, Axes]:
+    """One line a joint over the nodes; ``units`` are a revolute and a prismatic joint's."""
+    slides = _slides(trajectory, robot)
+    figure, axes = _axes(axes)
+    names, unit = _labels(trajectory.joint_names, units, slides)
+    for row, name, style in zip(values.T, names, _styles(len(names)), strict=True):
+        axes.plot(*_thin(trajectory.t, row), label=name, **style)
+    _finish(axes, trajectory, f"{what} [{unit}]", len(names))
+    return figure, axes
+
+
+def _axes(axes: Axes | None) -> tuple[Figure | SubFigure, Axes]:
+    if axes is None:
+        figure = Figure(figsize=(8.0, 4.5), layout="constrained")
+        return figure, figure.subplots()
+    return axes.figure, axes
+
+
+def _slides(trajectory: Trajectory, robot: Robot | None) -> NDArray[np.bool_] | None:
+    """Which coordinates (n,) are prismatic, or None without a robot to ask."""
+    if robot is None:
+        return None
+    if robot.joint_names != trajectory.joint_names:
+        raise InputError(
+            f"robot {robot.name!r} has joints {', '.join(robot.joint_names)}; "
+            f"the trajectory has {', '.join(trajectory.joint_names)}"
+        )
+    slides = np.zeros(robot.dof, dtype=bool)
+    followers = {tie.follower - 1 for tie in robot.ties}
+    for body, coordinate in enumerate(robot.tree.coordinate):
+        if body not in followers:
+            slides[coordinate] = robot.tree.prismatic[body]
+    return slides
+
+
+def _labels(names: Sequence[str], units: tuple[str, str], slides: NDArray[np.bool_] | None) -> tuple[list[str], str]:
+    """Legend entries and the unit on the axis; entries carry their own unit where joints differ."""
+    if slides is None:
+        return list(names), " or ".join(units)
+    if slides.all() or not slides.any():
+        return list(names), units[int(slides[0])]
+    return [f"{name} [{units[1]}]" if s else name for name, s in zip(names, slides, strict=True)], ", ".join(units)
+
+
+def _served(trajectory: Trajectory) -> list[int | None]:
+    """For each control (m,) the joint whose servo goes to it; None for forces, and where the record does not say."""
+    none: list[int | None] = [None] * trajectory.u.shape[1]
+    values = trajectory.scene_values
+    if "PositionServo" not in values or "actuation" not in values or not values["PositionServo"].size:
+        return none
+    actuation = values["actuation"]
+    joints = range(min(len(trajectory.joint_names), len(actuation)))
+    for joint in values["PositionServo"][:, 0].tolist():
+        # A file may hold anything.
+        drives = np.flatnonzero(actuation[int(joint)]) if joint in joints else np.zeros(0, dtype=np.int64)
+        if len(drives) and drives[0] < len(none):
+            none[int(drives[0])] = int(joint)
+    return none
+
+
+def _position_unit(joint: int, slides: NDArray[np.bool_] | None) -> str:
+    return "rad or m" if slides is None else ("rad", "m")[int(slides[joint])]
+
+
+def _styles(lines: int) -> list[dict[str, Any]]:
+    """Line styles that stay apart: all colours, then all colours dashed, and so on."""
+    pairs = ({"color": color, "linestyle": dash, "linewidth": 1.4} for dash in cycle(DASHES) for color in COLORS)
+    return list(islice(pairs, lines))
+
+
+def _finish(axes: Axes, trajectory: Trajectory, label: str, lines: int) -> None:
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel(label)
+    axes.grid(visible=True, color="0.92", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    if trajectory.duration > 0.0:
+        axes.set_xlim(trajectory.t[0], trajectory.t[-1])
+    if lines > 1:
+        axes.legend(
+            loc="upper left",
+            bbox_to_anchor=(1.0, 1.0),
+            frameon=False,
+            fontsize="small",
+            ncols=-(-lines // _LEGEND_ROWS),
+        )
+
+
+def _thin(t: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """A line of at most some thousand points that looks like the whole: the extremes of each stretch are kept."""
+    if len(t) <= _POINTS:
+        return t, values
+    stretch = -(-2 * len(t) // _POINTS)
+    whole = len(t) // stretch * stretch
+    blocks = values[:whole].reshape(-1, stretch)
+    first = np.arange(len(blocks)) * stretch
+    extremes = np.concatenate([first + blocks.argmin(axis=1), first + blocks.argmax(axis=1)])
+    kept = np.unique(np.concatenate([extremes, [0, len(t) - 1], np.arange(whole, len(t))]))
+    return t[kept], values[kept]
+
+
+def _thin_steps(t: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Where a step function over the intervals of ``t`` (N + 1,) changes, and to what; its last value is repeated."""
+    if not len(values):
+        return t, np.zeros(len(t))
+    changes = np.flatnonzero(np.concatenate([[True], np.diff(values) != 0.0]))
+    edges, steps = _thin(t[changes], values[changes])
+    return np.append(edges, t[-1]), np.append(steps, values[-1])

@@ -1,0 +1,5 @@
+"""Motions shown in meshcat: as one HTML file that plays by itself, as a film, or in a live window."""
+
+from varpin.show.replay.annotations import frame_names as frame_names
+from varpin.show.replay.motion import replay as replay
+from varpin.show.replay.video import check_film as check_film

@@ -1,0 +1,264 @@
+"""What a replay marks beside the robots themselves, checked and put on its clock: traces, targets, frames, torques."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import pinocchio as pin
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.errors import InputError
+from varpin.model import Robot
+from varpin.show.replay.script import Outlook, Target, Trace
+from varpin.support.checks import JointValues, as_floats, joint_array, require_finite
+from varpin.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from varpin.control.mpc import MpcRun
+
+Floats = NDArray[np.float64]
+
+# Points of a trace: a coarse motion's path is curved between its nodes, a long one's needs no more than so many.
+_FEWEST, _MOST = 200, 1000
+
+# Beads on the way that a plan means to take.
+_BEADS = 12
+
+
+def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequence[str]) -> list[tuple[str, ...]]:
+    """The frames each robot is asked for.
+
+    Args:
+        option: What the names were given as.
+        robots: The arms.
+        names: One or several, of which each robot takes those it has; or whether its end effector.
+
+    Raises:
+        InputError: No robot has a frame of such a name.
+    """
+    if isinstance(names, bool | np.bool_):
+        return [(robot.end_effector,) if names else () for robot in robots]
+    wanted = (names,) if isinstance(names, str) else tuple(names)
+    for name in wanted:
+        if not isinstance(name, str):
+            raise InputError(f"{option} must be names of frames, got {name!r}")
+        if not any(robot.free_model.existFrame(name) for robot in robots):
+            known = dict.fromkeys(frame.name for robot in robots for frame in robot.free_model.frames)
+            close = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+            hint = f"did you mean {' or '.join(map(repr, close))}?" if close else f"frames: {', '.join(known)}"
+            owner = f"robot {robots[0].name!r} has" if len(robots) == 1 else "the robots have"
+            raise InputError(f"{option}: {owner} no frame {name!r}; {hint}")
+    return [tuple(name for name in wanted if robot.free_model.existFrame(name)) for robot in robots]
+
+
+def traces(
+    kind: Literal["motion", "ghost"],
+    robot: Robot,
+    names: Sequence[str],
+    t: Floats,
+    q: Floats,
+    end: float,
+    growing: Floats | None = None,
+) -> list[Trace]:
+    """The paths of frames along a motion up to a time; none of a frame that does not move.
+
+    Args:
+        kind: Of what moves.
+        robot: The arm.
+        names: Of its frames.
+        t: Times (N + 1,) [s].
+        q: Configurations (N + 1, n) [rad or m], linear in between as on the page.
+        end: Of the motion that is shown [s].
+        growing: Times of the keyframes (K,) [s], to draw them as far as the motion has come.
+    """
+    times = np.append(t[t < end], min(end, t[-1]))
+    if len(times) - 1 > _MOST:
+        times = np.linspace(0.0, times[-1], _MOST + 1)
+    elif 1 < len(times) < _FEWEST:
+        parts = math.ceil(_FEWEST / (len(times) - 1))
+        fine = np.arange((len(times) - 1) * parts + 1) / parts
+        times = np.interp(fine, np.arange(len(times)), times)
+    rows = _at(times, t, q)
+    found = []
+    for name in names:
+        points = robot.frame_positions(rows, name)
+        kept = _moves(points)
+        if kept.sum() > 1:
+            reached = None if growing is None else np.interp(growing, times, np.cumsum(kept) - 1.0)
+            found.append(Trace(kind, name, points[kept], reached))
+    return found
+
+
+def outlooks(robot: Robot, names: Sequence[str], run: MpcRun, ahead: float, times: Floats) -> list[Outlook]:
+    """Where a controller's plans mean to take frames.
+
+    Args:
+        robot: The arm.
+        names: Of its frames.
+        run: What the controller did.
+        ahead: How far to look [s].
+        times: Of the keyframes (K,) [s].
+    """
+    ticks = run.period * np.arange(len(run.plans) + 1, dtype=np.float64)
+    found = []
+    for name in names:
+        beads = [
+            robot.frame_positions(_at(times, ticks, run.planned(ahead * part)), name)
+            for part in np.arange(1, _BEADS + 1) / _BEADS
+        ]
+        found.append(Outlook(name, np.stack(beads, axis=1)))
+    return found
+
+
+def _at(times: Floats, t: Floats, rows: Floats) -> Floats:
+    """Rows (N, n) at times (N,), read off at others."""
+    return np.column_stack([np.interp(times, t, column) for column in rows.T])
+
+
+def references(given: ArrayLike | Mapping[str, ArrayLike] | None) -> tuple[Trace, ...]:
+    """Paths in the world, by name.
+
+    Raises:
+        InputError: One of them is no path (K, 3), not finite, or stays in one place.
+    """
+    if given is None:
+        return ()
+    named = given if isinstance(given, Mapping) else {"reference": given}
+    found = []
+    for name, value in named.items():
+        what = f"reference[{name!r}]" if isinstance(given, Mapping) else "reference"
+        points = as_floats(what, value)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise InputError(f"{what} must have shape (K, 3), points on a path in the world [m], got {points.shape}")
+        points = points[_moves(require_finite(what, points))]
+        if len(points) < 2:
+            raise InputError(f"{what} stays in one place; give a place as a target")
+        found.append(Trace("reference", str(name), points))
+    return tuple(found)
+
+
+def _moves(points: Floats) -> NDArray[np.bool_]:
+    """Which points (P,) of a path (P, 3) are apart from the last one before that is."""
+    kept = np.zeros(len(points), dtype=np.bool_)
+    if not len(points):
+        return kept
+    apart = 1e-5 * float(np.ptp(points, axis=0).max())
+    last, kept[0] = points[0], True
+    for k, point in enumerate(points):
+        if np.linalg.norm(point - last) > apart:
+            last, kept[k] = point, True
+    return kept
+
+
+def target_tracks(given: Mapping[str, object] | None, end: float) -> dict[str, tuple[Floats, Floats, Floats | None]]:
+    """Times (K,) [s], places (K, 3) [m] and, of poses, turns (K, 4) of each target; one row of one that stays.
+
+    Args:
+        given: Points (3,), poses (4, 4), pin.SE3, or rows of either, spread evenly over the motion's time.
+        end: Of the motion [s].
+
+    Raises:
+        InputError: One of them is neither, not finite, or no rotation; or it moves and the motion does not.
+    """
+    if given is not None and not isinstance(given, Mapping):
+        raise InputError(f"targets must map names to places or poses, as in {{'cup': [0.5, 0, 0.3]}}, got {given!r}")
+    found: dict[str, tuple[Floats, Floats, Floats | None]] = {}
+    for name, value in (given or {}).items():
+        what = f"targets[{name!r}]"
+        array = require_finite(what, as_floats(what, _numbers(value)))
+        if array.shape in ((3,), (4, 4)):
+            array = array[None]
+        poses = array.ndim == 3 and array.shape[1:] == (4, 4)
+        if not (poses or (array.ndim == 2 and array.shape[1] == 3)) or not len(array):
+            raise InputError(
+                f"{what} must be a point (3,), a pose (4, 4) or pin.SE3, or rows of them, (K, 3) or (K, 4, 4); got "
+                f"shape {array.shape}"
+            )
+        if len(array) > 1 and end == 0.0:
+            raise InputError(f"the motion is a single pose, so {what} must stay, too, got {len(array)} rows")
+        times = np.linspace(0.0, end, len(array))
+        if not poses:
+            found[str(name)] = times, array, None
+            continue
+        R = array[:, :3, :3]
+        rigid = np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max() < 1e-6 and (np.linalg.det(R) > 0.0).all()
+        if not rigid or np.abs(array[:, 3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-9:
+            raise InputError(f"{what} is no pose: a rotation and a place above the row 0 0 0 1")
+        found[str(name)] = times, array[:, :3, 3], scipy.spatial.transform.Rotation.from_matrix(R).as_quat()
+    return found
+
+
+def _numbers(value: object) -> ArrayLike:
+    if isinstance(value, pin.SE3):
+        return value.homogeneous
+    if isinstance(value, Sequence) and value and all(isinstance(row, pin.SE3) for row in value):
+        return [row.homogeneous for row in value]
+    return value  # type: ignore[return-value]
+
+
+def target(name: str, track: tuple[Floats, Floats, Floats | None], times: Floats) -> Target:
+    """A target at the keyframes (K,) [s]."""
+    t, places, turns = track
+    if len(t) == 1:
+        return Target(name, places, turns)
+    at = _at(times, t, places)
+    if turns is None:
+        return Target(name, at)
+    between = scipy.spatial.transform.Slerp(t, scipy.spatial.transform.Rotation.from_quat(turns))
+    return Target(name, at, between(np.minimum(times, t[-1])).as_quat())
+
+
+def torque_shares(
+    robot: Robot, motion: Trajectory | ArrayLike, torques: bool | ArrayLike, limit: JointValues | None
+) -> Floats | None:
+    """How much of its limit each joint's torque takes in each step (N, n), in [0, 1]; None if it is not to be shown.
+
+    Args:
+        robot: The arm.
+        motion: Of which the controls are taken.
+        torques: Whether to; or the torques (N, n) themselves [N m or N].
+        limit: One or (n,) [N m or N]; the robot's own if left out, and where it has none the largest torque there is.
+
+    Raises:
+        InputError: The motion has no torques of all joints, or they are not (N, n), or a limit is not positive.
+    """
+    if isinstance(torques, bool | np.bool_):
+        if not torques:
+            if limit is not None:
+                raise InputError("torque_limit colours nothing without torques")
+            return None
+        if not isinstance(motion, Trajectory):
+            raise InputError("torques=True takes the controls of a trajectory; for an array, give the torques (N, n)")
+        values = require_finite("motion.u", motion.u)
+        if values.shape[1] != robot.dof:
+            raise InputError(
+                f"torques=True takes one control for each of the {robot.dof} joints, this trajectory has "
+                f"{values.shape[1]}; give the torques (N, {robot.dof}) themselves"
+            )
+        if motion.scene_values.get("PositionServo", np.zeros(0)).size:
+            raise InputError(
+                "torques=True takes controls for torques, and controls of this trajectory are positions that servos go "
+                f"to; give the torques (N, {robot.dof}) themselves"
+            )
+    else:
+        values = as_floats("torques", torques)
+        if values.ndim != 2 or values.shape[1] != robot.dof:
+            raise InputError(f"torques must have shape (N, {robot.dof}), one row a step, got {values.shape}")
+        values = require_finite("torques", values)
+    size = np.abs(values)
+    largest = size.max(axis=0, initial=0.0)
+    own = robot.effort_limit
+    bound = np.where(np.isfinite(own), own, largest)
+    if limit is not None:
+        given = joint_array("torque_limit", limit, robot.joint_names, uniform=True)
+        # Of joints that are not named the limit stays their own.
+        named = [not isinstance(limit, Mapping) or name in limit for name in robot.joint_names]
+        bound = np.where(named, given, bound)
+        if not (bound > 0.0).all():
+            raise InputError(f"torque_limit must be positive [N m or N], got {limit}")
+    return np.minimum(size / np.where(bound > 0.0, bound, 1.0), 1.0)

@@ -1,0 +1,195 @@
+"""A script put into meshcat: robots, what is marked, the view, and everything's motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import meshcat
+import numpy as np
+import pinocchio as pin
+from meshcat.animation import Animation, AnimationClip, AnimationTrack
+from numpy.typing import NDArray
+
+from varpin.errors import InputError
+from varpin.show.replay import marks
+from varpin.show.replay.picture import Picture, label, labels
+from varpin.show.replay.script import Actor, Outlook, Script, Target, Trace
+from varpin.show.replay.shapes import GHOST_COLOR, ShapeLoader
+from varpin.show.replay.view import set_view, side_by_side, view_direction
+
+Floats = NDArray[np.float64]
+
+_TRACE_COLORS = {"motion": 0xD1480F, "ghost": GHOST_COLOR, "reference": 0x157A3C}
+_TARGET_COLOR = 0xC0187A
+
+# From no torque to all there is; linear in between.
+EFFORT_COLORS = np.array([[0.72, 0.76, 0.8], [0.98, 0.75, 0.1], [0.8, 0.05, 0.05]])
+
+# Viewers compute in single precision, and with squares [m].
+_FARTHEST = 1e18
+
+# Of marks, in sizes of a robot's motion.
+_TUBE, _BEAD, _BALL, _TRIAD, _LABEL = 0.003, 0.006, 0.02, 0.1, 0.25
+
+
+def draw(viewer: meshcat.Visualizer, script: Script) -> None:
+    """Send everything a script shows."""
+    _Drawing(viewer, script).draw()
+
+
+class _Drawing:
+    """One script on its way to one viewer."""
+
+    def __init__(self, viewer: meshcat.Visualizer, script: Script) -> None:
+        self.viewer = viewer
+        self.script = script
+        self.loader = ShapeLoader(viewer)
+        self.clips: dict[meshcat.path.Path, AnimationClip] = {}
+        robots = {id(actor.robot): actor.robot for actor in script.actors}
+        self.pictures = {key: Picture.of(robot) for key, robot in robots.items()}
+
+    def draw(self) -> None:
+        size, places = self._stage()
+        for k, (actor, place) in enumerate(zip(self.script.actors, places, strict=True)):
+            number = f" {k + 1}" if k else ""
+            self._actor(actor, number, place, size)
+            # Robots in one place share what is marked there.
+            if not any((place == other).all() for other in places[:k]):
+                self._notes([*self.script.traces, *actor.traces], self.script.targets, f"notes{number}", place, size)
+            else:
+                self._notes(actor.traces, [], f"notes{number}", place, size)
+            self._outlooks(actor.outlooks, f"notes{number}", size)
+        if len(self.script.times) > 1:
+            repetitions = math.inf if self.script.loop else 1
+            self.viewer.set_animation(Animation(self.clips), play=True, repetitions=repetitions)
+
+    def _stage(self) -> tuple[float, list[Floats]]:
+        """Set the view; returns the size of the largest robot's motion [m] and where each robot goes."""
+        marked = [trace.points for trace in self.script.traces] + [target.places for target in self.script.targets]
+        extents, axes = [], []
+        size = 0.0
+        for actor in self.script.actors:
+            picture = self.pictures[id(actor.robot)]
+            positions = np.concatenate([_samples(rows) for rows in actor.positions.values()])
+            points = picture.swept(positions)
+            size = max(size, float(np.ptp(points, axis=0).max()))
+            lines = [trace.points for trace in actor.traces]
+            lines += [outlook.places.reshape(-1, 3) for outlook in actor.outlooks]
+            extents.append(np.concatenate([points, *lines, *marked]))
+            axes.append(picture.body_poses(positions)[0][..., 2].reshape(-1, 3))
+        if not np.abs(np.concatenate(extents)).max() < _FARTHEST:
+            raise InputError(f"what is to be shown has sizes or places beyond {_FARTHEST:g} m, which no viewer draws")
+        # A point, or what is too small to tell from one, is seen from a metre away.
+        size = size if size > 1.0 / _FARTHEST else 1.0
+        toward = view_direction(np.concatenate(axes))
+        offset = self.script.offset
+        places = side_by_side(extents, toward) if offset is None else [k * offset for k in range(len(extents))]
+        base = self.pictures[id(self.script.actors[0].robot)].corners(-1)
+        floor = (base if len(base) else extents[0])[:, 2].min()
+        points = np.concatenate([points + place for points, place in zip(extents, places, strict=True)])
+        set_view(self.viewer, points, toward, float(floor), size)
+        return size, places
+
+    def _actor(self, actor: Actor, number: str, place: Floats, size: float) -> None:
+        picture, tree = self.pictures[id(actor.robot)], actor.robot.tree
+        for kind, rows in actor.positions.items():
+            root = f"{kind}{number}"
+            self.viewer[root].set_transform(_translation(place))
+            nodes = picture.moving_nodes(root)
+            for j, node in enumerate(nodes):
+                joint = pin.SE3(tree.rotation[j], tree.translation[j])
+                self.viewer[node.removesuffix("/moving")].set_transform(joint.homogeneous)
+                self.viewer[node].set_transform(_joint_motion(bool(tree.prismatic[j]), rows[0, j]))
+                # One number a joint: the page then interpolates in q itself, and links stay whole at any frame rate.
+                name = "position[z]" if tree.prismatic[j] else "rotation[z]"
+                self._animate(node, name, "number", rows[:, j])
+            shapes = zip(picture.shapes, picture.bodies, picture.placements, strict=True)
+            for k, (shape, body, placement) in enumerate(shapes):
+                parent = nodes[body] if body >= 0 else f"{root}/base"
+                node = f"{parent}/shapes/{k} {label(shape.name)}"
+                if kind == "ghost":
+                    if body >= 0:
+                        self.loader.load_ghost(shape, placement, node)
+                elif actor.effort is not None and body >= 0:
+                    self.loader.load_plain(shape, placement, node)
+                    self._color(f"{node}/<object>", actor.effort[:, body])
+                else:
+                    self.loader.load(shape, placement, node)
+            for name, step in zip(actor.frames, labels(actor.frames), strict=True) if kind == "robot" else ():
+                body, placement = picture.frame(name)
+                node = f"{nodes[body] if body >= 0 else f'{root}/base'}/frames/{step}"
+                self.viewer[node].set_transform(placement.homogeneous)
+                self.viewer[node].set_object(marks.triad(_TRIAD * size))
+
+    def _color(self, node: str, shares: Floats) -> None:
+        stops = np.linspace(0.0, 1.0, len(EFFORT_COLORS))
+        colors = np.column_stack([np.interp(shares, stops, channel) for channel in EFFORT_COLORS.T])
+        self.viewer[node].set_property("color", [*colors[0].tolist(), 1.0])
+        self._animate(node, "material.color", "color", colors)
+
+    def _notes(self, traces: Sequence[Trace], targets: Sequence[Target], root: str, place: Floats, size: float) -> None:
+        """What is marked in the world of one robot."""
+        self.viewer[root].set_transform(_translation(place))
+        for k, trace in enumerate(traces):
+            node = f"{root}/traces/{k} {trace.kind} {label(trace.name)}"
+            self.viewer[node].set_object(marks.tube(trace.points, _TUBE * size, _TRACE_COLORS[trace.kind]))
+            if trace.reached is not None:
+                # three.js draws so many of its corners; a piece that is reached in part is drawn in part.
+                corners = marks.TUBE_PIECE * trace.reached
+                self._animate(f"{node}/<object>", "geometry[drawRange].count", "number", corners)
+        for target, step in zip(targets, labels(target.name for target in targets), strict=True):
+            node = f"{root}/targets/{step}"
+            pose = _translation(target.places[0])
+            if target.turns is not None:
+                pose[:3, :3] = pin.Quaternion(target.turns[0]).toRotationMatrix()
+            self.viewer[node].set_transform(pose)
+            if len(target.places) > 1:
+                self._animate(node, "position", "vector3", target.places)
+                if target.turns is not None:
+                    self._animate(node, "quaternion", "quaternion", target.turns)
+            self.viewer[f"{node}/ball"].set_object(marks.ball(_BALL * size, _TARGET_COLOR))
+            if target.turns is not None:
+                self.viewer[f"{node}/axes"].set_object(marks.triad(_TRIAD * size))
+            self.viewer[f"{node}/label"].set_object(marks.Label(target.name, _LABEL * size))
+            # Which point of the label, from 0 to 1, is at the target: one below the text, so that the ball stays free.
+            self.viewer[f"{node}/label/<object>"].set_property("center", {"x": 0.5, "y": 0.5 - 1.2 * _BALL / _LABEL})
+
+    def _outlooks(self, outlooks: Sequence[Outlook], root: str, size: float) -> None:
+        """Beads where plans mean to take frames."""
+        for k, outlook in enumerate(outlooks):
+            for b, places in enumerate(outlook.places.transpose(1, 0, 2)):
+                node = f"{root}/plans/{k} {label(outlook.name)}/{b}"
+                self.viewer[node].set_object(marks.bead(_BEAD * size, GHOST_COLOR))
+                self.viewer[node].set_transform(_translation(places[0]))
+                self._animate(node, "position", "vector3", places)
+
+    def _animate(self, node: str, name: str, kind: str, values: Floats) -> None:
+        """Give a property of a node its values (K, ...) at the keyframes."""
+        path = self.viewer[node].path
+        # One frame a second, so that keyframe times are seconds.
+        clip = self.clips.setdefault(path, AnimationClip({}, fps=1))
+        clip.tracks[name] = AnimationTrack(name, kind, self.script.times.tolist(), values.tolist())
+
+
+def _translation(place: Floats) -> Floats:
+    """Transform (4, 4)."""
+    pose = np.eye(4)
+    pose[:3, 3] = place
+    return pose
+
+
+def _joint_motion(prismatic: bool, position: float) -> Floats:
+    """Transform (4, 4) of a joint along or about z."""
+    motion = np.eye(4)
+    if prismatic:
+        motion[2, 3] = position
+    else:
+        c, s = math.cos(position), math.sin(position)
+        motion[:2, :2] = [[c, -s], [s, c]]
+    return motion
+
+
+def _samples(rows: Floats) -> Floats:
+    """Some of many rows, the first and the last among them."""
+    return rows[np.unique(np.linspace(0, len(rows) - 1, 50).astype(int))]

@@ -1,0 +1,182 @@
+"""What a robot looks like: its meshes, or a skeleton where there are none, body by body."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from varpin.model import Robot, readable_geometry
+from varpin.model.tree import joint_axis, z_to
+
+Floats = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
+_ROD, _JOINT, _CENTER = (0.45, 0.52, 0.6, 1.0), (0.85, 0.45, 0.15, 1.0), (0.15, 0.35, 0.65, 1.0)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What to draw, body by body; body -1 is the base.
+
+    A body's node moves by one number: its angle about, or its way along, the z axis of the joint frame.
+
+    Attributes:
+        robot: The arm.
+        shapes: Its visual geometry, or a skeleton; on joints of ``robot.free_model``.
+        bodies: The body each shape is on, -1 for the base.
+        placements: Of each shape in its body's frame.
+    """
+
+    robot: Robot
+    shapes: Sequence[pin.GeometryObject]
+    bodies: Sequence[int]
+    placements: Sequence[pin.SE3]
+
+    @classmethod
+    def of(cls, robot: Robot) -> Picture:
+        """The picture of a robot, made of the meshes that can be read."""
+        visuals, missing = readable_geometry(robot)
+        shapes = list(visuals.geometryObjects)
+        problem = "; ".join(dict.fromkeys(error for _, error in missing.values()))
+        problem = problem or f"robot {robot.name!r} comes without visual geometry"
+        if not shapes:
+            logger.warning("%s; drawing a skeleton of its joints and centres of mass instead", problem)
+            shapes = _skeleton(robot)
+        elif missing:
+            links = ", ".join(map(repr, missing))
+            logger.warning("%s; drawing the skeleton of %s instead", problem, links)
+            bare = {joint for joint, _ in missing.values()}
+            shapes += [shape for shape in _skeleton(robot) if shape.parentJoint in bare]
+        turns = _turns(robot)
+        return cls(
+            robot,
+            shapes,
+            [shape.parentJoint - 1 for shape in shapes],
+            [turns[shape.parentJoint] * shape.placement for shape in shapes],
+        )
+
+    def frame(self, name: str) -> tuple[int, pin.SE3]:
+        """The body a frame of the model is on, -1 for the base, and its placement there."""
+        model = self.robot.free_model
+        frame = model.frames[model.getFrameId(name)]
+        return frame.parentJoint - 1, _turns(self.robot)[frame.parentJoint] * frame.placement
+
+    def moving_nodes(self, root: str) -> list[str]:
+        """Scene path of each body (b,) below a root."""
+        names = labels(self.robot.free_model.names[1:])
+        nodes: list[str] = []
+        for name, parent in zip(names, self.robot.tree.parent, strict=True):
+            nodes.append(f"{nodes[parent] if parent >= 0 else root}/{name}/moving")
+        return nodes
+
+    def body_poses(self, positions: Floats) -> tuple[Floats, Floats]:
+        """World orientation (S, b, 3, 3) and place (S, b, 3) [m] of each body at joint positions (S, b)."""
+        tree = self.robot.tree
+        samples, bodies = positions.shape
+        R, p = np.empty((samples, bodies, 3, 3)), np.empty((samples, bodies, 3))
+        for j, parent in enumerate(tree.parent):
+            before = R[:, parent] if parent >= 0 else np.broadcast_to(np.eye(3), (samples, 3, 3))
+            origin = p[:, parent] if parent >= 0 else np.zeros(3)
+            frame = before @ tree.rotation[j]
+            p[:, j] = origin + before @ tree.translation[j]
+            if tree.prismatic[j]:
+                R[:, j] = frame
+                p[:, j] += positions[:, j, None] * frame[:, :, 2]
+            else:
+                c, s = np.cos(positions[:, j, None]), np.sin(positions[:, j, None])
+                R[:, j] = frame
+                R[:, j, :, 0] = c * frame[:, :, 0] + s * frame[:, :, 1]
+                R[:, j, :, 1] = c * frame[:, :, 1] - s * frame[:, :, 0]
+        return R, p
+
+    def corners(self, body: int) -> Floats:
+        """Corners (k, 3) of the boxes around the shapes on a body, in its frame [m]."""
+        boxes = [np.empty((0, 3))]
+        for shape, on, placement in zip(self.shapes, self.bodies, self.placements, strict=True):
+            if on == body:
+                shape.geometry.computeLocalAABB()
+                box = np.array([shape.geometry.aabb_local.min_, shape.geometry.aabb_local.max_])
+                corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(8, 3)
+                boxes.append(corners @ placement.rotation.T + placement.translation)
+        return np.concatenate(boxes)
+
+    def swept(self, positions: Floats) -> Floats:
+        """Points (k, 3) [m] around all that is drawn at joint positions (S, b), in the world."""
+        R, p = self.body_poses(positions)
+        points = [self.corners(-1), p.reshape(-1, 3)]
+        for j in range(R.shape[1]):
+            points.append((self.corners(j) @ R[:, j].transpose(0, 2, 1) + p[:, j, None]).reshape(-1, 3))
+        return np.concatenate(points)
+
+
+def _turns(robot: Robot) -> list[pin.SE3]:
+    """From each joint's frame in the model, the universe's first, to that of its body, whose z axis it moves by."""
+    model = robot.free_model
+    axes = [joint_axis(model, joint)[1] for joint in range(1, model.njoints)]
+    return [pin.SE3.Identity(), *(pin.SE3(z_to(axis).T, np.zeros(3)) for axis in axes)]
+
+
+def label(name: str) -> str:
+    """A name as one step of a scene path."""
+    return name.replace("/", "_") or "_"
+
+
+# Steps of scene paths that are not of joints.
+_TAKEN = ("base", "shapes", "frames", "<object>")
+
+
+def labels(names: Iterable[str]) -> list[str]:
+    """Names as steps of scene paths, no two the same."""
+    found: dict[str, None] = dict.fromkeys(_TAKEN)
+    for name in names:
+        step, count = label(name), 2
+        while step in found:
+            step, count = f"{label(name)} {count}", count + 1
+        found[step] = None
+    return list(found)[len(_TAKEN) :]
+
+
+def _skeleton(robot: Robot) -> list[pin.GeometryObject]:
+    """Spheres at the joints and at the centres of mass, and rods from each joint to what hangs on it."""
+    model = robot.free_model
+    joints = range(1, model.njoints)
+    ends: dict[int, list[Floats]] = {joint: [] for joint in range(model.njoints)}
+    for joint in joints:
+        ends[model.parents[joint]].append(model.jointPlacements[joint].translation)
+    for frame in model.frames:
+        if frame.type in (pin.FrameType.BODY, pin.FrameType.OP_FRAME):
+            ends[frame.parentJoint].append(frame.placement.translation)
+    centers = {joint: model.inertias[joint].lever for joint in joints if model.inertias[joint].mass > 0.0}
+    reach = {0: 0.0}
+    for joint in joints:
+        reach[joint] = reach[model.parents[joint]] + float(np.linalg.norm(model.jointPlacements[joint].translation))
+    points = [(joint, point) for joint in ends for point in [*ends[joint], centers.get(joint, np.zeros(3))]]
+    size = max(reach[joint] + float(np.linalg.norm(point)) for joint, point in points) or 1.0
+    radius = 0.015 * size
+
+    shapes: list[pin.GeometryObject] = []
+
+    def add(joint: int, placement: pin.SE3, form: Any, color: tuple[float, ...]) -> None:
+        shape = pin.GeometryObject(f"skeleton{len(shapes)}", joint, placement, form)
+        shape.meshColor = np.array(color)
+        shapes.append(shape)
+
+    for joint in range(model.njoints):
+        if joint:
+            add(joint, pin.SE3.Identity(), pin.coal.Sphere(2.0 * radius), _JOINT)
+        center = centers.get(joint)
+        for point in [*ends[joint], *([] if center is None else [center])]:
+            length = float(np.linalg.norm(point))
+            if length > radius:
+                placement = pin.SE3(z_to(point / length), 0.5 * point)
+                add(joint, placement, pin.coal.Cylinder(radius, length), _ROD)
+        if center is not None:
+            add(joint, pin.SE3(np.eye(3), center), pin.coal.Sphere(1.5 * radius), _CENTER)
+    return shapes

@@ -1,0 +1,234 @@
+"""Films of a page, drawn frame by frame at exact times by a headless Chromium."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import importlib.util
+import math
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.errors import InputError, MissingDependency, VarpinError
+from varpin.support.checks import count
+from varpin.trajectory import atomic_file
+
+if TYPE_CHECKING:
+    from selenium.webdriver import Chrome
+
+Floats = NDArray[np.float64]
+
+FORMATS = (".gif", ".mp4")
+
+# Distributions by what they are imported as.
+_PACKAGES = {"imageio": "imageio", "imageio_ffmpeg": "imageio-ffmpeg", "selenium": "selenium"}
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+_DRIVER = "chromedriver"
+
+# Rendered in software, to be the same everywhere; without a sandbox, which containers do not allow: the page is ours.
+_FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-dev-shm-usage",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+    "--hide-scrollbars",
+)
+
+_PATIENCE = 120.0  # [s] for a page to load
+
+_STOP = "viewer.animator.pause(); viewer.set_3d_pane_size(arguments[0], arguments[1]);"
+# Textures are read in the background.
+_COMPLETE = """
+let complete = document.documentElement.dataset.loaded === "true";
+if (complete) viewer.scene.traverse(node => {
+    for (const material of [node.material || []].flat())
+        if (material.map && !(material.map.image && material.map.image.complete !== false)) complete = false;
+});
+return complete;
+"""
+_DRAW = "viewer.animator.seek(arguments[0]); return viewer.capture_image();"
+
+# A palette for each frame, for colours come and go; no frame waits for the others.
+_FILTER = "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=new=1"
+_GIF = {"codec": "gif", "pix_fmt_out": "pal8", "quality": None, "output_params": ["-filter_complex", _FILTER]}
+
+
+def frame_size(size: tuple[int, int]) -> tuple[int, int]:
+    """A width and a height [pixels].
+
+    Raises:
+        InputError: It is something else.
+    """
+    if not isinstance(size, tuple | list) or len(size) != 2:
+        raise InputError(f"size must be a width and a height [pixels], got {size!r}")
+    width, height = (count("size", number, least=16) for number in size)
+    return width, height
+
+
+@dataclass(frozen=True)
+class Film:
+    """A film to be taken.
+
+    Attributes:
+        path: Where it goes.
+        size: Width and height [pixels].
+        period: Of its frames [s].
+        max_frames: Most of them; a longer film gets fewer a second.
+    """
+
+    path: Path
+    size: tuple[int, int]
+    period: float
+    max_frames: int
+
+    @classmethod
+    def of(cls, path: Path, size: tuple[int, int], fps: float, max_frames: int) -> Film:
+        """Whatever can be said before the work.
+
+        Raises:
+            InputError: Another format than gif and mp4, or a size that is none.
+            MissingDependency: A package or a program is not there.
+        """
+        check_film(path)
+        width, height = frame_size(size)
+        if width % 2 or height % 2:
+            raise InputError(f"size must be even numbers of pixels, as films have them, got {width} x {height}")
+        return cls(path, (width, height), 1.0 / fps, max_frames)
+
+    def times(self, duration: float) -> Floats:
+        """Of the frames (F,) [s], from 0 to a duration."""
+        period = max(self.period, duration / (self.max_frames - 1))
+        if self.path.suffix.lower() == ".gif":
+            # A GIF counts hundredths of a second, and below two of them viewers do as they please.
+            period = 0.01 * max(2, round(100.0 * period), math.ceil(100.0 * duration / (self.max_frames - 1) - 1e-9))
+        frames = math.floor(duration / period * (1.0 + 1e-9)) + 1
+        return np.arange(frames, dtype=np.float64) * period
+
+    def take(self, page: Path, duration: float) -> Path:
+        """Write the film of a page.
+
+        Raises:
+            VarpinError: The browser cannot show the page.
+            FileError: The file cannot be written.
+        """
+        import imageio_ffmpeg  # noqa: PLC0415 - of an extra
+
+        times = self.times(duration)
+        suffix = self.path.suffix.lower()
+        rate = 1.0 / (times[1] - times[0]) if len(times) > 1 else 1.0
+        options = _GIF if suffix == ".gif" else {}
+        with tempfile.TemporaryDirectory() as folder:
+            draft = Path(folder, f"film{suffix}")
+            writer = imageio_ffmpeg.write_frames(
+                str(draft), self.size, fps=rate, macro_block_size=2, ffmpeg_log_level="error", **options
+            )
+            writer.send(None)
+            with contextlib.closing(writer):
+                for frame in film_frames(page, times, self.size):
+                    writer.send(np.ascontiguousarray(frame))
+            with atomic_file(self.path) as stream:
+                stream.write(draft.read_bytes())
+        return self.path
+
+
+def check_film(path: Path) -> None:
+    """Whether a film could be written, as far as its name and what is installed tell.
+
+    Raises:
+        InputError: Another format than gif and mp4.
+        MissingDependency: A package or a program is not there.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(f"video must end in {' or '.join(FORMATS)}, got {path.name!r}")
+    packages = [name for module, name in _PACKAGES.items() if importlib.util.find_spec(module) is None]
+    if packages:
+        raise MissingDependency("video", packages, 'pip install "varpin[video]"')
+    programs = []
+    if _chromium() is None:
+        programs.append("chromium")
+    if shutil.which(_DRIVER) is None:
+        programs.append(_DRIVER)
+    if programs:
+        raise MissingDependency("video", programs, "apt install chromium chromium-driver")
+
+
+def _chromium() -> str | None:
+    return next((path for name in _BROWSERS if (path := shutil.which(name))), None)
+
+
+@contextlib.contextmanager
+def _browser(size: tuple[int, int]) -> Iterator[Chrome]:
+    """A headless Chromium whose page has a size [pixels]."""
+    from selenium import webdriver  # noqa: PLC0415 - of an extra
+    from selenium.common.exceptions import WebDriverException  # noqa: PLC0415
+    from selenium.webdriver.chrome.service import Service  # noqa: PLC0415
+
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        options = webdriver.ChromeOptions()
+        options.binary_location = _chromium() or ""
+        for flag in (*_FLAGS, f"--user-data-dir={profile}"):
+            options.add_argument(flag)
+        try:
+            browser = webdriver.Chrome(options=options, service=Service(shutil.which(_DRIVER)))
+        except WebDriverException as error:
+            raise VarpinError(f"Chromium does not start: {(error.msg or '').splitlines()[0]}") from None
+        try:
+            metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
+            browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+            yield browser
+        except WebDriverException as error:
+            raise VarpinError(f"Chromium cannot show the motion: {(error.msg or '').splitlines()[0]}") from None
+        finally:
+            browser.quit()
+
+
+def film_frames(
+    page: Path, times: Floats, size: tuple[int, int], scripts: Sequence[tuple[str, Sequence[float]]] = ()
+) -> Iterator[NDArray[np.uint8]]:
+    """A page's picture (height, width, 3) at each time.
+
+    Args:
+        page: To be shown.
+        times: [s of playback].
+        size: Width and height [pixels].
+        scripts: JavaScript to run before, with its arguments.
+
+    Raises:
+        VarpinError: The browser cannot show the page.
+    """
+    with _browser(size) as browser:
+        yield from _frames(browser, page, times, size, scripts)
+
+
+def _frames(
+    browser: Chrome, page: Path, times: Floats, size: tuple[int, int], scripts: Sequence[tuple[str, Sequence[float]]]
+) -> Iterator[NDArray[np.uint8]]:
+    import imageio.v3 as imageio  # noqa: PLC0415 - of an extra
+
+    browser.get(page.resolve().as_uri())
+    give_up = time.monotonic() + _PATIENCE
+    while not browser.execute_script(_COMPLETE):
+        if time.monotonic() > give_up:
+            raise VarpinError(f"Chromium did not finish loading the motion within {_PATIENCE:g} s")
+        time.sleep(0.05)
+    browser.execute_script(_STOP, *size)
+    for script, arguments in scripts:
+        browser.execute_script(script, *arguments)
+    for seconds in times:
+        address = browser.execute_script(_DRAW, float(seconds))
+        picture = base64.b64decode(address.partition(",")[2])
+        yield np.asarray(imageio.imread(picture, extension=".png"))[..., :3]

@@ -1,0 +1,48 @@
+"""A motion shown in meshcat: as one HTML file that needs no server, or live in a browser window."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import webbrowser
+from pathlib import Path
+
+import meshcat
+
+from varpin.show.replay.drawing import draw
+from varpin.show.replay.page import Inline, Page
+from varpin.show.replay.script import Script
+from varpin.trajectory import atomic_file
+
+logger = logging.getLogger(__name__)
+
+
+def write_page(path: Path, script: Script) -> Path:
+    """Write a script as one self-contained HTML file."""
+    with atomic_file(path) as stream:
+        stream.write(_page(script).encode())
+    return path
+
+
+def inline(script: Script, size: tuple[int, int]) -> Inline:
+    """A script's page for a notebook, of a width and a height [pixels]."""
+    return Inline(_page(script), script.title, size)
+
+
+def _page(script: Script) -> str:
+    page = Page()
+    draw(meshcat.Visualizer(window=page), script)
+    return page.html(script.title)
+
+
+def show(script: Script) -> meshcat.Visualizer:
+    """Draw a script in a new meshcat server, and point a web browser to it."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        viewer = meshcat.Visualizer()
+    draw(viewer, script)
+    url = viewer.url()
+    logger.info("meshcat serves the motion at %s", url)
+    if not webbrowser.open(url, new=2):
+        logger.warning("no web browser could be started; open %s in one", url)
+    return viewer

@@ -1,0 +1,1 @@
+"""Motions: stepping a scene, and the look at what came out."""

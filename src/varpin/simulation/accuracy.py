@@ -1,0 +1,288 @@
+"""What is wrong with a motion: from how large an error on, in which units, over how long, and where one looks.
+
+Definitions alone: :mod:`varpin.simulation.soundness` estimates errors by smaller steps, :mod:`varpin.study.extremes`
+knows them from exact motions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.mechanics.scene import Scene
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# What is wrong: error of the energy balance, in units of the energy that was turned over; of a joint's position, in
+# units of its way over a period, and of the way of the joint that goes furthest; of its velocity, in units of its
+# largest one: velocities have peaks, which a small shift in time moves by much.
+WRONG_ENERGY = 0.1
+WRONG_POSITION, WRONG_MOTION, WRONG_VELOCITY = 0.1, 0.05, 0.25
+# Steps looked at from the start, and from each other place.
+FIRST, WINDOW = 384, 64
+# Nodes on either side of a place within which a joint's period is looked for.
+HORIZON = 1024
+# Other places looked at: where velocities change most, and as many spread over the motion.
+VIOLENT, _SPREAD = 4, 3
+# And where single steps have most of the energy's error.
+_JUMPS = 2
+# An error from which on more places are looked at, in units of what is wrong; and how many.
+CLOSE, _BETWEEN = 0.4, 15
+# Steps after which a start is judged by its way so far; before that a method of first order is behind by half a step.
+_SOON = (80, 160)
+# A small disturbance that grows by this is the motion's own doing: from there on no single motion can be told.
+PREDICTABLE, DISTURBANCE = 10.0, 1e-7
+# What a joint does that moves this much less than others of its kind, and with this much less speed than would have
+# their energy, is measured in these parts of theirs.
+LITTLE, LIGHT = 1e-2, 1e-2
+# Part of a joint's motion so far below which what it does at one place is rest.
+_REST = 1e-3
+# Part of a speed that counts as changed if nothing changes it: a wheel that turns evenly turns over next to nothing.
+EVEN = 1e-3
+
+
+@dataclass(frozen=True)
+class MotionError:
+    """How far a motion is from the right one, at its worst over the joints and the places looked at.
+
+    Attributes:
+        step: Where the place begins.
+        joint: Which coordinate.
+        position: Error of q there over a period, in units of the joint's way over it.
+        velocity: Error of v, in units of the joint's largest.
+        motion: Error of q, in units of the way of the joint that goes furthest.
+        settled: Whether it is good to about a tenth, and not to a factor of two alone.
+    """
+
+    step: int
+    joint: int
+    position: float
+    velocity: float
+    motion: float
+    settled: bool = True
+
+    @property
+    def worst(self) -> float:
+        """The largest error, in units of what is wrong; NaN counts as more than anything."""
+        shares = self.position / WRONG_POSITION, self.velocity / WRONG_VELOCITY, self.motion / WRONG_MOTION
+        return float(np.nan_to_num(shares, nan=np.inf).max())
+
+
+@dataclass(frozen=True)
+class Place:
+    """A node of a motion from which on it is judged, and how far.
+
+    Attributes:
+        step: The node.
+        span: Over how many steps each joint goes one and a half times to and fro, or right round (n,).
+        whole: Whether it does so; else ``span`` is all the steps there are (n,).
+        judged: Over how many steps errors count (n,): a period.
+        varied: How much v has varied after each step (K, n).
+    """
+
+    step: int
+    span: Integers
+    whole: NDArray[np.bool_]
+    judged: Integers
+    varied: Floats
+
+    @classmethod
+    def at(cls, scene: Scene, trajectory: Trajectory, step: int) -> Place:
+        """The place at a node."""
+        ahead = slice(step, step + HORIZON + 1)
+        q, v = trajectory.q[ahead], trajectory.v[ahead]
+        span, whole = _periods(scene, q, v)
+        # A period is two thirds of the span.
+        judged = np.where(whole, (2 * span + 2) // 3, span)
+        return cls(step, span, whole, judged, np.abs(np.diff(v, axis=0)).cumsum(axis=0))
+
+    def error(
+        self, scene: Scene, trajectory: Trajectory, inertia: Floats, off: tuple[Floats, Floats], *, cut: bool
+    ) -> MotionError:
+        """The error from here on, of the distances of q and v from the right motion (K + 1, n), NaN if not known.
+
+        ``cut`` says that the right motion cannot be told any further than K steps; else what there is stands for a
+        period, over which errors grow as the motion goes on. What dies out soon is judged by the way that it takes,
+        too.
+        """
+        count = len(off[0]) - 1
+        soon = [until for until in _SOON if until < count] if self.step == 0 else []
+        found = [self._until(scene, trajectory, inertia, off, until, cut=True) for until in soon]
+        found.append(self._until(scene, trajectory, inertia, off, count, cut=cut))
+        return max(found, key=lambda error: error.worst)
+
+    def _until(
+        self,
+        scene: Scene,
+        trajectory: Trajectory,
+        inertia: Floats,
+        off: tuple[Floats, Floats],
+        until: int,
+        *,
+        cut: bool,
+    ) -> MotionError:
+        """:meth:`error` by the first steps."""
+        here = np.minimum(self.judged, until)
+        # What cannot be told any more is no part of the way.
+        end = np.minimum(self.span, until) if cut else self.span
+        way, speed = _units(scene, trajectory, self.step, end, self.whole | (end < self.span), inertia)
+        joints = np.arange(len(here))
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            far, fast = (np.maximum.accumulate(part, axis=0)[here, joints] for part in off)
+            so_far = self.varied[here - 1, joints]
+            growth = np.where(so_far > 0.0, self.varied[self.judged - 1, joints] / so_far, np.inf)
+            growth = np.maximum(np.minimum(growth, self.judged / here), 1.0)
+            rounding = 1e3 * np.finfo(np.float64).eps * (1.0 + np.abs(trajectory.q[self.step]).max())
+            position = np.where(far <= rounding, 0.0, far * (1.0 if cut else growth) / way)
+            velocity = np.where(fast <= 1e-9 * speed, 0.0, fast / speed)
+            motion = position * way / way.max()
+            shares = np.array([position / WRONG_POSITION, velocity / WRONG_VELOCITY, motion / WRONG_MOTION])
+        joint = int(np.argmax(np.nan_to_num(shares, nan=np.inf).max(axis=0)))
+        return MotionError(self.step, joint, float(position[joint]), float(velocity[joint]), float(motion[joint]))
+
+
+def grown(plain: Floats, moved: Floats, disturbance: float) -> int:
+    """Steps, one at least, until two motions' q (K + 1, n), apart by a disturbance at first, are apart out of hand."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        apart = ~(np.abs(moved - plain).max(axis=1) <= PREDICTABLE * disturbance)
+    return max(1, int(apart.argmax())) if apart.any() else len(plain) - 1
+
+
+def disturbance(trajectory: Trajectory, step: int, count: int) -> tuple[float, float]:
+    """What is added to q and v at a node to see whether the motion of the steps after it can be told."""
+    nodes = trajectory.q[step : step + count + 1]
+    moved = DISTURBANCE * max(1.0, float(np.abs(trajectory.q[step]).max()))
+    # In v, by what the same part of the motion has.
+    way = max(float(np.ptp(nodes, axis=0).max()), moved)
+    return moved, DISTURBANCE * float(np.abs(trajectory.v[step : step + count + 1]).max()) / max(1.0, way)
+
+
+def places(scene: Scene, trajectory: Trajectory) -> Integers:
+    """The nodes that a motion is looked at from (K,).
+
+    The start, the places where velocities change most, some spread over the motion, and the steps with most of the
+    energy's error.
+    """
+    # Where a joint goes to and fro within the first steps, what comes after is to be looked at, too.
+    v, steps = trajectory.v, trajectory.steps
+    seen = np.zeros(steps, dtype=bool)
+    seen[: min(FIRST, int(Place.at(scene, trajectory, 0).judged.min()))] = True
+    found = [0, *blows(v, WINDOW, seen)]
+    for place in np.linspace(0, max(0, steps - WINDOW), _SPREAD + 1)[1:].astype(np.int64):
+        if not seen[place : place + WINDOW].all():
+            found.append(int(place))
+    # Single steps that are worse than others, as a whole one is among steps in parts.
+    jumps = np.abs(np.diff(trajectory.statistics.energy_defect, prepend=0.0))
+    found += np.argsort(-np.nan_to_num(jumps, nan=np.inf), kind="stable")[:_JUMPS].tolist()
+    return np.unique(found)
+
+
+def between(steps: int, seen: Integers) -> Integers:
+    """More nodes to look from, evenly spread, where errors at those seen come close to what is wrong."""
+    return np.setdiff1d(np.linspace(0, steps, _BETWEEN + 2)[1:-1].astype(np.int64), seen)
+
+
+def blows(v: Floats, length: int, seen: NDArray[np.bool_] | None = None) -> list[int]:
+    """The first steps of windows of some length about the largest changes of v (N + 1, n); they are marked as seen."""
+    steps = len(v) - 1
+    seen = np.zeros(steps, dtype=bool) if seen is None else seen
+    change = np.abs(np.diff(v, axis=0))
+    most = change.max(axis=0)
+    # A joint's changes in units of its own largest.
+    change = ((change / np.where(most > 0.0, most, np.inf)) ** 2).sum(axis=1)
+    found: list[int] = []
+    for _ in range(VIOLENT):
+        if seen.all():
+            break
+        peak = int(np.argmax(np.where(seen, -1.0, change)))
+        found.append(min(max(0, peak - length // 4), max(0, steps - length)))
+        seen[found[-1] : found[-1] + length] = True
+    return found
+
+
+def inertias(scene: Scene, q: Floats) -> Floats:
+    """What each joint has to move, its entry on the diagonal of M, at most at some configurations: (n,) of (K, n)."""
+    largest: Floats = np.diagonal(masses(scene, q), axis1=1, axis2=2).max(axis=0)
+    return largest
+
+
+def masses(scene: Scene, q: Floats) -> Floats:
+    """M at some configurations (K, n, n)."""
+    q = np.ascontiguousarray(q)
+    return scene.core.jets(q, np.zeros_like(q))[0]
+
+
+def changed(v: Floats) -> Floats:
+    """By how much velocities change over the nodes (K, ...), at most the largest."""
+    fastest = np.abs(v).max(axis=0)
+    change: Floats = np.clip(np.ptp(v, axis=0), EVEN * fastest, fastest)
+    return change
+
+
+def noticed(scene: Scene, way: Floats, speed: Floats, light: Floats, duration: Floats) -> tuple[Floats, Floats]:
+    """Ways and largest velocities (..., n) as units of errors; a joint that hardly moves is measured by the others.
+
+    ``light`` are the velocities that would have little of the others' energy (..., n), ``duration`` how long they are
+    looked at [s].
+    """
+    least = np.minimum(LITTLE * _of_its_kind(scene, speed), light)
+    least_way = np.minimum(LITTLE * _of_its_kind(scene, way), light * duration)
+    return np.maximum(way, least_way), np.maximum(speed, least)
+
+
+def light_speed(inertia: Floats, change: Floats) -> Floats:
+    """The velocity of each joint that has little of the energy of what changes most (..., n)."""
+    root = np.sqrt(inertia)
+    light: Floats = LIGHT * (root * change).max(axis=-1, keepdims=True) / root
+    return light
+
+
+def _of_its_kind(scene: Scene, values: Floats) -> Floats:
+    """For each coordinate (..., n), the largest value of all that turn, or of all that slide: units do not compare."""
+    sliding = scene.robot.slides
+    largest = [values[..., kind].max(axis=-1, initial=0.0, keepdims=True) for kind in (sliding, ~sliding)]
+    each: Floats = np.where(sliding, *largest)
+    return each
+
+
+def _periods(scene: Scene, q: Floats, v: Floats) -> tuple[Integers, NDArray[np.bool_]]:
+    """Over how many steps each joint goes to and fro, or right round (n,), for q and v (K + 1, n).
+
+    All of them where it does not, which the second value says. Where a joint turns back the way is as long as there and
+    back, and the velocity small; one and a half ways to and fro, with all that the velocity does, are no such place.
+    """
+    gone = np.abs(np.diff(q, axis=0)).cumsum(axis=0)
+    wide = (np.maximum.accumulate(q, axis=0) - np.minimum.accumulate(q, axis=0))[1:]
+    varied = np.abs(np.diff(v, axis=0)).cumsum(axis=0)
+    fastest = np.maximum.accumulate(np.abs(v), axis=0)[1:]
+    round_once = ~scene.robot.slides & (wide >= 2.0 * np.pi)
+    over = ((gone >= 3.0 * wide) | round_once) & (varied >= 4.0 * fastest) & (wide > 0.0)
+    whole = np.asarray(over.any(axis=0))
+    span: Integers = np.where(whole, over.argmax(axis=0) + 1, len(q) - 1)
+    return span, whole
+
+
+def _units(
+    scene: Scene, trajectory: Trajectory, step: int, span: Integers, whole: NDArray[np.bool_], inertia: Floats
+) -> tuple[Floats, Floats]:
+    """In what each joint's errors of q and v are measured (n,): its way over a period, and its largest velocity."""
+    n = len(span)
+    before = np.zeros(n, dtype=np.int64)
+    if step:
+        behind = slice(max(0, step - HORIZON), step + 1)
+        before = _periods(scene, trajectory.q[behind][::-1], trajectory.v[behind][::-1])[0]
+    # Where the motion ends within a period, what came before completes it.
+    begin = step - np.where(whole, 0, before)
+    way, speed, change = np.empty(n), np.empty(n), np.empty(n)
+    for i in range(n):
+        nodes, so_far = (slice(first, step + span[i] + 1) for first in (begin[i], 0))
+        way[i] = max(np.ptp(trajectory.q[nodes, i]), _REST * np.ptp(trajectory.q[so_far, i]))
+        speed[i] = max(np.abs(trajectory.v[nodes, i]).max(), _REST * np.abs(trajectory.v[so_far, i]).max())
+        change[i] = changed(trajectory.v[nodes, i])
+    way, speed = noticed(scene, way, speed, light_speed(inertia, change), trajectory.dt * span.astype(np.float64))
+    tiny = np.finfo(np.float64).tiny
+    return np.maximum(way, tiny), np.maximum(speed, tiny)

@@ -1,0 +1,73 @@
+"""Limits of the robot's description that a motion leaves: of joints' positions and velocities, and of their motors.
+
+No motion is stopped by them; as a motion of the robot without end stops, and with motors as strong as it takes, it may
+be right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.mechanics.forces import drive_forces
+from varpin.mechanics.scene import Scene
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+# How the sentences begin, none of which says anything against the motion as a solution of its equations.
+POSITION = "joints leave their limits"
+VELOCITY = "joints pass their velocity limits"
+EFFORT = "controls pass the joints' effort limits"
+KINDS = (POSITION, VELOCITY, EFFORT)
+# Beyond its limit by more than this a joint is spoken of: of position [rad or m], of others as a share of the limit.
+_OUTSIDE, _SHARE = 1e-6, 1e-6
+# So many joints are told of with numbers.
+_NAMED = 6
+
+
+def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
+    """Which kinds of limits a motion leaves, and for each a sentence: which joints, by how much, and when."""
+    robot, t = scene.robot, trajectory.t
+    for kind, why, of, (least, most), beyond, units in (
+        (POSITION, "which nothing stops", _positions, scene.bounds.position, _OUTSIDE, ("rad", "m")),
+        (VELOCITY, "which nothing holds back", _velocities, scene.bounds.velocity, None, ("rad/s", "m/s")),
+        (EFFORT, "which nothing cuts off", _efforts, scene.bounds.effort, None, ("N m", "N")),
+    ):
+        if not (np.isfinite(least).any() or np.isfinite(most).any()):
+            continue
+        values = of(scene, trajectory)
+        top, bottom = values.max(axis=0, initial=-np.inf), values.min(axis=0, initial=np.inf)
+        if ((top <= most) & (bottom >= least)).all():
+            continue
+        slides = robot.slides
+        with np.errstate(invalid="ignore"):
+            excess = np.maximum(least - values, values - most)
+            excess = np.where(excess > (_SHARE * most if beyond is None else beyond), excess, -np.inf)
+        parts = []
+        worst = excess.max(axis=0, initial=-np.inf)
+        joints = [int(c) for c in np.argsort(-worst, kind="stable") if worst[c] > 0.0]
+        for c in joints[:_NAMED]:
+            first, peak = int(np.argmax(excess[:, c] > 0.0)), int(np.argmax(excess[:, c]))
+            since = "from the start" if first == 0 else f"from t = {t[first]:.4g} s"
+            side, limit = ("above", most[c]) if values[peak, c] > most[c] else ("below", least[c])
+            amount = f"at most {worst[c]:.3g} {units[int(slides[c])]} {side} {limit:.4g} at t = {t[peak]:.4g} s"
+            parts.append(f"{robot.joint_names[c]!r} {since}, {amount}")
+        if parts:
+            more = f"; and {len(joints) - _NAMED} more" if len(joints) > _NAMED else ""
+            yield kind, f"{kind}, {why}: {'; '.join(parts)}{more}"
+
+
+def _positions(_: Scene, trajectory: Trajectory) -> Floats:
+    return trajectory.q
+
+
+def _velocities(_: Scene, trajectory: Trajectory) -> Floats:
+    return trajectory.v
+
+
+def _efforts(scene: Scene, trajectory: Trajectory) -> Floats:
+    """Forces of the motors (N, n) [N m or N]."""
+    return drive_forces(scene.elements, trajectory.q[:-1], trajectory.v[:-1], trajectory.u @ scene.actuation.T)

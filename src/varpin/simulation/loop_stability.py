@@ -1,0 +1,580 @@
+"""Is a digital control loop stable at its period? Asked of a finished motion; the law itself is not called again.
+
+Two looks. What theory says: where the record determines the law, u = K (q, v) + c, with a share of gravity's torque if
+need be, the loop is linearized at the equilibrium next to the motion. With the plant's exact step under a held control,
+x' = A x + B u (Franklin, Powell and Workman 1998, section 4.3), it is stable if the spectral radius of A + B K is below
+one. And what the record shows of any other law: the controls do work and grow steadily, by orders of magnitude, or by
+less if they turn round from period to period. What a law would do in continuous time is not held against its period: a
+pendulum that falls, falls.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from varpin.errors import LinearizationError
+from varpin.integrators import Integrator
+from varpin.integrators.explicit import accelerations
+from varpin.mechanics.forces import drive_forces
+from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.scene import Scene
+from varpin.simulation.chatter import RUN, alternation
+from varpin.simulation.soundness import Finding, examined, with_warnings
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+_ADVICE = "take a shorter period or lower gains; where neither helps, look at the signs of the law"
+KIND = "unstable loop"
+_FLIPS = "flipping controls"
+# Growth of the controls from the first quarter of a motion to its end, and over each of the last two quarters, that is
+# spoken of. A steady growth by 1e3 is one by 1e3 ** (3/4) from the end of the first quarter.
+_GREW, _GROWS = 1e2, 2.0
+# Nodes that a law is sought from: so many with the largest changes, and as many spread over the motion.
+_NODES = 32
+# Error of a fit up to which a law is what was fitted, in units of rounding, and in units of how badly squares of the
+# state are fitted: along a smooth motion that stays on a curve, anything can be.
+_EXACT, _TELLING = (32.0, 1e5), 1e-6
+# Directions in which the state moves by less than this share of the largest are not known: from the whole of a record,
+# and from its last changes.
+_EXCITED, _CHANGED = 1e-9, 1e-3
+# Growth of the controls' changes over the second half of a motion that is spoken of if they turn round.
+_WANTS = 1.5
+# Angle over a period [rad] from which on they do: goals that move, and plants, take many periods for a turn.
+_TURNS = np.pi / 6.0
+# Part of its size at first that what alternates has at the end if it does not calm down.
+_CALMS = 0.5
+# Growth of the controls up to a step that fails that is spoken of.
+_OUTGROWN = 10.0
+# Nodes at one extreme value from which on a control saturates there.
+_SATURATED = 2
+# Ways from one limit to the other that are a cycle, and those of them within the last half of a motion. The last
+# stretches between them are compared: of a motion that calms down they are shorter and shorter.
+_CYCLES, _LATE, _STRETCHES, _KEEPS = 6, 2, 8, 0.9
+# Part of what a control does with its joint that is pushing it on: a law that only pushes pumps it up on purpose.
+_PUMPS = 0.7
+# Nodes that a clipped law is sought from where it cannot be fitted.
+_SOUGHT = 400
+# Beyond this nothing can be squared.
+_HUGE = 1e120
+# Newton's iterations from one start, and halvings of one of its steps.
+_ITERATIONS, _HALVINGS = 30, 6
+# Growth over the whole motion that is worth a word, of a spectral radius that rounding cannot explain.
+_WORTH, _ABOVE_ONE = 1.01, 1e-6
+# Growth over a period that is spoken of where no equilibrium is found.
+_FAST = 1.05
+
+
+@dataclass(frozen=True)
+class Span:
+    """Directions in which a state moved.
+
+    Attributes:
+        directions: Orthonormal after division by ``unit`` (2n, r).
+        unit: Of each entry of (q, v) (2n,).
+    """
+
+    directions: Floats
+    unit: Floats
+
+    def values(self, matrix: Floats) -> NDArray[np.complex128]:
+        """Eigenvalues of a matrix (2n, 2n) within these directions."""
+        inside = self.directions.T @ (matrix * self.unit / self.unit[:, None]) @ self.directions
+        return np.asarray(np.linalg.eigvals(inside), dtype=np.complex128)
+
+
+@dataclass(frozen=True)
+class Law:
+    """What a record tells of a control law: u = Kq q + Kv v + S L_q(q, 0) + c.
+
+    Attributes:
+        Kq: (m, n).
+        Kv: (m, n).
+        S: Share of gravity's and the springs' forces (m, n).
+        c: (m,).
+        span: What of (q, v) it was seen for.
+        near: The configuration where the motion was slowest to change (n,).
+    """
+
+    Kq: Floats
+    Kv: Floats
+    S: Floats
+    c: Floats
+    span: Span
+    near: Floats
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A linearized plant with a law.
+
+    Attributes:
+        A: Rate of (q, v) by (q, v) (2n, 2n) [1/s].
+        B: By u (2n, m).
+        K: The law (m, 2n).
+        span: What of (q, v) the law is known for.
+        q: Where it was linearized (n,).
+    """
+
+    A: Floats
+    B: Floats
+    K: Floats
+    span: Span
+    q: Floats
+
+    def multiplier(self, period: float) -> complex:
+        """By what a period [s] multiplies deviations: of the loop with a zero-order hold the largest eigenvalue."""
+        size, m = self.B.shape
+        held = scipy.linalg.expm(period * np.block([[self.A, self.B], [np.zeros((m, size + m))]]))
+        values = self.span.values(held[:size, :size] + held[:size, size:] @ self.K)
+        return complex(values[np.argmax(np.abs(values))])
+
+    def owes(self, period: float) -> bool:
+        """Whether its growth is the period's doing, and not that of the law in continuous time as well.
+
+        Directions that the state keeps to from period to period it need not keep to in between: where not all are
+        known, what turns round within some periods is the period's.
+        """
+        multiplier = self.multiplier(period)
+        if self.span.directions.shape[1] < len(self.span.unit) and np.abs(np.angle(multiplier)) >= _TURNS:
+            return True
+        return bool(np.log(np.abs(multiplier)) > 1.5 * max(self.rate(), 0.0) * period)
+
+    def rate(self) -> float:
+        """The fastest rate of growth if the law acted at every instant [1/s]; negative if the loop is stable then."""
+        return float(self.span.values(self.A + self.B @ self.K).real.max())
+
+
+def examined_in_loop(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None
+) -> tuple[Trajectory, tuple[Finding, ...]]:
+    """:func:`varpin.simulation.soundness.examined`, and the loop too.
+
+    ``hold`` is the period of the loop in steps, None without feedback.
+    """
+    trajectory, found = examined(scene, integrator, trajectory)
+    if hold is not None:
+        loop = unstable_loop(scene, trajectory, hold) or _flipping(scene, trajectory, hold)
+        found = (*(loop or _cycling(scene, trajectory, hold)), *found)
+    return with_warnings(trajectory, found), found
+
+
+def _flipping(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding, ...]:
+    """Says if a law that may saturate flips from period to period and does not calm down.
+
+    Controls that alternate are no excuse for velocities that do: they are made of them.
+    """
+    if trajectory.dw.any():
+        return ()
+    period, v, u = hold * trajectory.dt, trajectory.v[::hold], trajectory.u[::hold]
+    advice = f"the law is too fast for its period of {period:g} s; take a shorter period or lower gains"
+    if not len(u):
+        return ()
+    found = alternation(v)
+    if found is not None:
+        size = np.abs(np.diff(v[found.first : found.first + found.changes + 3, found.joint], n=2))
+        if size[-1] >= _CALMS * size[0]:
+            sentence = (
+                f"under the control law the velocity of {scene.robot.joint_names[found.joint]} alternates from period "
+                f"to period, {found.changes} times in a row from t = {trajectory.t[hold * found.first]:.4g} s on: "
+                f"{advice}"
+            )
+            return (Finding(_FLIPS, sentence, found.joint),)
+    late = u[len(u) // 2 :]
+    high, low = late == u.max(axis=0, initial=-np.inf), late == u.min(axis=0, initial=np.inf)
+    flips = ((high[1:] & low[:-1]) | (low[1:] & high[:-1])).sum(axis=0)
+    flips[np.ptp(u, axis=0) == 0.0] = 0
+    if len(late) <= RUN or not 2 * flips.max(initial=0) > len(late):
+        return ()
+    worst = int(np.argmax(flips))
+    sentence = (
+        f"control {worst} goes from one of its limits to the other at {flips[worst]} of the last {len(late)} periods: "
+        f"{advice}"
+    )
+    return (Finding(_FLIPS, sentence),)
+
+
+def _cycling(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding, ...]:
+    """Says if a law whose goal stands still sends a control from limit to limit again and again.
+
+    It is not to calm down. Only of laws that leave too few nodes inside their limits to be told from them.
+    """
+    if trajectory.dw.any():
+        return ()
+    at = np.arange(0, trajectory.steps, hold)
+    x, u = np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1), trajectory.u[at]
+    if len(u) <= _CYCLES or np.abs(x).max() >= _HUGE:
+        return ()
+    side = _at_limit(u, u.max(axis=0)).astype(np.int64) - _at_limit(u, u.min(axis=0))
+    half, v = len(u) // 2, trajectory.v[at] @ scene.actuation
+    ways = {}
+    for k in range(u.shape[1]):
+        arrivals = _arrivals(side[:, k])
+        late = int((arrivals >= half).sum())
+        if len(arrivals) < _CYCLES or late < _LATE:
+            continue
+        before, after = np.array_split(np.diff(arrivals)[-_STRETCHES:], 2)
+        work = side[half:, k] * v[half:, k]
+        calms = after.mean() < _KEEPS * before.mean()
+        if not calms and work.sum() <= _PUMPS * np.abs(work).sum() and _clips(scene, x, u, side, k, len(arrivals)):
+            ways[k] = late
+    if not ways:
+        return ()
+    with np.errstate(all="ignore"):
+        try:
+            known = _law_inside_limits(scene, x, u) is not None
+        except (np.linalg.LinAlgError, LinearizationError):
+            known = False
+    if known:
+        return ()
+    worst = max(ways, key=lambda k: ways[k])
+    low, high = u[:, worst].min(), u[:, worst].max()
+    return (
+        Finding(
+            KIND,
+            f"the control loop seems unstable at its period of {hold * trajectory.dt:g} s: control {worst} goes from "
+            f"one of its limits, {low:.4g} and {high:.4g}, to the other {ways[worst]} times in the last "
+            f"{len(u) - half} periods and does not calm down; {_ADVICE}",
+        ),
+    )
+
+
+def _arrivals(side: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Nodes at which a control comes to a limit from the other one; ``side`` (P,) is 1, -1 at the limits, 0 inside."""
+    visits = np.flatnonzero(side)
+    arrivals: NDArray[np.int64] = visits[1:][side[visits[1:]] != side[visits[:-1]]]
+    return arrivals
+
+
+def _clips(scene: Scene, x: Floats, u: Floats, side: NDArray[np.int64], k: int, ways: int) -> bool:
+    """Whether control k of u (P, m) is a clipped law of its own joints' state or, failing that, of the whole one.
+
+    Fewer ways than twice the unknowns of a law say nothing: some law would give them by chance (Cover 1965).
+    """
+    own = np.tile(scene.actuation[:, k] != 0.0, 2)
+    return any(
+        ways >= 2 * (columns.sum() + 1) and _clipped_law(x[:, columns], u[:, k], side[:, k])
+        for columns in (own, np.ones_like(own))
+    )
+
+
+def _clipped_law(x: Floats, u: Floats, side: NDArray[np.int64]) -> bool:
+    """Whether some k x + c, clipped to its limits, gives u (P,) at x (P, 2n); ``side`` (P,) is 1, -1 at the limits.
+
+    A goal that moves sends a control to its limits at other states each time.
+    """
+    turns = np.flatnonzero(side[1:] != side[:-1])
+    tight = np.unique(np.concatenate([turns, turns + 1]))
+    spread = np.linspace(0, len(x) - 1, _SOUGHT).astype(np.int64)
+    rows = np.unique(np.concatenate([tight[:: 1 + len(tight) // _SOUGHT], spread]))
+    x, u, side = x[rows], u[rows], side[rows]
+    weight = np.ones(len(x))
+    unit = _spread(x, weight)
+    moving = unit > 0.0
+    columns = np.concatenate([_centered(x[:, moving], weight) / unit[moving], np.ones((len(x), 1))], axis=1)
+    target = 2.0 * (u - u.min()) / np.ptp(u) - 1.0
+    above, below, free = side > 0, side < 0, side == 0
+    result = scipy.optimize.linprog(
+        np.zeros(columns.shape[1]),
+        A_ub=np.concatenate([-columns[above], columns[below]]),
+        b_ub=np.concatenate([-target[above], target[below]]),
+        A_eq=columns[free],
+        b_eq=target[free],
+        bounds=(None, None),
+        method="highs",
+    )
+    return bool(result.status == 0)
+
+
+def outgrown(u: Floats, period: float) -> tuple[Finding, ...]:
+    """Of a motion that cannot go on: controls (P, m) of its periods [s] that have grown by much, in words.
+
+    A loop that is fast enough ends a motion before its law can be told.
+    """
+    size = np.abs(u).max(axis=1, initial=0.0)
+    first = int(np.argmax(size > 0.0)) if size.any() else 0
+    if len(u) < 2 or not size[-1] >= _OUTGROWN * size[first] > 0.0:
+        return ()
+    count = len(u) - 1 - first
+    periods = "one period" if count == 1 else f"{count} periods"
+    return (
+        Finding(
+            KIND,
+            f"the control loop may be unstable at its period of {period:g} s: controls grow from {size[first]:.3g} to "
+            f"{size[-1]:.3g} within {periods}; {_ADVICE}",
+        ),
+    )
+
+
+def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[Finding, ...]:
+    """What is to be said of the loop of a motion whose controls came of its state every ``hold`` steps, if anything."""
+    period = hold * trajectory.dt
+    at = np.arange(0, trajectory.steps, hold)
+    x = np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1)
+    u = trajectory.u[at]
+    if len(at) < 3 or not u.size or not np.ptp(u, axis=0).any():
+        return ()
+    with np.errstate(all="ignore"):
+        try:
+            found = _by_theory(scene, x, u, period)
+        except (np.linalg.LinAlgError, LinearizationError):
+            found = ()
+        if found or not _does_work(scene, trajectory.part(int(at[round(0.75 * (len(at) - 1))]), trajectory.steps)):
+            return found
+        try:
+            return _by_the_record(u, period) or _by_last_changes(x, u, period)
+        except (np.linalg.LinAlgError, LinearizationError):
+            return ()
+
+
+def _does_work(scene: Scene, trajectory: Trajectory) -> bool:
+    """Whether the controls bring energy into a motion, rather than take it out."""
+    ways, before = np.diff(trajectory.q, axis=0), trajectory.u @ scene.actuation.T
+    middle = 0.5 * (trajectory.q[1:] + trajectory.q[:-1])
+    force = drive_forces(scene.elements, middle, ways / trajectory.dt, before)
+    return bool(((force / np.abs(force).max()) * (ways / np.abs(ways).max())).sum() > 0.0)
+
+
+def _by_the_record(u: Floats, period: float) -> tuple[Finding, ...]:
+    """Controls that have grown by orders of magnitude, and still do."""
+    largest = np.maximum.accumulate(np.abs(u), axis=0)
+    last = len(u) - 1
+    quarter, half, three = (largest[round(share * last)] for share in (0.25, 0.5, 0.75))
+    steadily = (largest[last] >= _GROWS * three) & (three >= _GROWS * half)
+    grew = np.where(steadily & (quarter > 0.0), largest[last] / quarter, 0.0)
+    worst = int(np.argmax(grew))
+    if not grew[worst] >= _GREW:
+        return ()
+    return (
+        Finding(
+            KIND,
+            f"the control loop is unstable at its period of {period:g} s: control {worst} grows from "
+            f"{quarter[worst]:.3g} in the first quarter of the motion to {largest[last, worst]:.3g} in the end; "
+            f"{_ADVICE}",
+        ),
+    )
+
+
+def _by_last_changes(x: Floats, u: Floats, period: float) -> tuple[Finding, ...]:
+    """Controls whose changes grow, in a motion that turns round within some periods."""
+    n, last = x.shape[1] // 2, len(u) - 1
+    window = 3 * n + 8
+    if last < 2 * window:
+        return ()
+    changes = np.abs(np.diff(u, axis=0))
+    peaks = np.array([part.max(axis=0) for part in np.array_split(changes[last // 2 :], 4)])
+    growing = (np.diff(peaks, axis=0) > 0.0).all(axis=0) & (peaks[-1] >= _WANTS * peaks[0])
+    if not growing.any():
+        return ()
+    # The last changes of the state as a linear map of those before (dynamic mode decomposition, Schmid 2010).
+    dx = np.diff(x[-window:], axis=0)
+    dx -= dx.mean(axis=0)
+    size = np.sqrt(np.mean(dx**2, axis=0))
+    left, sizes, _ = np.linalg.svd(dx[:, size > 0.0] / size[size > 0.0], full_matrices=False)
+    modes = (left * sizes)[:, sizes > _CHANGED * sizes[0]]
+    step = np.linalg.lstsq(modes[:-1], modes[1:], rcond=None)[0]
+    values = np.linalg.eigvals(step)
+    growth = float(np.abs(values[np.abs(np.angle(values)) >= _TURNS]).max(initial=0.0))
+    if not 0.5 * last * np.log(growth) > np.log(_WANTS):
+        return ()
+    worst = int(np.argmax(np.where(growing, peaks[-1], 0.0)))
+    return (
+        Finding(
+            KIND,
+            f"the control loop is unstable at its period of {period:g} s: changes of control {worst} grow from "
+            f"{peaks[0, worst]:.3g} to {peaks[-1, worst]:.3g} over the second half of the motion, and each period "
+            f"multiplies deviations by {growth:.4g} in the end; {_ADVICE}",
+        ),
+    )
+
+
+def _by_theory(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Finding, ...]:
+    """The spectral radius of the loop, where the record determines the law."""
+    law = _law_inside_limits(scene, x, u)
+    if law is None:
+        return ()
+    loop = loop_at_rest(scene, law)
+    rests = loop is not None
+    if loop is None:
+        loop = _linearized(scene, law, law.near)[0]
+    multiplier = loop.multiplier(period)
+    growth = float(np.abs(multiplier))
+    if not (growth > 1.0 + _ABOVE_ONE and len(u) * np.log(growth) > np.log(_WORTH) and loop.owes(period)):
+        return ()
+    # Away from an equilibrium only what a slow motion cannot be taken for.
+    if not rests and (np.abs(np.angle(multiplier)) < _TURNS or growth < _FAST):
+        return ()
+    place = "its equilibrium q" if rests else "q"
+    stable = next((period / 2**k for k in range(1, 8) if np.abs(loop.multiplier(period / 2**k)) < 1.0), None)
+    advice = "take lower gains" if stable is None else f"with a period of {stable:g} s or lower gains it is stable"
+    return (
+        Finding(
+            KIND,
+            f"the control loop is unstable at its period of {period:g} s: each multiplies deviations by {growth:.4g} "
+            f"(linearized at {place} = [{', '.join(f'{value:.4g}' for value in loop.q)}]); {advice}",
+        ),
+    )
+
+
+def _law_inside_limits(scene: Scene, x: Floats, u: Floats) -> Law | None:
+    """The law from all nodes or, where it saturates, from those at which a control is inside its limits."""
+    law = fitted_law(scene, x, u)
+    if law is not None:
+        return law
+    free = _unsaturated(u)
+    if free.all():
+        return None
+    law = fitted_law(scene, x[free.all(axis=1)], u[free.all(axis=1)], spare=2)
+    if law is not None or u.shape[1] == 1:
+        return law
+    # Each control by itself: where one is at its limit another is not.
+    laws = [fitted_law(scene, x[rows], u[rows, k : k + 1], spare=2) for k, rows in enumerate(free.T)]
+    known = [law for law in laws if law is not None]
+    # Of directions that only some of them know nothing can be said of the loop.
+    if len(known) < len(laws) or any(law.span.directions.shape[1] < x.shape[1] for law in known):
+        return None
+    Kq, Kv, S, c = (np.concatenate([getattr(law, name) for law in known]) for name in ("Kq", "Kv", "S", "c"))
+    return Law(Kq=Kq, Kv=Kv, S=S, c=c, span=known[0].span, near=known[0].near)
+
+
+def _unsaturated(u: Floats) -> NDArray[np.bool_]:
+    """Where controls u (P, m) are not at their largest or smallest value, if they are there more than once (P, m)."""
+    return ~(_at_limit(u, u.max(axis=0)) | _at_limit(u, u.min(axis=0)))
+
+
+def _at_limit(u: Floats, limit: Floats) -> NDArray[np.bool_]:
+    """Where controls u (P, m) saturate at a value (m,), if they change at all (P, m)."""
+    at = u == limit
+    return np.asarray(at & (at.sum(axis=0) >= _SATURATED) & (np.ptp(u, axis=0) > 0.0), dtype=np.bool_)
+
+
+def fitted_law(scene: Scene, x: Floats, u: Floats, spare: int = 4) -> Law | None:
+    """The law that gives u (P, m) at (q, v) = x (P, 2n), if one that is linear but for gravity does, to rounding.
+
+    There are to be ``spare`` more nodes than directions in which the state moves.
+    """
+    n = scene.robot.dof
+    sound = (np.abs(x).max(axis=1) < _HUGE) & (np.abs(u).max(axis=1) < _HUGE)
+    x, u = x[sound], u[sound]
+    if len(x) < 4:
+        return None
+    # Each node counts alike, whatever a motion that runs away makes of the last ones.
+    weight = 1.0 / np.maximum(1.0, np.abs(x).max(axis=1))
+    unit = _spread(x, weight)
+    change = (np.abs(np.diff(x, axis=0)) / np.where(unit > 0.0, unit, np.inf)).max(axis=1)
+    near = x[int(np.argmin(change)), :n]
+    nodes = max(_NODES, 2 * n)
+    if len(x) > 2 * nodes:
+        moved = np.argpartition(change, -nodes)[-nodes:]
+        chosen = np.unique(np.concatenate([moved, np.linspace(0, len(x) - 1, nodes).astype(np.int64)]))
+        x, u, weight = x[chosen], u[chosen], weight[chosen]
+    unit = _spread(x, weight)
+    gains = _affine(x, u, weight, spare)
+    if gains is None:
+        gains = _affine(np.concatenate([x, _pull(scene, x[:, :n])], axis=1), u, weight, spare)
+    if gains is None:
+        return None
+    K, c = gains
+    S = K[:, 2 * n :] if K.shape[1] > 2 * n else np.zeros((len(K), n))
+    moving = np.flatnonzero(unit > 0.0)
+    _, sizes, rows = np.linalg.svd(_centered(x[:, moving], weight) / unit[moving], full_matrices=False)
+    directions = np.zeros((2 * n, int((sizes > _EXCITED * sizes[0]).sum())))
+    directions[moving] = rows[: directions.shape[1]].T
+    span = Span(directions, np.where(unit > 0.0, unit, 1.0))
+    return Law(Kq=K[:, :n], Kv=K[:, n : 2 * n], S=S, c=c, span=span, near=near)
+
+
+def _pull(scene: Scene, q: Floats) -> Floats:
+    """L_q(q, 0) at many configurations (P, n): the force of gravity and springs."""
+    nothing = np.zeros_like(q)
+    a, _, _, af = accelerations(scene, q, nothing, nothing)
+    return np.asarray(np.linalg.solve(af, a[..., None])[..., 0], dtype=np.float64)
+
+
+def _centered(columns: Floats, weight: Floats) -> Floats:
+    """Columns (P, k) times weights (P,), without their part along the weights: what a constant explains."""
+    rows: Floats = columns * weight[:, None]
+    along: Floats = np.asarray(weight @ rows, dtype=np.float64) / (weight @ weight)
+    return rows - weight[:, None] * along
+
+
+def _spread(columns: Floats, weight: Floats) -> Floats:
+    """Root mean square (k,) of centered columns; zero for what rounding leaves of a constant."""
+    size = np.sqrt(np.mean(_centered(columns, weight) ** 2, axis=0))
+    return np.where(size > 1e-13 * np.abs(columns * weight[:, None]).max(axis=0), size, 0.0)
+
+
+def _affine(x: Floats, u: Floats, weight: Floats, spare: int) -> tuple[Floats, Floats] | None:
+    """K (m, k) and c (m,) of u = K x + c, if that holds to rounding; K is the least of those that give the same."""
+    unit = _spread(x, weight)
+    moving = np.flatnonzero(unit > 0.0)
+    if not len(moving):
+        return None
+    state = _centered(x[:, moving], weight) / unit[moving]
+    left, sizes, right = np.linalg.svd(state, full_matrices=False)
+    known = sizes > _EXCITED * sizes[0]
+    left = left[:, known]
+    if len(x) < known.sum() + spare:
+        return None
+    target = _centered(u, weight)
+    scaled = (right[known].T / sizes[known]) @ (left.T @ target)
+    # What rounding leaves where a law has no gain would take the double eigenvalue of a free joint apart.
+    scaled[np.abs(scaled) < 1e-10 * np.abs(scaled).max(axis=0)] = 0.0
+    K = np.zeros((u.shape[1], x.shape[1]))
+    K[:, moving] = (scaled / unit[moving, None]).T
+    rest = u - x @ K.T
+    c = weight**2 @ rest / (weight @ weight)
+    off = np.abs((rest - c) * weight[:, None]).max()
+    terms = ((np.abs(x) @ np.abs(K.T) + np.abs(c)) * weight[:, None]).max()
+    squares = _centered((state / weight[:, None]) ** 2, weight)
+    missed = np.abs(squares - left @ (left.T @ squares)).max(axis=0) / np.abs(squares).max(axis=0)
+    # Rounding, which directions that are little excited enlarge.
+    rounding = np.finfo(np.float64).eps * min(_EXACT[0] * sizes[0] / sizes[known][-1], _EXACT[1]) * terms
+    allowed = min(rounding, _TELLING * np.median(missed) * np.abs(target).max())
+    return (K, c) if off <= allowed else None
+
+
+def loop_at_rest(scene: Scene, law: Law) -> Loop | None:
+    """The loop at an equilibrium, which Newton's method finds from ``law.near`` or, failing that, from its goal.
+
+    The goal is where the law asks for no control. None if no equilibrium is found.
+    """
+    n = scene.robot.dof
+    goal = law.near - np.linalg.lstsq(law.Kq, law.Kq @ law.near + law.c, rcond=None)[0]
+    for start in (law.near, goal):
+        loop, a, terms = _linearized(scene, law, start)
+        for _ in range(_ITERATIONS):
+            step = np.linalg.lstsq(loop.A[n:, :n] + loop.B[n:] @ loop.K[:, :n], -a, rcond=None)[0]
+            if np.abs(step).max() <= 1e-9 * max(1.0, np.abs(loop.q).max()):
+                # A matrix without an inverse may leave a force that no step takes away.
+                if np.abs(a).max() > 1e-6 * terms:
+                    break
+                return loop
+            before, q = np.abs(a).max(), loop.q
+            # Damped while the acceleration does not fall.
+            for halved in range(_HALVINGS):
+                loop, a, terms = _linearized(scene, law, q + 0.5**halved * step)
+                if np.abs(a).max() < before:
+                    break
+    return None
+
+
+def _linearized(scene: Scene, law: Law, q: Floats) -> tuple[Loop, Floats, float]:
+    """The loop at rest at q (n,); the acceleration there (n,), and the size of the terms that cancel in it."""
+    n = len(q)
+    u, Kq = law.Kq @ q + law.c, law.Kq
+    if law.S.any():
+        jet = lagrangian_jet(scene, q, np.zeros(n))
+        u, Kq = u + law.S @ jet.Lq, Kq + law.S @ jet.Lqq
+    force = scene.actuation @ u
+    a, aq, av, af = (value[0] for value in accelerations(scene, q[None], np.zeros((1, n)), force[None]))
+    pushed = af @ scene.actuation
+    sizes = np.abs(law.Kq) @ (np.abs(q) + law.span.unit[:n]) + np.abs(law.c)
+    terms = np.abs(pushed) @ sizes + np.abs(a - af @ force)
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [aq, av]])
+    B = np.concatenate([np.zeros_like(pushed), pushed])
+    return Loop(A, B, np.concatenate([Kq, law.Kv], axis=1), law.span, q), a, float(terms.max())

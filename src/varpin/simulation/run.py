@@ -1,0 +1,728 @@
+"""From initial state and controls to a trajectory."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.core.arrays import Commands
+from varpin.errors import InputError, UnknownJoint, VarpinError
+from varpin.integrators import Integrator, Midpoint, Reference, Segment, integrator_of
+from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
+from varpin.mechanics.policy import LinearPolicy, OpenLoop, takes
+from varpin.mechanics.scene import Scene, require_scene
+from varpin.mechanics.wiener import wiener_increments
+from varpin.simulation import limits
+from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstable_loop
+from varpin.simulation.refinement import INTEGRATORS, SENSIBLE
+from varpin.simulation.soundness import Finding, announce, evident, with_warnings
+from varpin.simulation.tolerance import Motion, choose
+from varpin.support.checks import (
+    JointValues,
+    as_floats,
+    control_array,
+    control_values,
+    count,
+    joint_array,
+    positive,
+    require_finite,
+)
+from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
+
+Floats = NDArray[np.float64]
+ControlLaw = Callable[[float, Floats, Floats], JointValues]
+Progress = Callable[[int, int], None]
+Futile = Callable[[list[Segment]], str | None]
+
+logger = logging.getLogger(__name__)
+
+# Work between two looks at the progress callback and at Ctrl-C, in steps of one joint: some tens of milliseconds.
+_CHUNK = 30_000
+# What steps where no integrator is given.
+_MIDPOINT = Midpoint()
+# Parts of a motion that are kept one by one.
+_PARTS = 256
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during a simulation.
+
+    Attributes:
+        trajectory: What was computed before it.
+    """
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.trajectory = trajectory
+        super().__init__(f"interrupted after {trajectory.steps} steps; they are in .trajectory")
+
+
+class _StepError(VarpinError, ValueError):
+    """A function of the user's failed in a step.
+
+    Attributes:
+        step: Index of the step.
+        time: When it was called [s].
+        trajectory: What was computed before; None where the function is called before the motion begins.
+    """
+
+    def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory | None) -> None:
+        self.step = step
+        self.time = time
+        self.trajectory = trajectory
+        before = "" if trajectory is None else "; what came before is in error.trajectory"
+        super().__init__(f"step {step} (t = {time:.6g} s): {problem}{before}")
+
+
+class ControlError(_StepError):
+    """A control law or the function of an OpenLoop raised, or returned something that is no control.
+
+    Attributes:
+        step: Index of the step it was called for.
+        time: The time it was called with [s].
+        trajectory: What was computed before; None from an ensemble, whose controls are evaluated before it begins.
+    """
+
+
+class NoiseError(_StepError):
+    """A function of a custom noise raised, or returned something that is no field.
+
+    Attributes:
+        step: Index of the step it was called in.
+        time: The start of that step [s].
+        trajectory: What was computed before.
+    """
+
+
+class ToleranceError(VarpinError, RuntimeError):
+    """No number of steps that was tried gives an error below 1 rad or m.
+
+    Attributes:
+        tolerance: What was asked for [rad or m].
+        error: The best estimate of an error [rad or m]; infinite where there is none.
+        steps: With how many steps.
+    """
+
+    def __init__(self, tolerance: float, duration: float, steps: int, error: float) -> None:
+        self.tolerance, self.error, self.steps = tolerance, error, steps
+        known = f"is still {error:.1e} rad or m" if np.isfinite(error) else "is unknown"
+        super().__init__(
+            f"tolerance = {tolerance:g} cannot be met over {duration:g} s: with {steps} steps the error in q "
+            f"{known}. A chaotic motion has no end that any method gets right, and one whose forces are too stiff or "
+            "jump may need more; ask for a shorter duration, or give dt and steps"
+        )
+
+
+class StepFailure(VarpinError, RuntimeError):
+    """The step equation could not be solved on its principal branch.
+
+    Attributes:
+        step: Index of the step that failed.
+        time: Its start [s].
+        residual: The last residual, in units of the rounding error of its terms.
+        reason: What stopped the last attempt.
+        q: Configuration at the start of the step (n,) [rad or m].
+        v: Velocity there (n,).
+        p: Momentum there (n,).
+        trajectory: What was computed before, with a warning if its control loop is unstable.
+    """
+
+    def __init__(self, step: int, time: float, failure: Failure, trajectory: Trajectory) -> None:
+        self.step = step
+        self.time = float(time)
+        self.residual = failure.residual
+        self.reason = failure.reason
+        self.q, self.v, self.p = trajectory.q[-1], trajectory.v[-1], trajectory.p[-1]
+        self.trajectory = trajectory
+        told = [sentence for sentence in trajectory.warnings if not sentence.startswith(limits.KINDS)]
+        advice = told[0] if told else "a smaller dt may go further"
+        super().__init__(
+            f"step {step} (t = {time:.6g} s) cannot be trusted: {failure.reason}; last residual {failure.residual:.3g} "
+            f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}. What came before is in error.trajectory; "
+            f"{advice}"
+        )
+
+
+def _row(values: Floats) -> str:
+    """A vector on one line, whatever its length."""
+    return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"
+
+
+class _Record:
+    """The steps done so far; a trajectory can be made of them at any time.
+
+    Attributes:
+        steps: How many.
+        last: The part that was added last, or the first node.
+    """
+
+    def __init__(self, scene: Scene, integrator: Integrator, dt: float, dw: Floats, first: Segment) -> None:
+        self.scene, self.integrator, self.dt, self.dw = scene, integrator, dt, dw
+        self.steps, self.last = 0, first
+        self._first = first
+        self._joined: list[Segment] = []
+        self._parts: list[Segment] = []
+
+    def add(self, segment: Segment) -> None:
+        if not len(segment.q):
+            return
+        self.steps += len(segment.q)
+        self.last = segment
+        self._parts.append(segment)
+        # Single steps take many times the room of their numbers.
+        if len(self._parts) == _PARTS:
+            self._joined.append(join(self._parts))
+            self._parts = []
+
+    def trajectory(self) -> Trajectory:
+        dw = self.dw[: self.steps] if len(self.dw) else None
+        return _trajectory(self.scene, self.integrator, self.dt, self._first, [*self._joined, *self._parts], dw)
+
+
+def _trajectory(
+    scene: Scene, integrator: Integrator, dt: float, first: Segment, parts: list[Segment], dw: Floats | None
+) -> Trajectory:
+    """The motion from a first node on over parts that follow each other; no increments stand for zeros."""
+    steps = join(parts) if len(parts) > 1 else parts[0] if parts else first.part(0)
+    N = len(steps.u)
+    return Trajectory(
+        t=np.arange(N + 1, dtype=np.float64) * dt,
+        q=np.concatenate([first.q, steps.q]),
+        v=np.concatenate([first.v, steps.v]),
+        p=np.concatenate([first.p, steps.p]),
+        energy=np.concatenate([first.energy, steps.energy]),
+        u=steps.u,
+        dw=np.zeros((N, scene.processes)) if dw is None else dw,
+        masses=scene.robot.tree.mass.copy(),
+        dt=dt,
+        integrator=str(integrator),
+        robot=scene.robot.name,
+        joint_names=scene.robot.joint_names,
+        statistics=steps.statistics,
+        scene_values=scene.values,
+    )
+
+
+class Motions:
+    """Motions from one state under commands of any kind; they share their work arrays."""
+
+    def __init__(self, scene: Scene, integrator: Integrator, q0: Floats, v0: Floats, dt: float) -> None:
+        self.scene, self.integrator, self.dt = scene, integrator, dt
+        self._state, (self._first,) = integrator.start(scene, q0[None], v0[None])
+
+    def under(
+        self,
+        commands: Commands,
+        *,
+        increments: Floats | None = None,
+        integrator: Integrator | None = None,
+        futile: Futile | None = None,
+    ) -> tuple[Trajectory, Failure | None]:
+        """The motion, and why it stopped early, if it did; nothing is checked.
+
+        Args:
+            commands: For all of its steps.
+            increments: Of its Wiener processes (N, k) [s^0.5]; left out, there is no noise.
+            integrator: To make it with: the one of these motions with other options, and itself if left out.
+            futile: Asked after a third of a motion, about the parts that there are; where it answers with a reason, the
+                motion ends.
+        """
+        integrator = self.integrator if integrator is None else integrator
+        drawn = np.zeros((0, 0, self.scene.processes)) if increments is None else increments[None]
+        state = integrator.fork(self._state)
+        decisions, begin = len(commands.u), 0
+        parts: list[Segment] = []
+        failure: Failure | None = None
+        ends = {decisions} if futile is None else {decisions // 3, decisions} - {0}
+        for end in sorted(ends):
+            block = commands if end - begin == decisions else rows(commands, begin, end, _last_control(parts))
+            now = drawn[:, begin * commands.hold : end * commands.hold]
+            parts += integrator.rollout(self.scene, state, block, now, self.dt)
+            failure, begin = parts[-1].failure, end
+            if failure is None and futile is not None and end < decisions:
+                reason = futile(parts)
+                failure = None if reason is None else Failure(reason, 0.0)
+            if failure is not None:
+                break
+        dw = None if increments is None else increments[: sum(len(part.u) for part in parts)]
+        return _trajectory(self.scene, self.integrator, self.dt, self._first, parts, dw), failure
+
+
+def _last_control(parts: list[Segment]) -> Floats | None:
+    return parts[-1].u[None, -1] if parts else None
+
+
+def rollout(
+    scene: Scene, integrator: Integrator, q0: Floats, v0: Floats, commands: Commands, dt: float
+) -> tuple[Trajectory, Failure | None]:
+    """One of the :class:`Motions` from (q0, v0)."""
+    return Motions(scene, integrator, q0, v0, dt).under(commands)
+
+
+def simulate(
+    scene: Scene,
+    q0: JointValues,
+    v0: JointValues,
+    *,
+    dt: float | None = None,
+    steps: int | None = None,
+    duration: float | None = None,
+    tolerance: float | Accuracy | None = None,
+    controls: JointValues | ControlLaw | LinearPolicy | OpenLoop | None = None,
+    period: int = 1,
+    integrator: Integrator | None = None,
+    rng: np.random.Generator | int | None = None,
+    increments: ArrayLike | None = None,
+    check: bool = True,
+    progress: Progress | None = None,
+) -> Trajectory:
+    """Integrate a scene in time.
+
+    Give ``duration`` and ``tolerance``, and the cheapest integrator and step that keep the error in q within it are
+    found out and taken; or give two of ``dt``, ``steps`` and ``duration``.
+
+    Main args:
+        scene: The scene.
+        q0: Initial configuration, (n,) or by joint name, 0 for those not named [rad or m].
+        v0: Initial velocity, the same [rad/s or m/s].
+        dt: Time step [s].
+        steps: N, their number.
+        duration: steps * dt [s].
+        tolerance: The largest error in q allowed at any node [rad or m], in place of ``dt`` and ``steps``.
+            ``Trajectory.accuracy`` says what was taken, what error that estimates and how many steps finding out took;
+            it is itself a ``tolerance``, of the same scene's next motion, which tries first what it found. Where the
+            tolerance is out of reach a warning says what is reached. Rows of controls, (R, m), are then held over
+            duration / R each, a LinearPolicy needs its period in seconds, and noise and control laws are refused.
+        controls: None for none, servos staying where they are at ``q0``; an array (N, m), one row a step; one row
+            (m,) for all steps, by joint name too where each control is the force of a joint, with 0 for joints that
+            are not named; a :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that
+            returns (m,), or numbers by joint name; or :class:`varpin.OpenLoop`, a function of time alone. Controls are
+            constant over each step. A law is a digital controller: it is called once where each of its periods begins,
+            with the time and the state of that node, and what it returns is held over the period.
+        period: Of a control law, in steps.
+        integrator: :class:`Midpoint` with alpha = 1/2 if left out; with a tolerance, the cheapest that there is.
+
+    Other Args:
+        rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero, and a
+            noisy scene has a warning of it; so has an ``rng`` where nothing is random.
+        increments: The increments themselves, (N, k) [s^0.5], to replay or refine a path, see
+            :mod:`varpin.mechanics.wiener`. 0 asks for the motion without noise.
+        check: Look at the finished motion, whether the balance of its energy closes, its steps resolve it and its
+            control loop is stable, for ``Trajectory.warnings`` and the log. It takes about as long as the motion, and
+            at most as some thousands of steps where these are in doubt.
+        progress: Called now and then with (steps done, steps in all).
+
+    Returns:
+        The trajectory, frozen.
+
+    Raises:
+        InputError: Wrong shapes, values that are not finite, dt <= 0, steps < 0, a law of other arguments than
+            (t, q, v), a period without a law; dt or steps, noise or a law beside a tolerance.
+        ToleranceError: No step brings the error below 1 rad or m; a chaotic motion over a long time, say.
+        UnknownJoint: ``q0`` or ``v0`` names a joint that is no coordinate of the robot, or ``controls`` one that no
+            control drives.
+        ControlError: The control function returned something unusable; holds the trajectory so far.
+        NoiseError: A function of a CustomNoise did; holds the trajectory so far.
+        StepFailure: A step has no trustworthy solution; holds the trajectory so far.
+        SingularMassMatrix: M(q0) is not positive definite.
+        Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt; while a tolerance looks for its
+            integrator, a plain one.
+    """
+    joints = require_scene(scene).robot.joint_names
+    n = len(joints)
+    q0, v0 = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
+    if integrator is not None and not isinstance(integrator, Integrator):
+        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
+    if controls is None and scene.servo_joints:
+        controls = scene.command_at(q0)
+    accuracy: Accuracy | None = None
+    wished: tuple[Finding, ...] = ()
+    if tolerance is not None:
+        span = _time_of_wish(dt, steps, duration)
+        chosen = _chosen(scene, q0, v0, span, tolerance, controls, integrator)
+        integrator, steps, controls, accuracy, wished = chosen
+        dt = span / steps
+    else:
+        dt, steps = _times(dt, steps, duration)
+    period = count("period", period, least=1)
+    integrator = _MIDPOINT if integrator is None else integrator
+    law = controls if callable(controls) else None
+    if law is not None:
+        _require_law(law)
+    elif period != 1:
+        raise InputError(
+            f"period = {period} is of a control law, a function of (t, q, v); rows are given one a step, "
+            "and a LinearPolicy has a hold of its own"
+        )
+    _require_memory(scene, steps)
+    if callable(controls) or isinstance(controls, OpenLoop):
+        commands = open_loop(np.zeros((0, scene.controls)))
+    else:
+        commands = commands_of(scene, integrator, controls, steps, dt)
+    hold = period if law is not None else commands.hold if isinstance(controls, LinearPolicy) else None
+    dw = wiener_increments(scene.processes, dt, steps, rng, increments)
+    state, (start,) = integrator.start(scene, q0[None], v0[None])
+    record = _Record(scene, integrator, dt, dw, start)
+    # A sweep takes as long as the robot has joints, an elimination as their cube.
+    chunk = max(1, _CHUNK // (n + n**3 // 100))
+    # One step at a time where noise calls Python functions, so that what came before one that fails is recorded.
+    stepwise = scene.noise.diffusion is None
+    interrupted = False
+    try:
+        while record.steps < steps:
+            done = record.steps
+            if law is not None:
+                held = min(1 if stepwise else period, steps - done)
+                u = record.last.u[-1:] if done % period else _decision(law, record)
+                block = open_loop(u)._replace(hold=held)
+            elif isinstance(controls, OpenLoop):
+                block = open_loop(_sampled(controls, record, 1 if stepwise else min(chunk, steps - done)))
+            elif stepwise:
+                block = _next(commands, record)
+            else:
+                first = record.steps // commands.hold
+                before = record.last.u[None, -1] if record.steps else None
+                block = rows(commands, first, first + max(1, chunk // commands.hold), before)
+            drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
+            try:
+                (segment,) = integrator.rollout(scene, state, block, drawn, dt)
+            except InputError as error:
+                now = record.trajectory()
+                raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
+            record.add(segment)
+            if segment.failure is not None:
+                node = record.trajectory()
+                if hold is not None and check:
+                    # What a law has just decided is in no step yet.
+                    last = node.u[:0] if law is None else block.u
+                    decided = np.concatenate([node.u[: node.steps if law is None else done : hold], last])
+                    loop = unstable_loop(scene, node, hold) or outgrown(decided, hold * dt)
+                    node = with_warnings(node, loop)
+                raise StepFailure(node.steps, node.t[-1], segment.failure, node)
+            if progress is not None and (done // chunk < record.steps // chunk or record.steps == steps):
+                progress(record.steps, steps)
+    except KeyboardInterrupt:
+        interrupted = True
+    try:
+        trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
+        found = (*noise_forgotten(scene, rng, increments), *wished, *found)
+        trajectory = replace(with_warnings(trajectory, found), accuracy=accuracy)
+    except KeyboardInterrupt:
+        raise Interrupted(replace(record.trajectory(), accuracy=accuracy)) from None
+    if interrupted:
+        raise Interrupted(trajectory)
+    announce(logger, scene, dt, found)
+    return trajectory
+
+
+def _times(dt: float | None, steps: int | None, duration: float | None) -> tuple[float, int]:
+    """Dt [s] and the number of steps, from two of the three."""
+    given = {name: value for name, value in (("dt", dt), ("steps", steps), ("duration", duration)) if value is not None}
+    if len(given) != 2:
+        got = " and ".join(given) or "none of them"
+        raise InputError(
+            f"give two of dt [s], steps and duration [s], or duration and tolerance [rad or m], which chooses dt; "
+            f"got {got if len(given) < 3 else 'all three'}"
+        )
+    if duration is None:
+        return positive("dt", dt, "s"), count("steps", steps)
+    duration = positive("duration", duration, "s")
+    if dt is None:
+        steps = count("steps", steps, least=1)
+        return duration / steps, steps
+    dt = positive("dt", dt, "s")
+    steps = max(1, round(min(duration / dt, 1e15)))
+    if abs(steps * dt - duration) > 1e-9 * duration:
+        raise InputError(f"duration = {duration:g} s is no multiple of dt = {dt:g} s: dt = {duration / steps!r} s is")
+    return dt, steps
+
+
+def _time_of_wish(dt: float | None, steps: int | None, duration: float | None) -> float:
+    """The duration of a motion with a tolerance [s]."""
+    for name, value in (("dt", dt), ("steps", steps)):
+        if value is not None:
+            raise InputError(
+                f"{name} and tolerance do not go together: a tolerance chooses the steps; give duration and tolerance, "
+                f"or {name} without it"
+            )
+    if duration is None:
+        raise InputError("tolerance needs the duration of the motion [s]")
+    return positive("duration", duration, "s")
+
+
+def _chosen(
+    scene: Scene,
+    q0: Floats,
+    v0: Floats,
+    duration: float,
+    tolerance: float | Accuracy,
+    controls: JointValues | ControlLaw | LinearPolicy | OpenLoop | None,
+    integrator: Integrator | None,
+) -> tuple[Integrator, int, JointValues | LinearPolicy | OpenLoop | None, Accuracy, tuple[Finding, ...]]:
+    """Integrator, steps and controls for a tolerance, with the estimate and what is to be said of it."""
+    earlier = tolerance if isinstance(tolerance, Accuracy) else None
+    wish = positive("tolerance", tolerance.tolerance if isinstance(tolerance, Accuracy) else tolerance, "rad or m")
+    if scene.processes:
+        raise InputError(
+            "tolerance is of single motions without noise: leave the noise out of the scene, or give dt and steps"
+        )
+    if isinstance(integrator, Reference):
+        raise InputError("Reference chooses its own steps: its tolerance is rtol; give it dt and steps")
+    if callable(controls):
+        _require_law(controls)
+        raise InputError(
+            "a control law is called once every period, in steps, and a tolerance chooses the steps: give dt and "
+            "steps with a law, or a varpin.LinearPolicy with a period, or a varpin.OpenLoop(f)"
+        )
+    members = INTEGRATORS if integrator is None else (integrator,)
+    parts, most = 1, max(member.order for member in members)
+    given: Callable[[Integrator, int], Commands]
+    held = np.zeros((0, 0))
+    if isinstance(controls, LinearPolicy):
+        policy = controls
+        if controls.period is None:
+            raise InputError("tolerance chooses dt, so a LinearPolicy needs the period of its intervals, period= [s]")
+        parts = len(controls.gains)
+        if abs(parts * controls.period - duration) > 1e-9 * duration:
+            raise InputError(
+                f"the policy has {parts} intervals of {controls.period:g} s, {parts * controls.period:g} s in all, and "
+                f"duration = {duration:g} s"
+            )
+        if integrator is None:
+            members = tuple(member for member in members if member.variational != (controls.on == "velocity"))
+
+        def given(member: Integrator, steps: int) -> Commands:
+            return commands_of(scene, member, policy, steps, duration / steps)
+    elif isinstance(controls, OpenLoop):
+        # Held from the middle of each step.
+        most, of_time = 2, controls
+        sampled: dict[int, Commands] = {}
+
+        def given(member: Integrator, steps: int) -> Commands:
+            if steps not in sampled:
+                sampled[steps] = commands_of(scene, member, of_time, steps, duration / steps)
+            return sampled[steps]
+    else:
+        held = held_rows(scene, controls)
+        parts = len(held)
+
+        def given(member: Integrator, steps: int) -> Commands:  # noqa: ARG001 - as for the others
+            return open_loop(np.repeat(held, steps // parts, axis=0))
+
+    motion = Motion(scene, q0, v0, duration, parts, given, most, isinstance(controls, OpenLoop))
+    first = None
+    if earlier is not None:
+        known = integrator_of(earlier.integrator)
+        # The user's own guard and tolerance, where the integrator is given.
+        same = known if integrator is None else next((own for own in members if own.same_map(known)), None)
+        if same is not None:
+            first = same, earlier.dt
+    choice = choose(motion, members, wish, first)
+    record = Accuracy(
+        wish,
+        choice.error,
+        str(choice.integrator),
+        duration / choice.steps,
+        choice.search_steps,
+        choice.search_evaluations,
+    )
+    if not choice.error < SENSIBLE:
+        raise ToleranceError(wish, duration, choice.steps, choice.error)
+    found: tuple[Finding, ...] = ()
+    if not record.met:
+        cause = (
+            f"rounding leaves {choice.floor:.1e}"
+            if wish < choice.floor
+            else "errors grow along this motion, or its controls and forces jump inside steps"
+        )
+        found = (
+            Finding(
+                "tolerance not met",
+                f"tolerance = {wish:g} is not met: the estimated error in q is {record.error:.1e} with "
+                f"{record.integrator} at dt = {record.dt:.4g} s; {cause}",
+            ),
+        )
+    if not isinstance(controls, LinearPolicy | OpenLoop):
+        controls = np.repeat(held, choice.steps // parts, axis=0)
+    return choice.integrator, choice.steps, controls, record, found
+
+
+def held_rows(scene: Scene, controls: JointValues | None) -> Floats:
+    """Controls that are each held over an equal part of a motion, (R, m).
+
+    Raises:
+        UnknownJoint: A name that is no driven joint's.
+        InputError: The array is neither (R, m) nor (m,), or not finite.
+    """
+    m = scene.controls
+    if controls is None:
+        return np.zeros((1, m))
+    if isinstance(controls, Mapping):
+        return control_array("controls", controls, scene.control_joints)[None]
+    if hasattr(controls, "policy"):
+        raise InputError("controls is a plan: give its law, plan.policy, or its controls, plan.trajectory.u")
+    held = np.atleast_2d(require_finite("controls", as_floats("controls", controls)))
+    if held.ndim != 2 or held.shape[1] != m or not len(held):
+        raise InputError(f"controls must have shape (R, {m}) or ({m},), got {np.shape(controls)}")
+    return held
+
+
+def _told(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None, *, check: bool
+) -> tuple[Trajectory, tuple[Finding, ...]]:
+    """A whole motion with what is to be said of it; ``hold`` is the period of its feedback in steps, None for none."""
+    if check:
+        return examined_in_loop(scene, integrator, trajectory, hold)
+    found = evident(scene, integrator, trajectory)
+    return with_warnings(trajectory, found), found
+
+
+def noise_forgotten(
+    scene: Scene, rng: np.random.Generator | int | None, increments: ArrayLike | None = None
+) -> tuple[Finding, ...]:
+    """Says if a noisy scene is given nothing to draw its noise from, or a seed is given to a scene without noise."""
+    if scene.processes and rng is None and increments is None:
+        sentence = (
+            "the scene has noise, and none was drawn: this is the motion without it. rng=0, or any other seed, draws "
+            "it (in a scene file, seed = 0 under [simulate]); increments=0 says that none is meant"
+        )
+        return (Finding("noise not drawn", sentence),)
+    if rng is not None and not scene.processes:
+        sentence = "rng was given, but the scene has no noise, so nothing is random: varpin.Scene(robot, noise=...) has"
+        return (Finding("nothing random", sentence),)
+    return ()
+
+
+def _require_memory(scene: Scene, steps: int) -> None:
+    """Refuse a number of steps whose record cannot be held, before anything runs."""
+    columns = 3 * scene.robot.dof + 2 * scene.controls + len(STEP_NUMBERS) + 2
+    try:
+        np.empty((steps + 1, columns))
+    except (MemoryError, ValueError, OverflowError):
+        raise InputError(f"steps = {steps} needs more memory than there is: {columns * 8} bytes a step") from None
+
+
+def commands_of(
+    scene: Scene, integrator: Integrator, controls: JointValues | LinearPolicy | OpenLoop | None, steps: int, dt: float
+) -> Commands:
+    """Controls of ``steps`` steps of ``dt`` [s] as the core takes them.
+
+    They are None, (steps, m), (m,), by joint name, a function or a policy.
+
+    Raises:
+        UnknownJoint: A name that is no driven joint's.
+        InputError: The array is neither (steps, m) nor (m,), or not finite; the policy is for something else; a law.
+        ControlError: The function of an OpenLoop failed; it holds no trajectory.
+    """
+    if isinstance(controls, LinearPolicy):
+        if controls.joints is not None and controls.joints != scene.control_joints:
+            raise InputError(
+                f"the policy's controls are of joints {', '.join(controls.joints)}; "
+                f"the scene's of {', '.join(scene.control_joints or ('no single joints',))}"
+            )
+        if controls.servos is not None and controls.servos != scene.servo_joints:
+            raise InputError(
+                f"the policy's controls are positions of {', '.join(controls.servos) or 'no joints'} and forces of all "
+                f"others; the scene has servos on {', '.join(scene.servo_joints) or 'no joints'}"
+            )
+        return controls.commands(steps, scene.controls, scene.robot.dof, integrator.variational, dt)
+    if isinstance(controls, OpenLoop):
+        u = np.empty((steps, scene.controls))
+        for k in range(steps):
+            u[k] = _row_at(controls, scene, dt, k)
+        return open_loop(u)
+    if callable(controls):
+        raise InputError(
+            "controls must be rows, a varpin.LinearPolicy or a varpin.OpenLoop here; only simulate takes a control law"
+        )
+    return open_loop(control_rows(scene, controls, steps))
+
+
+def control_rows(scene: Scene, controls: JointValues | None, steps: int) -> Floats:
+    """Controls as one row a step, (steps, m).
+
+    Raises:
+        UnknownJoint: A name that is no driven joint's.
+        InputError: The array is neither (steps, m) nor (m,), or not finite.
+    """
+    shape = (steps, scene.controls)
+    if controls is None:
+        return np.zeros(shape)
+    if isinstance(controls, Mapping):
+        controls = control_array("controls", controls, scene.control_joints)
+    if hasattr(controls, "policy"):
+        raise InputError("controls is a plan: give its law, plan.policy, or its controls, plan.trajectory.u")
+    array = as_floats("controls", controls)
+    if array.shape != shape and array.shape != shape[1:]:
+        raise InputError(f"controls must have shape {shape}, one row a step, or {shape[1:]}, got {array.shape}")
+    return np.broadcast_to(require_finite("controls", array), shape).copy()
+
+
+def _next(commands: Commands, record: _Record) -> Commands:
+    """The command of the next step alone: a decision, or the control of the last one while it is held."""
+    decision, held = divmod(record.steps, commands.hold)
+    if held:
+        return open_loop(record.last.u[-1:])
+    before = record.last.u[None, -1] if record.steps else None
+    return rows(commands, decision, decision + 1, before)._replace(hold=1)
+
+
+def _require_law(law: ControlLaw) -> None:
+    """Refuse a function that cannot be called with (t, q, v)."""
+    if takes(law, 3):
+        return
+    if takes(law, 1):
+        raise InputError(
+            "controls is a function of one argument; a control law takes (t, q, v), and controls that are a function "
+            "of time alone are given as varpin.OpenLoop(f)"
+        )
+    raise InputError("controls must be a function of (t, q, v): it cannot be called with three arguments")
+
+
+def _decision(law: ControlLaw, record: _Record) -> Floats:
+    """The control (1, m) of the period that begins at the last node."""
+    k = record.steps
+    time = k * record.dt
+    state = record.last.q[-1].copy(), record.last.v[-1].copy()
+    return _called("controls(t, q, v)", lambda: law(time, *state), record.scene, k, time, record)[None]
+
+
+def _sampled(controls: OpenLoop, record: _Record, steps: int) -> Floats:
+    """Controls (steps, m) of the next steps, or of those before the first for which the function fails."""
+    u = np.empty((steps, record.scene.controls))
+    for k in range(steps):
+        try:
+            u[k] = _row_at(controls, record.scene, record.dt, record.steps + k, record)
+        except ControlError:
+            if k == 0:
+                raise
+            return u[:k].copy()
+    return u
+
+
+def _row_at(controls: OpenLoop, scene: Scene, dt: float, step: int, record: _Record | None = None) -> Floats:
+    """The control (m,) of one step, from its middle."""
+    time = (step + 0.5) * dt
+    return _called("OpenLoop: f(t)", lambda: controls.f(time), scene, step, time, record)
+
+
+def _called(
+    name: str, call: Callable[[], JointValues], scene: Scene, step: int, time: float, record: _Record | None
+) -> Floats:
+    """What a function of the user's returns as a control (m,).
+
+    Raises:
+        ControlError: It raised, or returned something else.
+    """
+    try:
+        value = call()
+    except Exception as error:
+        before = None if record is None else record.trajectory()
+        raise ControlError(step, time, f"{name} raised {error!r}", before) from error
+    try:
+        return control_values(name, value, scene.control_joints, scene.controls)
+    except (InputError, UnknownJoint) as error:
+        raise ControlError(step, time, str(error), None if record is None else record.trajectory()) from None

@@ -1,0 +1,239 @@
+"""The integrator and step that meet a tolerance on a motion, at least cost in evaluations, and the error to expect.
+
+Costs are counts, so that the same question has the same answer on every machine. Errors are those at all nodes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.core.arrays import Commands
+from varpin.integrators import Integrator
+from varpin.integrators.base import rows, steps_of
+from varpin.mechanics.scene import Scene
+from varpin.simulation.refinement import (
+    CHECKS,
+    ROUNDING,
+    SAFETY,
+    SENSIBLE,
+    Found,
+    Method,
+    Sample,
+    Search,
+    distance,
+    first_steps,
+)
+
+Floats = NDArray[np.float64]
+
+# Work between two chances for Ctrl-C, in steps of one joint.
+_CHUNK = 100_000
+# Nodes of a run that are kept, about.
+_NODES = 4096
+# Evaluations after which no further run is begun, times the number of joints.
+_PATIENCE = 50_000_000
+# A motion whose last differences shrink at least like this is taken to go on so.
+_SHRINKS, _LEFT = 0.75, 3.0
+# Controls of time are held over steps of this many times the number, too: a jump lies elsewhere in each of those.
+_OTHER = 1.37
+# An integrator that misses the tolerance by this factor is not worth more of its steps.
+_FAR = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What is to be integrated.
+
+    Attributes:
+        scene: Without noise.
+        q0: (n,) [rad or m].
+        v0: (n,) [rad/s or m/s].
+        duration: [s].
+        parts: A number that goes into all numbers of steps.
+        commands: Those of an integrator for a number of steps.
+        most: The greatest order that a method can have under these commands.
+        sampled: Whether the commands are samples of a function, which steps and half steps may see alike where it
+            jumps between them.
+    """
+
+    scene: Scene
+    q0: Floats
+    v0: Floats
+    duration: float
+    parts: int
+    commands: Callable[[Integrator, int], Commands]
+    most: int
+    sampled: bool = False
+
+
+class _Runs:
+    """Runs of a motion, and what they took together."""
+
+    def __init__(self, motion: Motion) -> None:
+        self.motion = motion
+        self.most = _PATIENCE / len(motion.q0)
+        self.steps = self.evaluations = 0
+        self._done: dict[tuple[str, int], Sample] = {}
+
+    def __call__(self, integrator: Integrator, steps: int) -> Sample:
+        key = str(integrator), steps
+        if key not in self._done:
+            self._done[key] = self._run(integrator, steps)
+        return self._done[key]
+
+    def _run(self, integrator: Integrator, steps: int) -> Sample:
+        given, stride = self.motion, 1
+        while steps % (2 * stride) == 0 and steps // stride > _NODES:
+            stride *= 2
+        n, dt, nothing = len(given.q0), given.duration / steps, np.zeros((0, 0, 0))
+        commands = given.commands(integrator, steps)
+        state, (last,) = integrator.start(given.scene, given.q0[None], given.v0[None])
+        q, done, evaluations, pure = np.full((steps // stride, n), np.nan), 0, 0, True
+        chunk = max(1, _CHUNK // n // commands.hold)
+        while done < steps and pure:
+            first = done // commands.hold
+            block = rows(commands, first, first + chunk, last.u[None, -1] if done else None)
+            (last,) = integrator.rollout(given.scene, state, block, nothing, dt)
+            nodes = done + 1 + np.arange(len(last.q))
+            kept = nodes % stride == 0
+            q[nodes[kept] // stride - 1] = last.q[kept]
+            own = last.statistics
+            evaluations += int(own.sweeps.sum() + own.jets.sum())
+            pure = last.failure is None and own.split_steps == 0
+            done += steps_of(block)
+        self.steps += done
+        self.evaluations += evaluations
+        # A run that a guard has split says nothing of the method's order; the rest of it is left out.
+        return Sample(steps, q, float(evaluations) * steps / max(done, 1), pure)
+
+
+class _Wish(Search):
+    """A search whose costs are evaluations, and whose choice is held against a run at half its step."""
+
+    def __init__(self, methods: Sequence[Method], runs: _Runs) -> None:
+        super().__init__(methods, lambda: runs.evaluations > runs.most, math.inf)
+        self.sampled = runs.motion.sampled
+
+    def limits(self) -> list[tuple[Floats, float]]:
+        """See :meth:`Search.limits`; where no method shows its order, what differences that shrink point to."""
+        return super().limits() or [own for own in map(_rough_limit, self.methods) if own is not None]
+
+    def checked(self, choice: Found, tolerance: float) -> Found:
+        """See :meth:`Search.checked`; errors at all nodes."""
+        method, best = self._of(choice), choice
+        for trial in range(CHECKS):
+            if self.late() and best.steps > method.last.steps:
+                break
+            error = _error(method, best.steps)
+            if self.sampled:
+                error = max(error, _error_of_samples(method, best.steps))
+            if self.limit is not None:
+                error = max(error, distance(method.run(method.integrator, best.steps).q, self.limit) - self.uncertainty)
+            best = replace(best, error=max(error, self.floor) if math.isfinite(error) else math.inf, measured=True)
+            if best.error <= tolerance or trial == CHECKS - 1:
+                break
+            best = replace(best, steps=method.more(best.steps, error, tolerance))
+        return best
+
+    def as_they_are(self) -> list[Found]:
+        """See :meth:`Search.as_they_are`; nothing is known of a motion that no method has taken in whole steps."""
+        if any(method.whole for method in self.methods):
+            return super().as_they_are()
+        method = self.methods[-1]
+        return [Found(method.integrator, method.last.steps, math.inf, method.last.cost, measured=True)]
+
+
+def _rough_limit(method: Method) -> tuple[Floats, float] | None:
+    """The last run, and how far it is from the end, from differences that shrink twice, at whatever rate."""
+    if len(method.whole) < 4:
+        return None
+    a, b, c, d = (sample.q for sample in method.whole[-4:])
+    before, middle, after = distance(a, b), distance(b, c), distance(c, d)
+    if not (middle <= _SHRINKS * before and after <= _SHRINKS * middle and _LEFT * after < SENSIBLE):
+        return None
+    return d, _LEFT * after
+
+
+def _error(method: Method, steps: int) -> float:
+    """The error of a run at its nodes, by a run at half the step; NaN where one of them fails."""
+    once, twice = (method.run(method.integrator, k) for k in (steps, 2 * steps))
+    gain = 2.0**method.order if len(method.errors) == 0 or method.regular else 2.0
+    return distance(once.q, twice.q) * gain / (gain - 1.0)
+
+
+def _error_of_samples(method: Method, steps: int) -> float:
+    """How far the end is from that of a run whose steps lie otherwise; NaN where one of them fails."""
+    other = method.rounded(_OTHER * steps)
+    one, two = (method.run(method.integrator, k).q[-1] for k in (steps, other))
+    return float(np.abs(one - two).max())
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What to take, and what finding it out took.
+
+    Attributes:
+        integrator: The method.
+        steps: Of it.
+        error: The estimate, at all nodes [rad or m]; infinite where nothing is known.
+        search_steps: Steps of all runs.
+        search_evaluations: Evaluations in them.
+        floor: What rounding leaves of every wish [rad or m].
+    """
+
+    integrator: Integrator
+    steps: int
+    error: float
+    search_steps: int
+    search_evaluations: int
+    floor: float
+
+
+def choose(
+    motion: Motion, integrators: Sequence[Integrator], tolerance: float, first: tuple[Integrator, float] | None = None
+) -> Choice:
+    """The cheapest of some integrators, and its number of steps, for an error in q of at most ``tolerance``.
+
+    Args:
+        motion: To integrate.
+        integrators: To choose from.
+        tolerance: At all nodes [rad or m].
+        first: An integrator and a step [s] that are taken if they, or somewhat smaller steps, meet the tolerance.
+
+    Raises:
+        SingularMassMatrix: M(q0) is not positive definite.
+        VarpinError: No integrator gets to the end.
+    """
+    # It refuses states that no motion starts from.
+    integrators[0].start(motion.scene, motion.q0[None], motion.v0[None])
+    runs = _Runs(motion)
+
+    def of(integrator: Integrator, least: int) -> Method:
+        return Method(runs, integrator, least, motion.parts, min(integrator.order, motion.most))
+
+    if first is not None and motion.duration / first[1] < runs.most:
+        method = of(first[0], motion.parts)
+        steps = method.rounded(motion.duration / first[1] * (1.0 - 1e-9))
+        for _ in range(CHECKS):
+            error = _error(method, steps)
+            floor = ROUNDING * max(1.0, float(np.abs(runs(first[0], steps).q).max()))
+            if not (runs(first[0], steps).pure and math.isfinite(error) and error < SENSIBLE):
+                break
+            if max(error, floor) <= tolerance:
+                return Choice(first[0], steps, max(error, floor), runs.steps, runs.evaluations, floor)
+            if error > _FAR * tolerance:
+                break
+            steps = method.more(steps, error, tolerance)
+    coarse = first_steps(motion.scene, motion.q0, motion.v0, motion.duration, motion.parts)
+    if coarse > runs.most:
+        return Choice(integrators[0], coarse, math.inf, 0, 0, 0.0)
+    # Powers of two, for runs to share as many nodes as they can.
+    least = motion.parts * 2 ** math.ceil(math.log2(coarse // motion.parts))
+    search = _Wish([of(member, least) for member in integrators], runs)
+    (best, *_), _ = search.for_tolerance(tolerance / SAFETY)
+    return Choice(best.integrator, best.steps, best.error, runs.steps, runs.evaluations, search.floor)

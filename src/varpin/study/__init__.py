@@ -1,0 +1,1 @@
+"""Studies: speed against accuracy, advice, extremes, the paper."""

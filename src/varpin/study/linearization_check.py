@@ -1,0 +1,117 @@
+"""A linearization held against differences of the steps themselves, on a user's own model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.integrators import Integrator, Midpoint
+from varpin.linearization import linearize
+from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.scene import Scene, require_scene
+from varpin.simulation.run import simulate
+from varpin.support.checks import JointValues, finite_array, joint_array, positive
+
+Floats = NDArray[np.float64]
+
+# Central differences of eighth order.
+_WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+
+
+@dataclass(frozen=True)
+class LinearizationCheck:
+    """How far the derivatives of one step are from differences of it.
+
+    Errors and norms are the largest entries, in units of the variables' own sizes: positions in 1 rad or m, each
+    momentum in what moves its joint alone at 1 rad/s or m/s, 1 / (M^-1)_ii, velocities, controls and increments in 1.
+
+    Attributes:
+        A: Error and norm of dx1/dx0.
+        B: Error and norm of dx1/du.
+        G: Error and norm of dx1/dw.
+    """
+
+    A: tuple[float, float]
+    B: tuple[float, float]
+    G: tuple[float, float]
+
+    @property
+    def worst(self) -> float:
+        """The largest error relative to its norm."""
+        return max(error / norm if norm > 0.0 else error for error, norm in (self.A, self.B, self.G))
+
+
+def check_linearization(
+    scene: Scene,
+    q: JointValues,
+    v: JointValues,
+    u: ArrayLike | None = None,
+    *,
+    dt: float,
+    integrator: Integrator | None = None,
+    step: float = 1e-2,
+) -> LinearizationCheck:
+    """Compare :func:`varpin.linearize` with eighth-order differences of the step from (q, v).
+
+    Main args:
+        scene: The scene.
+        q: Configuration, (n,) or by joint name [rad or m].
+        v: Velocity, (n,) or by joint name [rad/s or m/s].
+        u: Controls (m,); zero if left out.
+        dt: Time step [s].
+
+    Other Args:
+        integrator: ``Midpoint()`` if left out.
+        step: Of the differences, in the units of :class:`LinearizationCheck`.
+
+    Raises:
+        InputError: Wrong shapes, or values that are not finite.
+        StepFailure: A step of the differences cannot be taken; a smaller ``step`` or ``dt`` may help.
+    """
+    n, m, k = require_scene(scene).robot.dof, scene.controls, scene.processes
+    q, v = joint_array("q", q, scene.robot.joint_names), joint_array("v", v, scene.robot.joint_names)
+    u = np.zeros(m) if u is None else finite_array("u", u, (m,))
+    dt, step = positive("dt", dt, "s"), positive("step", step, "1")
+    method = Midpoint() if integrator is None else integrator
+    options: dict[str, Any] = {"dt": dt, "steps": 1, "integrator": method, "check": False}
+    motion = simulate(scene, q, v, controls=u, increments=0.0, **options)
+    lin = linearize(scene, motion, integrator=method)
+    second = motion.p[0] if method.variational else v
+    mass = lagrangian_jet(scene, q, np.zeros(n)).Lvv
+    size = 1.0 / np.diag(np.linalg.inv(mass)) if method.variational else np.ones(n)
+    rows = np.concatenate([np.ones(n), size])
+
+    def take(x: Floats, control: Floats, dw: Floats) -> Floats:
+        velocity = x[n:]
+        if method.variational:
+            M = lagrangian_jet(scene, x[:n], np.zeros(n)).Lvv
+            velocity = np.asarray(np.linalg.solve(M, x[n:]), dtype=np.float64)
+        end = simulate(scene, x[:n], velocity, controls=control, increments=dw[None], **options)
+        return np.concatenate([end.q[1], end.p[1] if method.variational else end.v[1]])
+
+    x, zero = np.concatenate([q, second]), np.zeros(k)
+    return LinearizationCheck(
+        A=_compare(lin.A[0], lambda y: take(y, u, zero), x, step, rows, rows),
+        B=_compare(lin.B[0], lambda y: take(x, y, zero), u, step, rows, np.ones(m)),
+        G=_compare(lin.G[0], lambda y: take(x, u, y), zero, step, rows, np.ones(k)),
+    )
+
+
+def _compare(
+    given: Floats, function: Callable[[Floats], Floats], x: Floats, step: float, rows: Floats, columns: Floats
+) -> tuple[float, float]:
+    """Largest error of a derivative, and largest entry of what it should be, both in the units of rows and columns."""
+    if not x.size:
+        return 0.0, 0.0
+    derivative = np.zeros_like(given)
+    for j, size in enumerate(columns):
+        e = np.zeros_like(x)
+        e[j] = step * size
+        total = sum(w * (function(x + i * e) - function(x - i * e)) for i, w in _WEIGHTS.items())
+        derivative[:, j] = total / e[j]
+    scale = columns[None, :] / rows[:, None]
+    return float(np.abs((given - derivative) * scale).max()), float(np.abs(derivative * scale).max())

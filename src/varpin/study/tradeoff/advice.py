@@ -1,0 +1,295 @@
+"""Advice: the cheapest integrator and step that meet an accuracy, or the most accurate within a time.
+
+Costs are wall times. How errors are found out is in :mod:`varpin.simulation.refinement`.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.errors import InputError
+from varpin.integrators import Guard, Integrator, Reference, largest_step
+from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.scene import Scene
+from varpin.simulation.refinement import REACH, SAFETY, Found, Method, Sample, Search, first_steps
+from varpin.study.tradeoff.setting import Setting, integrators_of
+from varpin.support.checks import JointValues, positive
+from varpin.support.markup import facts, table
+
+Floats = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
+# Short runs are repeated for this long [s], at most so often, since a machine's first answers are its slowest.
+_TIMING, _REPEATS = 0.02, 5
+# Runs shorter than this are worth making to be sure [s].
+_CHEAP = 0.5
+# Nodes at which the midpoint integrator's largest step is looked up.
+_NODES = 32
+
+
+@dataclass(frozen=True)
+class Choice:
+    """An integrator at the step that serves a wish best.
+
+    Attributes:
+        integrator: The method.
+        dt: Its step [s].
+        steps: Over the horizon.
+        error: Predicted error in q at the end, the largest over the joints [rad or m]; infinite where not known.
+        seconds: Predicted wall time [s].
+        measured: Whether runs at steps as small or smaller stand behind it; else the method's order does.
+    """
+
+    integrator: Integrator
+    dt: float
+    steps: int
+    error: float
+    seconds: float
+    measured: bool
+
+    def __str__(self) -> str:
+        error = f"error {self.error:.1e}" if math.isfinite(self.error) else "unknown error"
+        return f"{self.integrator} at dt = {self.dt:.4g} s: {error} in {_time(self.seconds)}"
+
+
+@dataclass(frozen=True, eq=False)
+class Advice:
+    """Which integrator to take, at which step, and why.
+
+    Attributes:
+        best: The choice; its fields are this object's, too.
+        reached: Whether it meets the wish, as far as can be predicted.
+        alternatives: The best of every other method that has one, cheapest (or most accurate) first.
+        largest_step: The step [s] from which on the midpoint integrator's branch guard splits steps somewhere along
+            this motion; infinite if none is too large.
+        tolerance: What was asked for [rad or m], or None.
+        budget: What was asked for [s], or None.
+        calibration: What finding out took [s].
+        reason: In words.
+    """
+
+    best: Choice
+    reached: bool
+    alternatives: tuple[Choice, ...]
+    largest_step: float
+    tolerance: float | None
+    budget: float | None
+    calibration: float
+    reason: str = field(repr=False)
+
+    def __repr__(self) -> str:
+        return f"Advice({self.best}{'' if self.reached else ', which is not what was asked for'})"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (
+                str(choice.integrator), choice.dt, choice.steps, _time(choice.seconds),
+                f"{choice.error:.2e}" if math.isfinite(choice.error) else "unknown",
+                "" if choice.measured else "by the method's order",
+            )
+            for choice in (self.best, *self.alternatives)
+        ]  # fmt: skip
+        columns = ("integrator", "dt [s]", "steps", "time", "error [rad or m]", "")
+        return facts("Advice", [("", line) for line in self.reason.splitlines()], table(columns, rows, [0]))
+
+    @property
+    def integrator(self) -> Integrator:
+        """The method to take."""
+        return self.best.integrator
+
+    @property
+    def dt(self) -> float:
+        """The step to take [s]."""
+        return self.best.dt
+
+    @property
+    def steps(self) -> int:
+        """How many of them."""
+        return self.best.steps
+
+    @property
+    def error(self) -> float:
+        """The error in q at the end to expect [rad or m]."""
+        return self.best.error
+
+    @property
+    def seconds(self) -> float:
+        """The wall time to expect [s]."""
+        return self.best.seconds
+
+    def __str__(self) -> str:
+        return self.reason
+
+
+def advise(
+    scene: Scene,
+    q0: JointValues,
+    v0: JointValues,
+    *,
+    duration: float,
+    controls: JointValues | None = None,
+    tolerance: float | None = None,
+    budget: float | None = None,
+    integrators: Sequence[Integrator] | None = None,
+    patience: float = 60.0,
+) -> Advice:
+    """The cheapest integrator and step that meet an accuracy on a motion, or the most accurate in a time.
+
+    What counts is the error in q at the end, the largest over the joints, on this scene from this state under these
+    controls. It takes some times as long as the motion itself will. A horizon of many oscillations of a chaotic motion
+    has no end that any method gets right; the advice then says that the wish is not reached.
+
+    Main args:
+        scene: Without noise.
+        q0: Initial configuration, (n,) or by joint name [rad or m].
+        v0: Initial velocity, (n,) or by joint name [rad/s or m/s].
+        duration: The horizon [s].
+        tolerance: Accuracy to meet [rad or m].
+        budget: Wall time to keep to [s], instead.
+
+    Other Args:
+        controls: None for none, one row (m,), by joint name too, or rows (R, m) that are held over duration / R each.
+        integrators: To choose from; varpin's own fixed-step ones if left out.
+        patience: Time after which no further run is begun [s].
+
+    Raises:
+        InputError: Wrong arguments, or both or none of ``tolerance`` and ``budget``.
+        VarpinError: No integrator got to the end.
+    """
+    setting = Setting.of(scene, q0, v0, controls, duration)
+    members = integrators_of(integrators)
+    if any(isinstance(member, Reference) for member in members):
+        raise InputError("Reference chooses its own steps: its accuracy is its tolerance")
+    if (tolerance is None) == (budget is None):
+        raise InputError("give either a tolerance [rad or m] or a budget [s]")
+    patience = positive("patience", patience, "s")
+    rows = len(setting.controls)
+    first = first_steps(scene, setting.q0, setting.v0, setting.duration, rows)
+    begin = time.perf_counter()
+    methods = [Method(partial(_timed, setting), member, first, rows, member.order) for member in members]
+    search = _Timed(methods, lambda: time.perf_counter() > begin + patience, _CHEAP)
+    if tolerance is not None:
+        target = positive("tolerance", tolerance, "rad or m") / SAFETY
+        choices, reached = search.for_tolerance(target)
+    else:
+        choices, reached = search.for_budget(positive("budget", budget, "s"))
+    bound = _largest_step(setting, methods)
+    best, *others = (
+        Choice(own.integrator, setting.duration / own.steps, own.steps, own.error, own.cost, own.measured)
+        for own in choices
+    )
+    reason = _reason(best, others, reached, bound, tolerance, budget, duration)
+    return Advice(best, reached, tuple(others), bound, tolerance, budget, time.perf_counter() - begin, reason)
+
+
+def _timed(setting: Setting, integrator: Integrator, steps: int) -> Sample:
+    """A run and its wall time, the best of several short ones."""
+    outcome = setting.run(integrator, steps)
+    begin, seconds = time.perf_counter(), [outcome.seconds]
+    while len(seconds) < _REPEATS and time.perf_counter() - begin < _TIMING:
+        seconds.append(setting.run(integrator, steps).seconds)
+    pure = not outcome.failure and outcome.split_steps == 0
+    return Sample(steps, outcome.q[1:], min(seconds), pure)
+
+
+class _Timed(Search):
+    """A search whose costs are wall times [s]."""
+
+    def for_budget(self, budget: float) -> tuple[list[Found], bool]:
+        """The best of every method within a time [s], the most accurate first, and whether there is one."""
+        while not self.late():
+            reach = 1.0 if budget < self.cheap else REACH
+            rivals = [m for m in self.methods if m.open and reach * m.last.cost < budget]
+            if not rivals:
+                break
+            self.refine(min(rivals, key=lambda m: m.last.cost))
+        choices = []
+        for method in self.methods:
+            # More accuracy than rounding leaves is not to be had for more steps.
+            enough = method.steps_for(self.floor)
+            steps = min(_steps_within(method, 0.9 * budget), enough if enough is not None else sys.maxsize)
+            if not math.isfinite(method.error_at(steps)):
+                known = [s.steps for s, e in zip(method.whole, method.errors, strict=True) if np.isfinite(e)]
+                steps = max((k for k in known if method.cost_at(k) <= budget), default=0)
+            if steps:
+                choices.append(method.choice(steps, self.floor))
+        if choices:
+            return sorted(choices, key=lambda c: (c.error, c.cost)), True
+        return sorted(self.as_they_are(), key=lambda c: c.cost), False
+
+
+def _steps_within(method: Method, seconds: float) -> int:
+    """The most steps that a time allows, a multiple of R."""
+    rows = method.rows
+    counts = [rows, *(sample.steps for sample in method.samples)]
+    times = np.append(0.0, np.maximum.accumulate([sample.cost for sample in method.samples]))
+    inside = float(np.interp(seconds, times, counts))
+    most = inside if seconds <= times[-1] else counts[-1] + (seconds - times[-1]) / method.cost_a_step
+    return max(rows, rows * int(most / rows))
+
+
+def _largest_step(setting: Setting, methods: Sequence[Method]) -> float:
+    """The smallest of the midpoint guard's largest steps along the best motion there is [s]."""
+    able = [m for m in methods if m.whole]
+    if not able:
+        return math.nan
+    method = max(able, key=lambda m: (m.order, m.last.steps))
+    rows = len(setting.controls)
+    parts = method.last.steps // rows
+    samples = rows * max(k for k in range(1, max(1, _NODES // rows) + 1) if parts % k == 0)
+    motion = setting.run(method.integrator, method.last.steps, samples=samples)
+    margin = Guard().branch_margin
+    bounds = []
+    for q, v in zip(motion.q, motion.v, strict=True):
+        jet = lagrangian_jet(setting.scene, q, v)
+        bounds.append(largest_step(jet.Lvv, jet.Lqq, margin))
+    return min(bounds)
+
+
+def _reason(
+    best: Choice,
+    others: Sequence[Choice],
+    reached: bool,
+    bound: float,
+    tolerance: float | None,
+    budget: float | None,
+    duration: float,
+) -> str:
+    wish = f"an error of {tolerance:g} in q" if tolerance is not None else f"{_time(budget or 0.0)}"
+    if not reached:
+        lines = [f"{wish} is not within reach of what was tried; the best is {best}"]
+    elif tolerance is not None:
+        lines = [f"{best}, the cheapest within {wish} after {duration:g} s"]
+    else:
+        lines = [f"{best}, the most accurate after {duration:g} s within {wish}"]
+    if others and tolerance is not None and reached:
+        lines.append(f"next: {others[0]}, {others[0].seconds / best.seconds:.2g} times as long")
+    elif others:
+        lines.append(f"next: {others[0]}")
+    if not best.measured:
+        lines.append(f"the error is extrapolated from larger steps by the method's order, {best.integrator.order}")
+    if not best.integrator.variational:
+        lines.append(
+            "it is no variational integrator: over much longer horizons its energy drifts, and this advice is for "
+            f"{duration:g} s"
+        )
+    if math.isfinite(bound):
+        lines.append(f"the midpoint integrator's guard splits steps longer than {bound:.3g} s on this motion")
+    return "\n".join(lines)
+
+
+def _time(seconds: float) -> str:
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds:.2g} s"

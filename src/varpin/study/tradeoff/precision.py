@@ -1,0 +1,378 @@
+"""Work and precision: the error of each integrator at each step, and the time it takes."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.ensemble import without_geometry
+from varpin.errors import FileError, InputError, VarpinError
+from varpin.integrators import Integrator, Reference
+from varpin.mechanics.scene import Scene, require_scene
+from varpin.study.tradeoff.records import Record, pareto_front
+from varpin.study.tradeoff.setting import PARTS, Outcome, Setting, integrators_of
+from varpin.support.checks import JointValues, count, positive, writable
+from varpin.support.executors import in_order, require_executor
+
+Floats = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+Quantity = Literal["q", "end", "energy", "tip"]
+
+logger = logging.getLogger(__name__)
+
+# The largest of the steps that are taken where none are named [s], and how often it is halved.
+_COARSEST, _HALVINGS = 0.04, 8
+# Times at which motions are compared, at most; more if the controls change more often.
+_SAMPLES = 64
+# The looser of the reference's two tolerances, over the tighter.
+_LOOSER = 10.0
+
+HEADINGS = {
+    "integrator": "integrator",
+    "order": "order",
+    "dt": "dt [s]",
+    "steps": "steps",
+    "seconds": "wall time [s]",
+    "spread": "spread of wall time [s]",
+    "error": "largest error in q [rad or m]",
+    "end_error": "error in q at the end [rad or m]",
+    "energy_error": "energy error [J]",
+    "tip_error": "end-effector error [m]",
+    "newton_iterations": "Newton iterations",
+    "jets": "jets",
+    "sweeps": "sweeps",
+    "split_steps": "split steps",
+    "samples": "times compared",
+    "failure": "failure",
+}
+
+
+@dataclass(frozen=True)
+class WorkPrecisionRun:
+    """An integrator at one step. Errors are NaN where it failed.
+
+    Attributes:
+        integrator: As text.
+        options: The same with every option: what a resumed record knows it by.
+        order: Of its error in dt.
+        dt: Time step [s].
+        steps: N.
+        seconds: Wall time, the best of the repetitions [s].
+        spread: How far the middle one of the repetitions is above the best [s].
+        error: Largest error in q over the joints and the record's times [rad or m].
+        end_error: Largest error in q over the joints at the end [rad or m].
+        energy_error: Largest distance from the initial energy over all nodes [J]; NaN unless energy is to stay.
+        tip_error: Largest error of the end effector's position over the record's times [m].
+        newton_iterations: In all.
+        jets: Evaluations of the whole jet.
+        sweeps: Evaluations of its first derivatives alone, or of forward dynamics.
+        split_steps: Steps that a guard took in parts.
+        samples: At how many evenly spaced times its motion was compared with the reference's.
+        failure: Why it did not get to the end; empty if it did.
+    """
+
+    integrator: str
+    options: str
+    order: int
+    dt: float
+    steps: int
+    seconds: float
+    spread: float
+    error: float
+    end_error: float
+    energy_error: float
+    tip_error: float
+    newton_iterations: int
+    jets: int
+    sweeps: int
+    split_steps: int
+    samples: int
+    failure: str
+
+    @property
+    def survived(self) -> bool:
+        """Whether it got to the end."""
+        return not self.failure
+
+
+@dataclass(frozen=True, eq=False)
+class WorkPrecision(Record):
+    """Measured runs of one motion.
+
+    Attributes:
+        runs: In the order of the integrators, each from its largest step down.
+        robot: The robot's name.
+        duration: [s].
+        reference: What errors are measured against, as text.
+        reference_error: Largest distance in q from the same at a ten times looser tolerance, in twice as long
+            intervals [rad or m]. It is above the reference's own error; errors below it say that, and no more. NaN
+            where the measurement was interrupted before it was known; then there are no runs.
+        tip_reference_error: The same of the end effector [m].
+        samples: K: errors are taken at K evenly spaced times, the end being the last. A run that was added to a saved
+            record with a step that does not share these times has fewer of them.
+        missing: Runs that an interruption left out.
+    """
+
+    _run = WorkPrecisionRun
+    _format = "varpin.work-precision/2"
+    _headings = HEADINGS
+    _shown = ("integrator", "dt", "seconds", "error", "energy_error", "tip_error", "failure")
+
+    runs: tuple[WorkPrecisionRun, ...]
+    robot: str
+    duration: float
+    reference: str
+    reference_error: float
+    tip_reference_error: float
+    samples: int
+    missing: int = 0
+    fingerprint: str = field(default="", repr=False)
+
+    def __repr__(self) -> str:
+        lost = sum(not run.survived for run in self.runs)
+        notes = (f", {lost} failed" if lost else "") + (f", {self.missing} missing" if self.missing else "")
+        return f"WorkPrecision({self.robot}: {len(self.runs)} runs{notes}, reference to {self.reference_error:.1e})"
+
+    def error_of(self, run: WorkPrecisionRun, quantity: Quantity = "q") -> float:
+        """The error of a run, not below what the reference can tell; energy errors need no reference."""
+        values = {
+            "q": (run.error, self.reference_error),
+            "end": (run.end_error, self.reference_error),
+            "tip": (run.tip_error, self.tip_reference_error),
+            "energy": (run.energy_error, 0.0),
+        }
+        if quantity not in values:
+            raise InputError(f"quantity must be one of {', '.join(values)}, got {quantity!r}")
+        error, floor = values[quantity]
+        return max(error, floor) if math.isfinite(error) else math.nan
+
+    def at_floor(self, run: WorkPrecisionRun) -> bool:
+        """Whether the error of a run in q is too small for the reference to tell."""
+        return run.error <= self.reference_error
+
+    def pareto(self, quantity: Quantity = "q") -> tuple[WorkPrecisionRun, ...]:
+        """The runs that no other beats, from the fastest up.
+
+        One beats another that is no less accurate and faster by more than the spread of either time, and than 2 %.
+        """
+        return pareto_front(
+            self.runs, lambda run: run.seconds, lambda run: self.error_of(run, quantity), lambda run: run.spread
+        )
+
+
+def work_precision(
+    scene: Scene,
+    q0: JointValues,
+    v0: JointValues,
+    *,
+    duration: float,
+    controls: JointValues | None = None,
+    integrators: Sequence[Integrator] | None = None,
+    dts: Sequence[float] | None = None,
+    reference: Reference | None = None,
+    repeats: int = 3,
+    progress: Progress | None = None,
+    save: str | os.PathLike[str] | None = None,
+    executor: Executor | None = None,
+) -> WorkPrecision:
+    """Measure errors and wall times of integrators over steps, on one motion.
+
+    A run has one thread to itself. A run that fails is in the record with its
+    reason, and the others go on; Ctrl-C ends the measurement, and what is done is returned.
+
+    Main args:
+        scene: Without noise.
+        q0: Initial configuration, (n,) or by joint name [rad or m].
+        v0: Initial velocity, (n,) or by joint name [rad/s or m/s].
+        duration: Of the motion [s].
+        controls: None for none, one row (m,), by joint name too, or rows (R, m) that are held over duration / R each.
+        integrators: varpin's own fixed-step ones if left out.
+        dts: Time steps [s], each rounded so that the controls' intervals hold whole numbers of steps.
+
+    Other Args:
+        reference: What errors are measured against; its tolerance is varied to see how exact it is.
+        repeats: Of each run; the fastest counts. One more goes before them where runs are short.
+        progress: Called with (runs done, runs in all).
+        save: Keep the record in this npz, run by run; runs that it holds already are kept, and not run again,
+            whatever other steps and integrators are asked for.
+        executor: Any ``concurrent.futures.Executor`` that takes the runs, one at a time each; they follow each other
+            here if left out. Errors are the same; wall times are those of its workers, and to be trusted where each
+            has a core, and all have the same kind.
+
+    Raises:
+        InputError: Wrong arguments.
+        FileError: ``save`` cannot be written, or holds runs of another motion or reference.
+        VarpinError: The reference cannot integrate the motion.
+    """
+    setting = Setting.of(without_geometry(require_scene(scene)), q0, v0, controls, duration)
+    members, repeats = integrators_of(integrators), count("repeats", repeats, least=1)
+    executor = None if executor is None else require_executor(executor)
+    reference = Reference(rtol=1e-13) if reference is None else reference
+    if not isinstance(reference, Reference):
+        raise InputError(f"reference must be a varpin.Reference, got {reference!r}")
+    grids = _grids(setting, dts)
+    plan = {(repr(member), steps): member for member in members for steps in grids}
+    path = None if save is None else writable(save)
+    known = _known(path, setting, reference)
+    base = _record(setting, reference, _samples(grids, len(setting.controls))) if known is None else known
+    done = {(run.options, run.steps): run for run in base.runs}
+    kept = tuple(run for key, run in done.items() if key not in plan)
+
+    def now() -> WorkPrecision:
+        runs = [done[key] for key in plan if key in done]
+        return replace(base, runs=(*kept, *runs), missing=len(plan) - len(runs))
+
+    missing = [(member, key[1]) for key, member in plan.items() if key not in done]
+    try:
+        cells: list[_Cell] = []
+        if missing:
+            exact = _Exact(setting, reference, base.samples)
+            cells = [_Cell(setting, exact, member, steps, repeats) for member, steps in missing]
+            if known is None:
+                base = replace(base, reference_error=exact.error, tip_reference_error=exact.tip_error)
+        fresh = (_measure(cell) for cell in cells) if executor is None else in_order(executor, _measure, cells)
+        with closing(fresh):
+            for finished, key in enumerate(plan, 1):
+                if key not in done:
+                    done[key] = next(fresh)
+                if path is not None:
+                    now().save(path)
+                if progress is not None:
+                    progress(finished, len(plan))
+    except KeyboardInterrupt:
+        logger.warning("interrupted after %d of %d runs, which are kept", len(plan) - now().missing, len(plan))
+    return now()
+
+
+class _Exact:
+    """The reference's motion, and how far it is from the same at a looser tolerance."""
+
+    def __init__(self, setting: Setting, reference: Reference, samples: int) -> None:
+        atol = None if reference.atol is None else _LOOSER * reference.atol
+        looser = Reference(rtol=_LOOSER * reference.rtol, atol=atol)
+        # Over short intervals both tolerances may take the same steps and agree, exact or not: halved they do not.
+        tight = setting.run(reference, 2 * samples, samples=samples)
+        loose = setting.run(looser, samples, samples=samples)
+        for outcome in (tight, loose):
+            if outcome.failure:
+                raise VarpinError(f"the reference cannot integrate this motion: {outcome.failure}")
+        self.q = tight.q
+        self.tip = setting.scene.robot.frame_positions(tight.q)
+        self.error = float(np.abs(tight.q - loose.q).max())
+        self.tip_error = _largest(setting.scene.robot.frame_positions(loose.q) - self.tip)
+
+
+def _record(setting: Setting, reference: Reference, samples: int) -> WorkPrecision:
+    """A record without runs, whose reference has not been integrated."""
+    return WorkPrecision(
+        runs=(),
+        robot=setting.scene.robot.name,
+        duration=setting.duration,
+        reference=str(reference),
+        reference_error=math.nan,
+        tip_reference_error=math.nan,
+        samples=samples,
+        fingerprint=setting.fingerprint,
+    )
+
+
+def _known(path: Path | None, setting: Setting, reference: Reference) -> WorkPrecision | None:
+    """The record of an earlier run at ``path``, if there is one and it fits."""
+    if path is None or not path.exists():
+        return None
+    record = WorkPrecision.load(path)
+    here, there = setting.fingerprint.split(), record.fingerprint.split()
+    if len(there) != len(PARTS):
+        raise FileError(f"{path} is damaged: it does not say what motion it is of")
+    other = [part for part, own, found in zip(PARTS, here, there, strict=True) if own != found]
+    other += ["reference"] if record.reference != str(reference) else []
+    if other:
+        raise FileError(f"{path} holds runs of another motion (not the same: {', '.join(other)}): choose another file")
+    return record
+
+
+def _grids(setting: Setting, dts: Sequence[float] | None) -> list[int]:
+    """Numbers of steps, multiples of R, from the fewest up."""
+    rows = len(setting.controls)
+    if dts is None:
+        coarsest = rows * math.ceil(setting.duration / (_COARSEST * rows))
+        return [coarsest * 2**k for k in range(_HALVINGS + 1)]
+    grids = set()
+    for dt in dts:
+        ratio = setting.duration / positive("dts", dt, "s") / rows
+        if ratio < 0.5:
+            raise InputError(f"dts: {dt:g} s is longer than what the controls are held for")
+        grids.add(rows * round(ratio))
+    if not grids:
+        raise InputError("dts must be one step or more")
+    return sorted(grids)
+
+
+def _samples(grids: Sequence[int], rows: int) -> int:
+    """K, the most times up to a limit that all grids and the controls' intervals share."""
+    shared = math.gcd(*grids) // rows
+    most = max(1, _SAMPLES // rows)
+    return rows * max(k for k in range(1, min(shared, most) + 1) if shared % k == 0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cell:
+    """A run to be measured."""
+
+    setting: Setting
+    exact: _Exact
+    member: Integrator
+    steps: int
+    repeats: int
+
+
+def _measure(cell: _Cell) -> WorkPrecisionRun:
+    setting, exact, member, steps = cell.setting, cell.exact, cell.member, cell.steps
+    # Whatever goes wrong with one run, the others are worth having.
+    samples = _samples([steps, len(exact.q) - 1], len(setting.controls))
+    shared = slice(None, None, (len(exact.q) - 1) // samples)
+    try:
+        outcome = setting.run(member, steps, samples=samples, repeats=cell.repeats)
+    except Exception as reason:
+        lost = np.full_like(exact.q[shared], np.nan)
+        outcome = Outcome(lost, lost, np.nan, np.nan, 0, 0, 0, 0, f"{type(reason).__name__}: {reason}")
+    error = end = tip = energy = math.nan
+    if not outcome.failure:
+        off = np.abs(outcome.q - exact.q[shared])
+        error, end = float(off.max()), float(off[-1].max())
+        tip = _largest(setting.scene.robot.frame_positions(outcome.q) - exact.tip[shared])
+        energy = outcome.energy_error if setting.conservative else math.nan
+    return WorkPrecisionRun(
+        integrator=str(member),
+        options=repr(member),
+        order=member.order,
+        dt=setting.duration / steps,
+        steps=steps,
+        seconds=outcome.seconds if not outcome.failure else math.nan,
+        spread=outcome.spread,
+        error=error,
+        end_error=end,
+        energy_error=energy,
+        tip_error=tip,
+        newton_iterations=outcome.newton_iterations,
+        jets=outcome.jets,
+        sweeps=outcome.sweeps,
+        split_steps=outcome.split_steps,
+        samples=samples,
+        failure=outcome.failure,
+    )
+
+
+def _largest(vectors: Floats) -> float:
+    """The length of the longest row."""
+    return float(np.linalg.norm(vectors, axis=1).max())
