@@ -16,7 +16,8 @@ from varpin.io.scenefile import scenes
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs" / "extensions"))
 import executed
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
 PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
 # What pages write for the browser, and the package beside varpin's own that they are about.
 MADE = {
@@ -116,6 +117,42 @@ def test_the_gallery_says_what_comes_out(name):
     # Another machine rounds otherwise, and a search that swings up may then take another way.
     assert plan.cost == pytest.approx(float(cost), rel=1e-3)
     assert plan.iterations == pytest.approx(int(iterations), rel=0.3, abs=1)
+
+
+def equations(cell):
+    """The numbers in a cell of the map, "(E1) to (E3)" written out."""
+    for first, last in re.findall(r"\(([A-Z]\d+|1\.\d+)\)(?: to \(([A-Z]\d+|1\.\d+)\))?", cell):
+        stem, begin = re.match(r"([A-Z]|1\.)(\d+)", first).groups()
+        end = re.match(r"(?:[A-Z]|1\.)(\d+)", last or first).group(1)
+        yield from (f"({stem}{k})" for k in range(int(begin), int(end) + 1))
+
+
+def equation_map():
+    rows = re.findall(r"^\| (\([^|]*) \| [^|]* \| (.*) \|$", text_of("mathematics.md"), re.M)
+    return [(list(equations(cell)), re.findall(r"`([\w/]+\.(?:hpp|py))`: `(\w+)`", where)) for cell, where in rows]
+
+
+def test_every_equation_is_on_the_map():
+    shown = re.findall(r"\\tag\{([A-Z]\d+)\}", text_of("mathematics.md"))
+    assert len(set(shown)) == len(shown) > 30
+    mapped = [number for numbers, _ in equation_map() for number in numbers]
+    assert len(set(mapped)) == len(mapped)
+    assert {f"({tag})" for tag in shown} | {f"(1.{k})" for k in range(1, 11)} == set(mapped)
+
+
+@pytest.mark.parametrize(("numbers", "functions"), equation_map())
+def test_an_equation_is_computed_where_the_map_says(numbers, functions):
+    """The file defines the function, and names the equation in turn."""
+    assert functions
+    for file, name in functions:
+        folder = ROOT / ("src/core/include/varpin" if file.endswith(".hpp") else "src/varpin")
+        source = (folder / file).read_text(encoding="utf-8")
+        if file.endswith(".py"):
+            defined = rf"^ *(?:def|class) {name}\b"
+        else:
+            defined = rf"^ *(?!return)(?:[\w:<>*&]+ )+{name}\b(?!;).*[{{,]$"
+        assert re.search(defined, source, re.M), f"{file} defines no {name}"
+        assert not [number for number in numbers if number not in source], f"{file} does not name {numbers}"
 
 
 def test_every_public_name_is_on_one_page_of_the_api():
