@@ -14,7 +14,7 @@ from varpin.cli import command
 from varpin.io.scenefile import scenes
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs" / "extensions"))
-import executed
+import page_code
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -32,7 +32,6 @@ NEEDS = {
     "drake.md": "pydrake",
     "many-machines.md": "distributed",
     "mujoco.md": "mujoco",
-    "robots.md": "example_robot_data",
 }
 WIDEST = 96
 
@@ -84,11 +83,11 @@ def test_the_site_runs_pages_that_there_are():
 
 
 def test_what_a_block_prints_and_logs_is_put_under_it():
-    shown = executed.with_outputs("# A page\n\n```python\nx = 2\n```\n\n```python\nprint(x)\n```\n")
+    shown = page_code.with_outputs("# A page\n\n```python\nx = 2\n```\n\n```python\nprint(x)\n```\n")
     assert shown.count("```{code-block} text") == 1
     assert shown.endswith("```python\nprint(x)\n```\n\n```{code-block} text\n:class: output\n\n2\n```\n")
     with pytest.raises(RuntimeError, match="ZeroDivisionError"):
-        executed.with_outputs("```python\n1 / 0\n```\n")
+        page_code.with_outputs("```python\n1 / 0\n```\n")
 
 
 def gallery_rows():
