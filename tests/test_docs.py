@@ -82,10 +82,12 @@ def test_the_site_runs_pages_that_there_are():
         assert blocks(page, "python"), page
 
 
-def test_what_a_block_prints_and_logs_is_put_under_it():
+def test_what_a_block_prints_and_draws_is_put_under_it():
     shown = page_code.with_outputs("# A page\n\n```python\nx = 2\n```\n\n```python\nprint(x)\n```\n")
     assert shown.count("```{code-block} text") == 1
     assert shown.endswith("```python\nprint(x)\n```\n\n```{code-block} text\n:class: output\n\n2\n```\n")
+    drawn = page_code.with_outputs("```python\nfrom matplotlib.figure import Figure\n\nfigure = Figure()\n```\n")
+    assert re.search(r"```\n\n```\{raw\} html\n<img [^\n]*base64,iVBORw0KGgo[^\n]*>\n```\n$", drawn)
     with pytest.raises(RuntimeError, match="ZeroDivisionError"):
         page_code.with_outputs("```python\n1 / 0\n```\n")
 
