@@ -109,14 +109,6 @@ def controller(folder: Path) -> Image.Image:
     return Image.fromarray(picture)
 
 
-def small(image: Image.Image) -> bytes:
-    """A PNG with 256 colours."""
-    image, stream = image.convert("RGB"), io.BytesIO()
-    palette = image.quantize(256, Image.Quantize.MAXCOVERAGE)
-    image.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(stream, "png", optimize=True)
-    return stream.getvalue()
-
-
 def main() -> None:
     """Draw them."""
     finger = vp.load_robot("finger")
@@ -127,8 +119,8 @@ def main() -> None:
         page = vp.replay(finger, motion.q[:1], dt=1.0, html=Path(folder) / "finger.html")
         picture = matplotlib.image.imread(io.BytesIO(screenshot(page, 3.0)))
         (IMAGES / "replay.png").write_bytes(reach(Path(folder)))
-        (IMAGES / "notebook.png").write_bytes(small(notebook(Path(folder))))
-        (IMAGES / "controller.png").write_bytes(small(controller(Path(folder))))
+        notebook(Path(folder)).convert("RGB").save(IMAGES / "notebook.png", optimize=True)
+        controller(Path(folder)).save(IMAGES / "controller.png", optimize=True)
     figure = Figure(figsize=(11, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.imshow(picture)

@@ -8,7 +8,6 @@ Needs ``pip install "varpin[video]" pillow``, Chromium and chromedriver.
 
 from __future__ import annotations
 
-import io
 import sys
 import tempfile
 from collections.abc import Callable
@@ -20,7 +19,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
-from PIL import Image
 from scipy.interpolate import CubicSpline
 
 import varpin as vp
@@ -63,7 +61,7 @@ def joints(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
 
 def errors(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
     """How far the joints are from their reference."""
-    axes, motion, wanted = figure.subplots(), plan.trajectory, scene.marks()["ghost"]
+    axes, motion, wanted = _axes(figure), plan.trajectory, scene.marks()["ghost"]
     reference = CubicSpline(np.linspace(0.0, motion.duration, len(wanted)), wanted)
     for name, error in zip(scene.robot.joint_names, (motion.q - reference(motion.t)).T, strict=True):
         axes.plot(motion.t, 1e3 * error, label=name)
@@ -79,16 +77,17 @@ def paths(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
     )
     assert ensemble.q is not None
     for k, (axes, name) in enumerate(zip(parts, scene.robot.joint_names, strict=True)):
-        axes.plot(ensemble.t, 1e3 * (ensemble.q[:, :, k] - plan.trajectory.q[:, k]).T, linewidth=0.3, color=f"C{k}")
+        plots.apply_style(axes)
+        color = plots.COLORS[k % len(plots.COLORS)]
+        axes.plot(ensemble.t, 1e3 * (ensemble.q[:, :, k] - plan.trajectory.q[:, k]).T, linewidth=0.3, color=color)
         axes.set_ylabel(f"{name} [mrad]")
-        axes.grid(color="0.92")
     parts[0].set_title("8 noisy paths with feedback: how far they are from the plan", fontsize=10)
     parts[-1].set_xlabel("time [s]")
 
 
 def torques(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
     """Torques in units of their limits."""
-    axes, motion, limit = figure.subplots(), plan.trajectory, plan.problem.control_limits[1]
+    axes, motion, limit = _axes(figure), plan.trajectory, plan.problem.control_limits[1]
     for k, name in enumerate(scene.robot.joint_names):
         axes.stairs(motion.u[:, k] / limit[k], motion.t, label=name, baseline=None, linewidth=1.2)
     axes.set_title("torques", fontsize=10)
@@ -97,7 +96,7 @@ def torques(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
 
 def distance(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
     """How far the hand is from its target."""
-    axes, marks = figure.subplots(), scene.marks()
+    axes, marks = _axes(figure), scene.marks()
     (target,) = marks["targets"].values()
     tip = scene.robot.frame_positions(plan.trajectory.q, marks["trace"][0])
     axes.plot(plan.trajectory.t, 1e3 * np.linalg.norm(tip - target[-1], axis=1))
@@ -107,7 +106,7 @@ def distance(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
 
 def circle(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
     """The drawn path from above."""
-    axes, marks = figure.subplots(), scene.marks()
+    axes, marks = _axes(figure), scene.marks()
     (path,) = marks["reference"].values()
     tip = scene.robot.frame_positions(plan.trajectory.q, marks["trace"][0])
     axes.plot(*path[:, :2].T, color="#157a3c", linewidth=4.0, alpha=0.4, label="wanted")
@@ -127,16 +126,22 @@ def swing(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
     plots.plot_joints(motion, axes=above, robot=scene.robot)
     above.set_xlabel("")
     above.set_title("angles, and the torque within its limits (dashed)", fontsize=10)
+    plots.apply_style(below)
     below.stairs(motion.u[:, 0], motion.t, baseline=None, color="0.2")
     for bound in (-limit, limit):
         below.axhline(bound, color="0.3", linestyle="--", linewidth=0.9)
     _label(below, "torque [N m]", legend=False)
 
 
+def _axes(figure: SubFigure) -> Axes:
+    axes = figure.subplots()
+    plots.apply_style(axes)
+    return axes
+
+
 def _label(axes: Axes, name: str, *, legend: bool = True) -> None:
     axes.set_xlabel("time [s]")
     axes.set_ylabel(name)
-    axes.grid(color="0.92")
     if legend:
         axes.legend(fontsize=8)
 
@@ -180,14 +185,7 @@ def draw(name: str, scene: vp.SceneFile, plan: vp.Solution) -> None:
     axes.imshow(photograph(name, scene, plan))
     axes.axis("off")
     SHOTS[name].draw(right, scene, plan)
-    stream = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(stream)
-    image = Image.open(stream).convert("RGB")
-    # Of colours as different as can be, so that thin lines keep theirs; the sky is dithered.
-    palette = image.quantize(256, Image.Quantize.MAXCOVERAGE)
-    image.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(
-        HERE / "images" / f"gallery_{name}.png", optimize=True
-    )
+    FigureCanvasAgg(figure).print_png(HERE / "images" / f"gallery_{name}.png")
 
 
 def row(scene: vp.SceneFile, plan: vp.Solution) -> str:

@@ -25,8 +25,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 import varpin as vp
+from varpin import plots
 from varpin.mechanics.wiener import coarsen
 from varpin.study.paper import cases
 
@@ -257,7 +259,7 @@ def short(scale: Scale) -> tuple[str, Figure, list[tuple[str, Point]]]:
                     color=colour, marker=marker, linestyle=stroke, markersize=5, linewidth=1.1,
                 )  # fmt: skip
         axes.set(title=case.name, xlabel="time for one second [us]", ylim=(1e-13, LOST))
-        axes.grid(alpha=0.3)
+        plots.apply_style(axes)
     panels[0].set_ylabel("error in q after 1 s [rad]")
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=7, fontsize=8, frameon=False)
     return "\n".join(lines + against_trep(rows)), figure, rows
@@ -408,7 +410,7 @@ def long(scale: Scale) -> tuple[str, Figure]:
             linewidth=1.4, alpha=1.0 if first else 0.55,
         )  # fmt: skip
     axes.set(xlabel="t [s]", ylabel=f"energy error, rms over {scale.long / 100:g} s [m g n²/2]")
-    axes.grid(alpha=0.3)
+    plots.apply_style(axes)
     figure.legend(loc="outside right center", fontsize=8, frameon=False)
     return "\n".join(lines), figure
 
@@ -446,16 +448,21 @@ def control(scale: Scale) -> tuple[str, Figure]:
         for name in dict.fromkeys(name_of_text(run.integrator) for run in runs):
             colour, marker, _ = STYLES[name]
             own = [run for run in runs if name_of_text(run.integrator) == name and run.survived]
-            for cost, stroke, face in (("open_loop_cost", "-", colour), ("closed_loop_cost", ":", "none")):
+            kinds = (("open_loop_cost", "open loop", colour), ("closed_loop_cost", "with feedback", "none"))
+            for cost, kind, face in kinds:
                 pairs = [(1e3 * run.seconds, getattr(run, cost)) for run in own]
                 pairs = [(x, y) for x, y in pairs if np.isfinite(y)]
+                # No lines: a finer step is not always a slower solve.
                 if pairs:
                     axes.loglog(
-                        *zip(*pairs, strict=True), color=colour, marker=marker, linestyle=stroke, markerfacecolor=face,
-                        label=f"{name}, {'open loop' if stroke == '-' else 'with feedback'}",
+                        *zip(*pairs, strict=True), color=colour, marker=marker, linestyle="none", markerfacecolor=face,
+                        label=f"{name}, {kind}",
                     )  # fmt: skip
         axes.set(xlabel="solve time [ms]", title=f"finger, {start}", ylabel="true cost")
-        axes.grid(alpha=0.3)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("")
+        plots.apply_style(axes)
     handles = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return "\n".join(lines), figure
@@ -524,7 +531,7 @@ def noise(scale: Scale) -> tuple[str, Figure]:
     left.set(xlabel="dt [s]", ylabel="strong error of q after 1 s, rms [rad]", title="strong")
     for axes in (left, right):
         axes.set_xscale("log", base=2)
-        axes.grid(alpha=0.3)
+        plots.apply_style(axes)
     figure.legend(loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return "\n".join([*lines, "", *stationary(scale)]), figure
 
@@ -629,7 +636,7 @@ def stiff(scale: Scale) -> tuple[str, Figure]:
                 )
         tables.append("\n".join(lines))
         axes.set(xlabel=heading, title=f"stiff {kind} at the last of three joints")
-        axes.grid(alpha=0.3)
+        plots.apply_style(axes)
     panels[0].set_ylabel("error of the first two joints after 1 s [rad]")
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return "\n\n".join(tables), figure

@@ -73,9 +73,11 @@ def seek(browser, seconds):
 
 
 def picture(browser):
-    """The screen (height, width, 3), without the strip that holds meshcat's controls."""
+    """The scene (height, width, 3), without the strip that holds meshcat's controls, the bar and the key to colours."""
+    browser.execute_script("document.getElementById('about').style.visibility = 'hidden'")
+    bar = browser.execute_script("return document.getElementById('bar')?.offsetHeight ?? 0")
     image = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
-    return np.asarray(image, dtype=float)[40:]
+    return np.asarray(image, dtype=float)[40 : image.height - bar]
 
 
 def shape_poses(browser, figure="robot"):

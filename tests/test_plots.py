@@ -1,5 +1,6 @@
 """Figures: what is on them, and that making them leaves matplotlib's global state alone."""
 
+import dataclasses
 import io
 import subprocess
 import sys
@@ -160,7 +161,7 @@ def test_nothing_is_relative_to_no_energy():
 
 @pytest.mark.parametrize("links", [1, 3, 19])
 def test_overview_has_everything_once(links):
-    robot, trajectory = swing(links=links)
+    robot, trajectory = swing(links=links, controls=np.full((40, links), 0.1))
     figure, axes = plots.plot_trajectory(trajectory, robot=robot)
     assert isinstance(figure, Figure)
     assert [panel.get_ylabel() for panel in axes] == [
@@ -238,7 +239,31 @@ def test_long_lines_are_thinned_to_their_extremes():
 def test_start_without_steps_is_drawn():
     figure, axes = plots.plot_trajectory(swing(steps=0)[1])
     figure.canvas.draw()
-    assert len(axes) == 4
+    assert len(axes) == 3
+
+
+def test_an_overview_of_a_free_motion_has_no_panel_of_controls():
+    _, axes = plots.plot_trajectory(swing()[1])
+    assert [panel.get_ylabel().split()[0] for panel in axes] == ["position", "velocity", "E(t)"]
+
+
+def test_limits_are_drawn_where_the_motion_comes_near_them():
+    robot = vp.load_robot("ur5")
+    lower, upper = robot.position_limits
+    q0 = np.array([0.0, -1.0, 1.0, 0.0, 0.0, 0.0])
+    motion = vp.simulate(vp.Scene(robot, gravity=False), q0, np.zeros(6), dt=0.01, steps=2)
+    assert limit_lines(motion, robot) == []
+    # The elbow goes to its limit; the others' are far away.
+    turned = dataclasses.replace(motion, q=np.linspace(q0, np.where(np.arange(6) == 2, upper, q0), 3))
+    levels = {round(float(line.get_ydata()[0]), 6) for line in limit_lines(turned, robot)}
+    assert round(float(upper[2]), 6) in levels
+    assert all(np.abs(np.array([*lower, *upper]) - level).min() < 1e-6 for level in levels)
+    assert limit_lines(turned, None) == []
+
+
+def limit_lines(trajectory, robot):
+    _, axes = plots.plot_joints(trajectory, robot=robot)
+    return [line for line in axes.lines if line.get_label().startswith("_")]
 
 
 def test_plotting_a_motion_imports_no_optimizer():

@@ -8,6 +8,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from chromium import animation, commands, picture, seek, shape_poses, visit, wait_until
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.select import Select
 
 import varpin as vp
 from varpin.model import geometry
@@ -117,6 +120,73 @@ def test_speed_and_loop(finger, tmp_path):
     assert options == {"play": True, "repetitions": 1}
     _, options = animation(replay(finger, q, dt=0.1, html=tmp_path / "loop.html"))
     assert options["repetitions"] == float("inf")
+
+
+def bar(browser):
+    """What the bar shows: the clock [s of motion], its end, whether it says that the motion plays."""
+    return browser.execute_async_script(
+        """
+        requestAnimationFrame(() => requestAnimationFrame(() => arguments[0]([
+            ...document.getElementById("clock").textContent.split(/ [/] | s/).slice(0, 2).map(Number),
+            document.getElementById("play").title.startsWith("Pause")])));"""
+    )
+
+
+def test_the_bar_plays_pauses_and_goes_to_a_time(browser, finger, tmp_path):
+    q = np.linspace([0.1, 0.2, 0.3], [0.9, 0.8, 0.7], 21)
+    visit(browser, replay(finger, q, dt=0.1, speed=0.5, html=tmp_path / "bar.html"))
+    assert bar(browser)[1:] == [2.0, True]
+    browser.find_element(By.ID, "play").click()
+    paused = bar(browser)
+    assert not paused[2]
+    assert bar(browser) == paused
+    # Half of the way, in 4 s of playback for 2 s of motion.
+    browser.execute_script(
+        "const slider = document.getElementById('time'); slider.value = 2; slider.dispatchEvent(new Event('input'));"
+    )
+    assert bar(browser) == [1.0, 2.0, False]
+    poses = shape_poses(browser)
+    seek(browser, 2.0)
+    for k, expected in shape_poses(browser).items():
+        np.testing.assert_allclose(poses[k], expected, atol=1e-6)
+    browser.find_element(By.TAG_NAME, "body").send_keys(Keys.ARROW_RIGHT)
+    assert bar(browser)[0] == pytest.approx(1.02)
+    browser.find_element(By.TAG_NAME, "body").send_keys(Keys.SPACE)
+    assert bar(browser)[2]
+
+
+def test_the_bar_sets_the_speed(browser, finger, tmp_path):
+    visit(browser, replay(finger, [[0.1] * 3, [0.5] * 3], dt=1.0, speed=0.5, html=tmp_path / "speed.html"))
+    choice = Select(browser.find_element(By.ID, "speed"))
+    assert choice.first_selected_option.text == "0.5 x"
+    choice.select_by_visible_text("2 x")
+    assert browser.execute_script("return viewer.animator.mixer.timeScale") == 4.0
+
+
+def test_a_motion_that_is_over_stays_and_plays_again(browser, finger, tmp_path):
+    visit(browser, replay(finger, [[0.1] * 3, [0.5] * 3], dt=0.3, loop=False, html=tmp_path / "once.html"))
+    wait_until(lambda: bar(browser) == [0.3, 0.3, False])
+    browser.find_element(By.ID, "play").click()
+    wait_until(lambda: bar(browser) == [0.3, 0.3, False])
+
+
+def test_a_pose_has_no_bar(browser, finger, tmp_path):
+    visit(browser, replay(finger, [[0.1] * 3], dt=1.0, html=tmp_path / "pose.html"))
+    assert browser.find_elements(By.ID, "bar") == []
+
+
+def test_the_key_names_what_has_a_colour_of_its_own(finger, tmp_path):
+    q = np.linspace([0.1, 0.2, 0.3], [0.9, 0.8, 0.7], 5)
+    plain = replay(finger, q, dt=0.1, html=tmp_path / "plain.html").read_text()
+    assert re.findall("<li>.*</li>", plain) == []
+    marked = replay(
+        finger, q, dt=0.1, html=tmp_path / "key.html", trace=True, ghost=q[::-1], torques=np.zeros((4, 3)),
+        reference={"way": [[0.0, 0.0, 0.1], [0.1, 0.0, 0.1]]}, targets={"cup <1>": [0.1, 0.0, 0.0]},
+    ).read_text()  # fmt: skip
+    words = [re.sub("<.*?>", "", line) for line in re.findall("<li>.*</li>", marked)]
+    frame = finger.end_effector
+    paths = [f"path of {frame}", f"path of {frame}, ghost"]
+    assert words == ["torque: none, half, all of the limit", "ghost", *paths, "reference: way", "target"]
 
 
 def test_trajectory_and_its_array_give_the_same_animation(finger, motion, tmp_path):

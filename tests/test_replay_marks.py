@@ -265,15 +265,17 @@ def test_targets_stand_or_move(browser, ur5, sweep, tmp_path):
         for (const name of arguments[0]) {
             kinds[name] = [];
             viewer.scene_tree.find(["meshcat", "notes", "targets", name]).object.traverse(node => {
-                if (node.isSprite) kinds[name].push("text of " + node.material.map.image.width);
+                if (node.isSprite) kinds[name].push(atob(node.material.map.image.src.split(",")[1]));
                 else if (node.isMesh) kinds[name].push(node.parent.name);
             });
         }
         return kinds;""",
         list(targets),
     )
-    assert sorted(kinds["point"]) == ["ball", "text of 256"]
-    assert sorted(kinds["turns"]) == ["axes", "ball", "text of 256"]
+    plates = {name: kind.pop(next(k for k, part in enumerate(kind) if "<svg" in part)) for name, kind in kinds.items()}
+    assert sorted(kinds["point"]) == ["ball"]
+    assert sorted(kinds["turns"]) == ["axes", "ball"]
+    assert all(f">{name}</text>" in plate for name, plate in plates.items())
 
 
 def link_colors(browser, figure="robot"):

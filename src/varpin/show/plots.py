@@ -1,4 +1,4 @@
-"""Figures of trajectories, and of speed against accuracy.
+"""Figures of trajectories, and of speed against accuracy, in one style.
 
 Figures are made without pyplot: nothing is shown, registered or configured globally. Save one with
 ``figure.savefig("motion.png")``; a notebook displays it as the value of a cell.
@@ -43,7 +43,8 @@ def plot_joints(
     Args:
         trajectory: The motion.
         axes: Where to draw; a new figure if left out.
-        robot: The robot of the motion. With it joints are labelled in their own units, rad or m.
+        robot: The robot of the motion. With it joints are labelled in their own units, rad or m, and limits that the
+            motion comes near are drawn, dotted.
 
     Returns:
         The figure and its axes.
@@ -51,14 +52,16 @@ def plot_joints(
     Raises:
         InputError: ``robot`` has other joints than the trajectory.
     """
-    return _plot_nodes(trajectory, trajectory.q, "position", ("rad", "m"), axes, robot)
+    limits = None if robot is None else robot.position_limits
+    return _plot_nodes(trajectory, trajectory.q, "position", ("rad", "m"), axes, robot, limits)
 
 
 def plot_velocities(
     trajectory: Trajectory, axes: Axes | None = None, *, robot: Robot | None = None
 ) -> tuple[Figure | SubFigure, Axes]:
     """Joint velocities over time; arguments as for :func:`plot_joints`."""
-    return _plot_nodes(trajectory, trajectory.v, "velocity", ("rad/s", "m/s"), axes, robot)
+    limits = None if robot is None else (-robot.velocity_limit, robot.velocity_limit)
+    return _plot_nodes(trajectory, trajectory.v, "velocity", ("rad/s", "m/s"), axes, robot, limits)
 
 
 def plot_controls(
@@ -73,7 +76,8 @@ def plot_controls(
     Args:
         trajectory: The motion.
         axes: Where to draw; a new figure if left out.
-        robot: The robot of the motion. With it the controls of joints are labelled in N m or N.
+        robot: The robot of the motion. With it the controls of joints are labelled in N m or N, and limits that they
+            come near are drawn, dotted: of efforts, or of the positions of servos.
         labels: Names of the m controls. Left out, they are named after the joints if there are as many, which is
             right where every joint is actuated, and u1, u2, ... if not.
 
@@ -108,6 +112,9 @@ def plot_controls(
     for row, name, style in zip(trajectory.u.T, names, _styles(controls), strict=True):
         edges, values = _thin_steps(trajectory.t, row)
         axes.step(edges, values, where="post", label=name, **style)
+    limits = _control_limits(robot, joints)
+    if limits is not None:
+        _draw_limits(axes, trajectory.u, limits)
     _finish(axes, trajectory, f"{what} [{unit}]", controls)
     return figure, axes
 
@@ -152,19 +159,22 @@ def plot_trajectory(
 
     Args:
         trajectory: The motion.
-        axes: Four axes to draw on; a new figure if left out.
+        axes: Four axes to draw on; a new figure if left out, without the panel of controls if there are none or all
+            are 0.
         robot: As for :func:`plot_joints`.
         labels: Names of the controls, as for :func:`plot_controls`.
 
     Returns:
-        The figure and its axes (4,).
+        The figure and its axes: four, or three without controls.
 
     Raises:
         InputError: ``axes`` are not four, or as for the single figures.
     """
+    driven = axes is not None or bool(np.any(trajectory.u))
     if axes is None:
-        new = Figure(figsize=(9.0, 10.0), layout="constrained")
-        panels = new.subplots(4, 1, sharex=True)
+        count = 4 if driven else 3
+        new = Figure(figsize=(9.0, 2.5 * count), layout="constrained")
+        panels = new.subplots(count, 1, sharex=True)
         new.suptitle(f"{trajectory.robot}: {trajectory.integrator}, dt = {trajectory.dt:g} s", fontsize="large")
     else:
         panels = np.asarray(axes, dtype=object).ravel()
@@ -172,12 +182,15 @@ def plot_trajectory(
             raise InputError(f"axes must be 4 (positions, velocities, controls, energy), got {panels.size}")
     plot_joints(trajectory, panels[0], robot=robot)
     plot_velocities(trajectory, panels[1], robot=robot)
-    plot_controls(trajectory, panels[2], robot=robot, labels=labels)
-    plot_energy_error(trajectory, panels[3])
+    if driven:
+        plot_controls(trajectory, panels[2], robot=robot, labels=labels)
+    elif labels is not None and len(labels) != trajectory.u.shape[1]:
+        raise InputError(f"labels must be {trajectory.u.shape[1]}, one a control, got {len(labels)}")
+    plot_energy_error(trajectory, panels[-1])
     # The same joints have the same colours in all panels, so one legend serves them.
     handles, names = panels[0].get_legend_handles_labels()
     mixed = len({joint is None for joint in _served(trajectory)}) > 1
-    for panel in panels[1:3]:
+    for panel in panels[1:-1]:
         same = len(panel.get_legend_handles_labels()[1]) == len(names) and not (panel is panels[2] and mixed)
         if panel.get_legend() is not None and (panel is panels[1] or (same and labels is None)):
             panel.get_legend().remove()
@@ -185,7 +198,7 @@ def plot_trajectory(
         # The figure's legend takes its room beside all panels; that of one panel would push the others apart.
         panels[0].get_legend().remove()
         new.legend(handles, names, loc="outside right upper", frameon=False, fontsize="small")
-    for panel in panels[:3]:
+    for panel in panels[:-1]:
         panel.set_xlabel("")
     if axes is None:
         new.align_ylabels()
@@ -276,6 +289,14 @@ def plot_optimal_control_tradeoff(
     return figure, axes
 
 
+def apply_style(axes: Axes) -> None:
+    """Give axes the look of varpin's figures: a faint grid below everything, no frame at the top and the right."""
+    axes.set_prop_cycle(color=COLORS)
+    axes.grid(visible=True, color="0.92", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
 def _plot_trade(
     points: Sequence[tuple[str, float, float]],
     front: Sequence[tuple[float, float]],
@@ -301,9 +322,7 @@ def _plot_trade(
         zorder=1,
     )
     axes.set_xscale("log")
-    axes.grid(visible=True, color="0.92", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    apply_style(axes)
     axes.legend(frameon=False, fontsize="small")
     return figure, axes
 
@@ -315,6 +334,7 @@ def _plot_nodes(
     units: tuple[str, str],
     axes: Axes | None,
     robot: Robot | None,
+    limits: tuple[Floats, Floats] | None,
 ) -> tuple[Figure | SubFigure, Axes]:
     """One line a joint over the nodes; ``units`` are a revolute and a prismatic joint's."""
     slides = _slides(trajectory, robot)
@@ -322,8 +342,38 @@ def _plot_nodes(
     names, unit = _labels(trajectory.joint_names, units, slides)
     for row, name, style in zip(values.T, names, _styles(len(names)), strict=True):
         axes.plot(*_thin(trajectory.t, row), label=name, **style)
+    if limits is not None:
+        _draw_limits(axes, values, limits)
     _finish(axes, trajectory, f"{what} [{unit}]", len(names))
     return figure, axes
+
+
+def _control_limits(robot: Robot | None, joints: Sequence[int | None]) -> tuple[Floats, Floats] | None:
+    """Of controls (m,): a servo's are its joint's positions, of one control a joint they are efforts; else None."""
+    if robot is None or not joints:
+        return None
+    served = [joint for joint in joints if joint is not None]
+    if len(served) == len(joints):
+        lower, upper = robot.position_limits
+        return lower[served], upper[served]
+    if not served and len(joints) == robot.dof:
+        return -robot.effort_limit, robot.effort_limit
+    return None
+
+
+def _draw_limits(axes: Axes, values: Floats, limits: tuple[Floats, Floats]) -> None:
+    """Limits as dotted lines, in the colours of their joints, where values (N, k) come near them or pass them.
+
+    Others would only press the motion flat.
+    """
+    if not values.size:
+        return
+    low, high = float(values.min()), float(values.max())
+    near = 0.3 * (high - low)
+    for k, style in enumerate(_styles(values.shape[1])):
+        for limit in (limits[0][k], limits[1][k]):
+            if low - near <= limit <= high + near:
+                axes.axhline(limit, color=style["color"], linewidth=0.9, linestyle=(0, (1, 2)), zorder=1)
 
 
 def _axes(axes: Axes | None) -> tuple[Figure | SubFigure, Axes]:
@@ -388,9 +438,7 @@ def _styles(lines: int) -> list[dict[str, Any]]:
 def _finish(axes: Axes, trajectory: Trajectory, label: str, lines: int) -> None:
     axes.set_xlabel("time [s]")
     axes.set_ylabel(label)
-    axes.grid(visible=True, color="0.92", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    apply_style(axes)
     if trajectory.duration > 0.0:
         axes.set_xlim(trajectory.t[0], trajectory.t[-1])
     if lines > 1:

@@ -13,24 +13,19 @@ from numpy.typing import NDArray
 
 from varpin.errors import InputError
 from varpin.show.replay import marks
+from varpin.show.replay.legend import EFFORT_COLORS, GHOST_COLOR, TARGET_COLOR, TRACE_COLORS
 from varpin.show.replay.picture import Picture, label, labels
 from varpin.show.replay.script import Actor, Outlook, Script, Target, Trace
-from varpin.show.replay.shapes import GHOST_COLOR, ShapeLoader
+from varpin.show.replay.shapes import ShapeLoader
 from varpin.show.replay.view import set_view, side_by_side, view_direction
 
 Floats = NDArray[np.float64]
-
-_TRACE_COLORS = {"motion": 0xD1480F, "ghost": GHOST_COLOR, "reference": 0x157A3C}
-_TARGET_COLOR = 0xC0187A
-
-# From no torque to all there is; linear in between.
-EFFORT_COLORS = np.array([[0.72, 0.76, 0.8], [0.98, 0.75, 0.1], [0.8, 0.05, 0.05]])
 
 # Viewers compute in single precision, and with squares [m].
 _FARTHEST = 1e18
 
 # Of marks, in sizes of a robot's motion.
-_TUBE, _BEAD, _BALL, _TRIAD, _LABEL = 0.003, 0.006, 0.02, 0.1, 0.25
+_TUBE, _BEAD, _BALL, _TRIAD, _LABEL = 0.003, 0.006, 0.02, 0.1, 0.045
 
 
 def draw(viewer: meshcat.Visualizer, script: Script) -> None:
@@ -133,7 +128,7 @@ class _Drawing:
         self.viewer[root].set_transform(_translation(place))
         for k, trace in enumerate(traces):
             node = f"{root}/traces/{k} {trace.kind} {label(trace.name)}"
-            self.viewer[node].set_object(marks.tube(trace.points, _TUBE * size, _TRACE_COLORS[trace.kind]))
+            self.viewer[node].set_object(marks.tube(trace.points, _TUBE * size, TRACE_COLORS[trace.kind]))
             if trace.reached is not None:
                 # three.js draws so many of its corners; a piece that is reached in part is drawn in part.
                 corners = marks.TUBE_PIECE * trace.reached
@@ -148,12 +143,10 @@ class _Drawing:
                 self._animate(node, "position", "vector3", target.places)
                 if target.turns is not None:
                     self._animate(node, "quaternion", "quaternion", target.turns)
-            self.viewer[f"{node}/ball"].set_object(marks.ball(_BALL * size, _TARGET_COLOR))
+            self.viewer[f"{node}/ball"].set_object(marks.ball(_BALL * size, TARGET_COLOR))
             if target.turns is not None:
                 self.viewer[f"{node}/axes"].set_object(marks.triad(_TRIAD * size))
-            self.viewer[f"{node}/label"].set_object(marks.Label(target.name, _LABEL * size))
-            # Which point of the label, from 0 to 1, is at the target: one below the text, so that the ball stays free.
-            self.viewer[f"{node}/label/<object>"].set_property("center", {"x": 0.5, "y": 0.5 - 1.2 * _BALL / _LABEL})
+            self.viewer[f"{node}/label"].set_object(marks.Label(target.name, _LABEL * size, 1.2 * _BALL * size))
 
     def _outlooks(self, outlooks: Sequence[Outlook], root: str, size: float) -> None:
         """Beads where plans mean to take frames."""

@@ -185,7 +185,7 @@ def replay(
         efforts = _efforts(arm, shares[k], t[-1], times)
         actors.append(Actor(arm, positions, tuple(lines), tuple(plans), triads[k], efforts))
     marked = tuple(target(name, track, times) for name, track in tracks.items())
-    script = Script(times / speed, tuple(actors), paths, marked, step, loop)
+    script = Script(times / speed, tuple(actors), paths, marked, step, loop, speed)
 
     from varpin.show.replay import viewer  # noqa: PLC0415 - meshcat is slow to import, and few runs show anything
 

@@ -13,6 +13,11 @@ import meshcat
 import umsgpack
 
 from varpin.errors import InputError
+from varpin.show.replay.legend import Entry, legend
+from varpin.show.replay.script import Script
+
+# To choose from; 1 is true speed.
+_SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 
 
 class Page:
@@ -29,27 +34,54 @@ class Page:
         except OverflowError:
             raise InputError("what is to be shown has sizes or places beyond 3e38, which no viewer draws") from None
 
-    def html(self, title: str) -> str:
-        """The page: meshcat's viewer and the commands, compressed."""
+    def html(self, script: Script) -> str:
+        """The page: meshcat's viewer, the commands, compressed, the key to the colours and the bar."""
         viewer = Path(meshcat.viewer_assets_path(), "dist", "main.min.js").read_text(encoding="utf-8")
         stream = b"".join(len(command).to_bytes(4, "little") + command for command in self.commands)
         packed = base64.b64encode(gzip.compress(stream, 6, mtime=0)).decode()
+        title, key = markup.escape(script.title), "\n".join(map(_line, legend(script)))
         return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
-<title>{markup.escape(title)} - varpin</title>
+<title>{title} - varpin</title>
 <link rel="icon" href="data:,">
-<style>body {{ margin: 0; }} #meshcat-pane {{ width: 100vw; height: 100vh; overflow: hidden; }}</style>
+<style>{_part("player.css")}</style>
 </head>
 <body>
-<div id="meshcat-pane"></div>
+<div id="stage"><div id="meshcat-pane"></div><div id="about"><h1>{title}</h1><ul>{key}</ul></div></div>
+{_bar(script)}
 <script>{viewer}</script>
 <script id="commands" type="text/plain">{packed}</script>
-<script>{_PLAYER}</script>
+<script>{_part("player.js")}</script>
 </body>
 </html>
 """
+
+
+def _part(name: str) -> str:
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+
+
+def _line(entry: Entry) -> str:
+    colors = entry.colors if len(entry.colors) > 1 else entry.colors * 2
+    swatch = f'<span class="swatch" style="background: linear-gradient(to right, {", ".join(colors)})"></span>'
+    return f"<li>{swatch}{markup.escape(entry.text)}</li>"
+
+
+def _bar(script: Script) -> str:
+    """Play and pause, the time, the speed; nothing for a pose."""
+    if len(script.times) < 2:
+        return ""
+    options = "".join(
+        f'<option value="{speed:g}"{" selected" if speed == script.speed else ""}>{speed:g} x</option>'
+        for speed in sorted({*_SPEEDS, script.speed})
+    )
+    return (
+        f'<div id="bar" data-speed="{script.speed!r}"><button id="play" type="button"></button>'
+        '<input id="time" type="range" min="0" step="any" value="0" aria-label="Time">'
+        f'<output id="clock"></output><select id="speed" title="Speed" aria-label="Speed">{options}</select></div>'
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,33 +108,3 @@ class Inline:
             f'<iframe srcdoc="{markup.escape(self.html)}" title="{markup.escape(self.title)}" sandbox="allow-scripts" '
             f'style="width: 100%; max-width: {width}px; height: {height}px; border: 0"></iframe>'
         )
-
-
-# The commands go to the viewer one after the other, for a property or an animation needs the object it speaks of.
-# A mesh that three.js cannot take is left out; the rest plays.
-_PLAYER = """
-var viewer;
-async function play() {
-    viewer = new MeshCat.Viewer(document.getElementById("meshcat-pane"));
-    const packed = atob(document.getElementById("commands").textContent);
-    const bytes = new Uint8Array(packed.length);
-    for (let i = 0; i < packed.length; i++) bytes[i] = packed.charCodeAt(i);
-    const unzip = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-    const data = await new Response(unzip).arrayBuffer();
-    const view = new DataView(data);
-    for (let at = 0; at < data.byteLength;) {
-        const size = view.getUint32(at, true);
-        try {
-            viewer.handle_command_bytearray(new Uint8Array(data.slice(at + 4, at + 4 + size)));
-        } catch (error) {
-            console.error(error);
-        }
-        at += 4 + size;
-    }
-    document.documentElement.dataset.loaded = "true";
-}
-play().catch(error => {
-    console.error(error);
-    document.getElementById("meshcat-pane").textContent = "This motion cannot be shown here: " + error.message;
-});
-"""

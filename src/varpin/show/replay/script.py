@@ -95,6 +95,7 @@ class Script:
         targets: In the world of each robot.
         offset: From one robot to the next (3,) [m]; None for as far as they need beside each other.
         loop: Start again at the end.
+        speed: Seconds of motion in a second of playback.
     """
 
     times: Floats
@@ -103,6 +104,7 @@ class Script:
     targets: tuple[Target, ...] = field(default=())
     offset: Floats | None = None
     loop: bool = True
+    speed: float = 1.0
 
     @property
     def title(self) -> str:

@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike
 from pinocchio.visualize.meshcat_visualizer import MeshcatVisualizer, hasMeshFileInfo, loadMesh
 
 from varpin.show.replay import wavefront
+from varpin.show.replay.legend import GHOST_COLOR
 
 logger = logging.getLogger(__name__)
 
-# A colour that neither robots nor the background have.
-GHOST_COLOR, _GHOST_OPACITY = 0x1450D2, 0.35
+_GHOST_OPACITY = 0.35
 _WHITE = 0xFFFFFF
 # three.js's word for textures that go on beyond their edges.
 _REPEAT = 1000

@@ -33,7 +33,7 @@ def inline(script: Script, size: tuple[int, int]) -> Inline:
 def _page(script: Script) -> str:
     page = Page()
     draw(meshcat.Visualizer(window=page), script)
-    return page.html(script.title)
+    return page.html(script)
 
 
 def show(script: Script) -> meshcat.Visualizer:

@@ -1,0 +1,54 @@
+"""The key to a replay's colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.show.replay.script import Script
+
+# Colours that neither robots nor the background have.
+GHOST_COLOR, TARGET_COLOR = 0x1450D2, 0xC0187A
+TRACE_COLORS = {"motion": 0xD1480F, "ghost": GHOST_COLOR, "reference": 0x157A3C}
+
+# From no torque to all there is; linear in between.
+EFFORT_COLORS = np.array([[0.72, 0.76, 0.8], [0.98, 0.75, 0.1], [0.8, 0.05, 0.05]])
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A line of the key.
+
+    Attributes:
+        text: What has the colour.
+        colors: One, or several that go over into each other from left to right, as CSS has them.
+    """
+
+    text: str
+    colors: tuple[str, ...]
+
+
+def legend(script: Script) -> list[Entry]:
+    """A line for each kind of thing that a script shows in a colour of its own."""
+    entries = []
+    if any(actor.effort is not None for actor in script.actors):
+        scale = tuple(_css(color) for color in np.rint(255.0 * EFFORT_COLORS).astype(int))
+        entries.append(Entry("torque: none, half, all of the limit", scale))
+    if any("ghost" in actor.positions for actor in script.actors):
+        planned = any(actor.outlooks for actor in script.actors)
+        entries.append(Entry("plan" if planned else "ghost", (f"#{GHOST_COLOR:06x}",)))
+    traces = [*script.traces, *(trace for actor in script.actors for trace in actor.traces)]
+    for kind, text in (("motion", "path of {}"), ("ghost", "path of {}, ghost"), ("reference", "reference: {}")):
+        names = dict.fromkeys(trace.name for trace in traces if trace.kind == kind)
+        if names:
+            words = "reference" if [*names] == ["reference"] else text.format(", ".join(names))
+            entries.append(Entry(words, (f"#{TRACE_COLORS[kind]:06x}",)))
+    if script.targets:
+        entries.append(Entry("target", (f"#{TARGET_COLOR:06x}",)))
+    return entries
+
+
+def _css(color: NDArray[np.int64]) -> str:
+    return "#" + "".join(f"{part:02x}" for part in color)
