@@ -56,3 +56,4 @@ autodoc_preserve_defaults = True
 autoclass_content = "both"
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
+mathjax3_config = {"chtml": {"scale": 0.92}}  # as large as the text around it
