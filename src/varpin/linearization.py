@@ -1,4 +1,7 @@
-"""The structured linearization of a stochastic discrete map, and what it says of means and covariances."""
+"""The structured linearization of a stochastic discrete map, and what it says of means and covariances.
+
+Equation (L3) of docs/mathematics.md; (1.7) and (1.10) of the paper.
+"""
 
 from __future__ import annotations
 

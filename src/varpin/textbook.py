@@ -15,6 +15,8 @@ correction F_i' F_i of (1.3) is (dF_i/dv) M^-1 F_i, which vanishes here because 
 Sources: Johnson and Murphey, "Scalable variational integrators for constrained mechanical systems in generalized
 coordinates", 2009; Johnson, Schultz and Murphey, "Structured linearization of discrete mechanical systems", 2015;
 Theodorou, Tassa and Todorov, "Stochastic differential dynamic programming", 2010.
+
+Equations (D1), (D2), (D3), (D4) and (O2) of docs/mathematics.md; (1.1) of the paper.
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 
 NB_MODULE(_core, m) {
     m.doc() = "The compiled core.";
+    // A function of the user's own may hold the scene that holds it: what is left then when Python ends is no mistake.
+    nanobind::set_leak_warnings(false);
     varpin::border::register_mechanism(m);
     varpin::border::register_kinematics(m);
     varpin::border::register_elimination(m);

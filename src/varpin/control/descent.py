@@ -1,4 +1,7 @@
-"""Costs as descent sees them: their differences, digit by digit, and how much of them is at stake."""
+"""Costs as descent sees them: their differences, digit by digit, and how much of them is at stake.
+
+Equation (O9) of docs/mathematics.md.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""An optimal control problem: a scene, a cost, a horizon and how it is discretized."""
+"""An optimal control problem: a scene, a cost, a horizon and how it is discretized.
+
+Equation (O1) of docs/mathematics.md.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The contract of every integrator."""
+"""The contract of every integrator.
+
+Equation (N1) of docs/mathematics.md; (1.3) of the paper.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The midpoint variational integrator."""
+"""The midpoint variational integrator.
+
+Equation (G2) of docs/mathematics.md.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The Lagrangian L(q, v) = 1/2 v' M(q) v - V(q) of a scene, its derivatives, and the discrete Lagrangian's."""
+"""The Lagrangian L(q, v) = 1/2 v' M(q) v - V(q) of a scene, its derivatives, and the discrete Lagrangian's.
+
+Equations (J1), (J2), (D1) and (D2) of docs/mathematics.md.
+"""
 
 from __future__ import annotations
 

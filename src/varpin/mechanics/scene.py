@@ -1,4 +1,7 @@
-"""A scene: a robot and only what it needs around it. Gravity, forces on joints, actuation, noise."""
+"""A scene: a robot and only what it needs around it. Gravity, forces on joints, actuation, noise.
+
+Equation (1.1) of the paper.
+"""
 
 from __future__ import annotations
 

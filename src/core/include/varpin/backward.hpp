@@ -11,6 +11,7 @@
 // and so on in u; v0 grows by (1/2) sum_i g_i' S g_i. Where the change of the control costs (1/2) (u - w)' R (u - w),
 // w the control before, the decision adds R to Q_uu and to Q_ww and -R to Q_uw: gains on w are those on x with -R in
 // place of Q_ux, and the value before it is one of (x, w).
+// Equations (O2), (O4) and (O6) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>

@@ -2,6 +2,7 @@
 // docs/mathematics.md, "Limits". Control-limited differential dynamic programming (Tassa, Mansard and Todorov 2014)
 // projects Newton steps onto the box instead. They may end where no projection of the next one descends; far from well
 // conditioned they do.
+// Equation (O4) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>

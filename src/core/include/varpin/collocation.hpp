@@ -9,6 +9,7 @@
 //
 // N falls apart into one matrix for each block of the tree; elimination needs none of them. On the
 // branch of solutions that is connected to h -> 0 its determinant is positive.
+// Equations (D3), (D4), (S1), (C1), (C3), (L1) and (L2) of docs/mathematics.md; (1.8) and (1.9) of the paper.
 #pragma once
 
 #include <algorithm>

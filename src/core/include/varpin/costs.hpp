@@ -1,5 +1,6 @@
 // Costs weight . r^2 at samples (q, v, u), with their gradients and the Hessians of Gauss and Newton, 2 J' weight J,
 // in z = (q, v, u); and those of changes of controls. docs/mathematics.md, "Costs in the task", "Smooth controls".
+// Equations (O5), (O7) and (O8) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>

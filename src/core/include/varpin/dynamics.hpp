@@ -10,6 +10,7 @@
 //
 //     dtau_j/d(q,v)_i = F_j . X_i + (C_j' S_j) . U_i
 //     dtau_i/d(q,v)_j = S_i . (Y_j X_j + C_j U_j + (S_j x* Phi_j, 0))
+// Equations (X3) and (X4) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>

@@ -15,6 +15,7 @@
 //
 // The symmetric part M + c (A + A') - k L_qq goes alike with rows and columns (S, W) of twelve entries, M alone with S:
 // that is the articulated body algorithm (Featherstone 2008).
+// Equations (E1), (E2) and (E3) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>

@@ -6,6 +6,7 @@
 //
 // The derivatives of (q1, v1) in (q0, v0, force) are the same sums of the derivatives of a_i. Noise makes the velocity
 // jump by M^-1 sum_i F_i dw_i: in Euler's method beside the step, in the others before it.
+// Equations (X1) and (X2) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>

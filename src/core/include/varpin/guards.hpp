@@ -9,6 +9,7 @@
 // of their own: with coordinates i of its own and a of what carries it, the Jacobi energy J = sum_i p_i v_i - L of the
 // part's bodies changes by dJ = sum_i F_i dq_i - sum_a (L_q,a dq_a + L_v,a dv_a), L_q,a and L_v,a by the trapezoidal
 // rule.
+// Equation (G1) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>

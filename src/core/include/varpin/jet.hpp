@@ -9,6 +9,7 @@
 // Vectors are taken about the root of their branch, or the last joint of a run of sliders there: it moves with them, so
 // that what stands or slides far away keeps its digits. With T = Dual and (q, v) moving along a direction, the slopes
 // of M, A and L_qq are third derivatives of L, contracted with the direction.
+// Equations (J1) and (J2) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>

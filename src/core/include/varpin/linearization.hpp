@@ -8,6 +8,7 @@
 //     alpha_i = h (b_i zp + sum_j abar_ji lam_j),    beta_i = -lam_i,    gamma_i = h (b_i zp + sum_j f_ji lam_j),
 //
 // and at a root first derivatives of V are enough: d2 phi = sum_i (dQ_i, dV_i, df)' d2 psi_i (dQ_i, dV_i, df).
+// Equation (L4) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>

@@ -12,6 +12,7 @@
 // plain recursion is eps of their root here, so that weights may be twice as many digits apart. Every Hessian must be
 // positive semidefinite; the part of a gradient that it knows nothing of is carried along as it is. Where the change of
 // the control costs something, the control before is part of x.
+// Equation (O3) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>

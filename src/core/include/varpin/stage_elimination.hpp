@@ -9,6 +9,7 @@
 //     column_m = (delta_cm S + h a_cm W, h a_cm S(angular))_c         l0_i = -h abar_ic (S x* H, -g x (Y S)(linear))_c
 //
 // all of nine entries for each c; D is a small matrix in place of a number.
+// Equations (E1), (E2), (E3) and (E4) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>

@@ -1,6 +1,7 @@
 // The variational stepper: collocation steps, accepted by the guards or else taken in halves, and halves of halves;
 // kicks of noise before the step, or half before and half after. docs/mathematics.md, "The principal branch" and
 // "Noise".
+// Equations (C2) and (N2) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>

@@ -1,4 +1,7 @@
-"""The runs: each cell of (setting, case, method, dt) once, and kept on disk: an interrupted reproduction goes on."""
+"""The runs: each cell of (setting, case, method, dt) once, and kept on disk: an interrupted reproduction goes on.
+
+Equation (O10) of docs/mathematics.md.
+"""
 
 from __future__ import annotations
 
