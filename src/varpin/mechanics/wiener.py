@@ -43,9 +43,10 @@ def wiener_increments(
     if increments is not None:
         if rng is not None:
             raise InputError("give rng, to draw the Wiener increments, or increments, to use yours; not both")
-        if np.ndim(increments) == 0 and as_floats("increments", increments) == 0.0:
+        given = as_floats("increments", increments)
+        if given.ndim == 0 and given == 0.0:
             return np.zeros((0, processes))
-        return finite_array("increments", increments, (steps, processes))
+        return finite_array("increments", given, (steps, processes))
     if rng is None or processes == 0:
         return np.zeros((0, processes))
     deviation = math.sqrt(positive("dt", dt, "s"))
