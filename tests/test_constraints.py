@@ -700,3 +700,26 @@ def test_scene_files_have_constraints(tmp_path):
         path.write_text(SCENE_FILE.replace(*change))
         with pytest.raises(vp.SceneFileError, match=words):
             vp.load_scene(path)
+
+
+def test_a_function_gets_angles_with_their_whole_turns():
+    robot = vp.planar_chain(2)
+    on_a_line = [vp.PointOnPlane("tip", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))]
+    q = vp.assemble(vp.Scene(robot, constraints=on_a_line), [2.0 * np.pi + 0.5, 2.0])
+    forces = vp.CustomForce(lambda q, v: -5.0 * q), vp.JointSpring(5.0)
+    scenes = [vp.Scene(robot, constraints=on_a_line, forces=[force]) for force in forces]
+    motions = [vp.simulate(scene, q, [0, 0], dt=1e-3, steps=200, integrator=vp.Gauss(2)) for scene in scenes]
+    np.testing.assert_allclose(motions[0].q, motions[1].q, atol=1e-9)
+
+
+def test_rows_whose_terms_vanish_hold_from_rest():
+    robot = vp.planar_chain(3)
+    scene = vp.Scene(robot, constraints=[vp.JointTie("joint1", "joint2", (0.0, 0.0))])
+    motion = vp.simulate(scene, [0.0, 0.2, 0.3], [0, 0, 0], dt=2e-3, steps=50, integrator=vp.Gauss(2))
+    assert np.abs(motion.q[:, 0]).max() < 1e-15
+    base = vp.load_robot("ur5", base="planar")
+    held = vp.Scene(base, constraints=[vp.FrameOnFrame("base_link", "universe")])
+    motion = vp.simulate(held, np.zeros(base.dof), np.zeros(base.dof), dt=2e-3, steps=20, integrator=vp.Gauss(2))
+    fixed = vp.load_robot("ur5")
+    alone = vp.simulate(vp.Scene(fixed), np.zeros(6), np.zeros(6), dt=2e-3, steps=20, integrator=vp.Gauss(2))
+    np.testing.assert_allclose(motion.q[:, 3:], alone.q, atol=1e-9)

@@ -242,3 +242,27 @@ def test_it_is_planned_with():
     cost = vp.ControlCost(1e-2) + vp.TrackingCost(Q0, 10.0)
     problem = vp.OptimalControlProblem(own, cost, Q0, V0, dt=0.02, steps=10)
     assert vp.solve(problem, check=False).status is vp.Status.CONVERGED
+
+
+def test_a_motion_is_linearized_with_its_own_functions():
+    robot = vp.planar_chain(2)
+    scene = vp.Scene(robot, forces=[vp.CustomForce(lambda q, v: -5.0 * v)])
+    motion = vp.simulate(scene, [0.3, 0.2], [0.0, 0.0], dt=1e-3, steps=50)
+    vp.linearize(scene, motion)
+    for other in (vp.Scene(robot), vp.Scene(robot, forces=[vp.CustomForce(lambda q, v: -4.0 * v)])):
+        with pytest.raises(vp.InputError, match="another scene"):
+            vp.linearize(other, motion)
+
+
+def test_a_function_that_raises_in_the_check_leaves_the_motion():
+    def drag(q, v):
+        if abs(v[1]) > 4.6:
+            raise ValueError("beyond the table")
+        return -0.1 * v
+
+    force = vp.CustomForce(drag, lambda q, v: (np.zeros((2, 2)), -0.1 * np.eye(2)))
+    scene = vp.Scene(vp.planar_chain(2), forces=[force])
+    motion = vp.simulate(scene, [0.3, 0.3], [0.0, 0.0], dt=0.05, steps=30)
+    assert motion.steps == 30
+    assert "not checked" in motion.warnings[0]
+    assert "beyond the table" in motion.warnings[0]

@@ -346,7 +346,8 @@ def _matching(scene: Scene, trajectory: Trajectory, given: Integrator | None) ->
     require_motion(scene, trajectory)
     integrator = _integrator_of(scene, trajectory, given)
     require_scene_of(scene, trajectory)
-    if not trajectory.scene_values:
+    functions = scene.custom is not None or "constraints.custom" in scene.values
+    if not trajectory.scene_values or functions:
         _require_steps_of(scene, trajectory, integrator)
     return integrator
 

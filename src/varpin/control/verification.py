@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -21,6 +22,10 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
+logger = logging.getLogger(__name__)
+
+# Above, the costs are not known well enough to say anything of the plan.
+_UNTOLD = 0.01
 _READING = (
     "where feedback loses some percent, the plan holds; where it loses much, dt is too coarse (controls alone also "
     "lose much where a motion is unstable)"
@@ -56,6 +61,11 @@ class Verification:
     status: Status = Status.CONVERGED
 
     @property
+    def told(self) -> bool:
+        """Whether the costs are known to a percent; if not, they say nothing of the plan."""
+        return not (np.isfinite(self.accuracy) and self.accuracy > _UNTOLD)
+
+    @property
     def open_loop_loss(self) -> float:
         """What the controls alone cost above the plan, relative to the plan's cost; NaN where they run away."""
         return excess(self.open_loop_cost, self.planned_cost)
@@ -64,6 +74,14 @@ class Verification:
     def closed_loop_loss(self) -> float:
         """The same with feedback."""
         return excess(self.closed_loop_cost, self.planned_cost)
+
+    @property
+    def _untold(self) -> str:
+        return (
+            f"these costs say nothing of the plan: with {self.substeps} Runge-Kutta steps in one of the plan's they "
+            f"still change by {percent(self.accuracy)}. Dampers or dry friction are too fast for it; simulate the "
+            "plan's policy with varpin.Radau(3) in small steps instead, or give max_substeps"
+        )
 
     @property
     def _rows(self) -> list[tuple[str, float, str, str]]:
@@ -77,7 +95,7 @@ class Verification:
         shown = [row if np.isfinite(row[1]) else (row[0], "runs away", "", "") for row in self._rows]
         head = ("", "cost", "loss", "end off by [rad or m]")
         said = [
-            ("how to read it", _READING),
+            ("how to read it", _READING if self.told else self._untold),
             ("a step is off by", f"{self.defect:.2e} rad or m"),
             *([] if self.status.converged else [("the plan is unfinished", self.status.value)]),
         ]
@@ -94,7 +112,7 @@ class Verification:
                 *lines,
                 f"a step is off by {self.defect:.2e} rad or m at most; costs are good to {good} of themselves "
                 f"({self.substeps} substeps a step)",
-                f"read it so: {_READING}",
+                f"read it so: {_READING}" if self.told else self._untold,
                 *([] if self.status.converged else [f"the plan is unfinished, {self.status.value}"]),
             ]
         )
@@ -152,7 +170,7 @@ def verify(
             break
         substeps *= 2
     end = plan.q[-1]
-    return Verification(
+    found = Verification(
         planned_cost=planned_cost,
         open_loop_cost=opened[0],
         closed_loop_cost=closed[0],
@@ -163,6 +181,9 @@ def verify(
         accuracy=accuracy,
         status=status,
     )
+    if not found.told:
+        logger.warning("%s", found._untold)
+    return found
 
 
 def _fine_costs(problem: OptimalControlProblem, substeps: int) -> tuple[BoundSum, BoundSum]:

@@ -64,6 +64,7 @@ VALUES = {
     "FrameSpring": "springs between frames are others",
     "FrameLengthSpring": "springs between frames are others",
     "FrameDamper": "dampers between frames are others",
+    "functions": "forces that are functions are others",
     "constraints.between": "constraints between frames are others",
     "constraints.ties": "ties of joints are others",
     "constraints.custom": "custom constraints are others",
@@ -437,6 +438,9 @@ class Scene(Frozen):
         for kind in OF_COUPLINGS:
             if ends := [(each.a, each.b, *each.values) for each in self.couplings if each.kind == kind]:
                 own[kind] = np.array(ends, dtype=np.float64)
+        if self.custom is not None:
+            # Of functions nothing but how many there are.
+            own["functions"] = np.array([float(len(self.custom.parts))])
         own |= _numbers_of(self.bound_constraints.rows)
         own |= {"rotation": tree.rotation, "translation": tree.translation}
         own |= {"ratio": tree.ratio, "offset": tree.offset}
@@ -590,7 +594,7 @@ def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> l
     if values:
         found += [
             f"{VALUES[name]} in the scene"
-            for name in (*OF_COUPLINGS, *OF_CONSTRAINTS)
+            for name in (*OF_COUPLINGS, *OF_CONSTRAINTS, "functions")
             if name in scene.values and name not in values
         ]
     return list(dict.fromkeys(found))

@@ -427,7 +427,7 @@ def _built(
     coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
     if not coordinates:
         raise RobotError(f"robot {description.name!r} has no joint that moves")
-    with_rotors(model, armature, coordinates, (*locked, *(model.names[joint] for joint in followers)))
+    with_rotors(model, armature, coordinates, tuple(locked))
     tree = flatten(model, ties, coordinates)
     robot = Robot(
         name=description.name,

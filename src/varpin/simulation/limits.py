@@ -76,4 +76,10 @@ def _velocities(_: Scene, trajectory: Trajectory) -> Floats:
 
 def _efforts(scene: Scene, trajectory: Trajectory) -> Floats:
     """Forces of the motors (N, n) [N m or N]."""
-    return drive_forces(scene.elements, trajectory.q[:-1], trajectory.v[:-1], trajectory.u @ scene.actuation.T)
+    q, v = trajectory.q[:-1], trajectory.v[:-1]
+    forces = drive_forces(scene.elements, q, v, trajectory.u @ scene.actuation.T)
+    # Where controls change within a step, the largest of its stages counts.
+    for stage in range(trajectory.u_stages.shape[1]):
+        own = drive_forces(scene.elements, q, v, trajectory.u_stages[:, stage] @ scene.actuation.T)
+        forces = np.where(np.abs(own) > np.abs(forces), own, forces)
+    return forces

@@ -411,7 +411,7 @@ def simulate(
                 now = record.trajectory()
                 raise ForceError(now.steps, float(now.t[-1]), str(error), now) from error
             except InputError as error:
-                if not stepwise:
+                if scene.noise.diffusion is not None:
                     raise  # of a custom constraint
                 now = record.trajectory()
                 raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
@@ -430,7 +430,12 @@ def simulate(
     except KeyboardInterrupt:
         interrupted = True
     try:
-        trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
+        try:
+            trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
+        except CustomForceError as error:
+            # Steps that the check takes again may go where the function is not defined. The motion stands.
+            sentence = f"the motion was not checked: {error}"
+            trajectory, found = record.trajectory(), (Finding("check", sentence),)
         if check and isinstance(controls, OpenLoop):
             found = (*found, *_undersampled(controls, scene, integrator, trajectory))
         found = (*noise_forgotten(scene, rng, increments), *wished, *found)

@@ -398,7 +398,9 @@ class ConstrainedStepper {
         }
     }
 
-    bool unwinds(int i) const { return mechanism.tree.periodic[i] && !mechanism.forces.anchors(i); }
+    bool unwinds(int i) const {
+        return mechanism.tree.periodic[i] && !mechanism.forces.anchors(i) && !mechanism.couplings.has_outer();
+    }
     void unwind(int i, PathState& path) const {
         if (unwinds(i)) path.place[i].unwind();
     }
@@ -710,12 +712,17 @@ class ConstrainedStepper {
                 if (!(error <= worst)) worst = error;
             }
         }
+        double swiftest = 0.0;
+        for (const double velocity : equation.V) swiftest = std::max(swiftest, std::abs(velocity));
         for (int k = 1; k <= stages; ++k) {
             for (int a = 0; a < r; ++a) {
                 const int row = here.order[a];
                 const double g = point[k - 1].g[row];
                 right[stages * n + (k - 1) * r + a] = -row_scale[row] * g / h;
-                const double error = std::abs(g) / (rounding_unit * point[k - 1].scale[row]);
+                // Terms may vanish where the row holds; what it may be off by then is the rounding of the stages' way.
+                double scale = point[k - 1].scale[row];
+                for (int c = 0; c < n; ++c) scale += std::abs(point[k - 1].C[row * n + c]) * h * swiftest;
+                const double error = scale > nothing ? std::abs(g) / (rounding_unit * scale) : std::abs(g);
                 if (!(error <= worst)) worst = error;
             }
         }

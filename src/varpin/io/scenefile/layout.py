@@ -264,8 +264,9 @@ def _load(spec: SceneSpec, held: Mapping[str, float]) -> Robot:
     except RobotNotFound as error:
         raise table.error("source", str(error)) from None
     except UnknownJoint as error:
+        key = "armature" if isinstance(own.armature, Mapping) and error.joint in own.armature else "lock"
         raise table.error(
-            f"lock.{error.joint}", f"there is no such joint; {suggestion(error.joint, error.joints, 'joints')}"
+            f"{key}.{error.joint}", f"there is no such joint; {suggestion(error.joint, error.joints, 'joints')}"
         ) from None
     except UnknownFrame as error:
         index = [load.frame for load in own.payload].index(error.frame)
