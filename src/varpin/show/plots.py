@@ -373,7 +373,10 @@ def _draw_limits(axes: Axes, values: Floats, limits: tuple[Floats, Floats]) -> N
     for k, style in enumerate(_styles(values.shape[1])):
         for limit in (limits[0][k], limits[1][k]):
             if low - near <= limit <= high + near:
-                axes.axhline(limit, color=style["color"], linewidth=0.9, linestyle=(0, (1, 2)), zorder=1)
+                across = axes.get_yaxis_transform()
+                look = {"color": style["color"], "linewidth": 0.9, "linestyle": (0, (1, 2)), "zorder": 1}
+                # Not among the axes' lines, which are the joints.
+                axes.hlines(limit, 0.0, 1.0, transform=across, **look)
 
 
 def _axes(axes: Axes | None) -> tuple[Figure | SubFigure, Axes]:
