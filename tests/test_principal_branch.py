@@ -121,7 +121,7 @@ NAMES = ["chain2", "chain3", "finger"]
 @pytest.mark.parametrize("forced", [False, True], ids=["free", "forced"])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_whole_step_is_on_the_branch_that_starts_at_nothing(name, forced):
-    whole, cut, jumps, gentle, refused = check(name, forced, 20, seed=5)
+    whole, cut, jumps, gentle, refused = check(name, forced, 40 if name == "chain2" else 20, seed=5)
     # A solver that refuses what is easy proves nothing by what it takes.
     assert refused <= 0.3 * gentle
     assert whole >= 5
