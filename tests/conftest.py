@@ -56,7 +56,7 @@ def script():
 
 
 @pytest.fixture(scope="session")
-def browser(tmp_path_factory):
+def chromium_session(tmp_path_factory):
     """Headless Chromium, for the tests of whole pages; they are skipped where there is none, except in CI."""
     chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if not (chromium and driver):
@@ -66,3 +66,10 @@ def browser(tmp_path_factory):
 
     with session(chromium, driver, tmp_path_factory.mktemp("chromium")) as opened:
         yield opened
+
+
+@pytest.fixture
+def browser(chromium_session):
+    """The session's browser. A page left open would go on drawing, at the cost of the tests after it."""
+    yield chromium_session
+    chromium_session.get("about:blank")

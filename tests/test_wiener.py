@@ -444,7 +444,11 @@ def test_the_equations_in_numpy_are_those_of_the_robots():
     pytest.param("finger", "split", 0.5, marks=pytest.mark.slow),
     pytest.param("finger", "left", 0.1, marks=pytest.mark.slow),
 ])  # fmt: skip
-@pytest.mark.parametrize(("dt", "duration"), [(1e-3, 60.0), (5e-3, 200.0), (2e-2, 400.0)])
+@pytest.mark.parametrize(("dt", "duration"), [
+    pytest.param(1e-3, 60.0, marks=pytest.mark.slow),
+    (5e-3, 200.0),
+    (2e-2, 400.0),
+])  # fmt: skip
 def test_langevin_equipartition(name, kick, friction, dt, duration):
     """The time average of p'M^-1 p is n kT within 4 standard errors."""
     mean, error = Bath(name, friction).simulated(kick, dt, duration)
@@ -452,7 +456,10 @@ def test_langevin_equipartition(name, kick, friction, dt, duration):
     assert abs(mean - 1.0) < 4.0 * error
 
 
-@pytest.mark.parametrize(("name", "friction", "dt"), [("pendulum", 0.6, 2e-2), ("finger", 0.5, 2e-2)])
+@pytest.mark.parametrize(("name", "friction", "dt"), [
+    ("pendulum", 0.6, 2e-2),
+    pytest.param("finger", 0.5, 2e-2, marks=pytest.mark.slow),
+])  # fmt: skip
 def test_euler_maruyama_heats_up_where_the_midpoint_rule_does_not(name, friction, dt):
     bath = Bath(name, friction)
     mean, error = bath.simulated("split", dt, 100.0)

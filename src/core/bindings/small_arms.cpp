@@ -13,16 +13,18 @@ std::unique_ptr<Made> of_size(const Mechanism& mechanism, const Tableau& tableau
     if (tableau.stages != 1 || tree.size() != n || tree.blocks.size() != 1) return nullptr;
     if (eliminates(mechanism, solver) || eliminates(tree, solver)) return nullptr;
     switch (n) {
-        case 2:
-            return make(Known<2>(n));
         case 3:
             return make(Known<3>(n));
+#ifndef VARPIN_FEW_SIZES
+        case 2:
+            return make(Known<2>(n));
         case 4:
             return make(Known<4>(n));
         case 6:
             return make(Known<6>(n));
         case 7:
             return make(Known<7>(n));
+#endif
         default:
             return nullptr;
     }
