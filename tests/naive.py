@@ -117,8 +117,8 @@ def hessian(f, x: np.ndarray) -> np.ndarray:
     return directional(lambda y: gradient(f, y), x, np.eye(x.size))
 
 
-def continuous(scene: vp.Scene, q, v, controls, dt, running, law=None):
-    """The continuous motion under controls held over dt, by a high-order method on Pinocchio's own dynamics.
+def continuous(scene: vp.Scene, q, v, controls, dt, running, law=None, method="DOP853", rtol=1e-11):
+    """The continuous motion under controls held over dt, by a method of SciPy on Pinocchio's own dynamics.
 
     ``running(t, q, v, u)`` is integrated beside it. With ``law(k, q, v, u)`` the control of interval k is that, else
     its row of ``controls``. Returns q (N + 1, n), v (N + 1, n) and the integral.
@@ -135,7 +135,7 @@ def continuous(scene: vp.Scene, q, v, controls, dt, running, law=None):
             return np.concatenate([at_v, pin.aba(model, data, at_q, at_v, force), [running(t, at_q, at_v, u)]])
 
         start = np.concatenate([qs[-1], vs[-1], [0.0]])
-        end = solve_ivp(slope, (k * dt, (k + 1) * dt), start, method="DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
+        end = solve_ivp(slope, (k * dt, (k + 1) * dt), start, method=method, rtol=rtol, atol=1e-2 * rtol).y[:, -1]
         qs.append(end[:n])
         vs.append(end[n : 2 * n])
         total += end[-1]

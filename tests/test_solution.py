@@ -116,6 +116,19 @@ def test_motion_that_runs_away():
     assert fine.accuracy <= 1e-6
 
 
+def test_dampers_far_faster_than_the_step_are_followed(load):
+    """An xarm7 with its file's dampers: the true cost by SciPy's Radau on Pinocchio's forward dynamics."""
+    problem, running, end = tracking("xarm7", vp.Gauss(4), damping=load("xarm7").damping, steps=6)
+    sol = vp.solve(problem)
+    found = sol.verify(tolerance=1e-7)
+    assert found.integrator == "Radau(stages=3)"
+    q, v, integral = continuous(
+        problem.scene, problem.q0, problem.v0, sol.controls, problem.dt, running, method="Radau", rtol=1e-9
+    )
+    assert found.open_loop_cost == pytest.approx(integral + end(q[-1], v[-1]), rel=1e-6)
+    assert found.open_loop_gap == pytest.approx(np.abs(q[-1] - sol.trajectory.q[-1]).max(), rel=1e-4)
+
+
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, "tight"])
 def test_wrong_tolerances(wrong):
     with pytest.raises(vp.InputError, match="tolerance"):

@@ -99,7 +99,8 @@ def add_integrator(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--integrator",
         metavar="NAME",
-        help=f"{', '.join(BY_NAME)}; with options as Python writes them, 'Gauss(stages=3)'; default: Midpoint",
+        help=f"{', '.join(BY_NAME)}; with options as Python writes them, 'Gauss(stages=3)'; default: Midpoint, "
+        "or Radau(stages=3) where dampers are faster than the step",
     )
     group.add_argument("--stages", type=int, metavar="N", help="of Gauss: 1 to 6, of order twice as many; default: 2")
     group.add_argument(

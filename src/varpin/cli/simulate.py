@@ -82,7 +82,7 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
         return _run(request, errors, file.scene, driven, file.spec.steps, lambda p: file.simulate(progress=p), outputs)
     outputs = outputs_of(request)
     steps = _steps(request)
-    free = request.tolerance is not None and request.integrator is request.stages is request.alpha is None
+    free = request.integrator is request.stages is request.alpha is None
     integrator = None if free else integrator_asked_for(request)
     scene, q0, v0, torque = motion_of(request)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 from varpin.control.costs import BoundSum
 from varpin.control.history import Status
 from varpin.control.problem import OptimalControlProblem, bind_cost
+from varpin.core import fastest_damping
 from varpin.core.arrays import Commands
-from varpin.integrators import Integrator, RungeKutta4
+from varpin.integrators import Integrator, Radau, RungeKutta4
 from varpin.integrators.base import open_loop
 from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.run import rollout
@@ -26,6 +28,10 @@ logger = logging.getLogger(__name__)
 
 # Above, the costs are not known well enough to say anything of the plan.
 _UNTOLD = 0.01
+# What the continuous system is integrated with; and where damping is faster than the plan's step by this factor, or is
+# at one of so many nodes.
+_USUAL, _FAST = RungeKutta4(), Radau(3)
+_FASTER, _NODES = 8.0, 8
 _READING = (
     "where feedback loses some percent, the plan holds; where it loses much, dt is too coarse (controls alone also "
     "lose much where a motion is unstable)"
@@ -48,6 +54,8 @@ class Verification:
         substeps: Of the accurate integration, in one step of the plan.
         accuracy: Relative change over the last doubling of the substeps, of the cost that changed more.
         status: How the search for the plan ended.
+        integrator: Of the accurate integration: ``Radau(stages=3)`` where dampers, friction or servos are much faster
+            than the plan's step.
     """
 
     planned_cost: float
@@ -59,6 +67,7 @@ class Verification:
     substeps: int
     accuracy: float
     status: Status = Status.CONVERGED
+    integrator: str = "RungeKutta4"
 
     @property
     def told(self) -> bool:
@@ -78,9 +87,9 @@ class Verification:
     @property
     def _untold(self) -> str:
         return (
-            f"these costs say nothing of the plan: with {self.substeps} Runge-Kutta steps in one of the plan's they "
-            f"still change by {percent(self.accuracy)}. Dampers or dry friction are too fast for it; simulate the "
-            "plan's policy with varpin.Radau(3) in small steps instead, or give max_substeps"
+            f"these costs say nothing of the plan: with {self.substeps} steps of {self.integrator} in one of its, "
+            f"they still change by {percent(self.accuracy)}. Springs, dampers or dry friction are too fast; give "
+            "a larger max_substeps"
         )
 
     @property
@@ -136,29 +145,33 @@ def verify(
     problem: OptimalControlProblem,
     plan: Trajectory,
     planned_cost: float,
-    policy: Callable[[int], LinearPolicy],
+    policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
     *,
     status: Status,
     tolerance: float,
     max_substeps: int,
     progress: Callable[[int, int], None] | None,
 ) -> Verification:
-    """Hold a plan, and its policy on (q, v) for a number of substeps, against accurate integrations.
+    """Hold a plan, and its policy on a state for a number of substeps, against accurate integrations.
 
     The substeps double until neither cost changes by more than ``tolerance`` of itself.
     """
+    integrator = _FAST if _fast(problem, plan) else _USUAL
+    state: Literal["momentum", "velocity"] = "momentum" if integrator.variational else "velocity"
     substeps, before = 2, (np.nan, np.nan)
     blind = open_loop(plan.u[:: problem.hold])
     while True:
         if progress is not None:
             progress(substeps, max_substeps)
         costs = _fine_costs(problem, substeps)
-        opened = accurate_cost(problem, blind._replace(hold=problem.hold * substeps), substeps, costs)
-        fed = policy(substeps)
-        feedback = fed.commands(
-            problem.steps * substeps, problem.scene.controls, problem.scene.robot.dof, variational=False
+        opened = accurate_cost(problem, blind._replace(hold=problem.hold * substeps), substeps, costs, integrator)
+        feedback = policy(state, substeps).commands(
+            problem.steps * substeps,
+            problem.scene.controls,
+            problem.scene.robot.dof,
+            variational=integrator.variational,
         )
-        closed = accurate_cost(problem, feedback, substeps, costs)
+        closed = accurate_cost(problem, feedback, substeps, costs, integrator)
         changes = [
             abs(now[0] - then) / max(abs(now[0]), 1e-300)
             for now, then in zip((opened, closed), before, strict=True)
@@ -176,14 +189,25 @@ def verify(
         closed_loop_cost=closed[0],
         open_loop_gap=float(np.abs(opened[1] - end).max()),
         closed_loop_gap=float(np.abs(closed[1] - end).max()),
-        defect=_defect(problem, plan, substeps),
+        defect=_defect(problem, plan, substeps, integrator),
         substeps=substeps,
         accuracy=accuracy,
         status=status,
+        integrator=str(integrator),
     )
     if not found.told:
         logger.warning("%s", found._untold)
     return found
+
+
+def _fast(problem: OptimalControlProblem, plan: Trajectory) -> bool:
+    """Whether dampers or friction are so fast that an explicit method would take many substeps to follow them."""
+    if not problem.scene.dissipates or not plan.steps:
+        return False
+    at = np.unique(np.linspace(0, plan.steps, _NODES, dtype=np.int64))
+    forces = np.ascontiguousarray(plan.u[np.minimum(at, plan.steps - 1)] @ problem.scene.actuation.T)
+    least = _FASTER / problem.dt
+    return fastest_damping(problem.scene.core, plan.q[at], plan.v[at], forces, least) > 0.0
 
 
 def _fine_costs(problem: OptimalControlProblem, substeps: int) -> tuple[BoundSum, BoundSum]:
@@ -218,10 +242,9 @@ def accurate_cost(
     return float(integral + end + smooth), motion.q[-1]
 
 
-def _defect(problem: OptimalControlProblem, trajectory: Trajectory, substeps: int) -> float:
+def _defect(problem: OptimalControlProblem, trajectory: Trajectory, substeps: int, integrator: Integrator) -> float:
     """Largest distance in q between the plan's steps and accurate ones from the same nodes."""
     scene, h, n = problem.scene, problem.dt / substeps, problem.scene.robot.dof
-    integrator = RungeKutta4()
     state, _ = integrator.start(scene, trajectory.q[:-1].copy(), trajectory.v[:-1].copy())
     # Every step is a path of its own, with its own control handed over as a force.
     commands = open_loop(np.zeros((1, scene.controls)))._replace(hold=substeps)

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.mechanics.forces import drive_forces
+from varpin.mechanics.forces import drive_forces, of_kind
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
 
@@ -33,6 +33,7 @@ def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
     if not any(scene.bounded):
         return
     robot, t = scene.robot, trajectory.t
+    stopped = {own.coordinate for own in of_kind(scene.elements, "JointStop")}
     for bounded, (kind, why, of, (least, most), beyond, units) in zip(
         scene.bounded,
         (
@@ -60,10 +61,12 @@ def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
             since = "from the start" if first == 0 else f"from t = {t[first]:.4g} s"
             side, limit = ("above", most[c]) if values[peak, c] > most[c] else ("below", least[c])
             amount = f"at most {worst[c]:.3g} {units[int(slides[c])]} {side} {limit:.4g} at t = {t[peak]:.4g} s"
-            parts.append(f"{robot.joint_names[c]!r} {since}, {amount}")
+            softly = " (its stop gives way)" if kind == POSITION and c in stopped else ""
+            parts.append(f"{robot.joint_names[c]!r} {since}, {amount}{softly}")
         if parts:
             more = f"; and {len(joints) - _NAMED} more" if len(joints) > _NAMED else ""
-            yield kind, f"{kind}, {why}: {'; '.join(parts)}{more}"
+            reason = "" if kind == POSITION and set(joints) <= stopped else f", {why}"
+            yield kind, f"{kind}{reason}: {'; '.join(parts)}{more}"
 
 
 def _positions(_: Scene, trajectory: Trajectory) -> Floats:

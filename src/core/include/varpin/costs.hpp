@@ -13,8 +13,8 @@
 
 namespace varpin {
 
-// A frame that stands at `offset` in the last of some bodies. Or, in the place of one, the centre of mass of all of them:
-// it has a position and no more.
+// A frame that stands at `offset` in the last of some bodies. Or, in the place of one, the centre of mass of all of
+// them: it has a position and no more.
 struct CostFrame {
     Links links;
     Placement offset;
