@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 Members = Mapping[str, NDArray[Any]]
 
 _FORMAT = "varpin.solution/2"
-_PROBLEM = ("q0", "v0", "t0", "steps", "hold", "sampling", "control_limits")
+_PROBLEM = ("q0", "v0", "t0", "steps", "hold", "controls", "sampling", "control_limits")
 _NUMBERS = ("cost", "above", "first", "best_cost", "best_noise", "regularization", "growth")
 _COLUMNS = tuple(item.name for item in fields(Iteration))
 
@@ -117,7 +117,7 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     if not abs(found - plan.cost) <= 1e-9 * max(abs(found), abs(plan.cost)):
         raise FileError(f"{source} is of a problem with another cost: {plan.cost:.9g}, and here {found:.9g}")
     history = _iterations(source, plan.history)
-    if problem.rate is not None and plan.previous_gains is None:
+    if (problem.rate is not None or problem.linear) and plan.previous_gains is None:
         raise FileError(f"{source}: previous_gains is missing")
     given = {item.name: getattr(plan, item.name) for item in fields(_Plan) if item.name != "best"}
     given |= {"status": Status[plan.status], "history": history}
@@ -187,6 +187,8 @@ def _surroundings(problem: OptimalControlProblem) -> dict[str, Floats]:
 def _require_problem(source: Path, members: Members, problem: OptimalControlProblem) -> None:
     """Refuse a solution of another problem, by its numbers and its noise."""
     given = {name: getattr(problem, name) for name in (*_PROBLEM, "dt")}
+    # Files without a word of it are older than the choice.
+    members = {"controls": np.array("held"), **members}
     for name, value in (given | {"problem.integrator": repr(problem.integrator)}).items():
         if name not in members or not np.array_equal(members[name], value):
             what = name.removeprefix("problem.")

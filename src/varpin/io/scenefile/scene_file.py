@@ -93,6 +93,7 @@ class SceneFile:
                 sampling=spec.sampling,  # type: ignore[arg-type]
                 hold=spec.hold,
                 control_limits=(-most, most),
+                controls=spec.shape,  # type: ignore[arg-type]
             )
         except (InputError, CostError) as error:
             raise spec.root.error("cost", str(error)) from None
@@ -182,7 +183,7 @@ class SceneFile:
 
     def _planned_apart(self, options: dict[str, Any]) -> LinearPolicy | None:
         """The policies of all groups of joints side by side; None where they cannot be planned apart."""
-        if not self._parts:
+        if not self._parts or self.spec.shape == "linear":
             return None
         problem, driven = self.problem, self._layout.driven
         names, n, m, R = self.robot.joint_names, self.robot.dof, self.scene.controls, problem.decisions
