@@ -68,6 +68,8 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
     problem, motion = solution.problem, solution.trajectory
     _, found = examined(problem.scene, problem.integrator, motion)
     told = [finding for finding in found if finding.kind not in (*_OF_STEPS, _ALTERNATION)]
+    if solution.refinement is not None and not solution.refinement.met:
+        told.append(Finding("true cost", solution.refinement.reason))
     told += _unfinished(solution) + (_alternating(solution) or _restless(solution))
     try:
         replay = replayed(solution)

@@ -19,6 +19,7 @@ from varpin.control.descent import rounding
 from varpin.control.examination import looked_at
 from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.refinement import refine
 from varpin.control.solution import Solution
 from varpin.control.trials import Attempt, Trials
 from varpin.core import Watch
@@ -92,6 +93,7 @@ def solve(
     resume: Solution | None = None,
     progress: Progress | None = None,
     check: bool = True,
+    true_cost: float | None = None,
 ) -> Solution:
     """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
 
@@ -145,6 +147,12 @@ def solve(
         check: Look at the finished plan, whether it costs in finer steps what it promises and its velocities neither
             alternate nor go up and down all the time, for ``Solution.warnings`` and the log. It takes as long as some
             motions of the search.
+        true_cost: How far the cost of the plan with its feedback on the continuous system may be from what the plan
+            says, relative to that: 0.01 for a percent. The problem's step is the coarsest; half of it follows, from
+            the plan before, until :meth:`Solution.verify` says that the wish is met. ``Solution.problem`` has the step
+            of the plan, ``Solution.refinement`` what it took, or why the wish cannot be met, which is a warning, too.
+            Controls that are held over several steps keep their period. ``max_iterations`` is for each step,
+            ``time_limit`` for all; Ctrl-C keeps the best plan so far.
 
     Returns:
         The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers, and
@@ -181,6 +189,30 @@ def solve(
         if progress is not None:
             # Convergence may take a last look after the last iteration.
             progress(min(item.index + 1 - known, max_iterations), max_iterations)
+
+    if true_cost is not None:
+        if resume is not None:
+            raise InputError("true_cost begins with a search of its own: leave out either resume or true_cost")
+
+        def once(finer: OptimalControlProblem, start: LinearPolicy | None) -> Solution:
+            return solve(
+                finer,
+                controls if start is None else start,
+                tolerance=tolerance,
+                max_iterations=max_iterations,
+                second_order=second_order,
+                forward=forward,
+                armijo=armijo,
+                backtracking=backtracking,
+                regularization=regularization,
+                time_limit=max(deadline - time.perf_counter(), 1e-9),
+                callback=callback,
+                progress=progress,
+                check=False,
+            )
+
+        refined = refine(problem, once, positive("true_cost", true_cost, "1"), lambda: deadline - time.perf_counter())
+        return looked_at(refined)[0] if check else refined
 
     search = _Search(problem, second_order, forward, armijo, backtracking, regularization)
     if resume is None:

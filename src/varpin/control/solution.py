@@ -16,6 +16,7 @@ from varpin.control.costs import barriers_of
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.refined import Refinement
 from varpin.control.solution_file import read, write
 from varpin.control.verification import Verification, verify
 from varpin.errors import InputError
@@ -96,7 +97,8 @@ class Solution(Frozen):
         search: From where :func:`varpin.solve` can go on, with ``resume``.
         warnings: What looks wrong with the plan, in sentences that say what to change: it costs more than planned when
             its steps are taken in quarters, its velocities alternate or go up and down all the time, its energy balance
-            does not close.
+            does not close, a wish for its true cost is not met.
+        refinement: What finding the step took where a true cost was wished for; else None.
     """
 
     problem: OptimalControlProblem
@@ -112,6 +114,7 @@ class Solution(Frozen):
     search: SearchState | None = None
     previous_gains: Floats | None = None
     warnings: tuple[str, ...] = ()
+    refinement: Refinement | None = None
 
     def __post_init__(self) -> None:
         for array in (self.gains, self.feedforward, self.gradient, self.previous_gains):
@@ -189,7 +192,9 @@ class Solution(Frozen):
     def table(self) -> str:
         """The iterations, one row each, and how and why they ended; :class:`Solution` explains the columns."""
         warned = (f"warning: {sentence}" for sentence in self.warnings)
-        return "\n".join([Iteration.HEADER, *map(str, self.history), *warned, self.status.value, f"({self.reason})"])
+        refined = [] if self.refinement is None else str(self.refinement).splitlines()
+        ended = [self.status.value, f"({self.reason})"]
+        return "\n".join([Iteration.HEADER, *map(str, self.history), *refined, *warned, *ended])
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the solution as a compressed npz file without pickle; returns its path.

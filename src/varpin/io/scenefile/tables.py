@@ -302,6 +302,7 @@ class SolveKeys(Keys):
     second_order: Annotated[bool, FLAG] = False
     forward: Annotated[str, word("closed", "open")] = "closed"
     regularization: Annotated[float, number(least=0.0)] = 0.0
+    true_cost: Annotated[float, number(above=0.0)] = 0.0
 
 
 def _output(*endings: str) -> Rule:
