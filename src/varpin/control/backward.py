@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from varpin import core
 from varpin.control.costs import CostError, Expansion
 from varpin.control.descent import Model, Stake, at_stake
-from varpin.control.lines import RULE, Derivatives, LinearSteps, linear_steps, size
+from varpin.control.lines import RULE, Derivatives, LinearSteps, at_samples, linear_steps, size
+from varpin.control.moments import Feedback, noise_gradient
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.square_root import Squares, squares_of
 from varpin.errors import LinearizationError
@@ -250,6 +251,8 @@ class Along:
         if problem.linear:
             self.blocks, self.states = [(0, problem.decisions)], size(problem)
         self.kept: tuple[Linearization, Floats] | None = None
+        # What is added to the cost's gradient at its samples (N s, 2n + m): of the noise, where it is differentiated.
+        self.added: Floats | float = 0.0
 
     @cached_property
     def running(self) -> Expansion:
@@ -259,6 +262,26 @@ class Along:
             if not np.isfinite(array).all():
                 raise CostError(repr(problem.cost), f"its {name} along the motion is not finite")
         return found
+
+    def differentiate_noise(self, plan: Plan) -> None:
+        """Let passes from here on have the whole gradient of what noise adds under the gains of ``plan``."""
+        problem, N = self.problem, self.problem.steps
+        lin, velocity = self.linearized(0, N)
+        feedback = Feedback(plan.feedback, plan.previous)
+        pull = noise_gradient(problem, self.trajectory, feedback, self.rate)
+        # A gradient in (x, u) is one in (q, v, u) at the step's first sample.
+        rule, x, m = problem.rule, 2 * problem.scene.robot.dof, problem.scene.controls
+        D = np.zeros((N, x + m, x + m))
+        D[:, :x] = at_samples(rule[:1], np.concatenate([lin.A, lin.B], axis=2), velocity)[0]
+        D[:, x:, x:] = np.eye(m)
+        added = np.zeros((N, len(rule), x + m))
+        added[:, 0] = np.linalg.solve(np.swapaxes(D, 1, 2), pull[:, :, None])[:, :, 0] / (problem.dt * rule[0, 0])
+        self.added = added.reshape(-1, x + m)
+
+    @property
+    def slopes(self) -> Floats:
+        """The gradient of the running cost at its samples, with what is added to it."""
+        return self.running.gradient + self.added
 
     @cached_property
     def stake(self) -> Stake:
@@ -322,7 +345,7 @@ class Along:
             Gx=lin.Gx,
             Gu=lin.Gu,
             rule=problem.rule,
-            gradient=self.running.gradient[points],
+            gradient=self.slopes[points],
             hessian=hessian[points] if len(hessian) > 1 else hessian,
             velocity=velocity,
             curvature=np.zeros((0, size, size)) if curvature is None else curvature[begin:end],
@@ -412,7 +435,7 @@ def _one_pass(
     if roots:
         final, squares = (
             squares_of(along.terminal.cost.gradient, along.terminal.cost.hessian),
-            squares_of(running.gradient, running.hessian),
+            squares_of(along.slopes, running.hessian),
         )
         change = squares_of(along.pull, along.rate)
         if final is None or squares is None or change is None:

@@ -88,23 +88,35 @@ def linear_steps(
 
 def _sampled(problem: OptimalControlProblem, found: Derivatives) -> list[Floats]:
     """D (N, 2n + m, 2n + 2m) of (q, v, u) at each sample of the steps in (x, w, u)."""
-    n, m, N = problem.scene.robot.dof, problem.scene.controls, problem.steps
-    x = 2 * n
-    before = np.zeros((N, x, x + 2 * m))
-    before[:, :, :x] = np.eye(x)
+    m, x = problem.scene.controls, 2 * problem.scene.robot.dof
     after = np.concatenate([found.A, found.begin, found.end], axis=2)
+    parts = []
+    for D, share in zip(at_samples(problem.rule, after, found.velocity), problem.places, strict=True):
+        own = np.zeros((len(D), m, x + 2 * m))
+        own[:, :, x : x + m], own[:, :, x + m :] = (1.0 - share) * np.eye(m), share * np.eye(m)
+        parts.append(np.concatenate([D, own], axis=1))
+    return parts
+
+
+def at_samples(rule: Floats, J: Floats, velocity: Floats) -> list[Floats]:
+    """D (N, 2n, y) of (q, v) at each sample of N steps, in the y variables of J (N, 2n, y), the state x the first.
+
+    ``velocity`` is dv/dx (N + 1, n, 2n) at nodes, or (0, n, 2n) where x holds v or nobody asks.
+    """
+    N, x, size = J.shape
+    n = x // 2
+    before = np.zeros((N, x, size))
+    before[:, :, :x] = np.eye(x)
     # Of (q, v) at the nodes before and after a step.
     nodes = []
-    for end, J in enumerate((before, after)):
-        nodes += [J[:, :n], found.velocity[end : N + end] @ J if len(found.velocity) else J[:, n:]]
+    for end, own in enumerate((before, J)):
+        nodes += [own[:, :n], velocity[end : N + end] @ own if len(velocity) else own[:, n:]]
     parts = []
-    for row, share in zip(problem.rule, problem.places, strict=True):
-        D = np.zeros((N, x + m, x + 2 * m))
+    for row in rule:
+        D = np.zeros((N, x, size))
         for half in range(2):
             for weight, node in zip(row[1 + 4 * half : 5 + 4 * half], nodes, strict=True):
                 if weight:
                     D[:, half * n : (half + 1) * n] += weight * node
-        D[:, x:, x : x + m] = (1.0 - share) * np.eye(m)
-        D[:, x:, x + m :] = share * np.eye(m)
         parts.append(D)
     return parts
