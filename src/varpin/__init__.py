@@ -92,6 +92,8 @@ if TYPE_CHECKING:
     from varpin.control import MonteCarlo as MonteCarlo
     from varpin.control import MonteCarloInterrupted as MonteCarloInterrupted
     from varpin.control import OptimalControlProblem as OptimalControlProblem
+    from varpin.control import Refined as Refined
+    from varpin.control import Refinement as Refinement
     from varpin.control import SearchState as SearchState
     from varpin.control import Solution as Solution
     from varpin.control import Status as Status
@@ -184,6 +186,8 @@ _LATE: dict[str, tuple[str, ...]] = {
         "MonteCarlo",
         "MonteCarloInterrupted",
         "OptimalControlProblem",
+        "Refined",
+        "Refinement",
         "SearchState",
         "Solution",
         "Status",

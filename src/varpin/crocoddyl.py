@@ -160,6 +160,8 @@ def shooting_problem(problem: OptimalControlProblem) -> crocoddyl.ShootingProble
     """
     if problem.rate is not None:
         raise InputError("crocoddyl's actions know no control but their own: leave the ControlRateCost out")
+    if problem.linear:
+        raise InputError("crocoddyl's actions hold their control over a step; the problem's are linear between nodes")
     if problem.hold != 1:
         raise InputError(f"crocoddyl decides at every step; the problem holds its controls over {problem.hold}")
     x0 = _state(problem, problem.q0, problem.v0)

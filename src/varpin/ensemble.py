@@ -230,6 +230,8 @@ def simulate_ensemble(
             raise InputError("controls are needed: the scene has servos, and the paths begin at different positions")
         controls = scene.command_at(start[0][0])
     commands = commands_of(scene, integrator, controls, steps, dt)
+    if len(commands.places):
+        raise InputError("an ensemble takes controls that are held; those of the policy are linear between nodes")
     with executing(executor, workers) as pool:
         shared = Shared(without_geometry(scene), integrator, commands, dt, steps, children(rng, paths))
         sums = _Sums(shared, paths, levels, store=store)

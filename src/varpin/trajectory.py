@@ -190,6 +190,8 @@ class Trajectory(Frozen):
         u_stages: Controls (N, s, m) at the stages of each step, where they change within it
             (:class:`varpin.OpenLoop`, :class:`varpin.FirstOrderHold`, with a method of several stages); else (N, 0, m).
             The motion is that under the polynomial through them.
+        u_nodes: Controls at the nodes (N + 1, m) of a policy or a plan whose controls are linear between them; of other
+            motions (N + 1, 0).
         accuracy: The estimated error, and what finding integrator and step took, of a motion that was asked for with a
             tolerance; None of others.
         constraint_forces: Of a scene's constraints, the mean over each step (N, c) [N or N m]: the joints feel
@@ -223,6 +225,9 @@ class Trajectory(Frozen):
     u_stages: Annotated[Floats, Axes("steps", "stages", "controls", finite=True)] = field(
         default_factory=lambda: np.zeros((0, 0, 0)), repr=False
     )
+    u_nodes: Annotated[Floats, Axes("nodes", "lines", finite=True)] = field(
+        default_factory=lambda: np.zeros((0, 0)), repr=False
+    )
 
     def __post_init__(self) -> None:
         if not self.constraint_labels and not np.size(self.constraint_forces):
@@ -239,7 +244,10 @@ class Trajectory(Frozen):
         if not np.size(self.u_stages):
             object.__setattr__(self, "u_stages", np.zeros((nodes - 1, 0, self.u.shape[1])))
         self._require("u_stages", (nodes - 1, np.shape(self.u_stages)[1], self.u.shape[1]))
-        for name in (*_ARRAYS, "constraint_forces", "u_stages"):
+        if not np.size(self.u_nodes):
+            object.__setattr__(self, "u_nodes", np.zeros((nodes, 0)))
+        self._require("u_nodes", (nodes, self.u.shape[1] if self.u_nodes.shape[1] else 0))
+        for name in (*_ARRAYS, "constraint_forces", "u_stages", "u_nodes"):
             getattr(self, name).setflags(write=False)
         for array in vars(self.statistics).values():
             array.setflags(write=False)
@@ -266,7 +274,7 @@ class Trajectory(Frozen):
         nodes, steps = slice(begin, end + 1), slice(begin, end)
         return replace(
             self,
-            **{name: getattr(self, name)[nodes] for name in ("t", "q", "v", "p", "energy")},
+            **{name: getattr(self, name)[nodes] for name in ("t", "q", "v", "p", "energy", "u_nodes")},
             u=self.u[steps],
             u_stages=self.u_stages[steps],
             dw=self.dw[steps],
@@ -412,6 +420,8 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
         name: np.concatenate([getattr(first, name)[:1], *(getattr(part, name)[1:] for part in parts)])
         for name in ("q", "v", "p", "energy")
     }
+    # At the node where two motions meet each may have a control of its own.
+    arrays["u_nodes"] = np.zeros((steps + 1, 0))
     of_steps = ("u", "u_stages", "dw", "constraint_forces")
     arrays |= {name: np.concatenate([getattr(part, name) for part in parts]) for name in of_steps}
     return replace(

@@ -87,6 +87,7 @@ class CommandArrays {
           limits(field<In<2>>(commands, "limits")),
           before(field<In<2>>(commands, "before")),
           within(field<In<3>>(commands, "within")),
+          places(field<In<1>>(commands, "places")),
           hold(nb::cast<int>(commands.attr("hold"))) {
         const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
         const std::size_t decisions = u.shape(0), width = gains.shape(2);
@@ -101,6 +102,12 @@ class CommandArrays {
         }
         require(limits, "limits", {2, m});
         earlier = given(before, "before", {paths, m});
+        linear = places.shape(0) > 0;
+        if (linear) {
+            require(places, "places", {static_cast<std::size_t>(stages)});
+            if (!earlier && steps > 0) throw std::invalid_argument("controls on a line begin at the control before");
+            if (within.shape(0) > 0) throw std::invalid_argument("controls are on a line or given at stages");
+        }
         if (within.shape(0) == 0) return;
         require(within, "within", {steps, static_cast<std::size_t>(stages), m});
         if (feedback || hold != 1)
@@ -119,7 +126,8 @@ class CommandArrays {
                 limits.data(),
                 limits.data() + m,
                 earlier ? before.data() : nullptr,
-                changing ? within.data() : nullptr};
+                changing ? within.data() : nullptr,
+                linear ? places.data() : nullptr};
     }
 
   private:
@@ -127,10 +135,12 @@ class CommandArrays {
     In<3> gains;
     In<2> reference, limits, before;
     In<3> within;
+    In<1> places;
     int hold;
     bool feedback = false;  // whether there are gains
     bool earlier = false;   // whether the controls before the first are known
     bool changing = false;  // whether controls change within steps
+    bool linear = false;    // whether they are linear over each decision's steps
 };
 
 // Increments of Wiener processes (P, N, k), or null where there are none: (0, 0, k), or k = 0.

@@ -34,19 +34,28 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", metavar="SCENE", help="path of a scene file (TOML), or name of a scene of varpin")
     parser.add_argument("--resume", type=Path, metavar="NPZ", help="go on from a solution that --save wrote")
     parser.add_argument("--max-iterations", type=int, metavar="N", help="at most; default: the scene's, or 100")
+    parser.add_argument(
+        "--true-cost",
+        type=float,
+        metavar="PART",
+        help="halve the scene's step until the plan's cost on the continuous system is this close to what the plan "
+        "says: 0.01 for a percent",
+    )
     add_outputs(parser, "solution")
 
 
 def _solve(request: argparse.Namespace, errors: Console) -> int:
     file = scene_file(request, request.scene, "solve")
     outputs = outputs_of(request, file.marks)
-    options = {} if request.max_iterations is None else {"max_iterations": request.max_iterations}
+    given = {"max_iterations": request.max_iterations, "true_cost": request.true_cost}
+    options = {name: value for name, value in given.items() if value is not None}
     resume = None if request.resume is None else file.load_solution(request.resume)
     with request.interrupts.keeping():
         begin = time.perf_counter()
         solution = file.solve(resume=resume, **options)
         wall_time = time.perf_counter() - begin
-        status = 0 if solution.status.converged else STEP_FAILED
+        unmet = solution.refinement is not None and not solution.refinement.met
+        status = 0 if solution.status.converged and not unmet else STEP_FAILED
         if solution.status is Status.INTERRUPTED:
             status = INTERRUPTED
         saved = None if request.save is None else writable(request.save)
@@ -65,6 +74,8 @@ def _solve(request: argparse.Namespace, errors: Console) -> int:
         console.print(_plan_table(file, solution, wall_time, written))
     if not solution.status.converged:
         say(errors, solution.status.value, style="yellow")
+    if unmet and solution.refinement is not None:
+        say(errors, solution.refinement.reason, style="yellow")
     return status
 
 
@@ -76,6 +87,10 @@ def _plan_table(file: SceneFile, solution: Solution, wall_time: float, files: It
     add_row(table, "status", solution.status.value, style="" if solution.status.converged else "bold yellow")
     noise = f", and {solution.noise_cost:.6g} by noise" if solution.noise_cost else ""
     add_row(table, "cost", f"{solution.cost:.6g}{noise}, after {solution.iterations} iterations")
+    if solution.refinement is not None and solution.refinement.tried:
+        tried = solution.refinement.tried[solution.refinement.chosen]
+        steps = ", ".join(f"{row.dt:g} s" for row in solution.refinement.tried)
+        add_row(table, "true cost", f"{tried.true_cost:.6g}, of the steps {steps}")
     add_row(table, "wall time", f"{wall_time:.3g} s")
     most = np.abs(solution.trajectory.u).max(axis=0, initial=0.0)
     add_row(table, "largest controls", "  ".join(f"{value:.4g}" for value in most))

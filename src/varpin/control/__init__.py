@@ -7,6 +7,8 @@ from varpin.control.history import Status as Status
 from varpin.control.monte_carlo import MonteCarlo as MonteCarlo
 from varpin.control.monte_carlo import MonteCarloInterrupted as MonteCarloInterrupted
 from varpin.control.problem import OptimalControlProblem as OptimalControlProblem
+from varpin.control.refined import Refined as Refined
+from varpin.control.refined import Refinement as Refinement
 from varpin.control.search import replan as replan
 from varpin.control.search import solve as solve
 from varpin.control.solution import Solution as Solution

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from varpin import core
 from varpin.control.costs import CostError, Expansion
 from varpin.control.descent import Model, Stake, at_stake
+from varpin.control.lines import RULE, Derivatives, LinearSteps, at_samples, linear_steps, size
+from varpin.control.moments import Feedback, noise_gradient
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.square_root import Squares, squares_of
 from varpin.errors import LinearizationError
@@ -39,7 +41,7 @@ class Plan:
 
     feedforward: Floats  # (R, m)
     feedback: Floats  # (R, m, 2n)
-    previous: Floats | None  # (R, m, m) gains on the control before, where its change costs something
+    previous: Floats | None  # (R, m, m) gains on the control before, where its change costs something or it acts on
     gradient: Floats  # (R, m)
     slope: float
     curvature: float
@@ -65,7 +67,7 @@ class Plan:
         """The gradient (R, m) without what pushes controls against limits they are at: zero at an optimum."""
         if not problem.limited:
             return self.gradient
-        u, (lower, upper) = trajectory.u[:: problem.hold], problem.control_limits
+        u, (lower, upper) = problem.decided(trajectory), problem.control_limits
         held = ((u <= lower) & (self.gradient > 0.0)) | ((u >= upper) & (self.gradient < 0.0))
         return np.where(held, 0.0, self.gradient)
 
@@ -187,7 +189,7 @@ def _within_limits(along: Along, regularization: float, curvature: Floats | None
         slope = float((plan.gradient * _foreseen(along, plan)[1]).sum())
         if slope < 0.0:
             return replace(plan, slope=slope, curvature=-2.0 * (plan.expected_decrease + slope), limited=True)
-    nominal = _Limits(along.slack, np.zeros((0, along.running.gradient.shape[1])))
+    nominal = _Limits(along.slack, np.zeros((0, along.states + along.problem.scene.controls)))
     return _pass(along, regularization, curvature=curvature, limits=nominal)[0]
 
 
@@ -195,15 +197,21 @@ def _foreseen(along: Along, plan: Plan) -> tuple[Floats, Floats]:
     """Where the linearized motion goes under a plan whose controls are clipped to their limits.
 
     The state, and the change of the control before, before each decision (R, 2n + m), and the controls' changes (R, m).
+    Where controls are linear between nodes the state is X of :mod:`varpin.control.lines`.
     """
-    problem, (R, m, x) = along.problem, plan.feedback.shape
+    problem, (R, m, _), x = along.problem, plan.feedback.shape, along.states
+    feedback = plan.feedback
+    if problem.linear and plan.previous is not None:
+        feedback = np.zeros((R, m, x))
+        feedback[:, :, : plan.feedback.shape[2]] = plan.feedback
+        feedback[:, :, plan.feedback.shape[2] :][:, :, :m] = plan.previous
     expected, moves, state = np.empty((R, x + m)), np.empty((R, m)), np.zeros(x + m)
-    previous = np.zeros((0, m, m)) if plan.previous is None else plan.previous
+    previous = np.zeros((0, m, m)) if plan.previous is None or problem.linear else plan.previous
     for begin, end in along.blocks:
         rows = slice(begin // problem.hold, end // problem.hold)
         gains = core.Gains(
             feedforward=plan.feedforward[rows],
-            feedback=plan.feedback[rows],
+            feedback=feedback[rows],
             previous=previous[rows],
             control_gradient=plan.gradient[rows],
             costate=np.zeros((0, x)),
@@ -232,13 +240,19 @@ class Along:
         m = problem.scene.controls
         self.rate, self.pull = np.zeros((0, m, m)), np.zeros((0, m))
         if problem.rate is not None:
-            self.pull, self.rate = problem.rate.expand(trajectory.u[:: problem.hold], problem.period)
+            self.pull, self.rate = problem.rate.expand(problem.decided(trajectory), problem.period)
         self.slack = np.zeros((0, 2, m))
         if problem.limited:
-            self.slack = problem.control_limits - trajectory.u[:: problem.hold, None]
+            self.slack = problem.control_limits - problem.decided(trajectory)[:, None]
         block = max(1, _BLOCK // problem.hold) * problem.hold
         self.blocks = [(max(0, end - block), end) for end in range(problem.steps, 0, -block)][::-1]
+        # The states of the pass: with a control that acts on among them.
+        self.states = 2 * problem.scene.robot.dof
+        if problem.linear:
+            self.blocks, self.states = [(0, problem.decisions)], size(problem)
         self.kept: tuple[Linearization, Floats] | None = None
+        # What is added to the cost's gradient at its samples (N s, 2n + m): of the noise, where it is differentiated.
+        self.added: Floats | float = 0.0
 
     @cached_property
     def running(self) -> Expansion:
@@ -248,6 +262,26 @@ class Along:
             if not np.isfinite(array).all():
                 raise CostError(repr(problem.cost), f"its {name} along the motion is not finite")
         return found
+
+    def differentiate_noise(self, plan: Plan) -> None:
+        """Let passes from here on have the whole gradient of what noise adds under the gains of ``plan``."""
+        problem, N = self.problem, self.problem.steps
+        lin, velocity = self.linearized(0, N)
+        feedback = Feedback(plan.feedback, plan.previous)
+        pull = noise_gradient(problem, self.trajectory, feedback, self.rate)
+        # A gradient in (x, u) is one in (q, v, u) at the step's first sample.
+        rule, x, m = problem.rule, 2 * problem.scene.robot.dof, problem.scene.controls
+        D = np.zeros((N, x + m, x + m))
+        D[:, :x] = at_samples(rule[:1], np.concatenate([lin.A, lin.B], axis=2), velocity)[0]
+        D[:, x:, x:] = np.eye(m)
+        added = np.zeros((N, len(rule), x + m))
+        added[:, 0] = np.linalg.solve(np.swapaxes(D, 1, 2), pull[:, :, None])[:, :, 0] / (problem.dt * rule[0, 0])
+        self.added = added.reshape(-1, x + m)
+
+    @property
+    def slopes(self) -> Floats:
+        """The gradient of the running cost at its samples, with what is added to it."""
+        return self.running.gradient + self.added
 
     @cached_property
     def stake(self) -> Stake:
@@ -273,6 +307,15 @@ class Along:
             g, H = D.T @ g, D.T @ H @ D
         return _Terminal(cost, D, g, H)
 
+    @cached_property
+    def line(self) -> LinearSteps:
+        """The steps with the control in the state, where controls are linear between nodes."""
+        problem, running = self.problem, self.running
+        lin, velocity = self.linearized(0, problem.steps)
+        ramp = problem.integrator.ramps(problem.scene, self.trajectory) @ problem.scene.actuation
+        found = Derivatives(lin.A, lin.B - ramp, ramp, velocity)
+        return linear_steps(problem, found, running.gradient, running.hessian, self.rate, self.pull)
+
     def linearized(self, begin: int, end: int) -> tuple[Linearization, Floats]:
         """A block of steps, and dv/dx at its nodes where they are needed."""
         if self.kept is not None:
@@ -289,6 +332,8 @@ class Along:
 
     def steps(self, begin: int, end: int, curvature: Floats | None, limits: _Limits) -> core.ExpandedSteps:
         """A block of steps as the core takes them."""
+        if self.problem.linear:
+            return self._on_lines(limits)
         problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.rule)
         size = hessian.shape[-1]
         rows, points = slice(begin // problem.hold, end // problem.hold), slice(begin * samples, end * samples)
@@ -300,7 +345,7 @@ class Along:
             Gx=lin.Gx,
             Gu=lin.Gu,
             rule=problem.rule,
-            gradient=self.running.gradient[points],
+            gradient=self.slopes[points],
             hessian=hessian[points] if len(hessian) > 1 else hessian,
             velocity=velocity,
             curvature=np.zeros((0, size, size)) if curvature is None else curvature[begin:end],
@@ -308,6 +353,25 @@ class Along:
             expected=limits.expected[rows],
             rate=self.rate[rows],
             pull=self.pull[rows],
+        )
+
+    def _on_lines(self, limits: _Limits) -> core.ExpandedSteps:
+        N, X, m = self.line.B.shape
+        return core.ExpandedSteps(
+            A=self.line.A,
+            B=self.line.B,
+            G=np.zeros((N, X, 0)),
+            Gx=np.zeros((N, X, 0, X)),
+            Gu=np.zeros((N, X, 0, m)),
+            rule=RULE,
+            gradient=self.line.gradient,
+            hessian=self.line.hessian,
+            velocity=np.zeros((0, X // 2, X)),
+            curvature=np.zeros((0, X + m, X + m)),
+            slack=limits.slack,
+            expected=limits.expected,
+            rate=np.zeros((0, m, m)),
+            pull=np.zeros((0, m)),
         )
 
 
@@ -360,6 +424,8 @@ def _one_pass(
     if curvature is not None and problem.integrator.variational:
         pull = along.terminal.cost.gradient[:, n:]
         by_states = by_states + velocity_curvature(scene, along.trajectory.q[-1:], along.trajectory.v[-1:], pull)[0]
+    if problem.linear:
+        return _one_pass_on_lines(along, regularization, limits, roots=roots), np.empty((0, 2 * n))
     noisy = N if k else 0
     jumps, spread = np.empty((noisy, 2 * n, n)), np.empty((noisy, 2 * n, 2 * n))
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, 2 * n)), np.empty((R, m))
@@ -369,7 +435,7 @@ def _one_pass(
     if roots:
         final, squares = (
             squares_of(along.terminal.cost.gradient, along.terminal.cost.hessian),
-            squares_of(running.gradient, running.hessian),
+            squares_of(along.slopes, running.hessian),
         )
         change = squares_of(along.pull, along.rate)
         if final is None or squares is None or change is None:
@@ -418,6 +484,55 @@ def _one_pass(
         along.model,
     )
     return plan, costate
+
+
+def _one_pass_on_lines(along: Along, regularization: float, limits: _Limits | None, *, roots: bool) -> Plan | None:
+    """The pass of a plan whose controls are linear between nodes."""
+    problem, X, x = along.problem, along.states, 2 * along.problem.scene.robot.dof
+    R, m = problem.decisions, problem.scene.controls
+    cost, D, by_state, by_states = along.terminal
+    end_gradient, end_hessian = np.zeros(X), np.zeros((X, X))
+    end_gradient[:x], end_hessian[:x, :x] = by_state, by_states
+    feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, X)), np.empty((R, m))
+    gains = core.Gains(
+        feedforward=feedforward,
+        feedback=feedback,
+        previous=np.empty((0, m, m)),
+        control_gradient=gradient,
+        costate=np.empty((0, X)),
+        spread=np.empty((0, X, X)),
+    )
+    steps = along.steps(0, R, None, limits or _Limits(np.zeros((0, 2, m)), np.zeros((0, X + m))))
+    how = (problem.dt, 1, float(regularization))
+    found: core.BackwardPass | core.RootPass
+    if roots:
+        final = squares_of(cost.gradient, cost.hessian)
+        squares = squares_of(along.line.gradient, along.line.hessian)
+        change = squares_of(np.zeros((0, m)), np.zeros((0, m, m)))
+        if final is None or squares is None or change is None:
+            return None
+        wide = np.concatenate([D, np.zeros((x, X - x))], axis=1)
+        found = core.RootPass(m, final.after(wide).core, end_gradient)
+        failed = found.run(*how, steps, gains, squares.core, change.core)
+    else:
+        found = core.BackwardPass(m, end_gradient, end_hessian)
+        failed = found.run(*how, steps, gains)
+    if failed >= 0 or not (np.isfinite(found.slope) and np.isfinite(found.curvature)):
+        return None
+    return Plan(
+        feedforward,
+        feedback[:, :, :x].copy(),
+        feedback[:, :, x : x + m].copy(),
+        gradient,
+        found.slope,
+        found.curvature,
+        0.0,
+        np.empty((0, x, x // 2)),
+        np.empty((0, x, x)),
+        limits is not None,
+        found.loss,
+        along.model,
+    )
 
 
 def _linearize(problem: OptimalControlProblem, part: Trajectory, begin: int) -> Linearization:

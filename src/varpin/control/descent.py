@@ -87,14 +87,14 @@ def at_stake(problem: OptimalControlProblem, trajectory: Trajectory, model: Mode
         free += factor * float(could.sum())
         moved += factor * float(np.minimum(could, does).sum())
     if problem.rate is not None:
-        rate = float(problem.rate.value(trajectory.u[:: problem.hold], problem.period))
+        rate = float(problem.rate.value(problem.decided(trajectory), problem.period))
         free, moved = free + rate, moved + rate
     return Stake(free, moved)
 
 
 def _variables(problem: OptimalControlProblem, trajectory: Trajectory) -> tuple[Floats, Floats]:
     """(q, v, u) at the samples of a motion, and (q, v) at its end."""
-    along = np.concatenate(problem.samples(trajectory.q, trajectory.v, trajectory.u), axis=1)
+    along = np.concatenate(problem.samples(trajectory.q, trajectory.v, problem.control_rows(trajectory)), axis=1)
     return along, np.concatenate([trajectory.q[-1:], trajectory.v[-1:]], axis=1)
 
 

@@ -12,7 +12,7 @@ from varpin.control.problem import OptimalControlProblem, default_integrator
 from varpin.control.solution import Solution
 from varpin.control.verification import accurate_cost, percent
 from varpin.errors import VarpinError
-from varpin.integrators.base import open_loop
+from varpin.integrators.base import open_line, open_loop
 from varpin.simulation.chatter import alternation, restlessness
 from varpin.simulation.soundness import Finding, announce, evident, examined
 
@@ -68,6 +68,8 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
     problem, motion = solution.problem, solution.trajectory
     _, found = examined(problem.scene, problem.integrator, motion)
     told = [finding for finding in found if finding.kind not in (*_OF_STEPS, _ALTERNATION)]
+    if solution.refinement is not None and not solution.refinement.met:
+        told.append(Finding("true cost", solution.refinement.reason))
     told += _unfinished(solution) + (_alternating(solution) or _restless(solution))
     try:
         replay = replayed(solution)
@@ -94,10 +96,12 @@ def replayed(solution: Solution) -> Replay:
     """
     problem = solution.problem
     variational = problem.integrator.variational
-    alone = open_loop(solution.controls)._replace(hold=problem.hold * PARTS)
+    times = problem.integrator.stage_times
+    alone = open_line(solution.controls, times) if problem.linear else open_loop(solution.controls)
+    alone = alone._replace(hold=problem.hold * PARTS)
     policy = solution.policy_on("momentum" if variational else "velocity", PARTS)
     m, n = problem.scene.controls, problem.scene.robot.dof
-    fed = policy.commands(problem.steps * PARTS, m, n, variational=variational)
+    fed = policy.commands(problem.steps * PARTS, m, n, variational=variational, stage_times=times)
     first = np.inf if solution.search is None else abs(solution.search.first)
     # Where the optimum costs nothing, there is nothing to be relative to but where the search began.
     base = abs(solution.cost) + (1e-9 * first if np.isfinite(first) else 0.0)

@@ -175,6 +175,8 @@ class Mpc:
     def __post_init__(self) -> None:
         if not isinstance(self.problem, OptimalControlProblem):
             raise InputError(f"problem must be an OptimalControlProblem, got {type(self.problem).__name__}")
+        if self.problem.linear:
+            raise InputError("Mpc decides on controls that are held: the problem's are linear between nodes")
         count("iterations", self.iterations, least=1)
         count("first_iterations", self.first_iterations, least=1)
         positive("tolerance", self.tolerance, "1")

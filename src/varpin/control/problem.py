@@ -36,11 +36,15 @@ from varpin.trajectory import Trajectory, require_motion
 
 Floats = NDArray[np.float64]
 Sampling = Literal["midpoint", "gauss", "start"]
+Shape = Literal["held", "linear"]
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class OptimalControlProblem(Frozen):
     """Minimize the expected cost of a motion from (q0, v0) over the controls, each held over ``hold`` steps.
+
+    With ``controls="linear"`` they are linear in time between the nodes, and chosen at each node, the first one
+    included. What is smooth in time takes a fraction of the nodes then. Limits are kept at the nodes, so everywhere.
 
     Running costs are integrals in time, sampled once a step, and references are functions of time: the problem means
     the same at every ``dt``. Controls stay within their limits, feedback included. Costs add up, and numbers scale
@@ -78,6 +82,7 @@ class OptimalControlProblem(Frozen):
         hold: Steps that share one control: a digital controller's period over the integrator's step.
         t0: When the horizon begins [s]; references that are functions of time see it.
         control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none.
+        controls: ``"held"``, each constant over ``hold`` steps, or ``"linear"`` in time between nodes.
         rate: What changes of the controls cost: ``rate.weight`` (m, m) and ``rate.before``, the control before the
             horizon (m,) or None; None where they cost nothing.
     """
@@ -97,6 +102,7 @@ class OptimalControlProblem(Frozen):
     terminal: BoundSum = field(repr=False)
     rule: Floats = field(repr=False)
     rate: ControlRate | None = field(repr=False)
+    controls: Shape
 
     def __init__(
         self,
@@ -112,6 +118,7 @@ class OptimalControlProblem(Frozen):
         hold: int = 1,
         t0: float = 0.0,
         control_limits: tuple[JointValues, JointValues] | None = None,
+        controls: Shape = "held",
     ) -> None:
         """Describe a problem; the class says what each argument is.
 
@@ -121,7 +128,8 @@ class OptimalControlProblem(Frozen):
         Raises:
             UnknownJoint: A name that is no joint's, or of controls no driven joint's.
             InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
-                reference that does not fit the problem's grid, or limits that leave a control nothing.
+                reference that does not fit the problem's grid, or limits that leave a control nothing; linear controls
+                with ``hold`` or in a scene with noise.
             CostError: A reference that is a function fails.
         """
         n, m = require_scene(scene).robot.dof, scene.controls
@@ -133,6 +141,12 @@ class OptimalControlProblem(Frozen):
             raise InputError(f"steps = {steps} is no multiple of hold = {hold}")
         if not is_one_of(sampling, ("midpoint", "gauss", "start")):
             raise InputError(f"sampling must be 'midpoint', 'gauss' or 'start', got {sampling!r}")
+        if not is_one_of(controls, ("held", "linear")):
+            raise InputError(f"controls must be 'held' or 'linear', got {controls!r}")
+        if controls == "linear" and hold != 1:
+            raise InputError(f"linear controls change at every node: leave hold = {hold} out, or take controls='held'")
+        if controls == "linear" and scene.processes:
+            raise InputError("plans with linear controls know no noise: take controls='held', or leave the noise out")
         if integrator is not None and not isinstance(integrator, Integrator):
             raise InputError(f"integrator must be one of varpin's, for example varpin.Gauss(4), got {integrator!r}")
         if m == 0:
@@ -160,6 +174,7 @@ class OptimalControlProblem(Frozen):
             "terminal": terminal,
             "rule": rule,
             "rate": control_rate(cost, m, scene.control_joints),
+            "controls": controls,
         }
         for name, value in values.items():
             if isinstance(value, np.ndarray):
@@ -167,7 +182,7 @@ class OptimalControlProblem(Frozen):
             object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
-        held = f", each control held over {self.hold}" if self.hold > 1 else ""
+        held = f", each control held over {self.hold}" if self.hold > 1 else ", linear controls" if self.linear else ""
         return f"OptimalControlProblem({self.scene!r}, {self.steps} steps of {self.dt:g} s{held}, {self.integrator})"
 
     def _repr_html_(self) -> str:
@@ -176,6 +191,7 @@ class OptimalControlProblem(Frozen):
             ("scene", self.scene),
             ("horizon", f"{self.steps} steps of {self.dt:g} s, {self.duration:g} s from t = {self.t0:g} s"),
             ("decisions", f"{self.decisions} of {self.scene.controls} controls, {limited} of them with limits"),
+            *([("controls", "linear between nodes")] if self.linear else []),
             ("integrator", f"{self.integrator}, the cost sampled by the rule {self.sampling!r}"),
             ("from q [rad or m]", listed(f"{x:.4g}" for x in self.q0)),
             ("at v [rad/s or m/s]", listed(f"{x:.4g}" for x in self.v0)),
@@ -189,8 +205,13 @@ class OptimalControlProblem(Frozen):
 
     @property
     def decisions(self) -> int:
-        """R, the number of controls to choose: steps / hold."""
-        return self.steps // self.hold
+        """R, the number of controls to choose: steps / hold, or steps + 1 where they are linear between nodes."""
+        return self.steps + 1 if self.linear else self.steps // self.hold
+
+    @property
+    def linear(self) -> bool:
+        """Whether controls are linear in time between nodes."""
+        return self.controls == "linear"
 
     @property
     def period(self) -> float:
@@ -209,6 +230,7 @@ class OptimalControlProblem(Frozen):
         hold: int | None = None,
         t0: float | None = None,
         before: JointValues | None = None,
+        controls: Shape | None = None,
     ) -> OptimalControlProblem:
         """The same problem, discretized otherwise or from another state.
 
@@ -225,7 +247,7 @@ class OptimalControlProblem(Frozen):
             steps = round(self.duration / positive("dt", dt, "s"))
             if abs(steps * dt - self.duration) > 1e-9 * self.duration:
                 raise InputError(f"the horizon of {self.duration:g} s is no multiple of dt = {dt:g} s")
-        if all(option is None for option in (dt, steps, integrator, sampling, hold)):
+        if all(option is None for option in (dt, steps, integrator, sampling, hold, controls)):
             return self._restarted(q0, v0, t0, before)
         return OptimalControlProblem(
             self.scene,
@@ -239,6 +261,7 @@ class OptimalControlProblem(Frozen):
             hold=self.hold if hold is None else hold,
             t0=self.t0 if t0 is None else t0,
             control_limits=(self.control_limits[0], self.control_limits[1]),
+            controls=self.controls if controls is None else controls,
         )
 
     def _restarted(
@@ -271,7 +294,7 @@ class OptimalControlProblem(Frozen):
             return f"joints {', '.join(its.joint_names)}, not {', '.join(robot.joint_names)}"
         if not np.array_equal(robot.tree.mass, its.tree.mass):
             return f"links of {its.tree.mass.sum():.6g} kg, not {robot.tree.mass.sum():.6g} kg"
-        for name in ("dt", "steps", "hold", "sampling", "q0", "v0", "integrator", "control_limits"):
+        for name in ("dt", "steps", "hold", "controls", "sampling", "q0", "v0", "integrator", "control_limits"):
             mine, theirs = getattr(self, name), getattr(other, name)
             if not np.array_equal(mine, theirs):
                 return f"{name} = {theirs}, not {mine}"
@@ -305,6 +328,8 @@ class OptimalControlProblem(Frozen):
         jet = lagrangian_jet(self.scene, self.q0, np.zeros(n))
         rates = np.abs(np.linalg.eigvals(np.linalg.solve(jet.Lvv, jet.Lqq)))
         omega = 2.0 * float(np.sqrt(rates.max())) + 1.0 / self.duration
+        if self.linear:
+            R = self.steps
         gains = np.zeros((R, m, 2 * n))
         if np.linalg.matrix_rank(self.scene.actuation) == n and omega * self.dt * self.hold <= 0.25:
             in_v = np.eye(n) if self.integrator.variational else jet.Lvv
@@ -317,18 +342,33 @@ class OptimalControlProblem(Frozen):
             hold=self.hold,
             on="momentum" if self.integrator.variational else "velocity",
             limits=(self.control_limits[0], self.control_limits[1]),
+            before=self.holding_controls() if self.linear else None,
             period=self.period,
             joints=self.scene.control_joints,
             servos=self.scene.servo_joints,
+            linear=self.linear,
         )
+
+    def decided(self, trajectory: Trajectory) -> Floats:
+        """The controls (R, m) of a motion on the problem's grid, one row for each decision."""
+        return trajectory.u_nodes if self.linear else trajectory.u[:: self.hold]
+
+    def control_rows(self, trajectory: Trajectory) -> Floats:
+        """The controls of a motion as :meth:`samples` takes them."""
+        return trajectory.u_nodes if self.linear else trajectory.u
 
     def samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
         """Where running costs are taken, the s samples of a step one after another.
 
-        q and v (..., N s, n) and u (..., N s, m), from q and v at the nodes (..., N + 1, n) and u (..., N, m).
+        q and v (..., N s, n) and u (..., N s, m), from q and v at the nodes (..., N + 1, n) and u (..., N, m), or
+        (..., N + 1, m) at the nodes where controls are linear between them.
         """
         motions = (x.reshape(-1, *x.shape[-2:]) for x in (q, v))
         at_q, at_v = (x.reshape(*q.shape[:-2], *x.shape[-2:]) for x in sample_steps(self.rule, *motions))
+        if self.linear:
+            share = self.places[:, None]
+            between = (1.0 - share) * u[..., :-1, None, :] + share * u[..., 1:, None, :]
+            return at_q, at_v, np.ascontiguousarray(between.reshape(*at_q.shape[:-1], u.shape[-1]))
         return at_q, at_v, u if len(self.rule) == 1 else np.repeat(u, len(self.rule), axis=-2)
 
     def costs(self, q: Floats, v: Floats, u: Floats) -> Floats:
@@ -348,6 +388,8 @@ class OptimalControlProblem(Frozen):
                 controls, or another time step.
         """
         require_motion(self.scene, trajectory)
+        if self.linear and not trajectory.u_nodes.shape[1]:
+            raise InputError("the motion has no controls at nodes, and the problem's are linear between them")
         if trajectory.steps != self.steps or abs(trajectory.dt - self.dt) > 1e-12 * self.dt:
             raise InputError(
                 f"the motion has {trajectory.steps} steps of {trajectory.dt:g} s; "
@@ -361,11 +403,11 @@ class OptimalControlProblem(Frozen):
         Differences of two costs are sums of differences of shares. A constant in a cost leaves them as they are,
         however large it is.
         """
-        q, v, u = trajectory.q, trajectory.v, trajectory.u
+        q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
         return self.shares_along(q, v, u, self.running.compiled.values(*self.samples(q, v, u)))
 
     def shares_along(self, q: Floats, v: Floats, u: Floats, compiled: Floats) -> Floats:
-        """:meth:`shares` of a motion, q and v (N + 1, n) and u (N, m).
+        """:meth:`shares` of a motion, q and v (N + 1, n) and u (N, m), or (N + 1, m) at the nodes.
 
         ``compiled`` are values of the running terms that the core evaluates, at all samples (N s, terms).
         """
@@ -404,10 +446,15 @@ class OptimalControlProblem(Frozen):
 
     def expand_running(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the running costs along a motion, at their samples, in (q, v, u)."""
-        q, v, u = trajectory.q, trajectory.v, trajectory.u
-        if self.running.others:
+        q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
+        if self.running.others or self.linear:
             return self.running.expand(*self.samples(q, v, u))
         return Expansion(*self.running.compiled.core.expand_steps(self.rule, q, v, u))
+
+    @property
+    def places(self) -> Floats:
+        """Where in a step of unit length running costs are sampled (s,)."""
+        return _rule(self.sampling, self.dt)[0]
 
     def expand_terminal(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""

@@ -19,13 +19,14 @@ from varpin.control.descent import rounding
 from varpin.control.examination import looked_at
 from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.refinement import refine
 from varpin.control.solution import Solution
 from varpin.control.trials import Attempt, Trials
 from varpin.core import Watch
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, LinearizationError
 from varpin.integrators import Integrator
-from varpin.integrators.base import open_loop
+from varpin.integrators.base import open_line, open_loop
 from varpin.integrators.variational import Variational
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.policy import LinearPolicy
@@ -92,6 +93,7 @@ def solve(
     resume: Solution | None = None,
     progress: Progress | None = None,
     check: bool = True,
+    true_cost: float | None = None,
 ) -> Solution:
     """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
 
@@ -145,6 +147,12 @@ def solve(
         check: Look at the finished plan, whether it costs in finer steps what it promises and its velocities neither
             alternate nor go up and down all the time, for ``Solution.warnings`` and the log. It takes as long as some
             motions of the search.
+        true_cost: How far the cost of the plan with its feedback on the continuous system may be from what the plan
+            says, relative to that: 0.01 for a percent. The problem's step is the coarsest; half of it follows, from
+            the plan before, until :meth:`Solution.verify` says that the wish is met. ``Solution.problem`` has the step
+            of the plan, ``Solution.refinement`` what it took, or why the wish cannot be met, which is a warning, too.
+            Controls that are held over several steps keep their period. ``max_iterations`` is for each step,
+            ``time_limit`` for all; Ctrl-C keeps the best plan so far.
 
     Returns:
         The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers, and
@@ -168,6 +176,8 @@ def solve(
         raise InputError(f"callback must be a function of one Iteration, got {callback!r}")
     if progress is not None and not callable(progress):
         raise InputError(f"progress must be a function of (iterations done, max_iterations), got {progress!r}")
+    if problem.linear and second_order:
+        raise InputError("second_order is for held controls; the problem's are linear between nodes")
     positive("tolerance", tolerance, "1")
     deadline = time.perf_counter() + (np.inf if time_limit == np.inf else positive("time_limit", time_limit, "s"))
     fraction("armijo", armijo)
@@ -179,6 +189,30 @@ def solve(
         if progress is not None:
             # Convergence may take a last look after the last iteration.
             progress(min(item.index + 1 - known, max_iterations), max_iterations)
+
+    if true_cost is not None:
+        if resume is not None:
+            raise InputError("true_cost begins with a search of its own: leave out either resume or true_cost")
+
+        def once(finer: OptimalControlProblem, start: LinearPolicy | None) -> Solution:
+            return solve(
+                finer,
+                controls if start is None else start,
+                tolerance=tolerance,
+                max_iterations=max_iterations,
+                second_order=second_order,
+                forward=forward,
+                armijo=armijo,
+                backtracking=backtracking,
+                regularization=regularization,
+                time_limit=max(deadline - time.perf_counter(), 1e-9),
+                callback=callback,
+                progress=progress,
+                check=False,
+            )
+
+        refined = refine(problem, once, positive("true_cost", true_cost, "1"), lambda: deadline - time.perf_counter())
+        return looked_at(refined)[0] if check else refined
 
     search = _Search(problem, second_order, forward, armijo, backtracking, regularization)
     if resume is None:
@@ -228,9 +262,16 @@ def _first_commands(problem: OptimalControlProblem, controls: JointValues | Line
     if isinstance(controls, LinearPolicy):
         if (hold := controls.hold_at(problem.dt)) != problem.hold:
             raise InputError(f"the policy holds its controls over {hold} steps, the problem {problem.hold}")
-        commands = controls.commands(problem.steps, m, problem.scene.robot.dof, variational, problem.dt)
+        if controls.linear != problem.linear:
+            policy, own = ("linear", "held") if controls.linear else ("held", "linear")
+            raise InputError(f"the policy's controls are {policy}, the problem's {own}")
+        commands = controls.commands(
+            problem.steps, m, problem.scene.robot.dof, variational, problem.dt, problem.integrator.stage_times
+        )
         narrowed = np.clip(commands.limits, *problem.control_limits)
         narrowed.setflags(write=False)
+        if problem.linear:
+            return commands._replace(limits=narrowed, before=np.clip(commands.before, *narrowed))
         if problem.rate is not None and problem.rate.before is not None:
             commands = commands._replace(before=problem.rate.before[None].copy())
         return commands._replace(limits=narrowed)
@@ -289,6 +330,10 @@ def _search_of(problem: OptimalControlProblem, controls: object, resume: Solutio
 
 
 def _held(u: Floats, problem: OptimalControlProblem) -> Commands:
+    if problem.linear:
+        return open_line(np.clip(u, *problem.control_limits), problem.integrator.stage_times)._replace(
+            limits=problem.control_limits.copy()
+        )
     return open_loop(u)._replace(hold=problem.hold, limits=problem.control_limits.copy())
 
 
@@ -721,12 +766,16 @@ class _Search:
         if bounds.parts < np.inf and (bounds.watched or step < 1.0):
             # Explicit methods count no parts.
             parts = bounds.parts * max(1, int(self.trajectory.statistics.substeps[: self.trials.third].sum()))
-        u = self.trajectory.u[:: problem.hold] + step * plan.feedforward
+        u = problem.decided(self.trajectory) + step * plan.feedforward
         if problem.limited:
             u = _onto_limits(u, problem.control_limits)
+        commands = feedback._replace(u=u)
+        if problem.linear:
+            # Nothing is fed back to the first control: its state is given.
+            commands = feedback._replace(u=u[1:], before=np.clip(u[:1], *problem.control_limits))
         try:
             attempt = self.trials.attempt(
-                feedback._replace(u=u), integrator=bounds.integrator, most=most + _DEARER * abs(most), parts=parts
+                commands, integrator=bounds.integrator, most=most + _DEARER * abs(most), parts=parts
             )
             if not attempt.whole:
                 # Whatever makes a step of few halvings fail, more may mend.
@@ -745,11 +794,14 @@ class _Search:
     def _feedback(self, plan: Plan) -> Commands:
         """The commands of trials, but for the feed-forward part that theirs is on top of."""
         problem, here = self.problem, self.trajectory
-        commands = _held(here.u[:: problem.hold], problem)
+        commands = _held(problem.decided(here), problem)
         if self.forward == "open":
             return commands
         gains, reference = plan.feedback, states(problem, here)[: -1 : problem.hold]
-        if plan.previous is not None:
+        if problem.linear and plan.previous is not None:
+            gains = np.concatenate([plan.feedback, plan.previous], axis=2)[1:]
+            reference = np.hstack([reference, here.u_nodes[:-1]])
+        elif plan.previous is not None:
             before = here.u[: -problem.hold : problem.hold]
             gains = np.concatenate([gains, plan.previous], axis=2)
             # The first change is from a control that is given.
@@ -799,7 +851,7 @@ class _Search:
 
 
 def _previous_gains(problem: OptimalControlProblem, plan: Plan | None) -> Floats | None:
-    if problem.rate is None:
+    if problem.rate is None and not problem.linear:
         return None
     m = problem.scene.controls
     return np.zeros((problem.decisions, m, m)) if plan is None else plan.previous

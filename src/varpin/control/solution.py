@@ -16,6 +16,7 @@ from varpin.control.costs import barriers_of
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.refined import Refinement
 from varpin.control.solution_file import read, write
 from varpin.control.verification import Verification, verify
 from varpin.errors import InputError
@@ -79,9 +80,12 @@ class Solution(Frozen):
     Attributes:
         problem: What was solved.
         trajectory: The motion without noise.
-        gains: Feedback (R, m, 2n) on x = (q, p) or (q, v), for each of R decisions.
+        gains: Feedback (R, m, 2n) on x = (q, p) or (q, v), for each of R decisions. Where controls are linear between
+            nodes, decision k > 0 is the control at node k, and reacts to the state at node k - 1, where its line
+            begins; the first has gains on the initial state.
         previous_gains: Feedback (R, m, m) on the control of the decision before, where its changes cost something
-            (:class:`ControlRateCost`): u_k + gains_k (x - x_k) + previous_gains_k (u_before - u_(k-1)). Else None.
+            (:class:`ControlRateCost`) or controls are linear between nodes:
+            u_k + gains_k (x - x_k) + previous_gains_k (u_before - u_(k-1)). Else None.
         feedforward: The change of the controls (R, m) that the last backward pass asked for; zero at an optimum.
         gradient: Of the expected cost in the controls (R, m), under the solver's model of the noise. At an optimum it
             is zero but where it pushes a control against its limit.
@@ -93,7 +97,8 @@ class Solution(Frozen):
         search: From where :func:`varpin.solve` can go on, with ``resume``.
         warnings: What looks wrong with the plan, in sentences that say what to change: it costs more than planned when
             its steps are taken in quarters, its velocities alternate or go up and down all the time, its energy balance
-            does not close.
+            does not close, a wish for its true cost is not met.
+        refinement: What finding the step took where a true cost was wished for; else None.
     """
 
     problem: OptimalControlProblem
@@ -109,6 +114,7 @@ class Solution(Frozen):
     search: SearchState | None = None
     previous_gains: Floats | None = None
     warnings: tuple[str, ...] = ()
+    refinement: Refinement | None = None
 
     def __post_init__(self) -> None:
         for array in (self.gains, self.feedforward, self.gradient, self.previous_gains):
@@ -123,7 +129,7 @@ class Solution(Frozen):
     @property
     def controls(self) -> Floats:
         """One row for each decision (R, m)."""
-        return self.trajectory.u[:: self.problem.hold]
+        return self.problem.decided(self.trajectory)
 
     @property
     def iterations(self) -> int:
@@ -138,7 +144,7 @@ class Solution(Frozen):
         return Violations(
             position=_beyond(motion.q, [robot.position_limits, *(term.limits for term in joints)]),
             velocity=_beyond(motion.v, [(-speed, speed), *(term.limits for term in speeds)]),
-            control=_beyond(motion.u, [self.problem.control_limits]),
+            control=_beyond(self.problem.control_rows(motion), [self.problem.control_limits]),
         )
 
     @property
@@ -173,7 +179,7 @@ class Solution(Frozen):
         if beyond.control.any():
             rows.append(("controls beyond limits", f"{beyond.control.max():.3g} at most"))
         rows += [("warning", warning) for warning in self.warnings]
-        most = np.abs(motion.u).max(axis=0, initial=0.0)
+        most = np.abs(problem.control_rows(motion)).max(axis=0, initial=0.0)
         rows.append(("largest controls", listed(f"{value:.4g}" for value in most)))
         columns = ("", "cost", "noise cost", "expected", "decrease", "gradient", "regularization", "step", "rollouts")
         history = [
@@ -186,7 +192,9 @@ class Solution(Frozen):
     def table(self) -> str:
         """The iterations, one row each, and how and why they ended; :class:`Solution` explains the columns."""
         warned = (f"warning: {sentence}" for sentence in self.warnings)
-        return "\n".join([Iteration.HEADER, *map(str, self.history), *warned, self.status.value, f"({self.reason})"])
+        refined = [] if self.refinement is None else str(self.refinement).splitlines()
+        ended = [self.status.value, f"({self.reason})"]
+        return "\n".join([Iteration.HEADER, *map(str, self.history), *refined, *warned, *ended])
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the solution as a compressed npz file without pickle; returns its path.
@@ -216,8 +224,10 @@ class Solution(Frozen):
         ``before`` is the control, (m,) or by joint name, that has acted before that decision; left out, the plan's own.
 
         Raises:
-            InputError: Not from 0 to R - 1, or a control of a wrong shape.
+            InputError: Not from 0 to R - 1, a control of a wrong shape, or controls that are linear between nodes.
         """
+        if self.problem.linear:
+            raise InputError("a plan with linear controls is not shifted; plan with controls='held' for that")
         if not 0 <= count("decisions", decisions) < len(self.gains):
             raise InputError(f"decisions must be from 0 to {len(self.gains) - 1}, got {decisions}")
         policy = self.policy
@@ -255,6 +265,11 @@ class Solution(Frozen):
             raise InputError(f"x must be 'momentum' or 'velocity', got {x!r}")
         gains, trajectory, hold = self.gains, self.trajectory, self.problem.hold
         rows, n = slice(0, -1, hold), self.problem.scene.robot.dof
+        linear, first, previous_gains = self.problem.linear, None, self.previous_gains
+        if linear:
+            # The first control is what the lines begin at.
+            first, gains = self.controls[0], gains[1:]
+            previous_gains = None if previous_gains is None else previous_gains[1:]
         if self.problem.integrator.variational != (x == "momentum"):
             rates = velocity_at_nodes(self.problem.scene, trajectory.q[rows], trajectory.v[rows])
             by_q, by_p = rates[:, :, :n], rates[:, :, n:]
@@ -268,14 +283,15 @@ class Solution(Frozen):
         reference = np.hstack([trajectory.q[rows], nodes[rows]])
         limits, rate = self.problem.control_limits, self.problem.rate
         return LinearPolicy(
-            self.controls,
+            self.controls[1:] if linear else self.controls,
             gains,
             reference,
             hold * substeps,
             x,
             (limits[0], limits[1]),
-            previous_gains=self.previous_gains,
-            before=None if rate is None else rate.before,
+            previous_gains=previous_gains,
+            before=first if linear or rate is None else rate.before,
+            linear=linear,
             period=self.problem.period,
             joints=self.problem.scene.control_joints,
             servos=self.problem.scene.servo_joints,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.refined import Refined, Refinement
 from varpin.errors import FileError
 from varpin.io.archive import Axes, members_of, read_npz, record_of, write_npz
 from varpin.mechanics.scene import same
@@ -24,8 +25,10 @@ Floats = NDArray[np.float64]
 Members = Mapping[str, NDArray[Any]]
 
 _FORMAT = "varpin.solution/2"
-_PROBLEM = ("q0", "v0", "t0", "steps", "hold", "sampling", "control_limits")
+_PROBLEM = ("q0", "v0", "t0", "steps", "hold", "controls", "sampling", "control_limits")
+_STATUSES = tuple(Status)
 _NUMBERS = ("cost", "above", "first", "best_cost", "best_noise", "regularization", "growth")
+_REFINED = tuple(item.name for item in fields(Refined) if item.name != "status")
 _COLUMNS = tuple(item.name for item in fields(Iteration))
 
 
@@ -55,6 +58,16 @@ class _Best:
 
 
 @dataclass(frozen=True, eq=False)
+class _Refinement:
+    """Of a :class:`Refinement` what is no row of the steps tried."""
+
+    wish: float
+    met: int
+    chosen: int
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
 class _Plan:
     """A :class:`Solution` without its problem and its motions. The history has a row for each iteration."""
 
@@ -68,6 +81,8 @@ class _Plan:
     warnings: tuple[str, ...] = field(metadata={"entry": "plan.warnings"})
     history: Annotated[Floats, Axes("iterations", len(_COLUMNS))]
     previous_gains: Annotated[Floats, Axes("decisions", "controls", "controls", finite=True)] | None = None
+    refined: Annotated[Floats, Axes("refined", len(_REFINED) + 1)] | None = None
+    refinement: _Refinement | None = None
     search: _Search | None = None
     best: _Best | None = None
 
@@ -91,7 +106,17 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
         numbers |= {"bounded": int(state.bounded), "cut": int(state.cut), "history": len(state.history)}
         search = _Search(prefixes[id(state.trajectory)], gains=np.array(state.gains), **numbers)
         best = None if state.best is None else _Best(prefixes[id(state.best)])
-    given = {item.name: solution[item.name] for item in fields(_Plan) if item.name not in ("search", "best")}
+    own = ("search", "best", "refined", "refinement")
+    given = {item.name: solution[item.name] for item in fields(_Plan) if item.name not in own}
+    refinement: Refinement | None = solution["refinement"]
+    if refinement is not None:
+        given["refined"] = np.array(
+            [
+                [*(float(getattr(row, name)) for name in _REFINED), _STATUSES.index(row.status)]
+                for row in refinement.tried
+            ]
+        ).reshape(-1, len(_REFINED) + 1)
+        given["refinement"] = _Refinement(refinement.wish, int(refinement.met), refinement.chosen, refinement.reason)
     given |= {"status": solution["status"].name, "history": _rows(solution["history"])}
     members |= members_of(_Plan(**given, search=search, best=best))
     members |= {name: getattr(problem, name) for name in _PROBLEM}
@@ -117,12 +142,30 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     if not abs(found - plan.cost) <= 1e-9 * max(abs(found), abs(plan.cost)):
         raise FileError(f"{source} is of a problem with another cost: {plan.cost:.9g}, and here {found:.9g}")
     history = _iterations(source, plan.history)
-    if problem.rate is not None and plan.previous_gains is None:
+    if (problem.rate is not None or problem.linear) and plan.previous_gains is None:
         raise FileError(f"{source}: previous_gains is missing")
-    given = {item.name: getattr(plan, item.name) for item in fields(_Plan) if item.name != "best"}
+    given = {item.name: getattr(plan, item.name) for item in fields(_Plan) if item.name not in ("best", "refined")}
+    given["refinement"] = _refinement(source, plan)
     given |= {"status": Status[plan.status], "history": history}
     given |= {"search": _search(source, members, plan, motions, history, problem)}
     return given | {"problem": problem, "trajectory": motions[""]}
+
+
+def _refinement(source: Path, plan: _Plan) -> Refinement | None:
+    own, rows = plan.refinement, plan.refined
+    if own is None or rows is None:
+        return None
+    whole, kinds = {"steps", "iterations"}, rows[:, -1]
+    if not (np.isin(kinds, np.arange(len(_STATUSES))).all() and 0 <= own.chosen <= len(rows)):
+        raise FileError(f"{source}: what a refinement tried does not fit together")
+    tried = tuple(
+        Refined(
+            **{name: int(value) if name in whole else value for name, value in zip(_REFINED, row[:-1], strict=True)},
+            status=_STATUSES[int(row[-1])],
+        )
+        for row in rows.tolist()
+    )
+    return Refinement(own.wish, bool(own.met), tried, own.chosen, own.reason)
 
 
 def _search(
@@ -187,6 +230,8 @@ def _surroundings(problem: OptimalControlProblem) -> dict[str, Floats]:
 def _require_problem(source: Path, members: Members, problem: OptimalControlProblem) -> None:
     """Refuse a solution of another problem, by its numbers and its noise."""
     given = {name: getattr(problem, name) for name in (*_PROBLEM, "dt")}
+    # Files without a word of it are older than the choice.
+    members = {"controls": np.array("held"), **members}
     for name, value in (given | {"problem.integrator": repr(problem.integrator)}).items():
         if name not in members or not np.array_equal(members[name], value):
             what = name.removeprefix("problem.")

@@ -15,7 +15,7 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.core import Watch
 from varpin.core.arrays import Bytes, Commands, Nodes
 from varpin.integrators import Integrator
-from varpin.integrators.base import Failure, statistics_of
+from varpin.integrators.base import Failure, Lines, lines, statistics_of
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -39,6 +39,7 @@ class Attempt:
     values: Floats
     failure: Failure | None
     verdict: Watch.Verdict
+    line: Lines | None = None  # its controls, where they are linear between nodes
 
     @property
     def whole(self) -> bool:
@@ -48,7 +49,11 @@ class Attempt:
     def shares(self) -> Floats:
         """What its cost is the sum of, one that is whole: as :meth:`OptimalControlProblem.shares`."""
         q, v, _, _ = self.nodes
-        return self.trials.problem.shares_along(q, v, self.u, self.values)
+        problem = self.trials.problem
+        if self.line is not None:
+            u = self.line.nodes
+            return problem.shares_along(q, v, u, problem.running.compiled.values(*problem.samples(q, v, u)))
+        return problem.shares_along(q, v, self.u, self.values)
 
     def trajectory(self) -> Trajectory:
         """Its motion, as far as it went."""
@@ -61,7 +66,7 @@ class Attempt:
             v=v,
             p=p,
             energy=energy,
-            u=self.u[:done],
+            u=self.u[:done] if self.line is None else self.line.mean[:done],
             dw=own.silence[:done],
             masses=own.masses.copy(),
             dt=own.problem.dt,
@@ -70,6 +75,8 @@ class Attempt:
             joint_names=scene.robot.joint_names,
             statistics=statistics_of(self.written, 0, done, self.halvings),
             scene_values=scene.values,
+            u_stages=np.zeros((done, 0, scene.controls)) if self.line is None else self.line.stages[:done],
+            u_nodes=np.zeros((done + 1, 0)) if self.line is None else self.line.nodes[: done + 1],
         )
 
 
@@ -122,6 +129,8 @@ class Trials:
             ended=np.zeros(1, dtype=np.int64),
             done=np.zeros(1, dtype=np.int64),
         )
+        if problem.linear:
+            return self._on_lines(commands, integrator, (q, v, p, energy), nodes)
         terms = problem.running.compiled
         values = np.empty((N * len(problem.rule), terms.count))
         watch = Watch(terms.core, problem.rule, q, v, u, values)
@@ -129,3 +138,21 @@ class Trials:
         state = integrator.fork(self._state)
         failure, halvings = integrator.watched(scene, state, commands, problem.dt, nodes, watch)
         return Attempt(self, (q, v, p, energy), u, nodes, halvings, values, failure, watch.verdict)
+
+    def _on_lines(
+        self, commands: Commands, integrator: Integrator, into: tuple[Floats, Floats, Floats, Floats], nodes: Nodes
+    ) -> Attempt:
+        """The motion under controls that are linear between nodes; nothing ends it early."""
+        (segment,) = integrator.rollout(
+            self.problem.scene, integrator.fork(self._state), commands, self.problem.scene.silence, self.problem.dt
+        )
+        done, own = len(segment.u), segment.statistics
+        for array, found in zip(into, (segment.q, segment.v, segment.p, segment.energy), strict=True):
+            array[1 : done + 1] = found
+        nodes.tally[0, :done] = np.stack([own.newton_iterations, own.jets, own.sweeps, own.substeps], axis=1)
+        nodes.quality[0, :done] = np.stack([own.residual, own.branch_margin, own.energy_defect], axis=1)
+        nodes.done[0] = done
+        line = lines(commands, segment.u, self.problem.integrator.stage_times)
+        return Attempt(
+            self, into, segment.u, nodes, own.halvings, np.zeros((0, 0)), segment.failure, Watch.Verdict.going, line
+        )

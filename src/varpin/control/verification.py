@@ -16,7 +16,7 @@ from varpin.control.problem import OptimalControlProblem, bind_cost
 from varpin.core import fastest_damping
 from varpin.core.arrays import Commands
 from varpin.integrators import Integrator, Radau, RungeKutta4
-from varpin.integrators.base import open_loop
+from varpin.integrators.base import open_line, open_loop
 from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.run import rollout
 from varpin.support.markup import facts, table
@@ -159,7 +159,8 @@ def verify(
     integrator = _FAST if _fast(problem, plan) else _USUAL
     state: Literal["momentum", "velocity"] = "momentum" if integrator.variational else "velocity"
     substeps, before = 2, (np.nan, np.nan)
-    blind = open_loop(plan.u[:: problem.hold])
+    times = integrator.stage_times
+    blind = open_line(problem.decided(plan), times) if problem.linear else open_loop(problem.decided(plan))
     while True:
         if progress is not None:
             progress(substeps, max_substeps)
@@ -170,6 +171,7 @@ def verify(
             problem.scene.controls,
             problem.scene.robot.dof,
             variational=integrator.variational,
+            stage_times=times,
         )
         closed = accurate_cost(problem, feedback, substeps, costs, integrator)
         changes = [
@@ -233,12 +235,18 @@ def accurate_cost(
     if failure is not None:
         return np.nan, np.full(n, np.nan)
     running, terminal = _fine_costs(problem, substeps) if costs is None else costs
-    # Simpson's rule within each step of the plan: the control jumps between steps.
-    after = running.value(motion.q, motion.v, np.vstack([motion.u, motion.u[-1:]]))
-    before = running.value(motion.q, motion.v, np.vstack([motion.u[:1], motion.u]))
+    # Simpson's rule within each step of the plan: a held control jumps between steps.
+    if problem.linear:
+        before = after = running.value(motion.q, motion.v, motion.u_nodes)
+    else:
+        after = running.value(motion.q, motion.v, np.vstack([motion.u, motion.u[-1:]]))
+        before = running.value(motion.q, motion.v, np.vstack([motion.u[:1], motion.u]))
     integral = h / 3.0 * (after[:-1:2] + 4.0 * after[1::2] + before[2::2]).sum()
     end = terminal.value(motion.q[-1:], motion.v[-1:], np.zeros((1, m)))[0]
-    smooth = 0.0 if problem.rate is None else problem.rate.value(motion.u, problem.period)
+    smooth = 0.0
+    if problem.rate is not None:
+        decided = motion.u_nodes[::substeps] if problem.linear else motion.u
+        smooth = float(problem.rate.value(decided, problem.period))
     return float(integral + end + smooth), motion.q[-1]
 
 
@@ -246,6 +254,13 @@ def _defect(problem: OptimalControlProblem, trajectory: Trajectory, substeps: in
     """Largest distance in q between the plan's steps and accurate ones from the same nodes."""
     scene, h, n = problem.scene, problem.dt / substeps, problem.scene.robot.dof
     state, _ = integrator.start(scene, trajectory.q[:-1].copy(), trajectory.v[:-1].copy())
+    if problem.linear:
+        off = []
+        for k in range(trajectory.steps):
+            line = open_line(trajectory.u_nodes[k : k + 2], integrator.stage_times)._replace(hold=substeps)
+            motion, failure = rollout(scene, integrator, trajectory.q[k], trajectory.v[k], line, h)
+            off.append(np.nan if failure else float(np.abs(motion.q[-1] - trajectory.q[k + 1]).max()))
+        return float(np.max(off))
     # Every step is a path of its own, with its own control handed over as a force.
     commands = open_loop(np.zeros((1, scene.controls)))._replace(hold=substeps)
     force = trajectory.u @ scene.actuation.T

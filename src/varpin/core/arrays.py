@@ -12,6 +12,8 @@ Bytes = NDArray[np.uint8]
 
 _HELD: Floats = np.zeros((0, 0, 0))
 _HELD.setflags(write=False)
+_NOWHERE: Floats = np.zeros(0)
+_NOWHERE.setflags(write=False)
 
 
 class Tree(NamedTuple):
@@ -128,6 +130,9 @@ class Commands(NamedTuple):
     before: Floats  # (P, m) the control before the first of each path; (0, m) for what the reference has
     # (N, s, m) at the stages of each step, of which u has the mean, without feedback and hold; empty where held
     within: Floats = _HELD
+    # (s,) of the stages in a step of unit length: controls are then linear in time over each decision's steps, from the
+    # control before to u, which is reached at their end; empty where they are held
+    places: Floats = _NOWHERE
 
 
 class Nodes(NamedTuple):

@@ -9,7 +9,7 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -385,12 +385,42 @@ def open_loop(u: Floats) -> Commands:
     return Commands(u, np.zeros((0, m, 0)), np.zeros((0, 0)), 1, no_limits(m), np.zeros((0, m)))
 
 
+def open_line(u: Floats, times: Sequence[float]) -> Commands:
+    """Controls (N + 1, m) at nodes without feedback, linear between them, for a method with stages at ``times``."""
+    return open_loop(u[1:])._replace(before=u[:1].copy(), places=np.array(tuple(times) or (0.5,)))
+
+
 @functools.cache
 def no_limits(controls: int) -> Floats:
     """The limits (2, m) of controls that have none; not to be written to."""
     limits = np.outer([-np.inf, np.inf], np.ones(controls))
     limits.setflags(write=False)
     return limits
+
+
+class Lines(NamedTuple):
+    """Controls of N steps that are linear between nodes."""
+
+    mean: Floats  # over each step (N, m)
+    stages: Floats  # at the stages of each step (N, s, m), (N, 0, m) for methods that hold the mean
+    nodes: Floats  # (N + 1, m)
+
+
+def lines(commands: Commands, ends: Floats, times: Sequence[float]) -> Lines:
+    """The controls of steps on the lines of ``commands``, from what a rollout wrote of them.
+
+    ``ends`` (N, m) are the controls at the end of each step's decision, ``times`` are :attr:`Integrator.stage_times`.
+    """
+    steps = np.arange(len(ends))
+    begins = np.vstack([commands.before[:1], ends])[steps - steps % commands.hold]
+
+    def at(places: Floats) -> Floats:
+        share = ((steps % commands.hold)[:, None] + places)[:, :, None] / commands.hold
+        found: Floats = (1.0 - share) * begins[:, None] + share * ends[:, None]
+        return found
+
+    mean, after = at(np.array([0.5, 1.0])).swapaxes(0, 1)
+    return Lines(mean.copy(), at(np.array(times)), np.vstack([commands.before[:1], after]))
 
 
 def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> Floats:

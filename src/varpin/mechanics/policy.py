@@ -106,6 +106,8 @@ def takes(function: Callable[..., object], arguments: int) -> bool:
 class LinearPolicy(Frozen):
     """u = u_k + gains_k (x - x_k) within limits, evaluated at the start of each of N intervals and held over it.
 
+    With ``linear`` it is the control at the end of the interval, and the control is linear in time from the one before.
+
     x is (q, p) for variational integrators and (q, v) for the others. Where changes of the control cost something
     (:class:`varpin.ControlRateCost`), the control of the interval before is fed back, too:
     u = u_k + gains_k (x - x_k) + previous_gains_k (u_before - previous_k).
@@ -124,6 +126,7 @@ class LinearPolicy(Frozen):
             over as many steps as that takes.
         joints: The joint whose force, or servo's position, each control is, or None where nobody said.
         servos: The joints whose controls are positions, or None where nobody said.
+        linear: Whether controls are linear in time over each interval, from ``before`` on, and not held.
     """
 
     u: Floats
@@ -138,6 +141,7 @@ class LinearPolicy(Frozen):
     period: float | None
     joints: tuple[str, ...] | None
     servos: tuple[str, ...] | None
+    linear: bool
 
     def __init__(
         self,
@@ -154,6 +158,7 @@ class LinearPolicy(Frozen):
         period: float | None = None,
         joints: Sequence[str] | None = None,
         servos: Sequence[str] | None = None,
+        linear: bool = False,
     ) -> None:
         """Make a policy.
 
@@ -175,6 +180,8 @@ class LinearPolicy(Frozen):
                 ``limits`` and ``before``, and a scene with other controls refuses the policy.
             servos: The joints whose controls are positions, :attr:`varpin.Scene.servo_joints`: a scene with other
                 servos refuses the policy.
+            linear: Controls are linear in time over each interval: u and what is fed back are those at its end. It
+                needs ``before``, the control at the first node.
 
         Raises:
             InputError: Shapes that do not fit each other, values that are not finite, or names without ``joints``.
@@ -212,6 +219,9 @@ class LinearPolicy(Frozen):
             )
         object.__setattr__(self, "limits", named_limits("limits", limits, names, m))
         start = None if before is None else control_values("before", before, names, m)
+        object.__setattr__(self, "linear", bool(linear))
+        if linear and start is None:
+            raise InputError("controls that are linear between nodes begin at one: give before, that of the first node")
         changes: Floats | None = None
         expected: Floats | None = None
         if previous_gains is not None:
@@ -229,7 +239,8 @@ class LinearPolicy(Frozen):
     def __repr__(self) -> str:
         steps, m, size = self.gains.shape
         on = "" if self.on is None else f" on (q, {'p' if self.on == 'momentum' else 'v'})"
-        return f"LinearPolicy({steps} intervals of {self.hold} steps, {m} controls, {size // 2} joints{on})"
+        line = ", linear between nodes" if self.linear else ""
+        return f"LinearPolicy({steps} intervals of {self.hold} steps, {m} controls, {size // 2} joints{on}{line})"
 
     def without_feedback(self) -> LinearPolicy:
         """The controls alone."""
@@ -241,9 +252,11 @@ class LinearPolicy(Frozen):
             self.hold,
             self.on,
             limits,
+            before=self.before if self.linear else None,
             period=self.period,
             joints=self.joints,
             servos=self.servos,
+            linear=self.linear,
         )
 
     def hold_at(self, dt: float) -> int:
@@ -265,7 +278,7 @@ class LinearPolicy(Frozen):
     def control(self, interval: int, x: ArrayLike, before: ArrayLike | None = None) -> Floats:
         """The control (m,) of an interval at the state x (2n,), after the control ``before`` (m,).
 
-        Left out, that is what the policy expects.
+        Left out, that is what the policy expects. Of a ``linear`` policy it is the control at the interval's end.
 
         Raises:
             InputError: There is no such interval, or an argument of a wrong shape or value.
@@ -278,10 +291,19 @@ class LinearPolicy(Frozen):
             u = u + self.previous_gains[interval] @ (finite_array("before", before, (m,)) - self.previous[interval])
         return np.asarray(np.clip(u, *self.limits), dtype=np.float64)
 
-    def commands(self, steps: int, controls: int, dof: int, variational: bool, dt: float | None = None) -> Commands:
+    def commands(
+        self,
+        steps: int,
+        controls: int,
+        dof: int,
+        variational: bool,
+        dt: float | None = None,
+        stage_times: Sequence[float] = (),
+    ) -> Commands:
         """The policy as the core takes it, for an integrator on (q, p) if it is ``variational``, else on (q, v).
 
-        Its intervals have :meth:`hold_at` steps, or ``hold`` where ``dt`` [s] is left out.
+        Its intervals have :meth:`hold_at` steps, or ``hold`` where ``dt`` [s] is left out. Where it is ``linear``, the
+        integrator's ``stage_times`` say where in a step it looks at the controls.
 
         Raises:
             InputError: It is for another number of steps, controls or coordinates, for another dt, or for the other x.
@@ -310,4 +332,5 @@ class LinearPolicy(Frozen):
             gains = np.concatenate([gains, self.previous_gains], axis=2)
             reference = np.concatenate([reference, self.previous], axis=1)
         before = np.zeros((0, controls)) if self.before is None else self.before[None].copy()
-        return Commands(self.u, gains, reference, hold, self.limits, before)
+        found = Commands(self.u, gains, reference, hold, self.limits, before)
+        return found if not self.linear else found._replace(places=np.array(tuple(stage_times) or (0.5,)))

@@ -14,7 +14,7 @@ from varpin.core import fastest_damping
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, UnknownJoint, VarpinError
 from varpin.integrators import Integrator, Midpoint, Radau, Reference, Segment, integrator_of
-from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
+from varpin.integrators.base import Failure, join, lines, open_loop, rows, steps_of
 from varpin.integrators.within import Times, changing
 from varpin.mechanics.assembly import along_constraints, assemble, missed
 from varpin.mechanics.custom import CustomForceError
@@ -181,8 +181,11 @@ class _Record:
         last: The part that was added last, or the first node.
     """
 
-    def __init__(self, scene: Scene, integrator: Integrator, dt: float, dw: Floats, first: Segment) -> None:
+    def __init__(
+        self, scene: Scene, integrator: Integrator, dt: float, dw: Floats, first: Segment, line: Commands | None
+    ) -> None:
         self.scene, self.integrator, self.dt, self.dw = scene, integrator, dt, dw
+        self._line = line  # the commands of controls that are linear between nodes
         self.steps, self.last = 0, first
         self._first = first
         self._joined: list[Segment] = []
@@ -205,7 +208,8 @@ class _Record:
     def trajectory(self) -> Trajectory:
         dw = self.dw[: self.steps] if len(self.dw) else None
         within = np.concatenate(self._within) if self._within else None
-        return _trajectory(self.scene, self.integrator, self.dt, self._first, [*self._joined, *self._parts], dw, within)
+        parts = [*self._joined, *self._parts]
+        return _trajectory(self.scene, self.integrator, self.dt, self._first, parts, dw, within, self._line)
 
 
 def _trajectory(
@@ -216,17 +220,24 @@ def _trajectory(
     parts: list[Segment],
     dw: Floats | None,
     within: Floats | None,
+    on: Commands | None = None,
 ) -> Trajectory:
-    """The motion from a first node on over parts that follow each other; no increments stand for zeros."""
+    """The motion from a first node on over parts that follow each other; no increments stand for zeros.
+
+    ``on`` are the commands of all of it where its controls are linear between nodes.
+    """
     steps = join(parts) if len(parts) > 1 else parts[0] if parts else first.part(0)
     N = len(steps.u)
+    u, nodes = steps.u, np.zeros((N + 1, 0))
+    if on is not None:
+        u, within, nodes = lines(on, steps.u, integrator.stage_times)
     return Trajectory(
         t=np.arange(N + 1, dtype=np.float64) * dt,
         q=np.concatenate([first.q, steps.q]),
         v=np.concatenate([first.v, steps.v]),
         p=np.concatenate([first.p, steps.p]),
         energy=np.concatenate([first.energy, steps.energy]),
-        u=steps.u,
+        u=u,
         dw=np.zeros((N, scene.processes)) if dw is None else dw,
         masses=scene.robot.tree.mass.copy(),
         dt=dt,
@@ -238,6 +249,7 @@ def _trajectory(
         constraint_forces=np.zeros((N, len(scene.constraint_order))) if steps.impulses is None else steps.impulses / dt,
         constraint_labels=scene.constraint_labels,
         u_stages=np.zeros((N, 0, scene.controls)) if within is None else within,
+        u_nodes=nodes,
     )
 
 
@@ -266,7 +278,9 @@ class Motions:
         done = len(segment.u)
         dw = None if increments is None else increments[:done]
         within = commands.within[:done] if len(commands.within) else None
-        return _trajectory(self.scene, self.integrator, self.dt, self._first, [segment], dw, within), segment.failure
+        line = commands if len(commands.places) else None
+        made = _trajectory(self.scene, self.integrator, self.dt, self._first, [segment], dw, within, line)
+        return made, segment.failure
 
 
 def rollout(
@@ -388,7 +402,11 @@ def simulate(
     hold = period if law is not None else commands.hold if isinstance(controls, LinearPolicy) else None
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
     state, (start,) = integrator.start(scene, q0[None], v0[None])
-    record = _Record(scene, integrator, dt, dw, start)
+    linear = bool(len(commands.places))
+    if linear:
+        # Gains of a held control are looked at by the loop's check; those of lines are not.
+        hold = None
+    record = _Record(scene, integrator, dt, dw, start, commands if linear else None)
     # A sweep takes as long as the robot has joints, an elimination as their cube.
     chunk = max(1, _CHUNK // (n + n**3 // 100))
     # One step at a time where noise or forces call Python functions: what came before one that fails is recorded.
@@ -403,12 +421,13 @@ def simulate(
                 block = open_loop(u)._replace(hold=held)
             elif isinstance(controls, OpenLoop):
                 block = _sampled(controls, record, 1 if stepwise else min(chunk, steps - done))
-            elif stepwise:
+            elif stepwise and not linear:
                 block = _next(commands, record)
             else:
                 first = record.steps // commands.hold
                 before = record.last.u[None, -1] if record.steps else None
-                block = rows(commands, first, first + max(1, chunk // commands.hold), before)
+                most = 1 if stepwise else max(1, chunk // commands.hold)
+                block = rows(commands, first, first + most, before)
             drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
             try:
                 (segment,) = integrator.rollout(scene, state, block, drawn, dt)
@@ -561,6 +580,8 @@ def _chosen(
     held = np.zeros((0, 0))
     if isinstance(controls, LinearPolicy):
         policy = controls
+        if controls.linear:
+            raise InputError("tolerance chooses dt, and a policy whose controls are linear between nodes takes it: dt=")
         if controls.period is None:
             raise InputError("tolerance chooses dt, so a LinearPolicy needs the period of its intervals, period= [s]")
         parts = len(controls.gains)
@@ -584,11 +605,11 @@ def _chosen(
                 sampled[key] = commands_of(scene, member, of_time, steps, duration / steps)
             return sampled[key]
     elif isinstance(controls, FirstOrderHold):
-        lines = controls
+        by_nodes = controls
         parts = len(controls.u) - 1
 
         def given(member: Integrator, steps: int) -> Commands:
-            return commands_of(scene, member, lines.refined(steps // parts), steps, duration / steps)
+            return commands_of(scene, member, by_nodes.refined(steps // parts), steps, duration / steps)
     else:
         held = held_rows(scene, controls)
         parts = len(held)
@@ -712,7 +733,14 @@ def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps:
                 f"the policy's controls are positions of {', '.join(controls.servos) or 'no joints'} and forces of all "
                 f"others; the scene has servos on {', '.join(scene.servo_joints) or 'no joints'}"
             )
-        return controls.commands(steps, scene.controls, scene.robot.dof, integrator.variational, dt)
+        if controls.linear and scene.processes:
+            raise InputError(
+                "a policy whose controls are linear between nodes acts in scenes without noise alone: leave the "
+                "scene's noise out, or plan with held controls"
+            )
+        return controls.commands(
+            steps, scene.controls, scene.robot.dof, integrator.variational, dt, integrator.stage_times
+        )
     if isinstance(controls, OpenLoop):
         return _evaluated(controls, scene, integrator, dt, range(steps))
     if isinstance(controls, FirstOrderHold):

@@ -230,9 +230,10 @@ class ConstrainedStepper {
                     kick(push.data(), state);
                 }
                 const double* extra = drift ? drift + row * n : nullptr;
-                stride = commands.within ? n : 0;
-                if (commands.within) {
-                    stage_forces(mechanism, extra, commands.within + s * stages * controls, stages, given.data());
+                const double* within = stage_controls(commands, p, s, stages, u, line);
+                stride = within ? n : 0;
+                if (within) {
+                    stage_forces(mechanism, extra, within, stages, given.data());
                 } else {
                     constant_force(mechanism, extra, u + s * controls, force.data());
                 }
@@ -325,6 +326,7 @@ class ConstrainedStepper {
     static constexpr int most_corrections = 12;
 
     std::vector<double> given;   // (s, n) force at the stages of the whole step, where it varies
+    std::vector<double> line;    // (s, m) controls there, where they are linear
     std::vector<double> at;      // (s + 1, s) t_kj
     std::vector<double> weight;  // (s, s) w_ik
     Trial trial;

@@ -269,9 +269,9 @@ class ExplicitRollout {
         std::vector<double>& at_v = stepper_.v;
         double* u = nodes.u + path * nodes.steps * m;
         apply_policy(commands, path, s, n, at_q.data(), at_v.data(), u);
+        const double* within = stage_controls(commands, path, s, stepper_.places(), u, line_);
         u += s * m;
-        const int places = commands.within ? stepper_.places() : 1;
-        stage_forces(*mechanism_, drift, commands.within ? commands.within + s * places * m : u, places, force_.data());
+        stage_forces(*mechanism_, drift, within ? within : u, within ? stepper_.places() : 1, force_.data());
         if (!regular) return Outcome::singular;
         const bool beside = method_ == ExplicitMethod::euler;
         if (dw) {
@@ -282,7 +282,7 @@ class ExplicitRollout {
                 at_state();
             }
         }
-        regular = stepper_.step(h, force_.data(), commands.within ? n : 0);
+        regular = stepper_.step(h, force_.data(), within ? n : 0);
         if (dw && beside) add_jump();
         nodes.tally[(path * nodes.steps + s) * 4 + 2] = stepper_.stages();
         return regular ? enter_node(nodes, path, s) : Outcome::singular;
@@ -308,7 +308,7 @@ class ExplicitRollout {
     std::int64_t paths_;
     std::vector<double> center_;  // (P, n, k) of the diffusion fields
     ExplicitStepper stepper_;
-    std::vector<double> force_, jump_;
+    std::vector<double> force_, jump_, line_;
 };
 
 }  // namespace varpin

@@ -1,10 +1,12 @@
 // What drives a step from outside: controls with their feedback, and the impulses of noise.
 // docs/mathematics.md, "Noise". Controls u = u_r + gains_r (x - reference_r), r the decision; an impulse is
 // sum_i F_i(q, u) dw_i. Controls that change within a step are given at the stages of the method; u is their mean then.
+// Or they are linear in time over each decision's steps: from the control before to u, which is reached at their end.
 #pragma once
 
 #include <cmath>
 #include <cstddef>
+#include <vector>
 
 #include "varpin/tree.hpp"
 
@@ -22,6 +24,7 @@ struct Commands {
     const double* greatest = nullptr;   // (m)
     const double* before = nullptr;     // (P, m) the control before the first of each path, or null for the reference's
     const double* within = nullptr;     // (N, s, m) at the stages of each step, or null where they are held over it
+    const double* places = nullptr;     // (s) of the stages in a step where controls are linear, with `before`; or null
 };
 
 // Controls of step s of a path into row s of u (N, m). Beyond a limit a control is that limit.
@@ -53,6 +56,24 @@ inline void apply_policy(const Commands& commands, std::ptrdiff_t path, std::ptr
         if (total > commands.greatest[c]) total = commands.greatest[c];
         decision[c] = total;
     }
+}
+
+// The controls (stages, m) at the stages of step s of a path, whose rows of u the policy has been applied to; null where
+// they are held over it. Those of a line go into `line`.
+inline const double* stage_controls(const Commands& commands, std::ptrdiff_t path, std::ptrdiff_t s, int stages,
+                                    const double* u, std::vector<double>& line) {
+    const int m = commands.controls;
+    if (commands.within) return commands.within + s * stages * m;
+    if (!commands.places) return nullptr;
+    const std::ptrdiff_t first = s - s % commands.hold;
+    const double* from = first > 0 ? u + (first - 1) * m : commands.before + path * m;
+    const double* to = u + s * m;
+    line.resize(static_cast<std::size_t>(stages) * m);
+    for (int i = 0; i < stages; ++i) {
+        const double share = (static_cast<double>(s - first) + commands.places[i]) / commands.hold;
+        for (int c = 0; c < m; ++c) line[i * m + c] = (1.0 - share) * from[c] + share * to[c];
+    }
+    return line.data();
 }
 
 // The force drift + B u that is constant over a step; drift (n) is null for none.

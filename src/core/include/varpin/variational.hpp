@@ -217,10 +217,10 @@ class VariationalStepper {
                 const double* dw = noisy ? increments + row * k : nullptr;
                 apply_policy(commands, path, s, n, state.q.data(), state.momentum.data(), u);
                 if (noisy) noise_kick(left, u + s * m, dw, state);
-                stride = commands.within ? static_cast<int>(n) : 0;
-                if (commands.within) {
-                    stage_forces(mechanism, drift ? drift + row * n : nullptr, commands.within + s * stages * m, stages,
-                                 given.data());
+                const double* within = stage_controls(commands, path, s, stages, u, line);
+                stride = within ? static_cast<int>(n) : 0;
+                if (within) {
+                    stage_forces(mechanism, drift ? drift + row * n : nullptr, within, stages, given.data());
                 } else {
                     constant_force(mechanism, drift ? drift + row * n : nullptr, u + s * m, force.data());
                 }
@@ -249,6 +249,7 @@ class VariationalStepper {
   private:
     Trial trial;
     std::vector<double> given;  // (s, n) force at the stages of the whole step, where it varies
+    std::vector<double> line;   // (s, m) controls there, where they are linear
     std::vector<double> guess;  // (s, n) what was extrapolated
     std::vector<double> bend;   // (2, n)
     std::vector<double> at;     // (n)

@@ -93,6 +93,7 @@ class SceneFile:
                 sampling=spec.sampling,  # type: ignore[arg-type]
                 hold=spec.hold,
                 control_limits=(-most, most),
+                controls=spec.shape,  # type: ignore[arg-type]
             )
         except (InputError, CostError) as error:
             raise spec.root.error("cost", str(error)) from None
@@ -182,13 +183,13 @@ class SceneFile:
 
     def _planned_apart(self, options: dict[str, Any]) -> LinearPolicy | None:
         """The policies of all groups of joints side by side; None where they cannot be planned apart."""
-        if not self._parts:
+        if not self._parts or self.spec.shape == "linear":
             return None
         problem, driven = self.problem, self._layout.driven
         names, n, m, R = self.robot.joint_names, self.robot.dof, self.scene.controls, problem.decisions
         u, gains, reference = np.zeros((R, m)), np.zeros((R, m, 2 * n)), np.zeros((R, 2 * n))
         for layout, part in self._parts:
-            plan = solve(part, **options, check=False).policy
+            plan = solve(part, **{**options, "true_cost": None}, check=False).policy
             rows = np.array([driven.index(name) for name in layout.driven])
             order = np.array([names.index(name) for name in layout.robot.joint_names])
             x = np.concatenate([order, n + order])

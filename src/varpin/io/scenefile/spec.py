@@ -170,6 +170,7 @@ class SceneSpec:
         steps: N.
         hold: Steps that share a control.
         sampling: Of running costs.
+        shape: Of a plan's controls in time: ``"held"``, or ``"linear"`` between nodes.
         integrator: The integrator.
         costs: Terms.
         controls: Of a simulation: None for none, ``"hold"`` for holding ones, or values over time.
@@ -200,6 +201,7 @@ class SceneSpec:
     steps: int
     hold: int
     sampling: str
+    shape: str
     integrator: Integrator
     costs: tuple[CostSpec, ...]
     controls: Reference | str | None

@@ -205,6 +205,7 @@ class HorizonKeys(Keys):
     duration: Annotated[float | None, number("s", above=0.0)] = None
     hold: Annotated[int, whole(1)] = 1
     sampling: Annotated[str, word("gauss", "midpoint", "start")] = "gauss"
+    controls: Annotated[str, word("held", "linear")] = "held"
 
     @property
     def count(self) -> int:
@@ -301,6 +302,7 @@ class SolveKeys(Keys):
     second_order: Annotated[bool, FLAG] = False
     forward: Annotated[str, word("closed", "open")] = "closed"
     regularization: Annotated[float, number(least=0.0)] = 0.0
+    true_cost: Annotated[float, number(above=0.0)] = 0.0
 
 
 def _output(*endings: str) -> Rule:
@@ -499,6 +501,7 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
         steps=horizon.count,
         hold=horizon.hold,
         sampling=horizon.sampling,
+        shape=horizon.controls,
         integrator=_integrator(root.table("integrator"), keys.integrator),
         costs=tuple(_cost(root.table(f"cost[{k}]"), entry, horizon.dt) for k, entry in enumerate(keys.cost)),
         controls=controls,

@@ -1,0 +1,122 @@
+"""Plans whose controls are linear between nodes, as the backward pass sees them: with the control in the state.
+
+The state of the exact recursion is X = (x, w), w the control at the node, and the decision the control u at the next
+one: X' = (A x + (B - ramp) w + ramp u, u). The first control is a decision of its own, before the first step. Equation
+(O11) of docs/mathematics.md.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.problem import OptimalControlProblem
+
+Floats = NDArray[np.float64]
+
+# A cost that is sampled at (X, u) before the step, as it is.
+RULE: Floats = np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+RULE.setflags(write=False)
+
+
+class Derivatives(NamedTuple):
+    """Of N steps: in the state, in controls at their start and at their end, and of velocities at nodes."""
+
+    A: Floats  # (N, 2n, 2n)
+    begin: Floats  # (N, 2n, m)
+    end: Floats  # (N, 2n, m)
+    velocity: Floats  # dv/dx (N + 1, n, 2n) at nodes; (0, n, 2n) where x holds v, or nobody asks
+
+
+class LinearSteps(NamedTuple):
+    """N + 1 steps in X and u: the first decides on the first control alone, and takes no time."""
+
+    A: Floats  # (N + 1, X, X)
+    B: Floats  # (N + 1, X, m)
+    gradient: Floats  # (N + 1, X + m) of the cost per dt
+    hessian: Floats  # (N + 1, X + m, X + m)
+
+
+def size(problem: OptimalControlProblem) -> int:
+    """The number of states X: the core takes pairs, so one of them may be nothing."""
+    states = 2 * problem.scene.robot.dof + problem.scene.controls
+    return states + states % 2
+
+
+def linear_steps(
+    problem: OptimalControlProblem, found: Derivatives, gradient: Floats, hessian: Floats, rate: Floats, pull: Floats
+) -> LinearSteps:
+    """The steps of a plan with linear controls.
+
+    Args:
+        problem: The problem.
+        found: Derivatives along the motion.
+        gradient: Of the running cost at its samples (N s, 2n + m).
+        hessian: Likewise (N s, 2n + m, 2n + m), or (1, ...) for all.
+        rate: Of what changes of the controls cost, (N + 1, m, m), or (0, m, m) for nothing.
+        pull: Likewise its gradient (N + 1, m).
+    """
+    n, m, h, N = problem.scene.robot.dof, problem.scene.controls, problem.dt, problem.steps
+    X, x = size(problem), 2 * n
+    A, B = np.zeros((N + 1, X, X)), np.zeros((N + 1, X, m))
+    A[0, :x, :x] = np.eye(x)
+    A[1:, :x, :x], A[1:, :x, x : x + m], B[1:, :x] = found.A, found.begin, found.end
+    B[:, x : x + m] = np.eye(m)
+    # In (x, w, u); X has room between w and u.
+    g, H = np.zeros((N + 1, x + 2 * m)), np.zeros((N + 1, x + 2 * m, x + 2 * m))
+    samples = len(problem.rule)
+    of_sample = hessian.reshape(-1, samples, x + m, x + m) if len(hessian) > 1 else hessian[:, None]
+    for s, (D, weight) in enumerate(zip(_sampled(problem, found), problem.rule[:, 0], strict=True)):
+        own = of_sample[:, s if of_sample.shape[1] > 1 else 0]
+        across = weight * np.swapaxes(D, 1, 2)
+        g[1:] += (across @ gradient[s::samples, :, None])[:, :, 0]
+        H[1:] += across @ (own @ D)
+    if len(rate):
+        change = np.concatenate([np.zeros((m, x)), -np.eye(m), np.eye(m)], axis=1)
+        change = np.stack([np.where(np.arange(x + 2 * m) < x + m, 0.0, change), *[change] * N])
+        across = np.swapaxes(change, 1, 2) / h
+        g += (across @ pull[:, :, None])[:, :, 0]
+        H += across @ (rate @ change)
+    kept = np.r_[0 : x + m, X : X + m]
+    wide_g, wide_H = np.zeros((N + 1, X + m)), np.zeros((N + 1, X + m, X + m))
+    wide_g[:, kept] = g
+    wide_H[:, kept[:, None], kept] = H
+    return LinearSteps(A, B, wide_g, wide_H)
+
+
+def _sampled(problem: OptimalControlProblem, found: Derivatives) -> list[Floats]:
+    """D (N, 2n + m, 2n + 2m) of (q, v, u) at each sample of the steps in (x, w, u)."""
+    m, x = problem.scene.controls, 2 * problem.scene.robot.dof
+    after = np.concatenate([found.A, found.begin, found.end], axis=2)
+    parts = []
+    for D, share in zip(at_samples(problem.rule, after, found.velocity), problem.places, strict=True):
+        own = np.zeros((len(D), m, x + 2 * m))
+        own[:, :, x : x + m], own[:, :, x + m :] = (1.0 - share) * np.eye(m), share * np.eye(m)
+        parts.append(np.concatenate([D, own], axis=1))
+    return parts
+
+
+def at_samples(rule: Floats, J: Floats, velocity: Floats) -> list[Floats]:
+    """D (N, 2n, y) of (q, v) at each sample of N steps, in the y variables of J (N, 2n, y), the state x the first.
+
+    ``velocity`` is dv/dx (N + 1, n, 2n) at nodes, or (0, n, 2n) where x holds v or nobody asks.
+    """
+    N, x, size = J.shape
+    n = x // 2
+    before = np.zeros((N, x, size))
+    before[:, :, :x] = np.eye(x)
+    # Of (q, v) at the nodes before and after a step.
+    nodes = []
+    for end, own in enumerate((before, J)):
+        nodes += [own[:, :n], velocity[end : N + end] @ own if len(velocity) else own[:, n:]]
+    parts = []
+    for row in rule:
+        D = np.zeros((N, x, size))
+        for half in range(2):
+            for weight, node in zip(row[1 + 4 * half : 5 + 4 * half], nodes, strict=True):
+                if weight:
+                    D[:, half * n : (half + 1) * n] += weight * node
+        parts.append(D)
+    return parts

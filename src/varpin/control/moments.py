@@ -1,0 +1,215 @@
+"""What noise adds to the cost of a motion under feedback, to second order, and its gradient in the motion.
+
+With the gains held, the covariance of (x, u) goes forward, the quadratic value W backward, and what noise adds is a sum
+over the steps. The share of a step depends on the state and the control that it begins with alone, through its
+derivatives, the Hessians of its costs and its noise: that is differentiated, by central differences of the linearized
+steps. Equation (O12) of docs/mathematics.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.lines import at_samples
+from varpin.control.problem import OptimalControlProblem
+from varpin.linearization import linearize_steps, velocity_at_nodes
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+# Of the largest value that a coordinate, a momentum or a control has along the motion.
+_SHIFT = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class Feedback:
+    """Gains (R, m, 2n) on the state, and (R, m, m) on the control before where its change costs something."""
+
+    state: Floats
+    before: Floats | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """N linearized steps in (x, u) with their costs to second order."""
+
+    J: Floats  # (N, 2n, 2n + m)
+    g: Floats  # (N, 2n, k) what noise does
+    gz: Floats  # (N, 2n, k, 2n + m) its derivative in (x, u)
+    cost: Floats  # (N, 2n + m, 2n + m) Hessian of the running cost
+    kicked: Floats  # (N, 2n, 2n) of the part that is sampled after the kick, in the state there
+
+
+def noise_gradient(problem: OptimalControlProblem, trajectory: Trajectory, feedback: Feedback, rate: Floats) -> Floats:
+    """The gradient (N, 2n + m) of what noise adds, in the state and the control that each step begins with.
+
+    Without what a backward pass has of it: the part through the strength of the noise alone.
+
+    Args:
+        problem: The problem.
+        trajectory: The motion.
+        feedback: Of a backward pass along it.
+        rate: Hessian (R, m, m) of what changes of controls cost, or (0, m, m).
+    """
+    n, m, N = problem.scene.robot.dof, problem.scene.controls, problem.steps
+    here = _steps_of(problem, trajectory)
+    W = _values(problem, here, feedback, _end_hessian(problem, trajectory), rate)
+    C = _covariances(problem, here, feedback)
+    variational = problem.integrator.variational
+    x = np.concatenate([trajectory.q, trajectory.p if variational else trajectory.v], axis=1)
+    y = np.concatenate([x[:-1], trajectory.u], axis=1)
+    slopes = velocity_at_nodes(problem.scene, trajectory.q, trajectory.v)
+    size = np.abs(y).max(axis=0)
+    shift = _SHIFT * np.where(size > 0.0, size, 1.0)
+    found = np.empty((N, 2 * n + m))
+    for c in range(2 * n + m):
+        change = []
+        for sign in (1.0, -1.0):
+            moved = np.zeros(2 * n + m)
+            moved[c] = sign * shift[c]
+            # Every other step begins at a moved state, and the node after it is where that leads.
+            shares = np.empty(N)
+            for first in range(min(2, N)):
+                own = slice(first, N, 2)
+                dx, du = np.zeros((N + 1, 2 * n)), np.zeros((N, m))
+                dx[:-1][own], du[own] = moved[: 2 * n], moved[2 * n :]
+                dx[1:][own] = here.J[own] @ moved
+                shares[own] = _shares(
+                    problem, _steps_of(problem, _moved(trajectory, dx, du, slopes, variational)), W, C
+                )[own]
+            change.append(shares)
+        found[:, c] = (change[0] - change[1]) / (2.0 * shift[c])
+    # The end's own Hessian depends on where it is, too.
+    at_end = np.empty(2 * n)
+    for c in range(2 * n):
+        change = []
+        for sign in (1.0, -1.0):
+            dx = np.zeros((N + 1, 2 * n))
+            dx[N, c] = sign * shift[c]
+            end = _moved(trajectory, dx, np.zeros((N, m)), slopes, variational)
+            change.append(0.5 * (_end_hessian(problem, end) * C[N, : 2 * n, : 2 * n]).sum())
+        at_end[c] = (change[0] - change[1]) / (2.0 * shift[c])
+    found[-1] += here.J[-1].T @ at_end
+    spread = problem.dt * (W[1:, : 2 * n, : 2 * n] + here.kicked)
+    known: Floats = np.einsum("Nakz,Nab,Nbk->Nz", here.gz, spread, here.g)
+    return found - known
+
+
+def _end_hessian(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
+    """Of the terminal cost in x (2n, 2n)."""
+    n = problem.scene.robot.dof
+    H: Floats = problem.expand_terminal(trajectory).hessian[0, : 2 * n, : 2 * n]
+    if not problem.integrator.variational:
+        return H
+    D = np.eye(2 * n)
+    D[n:] = velocity_at_nodes(problem.scene, trajectory.q[-1:], trajectory.v[-1:])[0]
+    return np.asarray(D.T @ H @ D)
+
+
+def _moved(trajectory: Trajectory, dx: Floats, du: Floats, slopes: Floats, variational: bool) -> Trajectory:
+    """Nodes and controls next to those of a motion: no motion, but each of its steps can be linearized."""
+    n = trajectory.q.shape[1]
+    q = trajectory.q + dx[:, :n]
+    if not variational:
+        return replace(trajectory, q=q, v=trajectory.v + dx[:, n:], u=trajectory.u + du)
+    v = trajectory.v + np.einsum("Nix,Nx->Ni", slopes, dx)
+    return replace(trajectory, q=q, p=trajectory.p + dx[:, n:], v=v, u=trajectory.u + du)
+
+
+def _steps_of(problem: OptimalControlProblem, trajectory: Trajectory) -> _Steps:
+    scene, n, m, N = problem.scene, problem.scene.robot.dof, problem.scene.controls, problem.steps
+    x, h, rule, samples = 2 * n, problem.dt, problem.rule, len(problem.rule)
+    lin = linearize_steps(scene, trajectory, problem.integrator, problem.q0)
+    velocity = np.zeros((0, n, x))
+    if problem.integrator.variational and rule[:, [2, 4, 6, 8]].any():
+        velocity = velocity_at_nodes(scene, trajectory.q, trajectory.v)
+    J = np.concatenate([lin.A, lin.B], axis=2)
+    hessian = problem.expand_running(trajectory).hessian
+    of_sample = hessian.reshape(-1, samples, x + m, x + m) if len(hessian) > 1 else hessian[:, None]
+    cost, kicked = np.zeros((N, x + m, x + m)), np.zeros((N, x, x))
+    own = np.zeros((N, m, x + m))
+    own[:, :, x:] = np.eye(m)
+    after = np.broadcast_to(np.eye(x), (N, x, x))
+    nothing = rule.copy()
+    nothing[:, [1, 2, 5, 6]] = 0.0
+    for s, (D, P) in enumerate(zip(at_samples(rule, J, velocity), at_samples(nothing, after, velocity), strict=True)):
+        H = of_sample[:, s if of_sample.shape[1] > 1 else 0]
+        whole = np.concatenate([D, own], axis=1)
+        weight = h * rule[s, 0]
+        cost += weight * np.swapaxes(whole, 1, 2) @ H @ whole
+        if nothing[s, 1:].any():
+            kicked += weight * np.swapaxes(P, 1, 2) @ H[:, :x, :x] @ P
+    return _Steps(J, lin.G, np.concatenate([lin.Gx, lin.Gu], axis=3), cost, kicked)
+
+
+def _hessian(problem: OptimalControlProblem, steps: _Steps, W: Floats, k: int | slice) -> Floats:
+    """Of the cost of step k and what follows in (x, u), with the value W after it."""
+    J, gz, x = steps.J[k], steps.gz[k], steps.J.shape[1]
+    across = W[..., :x, x:]
+    spread = problem.dt * (W[..., :x, :x] + steps.kicked[k])
+    Y = steps.cost[k] + np.swapaxes(J, -1, -2) @ W[..., :x, :x] @ J
+    mixed = np.swapaxes(J, -1, -2) @ across
+    Y[..., :, x:] += mixed
+    Y[..., x:, :] += np.swapaxes(mixed, -1, -2)
+    Y[..., x:, x:] += W[..., x:, x:]
+    added: Floats = np.einsum("...akz,...ab,...bky->...zy", gz, spread, gz, optimize=True)
+    return Y + added
+
+
+def _shares(problem: OptimalControlProblem, steps: _Steps, W: Floats, C: Floats) -> Floats:
+    """What noise adds in each step (N,), by the values W after steps and the covariances C before them."""
+    x = steps.J.shape[1]
+    spread = problem.dt * (W[1:, :x, :x] + steps.kicked)
+    before = np.einsum("Nzy,Nzy->N", C[:-1], _hessian(problem, steps, W[1:], slice(None)))
+    total: Floats = 0.5 * (before + np.einsum("Nak,Nab,Nbk->N", steps.g, spread, steps.g))
+    return total
+
+
+def _decision(feedback: Feedback, r: int, x: int, m: int) -> Floats:
+    """How (x, u) follow from (x, the control before)."""
+    T = np.zeros((x + m, x + m))
+    T[:x, :x], T[x:, :x] = np.eye(x), feedback.state[r]
+    if feedback.before is not None:
+        T[x:, x:] = feedback.before[r]
+    return T
+
+
+def _values(
+    problem: OptimalControlProblem, steps: _Steps, feedback: Feedback, terminal: Floats, rate: Floats
+) -> Floats:
+    """The value's Hessians (N + 1, 2n + m, 2n + m) at nodes in (x, the control before), under the gains."""
+    N, x, m = problem.steps, steps.J.shape[1], problem.scene.controls
+    W = np.zeros((N + 1, x + m, x + m))
+    W[N, :x, :x] = terminal
+    for k in range(N - 1, -1, -1):
+        W[k] = _hessian(problem, steps, W[k + 1], k)
+        if k % problem.hold == 0:
+            r = k // problem.hold
+            T = _decision(feedback, r, x, m)
+            W[k] = T.T @ W[k] @ T
+            if len(rate):
+                change = T[x:].copy()
+                change[:, x:] -= np.eye(m)
+                W[k] += change.T @ rate[r] @ change
+    return W
+
+
+def _covariances(problem: OptimalControlProblem, steps: _Steps, feedback: Feedback) -> Floats:
+    """The covariances (N + 1, 2n + m, 2n + m) of (x, u) with which steps begin, and of the end."""
+    N, x, m = problem.steps, steps.J.shape[1], problem.scene.controls
+    C, own = np.zeros((N + 1, x + m, x + m)), np.zeros((x + m, x + m))
+    for k in range(N):
+        if k % problem.hold == 0:
+            T = _decision(feedback, k // problem.hold, x, m)
+            own = T @ own @ T.T
+        C[k] = own
+        through = np.zeros((x + m, x + m))
+        through[:x], through[x:, x:] = steps.J[k], np.eye(m)
+        g, gz = steps.g[k], steps.gz[k]
+        own = through @ own @ through.T
+        own[:x, :x] += problem.dt * (g @ g.T + np.einsum("akz,zy,bky->ab", gz, C[k], gz, optimize=True))
+    C[N] = own
+    return C

@@ -1,0 +1,163 @@
+"""The coarsest plan that costs on the continuous system what it promises."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.history import Status
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.refined import Refined, Refinement, part
+from varpin.control.solution import Solution
+from varpin.control.verification import Verification
+from varpin.errors import InputError, VarpinError
+from varpin.mechanics.policy import LinearPolicy
+from varpin.simulation.run import rollout
+
+Floats = NDArray[np.float64]
+Search = Callable[[OptimalControlProblem, LinearPolicy | None], Solution]
+
+logger = logging.getLogger(__name__)
+
+# Of the wish, how well true costs are known.
+_KNOWN = 0.1
+# A step is halved no more often.
+_HALVINGS = 10
+# Halvings of the step that must bring the least loss down, or the wish is out of reach.
+_PATIENCE = 3
+
+
+def refine(problem: OptimalControlProblem, search: Search, wish: float, time_left: Callable[[], float]) -> Solution:
+    """Plan with the problem's step, then from that plan with half of it, until the loss is within the ``wish``.
+
+    Args:
+        problem: With the coarsest step.
+        search: Makes a plan from first controls; interrupted, it returns one with that status.
+        wish: On the loss with feedback, which is that of :attr:`Verification.closed_loop_loss`.
+        time_left: For all of it [s].
+    """
+    tried: list[Refined] = []
+    best: Solution | None = None
+    chosen, start = 0, None
+    while True:
+        began = time.perf_counter()
+        try:
+            solution = search(problem, start)
+            told = None if solution.status is Status.INTERRUPTED else solution.verify(tolerance=_KNOWN * wish)
+        except KeyboardInterrupt:
+            solution, told = replace(solution, status=Status.INTERRUPTED), None
+        except VarpinError as error:
+            if best is None:
+                raise
+            return _with(best, wish, tried, chosen, f"with dt = {problem.dt:g} s there is no plan: {error}")
+        if told is None:
+            ended = f"interrupted with dt = {problem.dt:g} s"
+            if best is None:
+                return _with(solution, wish, tried, 0, ended)
+            return _with(replace(best, status=Status.INTERRUPTED, reason=ended), wish, tried, chosen, ended)
+        tried.append(_row(solution, told, time.perf_counter() - began))
+        logger.info("%s: true cost: %s", problem.scene.robot.name, tried[-1])
+        if best is None or not abs(tried[-1].loss) >= abs(tried[chosen].loss):
+            best, chosen = solution, len(tried) - 1
+        if _within(tried[-1], wish) and solution.status.converged:
+            return _with(solution, wish, tried, len(tried) - 1, "", met=True)
+        ended = _ended(problem, solution, tried, chosen, wish, time_left())
+        if ended:
+            return _with(best, wish, tried, chosen, ended)
+        try:
+            problem = _halved(problem)
+            start = start_of(problem, solution)
+        except VarpinError as error:
+            return _with(best, wish, tried, chosen, f"half the step cannot be taken: {error}")
+
+
+def _ended(
+    problem: OptimalControlProblem, solution: Solution, tried: list[Refined], chosen: int, wish: float, left: float
+) -> str:
+    """Why half the step is not tried, if it is not."""
+    if left <= 0.0:
+        return f"the time limit came after dt = {problem.dt:g} s"
+    if len(tried) > _HALVINGS:
+        return f"the step has been halved {_HALVINGS} times"
+    if len(tried) - 1 - chosen >= _PATIENCE:
+        return f"the last {_PATIENCE} halvings of the step have not lowered the loss"
+    if _within(tried[-1], wish) and solution.status in (Status.STALLED, Status.INDEFINITE, Status.NOT_DIFFERENTIABLE):
+        return f"the loss is within the wish, but the search ended {solution.status.name}"
+    return ""
+
+
+def _row(solution: Solution, told: Verification, seconds: float) -> Refined:
+    problem = solution.problem
+    return Refined(
+        dt=problem.dt,
+        steps=problem.steps,
+        cost=solution.cost,
+        true_cost=told.closed_loop_cost,
+        open_loop_cost=told.open_loop_cost,
+        loss=told.closed_loop_loss if told.told else np.nan,
+        iterations=solution.iterations,
+        status=solution.status,
+        seconds=seconds,
+    )
+
+
+def _within(row: Refined, wish: float) -> bool:
+    return bool(abs(row.loss) <= wish)
+
+
+def _with(
+    solution: Solution, wish: float, tried: list[Refined], chosen: int, reason: str, *, met: bool = False
+) -> Solution:
+    """The solution with what it took."""
+    total = sum(row.seconds for row in tried) or 1.0
+    rows = tuple(replace(row, share=row.seconds / total) for row in tried)
+    if met:
+        reason = f"dt = {rows[chosen].dt:g} s loses {part(rows[chosen].loss)}, within {part(wish)[1:]}"
+    elif rows:
+        loss = rows[chosen].loss
+        reached = f"the best plan loses {part(loss)}" if np.isfinite(loss) else "no plan's true cost is known"
+        reason = f"true_cost = {wish:g} is not met: {reason}; {reached} at dt = {rows[chosen].dt:g} s"
+    logger.log(logging.INFO if met else logging.WARNING, "%s: %s", solution.problem.scene.robot.name, reason)
+    return replace(solution, refinement=Refinement(wish, met, rows, chosen, reason))
+
+
+def _halved(problem: OptimalControlProblem) -> OptimalControlProblem:
+    """The problem with half the step; controls that are held over several steps keep their period."""
+    hold = problem.hold if problem.hold == 1 else 2 * problem.hold
+    return problem.at(dt=0.5 * problem.dt, steps=2 * problem.steps, hold=hold)
+
+
+def start_of(problem: OptimalControlProblem, coarse: Solution) -> LinearPolicy:
+    """First controls of a problem with half the step: those that a coarse plan's policy applies on its grid.
+
+    Raises:
+        InputError: The policy does not get to the end there.
+    """
+    own, n, m = problem.integrator, problem.scene.robot.dof, problem.scene.controls
+    on: Literal["momentum", "velocity"] = "momentum" if own.variational else "velocity"
+    policy = coarse.policy_on(on, 2)
+    commands = policy.commands(problem.steps, m, n, own.variational, dt=problem.dt, stage_times=own.stage_times)
+    motion, failure = rollout(problem.scene, own, problem.q0, problem.v0, commands, problem.dt)
+    if failure is not None:
+        raise InputError(f"the plan before does not get to its end in half the step: {failure.reason}")
+    u = problem.decided(motion)
+    x = np.hstack([motion.q, motion.p if own.variational else motion.v])[: -1 : problem.hold]
+    # Feedback keeps rounding small where motions are unstable; lines change their control too late for that.
+    gains = np.zeros((len(x), m, 2 * n)) if problem.linear else np.repeat(policy.gains, len(x) // len(policy.gains), 0)
+    return LinearPolicy(
+        u[1:] if problem.linear else u,
+        gains,
+        x,
+        problem.hold,
+        on,
+        (problem.control_limits[0], problem.control_limits[1]),
+        before=u[0] if problem.linear else None,
+        period=problem.period,
+        linear=problem.linear,
+    )

@@ -1,0 +1,203 @@
+"""Plans whose controls are linear in time between nodes."""
+
+import numpy as np
+import pytest
+
+import varpin as vp
+
+N = 8
+RNG = np.random.default_rng(3)
+
+
+def links(*, cost: vp.Cost | None = None, **options: object) -> vp.OptimalControlProblem:
+    """Two links that reach."""
+    if cost is None:
+        end = vp.TrackingCost([0.6, -0.4], 1e3) + vp.VelocityCost(1e2)
+        cost = vp.ControlCost(1e-2) + vp.VelocityCost(0.1) + vp.Terminal(end)
+    given = {"dt": 0.1, "steps": N, "controls": "linear"} | options
+    return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(2), damping=0.1), cost, [0.1, 0.2], [0.0, 0.0], **given)
+
+
+def cost_under(problem: vp.OptimalControlProblem, u: np.ndarray) -> float:
+    """The cost of controls (N + 1, m) at the nodes, without any feedback."""
+    return problem.cost_of(problem.simulate(line(problem, u)))
+
+
+def line(problem: vp.OptimalControlProblem, u: np.ndarray) -> vp.LinearPolicy:
+    n, m = problem.scene.robot.dof, problem.scene.controls
+    steps = problem.steps
+    return vp.LinearPolicy(u[1:], np.zeros((steps, m, 2 * n)), np.zeros((steps, 2 * n)), before=u[0], linear=True)
+
+
+def test_the_optimum_of_a_double_integrator_is_the_continuous_one() -> None:
+    """Least effort from rest to rest is linear in time: two intervals hold it exactly."""
+    robot = vp.planar_chain(1)
+    scene = vp.Scene(robot, gravity=False)
+    inertia = float(vp.lagrangian_jet(scene, np.zeros(1), np.zeros(1)).Lvv[0, 0])
+    r, w, T = 0.3, 50.0, 1.2
+    cost = vp.ControlCost(r) + vp.Terminal(vp.TrackingCost([1.0], w) + vp.VelocityCost(w))
+    problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=T / 2, steps=2, controls="linear")
+    plan = vp.solve(problem, check=False)
+    # u = a + b t under (q, v)(T) = G (a, b), by hand.
+    G = np.array([[T**2 / 2, T**3 / 6], [T, T**2 / 2]]) / inertia
+    E = r * np.array([[T, T**2 / 2], [T**2 / 2, T**3 / 3]])
+    a, b = np.linalg.solve(E + w * G.T @ G, w * G.T @ [1.0, 0.0])
+    end = G @ [a, b]
+    least = np.array([a, b]) @ E @ [a, b] + w * ((end[0] - 1.0) ** 2 + end[1] ** 2)
+    assert plan.status.converged
+    np.testing.assert_allclose(plan.controls[:, 0], a + b * np.array([0.0, T / 2, T]), rtol=1e-9)
+    assert plan.cost == pytest.approx(least, rel=1e-12)
+    held = vp.solve(problem.at(controls="held"), check=False)
+    assert held.cost > 1.01 * least
+
+
+@pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.Midpoint(), vp.RungeKutta4(), vp.Radau(2)], ids=str)
+@pytest.mark.parametrize("rate", [None, vp.ControlRateCost(1e-3), vp.ControlRateCost(1e-3, before=[1.0, -1.0])])
+def test_the_gradient_is_that_of_the_cost(integrator: vp.Integrator, rate: vp.Cost | None) -> None:
+    base = links().cost
+    problem = links(cost=base if rate is None else base + rate, integrator=integrator)
+    start = 3.0 * np.random.default_rng(0).normal(size=(N + 1, 2))
+    plan = vp.solve(problem, start, max_iterations=0, check=False)
+    np.testing.assert_array_equal(plan.controls, start)
+    step, found = 1e-5, np.empty((N + 1, 2))
+    for index in np.ndindex(N + 1, 2):
+        away = np.zeros((N + 1, 2))
+        away[index] = step
+        found[index] = (cost_under(problem, start + away) - cost_under(problem, start - away)) / (2.0 * step)
+    np.testing.assert_allclose(plan.gradient, found, atol=2e-6 * np.abs(found).max())
+
+
+@pytest.mark.parametrize("limited", [False, True])
+def test_no_controls_cost_less_than_those_of_a_plan(limited: bool) -> None:
+    limits = {"control_limits": ([-4.0, -1.0], [4.0, 1.0])} if limited else {}
+    problem = links(**limits)
+    plan = vp.solve(problem, tolerance=1e-12, check=False)
+    assert plan.status.converged
+    u = plan.controls
+    lower, upper = problem.control_limits
+    at_limit = (u == lower) | (u == upper)
+    assert at_limit.any() == limited
+    assert ((u >= lower) & (u <= upper)).all()
+    # Where a control is free its gradient is zero, and at a limit it pushes outward.
+    scale = np.abs(vp.solve(problem, max_iterations=0, check=False).gradient).max()
+    assert np.abs(plan.gradient[~at_limit]).max() < 1e-5 * scale
+    assert (plan.gradient[u == lower] >= 0.0).all()
+    assert (plan.gradient[u == upper] <= 0.0).all()
+    for _ in range(5):
+        other = np.clip(u + 1e-2 * RNG.normal(size=u.shape), lower, upper)
+        assert cost_under(problem, other) > plan.cost
+
+
+def test_the_motion_of_a_plan_is_that_of_its_policy() -> None:
+    problem = links()
+    plan = vp.solve(problem, check=False)
+    assert plan.gains.shape == (N + 1, 2, 4)
+    assert plan.previous_gains.shape == (N + 1, 2, 2)
+    again = problem.simulate(plan.policy)
+    np.testing.assert_allclose(again.q, plan.trajectory.q, atol=1e-12)
+    np.testing.assert_allclose(again.u_nodes, plan.controls, atol=1e-10)
+    by_hand = vp.simulate(
+        problem.scene,
+        problem.q0,
+        problem.v0,
+        dt=problem.dt,
+        steps=N,
+        controls=vp.FirstOrderHold(plan.controls),
+        integrator=problem.integrator,
+    )
+    np.testing.assert_allclose(by_hand.q, plan.trajectory.q, atol=1e-12)
+    np.testing.assert_allclose(by_hand.u_stages, plan.trajectory.u_stages, atol=1e-10)
+
+
+def test_feedback_is_that_of_the_optimum_from_another_state() -> None:
+    """Of a linear system under squares the optimum is linear in the state, and the policy is that optimum."""
+    cost = vp.ControlCost(0.1) + vp.VelocityCost(0.2) + vp.Terminal(vp.TrackingCost([1.0], 50.0) + vp.VelocityCost(5.0))
+    cost += vp.ControlRateCost(1e-2)
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=0.3)
+    problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=0.2, steps=N, controls="linear")
+    plan = vp.solve(problem, tolerance=1e-13, check=False)
+    moved = problem.at(q0=[0.3])
+    best = vp.solve(moved, tolerance=1e-13, check=False)
+    own = plan.policy
+    first = plan.controls[0] + plan.gains[0] @ [0.3, 0.0]
+    np.testing.assert_allclose(best.controls[0], first, rtol=1e-8)
+    policy = vp.LinearPolicy(
+        own.u, own.gains, own.reference, on=own.on, previous_gains=own.previous_gains, before=first,
+        previous=own.previous, linear=True,
+    )  # fmt: skip
+    np.testing.assert_allclose(moved.simulate(policy).u_nodes, best.controls, atol=1e-8)
+    # Without a say in the first control, feedback still does most of it.
+    fed, alone = moved.cost_of(moved.simulate(own)), moved.cost_of(moved.simulate(own.without_feedback()))
+    assert fed - best.cost < 0.05 * (alone - best.cost)
+
+
+def test_a_finer_grid_follows_the_same_line() -> None:
+    problem = links()
+    plan = vp.solve(problem, check=False)
+    fine = vp.simulate(
+        problem.scene, problem.q0, problem.v0, dt=problem.dt / 4, steps=4 * N, controls=plan.policy.without_feedback()
+    )
+    share = np.arange(4)[:, None] / 4
+    u = plan.controls
+    between = ((1.0 - share) * u[:-1, None] + share * u[1:, None]).reshape(-1, 2)
+    np.testing.assert_allclose(fine.u_nodes[:-1], between, atol=1e-12)
+    np.testing.assert_allclose(fine.u, 0.5 * (fine.u_nodes[1:] + fine.u_nodes[:-1]), atol=1e-12)
+    told = plan.verify()
+    assert abs(told.open_loop_loss) < 1e-3
+    assert abs(told.closed_loop_loss) < 1e-3
+    assert told.defect < 1e-4
+
+
+def test_half_the_nodes_do() -> None:
+    """What held controls reach to a thousandth takes fewer than half as many nodes with linear ones."""
+    best = vp.solve(links(dt=0.01, steps=80), check=False).cost
+
+    def nodes(controls: str) -> int:
+        for steps in (2, 3, 4, 6, 8, 12, 16, 24, 32, 48):
+            plan = vp.solve(links(dt=0.8 / steps, steps=steps, controls=controls), check=False)
+            if abs(plan.verify(tolerance=1e-6).open_loop_cost / best - 1.0) < 1e-3:
+                return steps
+        return 1000
+
+    assert 2 * nodes("linear") <= nodes("held")
+
+
+def test_saved_and_read_again(tmp_path) -> None:
+    problem = links()
+    plan = vp.solve(problem, check=False)
+    again = vp.Solution.load(plan.save(tmp_path / "plan.npz"), problem)
+    np.testing.assert_array_equal(again.controls, plan.controls)
+    np.testing.assert_array_equal(again.previous_gains, plan.previous_gains)
+    with pytest.raises(vp.VarpinError, match="controls"):
+        vp.Solution.load(tmp_path / "plan.npz", problem.at(controls="held"))
+    path = plan.trajectory.save(tmp_path / "motion.npz")
+    np.testing.assert_array_equal(vp.Trajectory.load(path).u_nodes, plan.controls)
+    more = vp.solve(problem, resume=again, max_iterations=2, check=False)
+    assert more.cost <= plan.cost
+
+
+def test_refusals() -> None:
+    with pytest.raises(vp.InputError, match="controls must be 'held' or 'linear'"):
+        links(controls="cubic")
+    with pytest.raises(vp.InputError, match="hold"):
+        links(hold=2)
+    scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(0.1))
+    with pytest.raises(vp.InputError, match="noise"):
+        vp.OptimalControlProblem(scene, vp.ControlCost(1.0), [0, 0], [0, 0], dt=0.1, steps=2, controls="linear")
+    problem = links()
+    plan = vp.solve(problem, check=False)
+    with pytest.raises(vp.InputError, match="second_order"):
+        vp.solve(links(integrator=vp.Midpoint()), second_order=True)
+    with pytest.raises(vp.InputError, match="held"):
+        vp.Mpc(problem)
+    with pytest.raises(vp.InputError, match="shifted"):
+        plan.shifted(1)
+    with pytest.raises(vp.InputError, match="are linear"):
+        vp.solve(problem.at(controls="held"), plan)
+    with pytest.raises(vp.InputError, match="before"):
+        vp.LinearPolicy(np.zeros((2, 1)), np.zeros((2, 1, 2)), np.zeros((2, 2)), linear=True)
+    with pytest.raises(vp.InputError, match="noise"):
+        vp.simulate(scene, [0, 0], [0, 0], dt=0.1, steps=N, controls=plan.policy, rng=0)
+    with pytest.raises(vp.InputError, match="linear between nodes"):
+        vp.simulate_ensemble(problem.scene, [0, 0], [0, 0], dt=0.1, steps=N, controls=plan.policy, paths=2, rng=0,
+                             integrator=problem.integrator)  # fmt: skip

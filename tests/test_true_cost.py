@@ -1,0 +1,112 @@
+"""Plans to a wished true cost."""
+
+import time
+
+import numpy as np
+import pytest
+
+import varpin as vp
+
+
+def reach(steps: int, controls: str = "held", **options: object) -> vp.OptimalControlProblem:
+    end = vp.TrackingCost([1.5, -1.0], 1e3) + vp.VelocityCost(1e2)
+    cost = vp.ControlCost(1e-3) + vp.VelocityCost(0.1) + vp.Terminal(end)
+    given = {"dt": 1.0 / steps, "steps": steps, "controls": controls, "integrator": vp.Gauss(2)} | options
+    return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(2), damping=0.1), cost, [0.0, 0.0], [0.0, 0.0], **given)
+
+
+@pytest.mark.parametrize("controls", ["held", "linear"])
+def test_the_first_step_within_the_wish_is_taken(controls: str) -> None:
+    problem = reach(3, controls)
+    plan = vp.solve(problem, true_cost=1e-4)
+    found = plan.refinement
+    assert found.met
+    assert found.chosen == len(found.tried) - 1 >= 1
+    assert plan.status.converged
+    assert abs(plan.verify().closed_loop_loss) <= 1e-4
+    assert all(abs(row.loss) > 1e-4 for row in found.tried[:-1])
+    np.testing.assert_allclose([row.dt for row in found.tried], [1 / 3 / 2**k for k in range(len(found.tried))])
+    assert sum(row.share for row in found.tried) == pytest.approx(1.0)
+    assert plan.problem.steps == found.tried[-1].steps == plan.trajectory.steps
+    assert str(found) in plan.table()
+    # Each row is the plan of its step, from whatever controls it began.
+    cold = vp.solve(problem.at(dt=found.tried[-1].dt), check=False)
+    assert plan.cost == pytest.approx(cold.cost, rel=1e-5)
+
+
+def test_a_warm_start_is_the_plan_before() -> None:
+    """Half the step begins with the coarse plan's motion: it takes few iterations."""
+    plan = vp.solve(reach(8), true_cost=1e-5, check=False)
+    tried = plan.refinement.tried
+    assert len(tried) >= 2
+    assert tried[-1].iterations < 0.7 * tried[0].iterations
+
+
+def test_held_periods_stay() -> None:
+    plan = vp.solve(reach(8, hold=2), true_cost=1e-5, check=False)
+    assert plan.refinement.met
+    assert plan.problem.period == pytest.approx(0.25)
+    assert len(plan.controls) == 4
+
+
+def test_a_wish_out_of_reach_says_so() -> None:
+    plan = vp.solve(reach(8), true_cost=1e-4, max_iterations=1)
+    found = plan.refinement
+    assert not found.met or plan.status.converged
+    limited = vp.solve(reach(3), true_cost=1e-12, time_limit=0.3)
+    assert not limited.refinement.met
+    assert "true_cost = 1e-12 is not met" in limited.refinement.reason
+    assert any("true_cost" in sentence for sentence in limited.warnings)
+    # A reference on the problem's own grid has no values in between.
+    rows = np.zeros((7, 2))
+    fixed = vp.OptimalControlProblem(
+        vp.Scene(vp.planar_chain(2)),
+        vp.ControlCost(1.0) + vp.TrackingCost(rows, 100.0),
+        [0.0, 0.0],
+        [0.0, 0.0],
+        dt=0.2,
+        steps=6,
+        sampling="start",
+    )
+    stuck = vp.solve(fixed, true_cost=1e-9, check=False)
+    assert "half the step cannot be taken" in stuck.refinement.reason
+
+
+@pytest.mark.parametrize("after", [1, 12])
+def test_an_interrupt_keeps_the_best(after: int) -> None:
+    calls = 0
+
+    def callback(_: vp.Iteration) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == after:
+            raise KeyboardInterrupt
+
+    plan = vp.solve(reach(4), true_cost=1e-9, callback=callback, check=False)
+    assert plan.status is vp.Status.INTERRUPTED
+    assert not plan.refinement.met
+    assert "interrupted" in plan.refinement.reason or not plan.refinement.tried
+    if plan.refinement.tried:
+        best = min(plan.refinement.tried, key=lambda row: abs(row.loss))
+        assert plan.problem.dt == pytest.approx(best.dt)
+
+
+def test_saved_with_the_plan(tmp_path) -> None:
+    plan = vp.solve(reach(4), true_cost=1e-4, check=False)
+    again = vp.Solution.load(plan.save(tmp_path / "plan.npz"), plan.problem)
+    assert again.refinement == plan.refinement
+
+
+def test_bad_wishes() -> None:
+    plan = vp.solve(reach(4), check=False)
+    with pytest.raises(vp.InputError, match="true_cost"):
+        vp.solve(reach(4), true_cost=0.0)
+    with pytest.raises(vp.InputError, match="resume"):
+        vp.solve(reach(4), resume=plan, true_cost=0.1)
+
+
+def test_the_time_limit_is_for_all_steps() -> None:
+    began = time.perf_counter()
+    plan = vp.solve(reach(4), true_cost=1e-13, time_limit=0.5, check=False)
+    assert not plan.refinement.met
+    assert time.perf_counter() - began < 20.0
