@@ -284,7 +284,10 @@ class Solution(Frozen):
     def verify(
         self, *, tolerance: float = 1e-10, max_substeps: int = 1024, progress: Callable[[int, int], None] | None = None
     ) -> Verification:
-        """Replay the plan through an accurate integration of the continuous system: classical Runge-Kutta, Simpson.
+        """Replay the plan through an accurate integration of the continuous system, costs by Simpson's rule.
+
+        By classical Runge-Kutta, or by :class:`Radau` with three stages where dampers or dry friction are too fast for
+        that, as friction is whose ``width`` a joint passes within a small part of a step.
 
         Main args:
             tolerance: On the relative change of the cost when the substeps are doubled.
@@ -299,7 +302,7 @@ class Solution(Frozen):
             self.problem,
             self.trajectory,
             self.cost,
-            lambda substeps: self.policy_on("velocity", substeps),
+            self.policy_on,
             status=self.status,
             tolerance=tolerance,
             max_substeps=max_substeps,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,10 @@ from varpin.control.costs import BoundSum
 from varpin.control.history import Status
 from varpin.control.problem import OptimalControlProblem, bind_cost
 from varpin.core.arrays import Commands
-from varpin.integrators import Integrator, RungeKutta4
+from varpin.integrators import Integrator, Radau, RungeKutta4
 from varpin.integrators.base import open_loop
 from varpin.mechanics.policy import LinearPolicy
+from varpin.simulation.friction import rate_at_rest
 from varpin.simulation.run import rollout
 from varpin.support.markup import facts, table
 from varpin.trajectory import Trajectory
@@ -27,9 +29,13 @@ logger = logging.getLogger(__name__)
 # Above, the costs are not known well enough to say anything of the plan.
 _UNTOLD = 0.01
 _READING = (
-    "where feedback loses some percent, the plan holds; where it loses much, dt is too coarse (controls alone also "
-    "lose much where a motion is unstable)"
+    "where feedback loses less than a percent, the plan holds; where it loses more, dt is too coarse (controls alone "
+    "also lose much where a motion is unstable)"
 )
+# What the continuous system is integrated with, and where dampers or dry friction are too fast for that. The first is
+# stable up to this product of rate and step.
+_ACCURATE, _STIFF = RungeKutta4(), Radau(3)
+_STABLE = 2.78
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,8 @@ class Verification:
         substeps: Of the accurate integration, in one step of the plan.
         accuracy: Relative change over the last doubling of the substeps, of the cost that changed more.
         status: How the search for the plan ended.
+        integrator: What the accurate integration was made with: classical Runge-Kutta, or Radau(3) where dampers or dry
+            friction are too fast for it.
     """
 
     planned_cost: float
@@ -59,6 +67,7 @@ class Verification:
     substeps: int
     accuracy: float
     status: Status = Status.CONVERGED
+    integrator: str = str(_ACCURATE)
 
     @property
     def told(self) -> bool:
@@ -78,9 +87,9 @@ class Verification:
     @property
     def _untold(self) -> str:
         return (
-            f"these costs say nothing of the plan: with {self.substeps} Runge-Kutta steps in one of the plan's they "
-            f"still change by {percent(self.accuracy)}. Dampers or dry friction are too fast for it; simulate the "
-            "plan's policy with varpin.Radau(3) in small steps instead, or give max_substeps"
+            f"these costs say nothing of the plan: with {self.substeps} steps of {self.integrator} in one of the "
+            f"plan's they still change by {percent(self.accuracy)}. Dampers, dry friction or stops are too fast for "
+            f"them: give more max_substeps than {self.substeps}, or friction a greater width"
         )
 
     @property
@@ -111,7 +120,7 @@ class Verification:
             [
                 *lines,
                 f"a step is off by {self.defect:.2e} rad or m at most; costs are good to {good} of themselves "
-                f"({self.substeps} substeps a step)",
+                f"({self.substeps} substeps a step of {self.integrator})",
                 f"read it so: {_READING}" if self.told else self._untold,
                 *([] if self.status.converged else [f"the plan is unfinished, {self.status.value}"]),
             ]
@@ -136,29 +145,67 @@ def verify(
     problem: OptimalControlProblem,
     plan: Trajectory,
     planned_cost: float,
-    policy: Callable[[int], LinearPolicy],
+    policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
     *,
     status: Status,
     tolerance: float,
     max_substeps: int,
     progress: Callable[[int, int], None] | None,
 ) -> Verification:
-    """Hold a plan, and its policy on (q, v) for a number of substeps, against accurate integrations.
+    """Hold a plan, and its policy on (q, p) or (q, v) for a number of substeps, against accurate integrations.
 
-    The substeps double until neither cost changes by more than ``tolerance`` of itself.
+    The substeps double until neither cost changes by more than ``tolerance`` of itself. Where an explicit method does
+    not get there, for dampers or dry friction are too fast for it, an L-stable one does it again.
     """
+    rate = rate_at_rest(problem.scene, problem.q0)
+    members = (_ACCURATE, _STIFF) if problem.dt * rate < _STABLE * max_substeps else (_STIFF,)
+    for integrator in members:
+        found = _against(
+            problem,
+            plan,
+            planned_cost,
+            policy,
+            integrator,
+            status=status,
+            tolerance=tolerance,
+            max_substeps=max_substeps,
+            progress=progress,
+        )
+        if found.told or not rate:
+            break
+    if not found.told:
+        logger.warning("%s", found._untold)
+    return found
+
+
+def _against(
+    problem: OptimalControlProblem,
+    plan: Trajectory,
+    planned_cost: float,
+    policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
+    integrator: Integrator,
+    *,
+    status: Status,
+    tolerance: float,
+    max_substeps: int,
+    progress: Callable[[int, int], None] | None,
+) -> Verification:
+    """:func:`verify` by one integrator."""
     substeps, before = 2, (np.nan, np.nan)
     blind = open_loop(plan.u[:: problem.hold])
+    state: Literal["momentum", "velocity"] = "momentum" if integrator.variational else "velocity"
     while True:
         if progress is not None:
             progress(substeps, max_substeps)
         costs = _fine_costs(problem, substeps)
-        opened = accurate_cost(problem, blind._replace(hold=problem.hold * substeps), substeps, costs)
-        fed = policy(substeps)
-        feedback = fed.commands(
-            problem.steps * substeps, problem.scene.controls, problem.scene.robot.dof, variational=False
+        opened = accurate_cost(problem, blind._replace(hold=problem.hold * substeps), substeps, costs, integrator)
+        feedback = policy(state, substeps).commands(
+            problem.steps * substeps,
+            problem.scene.controls,
+            problem.scene.robot.dof,
+            variational=integrator.variational,
         )
-        closed = accurate_cost(problem, feedback, substeps, costs)
+        closed = accurate_cost(problem, feedback, substeps, costs, integrator)
         changes = [
             abs(now[0] - then) / max(abs(now[0]), 1e-300)
             for now, then in zip((opened, closed), before, strict=True)
@@ -170,20 +217,18 @@ def verify(
             break
         substeps *= 2
     end = plan.q[-1]
-    found = Verification(
+    return Verification(
         planned_cost=planned_cost,
         open_loop_cost=opened[0],
         closed_loop_cost=closed[0],
         open_loop_gap=float(np.abs(opened[1] - end).max()),
         closed_loop_gap=float(np.abs(closed[1] - end).max()),
-        defect=_defect(problem, plan, substeps),
+        defect=_defect(problem, plan, substeps, integrator),
         substeps=substeps,
         accuracy=accuracy,
         status=status,
+        integrator=str(integrator),
     )
-    if not found.told:
-        logger.warning("%s", found._untold)
-    return found
 
 
 def _fine_costs(problem: OptimalControlProblem, substeps: int) -> tuple[BoundSum, BoundSum]:
@@ -205,7 +250,7 @@ def accurate_cost(
     """
     scene, h = problem.scene, problem.dt / substeps
     n, m = scene.robot.dof, scene.controls
-    motion, failure = rollout(scene, integrator or RungeKutta4(), problem.q0, problem.v0, commands, h)
+    motion, failure = rollout(scene, integrator or _ACCURATE, problem.q0, problem.v0, commands, h)
     if failure is not None:
         return np.nan, np.full(n, np.nan)
     running, terminal = _fine_costs(problem, substeps) if costs is None else costs
@@ -218,10 +263,9 @@ def accurate_cost(
     return float(integral + end + smooth), motion.q[-1]
 
 
-def _defect(problem: OptimalControlProblem, trajectory: Trajectory, substeps: int) -> float:
+def _defect(problem: OptimalControlProblem, trajectory: Trajectory, substeps: int, integrator: Integrator) -> float:
     """Largest distance in q between the plan's steps and accurate ones from the same nodes."""
     scene, h, n = problem.scene, problem.dt / substeps, problem.scene.robot.dof
-    integrator = RungeKutta4()
     state, _ = integrator.start(scene, trajectory.q[:-1].copy(), trajectory.v[:-1].copy())
     # Every step is a path of its own, with its own control handed over as a force.
     commands = open_loop(np.zeros((1, scene.controls)))._replace(hold=substeps)
