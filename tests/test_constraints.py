@@ -510,15 +510,24 @@ def test_a_custom_constraint_that_raises_is_told_of():
         raise RuntimeError("no value")
 
     scene = vp.Scene(vp.planar_chain(3), constraints=vp.CustomConstraint(1, broken, OWN.jacobian))
-    with pytest.raises(RuntimeError, match="no value"):
+    with pytest.raises(vp.CustomConstraintError, match=r"raised RuntimeError\('no value'\) at q ="):
         vp.simulate(scene, [1.0, 0.0, 0.0], np.zeros(3), dt=1e-2, steps=5)
 
     def late(q):
         return OWN.value(q) if q[2] < 0.05 else [np.nan]
 
     failing = vp.Scene(vp.planar_chain(3), constraints=vp.CustomConstraint(1, late, OWN.jacobian))
-    with pytest.raises(vp.InputError, match="value of a CustomConstraint"):
+    with pytest.raises(vp.ConstraintError, match="value of a CustomConstraint") as info:
         vp.simulate(failing, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], dt=1e-2, steps=50)
+    assert info.value.trajectory.steps == info.value.step > 0
+    whole = vp.simulate(
+        vp.Scene(vp.planar_chain(3), constraints=vp.CustomConstraint(1, OWN.value, OWN.jacobian)),
+        [1.0, 0.0, 0.0],
+        [0.0, 0.0, 1.0],
+        dt=1e-2,
+        steps=info.value.step,
+    )
+    np.testing.assert_array_equal(info.value.trajectory.q, whole.q)
     wrong = vp.Scene(vp.planar_chain(3), constraints=vp.CustomConstraint(2, OWN.value, OWN.jacobian))
     with pytest.raises(vp.InputError, match="value of a CustomConstraint"):
         wrong.constraint_values(np.zeros(3))

@@ -1,6 +1,9 @@
 """Forces that a user writes: against varpin's own, Pinocchio's aba, and differences."""
 
+import gc
 import itertools
+import pickle
+import weakref
 
 import numpy as np
 import pinocchio as pin
@@ -266,3 +269,163 @@ def test_a_function_that_raises_in_the_check_leaves_the_motion():
     assert motion.steps == 30
     assert "not checked" in motion.warnings[0]
     assert "beyond the table" in motion.warnings[0]
+
+
+def narrow(q, v):
+    """Friction that turns round within a ten-thousandth [rad/s]."""
+    return -0.5 * np.tanh(v / 1e-4)
+
+
+class TestDifferences:
+    def test_narrow_friction(self):
+        """Steps of differences become smaller than what they look at."""
+        own = vp.CustomForce(narrow)
+        for v in (0.0, 2e-5, 1e-4, 3e-4, 0.01):
+            _, by_v = own.slopes(np.zeros(3), np.full(3, v))
+            exact = -0.5 / 1e-4 / np.cosh(v / 1e-4) ** 2
+            np.testing.assert_allclose(by_v, exact * np.eye(3), rtol=0, atol=1e-6 * max(1.0, abs(exact)))
+
+    def test_what_they_may_be_off_by(self):
+        """The estimate bounds the error where the function is smooth, and is large at a jump."""
+        for f, slope in ((np.sin, np.cos), (lambda x: np.tanh(x / 1e-2), lambda x: 1e2 / np.cosh(x / 1e-2) ** 2)):
+            own = vp.CustomForce(lambda q, v, f=f: f(v))
+            for v in np.linspace(-0.05, 0.05, 11):
+                column, off = own._difference(np.zeros(1), np.array([v]), 1, 0)
+                assert abs(column[0] - slope(v)) <= off + 1e-12 < 1e-4
+        jump = vp.CustomForce(lambda q, v: np.sign(v))
+        column, off = jump._difference(np.zeros(1), np.zeros(1), 1, 0)
+        assert off > 1e-2 * column[0] > 1.0
+
+    def test_a_joint_that_narrow_friction_stops(self):
+        """As varpin's own friction has it, with Newton's method on derivatives by differences."""
+        own = vp.Scene(ROBOT, gravity=False, forces=vp.CustomForce(narrow))
+        other = vp.Scene(ROBOT, gravity=False, forces=vp.CoulombFriction(0.5, 1e-4))
+        one, two = (
+            vp.simulate(each, Q0, V0, dt=2e-3, steps=40, integrator=vp.Radau(2), check=False) for each in (own, other)
+        )
+        np.testing.assert_allclose(one.q, two.q, rtol=0, atol=1e-9)
+
+
+class TestDerivativesThatAreWrong:
+    def test_given_ones_are_named(self):
+        def wrong(q, v):
+            by_q, by_v = slopes(q, v)
+            by_v[0, 1] += 0.3
+            return by_q, by_v
+
+        exact = slopes(Q0, V0)[1][0, 1]
+        for start in (
+            simulate,
+            lambda own: simulate(own, integrator=vp.RungeKutta4()),
+            lambda own: simulate(own, integrator=vp.Reference()),
+            lambda own: simulate(own, dt=None, steps=None, duration=0.1, tolerance=1e-4),
+        ):
+            with pytest.raises(vp.CustomForceError) as info:
+                start(vp.Scene(ROBOT, forces=vp.CustomForce(drag, wrong)))
+            said = str(info.value)
+            assert "CustomForce drag" in said
+            assert f"dF/dv[0, 1] is {exact + 0.3:.8g}, and differences of f give {exact:.7g}" in said
+            assert "q = [ 0.3 -0.4  0.5]" in said
+
+    def test_complex_steps_are_tried_where_the_motion_starts(self):
+        """Beyond a threshold the function drops imaginary parts, and near zero it does not."""
+
+        def f(q, v):
+            return -v * (np.abs(v) if v[0].real > 5.0 else 1.0)
+
+        own = vp.Scene(ROBOT, forces=vp.CustomForce(f, "complex"))
+        vp.simulate(own, Q0, V0, dt=1e-2, steps=2)
+        with pytest.raises(vp.CustomForceError, match=r"complex steps do not give .* dF/dv\[0, 0\] is"):
+            vp.simulate(vp.Scene(ROBOT, forces=vp.CustomForce(f, "complex")), Q0, [6.0, 0, 0], dt=1e-2, steps=2)
+
+    def test_jumps_at_the_start_are_no_fault(self):
+        """A function without derivatives there, whose own are right elsewhere."""
+        own = vp.CustomForce(lambda q, v: -np.sign(v), lambda q, v: (np.zeros((3, 3)), np.zeros((3, 3))))
+        vp.Scene(ROBOT, forces=own).custom.check(Q0, np.zeros(3))
+
+
+def breaks(q, v):
+    """Not defined from some place on, where motions from Q0 and V0 come by."""
+    if q[0] > 0.36:
+        raise ValueError("beyond the table")
+    return -v
+
+
+def damps(q, v):
+    return np.zeros((3, 3)), -np.eye(3)
+
+
+class TestWhereItFails:
+    own = staticmethod(lambda **options: vp.Scene(ROBOT, forces=vp.CustomForce(breaks, damps), **options))
+
+    def check(self, error):
+        assert error.trajectory.steps == error.step > 0
+        assert "beyond the table" in str(error)
+        assert "q = [" in str(error)
+        assert error.time == error.trajectory.t[-1]
+
+    def test_with_a_tolerance(self):
+        with pytest.raises(vp.ForceError) as info:
+            vp.simulate(self.own(), Q0, V0, duration=0.5, tolerance=1e-5)
+        self.check(info.value)
+
+    def test_coarse_steps_may_fail(self):
+        """Where the motion itself keeps clear, only their runs are lost."""
+        reach = vp.simulate(vp.Scene(ROBOT, damping=1.0), Q0, V0, dt=1e-3, steps=100).q[:, 0].max() + 2e-3
+
+        def edge(q, v):
+            if q[0] > reach:
+                raise ValueError("beyond the table")
+            return -v
+
+        motion = vp.simulate(vp.Scene(ROBOT, forces=vp.CustomForce(edge)), Q0, V0, duration=0.1, tolerance=1e-5)
+        assert motion.accuracy.met
+
+    def test_in_an_ensemble(self):
+        with pytest.raises(vp.ForceError, match="path 0: CustomForce breaks") as info:
+            vp.simulate_ensemble(
+                self.own(noise=vp.AdditiveNoise(0.01)), Q0, V0, dt=0.01, steps=30, paths=4, rng=0, workers=2
+            )
+        self.check(info.value)
+        again = pickle.loads(pickle.dumps(info.value))
+        assert str(again) == str(info.value)
+        assert again.step == info.value.step
+
+    def test_in_a_plan(self):
+        """On the first motion it is an error; later on it costs trials."""
+        cost = vp.ControlCost(1e-3) + vp.TrackingCost([0.6, -0.4, 0.5], 10.0)
+        problem = vp.OptimalControlProblem(self.own(gravity=False), cost, Q0, V0, dt=0.03, steps=10)
+        with pytest.raises(vp.ForceError) as info:
+            vp.solve(problem, np.zeros(3))
+        self.check(info.value)
+        still = problem.at(v0=np.zeros(3))
+        plan = vp.solve(still, np.zeros(3), max_iterations=4, check=False)
+        assert plan.trajectory.q[:, 0].max() <= 0.37
+        assert plan.cost < still.cost_of(still.simulate(np.zeros((10, 3))))
+
+    def test_newton_names_it(self):
+        """A force that jumps leaves no solution of a step."""
+        jumps = vp.CustomForce(lambda q, v: -200.0 * np.sign(v - 0.013))
+        own = vp.Scene(ROBOT, gravity=False, forces=jumps)
+        with pytest.raises(vp.StepFailure, match="CustomForce <lambda> may be the reason"):
+            vp.simulate(own, Q0, V0, dt=0.01, steps=50, integrator=vp.Gauss(2), check=False)
+
+
+@pytest.mark.parametrize("kind", ["force", "constraint"])
+def test_a_scene_whose_function_knows_it_is_collected(kind):
+    """The core's own reference is none that keeps it alive."""
+
+    def made():
+        box = []
+        if kind == "force":
+            scene = vp.Scene(ROBOT, forces=vp.CustomForce(lambda q, v: -0.1 * v * len(box)))
+        else:
+            own = vp.CustomConstraint(1, lambda q: [q[0] * len(box)], lambda q: [[1.0, 0.0, 0.0]])
+            scene = vp.Scene(ROBOT, constraints=own)
+        box.append(scene)
+        vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-2, steps=2)
+        return weakref.ref(scene)
+
+    gone = made()
+    gc.collect()
+    assert gone() is None

@@ -38,6 +38,7 @@ from varpin.integrators import SemiImplicitEuler as SemiImplicitEuler
 from varpin.mechanics.assembly import assemble as assemble
 from varpin.mechanics.constraints import Constraint as Constraint
 from varpin.mechanics.constraints import CustomConstraint as CustomConstraint
+from varpin.mechanics.constraints import CustomConstraintError as CustomConstraintError
 from varpin.mechanics.constraints import Distance as Distance
 from varpin.mechanics.constraints import FrameOnFrame as FrameOnFrame
 from varpin.mechanics.constraints import JointTie as JointTie
@@ -76,6 +77,7 @@ from varpin.model import load_robot as load_robot
 from varpin.model import planar_chain as planar_chain
 from varpin.model import robot_names as robot_names
 from varpin.show.replay import replay as replay
+from varpin.simulation.run import ConstraintError as ConstraintError
 from varpin.simulation.run import ControlError as ControlError
 from varpin.simulation.run import ForceError as ForceError
 from varpin.simulation.run import Interrupted as Interrupted

@@ -20,11 +20,12 @@ from varpin.core.arrays import Commands
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, rows
-from varpin.mechanics.policy import LinearPolicy, OpenLoop
+from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.mechanics.wiener import Children, children
 from varpin.simulation.loop_stability import examined_in_loop
-from varpin.simulation.run import Motions, commands_of
+from varpin.simulation.run import Motions, commands_of, located
 from varpin.simulation.soundness import Finding, announce
 from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
 from varpin.support.executors import executing, in_order
@@ -170,7 +171,7 @@ def simulate_ensemble(
     steps: int,
     paths: int,
     rng: np.random.Generator | int,
-    controls: JointValues | LinearPolicy | OpenLoop | None = None,
+    controls: JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None = None,
     integrator: Integrator | None = None,
     store: bool = True,
     quantiles: Sequence[float] = (0.05, 0.5, 0.95),
@@ -191,7 +192,8 @@ def simulate_ensemble(
         steps: N.
         paths: P.
         rng: Seed or generator.
-        controls: None, (N, m), (m,), by joint name, :class:`OpenLoop`, or a :class:`LinearPolicy` that each path
+        controls: None, (N, m), (m,), by joint name, :class:`OpenLoop`, :class:`FirstOrderHold`, or a
+            :class:`LinearPolicy` that each path
             evaluates at its own state.
 
     Other Args:
@@ -210,6 +212,7 @@ def simulate_ensemble(
 
     Raises:
         InputError: Wrong shapes, values that are not finite, or a scene whose noise the core cannot evaluate.
+        ForceError: A function of a :class:`varpin.CustomForce` failed in a path, which it names and holds so far.
         VarpinError: Every path failed, or workers get lost again and again.
         EnsembleInterrupted: Ctrl-C; holds the paths that were done. It is a KeyboardInterrupt.
     """
@@ -508,7 +511,10 @@ class _Chunk:
         for drawn, child in zip(increments, self.generators[group], strict=True):
             child.standard_normal(out=drawn)
         increments *= np.sqrt(shared.dt)
-        segments = shared.integrator.rollout(shared.scene, state, decisions, increments, shared.dt)
+        try:
+            segments = shared.integrator.rollout(shared.scene, state, decisions, increments, shared.dt)
+        except CustomForceError as error:
+            raise self._located(group, error) from error
         alive = self.alive[group]
         done = [len(segment.q) * int(still) for segment, still in zip(segments, alive, strict=True)]
         self._store(begin + 1, group, segments, done)
@@ -521,6 +527,18 @@ class _Chunk:
             if segment.failure is not None:
                 self._fail(group.start + i, begin + k, segment.failure)
         return np.array(done, dtype=np.int64)
+
+    def _located(self, group: slice, error: CustomForceError) -> VarpinError:
+        """The error of a function that failed in one of some paths, with its path, its step and the motion before."""
+        own, task = self.shared, self.task
+        for i in range(group.start, group.stop):
+            (generator,) = own.seeds.generators(task.first + i, task.first + i + 1)
+            drawn = generator.standard_normal((own.steps, own.scene.processes)) * np.sqrt(own.dt)
+            given = own.scene, own.integrator, (task.q0[i], task.v0[i]), own.commands, own.dt
+            found = located(*given, drawn, error, f"path {task.first + i}: ")
+            if found is not error:
+                return found
+        return error
 
     def _fail(self, path: int, step: int, failure: Failure) -> None:
         self.alive[path] = False

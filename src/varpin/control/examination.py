@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from varpin.control.history import ITERATIONS, Status
-from varpin.control.problem import OptimalControlProblem, default_integrator
+from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
 from varpin.control.verification import accurate_cost, percent
 from varpin.errors import VarpinError
+from varpin.integrators import Integrator
 from varpin.integrators.base import open_line, open_loop
 from varpin.simulation.chatter import alternation, restlessness
 from varpin.simulation.soundness import Finding, announce, evident, examined
@@ -23,7 +24,7 @@ PARTS = 4
 # Of a plan's cost, what a robot may pay above it, and below it, without a word.
 LOSS, GAIN = 1e-3, 1e-2
 # Findings about single steps; what they come to over a whole plan, playing it again tells.
-_OF_STEPS = ("coarse steps", "fast damping", "split steps")
+_OF_STEPS = ("coarse steps", "fast damping", "fast friction", "split steps")
 # Of its cost, what a search that stalls may still promise without a word.
 _LITTLE = 1e-3
 _ALTERNATION, _RESTLESS = "alternating velocities", "restless velocities"
@@ -121,7 +122,7 @@ def _alternating(solution: Solution) -> list[Finding]:
     if problem.sampling == "midpoint":
         why = "costs sampled at the midpoints of steps do not see it; sampling='gauss' does"
     elif problem.integrator.order < 4:
-        why = f"{problem.integrator} is coarse at this dt; {default_integrator()}, the default, is less so"
+        why = f"{problem.integrator} is coarse at this dt; {_usual(problem)}, the default, is less so"
     else:
         why = "the optimum moves faster than the steps; a smaller dt, or a ControlRateCost, smooths it"
     return [
@@ -168,6 +169,10 @@ def _restless(solution: Solution) -> list[Finding]:
     ]
 
 
+def _usual(problem: OptimalControlProblem) -> Integrator:
+    return integrator_for(problem.scene, problem.q0, problem.dt)
+
+
 def _sentence(problem: OptimalControlProblem, replay: Replay) -> str:
     """What a plan loses in finer steps, why, and what to change."""
     fed, alone = (percent(part) if np.isfinite(part) else "runs away" for part in (replay.feedback, replay.alone))
@@ -178,8 +183,8 @@ def _sentence(problem: OptimalControlProblem, replay: Replay) -> str:
         why = (
             f"costs sampled by the rule {problem.sampling!r} miss what happens within steps; sampling='gauss' does not"
         )
-    elif problem.integrator.order < default_integrator().order:
-        why = f"{problem.integrator} is too coarse; {default_integrator()}, the default, is closer, and {finer}"
+    elif problem.integrator.order < _usual(problem).order:
+        why = f"{problem.integrator} is too coarse; {_usual(problem)}, the default, is closer, and {finer}"
     else:
         why = f"what is fast here is not resolved; {finer}"
     return (

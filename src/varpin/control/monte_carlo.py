@@ -86,7 +86,7 @@ class MonteCarlo:
                 f"{'simulated':16}{self.cost:14.6e} +- {self.standard_error:.1e} ({self.paths} paths{lost})",
                 f"{'predicted':16}{self.predicted:14.6e}",
                 f"{'difference':16}{gap:+14.6e} ({percent(excess(self.cost, self.predicted))}{apart})",
-                "read it so: within three standard errors (+-) the two agree; beyond, noise is too strong for the "
+                "how to read it: within three standard errors (+-) the two agree; beyond, noise is too strong for the "
                 "model",
                 *(f"warning: {warning}" for warning in self.warnings),
             ]

@@ -28,9 +28,10 @@ from varpin.errors import InputError, LinearizationError
 from varpin.integrators import Integrator
 from varpin.integrators.base import open_line, open_loop
 from varpin.integrators.variational import Variational
+from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.policy import LinearPolicy
-from varpin.simulation.run import StepFailure
+from varpin.simulation.run import StepFailure, located, named
 from varpin.support.checks import (
     JointValues,
     as_floats,
@@ -56,8 +57,8 @@ ARMIJO, BACKTRACKING = 1e-5, 0.25
 # long steps and grows after short ones.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
 _LONG, _SHORT = 0.5, 0.01
-# What a cost, a noise field or a step may raise somewhere off the motion that has been found.
-_LOST = (CostError, NoiseFieldError, LinearizationError)
+# What a cost, a noise field, a force or a step may raise somewhere off the motion that has been found.
+_LOST = (CostError, NoiseFieldError, CustomForceError, LinearizationError)
 # As much as this does not hide how far an optimum is; controls that do nothing need some.
 _LITTLE = 1e-4
 # Of Quu, what rounding may change without a word.
@@ -161,6 +162,7 @@ def solve(
     Raises:
         InputError: Controls of a wrong shape, or options out of their range.
         NoiseFieldError: A noise field of one's own fails on the first motion.
+        ForceError: A :class:`varpin.CustomForce` fails on the first motion; elsewhere it costs a trial.
         StepFailure: The first motion cannot be integrated; holds what came before.
         CostError: The cost of the first motion is not finite, or a cost of one's own fails there.
     """
@@ -457,10 +459,16 @@ class _Search:
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {begin:g} s"
 
     def begin(self, commands: Commands) -> None:
-        attempt = self.trials.attempt(commands)
+        problem = self.problem
+        try:
+            attempt = self.trials.attempt(commands)
+        except CustomForceError as error:
+            start = problem.q0, problem.v0
+            raise located(problem.scene, problem.integrator, start, commands, problem.dt, None, error) from error
         trajectory = attempt.trajectory()
         if attempt.failure is not None:
-            raise StepFailure(trajectory.steps, trajectory.t[-1], attempt.failure, trajectory)
+            failure = named(self.problem.scene, attempt.failure)
+            raise StepFailure(trajectory.steps, trajectory.t[-1], failure, trajectory)
         self.trajectory = trajectory
         self.shares = attempt.shares()
         self.cost = float(self.shares.sum())

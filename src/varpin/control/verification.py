@@ -18,6 +18,7 @@ from varpin.core.arrays import Commands
 from varpin.integrators import Integrator, Radau, RungeKutta4
 from varpin.integrators.base import open_line, open_loop
 from varpin.mechanics.policy import LinearPolicy
+from varpin.simulation.friction import rate_at_rest
 from varpin.simulation.run import rollout
 from varpin.support.markup import facts, table
 from varpin.trajectory import Trajectory
@@ -33,9 +34,11 @@ _UNTOLD = 0.01
 _USUAL, _FAST = RungeKutta4(), Radau(3)
 _FASTER, _NODES = 8.0, 8
 _READING = (
-    "where feedback loses some percent, the plan holds; where it loses much, dt is too coarse (controls alone also "
-    "lose much where a motion is unstable)"
+    "where feedback loses less than a percent, the plan holds; where it loses more, dt is too coarse (controls alone "
+    "also lose much where a motion is unstable)"
 )
+# Runge-Kutta is stable up to this product of rate and step.
+_STABLE = 2.78
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class Verification:
     substeps: int
     accuracy: float
     status: Status = Status.CONVERGED
-    integrator: str = "RungeKutta4"
+    integrator: str = str(_USUAL)
 
     @property
     def told(self) -> bool:
@@ -87,9 +90,9 @@ class Verification:
     @property
     def _untold(self) -> str:
         return (
-            f"these costs say nothing of the plan: with {self.substeps} steps of {self.integrator} in one of its, "
-            f"they still change by {percent(self.accuracy)}. Springs, dampers or dry friction are too fast; give "
-            "a larger max_substeps"
+            f"these costs say nothing of the plan: with {self.substeps} steps of {self.integrator} in one of the "
+            f"plan's they still change by {percent(self.accuracy)}. Springs, dampers, dry friction or stops are too "
+            f"fast for them: give more max_substeps than {self.substeps}, or friction a greater width"
         )
 
     @property
@@ -120,8 +123,8 @@ class Verification:
             [
                 *lines,
                 f"a step is off by {self.defect:.2e} rad or m at most; costs are good to {good} of themselves "
-                f"({self.substeps} substeps a step)",
-                f"read it so: {_READING}" if self.told else self._untold,
+                f"({self.substeps} substeps a step of {self.integrator})",
+                f"how to read it: {_READING}" if self.told else self._untold,
                 *([] if self.status.converged else [f"the plan is unfinished, {self.status.value}"]),
             ]
         )
@@ -152,11 +155,45 @@ def verify(
     max_substeps: int,
     progress: Callable[[int, int], None] | None,
 ) -> Verification:
-    """Hold a plan, and its policy on a state for a number of substeps, against accurate integrations.
+    """Hold a plan, and its policy on (q, p) or (q, v) for a number of substeps, against accurate integrations.
 
-    The substeps double until neither cost changes by more than ``tolerance`` of itself.
+    The substeps double until neither cost changes by more than ``tolerance`` of itself. Where an explicit method does
+    not get there, for dampers or dry friction are too fast for it, an L-stable one does it again.
     """
-    integrator = _FAST if _fast(problem, plan) else _USUAL
+    fast = _fast(problem, plan) or problem.dt * rate_at_rest(problem.scene, problem.q0) >= _STABLE * max_substeps
+    members = (_FAST,) if fast else (_USUAL, _FAST)
+    for integrator in members:
+        found = _against(
+            problem,
+            plan,
+            planned_cost,
+            policy,
+            integrator,
+            status=status,
+            tolerance=tolerance,
+            max_substeps=max_substeps,
+            progress=progress,
+        )
+        if found.told or not problem.scene.dissipates:
+            break
+    if not found.told:
+        logger.warning("%s", found._untold)
+    return found
+
+
+def _against(
+    problem: OptimalControlProblem,
+    plan: Trajectory,
+    planned_cost: float,
+    policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
+    integrator: Integrator,
+    *,
+    status: Status,
+    tolerance: float,
+    max_substeps: int,
+    progress: Callable[[int, int], None] | None,
+) -> Verification:
+    """:func:`verify` by one integrator."""
     state: Literal["momentum", "velocity"] = "momentum" if integrator.variational else "velocity"
     substeps, before = 2, (np.nan, np.nan)
     times = integrator.stage_times
@@ -185,7 +222,7 @@ def verify(
             break
         substeps *= 2
     end = plan.q[-1]
-    found = Verification(
+    return Verification(
         planned_cost=planned_cost,
         open_loop_cost=opened[0],
         closed_loop_cost=closed[0],
@@ -197,9 +234,6 @@ def verify(
         status=status,
         integrator=str(integrator),
     )
-    if not found.told:
-        logger.warning("%s", found._untold)
-    return found
 
 
 def _fast(problem: OptimalControlProblem, plan: Trajectory) -> bool:
@@ -231,7 +265,7 @@ def accurate_cost(
     """
     scene, h = problem.scene, problem.dt / substeps
     n, m = scene.robot.dof, scene.controls
-    motion, failure = rollout(scene, integrator or RungeKutta4(), problem.q0, problem.v0, commands, h)
+    motion, failure = rollout(scene, integrator or _USUAL, problem.q0, problem.v0, commands, h)
     if failure is not None:
         return np.nan, np.full(n, np.nan)
     running, terminal = _fine_costs(problem, substeps) if costs is None else costs

@@ -289,6 +289,16 @@ def join(segments: Sequence[Segment]) -> Segment:
     return Segment(**nodes, statistics=statistics, failure=segments[-1].failure, impulses=impulses)
 
 
+def check_functions(scene: Scene, q0: Floats, v0: Floats) -> None:
+    """Hold derivatives of custom forces against differences, once for a scene, where its first motion starts (P, n).
+
+    Raises:
+        CustomForceError: They are wrong.
+    """
+    if scene.custom is not None and len(q0):
+        scene.custom.check(q0[0], v0[0])
+
+
 def diffusion_and_drift(scene: Scene, q: Floats, v: Floats, u: Floats, start: Floats) -> tuple[Floats, Floats]:
     """Diffusion fields F (n, k) at one state, and the drift (n,) that takes them from Stratonovich to Ito.
 

@@ -12,7 +12,17 @@ from numpy.typing import NDArray
 from varpin.core import ExplicitMethod, ExplicitRollout, ForwardDynamics
 from varpin.core.arrays import Commands, Nodes, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
-from varpin.integrators.base import Failure, Integrator, Segment, control_of, drifts, forces, segments_of, steps_of
+from varpin.integrators.base import (
+    Failure,
+    Integrator,
+    Segment,
+    check_functions,
+    control_of,
+    drifts,
+    forces,
+    segments_of,
+    steps_of,
+)
 from varpin.integrators.explicit import REASONS, accelerations
 from varpin.integrators.tableau import gauss_coefficients, interpolation
 from varpin.mechanics.scene import Scene, refuse_constraints
@@ -93,6 +103,7 @@ class Reference(Integrator):
         refuse_constraints(scene, str(self))
         if scene.processes:
             raise InputError(f"{self} integrates no noise: leave it out of the scene")
+        check_functions(scene, q0, v0)
         paths, n = q0.shape
         run = ReferenceRun(
             x=np.hstack([q0, v0]),

@@ -269,6 +269,28 @@ class CustomConstraint(Constraint):
         return Bound(ConstraintRows(customs=(custom,)), tuple(f"{self!r}, row {k}" for k in range(r)))
 
 
+class CustomConstraintError(InputError):
+    """A function of a custom constraint raised, or returned something that is no value of it."""
+
+
+def _asked(name: str, call: Callable[[], ArrayLike], shape: tuple[int, ...], q: Floats) -> Floats:
+    """What a function of a custom constraint returns, checked.
+
+    Raises:
+        CustomConstraintError: It raised, or returned something else.
+    """
+    what = f"the {name} of a CustomConstraint"
+    try:
+        given = call()
+    except Exception as error:
+        place = np.array2string(q, precision=6)
+        raise CustomConstraintError(f"{what} raised {error!r} at q = {place}") from error
+    try:
+        return finite_array(what, given, shape)
+    except InputError as error:
+        raise CustomConstraintError(str(error)) from None
+
+
 @dataclass(frozen=True)
 class _Values:
     """G and C of a custom constraint, checked."""
@@ -278,11 +300,10 @@ class _Values:
 
     def __call__(self, q: Floats) -> tuple[Floats, Floats]:
         r = int(self.own.rows)
-        g = finite_array("the value of a CustomConstraint", self.own.value(q), (r,))
-        return g, self.jacobian(q)
+        return _asked("value", lambda: self.own.value(q), (r,), q), self.jacobian(q)
 
     def jacobian(self, q: Floats) -> Floats:
-        return finite_array("the jacobian of a CustomConstraint", self.own.jacobian(q), (int(self.own.rows), self.dof))
+        return _asked("jacobian", lambda: self.own.jacobian(q), (int(self.own.rows), self.dof), q)
 
 
 @dataclass(frozen=True)
@@ -294,8 +315,9 @@ class _Curvature:
 
     def __call__(self, q: Floats, weights: Floats) -> Floats:
         n = self.dof
-        if self.own.curvature is not None:
-            return finite_array("the curvature of a CustomConstraint", self.own.curvature(q, weights), (n, n))
+        own = self.own.curvature
+        if own is not None:
+            return _asked("curvature", lambda: own(q, weights), (n, n), q)
         slope = _Values(self.own, n).jacobian
         H = np.empty((n, n))
         for c in range(n):

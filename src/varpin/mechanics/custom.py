@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -20,11 +20,18 @@ Floats = NDArray[np.float64]
 Field: TypeAlias = Callable[[Floats, Floats], ArrayLike]
 Slopes: TypeAlias = Callable[[Floats, Floats], tuple[ArrayLike, ArrayLike]]
 
-# Of central differences of eighth order, and their step in units of what is moved, 1 at least.
+# Of central differences of eighth order, and of those of sixth order at the same points; what the two differ by, in
+# units of the derivative and the force, that needs no smaller step.
 _WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-_STEP = 2e-3
-# An imaginary step, and how far what comes of it may be from differences.
+_LOWER = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60, 4: 0.0}
+_SMOOTH = 1e-8
+# Their steps in units of what is moved, 1 at least: the next where the function is not smooth over four of one.
+_STEPS = (2e-3, 2e-4, 2e-5, 2e-6)
+# An imaginary step, and how far derivatives may be from differences, beside the error of those.
 _TINY, _AGREES = 1e-200, 1e-6
+_DOUBT = 10.0
+# Differences that are known less well than this are no derivatives.
+_KNOWN = 1e-4
 # States at which the complex step is held against differences, and how far from rest they are.
 _PROBES, _AROUND = 2, 0.3
 
@@ -45,7 +52,9 @@ class CustomForce(Force):
         f: Function of (q (n,), v (n,)) that returns the force (n,) [N m or N], n coordinates of the robot.
         derivatives: Function of (q, v) that returns (dF/dq, dF/dv), each (n, n); ``"complex"`` takes them by complex
             steps, exact to rounding, for an ``f`` of analytic operations (no ``abs``, no comparisons); left out,
-            by central differences of eighth order, good to about 1e-10 of the force where it is smooth.
+            by central differences of eighth order, good to about 1e-10 of the force where it is smooth, in steps that
+            become as small as it takes. Those that are given are held against differences once, where a motion
+            starts.
     """
 
     f: Field
@@ -118,17 +127,33 @@ class CustomForce(Force):
         return self._columns(column, q.size)
 
     def _differences(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
-        def column(moved: int, c: int) -> Floats:
-            total = np.zeros_like(q)
-            size = _STEP * max(1.0, abs(float((q, v)[moved][c])))
+        by_q, by_v = self._columns(lambda moved, c: self._difference(q, v, moved, c)[0], q.size)
+        return by_q, by_v
+
+    def _difference(self, q: Floats, v: Floats, moved: int, c: int) -> tuple[Floats, float]:
+        """A column of dF/dq or dF/dv, ``moved`` 0 or 1, and what it may be off by.
+
+        The step is made smaller until differences of two orders agree: friction may turn round within a small part of
+        it.
+        """
+        best, least = np.zeros_like(q), np.inf
+        for share in _STEPS:
+            size = share * max(1.0, abs(float((q, v)[moved][c])))
+            high, low, force = np.zeros_like(q), np.zeros_like(q), 0.0
             for steps, weight in _WEIGHTS.items():
                 for side in (1.0, -1.0):
                     state = [q.copy(), v.copy()]
                     state[moved][c] += side * steps * size
-                    total += side * weight / size * self.at(*state)
-            return total
-
-        return self._columns(column, q.size)
+                    value = self.at(*state)
+                    high += side * weight / size * value
+                    low += side * _LOWER[steps] / size * value
+                    force = max(force, float(np.abs(value).max(initial=0.0)))
+            off = float(np.abs(high - low).max(initial=0.0)) + np.finfo(np.float64).eps * force / size
+            if off < least:
+                best, least = high, off
+            if off <= _SMOOTH * max(1.0, force, float(np.abs(high).max(initial=0.0))):
+                break
+        return best, least
 
     @staticmethod
     def _columns(column: Callable[[int, int], Floats], n: int) -> tuple[Floats, Floats]:
@@ -138,13 +163,48 @@ class CustomForce(Force):
     def _check_complex(self, n: int) -> None:
         rng = np.random.default_rng(0)
         for _ in range(_PROBES):
-            q, v = _AROUND * rng.normal(size=(2, n))
-            pairs = zip(self._complex(q, v), self._differences(q, v), strict=True)
-            scale = 1.0 + np.abs(self.at(q, v)).max()
-            if any(not (np.abs(a - b) <= _AGREES * (scale + np.abs(b).max())).all() for a, b in pairs):
-                raise InputError(
-                    f"CustomForce {self.name}: complex steps do not give the derivatives of f, which drops imaginary "
-                    "parts somewhere (abs, comparisons, float(...)); leave derivatives out, or give a function"
+            self.check(*(_AROUND * rng.normal(size=(2, n))))
+
+    def check(self, q: Floats, v: Floats) -> None:
+        """Hold derivatives that are given, or taken by complex steps, against differences at a state.
+
+        Where the function has none, at a kink or an edge, or is not defined, nothing is said: steps tell.
+
+        Raises:
+            CustomForceError: They are others.
+        """
+        if self.derivatives is None:
+            return
+        try:
+            force = self.at(q, v)
+            found = [[self._difference(q, v, moved, c) for c in range(q.size)] for moved in (0, 1)]
+        except CustomForceError:
+            return
+        try:
+            own = self.slopes(q, v)
+        except CustomForceError:
+            if self.derivatives == "complex":
+                raise
+            return
+        scale = 1.0 + float(np.abs(force).max(initial=0.0))
+        for name, given, columns in zip(("dF/dq", "dF/dv"), own, found, strict=True):
+            for c, (column, off) in enumerate(columns):
+                size = scale + np.abs(column)
+                wrong = ~(np.abs(given[:, c] - column) <= _DOUBT * off + _AGREES * size)
+                # Differences across a jump grow as their step shrinks.
+                if off > _KNOWN * size.max() or not wrong.any():
+                    continue
+                r = int(np.argmax(np.abs(given[:, c] - column)))
+                if self.derivatives == "complex":
+                    why = (
+                        "complex steps do not give the derivatives of f, which drops imaginary parts somewhere (abs, "
+                        "comparisons, float(...)); leave derivatives out, or give a function"
+                    )
+                else:
+                    why = "derivatives(q, v) does not return the derivatives of f"
+                raise CustomForceError(
+                    f"CustomForce {self.name}: {why}: {name}[{r}, {c}] is {given[r, c]:.8g}, and differences of f give "
+                    f"{column[r]:.8g}, at {_place(q, v)}"
                 )
 
     def _asked(self, call: Callable[[], object], what: str, q: Floats, v: Floats) -> object:
@@ -175,9 +235,28 @@ class CustomForces(Frozen):
 
     Attributes:
         parts: The forces.
+        checked: Whether their derivatives have been held against differences.
     """
 
     parts: tuple[CustomForce, ...]
+    checked: list[bool] = field(default_factory=list, repr=False)
+
+    @property
+    def names(self) -> str:
+        """Of the functions."""
+        return ", ".join(part.name for part in self.parts)
+
+    def check(self, q: Floats, v: Floats) -> None:
+        """:meth:`CustomForce.check` of all, at the first state that a motion starts from.
+
+        Raises:
+            CustomForceError: Derivatives are wrong.
+        """
+        if self.checked:
+            return
+        for part in self.parts:
+            part.check(q, v)
+        self.checked.append(True)
 
     def __call__(self, q: Floats, v: Floats, derivatives: bool) -> tuple[Floats, Floats, Floats]:
         """The force (n,) and, if wanted, its derivatives (n, n) in q and v.

@@ -134,7 +134,9 @@ class CoulombFriction(Force):
     """Dry friction, smooth in the velocity: the force -g(v) tanh(v / width).
 
     g is ``level``; or, with ``breakaway``, level + (breakaway - level) exp(-(v / stribeck_velocity)^2). Nothing sticks
-    for good: under a load of half the level a joint creeps by about half the width.
+    for good: under a load of half the level a joint creeps by about half the width. Near rest it is a damper of level /
+    width, as a rule far faster than a step: implicit integrators take that, explicit ones do not, and
+    :attr:`Trajectory.warnings` says where a velocity near rest is wrong for it.
 
     Attributes:
         level: Friction of a joint that moves, >= 0 [N m or N].

@@ -37,6 +37,7 @@ from varpin.model.tree import block_ends, path_coordinates
 from varpin.support.checks import JointValues, as_floats, finite_array, joint_array
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
+from varpin.support.weak import Weak
 
 Floats = NDArray[np.float64]
 
@@ -375,8 +376,8 @@ class Scene(Frozen):
             gravity=self.gravity,
             forces=self.elements,
             couplings=self.couplings,
-            constraints=self.bound_constraints.rows,
-            custom=self.custom,
+            constraints=_unowned(self.bound_constraints.rows),
+            custom=None if self.custom is None else Weak(self.custom),
             actuation=self.actuation,
             constant=fields.constant,
             control=fields.control,
@@ -518,6 +519,13 @@ class Scene(Frozen):
                 "N m or N that no actuator takes"
             )
         return controls
+
+
+def _unowned(rows: ConstraintRows) -> ConstraintRows:
+    """Rows whose functions the scene keeps, and not the core."""
+    return rows._replace(
+        customs=tuple(own._replace(value=Weak(own.value), curvature=Weak(own.curvature)) for own in rows.customs)
+    )
 
 
 def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +18,7 @@ from varpin.integrators import Integrator, Midpoint, Radau, Reference, Segment, 
 from varpin.integrators.base import Failure, join, lines, open_loop, rows, steps_of
 from varpin.integrators.within import Times, changing
 from varpin.mechanics.assembly import along_constraints, assemble, missed
+from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop, takes
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
@@ -25,7 +27,7 @@ from varpin.simulation import limits
 from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstable_loop
 from varpin.simulation.refinement import INTEGRATORS, SENSIBLE
 from varpin.simulation.soundness import Finding, announce, evident, with_warnings
-from varpin.simulation.tolerance import Motion, choose
+from varpin.simulation.tolerance import Motion, Raised, choose
 from varpin.support.checks import (
     JointValues,
     as_floats,
@@ -56,6 +58,8 @@ _RINGS, _ASKED = 1.0, 200
 _CORRECTED, _UNSAID = 0.02, 1e-9
 # Steps at which a function of time is held against steps of half the length, and the share by which it may be off.
 _LOOKS, _ALIKE = 16, 0.05
+# Steps in one of a run in which a function failed, for where it does.
+_FINELY = 16
 # Parts of a motion that are kept one by one.
 _PARTS = 256
 
@@ -88,6 +92,16 @@ class _StepError(VarpinError, ValueError):
         before = "" if trajectory is None else "; what came before is in error.trajectory"
         super().__init__(f"step {step} (t = {time:.6g} s): {problem}{before}")
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _again, (type(self), str(self), vars(self).copy())
+
+
+def _again(kind: type[_StepError], message: str, values: dict[str, Any]) -> _StepError:
+    """An error that comes from another process."""
+    error = kind.__new__(kind, message)
+    vars(error).update(values)
+    return error
+
 
 class ControlError(_StepError):
     """A control law or the function of an OpenLoop raised, or returned something that is no control.
@@ -111,6 +125,16 @@ class NoiseError(_StepError):
 
 class ForceError(_StepError):
     """A function of a custom force raised, or returned something that is no force.
+
+    Attributes:
+        step: Index of the step it was called in.
+        time: The start of that step [s].
+        trajectory: What was computed before.
+    """
+
+
+class ConstraintError(_StepError):
+    """A function of a custom constraint raised, or returned something that is no value of it.
 
     Attributes:
         step: Index of the step it was called in.
@@ -166,6 +190,14 @@ class StepFailure(VarpinError, RuntimeError):
             f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}. What came before is in error.trajectory; "
             f"{advice}"
         )
+
+
+def named(scene: Scene, failure: Failure) -> Failure:
+    """A failure that names the functions of the scene's forces, which may be its reason."""
+    if scene.custom is None:
+        return failure
+    what = f"CustomForce {scene.custom.names} may be the reason, where it jumps or its derivatives are wrong"
+    return replace(failure, reason=f"{failure.reason} ({what})")
 
 
 def _row(values: Floats) -> str:
@@ -253,11 +285,50 @@ def _trajectory(
     )
 
 
+def _raised(error: CustomForceError | CustomConstraintError, record: _Record, where: str = "") -> _StepError:
+    """The error of a function that failed in the step after those of a record."""
+    now = record.trajectory()
+    kind = ForceError if isinstance(error, CustomForceError) else ConstraintError
+    return kind(now.steps, float(now.t[-1]), f"{where}{error}", now)
+
+
+def located(
+    scene: Scene,
+    integrator: Integrator,
+    start: tuple[Floats, Floats],
+    commands: Commands,
+    dt: float,
+    increments: Floats | None,
+    error: CustomForceError | CustomConstraintError,
+    where: str = "",
+) -> VarpinError:
+    """The error of a function that failed somewhere in a motion, with its step and the motion before.
+
+    The motion is made again, step by step, from ``start`` (q0, v0).
+    """
+    state, (first,) = integrator.start(scene, start[0][None], start[1][None])
+    dw = np.zeros((0, scene.processes)) if increments is None else increments
+    record = _Record(scene, integrator, dt, dw, first, commands if len(commands.places) else None)
+    for _ in range(steps_of(commands)):
+        block = _next(commands, record)
+        drawn = dw[None, record.steps : record.steps + 1] if len(dw) else dw[None, :0][:0]
+        try:
+            (segment,) = integrator.rollout(scene, state, block, drawn, dt)
+        except (CustomForceError, CustomConstraintError) as found:
+            return _raised(found, record, where)
+        record.add(segment, block.within)
+        if segment.failure is not None:
+            break
+    # What it depends on has changed in the meantime.
+    return error
+
+
 class Motions:
     """Motions from one state under commands of any kind; they share their work arrays."""
 
     def __init__(self, scene: Scene, integrator: Integrator, q0: Floats, v0: Floats, dt: float) -> None:
         self.scene, self.integrator, self.dt = scene, integrator, dt
+        self._start = q0, v0
         self._state, (self._first,) = integrator.start(scene, q0[None], v0[None])
 
     def under(
@@ -271,10 +342,17 @@ class Motions:
         Args:
             commands: For all of its steps.
             increments: Of its Wiener processes (N, k) [s^0.5]; left out, there is no noise.
+
+        Raises:
+            ForceError: A function of a CustomForce failed.
         """
         drawn = np.zeros((0, 0, self.scene.processes)) if increments is None else increments[None]
         state = self.integrator.fork(self._state)
-        (segment,) = self.integrator.rollout(self.scene, state, commands, drawn, self.dt)
+        try:
+            (segment,) = self.integrator.rollout(self.scene, state, commands, drawn, self.dt)
+        except CustomForceError as error:
+            given = self.scene, self.integrator, self._start, commands, self.dt, increments
+            raise located(*given, error) from error
         done = len(segment.u)
         dw = None if increments is None else increments[:done]
         within = commands.within[:done] if len(commands.within) else None
@@ -360,6 +438,7 @@ def simulate(
         ControlError: The control function returned something unusable; holds the trajectory so far.
         NoiseError: A function of a CustomNoise did; holds the trajectory so far.
         ForceError: A function of a CustomForce did; holds the trajectory so far.
+        ConstraintError: A function of a CustomConstraint did; holds the trajectory so far.
         StepFailure: A step has no trustworthy solution; holds the trajectory so far.
         SingularMassMatrix: M(q0) is not positive definite.
         AssemblyError: The scene's constraints cannot be kept next to q0.
@@ -410,7 +489,7 @@ def simulate(
     # A sweep takes as long as the robot has joints, an elimination as their cube.
     chunk = max(1, _CHUNK // (n + n**3 // 100))
     # One step at a time where noise or forces call Python functions: what came before one that fails is recorded.
-    stepwise = scene.noise.diffusion is None or scene.custom is not None
+    stepwise = scene.noise.diffusion is None or scene.custom is not None or bool(scene.bound_constraints.rows.customs)
     interrupted = False
     try:
         while record.steps < steps:
@@ -431,12 +510,9 @@ def simulate(
             drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
             try:
                 (segment,) = integrator.rollout(scene, state, block, drawn, dt)
-            except CustomForceError as error:
-                now = record.trajectory()
-                raise ForceError(now.steps, float(now.t[-1]), str(error), now) from error
+            except (CustomForceError, CustomConstraintError) as error:
+                raise _raised(error, record) from error
             except InputError as error:
-                if scene.noise.diffusion is not None:
-                    raise  # of a custom constraint
                 now = record.trajectory()
                 raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
             record.add(segment, block.within)
@@ -448,7 +524,7 @@ def simulate(
                     decided = np.concatenate([node.u[: node.steps if law is None else done : hold], last])
                     loop = unstable_loop(scene, node, hold) or outgrown(decided, hold * dt)
                     node = with_warnings(node, loop)
-                raise StepFailure(node.steps, node.t[-1], segment.failure, node)
+                raise StepFailure(node.steps, node.t[-1], named(scene, segment.failure), node)
             if progress is not None and (done // chunk < record.steps // chunk or record.steps == steps):
                 progress(record.steps, steps)
     except KeyboardInterrupt:
@@ -625,7 +701,20 @@ def _chosen(
         same = known if integrator is None else next((member for member in members if member.same_map(known)), None)
         if same is not None:
             first = same, earlier.dt
-    choice = choose(motion, members, wish, first)
+
+    def finely(run: Raised) -> VarpinError:
+        """Where the function fails in small steps, and where it did if it does not there."""
+        for steps in (_FINELY * run.steps, run.steps):
+            commands = given(run.integrator, steps)
+            found = located(scene, run.integrator, (q0, v0), commands, duration / steps, None, run.error)
+            if found is not run.error:
+                return found
+        return run.error
+
+    try:
+        choice = choose(motion, members, wish, first)
+    except Raised as run:
+        raise finely(run) from run.error
     record = Accuracy(
         wish,
         choice.error,
@@ -635,6 +724,8 @@ def _chosen(
         choice.search_evaluations,
     )
     if not choice.error < SENSIBLE:
+        if choice.raised is not None:
+            raise finely(choice.raised) from choice.raised.error
         raise ToleranceError(wish, duration, choice.steps, choice.error)
     found: tuple[Finding, ...] = ()
     if not record.met:

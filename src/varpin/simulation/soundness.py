@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,7 @@ from varpin.simulation.accuracy import (
     inertias,
 )
 from varpin.simulation.chatter import RUN, Alternation, alternation
+from varpin.simulation.friction import Stop, rate_at_stops, stops
 from varpin.simulation.limits import left as limits_left
 from varpin.simulation.retaking import Again, Finer, finer, taken_again
 from varpin.trajectory import Trajectory
@@ -65,6 +67,10 @@ WORK, LEAST_WORK = 50, 256
 _WINDOWS, _MARGIN = 16, 8.0
 # What they are taken again with where dampers are faster than the step.
 _STOPPING = Radau(3)
+# Steps from where a joint comes to rest that are taken again with it, and in how many parts each.
+_SETTLING, _SETTLED = 6, 2
+# What the velocity may be off by there: over several steps in widths of the friction; in one, of the largest velocity.
+_RUBS, _FELT = 0.1, 1e-3
 # Nodes at which mass matrices, and energies of single groups, are looked at; and rates of dampers.
 _NODES, _INERTIAS = 16, 4
 # The window of a motion that has one.
@@ -153,10 +159,10 @@ def evident(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tup
     For whoever does not take steps again; :func:`examined` says what is wrong.
     """
     found = []
-    rate = _fast_damping(scene, trajectory)
+    fast = _fast_damping(scene, trajectory)
     # With more stages what dampers are faster than a step leaves is less.
-    if not integrator.l_stable and trajectory.dt * rate > 2.0 * getattr(integrator, "stages", 1):
-        found.append(Finding("fast damping", _ringing(rate, trajectory.dt)))
+    if not integrator.l_stable and trajectory.dt * fast.rate > 2.0 * getattr(integrator, "stages", 1):
+        found.append(_ringing(scene, fast, trajectory.dt))
     if split := _in_parts(trajectory):
         found.append(Finding("split steps", f"{split}: dt = {trajectory.dt:g} s is coarse here"))
     return (*found, *_beyond_limits(scene, trajectory))
@@ -176,13 +182,30 @@ def _in_parts(trajectory: Trajectory) -> str:
     return f"{split} of {trajectory.steps} steps were taken in up to {most} parts"
 
 
-def _fast_damping(scene: Scene, trajectory: Trajectory) -> float:
-    """The fastest rate of the dampers [1/s] if a step cannot resolve it, else 0."""
+class _Fast(NamedTuple):
+    """What damps faster than a step can resolve.
+
+    Attributes:
+        rate: The fastest [1/s]; 0 for none.
+        stop: Where a joint comes to rest, if it is dry friction that is so fast there.
+    """
+
+    rate: float
+    stop: Stop | None = None
+
+
+def _fast_damping(scene: Scene, trajectory: Trajectory) -> _Fast:
+    """The fastest of the dampers if a step cannot resolve it."""
     if not scene.dissipates or not trajectory.steps:
-        return 0.0
+        return _Fast(0.0)
     # Rates change along the motion as the inertia does.
     at = [i * trajectory.steps // (_INERTIAS - 1) for i in range(_INERTIAS)]
-    return fastest_damping(scene.core, *_nodes_of(scene, trajectory, at), 2.0 / trajectory.dt)
+    least = 2.0 / trajectory.dt
+    fastest = _Fast(fastest_damping(scene.core, *_nodes_of(scene, trajectory, at), least))
+    for stop in stops(scene, trajectory):
+        if rate := rate_at_stops(scene, trajectory, [stop], max(least, fastest.rate)):
+            fastest = _Fast(rate, stop)
+    return fastest
 
 
 def _nodes_of(scene: Scene, trajectory: Trajectory, at: list[int]) -> tuple[Floats, Floats, Floats]:
@@ -196,11 +219,20 @@ def _applied(scene: Scene, trajectory: Trajectory) -> Floats:
     return np.ascontiguousarray(trajectory.u @ scene.actuation.T)
 
 
-def _ringing(rate: float, dt: float) -> str:
-    return (
-        f"damping is faster than the step (dt * {rate:.3g}/s = {dt * rate:.3g} > 2): velocities that it should stop "
-        "will ring; "
-        f"dt below {2.0 / rate:.3g} s resolves it, varpin.Radau(3) stops them"
+def _ringing(scene: Scene, fast: _Fast, dt: float, off: str = "", joint: int | None = None) -> Finding:
+    """Says that something damps faster than the step, and of what joint."""
+    times = f"(dt * {fast.rate:.3g}/s = {dt * fast.rate:.3g} > 2)"
+    cure = f"dt below {2.0 / fast.rate:.3g} s resolves it"
+    if fast.stop is None:
+        does = f"damping is faster than the step {times}: velocities that it should stop will ring; {cure}"
+        return Finding("fast damping", f"{does}, varpin.Radau(3) stops them{off}", joint)
+    name, wide = scene.robot.joint_names[fast.stop.joint], 0.5 * dt * fast.rate * fast.stop.width
+    return Finding(
+        "fast friction",
+        f"dry friction is faster than the step where joint {name!r} comes to rest or turns back {times}: its velocity "
+        f"may ring or creep there; {cure}, so does a width above {wide:.3g} rad/s or m/s, and varpin.Radau(3) stops "
+        f"it{off}",
+        fast.stop.joint if joint is None else joint,
     )
 
 
@@ -209,8 +241,9 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     if not trajectory.steps:
         return ()
     found = [*_energy(scene, integrator, trajectory)]
+    unsettled = _unsettled(scene, integrator, trajectory)
     if resolved(scene, integrator, trajectory):
-        return tuple(found)
+        return (*found, *unsettled)
     error = motion_error(scene, integrator, trajectory)
     if error is not None and spoken_of(error):
         dt, start = trajectory.dt, trajectory.t[error.step]
@@ -218,19 +251,45 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
             f"smaller steps from t = {start:.4g} s on move joint {trajectory.joint_names[error.joint]!r} by "
             f"{100 * error.position:.3g}% of its way over a period, and its velocity by {100 * error.velocity:.3g}%"
         )
-        rate = 0.0 if integrator.l_stable else _fast_damping(scene, trajectory)
-        if rate:
-            found.append(Finding("fast damping", f"{_ringing(rate, dt)}; {off}", error.joint))
+        fast = _Fast(0.0) if integrator.l_stable else _fast_damping(scene, trajectory)
+        if fast.rate:
+            found.append(_ringing(scene, fast, dt, f"; {off}", error.joint))
         else:
             split = f" ({_in_parts(trajectory)})" if _in_parts(trajectory) else ""
             sentence = f"dt = {dt:g} s is coarse for {integrator} here: {off}{split}"
             found.append(Finding("coarse steps", sentence, error.joint))
-    elif error is None and not integrator.l_stable and (rate := _fast_damping(scene, trajectory)):
+    elif error is None and not integrator.l_stable and (fast := _fast_damping(scene, trajectory)).rate:
         # No other method gets through these steps: whether they ring has to be seen in the motion itself.
         before, after = trajectory.v[:-1], trajectory.v[1:]
         if ((before * after < 0.0) & (np.abs(before) > _STILL) & (np.abs(after) > 0.5 * np.abs(before))).any():
-            found.append(Finding("fast damping", _ringing(rate, trajectory.dt)))
-    return tuple(found)
+            found.append(_ringing(scene, fast, trajectory.dt))
+    return (*found, *(own for own in unsettled if own.kind not in {other.kind for other in found}))
+
+
+def _unsettled(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Says if joints do not come to rest as dry friction has it, however little that is of their motion.
+
+    Their friction is wrong by itself where a velocity near rest is off by a part of the width over which it turns
+    round.
+    """
+    kicked = trajectory.dw.any() and scene.noise.diffusion is None
+    if integrator.l_stable or isinstance(integrator, Reference) or kicked:
+        return ()
+    for stop in stops(scene, trajectory):
+        rate = rate_at_stops(scene, trajectory, [stop], 2.0 / trajectory.dt)
+        count = min(_SETTLING, trajectory.steps - stop.step)
+        if not rate or count < _SETTLING // 2:
+            continue
+        again = taken_again(scene, _STOPPING, trajectory, integrator.stage_times, stop.step, count, _SETTLED)
+        if again is None:
+            continue
+        off = np.abs(again[1] - trajectory.v[stop.step : stop.step + count + 1])[1:, stop.joint]
+        lasting, most = float(np.median(off)), float(off.max())
+        speed = float(np.abs(trajectory.v[:, stop.joint]).max())
+        if lasting > _RUBS * stop.width or (most > stop.width and most > _FELT * speed):
+            since = f"; after t = {trajectory.t[stop.step]:.4g} s it is off by up to {most:.3g} rad/s or m/s"
+            return (_ringing(scene, _Fast(rate, stop), trajectory.dt, since),)
+    return ()
 
 
 def _energy(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -390,7 +449,7 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
         return False
     # So do dampers, but not where what they stop is at rest after a step, whatever its length. Other methods are held
     # against that in steps as long as theirs.
-    damped = bool(_fast_damping(scene, trajectory))
+    damped = bool(_fast_damping(scene, trajectory).rate)
     if steps == 1:
         return not damped and _halves_agree(scene, integrator, trajectory)
     other, times = _STOPPING if damped else integrator, 1 if damped and not integrator.l_stable else 2
@@ -493,7 +552,7 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     fastest, _, _, pulled = glance(scene.core, trajectory.q, trajectory.v, trajectory.u, substeps, trajectory.dt)
     if not fastest > _STILL:
         return None
-    other = finer(integrator, trajectory, damped=bool(_fast_damping(scene, trajectory)), pulled=pulled)
+    other = finer(integrator, trajectory, damped=bool(_fast_damping(scene, trajectory).rate), pulled=pulled)
     first = examined_nodes(scene, trajectory)
     inertia = inertias(scene, trajectory.q[first])
     # Steps whose error is known to be small.

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from varpin.core.arrays import Commands
 from varpin.integrators import Integrator
 from varpin.integrators.base import rows, steps_of
+from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.simulation.refinement import (
     CHECKS,
@@ -43,6 +44,8 @@ _SHRINKS, _LEFT = 0.75, 3.0
 _OTHER = 1.37
 # An integrator that misses the tolerance by this factor is not worth more of its steps.
 _FAR = 30.0
+# Runs in which a function of the user's fails, after which none is expected to pass.
+_RAISES = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +72,20 @@ class Motion:
     sampled: bool = False
 
 
+class Raised(Exception):
+    """A run in which a function of a custom force failed.
+
+    Attributes:
+        integrator: Of the run.
+        steps: Of the run.
+        error: Of the function.
+    """
+
+    def __init__(self, integrator: Integrator, steps: int, error: CustomForceError) -> None:
+        self.integrator, self.steps, self.error = integrator, steps, error
+        super().__init__(str(error))
+
+
 class _Runs:
     """Runs of a motion, and what they took together."""
 
@@ -76,6 +93,8 @@ class _Runs:
         self.motion = motion
         self.most = _PATIENCE / len(motion.q0)
         self.steps = self.evaluations = 0
+        self.raised: Raised | None = None
+        self._raises, self._passed = 0, False
         self._done: dict[tuple[str, int], Sample] = {}
 
     def __call__(self, integrator: Integrator, steps: int) -> Sample:
@@ -96,7 +115,16 @@ class _Runs:
         while done < steps and pure:
             first = done // commands.hold
             block = rows(commands, first, first + chunk, last.u[None, -1] if done else None)
-            (last,) = integrator.rollout(given.scene, state, block, nothing, dt)
+            try:
+                (last,) = integrator.rollout(given.scene, state, block, nothing, dt)
+            except CustomForceError as error:
+                # Coarse steps may go where the function is not defined.
+                self.raised, pure = Raised(integrator, steps, error), False
+                self._raises += 1
+                if self._raises >= _RAISES and not self._passed:
+                    raise self.raised from error
+                evaluations += steps
+                break
             nodes = done + 1 + np.arange(len(last.q))
             kept = nodes % stride == 0
             q[nodes[kept] // stride - 1] = last.q[kept]
@@ -106,6 +134,7 @@ class _Runs:
             done += steps_of(block)
         self.steps += done
         self.evaluations += evaluations
+        self._passed = self._passed or pure
         # A run that a guard has split says nothing of the method's order; the rest of it is left out.
         return Sample(steps, q, float(evaluations) * steps / max(done, 1), pure)
 
@@ -182,6 +211,7 @@ class Choice:
         search_steps: Steps of all runs.
         search_evaluations: Evaluations in them.
         floor: What rounding leaves of every wish [rad or m].
+        raised: The last run in which a function of a custom force failed, if one did.
     """
 
     integrator: Integrator
@@ -190,6 +220,7 @@ class Choice:
     search_steps: int
     search_evaluations: int
     floor: float
+    raised: Raised | None = None
 
 
 def choose(
@@ -206,6 +237,7 @@ def choose(
     Raises:
         SingularMassMatrix: M(q0) is not positive definite.
         VarpinError: No integrator gets to the end.
+        Raised: A function of a custom force fails in all runs.
     """
     # It refuses states that no motion starts from.
     integrators[0].start(motion.scene, motion.q0[None], motion.v0[None])
@@ -234,4 +266,4 @@ def choose(
     least = motion.parts * 2 ** math.ceil(math.log2(coarse // motion.parts))
     search = _Wish([of(member, least) for member in integrators], runs)
     (best, *_), _ = search.for_tolerance(tolerance / SAFETY)
-    return Choice(best.integrator, best.steps, best.error, runs.steps, runs.evaluations, search.floor)
+    return Choice(best.integrator, best.steps, best.error, runs.steps, runs.evaluations, search.floor, runs.raised)

@@ -1,0 +1,76 @@
+"""Dry friction that is faster than the step: where joints come to rest or turn back, and how fast it is there.
+
+Friction -g(v) tanh(v / width) is steep only near v = 0. The nodes of a motion hardly ever lie there, however many of
+its joints come to rest, and derivatives at nodes say nothing of it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.core import fastest_damping
+from varpin.mechanics.forces import dissipates, of_kind
+from varpin.mechanics.scene import Scene
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+# Places of a motion at which friction is looked at: so many of each joint, and in all.
+_OF_A_JOINT, _MOST = 2, 6
+# Rates below count as none [1/s].
+_SLOWEST = 1e-6
+
+
+class Stop(NamedTuple):
+    """A step in which a joint with dry friction comes to rest or turns back.
+
+    Attributes:
+        step: Its number.
+        joint: Which coordinate.
+        width: Velocity at which the joint's friction turns round [rad/s or m/s].
+    """
+
+    step: int
+    joint: int
+    width: float
+
+
+def stops(scene: Scene, trajectory: Trajectory) -> list[Stop]:
+    """Some of the steps in which joints with dry friction come to rest or turn back, the first and last of each."""
+    found = []
+    for own in of_kind(scene.elements, "CoulombFriction"):
+        c, width = own.coordinate, own.values[1]
+        v = trajectory.v[:, c]
+        before, after = v[:-1], v[1:]
+        # The velocity changes its sign, or another step like this one would take it there.
+        slows = (before * after <= 0.0) | ((np.abs(after) <= np.abs(after - before)) & (np.abs(after) < np.abs(before)))
+        at = np.flatnonzero(slows & (np.abs(before) > width))
+        chosen = at[np.unique(np.linspace(0, len(at) - 1, _OF_A_JOINT).astype(np.int64))] if len(at) else at
+        found += [Stop(step, c, width) for step in chosen.tolist()]
+    # The narrowest first, for what they come to is looked for at a few alone.
+    return sorted(found, key=lambda stop: (stop.width, stop.step))[:_MOST]
+
+
+def rate_at_stops(scene: Scene, trajectory: Trajectory, at: list[Stop], least: float) -> float:
+    """The fastest rate of all that damps [1/s] where joints come to rest, or 0 where none is faster than ``least``."""
+    if not at:
+        return 0.0
+    steps = [stop.step for stop in at]
+    v = trajectory.v[steps]
+    v[np.arange(len(at)), [stop.joint for stop in at]] = 0.0
+    force = np.ascontiguousarray(trajectory.u[steps] @ scene.actuation.T)
+    return float(fastest_damping(scene.core, trajectory.q[steps], v, force, least))
+
+
+def rate_at_rest(scene: Scene, q: Floats) -> float:
+    """The fastest rate of all that damps at a configuration (n,), where every joint is at rest [1/s].
+
+    There dry friction is as steep as it gets.
+    """
+    if not any(map(dissipates, scene.elements)) and not any(map(dissipates, scene.couplings)):
+        return 0.0
+    still = np.zeros((1, q.size))
+    return float(fastest_damping(scene.core, np.ascontiguousarray(q[None]), still, still, _SLOWEST))

@@ -1,0 +1,160 @@
+"""Dry friction: joints that stick and slip, arms that come to rest, and steps that friction is too fast for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+
+import varpin as vp
+from varpin.simulation import limits
+from varpin.simulation.friction import rate_at_rest
+from varpin.simulation.soundness import evident
+
+SAID = "dry friction is faster than the step"
+
+
+def block(width, level=1.0):
+    """One link without gravity, which dry friction brings to rest."""
+    return vp.Scene(vp.planar_chain(1), gravity=False, forces=vp.CoulombFriction(level, width))
+
+
+def accelerations(scene, q, v, u):
+    """By Pinocchio, and friction by its plain formula."""
+    force = u.copy()
+    for element in scene.elements:
+        c, (level, width, *_) = element.coordinate, element.values
+        force[c] -= level * np.tanh(v[c] / width)
+    model = scene.robot.model.copy()
+    model.gravity.linear = scene.gravity
+    return pin.aba(model, model.createData(), q, v, force)
+
+
+def own(motion):
+    return [sentence for sentence in motion.warnings if not sentence.startswith(limits.KINDS)]
+
+
+def test_stick_slip_of_one_joint():
+    """A servo's goal moves on evenly, and the joint follows in jerks, as SciPy's Radau has it of the plain equation."""
+    stiffness, damping, speed = 4.0, 0.1, 0.5
+    level, width, breakaway, fading = 0.5, 1e-3, 1.5, 0.2
+    scene = vp.Scene(
+        vp.planar_chain(1),
+        gravity=False,
+        forces=[vp.PositionServo(stiffness, damping), vp.CoulombFriction(level, width, breakaway, fading)],
+    )
+    inertia = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
+
+    def slope(t, x):
+        g = level + (breakaway - level) * np.exp(-((x[1] / fading) ** 2))
+        return [x[1], (stiffness * (speed * t - x[0]) - damping * x[1] - g * np.tanh(x[1] / width)) / inertia]
+
+    times = np.linspace(0.0, 4.0, 81)
+    exact = solve_ivp(slope, (0.0, 4.0), [0.0, 0.0], "Radau", t_eval=times, rtol=1e-9, atol=1e-12, max_step=0.01).y.T
+    at_rest = np.abs(exact[:, 1]) < width
+    assert 20 < at_rest.sum() < 75
+    assert exact[:, 1].max() > 2.0 * speed
+    goal = vp.FirstOrderHold((speed * np.linspace(0.0, 4.0, 4001))[:, None])
+    motion = vp.simulate(scene, [0.0], [0.0], dt=1e-3, steps=4000, controls=goal, integrator=vp.Radau(3))
+    np.testing.assert_allclose(motion.q[::50, 0], exact[:, 0], atol=2e-5)
+    np.testing.assert_allclose(motion.v[::50, 0][at_rest], exact[:, 1][at_rest], atol=1e-2 * width)
+    assert own(motion) == []
+
+
+def test_an_arm_comes_to_rest():
+    """All joints of an arm under friction that holds it, against SciPy; its energy never rises on the way."""
+    robot = vp.load_robot("ur5")
+    scene = vp.Scene(robot, gravity=False, forces=vp.CoulombFriction([8.0, 8.0, 5.0, 2.0, 2.0, 1.0], 1e-2))
+    begin, speed = np.array([0.0, -1.2, 1.5, -0.5, 0.3, 0.2]), np.array([1.0, 1.0, -1.0, 1.0, 2.0, 2.0])
+
+    def slope(_, x):
+        return np.concatenate([x[6:], accelerations(scene, x[:6], x[6:], np.zeros(6))])
+
+    times = np.linspace(0.0, 0.6, 13)
+    exact = solve_ivp(slope, (0.0, 0.6), np.append(begin, speed), "Radau", t_eval=times, rtol=1e-8, atol=1e-10).y.T
+    for integrator, error in ((vp.Radau(3), 2e-6), (vp.Gauss(3), 2e-6), (vp.Midpoint(), 2e-5)):
+        motion = vp.simulate(scene, begin, speed, dt=1e-3, steps=600, integrator=integrator)
+        np.testing.assert_allclose(motion.q[::50], exact[:, :6], atol=error)
+        assert np.abs(motion.v[-1]).max() < 1e-6
+        assert np.diff(motion.energy).max() <= 1e-12 * motion.energy[0]
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(4), vp.Radau(2), vp.Radau(3)], ids=str)
+@pytest.mark.parametrize("width", [1e-1, 1e-3, 1e-5])
+def test_friction_never_adds_energy(integrator, width):
+    """Whatever the width is in steps."""
+    for v0 in (2.0, 2.005, 2.013):
+        motion = vp.simulate(block(width), [0.0], [v0], dt=1e-2, steps=120, integrator=integrator)
+        assert np.diff(motion.energy).max() <= 1e-14
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4(), vp.SemiImplicitEuler()], ids=str)
+def test_friction_faster_than_the_step_is_told_of(integrator):
+    """Where the velocity near rest is wrong, and not where a step resolves the width."""
+    coarse = vp.simulate(block(1e-4), [0.0], [2.0], dt=1e-2, steps=120, integrator=integrator)
+    told = [sentence for sentence in own(coarse) if sentence.startswith(SAID)]
+    assert len(told) == 1
+    assert "joint 'joint1'" in told[0]
+    assert "> 2" in told[0]
+    # A rate of friction's slope over the inertia, which is the advice, too.
+    inertia = vp.lagrangian_jet(block(1e-4), [0.0], [0.0]).Lvv[0, 0]
+    assert rate_at_rest(block(1e-4), np.zeros(1)) == pytest.approx(1e4 / inertia)
+    assert f"dt below {2e-4 * inertia:.3g} s" in told[0]
+    for width, dt in ((1e-1, 1e-2), (1e-4, 1.0 * 1e-4 * inertia)):
+        fine = vp.simulate(block(width), [0.0], [0.2], dt=dt, duration=0.2, integrator=integrator)
+        assert [sentence for sentence in own(fine) if sentence.startswith(SAID)] == [], (width, dt)
+
+
+def test_friction_faster_than_the_step_without_a_check():
+    """From the record alone; and not of an integrator that stops what is so fast."""
+    motion = vp.simulate(block(1e-4), [0.0], [2.0], dt=1e-2, steps=120, check=False)
+    assert any(sentence.startswith(SAID) for sentence in motion.warnings)
+    for integrator in (vp.Radau(2), vp.Radau(3)):
+        assert "fast friction" not in {finding.kind for finding in evident(block(1e-4), integrator, motion)}
+        assert own(vp.simulate(block(1e-4), [0.0], [2.0], dt=1e-2, steps=120, integrator=integrator)) == []
+
+
+def test_joints_that_do_not_stop_are_quiet():
+    """Friction far faster than the step where nothing comes to rest, and where nothing begins to move."""
+    sliding = vp.simulate(block(1e-5, 0.1), [0.0], [2.0], dt=1e-2, steps=100)
+    resting = vp.simulate(block(1e-5), [0.0], [0.0], dt=1e-2, steps=100)
+    assert own(sliding) == own(resting) == []
+
+
+def problem(width, dt=0.02):
+    scene = vp.Scene(vp.planar_chain(2), gravity=False, forces=vp.CoulombFriction(0.5, width))
+    cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost([0.6, -0.4], 1e3) + vp.VelocityCost(10.0))
+    return vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=dt, steps=round(0.6 / dt))
+
+
+def test_problems_take_an_integrator_that_friction_is_not_too_fast_for():
+    assert problem(0.1).integrator == vp.Gauss(4)
+    rough = problem(1e-4)
+    assert rough.dt * rate_at_rest(rough.scene, rough.q0) > 200.0
+    assert rough.integrator == vp.Radau(4)
+    assert rough.at(dt=1e-4).integrator == vp.Radau(4)
+    given = vp.OptimalControlProblem(
+        rough.scene, rough.cost, rough.q0, rough.v0, dt=0.02, steps=30, integrator=vp.Gauss(2)
+    )
+    assert given.integrator == vp.Gauss(2)
+
+
+def test_verification_under_friction_that_is_too_fast_for_explicit_steps():
+    """The cost of the controls alone, against SciPy's Radau over each control."""
+    rough = problem(2e-4)
+    plan = vp.solve(rough, max_iterations=15)
+    found = plan.verify(tolerance=1e-5, max_substeps=256)
+    assert found.integrator == str(vp.Radau(3))
+    assert found.told
+    assert "Radau" in str(found)
+    scene, state, integral = rough.scene, np.zeros(4), 0.0
+    for u in plan.controls:
+
+        def slope(_, x, u=u):
+            return np.concatenate([x[2:], accelerations(scene, x[:2], x[2:], u)])
+
+        state = solve_ivp(slope, (0.0, rough.dt), state, "Radau", rtol=1e-8, atol=1e-11).y[:, -1]
+        integral += rough.dt * 1e-2 * (u**2).sum()
+    true = integral + 1e3 * ((state[:2] - [0.6, -0.4]) ** 2).sum() + 10.0 * (state[2:] ** 2).sum()
+    assert found.open_loop_cost == pytest.approx(true, rel=1e-4)
