@@ -5,12 +5,14 @@ Equation (O1) of docs/mathematics.md.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.control.constraints import BoundConstraint, Horizon, PlanConstraint
 from varpin.control.costs import (
     BoundSum,
     ControlRate,
@@ -78,6 +80,9 @@ class OptimalControlProblem(Frozen):
         hold: Steps that share one control: a digital controller's period over the integrator's step.
         t0: When the horizon begins [s]; references that are functions of time see it.
         control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none.
+        constraints: What the motion has to keep to, whatever it costs (:class:`PlanConstraint`): limits of joints, a
+            frame's goal, regions, clearance. Those of a :class:`Scene` are others: they belong to the mechanism, and
+            forces of their own keep them in every motion.
         rate: What changes of the controls cost: ``rate.weight`` (m, m) and ``rate.before``, the control before the
             horizon (m,) or None; None where they cost nothing.
     """
@@ -93,10 +98,12 @@ class OptimalControlProblem(Frozen):
     hold: int
     t0: float
     control_limits: Floats
+    constraints: tuple[PlanConstraint, ...]
     running: BoundSum = field(repr=False)
     terminal: BoundSum = field(repr=False)
     rule: Floats = field(repr=False)
     rate: ControlRate | None = field(repr=False)
+    bound_constraints: tuple[BoundConstraint, ...] = field(repr=False)
 
     def __init__(
         self,
@@ -112,6 +119,7 @@ class OptimalControlProblem(Frozen):
         hold: int = 1,
         t0: float = 0.0,
         control_limits: tuple[JointValues, JointValues] | None = None,
+        constraints: Sequence[PlanConstraint] = (),
     ) -> None:
         """Describe a problem; the class says what each argument is.
 
@@ -121,7 +129,8 @@ class OptimalControlProblem(Frozen):
         Raises:
             UnknownJoint: A name that is no joint's, or of controls no driven joint's.
             InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
-                reference that does not fit the problem's grid, or limits that leave a control nothing.
+                reference that does not fit the problem's grid, limits that leave a control nothing, or constraints
+                that are no plan constraints or of another robot.
             CostError: A reference that is a function fails.
         """
         n, m = require_scene(scene).robot.dof, scene.controls
@@ -144,6 +153,8 @@ class OptimalControlProblem(Frozen):
             t0 + times, dt * steps, steps, n, m, t0, scene.robot.joint_names, scene.control_joints, scene.robot
         )
         running, terminal = bind_cost(cost, t0 + times, points)
+        rate = control_rate(cost, m, scene.control_joints)
+        given = _constraints(constraints)
         values = {
             "scene": scene,
             "cost": cost,
@@ -156,10 +167,12 @@ class OptimalControlProblem(Frozen):
             "hold": hold,
             "t0": t0,
             "control_limits": named_limits("control_limits", control_limits, scene.control_joints, scene.controls),
+            "constraints": given,
             "running": running,
             "terminal": terminal,
             "rule": rule,
-            "rate": control_rate(cost, m, scene.control_joints),
+            "rate": rate,
+            "bound_constraints": _bind_constraints(given, scene, t0, dt, steps, hold, rate),
         }
         for name, value in values.items():
             if isinstance(value, np.ndarray):
@@ -239,6 +252,7 @@ class OptimalControlProblem(Frozen):
             hold=self.hold if hold is None else hold,
             t0=self.t0 if t0 is None else t0,
             control_limits=(self.control_limits[0], self.control_limits[1]),
+            constraints=self.constraints,
         )
 
     def _moved(
@@ -259,6 +273,10 @@ class OptimalControlProblem(Frozen):
             times = t0 + _times(_rule(self.sampling, self.dt)[0], self.steps, self.dt)
             points = replace(self.running.points, t=times, t0=t0)
             own["running"], own["terminal"] = bind_cost(self.cost, times, points, (self.running, self.terminal))
+        if self.constraints and ("rate" in own or "t0" in own):
+            rate, t0 = own.get("rate", self.rate), own.get("t0", self.t0)
+            grid = (t0, self.dt, self.steps, self.hold)
+            own["bound_constraints"] = _bind_constraints(self.constraints, scene, *grid, rate)
         moved = object.__new__(type(self))
         # Past the dataclass, which refuses assignments.
         vars(moved).update(vars(self) | own)
@@ -283,7 +301,23 @@ class OptimalControlProblem(Frozen):
         functions = [[(part.f, part.derivatives) for part in parts] for parts in own_code]
         if forces[0] != forces[1] or functions[0] != functions[1]:
             return "other forces"
+        if self.described_constraints != other.described_constraints:
+            return "other constraints"
         return ""
+
+    @property
+    def described_constraints(self) -> str:
+        """Its constraints in words and numbers, all that tells them from others; empty without any."""
+        return "; ".join(map(repr, self.constraints))
+
+    @property
+    def model_rule(self) -> Floats:
+        """Where in a step the quadratic model of the cost is made, as :attr:`rule`."""
+        return self.rule
+
+    def model_samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
+        """(q, v, u) at the points of :attr:`model_rule`, as :meth:`samples`."""
+        return self.samples(q, v, u)
 
     @property
     def limited(self) -> bool:
@@ -422,6 +456,36 @@ def default_integrator() -> Gauss:
     time than two.
     """
     return Gauss(stages=4)
+
+
+def _constraints(given: Sequence[PlanConstraint]) -> tuple[PlanConstraint, ...]:
+    if not isinstance(given, list | tuple):
+        raise InputError(f"constraints must be a list of plan constraints, got {type(given).__name__}")
+    for item in given:
+        if not isinstance(item, PlanConstraint):
+            raise InputError(
+                "constraints of a plan are for example varpin.WithinJointLimits(robot); those of the mechanism belong "
+                f"to varpin.Scene(constraints=); got {type(item).__name__}"
+            )
+    return tuple(given)
+
+
+def _bind_constraints(
+    constraints: tuple[PlanConstraint, ...],
+    scene: Scene,
+    t0: float,
+    dt: float,
+    steps: int,
+    hold: int,
+    rate: ControlRate | None,
+) -> tuple[BoundConstraint, ...]:
+    """Constraints on a grid."""
+    if not constraints:
+        return ()
+    times = t0 + np.arange(steps + 1, dtype=np.float64) * dt
+    before = None if rate is None else rate.before
+    horizon = Horizon(times, scene.robot, scene.controls, hold, scene.control_joints, before)
+    return tuple(item.bind(horizon) for item in constraints)
 
 
 def _rule(sampling: str, dt: float) -> tuple[Floats, Floats]:

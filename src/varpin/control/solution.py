@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from varpin.control.costs import barriers_of
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
+from varpin.control.multipliers import ConstraintReport, Multipliers, reports
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution_file import read, write
 from varpin.control.verification import Verification, verify
@@ -94,6 +96,7 @@ class Solution(Frozen):
         warnings: What looks wrong with the plan, in sentences that say what to change: it costs more than planned when
             its steps are taken in quarters, its velocities alternate or go up and down all the time, its energy balance
             does not close.
+        multipliers: Of the problem's constraints, and where their rounds stood; None without constraints.
     """
 
     problem: OptimalControlProblem
@@ -109,6 +112,7 @@ class Solution(Frozen):
     search: SearchState | None = None
     previous_gains: Floats | None = None
     warnings: tuple[str, ...] = ()
+    multipliers: Multipliers | None = None
 
     def __post_init__(self) -> None:
         for array in (self.gains, self.feedforward, self.gradient, self.previous_gains):
@@ -141,6 +145,16 @@ class Solution(Frozen):
             control=_beyond(motion.u, [self.problem.control_limits]),
         )
 
+    @cached_property
+    def constraints(self) -> tuple[ConstraintReport, ...]:
+        """How the motion keeps to each of the problem's constraints, in their order."""
+        return () if self.multipliers is None else reports(self.problem, self.trajectory, self.multipliers)
+
+    @property
+    def violation(self) -> float:
+        """The most that a constraint is violated, in its own unit; 0 where all hold or there are none."""
+        return max((item.violation for item in self.constraints), default=0.0)
+
     @property
     def policy(self) -> LinearPolicy:
         """Controls with feedback, on the x of the problem's integrator."""
@@ -152,7 +166,9 @@ class Solution(Frozen):
         return f"Solution(cost {self.cost:.6g}{noise}, {ended})"
 
     def __str__(self) -> str:
-        return "\n".join([repr(self), *(f"warning: {sentence}" for sentence in self.warnings)])
+        return "\n".join(
+            [repr(self), *map(str, self.constraints), *(f"warning: {sentence}" for sentence in self.warnings)]
+        )
 
     def _repr_html_(self) -> str:
         problem, beyond, motion = self.problem, self.violations, self.trajectory
@@ -172,6 +188,7 @@ class Solution(Frozen):
                 rows.append((f"{what} beyond limits [{unit}]", listed(over)))
         if beyond.control.any():
             rows.append(("controls beyond limits", f"{beyond.control.max():.3g} at most"))
+        rows += [("constraint", told) for told in self.constraints]
         rows += [("warning", warning) for warning in self.warnings]
         most = np.abs(motion.u).max(axis=0, initial=0.0)
         rows.append(("largest controls", listed(f"{value:.4g}" for value in most)))
@@ -186,7 +203,8 @@ class Solution(Frozen):
     def table(self) -> str:
         """The iterations, one row each, and how and why they ended; :class:`Solution` explains the columns."""
         warned = (f"warning: {sentence}" for sentence in self.warnings)
-        return "\n".join([Iteration.HEADER, *map(str, self.history), *warned, self.status.value, f"({self.reason})"])
+        rows = [*map(str, self.history), *map(str, self.constraints)]
+        return "\n".join([Iteration.HEADER, *rows, *warned, self.status.value, f"({self.reason})"])
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the solution as a compressed npz file without pickle; returns its path.
