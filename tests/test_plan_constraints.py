@@ -1,4 +1,4 @@
-"""Hard constraints of plans: against SciPy on the same discretization, KKT conditions by differences, what is refused."""
+"""Hard constraints of plans: against SciPy on the same grid, KKT conditions by differences, what is refused."""
 
 import numpy as np
 import pytest
@@ -128,7 +128,7 @@ def test_multipliers_are_slopes_of_the_least_cost():
 
 def test_control_limits_and_hold():
     """Within the box of the controls, each held over two steps, other integrators and samplings included."""
-    limits = (-16.0, 16.0)
+    limits = (-30.0, 30.0)
     for options in (
         {"hold": 2},
         {"integrator": vp.RungeKutta4(), "sampling": "start"},

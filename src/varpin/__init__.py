@@ -100,6 +100,7 @@ if TYPE_CHECKING:
     from varpin.control import Verification as Verification
     from varpin.control import Violations as Violations
     from varpin.control import solve as solve
+    from varpin.control.constraints import KeepClear as KeepClear
     from varpin.control.constraints import KeepInBox as KeepInBox
     from varpin.control.constraints import KeepInHalfSpace as KeepInHalfSpace
     from varpin.control.constraints import KeepInSphere as KeepInSphere
@@ -145,6 +146,7 @@ if TYPE_CHECKING:
     from varpin.linearization import linearize as linearize
     from varpin.linearization import propagate_moments as propagate_moments
     from varpin.linearization import second_order as second_order
+    from varpin.model.clearance import Obstacle as Obstacle
     from varpin.show.inspection import FrameReport as FrameReport
     from varpin.show.inspection import JointReport as JointReport
     from varpin.show.inspection import LinkReport as LinkReport
@@ -165,6 +167,7 @@ if TYPE_CHECKING:
 # What a simulation has no need of is imported with its first use: all of it at once takes as long as Pinocchio.
 _LATE: dict[str, tuple[str, ...]] = {
     "varpin.control.constraints": (
+        "KeepClear",
         "KeepInBox",
         "KeepInHalfSpace",
         "KeepInSphere",
@@ -195,6 +198,7 @@ _LATE: dict[str, tuple[str, ...]] = {
         "VelocityCost",
         "VelocityLimitBarrier",
     ),
+    "varpin.model.clearance": ("Obstacle",),
     "varpin.ensemble": ("Ensemble", "EnsembleInterrupted", "EnsembleStatistics", "PathFailure", "simulate_ensemble"),
     "varpin.show.inspection": ("FrameReport", "JointReport", "LinkReport", "RobotReport", "inspect_robot"),
     "varpin.linearization": ("Curvature", "Linearization", "Moments", "linearize", "propagate_moments", "second_order"),

@@ -271,7 +271,7 @@ class _Rounds:
         if out:
             return Status.MAX_ITERATIONS, f"{found.reason}; {state}"
         if found.iterations == 0 and begun.round > 0 and not feasible and begun.tolerance > _FINEST * self.tolerance:
-            # What is left to gain is below the tolerance of the search: nothing is to be learnt from a motion that stays.
+            # What is left to gain is below the tolerance of the search: a motion that stays teaches nothing.
             self.state = replace(begun, tolerance=_TIGHTER * begun.tolerance, round=begun.round + 1, backoff=backoff)
             return None, ""
         stays = worst.violation > max(FEASIBLE, _LOWERED * float(begun.worst.max()))
