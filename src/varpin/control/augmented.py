@@ -312,12 +312,14 @@ class _Rounds:
             return moved
         if found is None:
             return moved
-        return replace(
-            moved,
-            gains=found.feedback,
-            previous_gains=found.previous,
-            feedforward=found.feedforward,
-            gradient=found.gradient,
+        return self._steady(
+            replace(
+                moved,
+                gains=found.feedback,
+                previous_gains=found.previous,
+                feedforward=found.feedforward,
+                gradient=found.gradient,
+            )
         )
 
     def _steady(self, kept: Solution) -> Solution:
