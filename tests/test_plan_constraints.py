@@ -1,12 +1,15 @@
 """Hard constraints of plans: against SciPy on the same grid, KKT conditions by differences, what is refused."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from scipy.optimize import minimize
 
 import varpin as vp
 from varpin.control.backward import backward
 from varpin.control.penalties import penalized
+from varpin.model.clearance import capsule_around, clearance
+from varpin.model.kinematics import frame_kinematics
 
 
 def two_links(constraints=(), *, steps=24, cost=None, **options):
@@ -253,3 +256,104 @@ def test_what_is_refused():
         vp.WithinJointLimits(ROBOT, (-1, 1), margin=-1.0)
     with pytest.raises(vp.InputError, match="would leave them out"):
         vp.Mpc(two_links(FAMILIES["velocities"]))
+
+
+def test_clearance_derivatives():
+    """Of capsules against balls, boxes and each other, against differences; capsules hold all of their links."""
+    robot = vp.load_robot("ur5")
+    made = [
+        vp.Obstacle.sphere([0.4, 0.2, 0.5], 0.15),
+        vp.Obstacle.box([-0.3, 0.2, 0.3], [0.2, 0.3, 0.2]),
+        vp.Obstacle.capsule([0.5, -0.5, 0.0], [0.5, -0.5, 1.0], 0.05),
+    ]
+    measure = clearance(robot, made, itself=True)
+    q = np.random.default_rng(0).normal(size=(20, 6))
+    slopes = measure.slopes(q)
+    for c in range(6):
+        e = np.zeros(6)
+        e[c] = 1e-6
+        found = (measure.distances(q + e) - measure.distances(q - e)) / 2e-6
+        np.testing.assert_allclose(slopes[:, :, c], found, atol=1e-7)
+    points = np.random.default_rng(1).normal(size=(500, 3)) * [1.0, 0.2, 0.1]
+    begin, end, radius = capsule_around(points)
+    along = np.clip((points - begin) @ (end - begin) / ((end - begin) @ (end - begin)), 0.0, 1.0)
+    away = np.linalg.norm(points - begin - along[:, None] * (end - begin), axis=1)
+    assert away.max() == pytest.approx(radius, rel=1e-9)
+
+
+def test_capsule_distances_are_coals():
+    """The distances of random capsules, by formula and by coal; ends, insides and balls among them."""
+    rng = np.random.default_rng(3)
+    coal = pin.coal
+    robot = vp.planar_chain(1)
+    for _ in range(100):
+        a, b, c, d = rng.normal(size=(4, 3))
+        one, other = rng.uniform(0.05, 0.2, 2)
+        capsules = {"joint1": (a, b, one)}
+        own = clearance(robot, [vp.Obstacle.capsule(c, d, other)], capsules=capsules).distances(np.zeros((1, 1)))
+        R, p = frame_kinematics(robot, "joint1").placements(np.zeros((1, 1)))
+        shapes = []
+        for (x, y), r in ((((R[0] @ a + p[0]), (R[0] @ b + p[0])), one), ((c, d), other)):
+            turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), y - x).toRotationMatrix()
+            shapes += [coal.Capsule(r, float(np.linalg.norm(y - x))), coal.Transform3s(turn, 0.5 * (x + y))]
+        known = coal.distance(*shapes, coal.DistanceRequest(), coal.DistanceResult())
+        assert own[0, 0] == pytest.approx(known, abs=1e-6)
+
+
+def test_arm_goes_around_a_post():
+    """A tool behind a post: every link stays clear of it, which without the constraint it does not."""
+    robot = vp.load_robot("ur5")
+    begin = np.array([0.0, -1.2, 1.4, -1.8, -1.57, 0.0])
+    end = begin + np.eye(6)[0] * 1.6
+    post = vp.Obstacle.capsule([0.4, 0.45, 0.0], [0.4, 0.45, 0.55], 0.06, name="post")
+    clear = vp.KeepClear(robot, [post], 0.02)
+    goal = vp.ReachFrame(robot, "tool0", position=robot.frame_positions(end, "tool0"))
+    cost = vp.ControlCost(1.0 / robot.effort_limit**2) + vp.VelocityCost(0.2)
+    cost += vp.Terminal(vp.TrackingCost(end, 1.0) + vp.VelocityCost(100.0))
+    options = {"dt": 0.05, "steps": 30, "control_limits": (-robot.effort_limit, robot.effort_limit)}
+    plans = [
+        vp.solve(
+            vp.OptimalControlProblem(vp.Scene(robot, damping=0.1), cost, begin, np.zeros(6), constraints=c, **options),
+            check=False,
+        )
+        for c in ([goal], [goal, clear])
+    ]
+    apart = [clearance(robot, [post]).distances(plan.trajectory.q).min() for plan in plans]
+    assert apart[0] < -0.01
+    assert apart[1] >= 0.02 - 1e-9
+    assert plans[1].violation <= 1e-9
+    assert plans[1].status is vp.Status.CONVERGED
+
+
+def chance(constraint, paths):
+    """A plan with a margin of two deviations, and at worst how often motions violate a bound."""
+    robot = vp.planar_chain(2)
+    scene = vp.Scene(robot, damping=0.5, noise=vp.AdditiveNoise(0.1 * np.eye(2)))
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1.0) + vp.TrackingCost([1.0, 0.5], 10.0)
+    cost += vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0) + vp.VelocityCost(10.0))
+    problem = vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=0.03, steps=40, constraints=[constraint])
+    plan = vp.solve(problem, check=False)
+    assert plan.status is vp.Status.CONVERGED, plan.reason
+    options = {"controls": plan.policy, "integrator": problem.integrator}
+    found = vp.simulate_ensemble(scene, [0, 0], [0, 0], dt=0.03, steps=40, paths=paths, rng=1, **options)
+    c = problem.bound_constraints[0].value(found.q, found.v, np.zeros((paths, 40, 2)))
+    return float((c > 0.0).mean(axis=0).max())
+
+
+@pytest.mark.parametrize(
+    "constraint",
+    [
+        vp.WithinJointLimits(ROBOT, (-0.2, [0.9, 0.6]), margin=2.0),
+        pytest.param(vp.WithinVelocityLimits(ROBOT, (-1.5, 1.5), margin=2.0), marks=pytest.mark.slow),
+        pytest.param(vp.KeepOutOfSphere(ROBOT, "tip", [1.3, 0.0, -1.5], 0.25, margin=2.0), marks=pytest.mark.slow),
+    ],
+)
+def test_margins_against_monte_carlo(constraint):
+    """Each bound at each node: at most 2.28 % and three standard errors of 1e4 motions."""
+    share = chance(constraint, 10_000)
+    assert 0.005 < share <= 0.0228 + 3.0 * np.sqrt(0.0228 * 0.9772 / 10_000)
+
+
+def test_between_nodes_is_told():
+    plan = vp.solve(two_links(FAMILIES["velocities"], steps=12, dt=0.08))
+    assert any("between them" in sentence for sentence in plan.warnings)

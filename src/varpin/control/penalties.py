@@ -1,6 +1,6 @@
 """The augmented Lagrangian of a problem with constraints: a problem without them, whose cost has their penalties.
 
-Equation (O10) of docs/mathematics.md.
+Equation (P2) of docs/plan-constraints.md.
 """
 
 from __future__ import annotations

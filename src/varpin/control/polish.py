@@ -44,19 +44,24 @@ def onto_constraints(
         backoff: Of each constraint (K, rows).
     """
     best, worst = plan.trajectory, _worst(problem, plan.trajectory, backoff)
-    trials = Trials(problem)
+    trials, motion = Trials(problem), plan.trajectory
+    active = [
+        np.full(own.shape, item.source.equality) | (own > 0.0)
+        for item, own in zip(problem.bound_constraints, multipliers, strict=True)
+    ]
     for _ in range(_STEPS):
         if worst <= _DONE:
             break
-        commands = _corrected(problem, plan, best, multipliers, backoff)
-        attempt = trials.attempt(commands)
+        values = [c + b for c, b in zip(_values(problem, motion), backoff, strict=True)]
+        # A row that a step has run into stays: it may be next to one that the plan is held back by.
+        active = [rows | (c > 0.0) for rows, c in zip(active, values, strict=True)]
+        attempt = trials.attempt(_corrected(problem, plan, motion, values, active))
         if not attempt.whole:
             break
         motion = attempt.trajectory()
         now = _worst(problem, motion, backoff)
-        if not now < worst:
-            break
-        best, worst = motion, now
+        if now < worst:
+            best, worst = motion, now
     return best
 
 
@@ -78,18 +83,13 @@ def _corrected(
     problem: OptimalControlProblem,
     plan: Solution,
     motion: Trajectory,
-    multipliers: list[Floats],
-    backoff: list[Floats],
+    values: list[Floats],
+    active: list[Mask],
 ) -> Commands:
     """The motion's controls with the least change that brings its active rows to their bounds, to first order."""
     R, m = problem.decisions, problem.scene.controls
     u = motion.u[:: problem.hold]
     lower, upper = problem.control_limits
-    values = [c + b for c, b in zip(_values(problem, motion), backoff, strict=True)]
-    active = [
-        np.ones(c.shape, dtype=np.bool_) if item.source.equality else (c > 0.0) | (own > 0.0)
-        for item, c, own in zip(problem.bound_constraints, values, multipliers, strict=True)
-    ]
     around = _Around(problem, motion)
     G = around.rows(active).reshape(-1, R, m)
     free = (u > lower) & (u < upper)

@@ -84,7 +84,8 @@ class KeepClear(PlanConstraint):
             itself: Keep links clear of each other, too, but for neighbours: those on one joint or on two that follow
                 each other, and pairs that overlap at q = 0; ``pairs`` says which are left.
             srdf: An SRDF file, whose ``disable_collisions`` leave out more pairs of links.
-            capsules: By link, (begin (3,), end (3,), radius) in the link's own axes [m], in place of the fitted one.
+            capsules: By the name of a link, or of another frame, (begin (3,), end (3,), radius) in its own axes [m], in
+                place of the fitted one.
             margin: In standard deviations of what noise does to a distance.
 
         Raises:
