@@ -90,9 +90,11 @@ from varpin.trajectory import StepStatistics as StepStatistics
 from varpin.trajectory import Trajectory as Trajectory
 
 if TYPE_CHECKING:
+    from varpin.control import ConstraintReport as ConstraintReport
     from varpin.control import Iteration as Iteration
     from varpin.control import MonteCarlo as MonteCarlo
     from varpin.control import MonteCarloInterrupted as MonteCarloInterrupted
+    from varpin.control import Multipliers as Multipliers
     from varpin.control import OptimalControlProblem as OptimalControlProblem
     from varpin.control import Refined as Refined
     from varpin.control import Refinement as Refinement
@@ -102,6 +104,16 @@ if TYPE_CHECKING:
     from varpin.control import Verification as Verification
     from varpin.control import Violations as Violations
     from varpin.control import solve as solve
+    from varpin.control.constraints import KeepClear as KeepClear
+    from varpin.control.constraints import KeepInBox as KeepInBox
+    from varpin.control.constraints import KeepInHalfSpace as KeepInHalfSpace
+    from varpin.control.constraints import KeepInSphere as KeepInSphere
+    from varpin.control.constraints import KeepOutOfSphere as KeepOutOfSphere
+    from varpin.control.constraints import PlanConstraint as PlanConstraint
+    from varpin.control.constraints import ReachFrame as ReachFrame
+    from varpin.control.constraints import WithinControlRate as WithinControlRate
+    from varpin.control.constraints import WithinJointLimits as WithinJointLimits
+    from varpin.control.constraints import WithinVelocityLimits as WithinVelocityLimits
     from varpin.control.costs import BoundCost as BoundCost
     from varpin.control.costs import CenterOfMassCost as CenterOfMassCost
     from varpin.control.costs import ControlCost as ControlCost
@@ -138,6 +150,7 @@ if TYPE_CHECKING:
     from varpin.linearization import linearize as linearize
     from varpin.linearization import propagate_moments as propagate_moments
     from varpin.linearization import second_order as second_order
+    from varpin.model.clearance import Obstacle as Obstacle
     from varpin.show.inspection import FrameReport as FrameReport
     from varpin.show.inspection import JointReport as JointReport
     from varpin.show.inspection import LinkReport as LinkReport
@@ -157,6 +170,18 @@ if TYPE_CHECKING:
 
 # What a simulation has no need of is imported with its first use: all of it at once takes as long as Pinocchio.
 _LATE: dict[str, tuple[str, ...]] = {
+    "varpin.control.constraints": (
+        "KeepClear",
+        "KeepInBox",
+        "KeepInHalfSpace",
+        "KeepInSphere",
+        "KeepOutOfSphere",
+        "PlanConstraint",
+        "ReachFrame",
+        "WithinControlRate",
+        "WithinJointLimits",
+        "WithinVelocityLimits",
+    ),
     "varpin.control.costs": (
         "BoundCost",
         "CenterOfMassCost",
@@ -177,6 +202,7 @@ _LATE: dict[str, tuple[str, ...]] = {
         "VelocityCost",
         "VelocityLimitBarrier",
     ),
+    "varpin.model.clearance": ("Obstacle",),
     "varpin.ensemble": ("Ensemble", "EnsembleInterrupted", "EnsembleStatistics", "PathFailure", "simulate_ensemble"),
     "varpin.show.inspection": ("FrameReport", "JointReport", "LinkReport", "RobotReport", "inspect_robot"),
     "varpin.linearization": ("Curvature", "Linearization", "Moments", "linearize", "propagate_moments", "second_order"),
@@ -184,9 +210,11 @@ _LATE: dict[str, tuple[str, ...]] = {
     "varpin.control.mpc": ("Mpc", "MpcRun", "Plant"),
     "varpin.io.scenefile": ("Required", "SceneFile", "SceneFileError", "load_scene"),
     "varpin.control": (
+        "ConstraintReport",
         "Iteration",
         "MonteCarlo",
         "MonteCarloInterrupted",
+        "Multipliers",
         "OptimalControlProblem",
         "Refined",
         "Refinement",

@@ -50,6 +50,8 @@ class StepModel(crocoddyl.ActionModelAbstract):
     """
 
     def __init__(self, problem: OptimalControlProblem, step: int) -> None:
+        if problem.constraints:
+            raise InputError("hard constraints of a plan have no counterpart in crocoddyl: make them costs")
         n, m = problem.scene.robot.dof, problem.scene.controls
         super().__init__(crocoddyl.StateVector(2 * n), m, 0)
         self._problem = problem

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -14,6 +15,7 @@ from varpin.control.costs import CostError, Expansion
 from varpin.control.descent import Model, Stake, at_stake
 from varpin.control.lines import RULE, Derivatives, LinearSteps, at_samples, linear_steps, size
 from varpin.control.moments import Feedback, noise_gradient
+from varpin.control.penalties import PenalizedProblem, PenalizedRate, flat, rate_columns
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.square_root import Squares, squares_of
 from varpin.errors import LinearizationError
@@ -27,9 +29,13 @@ from varpin.linearization import (
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 # Nodes that are linearized at a time: their derivatives are not kept.
 _BLOCK = 2048
+
+# Passes that look for the constraints that their motion meets.
+_FORESEEN, _BISECTIONS = 60, 40
 
 # A pass whose Quu rounding may have changed by more than this part is made anew on square roots.
 TRUSTED = 1e-9
@@ -104,7 +110,7 @@ def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floa
 def _curvature(problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan, costate: Floats) -> Floats:
     """Second derivatives (N, 2n + m, 2n + m) in (x, u) that dynamics and noise fields add to the cost to go."""
     scene, n, h = problem.scene, problem.scene.robot.dof, problem.dt
-    N, samples, rule = problem.steps, len(problem.rule), problem.rule
+    N, samples, rule = problem.steps, len(problem.model_rule), problem.model_rule
     gradient = problem.expand_running(trajectory).gradient.reshape(N, samples, -1)
     by_q, by_v = gradient[:, :, :n], gradient[:, :, n : 2 * n]
     # The running cost's gradient in q0, v0, q1 and v1 of each step.
@@ -151,12 +157,146 @@ def backward(
     """
     along = Along(problem, trajectory) if along is None else along
     if not second_order:
-        return _within_limits(along, regularization, None)
+        return _foreseeing(along, regularization, None)
     # First derivatives of the cost to go, then with them second derivatives of the dynamics (stagewise Newton).
     plan, costate = _pass(along, max(regularization, 1e-3), costates=True)
     if plan is None:
         return None
-    return _within_limits(along, regularization, _curvature(problem, trajectory, plan, costate))
+    return _foreseeing(along, regularization, _curvature(problem, trajectory, plan, costate))
+
+
+def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
+    """The pass, in which penalties of constraints count where the linearized motion will meet them.
+
+    A penalty is zero up to its bound and a parabola beyond. Around the nominal motion alone it pulls back what is
+    beyond, and knows nothing of what the step brings there. So passes are made until the rows that count are those that
+    their linearized motion meets: Newton steps to the minimum of the piecewise quadratic model, each as long as lowers
+    it most. Where they do not settle, the best pass of them is taken.
+    """
+    problem = along.problem
+    if not isinstance(problem, PenalizedProblem) or len(along.blocks) > 1:
+        return _within_limits(along, regularization, curvature)
+    rows = _Rows(along, problem)
+    held, best, least = rows.begun, None, 0.0
+    for _ in range(_FORESEEN):
+        passing = rows.along(held)
+        plan = _within_limits(passing, regularization, curvature)
+        if plan is None:
+            break
+        ahead = rows.ahead(passing, plan)
+        change, slope = rows.change(plan, held, ahead)
+        if slope < 0.0 and change < least:
+            best, least = replace(plan, slope=slope, curvature=2.0 * (change - slope), limited=True), change
+        met = [penalty.held(s) for penalty, s in zip(rows.penalties, ahead, strict=True)]
+        if all(np.array_equal(a, b) for a, b in zip(met, held, strict=True)):
+            break
+        rows.move(plan, held, ahead)
+        held = [penalty.held(s) for penalty, s in zip(rows.penalties, rows.at, strict=True)]
+    if best is None:
+        return _within_limits(along, regularization, curvature)
+    return replace(best, model=along.model)
+
+
+class _Rows:
+    """The rows of all penalties around a motion, on which passes along it differ."""
+
+    def __init__(self, along: Along, problem: PenalizedProblem) -> None:
+        self.whole, self.problem, motion = along, problem, along.trajectory
+        # Made once, before passes take over what is there.
+        along.linearized(0, problem.steps)
+        q, v, u = motion.q, motion.v, motion.u
+        self.of_nodes = problem.penalties
+        self.of_rate = tuple(item for item in problem.all_penalties if item.bound.of_controls)
+        self.penalties = (*self.of_nodes, *self.of_rate)
+        self.own = problem.expand_own(motion)
+        self.signed = [item.signed(item.bound.value(q, v, u)) for item in self.penalties]
+        self.begun = [item.held(s) for item, s in zip(self.penalties, self.signed, strict=True)]
+        self.jacobians = [item.bound.jacobian(q, v) for item in self.of_nodes]
+        # Where the steps to the model's minimum have come to: the rows there, and the cost without penalties.
+        self.at, self.cost = self.signed, 0.0
+        # d(q, v)/dx at the nodes.
+        n = problem.scene.robot.dof
+        slopes = np.tile(np.eye(2 * n), (len(q), 1, 1))
+        if problem.integrator.variational:
+            slopes[:, n:] = velocity_at_nodes(problem.scene, q, v)
+        self.by_state = [J @ slopes[item.bound.places] for item, J in zip(self.of_nodes, self.jacobians, strict=True)]
+
+    def along(self, held: list[Mask]) -> Along:
+        """What passes are made from in which the rows ``held`` count."""
+        passing = copy(self.whole)
+        vars(passing).pop("model", None)
+        count = len(self.of_nodes)
+        passing.running = self.problem.with_held(self.own, self.signed[:count], self.jacobians, held[:count])
+        rate = self.problem.rate
+        if isinstance(rate, PenalizedRate):
+            u = self.whole.trajectory.u[:: self.problem.hold]
+            passing.pull, passing.rate = rate.expand(u, self.problem.period, held[count:])
+        return passing
+
+    def ahead(self, passing: Along, plan: Plan) -> list[Floats]:
+        """Where a plan takes what the penalties are squares of, on the linearized motion."""
+        problem, (lin, _) = self.problem, passing.linearized(0, self.problem.steps)
+        N, hold = problem.steps, problem.hold
+        slack = passing.slack
+        states, moves = np.zeros((N + 1, lin.A.shape[1])), np.zeros(plan.feedforward.shape)
+        for j in range(N):
+            k = j // hold
+            if j % hold == 0:
+                move = plan.feedforward[k] + plan.feedback[k] @ states[j]
+                if plan.previous is not None and k > 0:
+                    move = move + plan.previous[k] @ moves[k - 1]
+                moves[k] = np.clip(move, slack[k, 0], slack[k, 1]) if slack.size else move
+            states[j + 1] = lin.A[j] @ states[j] + lin.B[j] @ moves[k]
+        found = [
+            s + np.einsum("krx,kx->kr", J, states[item.bound.places])
+            for item, s, J in zip(self.of_nodes, self.signed[: len(self.of_nodes)], self.by_state, strict=True)
+        ]
+        for item, s in zip(self.of_rate, self.signed[len(self.of_nodes) :], strict=True):
+            bound = item.bound
+            rate = np.diff(moves, axis=0, prepend=np.zeros_like(moves[:1])) / problem.period
+            rate = rate[bound.places][:, rate_columns(item)]
+            found.append(s + np.concatenate([rate, -rate], axis=1))
+        return found
+
+    def move(self, plan: Plan, held: list[Mask], ahead: list[Floats]) -> None:
+        """Go on towards the minimum ``ahead`` of the model in which ``held`` rows count, as far as lowers it most."""
+        at, to = flat(self.at), flat(ahead)
+        counts = np.concatenate([rows.ravel() for rows in held])
+        weights = np.concatenate(
+            [np.full(s.size, item.weight) for item, s in zip(self.penalties, self.at, strict=True)]
+        )
+        equal = np.concatenate(
+            [np.full(s.size, item.equality) for item, s in zip(self.penalties, self.at, strict=True)]
+        )
+        way, of_held = to - at, np.where(counts, weights, 0.0)
+        least = 0.5 * float(of_held @ flat(self.signed) ** 2) - plan.expected_decrease
+        gap = self.cost + 0.5 * float(of_held @ at**2) - least
+
+        def slope(t: float) -> float:
+            s = at + t * way
+            pull = np.where(equal | (s > 0.0), weights, 0.0) - of_held
+            return float((pull * s) @ way) - 2.0 * (1.0 - t) * gap
+
+        low, high = 0.0, 1.0
+        if slope(high) <= 0.0:
+            low = high
+        for _ in range(_BISECTIONS if low < high else 0):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if slope(middle) <= 0.0 else (low, middle)
+        self.at = [a + low * (b - a) for a, b in zip(self.at, ahead, strict=True)]
+        self.cost = least + (1.0 - low) ** 2 * gap - 0.5 * float(of_held @ (at + low * way) ** 2)
+
+    def change(self, plan: Plan, held: list[Mask], ahead: list[Floats]) -> tuple[float, float]:
+        """By what the piecewise model changes over a plan's whole step, and its slope at the start."""
+        change, slope = -plan.expected_decrease, plan.slope
+        for item, s, t, now, rows in zip(self.penalties, self.signed, ahead, self.begun, held, strict=True):
+            half = 0.5 * item.weight
+            before, after = s * s, t * t
+            then = item.held(t)
+            change += half * float(before[rows].sum() - before[now].sum() + after[then].sum() - after[rows].sum())
+            pull = item.weight * s * (t - s)
+            slope += float(pull[now].sum() - pull[rows].sum())
+        return change, slope
 
 
 def _within_limits(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
@@ -270,7 +410,7 @@ class Along:
         feedback = Feedback(plan.feedback, plan.previous)
         pull = noise_gradient(problem, self.trajectory, feedback, self.rate)
         # A gradient in (x, u) is one in (q, v, u) at the step's first sample.
-        rule, x, m = problem.rule, 2 * problem.scene.robot.dof, problem.scene.controls
+        rule, x, m = problem.model_rule, 2 * problem.scene.robot.dof, problem.scene.controls
         D = np.zeros((N, x + m, x + m))
         D[:, :x] = at_samples(rule[:1], np.concatenate([lin.A, lin.B], axis=2), velocity)[0]
         D[:, x:, x:] = np.eye(m)
@@ -322,7 +462,7 @@ class Along:
             return self.kept
         problem, part = self.problem, self.trajectory.part(begin, end)
         # Velocities at nodes are needed where they are sampled and x does not hold them.
-        nodes = problem.integrator.variational and bool(problem.rule[:, [2, 4, 6, 8]].any())
+        nodes = problem.integrator.variational and bool(problem.model_rule[:, [2, 4, 6, 8]].any())
         lin = _linearize(problem, part, begin)
         n = problem.scene.robot.dof
         velocity = velocity_at_nodes(problem.scene, part.q, part.v) if nodes else np.zeros((0, n, 2 * n))
@@ -334,7 +474,7 @@ class Along:
         """A block of steps as the core takes them."""
         if self.problem.linear:
             return self._on_lines(limits)
-        problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.rule)
+        problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.model_rule)
         size = hessian.shape[-1]
         rows, points = slice(begin // problem.hold, end // problem.hold), slice(begin * samples, end * samples)
         lin, velocity = self.linearized(begin, end)
@@ -344,7 +484,7 @@ class Along:
             G=lin.G,
             Gx=lin.Gx,
             Gu=lin.Gu,
-            rule=problem.rule,
+            rule=problem.model_rule,
             gradient=self.slopes[points],
             hessian=hessian[points] if len(hessian) > 1 else hessian,
             velocity=velocity,
@@ -443,7 +583,7 @@ def _one_pass(
         by_roots = _ByRoots(core.RootPass(m, final.after(D).core, by_state), squares, change)
     if limits is None:
         limits = _Limits(np.zeros((0, 2, m)), np.zeros((0, 2 * n + m)))
-    samples = len(problem.rule)
+    samples = len(problem.model_rule)
     for begin, end in reversed(along.blocks):
         steps, points = slice(begin, end), slice(begin * samples, end * samples)
         rows = slice(begin // problem.hold, end // problem.hold)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from varpin.control.history import ITERATIONS, Status
+from varpin.control.multipliers import FEASIBLE
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
 from varpin.control.verification import accurate_cost, percent
@@ -15,6 +16,7 @@ from varpin.errors import VarpinError
 from varpin.integrators import Integrator
 from varpin.integrators.base import open_line, open_loop
 from varpin.simulation.chatter import alternation, restlessness
+from varpin.simulation.run import rollout
 from varpin.simulation.soundness import Finding, announce, evident, examined
 
 logger = logging.getLogger(__name__)
@@ -27,6 +29,8 @@ LOSS, GAIN = 1e-3, 1e-2
 _OF_STEPS = ("coarse steps", "fast damping", "fast friction", "split steps")
 # Of its cost, what a search that stalls may still promise without a word.
 _LITTLE = 1e-3
+# Of a tenth of a constraint's range, what it may be violated by between nodes without a word.
+_BETWEEN = 1e-2
 _ALTERNATION, _RESTLESS = "alternating velocities", "restless velocities"
 
 
@@ -71,7 +75,7 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
     told = [finding for finding in found if finding.kind not in (*_OF_STEPS, _ALTERNATION)]
     if solution.refinement is not None and not solution.refinement.met:
         told.append(Finding("true cost", solution.refinement.reason))
-    told += _unfinished(solution) + (_alternating(solution) or _restless(solution))
+    told += _unfinished(solution) + (_alternating(solution) or _restless(solution)) + _between(solution)
     try:
         replay = replayed(solution)
     except VarpinError as error:
@@ -147,6 +151,44 @@ def _unfinished(solution: Solution) -> list[Finding]:
     if solution.status is Status.STALLED and promised <= _LITTLE * abs(solution.cost):
         return []
     return [Finding("not converged", solution.reason)]
+
+
+def _between(solution: Solution) -> list[Finding]:
+    """Says where constraints that hold at the nodes are violated between them, in parts of a step."""
+    problem = solution.problem
+    if not problem.constraints or solution.violation > FEASIBLE:
+        return []
+    fine = problem.at(dt=problem.dt / PARTS, steps=problem.steps * PARTS, hold=problem.hold * PARTS)
+    motion, failure = rollout(
+        problem.scene,
+        problem.integrator,
+        problem.q0,
+        problem.v0,
+        open_loop(solution.controls)._replace(hold=problem.hold * PARTS),
+        fine.dt,
+    )
+    if failure is not None:
+        return []
+    found = []
+    for bound, whole, own in zip(fine.bound_constraints, problem.bound_constraints, solution.constraints, strict=True):
+        if bound.of_controls or bound.source.equality:
+            continue
+        c = bound.value(motion.q, motion.v, motion.u)
+        # Of what margins add, that of the node before.
+        c = c + (own.values - whole.value(solution.trajectory.q, solution.trajectory.v, solution.trajectory.u)).repeat(
+            PARTS, axis=0
+        )
+        place, row = np.unravel_index(int(np.argmax(c)), c.shape)
+        if c[place, row] > _BETWEEN * bound.scale:
+            found.append(
+                Finding(
+                    "constraints between nodes",
+                    f"{own.label} holds at the nodes, and between them {bound.rows[row]} is violated by "
+                    f"{c[place, row]:.2g} {bound.unit} at t = {bound.times[place]:.4g} s: a bound that is as much "
+                    "narrower, or a smaller dt, keeps it there, too",
+                )
+            )
+    return found
 
 
 def _restless(solution: Solution) -> list[Finding]:

@@ -31,6 +31,10 @@ class Status(Enum):
         "not converged: the derivatives of the dynamics or of the cost do not exist along the last motion; the log "
         "says where. A smaller dt, or a cost that is finite around the motion, may help"
     )
+    INFEASIBLE = (
+        "infeasible: a constraint cannot be met from the first controls, and the reason names it. Other first controls "
+        "may lead around an obstacle; a longer horizon, wider limits or another goal may help"
+    )
     OUT_OF_TIME = "stopped at the time limit: this is the best motion so far"
     INTERRUPTED = "interrupted: this is the best motion so far"
 

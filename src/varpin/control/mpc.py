@@ -177,6 +177,11 @@ class Mpc:
             raise InputError(f"problem must be an OptimalControlProblem, got {type(self.problem).__name__}")
         if self.problem.linear:
             raise InputError("Mpc decides on controls that are held: the problem's are linear between nodes")
+        if self.problem.constraints:
+            raise InputError(
+                "Mpc has no time for the rounds of hard constraints, and would leave them out: make them costs "
+                "(JointLimitBarrier, VelocityLimitBarrier, CustomCost), or plan with varpin.solve and follow the plan"
+            )
         count("iterations", self.iterations, least=1)
         count("first_iterations", self.first_iterations, least=1)
         positive("tolerance", self.tolerance, "1")

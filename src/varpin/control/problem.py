@@ -5,12 +5,14 @@ Equation (O1) of docs/mathematics.md.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.control.constraints import BoundConstraint, Horizon, PlanConstraint
 from varpin.control.costs import (
     BoundSum,
     ControlRate,
@@ -88,6 +90,9 @@ class OptimalControlProblem(Frozen):
         t0: When the horizon begins [s]; references that are functions of time see it.
         control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none.
         controls: ``"held"``, each constant over ``hold`` steps, or ``"linear"`` in time between nodes.
+        constraints: What the motion has to keep to, whatever it costs (:class:`PlanConstraint`): limits of joints, a
+            frame's goal, regions, clearance. Those of a :class:`Scene` are others: they belong to the mechanism, and
+            forces of their own keep them in every motion.
         rate: What changes of the controls cost: ``rate.weight`` (m, m) and ``rate.before``, the control before the
             horizon (m,) or None; None where they cost nothing.
     """
@@ -103,11 +108,13 @@ class OptimalControlProblem(Frozen):
     hold: int
     t0: float
     control_limits: Floats
+    constraints: tuple[PlanConstraint, ...]
     running: BoundSum = field(repr=False)
     terminal: BoundSum = field(repr=False)
     rule: Floats = field(repr=False)
     rate: ControlRate | None = field(repr=False)
     controls: Shape
+    bound_constraints: tuple[BoundConstraint, ...] = field(repr=False)
 
     def __init__(
         self,
@@ -124,6 +131,7 @@ class OptimalControlProblem(Frozen):
         t0: float = 0.0,
         control_limits: tuple[JointValues, JointValues] | None = None,
         controls: Shape = "held",
+        constraints: Sequence[PlanConstraint] = (),
     ) -> None:
         """Describe a problem; the class says what each argument is.
 
@@ -134,7 +142,8 @@ class OptimalControlProblem(Frozen):
             UnknownJoint: A name that is no joint's, or of controls no driven joint's.
             InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
                 reference that does not fit the problem's grid, or limits that leave a control nothing; linear controls
-                with ``hold`` or in a scene with noise.
+                with ``hold``, in a scene with noise or with constraints; constraints that are no plan constraints or
+                of another robot.
             CostError: A reference that is a function fails.
         """
         n, m = require_scene(scene).robot.dof, scene.controls
@@ -164,6 +173,10 @@ class OptimalControlProblem(Frozen):
         )
         running, terminal = bind_cost(cost, t0 + times, points)
         begin = joint_array("q0", q0, scene.robot.joint_names)
+        rate = control_rate(cost, m, scene.control_joints)
+        given = _constraints(constraints)
+        if given and controls == "linear":
+            raise InputError("plans with linear controls know no constraints: take controls='held'")
         values = {
             "scene": scene,
             "cost": cost,
@@ -176,11 +189,13 @@ class OptimalControlProblem(Frozen):
             "hold": hold,
             "t0": t0,
             "control_limits": named_limits("control_limits", control_limits, scene.control_joints, scene.controls),
+            "constraints": given,
             "running": running,
             "terminal": terminal,
             "rule": rule,
-            "rate": control_rate(cost, m, scene.control_joints),
+            "rate": rate,
             "controls": controls,
+            "bound_constraints": _bind_constraints(given, scene, t0, dt, steps, hold, rate),
         }
         for name, value in values.items():
             if isinstance(value, np.ndarray):
@@ -268,6 +283,7 @@ class OptimalControlProblem(Frozen):
             t0=self.t0 if t0 is None else t0,
             control_limits=(self.control_limits[0], self.control_limits[1]),
             controls=self.controls if controls is None else controls,
+            constraints=self.constraints,
         )
 
     def _restarted(
@@ -288,6 +304,10 @@ class OptimalControlProblem(Frozen):
             times = t0 + _times(_rule(self.sampling, self.dt)[0], self.steps, self.dt)
             points = replace(self.running.points, t=times, t0=t0)
             changed["running"], changed["terminal"] = bind_cost(self.cost, times, points, (self.running, self.terminal))
+        if self.constraints and ("rate" in changed or "t0" in changed):
+            rate, t0 = changed.get("rate", self.rate), changed.get("t0", self.t0)
+            grid = (t0, self.dt, self.steps, self.hold)
+            changed["bound_constraints"] = _bind_constraints(self.constraints, scene, *grid, rate)
         problem = object.__new__(type(self))
         # Past the dataclass, which refuses assignments.
         vars(problem).update(vars(self) | changed)
@@ -312,7 +332,23 @@ class OptimalControlProblem(Frozen):
         functions = [[(part.f, part.derivatives) for part in parts] for parts in custom]
         if forces[0] != forces[1] or functions[0] != functions[1]:
             return "other forces"
+        if self.described_constraints != other.described_constraints:
+            return "other constraints"
         return ""
+
+    @property
+    def described_constraints(self) -> str:
+        """Its constraints in words and numbers, all that tells them from others; empty without any."""
+        return "; ".join(map(repr, self.constraints))
+
+    @property
+    def model_rule(self) -> Floats:
+        """Where in a step the quadratic model of the cost is made, as :attr:`rule`."""
+        return self.rule
+
+    def model_samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
+        """(q, v, u) at the points of :attr:`model_rule`, as :meth:`samples`."""
+        return self.samples(q, v, u)
 
     @property
     def limited(self) -> bool:
@@ -484,6 +520,36 @@ def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
     """
     stages = default_integrator().stages
     return Radau(stages=stages) if dt * rate_at_rest(scene, q0) > _STIFF else default_integrator()
+
+
+def _constraints(given: Sequence[PlanConstraint]) -> tuple[PlanConstraint, ...]:
+    if not isinstance(given, list | tuple):
+        raise InputError(f"constraints must be a list of plan constraints, got {type(given).__name__}")
+    for item in given:
+        if not isinstance(item, PlanConstraint):
+            raise InputError(
+                "constraints of a plan are for example varpin.WithinJointLimits(robot); those of the mechanism belong "
+                f"to varpin.Scene(constraints=); got {type(item).__name__}"
+            )
+    return tuple(given)
+
+
+def _bind_constraints(
+    constraints: tuple[PlanConstraint, ...],
+    scene: Scene,
+    t0: float,
+    dt: float,
+    steps: int,
+    hold: int,
+    rate: ControlRate | None,
+) -> tuple[BoundConstraint, ...]:
+    """Constraints on a grid."""
+    if not constraints:
+        return ()
+    times = t0 + np.arange(steps + 1, dtype=np.float64) * dt
+    before = None if rate is None else rate.before
+    horizon = Horizon(times, scene.robot, scene.controls, hold, scene.control_joints, before)
+    return tuple(item.bind(horizon) for item in constraints)
 
 
 def _rule(sampling: str, dt: float) -> tuple[Floats, Floats]:

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from varpin.control.costs import barriers_of
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
+from varpin.control.multipliers import ConstraintReport, Multipliers, reports
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refined import Refinement
 from varpin.control.solution_file import read, write
@@ -99,6 +101,7 @@ class Solution(Frozen):
             its steps are taken in quarters, its velocities alternate or go up and down all the time, its energy balance
             does not close, a wish for its true cost is not met.
         refinement: What finding the step took where a true cost was wished for; else None.
+        multipliers: Of the problem's constraints, and where their rounds stood; None without constraints.
     """
 
     problem: OptimalControlProblem
@@ -115,6 +118,7 @@ class Solution(Frozen):
     previous_gains: Floats | None = None
     warnings: tuple[str, ...] = ()
     refinement: Refinement | None = None
+    multipliers: Multipliers | None = None
 
     def __post_init__(self) -> None:
         for array in (self.gains, self.feedforward, self.gradient, self.previous_gains):
@@ -147,6 +151,16 @@ class Solution(Frozen):
             control=_beyond(self.problem.control_rows(motion), [self.problem.control_limits]),
         )
 
+    @cached_property
+    def constraints(self) -> tuple[ConstraintReport, ...]:
+        """How the motion keeps to each of the problem's constraints, in their order."""
+        return () if self.multipliers is None else reports(self.problem, self.trajectory, self.multipliers)
+
+    @property
+    def violation(self) -> float:
+        """The most that a constraint is violated, in its own unit; 0 where all hold or there are none."""
+        return max((item.violation for item in self.constraints), default=0.0)
+
     @property
     def policy(self) -> LinearPolicy:
         """Controls with feedback, on the x of the problem's integrator."""
@@ -158,7 +172,9 @@ class Solution(Frozen):
         return f"Solution(cost {self.cost:.6g}{noise}, {ended})"
 
     def __str__(self) -> str:
-        return "\n".join([repr(self), *(f"warning: {sentence}" for sentence in self.warnings)])
+        return "\n".join(
+            [repr(self), *map(str, self.constraints), *(f"warning: {sentence}" for sentence in self.warnings)]
+        )
 
     def _repr_html_(self) -> str:
         problem, beyond, motion = self.problem, self.violations, self.trajectory
@@ -178,6 +194,7 @@ class Solution(Frozen):
                 rows.append((f"{what} beyond limits [{unit}]", listed(over)))
         if beyond.control.any():
             rows.append(("controls beyond limits", f"{beyond.control.max():.3g} at most"))
+        rows += [("constraint", told) for told in self.constraints]
         rows += [("warning", warning) for warning in self.warnings]
         most = np.abs(problem.control_rows(motion)).max(axis=0, initial=0.0)
         rows.append(("largest controls", listed(f"{value:.4g}" for value in most)))
@@ -193,8 +210,8 @@ class Solution(Frozen):
         """The iterations, one row each, and how and why they ended; :class:`Solution` explains the columns."""
         warned = (f"warning: {sentence}" for sentence in self.warnings)
         refined = [] if self.refinement is None else str(self.refinement).splitlines()
-        ended = [self.status.value, f"({self.reason})"]
-        return "\n".join([Iteration.HEADER, *map(str, self.history), *refined, *warned, *ended])
+        rows = [*map(str, self.history), *map(str, self.constraints), *refined]
+        return "\n".join([Iteration.HEADER, *rows, *warned, self.status.value, f"({self.reason})"])
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the solution as a compressed npz file without pickle; returns its path.

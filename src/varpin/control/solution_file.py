@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.control.history import Iteration, SearchState, Status
+from varpin.control.multipliers import Multipliers
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refined import Refined, Refinement
 from varpin.errors import FileError
@@ -85,6 +86,7 @@ class _Plan:
     refinement: _Refinement | None = None
     search: _Search | None = None
     best: _Best | None = None
+    multipliers: Multipliers | None = None
 
 
 def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
@@ -121,6 +123,8 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
     members |= members_of(_Plan(**given, search=search, best=best))
     members |= {name: getattr(problem, name) for name in _PROBLEM}
     members |= {"problem.integrator": repr(problem.integrator)} | _surroundings(problem)
+    if problem.constraints:
+        members["problem.constraints"] = problem.described_constraints
     return write_npz(path, _FORMAT, members)
 
 
@@ -130,6 +134,7 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     members = read_npz(source, _FORMAT)
     scene = problem.scene
     sizes = {"decisions": problem.decisions, "controls": scene.controls, "states": 2 * scene.robot.dof}
+    sizes |= {"rows": sum(item.size for item in problem.bound_constraints), "constraints": len(problem.constraints)}
 
     _require_problem(source, members, problem)
     motions = {"": _motion(source, members, "", problem)}
@@ -142,6 +147,8 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     if not abs(found - plan.cost) <= 1e-9 * max(abs(found), abs(plan.cost)):
         raise FileError(f"{source} is of a problem with another cost: {plan.cost:.9g}, and here {found:.9g}")
     history = _iterations(source, plan.history)
+    if bool(problem.constraints) != (plan.multipliers is not None):
+        raise FileError(f"{source}: multipliers of the problem's constraints do not belong to it, or are missing")
     if (problem.rate is not None or problem.linear) and plan.previous_gains is None:
         raise FileError(f"{source}: previous_gains is missing")
     given = {item.name: getattr(plan, item.name) for item in fields(_Plan) if item.name not in ("best", "refined")}
@@ -236,6 +243,9 @@ def _require_problem(source: Path, members: Members, problem: OptimalControlProb
         if name not in members or not np.array_equal(members[name], value):
             what = name.removeprefix("problem.")
             raise FileError(f"{source} is of a problem with {what} = {members.get(name, 'unknown')}, not {value}")
+    own, found = problem.described_constraints, str(members.get("problem.constraints", ""))
+    if own != found:
+        raise FileError(f"{source} is of a problem with constraints = {found or 'none'}, not {own or 'none'}")
     _require_surroundings(source, members, problem, "noise.")
 
 

@@ -1,0 +1,361 @@
+"""Hard constraints around S-DDP: the augmented Lagrangian, round by round, and a last step onto the constraints.
+
+After Howell, Jackson and Manchester, "ALTRO: a fast solver for constrained trajectory optimization" (2019).
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ParamSpec
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.backward import backward
+from varpin.control.costs import CostError
+from varpin.control.examination import looked_at
+from varpin.control.history import ITERATIONS, Iteration, Status
+from varpin.control.multipliers import FEASIBLE, ConstraintReport, Multipliers, reports, split
+from varpin.control.penalties import PenalizedProblem, flat, penalized
+from varpin.control.polish import deviations, onto_constraints
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.solution import Solution
+from varpin.errors import InputError, LinearizationError
+from varpin.mechanics.noise import NoiseFieldError
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+P = ParamSpec("P")
+
+logger = logging.getLogger(__name__)
+
+# Of all rounds together, where it is left to the solver.
+_MOST_ITERATIONS = 5 * ITERATIONS
+# Of a round; the next one has better multipliers.
+_OF_ROUND = 40
+_ROUNDS = 40
+# Tolerance of the search in the first round, and what each round leaves of it.
+_LOOSE, _TIGHTER = 1e-3, 0.1
+# Of the tolerance, what the last round takes, and what a round may take that has nothing else to go by.
+_FINAL, _FINEST = 1e-2, 1e-7
+# A penalty grows by this factor after a round that leaves more than this part of its constraint's violation.
+_GROWTH, _ENOUGH = 10.0, 0.2
+# Beyond this part of its first weight a penalty drowns the cost in rounding.
+_HEAVIEST = 1e9
+# Rounds in which margins follow the plan, and the part of a margin that may still change when they rest.
+_MOVING, _SETTLED = 12, 1e-3
+# A violation that so many rounds in a row leave at more than this part of itself, while penalties grow, will stay.
+_STUCK, _LOWERED = 3, 0.9
+# What penalties are to bring the violation to; the last step does the rest.
+_AIM = 1e-8
+
+
+def within_constraints(search: Callable[P, Solution]) -> Callable[P, Solution]:
+    """``search``, which solves problems without constraints, made to solve those with them, too.
+
+    It keeps its signature: its first argument is the problem, and its others are options of each round.
+    """
+    signature = inspect.signature(search)
+
+    @functools.wraps(search)
+    def solve(*args: P.args, **kwargs: P.kwargs) -> Solution:
+        given = signature.bind(*args, **kwargs)
+        problem = given.arguments.get("problem")
+        if not (isinstance(problem, OptimalControlProblem) and problem.constraints):
+            return search(*args, **kwargs)
+        if given.arguments.get("true_cost") is not None:
+            raise InputError("true_cost is for problems without constraints: leave it out, and see plan.verify()")
+        options = {name: value for name, value in given.arguments.items() if name != "problem"}
+        return _Rounds(problem, search, options).run()
+
+    return solve
+
+
+@dataclass
+class _State:
+    """Where the rounds stand before one of them; as :class:`Multipliers`."""
+
+    multipliers: list[Floats]
+    weights: Floats
+    first_weights: Floats
+    backoff: list[Floats]
+    worst: Floats
+    tolerance: float
+    round: int = 0
+    stuck: int = 0
+
+
+class _Rounds:
+    """Searches of the augmented Lagrangian, one after another, until the constraints hold."""
+
+    def __init__(
+        self, problem: OptimalControlProblem, search: Callable[..., Solution], options: dict[str, Any]
+    ) -> None:
+        self.problem, self.search, self.bound = problem, search, problem.bound_constraints
+        self.options = dict(options)
+        self.check = bool(self.options.pop("check", True))
+        self.callback = self.options.pop("callback", None)
+        self.progress = self.options.pop("progress", None)
+        self.controls = self.options.pop("controls", None)
+        self.resumed: Solution | None = self.options.pop("resume", None)
+        self.tolerance = self.options.pop("tolerance", 1e-7)
+        self.most = self.options.pop("max_iterations", _MOST_ITERATIONS)
+        self.limit = self.options.pop("time_limit", np.inf)
+        self.label = f"{problem.scene.robot.name}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
+        self.history: list[Iteration] = []
+        self.noisy = bool(problem.scene.processes) and any(item.source.margin > 0.0 for item in self.bound)
+        self.state: _State
+
+    def run(self) -> Solution:
+        began = time.perf_counter()
+        # Options are looked at, and the first motion made, by a search that does nothing more.
+        first = self._first()
+        last = len(self.history) + self.most
+        found, resume = first, self._resumed_search()
+        while True:
+            begun = self.state
+            known = len(self.history)
+            done = 0 if resume is None or resume.search is None else len(resume.search.history)
+            left = min(last - known, _OF_ROUND) - done
+            problem = penalized(self.problem, begun.multipliers, begun.weights, begun.backoff)
+            options: dict[str, Any] = dict(self.options)
+            if resume is None:
+                options["controls"] = self.controls if begun.round == 0 else found
+            else:
+                options["resume"] = replace(resume, problem=problem)
+                known -= done
+                self.history = self.history[:known]
+            if np.isfinite(self.limit):
+                options["time_limit"] = max(self.limit - (time.perf_counter() - began), 1e-9)
+            found = self.search(
+                problem,
+                tolerance=begun.tolerance,
+                max_iterations=max(left, 0),
+                callback=functools.partial(self._report, known, last),
+                check=False,
+                **options,
+            )
+            resume = None
+            self.history += [replace(item, index=item.index + known) for item in found.history]
+            kept = self._steady(self._kept(found, problem, begun, known))
+            status, reason = self._ended(kept, begun, found, last)
+            if status is not None:
+                break
+        if kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
+            try:
+                kept, told = self._polished(kept, problem)
+                reason = f"{reason}; {told}"
+            except KeyboardInterrupt:
+                status = Status.INTERRUPTED
+        plan = replace(kept, status=status, reason=reason)
+        return looked_at(plan)[0] if self.check else plan
+
+    def _first(self) -> Solution:
+        """The first motion, and the state of the first round."""
+        if self.resumed is not None:
+            return self._take_up(self.resumed)
+        zeros = [np.zeros(item.shape) for item in self.bound]
+        plain = penalized(self.problem, zeros, np.zeros(len(self.bound)), zeros)
+        first = self.search(
+            plain, self.controls, tolerance=self.tolerance, max_iterations=0, check=False, **self.options
+        )
+        cost = abs(first.cost) or 1.0
+        weights = np.array([cost / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
+        nothing = np.full(len(self.bound), np.inf)
+        self.state = _State(zeros, weights, weights, zeros, nothing, _LOOSE)
+        return first
+
+    def _take_up(self, resumed: object) -> Solution:
+        """Stand where a solution was made."""
+        if not isinstance(resumed, Solution):
+            raise InputError(f"resume must be a Solution, got {type(resumed).__name__}")
+        if self.controls is not None:
+            raise InputError("resume goes on from the solution's own controls: leave out either controls or resume")
+        difference = self.problem.differs(resumed.problem)
+        if difference:
+            raise InputError(f"resume: the solution is of another problem: {difference}; give it as controls")
+        known = resumed.multipliers
+        if resumed.search is None or known is None:
+            raise InputError("resume: the solution does not hold the state of its search; give it as controls")
+        self.state = _State(
+            split(self.bound, known.begun),
+            known.weights,
+            known.first_weights,
+            split(self.bound, known.backoff),
+            known.worst,
+            known.tolerance,
+            known.round,
+            known.stuck,
+        )
+        self.history = list(resumed.search.history)
+        return resumed
+
+    def _resumed_search(self) -> Solution | None:
+        """The solution that the round goes on from, its history that of the round alone."""
+        resumed = self.resumed
+        if resumed is None or resumed.search is None or resumed.multipliers is None:
+            return None
+        begun = resumed.multipliers.iterations
+        own = [replace(item, index=item.index - begun) for item in resumed.search.history[begun:]]
+        return replace(resumed, search=replace(resumed.search, history=tuple(own)))
+
+    def _report(self, known: int, last: int, item: Iteration) -> None:
+        item = replace(item, index=item.index + known)
+        if self.callback is not None:
+            self.callback(item)
+        if self.progress is not None:
+            self.progress(min(item.index + 1, last), last)
+
+    def _kept(self, found: Solution, problem: PenalizedProblem, begun: _State, known: int) -> Solution:
+        """What a round has found, as a solution of the problem with its constraints."""
+        motion = found.trajectory
+        values = [
+            part.updated(item.value(motion.q, motion.v, motion.u))
+            for item, part in zip(self.bound, problem.all_penalties, strict=True)
+        ]
+        multipliers = Multipliers(
+            values=flat(values),
+            backoff=flat(begun.backoff),
+            begun=flat(begun.multipliers),
+            weights=begun.weights.copy(),
+            first_weights=begun.first_weights.copy(),
+            worst=begun.worst.copy(),
+            tolerance=begun.tolerance,
+            round=begun.round,
+            iterations=known,
+            stuck=begun.stuck,
+        )
+        search = found.search
+        if search is not None:
+            passed = self.history[:known]
+            search = replace(
+                search,
+                history=(*passed, *(replace(item, index=item.index + known) for item in search.history)),
+            )
+        return replace(
+            found,
+            problem=self.problem,
+            cost=self.problem.cost_of(motion),
+            history=tuple(self.history),
+            search=search,
+            multipliers=multipliers,
+        )
+
+    def _ended(self, kept: Solution, begun: _State, found: Solution, last: int) -> tuple[Status | None, str]:
+        """How the rounds end, if they do; else the state of the next one is made."""
+        known = kept.multipliers
+        assert known is not None
+        told = reports(self.problem, kept.trajectory, known)
+        violation = np.array([item.violation for item in told])
+        worst = max(told, key=lambda item: item.violation)
+        state = f"round {begun.round}: {worst.label} is violated by {worst.violation:.1e} {worst.unit}"
+        logger.info("%s: %s", self.label, state)
+        if found.status is Status.INTERRUPTED or found.status is Status.OUT_OF_TIME:
+            return found.status, f"{found.reason}; {state}"
+        out = len(self.history) >= last and found.status is Status.MAX_ITERATIONS
+        feasible = worst.violation <= FEASIBLE
+        exact = begun.tolerance <= _FINAL * self.tolerance and found.status is not Status.MAX_ITERATIONS
+        backoff, settled = begun.backoff, True
+        if self.noisy and begun.round < _MOVING:
+            backoff = self._backoff(kept)
+            settled = all(
+                np.abs(new - old).max() <= _SETTLED * max(float(new.max()), 1e-300)
+                for new, old in zip(backoff, begun.backoff, strict=True)
+            )
+            backoff = begun.backoff if settled else backoff
+        if exact and feasible and settled:
+            return found.status, found.reason
+        if out:
+            return Status.MAX_ITERATIONS, f"{found.reason}; {state}"
+        if found.iterations == 0 and begun.round > 0 and not feasible and begun.tolerance > _FINEST * self.tolerance:
+            # What is left to gain is below the tolerance of the search: a motion that stays teaches nothing.
+            self.state = replace(begun, tolerance=_TIGHTER * begun.tolerance, round=begun.round + 1, backoff=backoff)
+            return None, ""
+        stays = worst.violation > max(FEASIBLE, _LOWERED * float(begun.worst.max()))
+        stuck = begun.stuck + 1 if stays else 0
+        heavy = bool((begun.weights >= _HEAVIEST * begun.first_weights).any())
+        if not feasible and (stuck >= _STUCK or begun.round + 1 >= _ROUNDS or (heavy and stuck)):
+            return Status.INFEASIBLE, _infeasible(worst)
+        if feasible and begun.round + 1 >= _ROUNDS:
+            return found.status, found.reason
+        more = (violation > np.maximum(_AIM, _ENOUGH * begun.worst)) & (begun.weights < _HEAVIEST * begun.first_weights)
+        weights = np.where(more, _GROWTH * begun.weights, begun.weights)
+        self.state = _State(
+            multipliers=split(self.bound, known.values),
+            weights=weights,
+            first_weights=begun.first_weights,
+            backoff=backoff,
+            worst=violation,
+            tolerance=begun.tolerance if exact else max(_FINAL * self.tolerance, _TIGHTER * begun.tolerance),
+            round=begun.round + 1,
+            stuck=stuck,
+        )
+        return None, ""
+
+    def _polished(self, kept: Solution, problem: PenalizedProblem) -> tuple[Solution, str]:
+        """The plan brought onto its constraints, with the gains that belong to it, and what is left in words."""
+        known = kept.multipliers
+        assert known is not None
+        motion = onto_constraints(self.problem, kept, split(self.bound, known.values), split(self.bound, known.backoff))
+        plan = kept if motion is kept.trajectory else self._along(kept, motion, problem)
+        return plan, f"constraints hold to {plan.violation:.1e}"
+
+    def _along(self, kept: Solution, motion: Trajectory, problem: PenalizedProblem) -> Solution:
+        """The plan with another motion, next to its own, and what a backward pass finds there."""
+        moved = replace(kept, trajectory=motion, cost=self.problem.cost_of(motion))
+        try:
+            found = backward(problem, motion, 0.0)
+        except (CostError, NoiseFieldError, LinearizationError):
+            return moved
+        if found is None:
+            return moved
+        return self._steady(
+            replace(
+                moved,
+                gains=found.feedback,
+                previous_gains=found.previous,
+                feedforward=found.feedforward,
+                gradient=found.gradient,
+            )
+        )
+
+    def _steady(self, kept: Solution) -> Solution:
+        """The plan with the feedback that it has under noise: that of its cost and of its goals alone.
+
+        Penalties of bounds would make it as stiff at them as in the last round, and not at all beside them; the margin
+        stands in their place.
+        """
+        if not self.problem.scene.processes:
+            return kept
+        known = kept.multipliers
+        assert known is not None
+        goals = [
+            first if item.source.equality else 0.0 for item, first in zip(self.bound, known.first_weights, strict=True)
+        ]
+        zeros = [np.zeros(item.shape) for item in self.bound]
+        calm = penalized(self.problem, zeros, np.array(goals), zeros)
+        found = backward(calm, kept.trajectory, 0.0)
+        if found is None:
+            return kept
+        return replace(kept, gains=found.feedback, previous_gains=found.previous, noise_cost=found.noise)
+
+    def _backoff(self, kept: Solution) -> list[Floats]:
+        """What margins come to around a plan."""
+        return [
+            item.source.margin * deviations(self.problem, kept, item)
+            if item.source.margin > 0.0
+            else np.zeros(item.shape)
+            for item in self.bound
+        ]
+
+
+def _infeasible(worst: ConstraintReport) -> str:
+    return (
+        f"{worst.label} cannot be met from here: {worst.where} stays violated by {worst.violation:.3g} {worst.unit}, "
+        "whatever its penalty"
+    )

@@ -1,0 +1,156 @@
+"""Hard constraints of a plan: what its motion has to keep to, whatever it costs.
+
+They are no constraints of the mechanism, which :class:`varpin.Constraint` is for: those are kept by forces of their own
+in every motion of the scene, these by the choice of the controls.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.errors import InputError
+from varpin.model import Robot
+from varpin.support.checks import finite
+from varpin.support.frozen import Frozen
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Horizon(Frozen):
+    """The grid that constraints are put on.
+
+    Attributes:
+        t: Times of the nodes (N + 1,) [s].
+        robot: Whose motion it is.
+        controls: m.
+        hold: Steps that share one control.
+        control_joints: The joint whose force each control is; None where controls are something else.
+        before: The control before the horizon (m,), or None where nothing is known of it.
+    """
+
+    t: Floats
+    robot: Robot
+    controls: int
+    hold: int
+    control_joints: tuple[str, ...] | None
+    before: Floats | None
+
+    @property
+    def steps(self) -> int:
+        """N."""
+        return len(self.t) - 1
+
+
+class BoundConstraint(Frozen, ABC):
+    """A constraint on a grid: c <= 0 or c = 0 for ``rows`` at each of K places, nodes or decisions.
+
+    Attributes:
+        source: The constraint.
+        places: Indices of nodes (K,), or of decisions where ``of_controls``.
+        times: Of the places (K,) [s].
+        rows: What each row of c is, in words.
+        unit: Of c.
+        scale: What of c is about as much as a tenth of the whole, in its unit: where penalties begin.
+    """
+
+    source: PlanConstraint
+    places: Integers
+    times: Floats
+    rows: tuple[str, ...]
+    unit: str
+    scale: float
+    of_controls: ClassVar[bool] = False
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(K, rows)."""
+        return len(self.places), len(self.rows)
+
+    @property
+    def size(self) -> int:
+        """How many numbers c has."""
+        return len(self.places) * len(self.rows)
+
+    @abstractmethod
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """C (..., K, rows) of motions, q and v (..., N + 1, n) at their nodes and u (..., N, m)."""
+
+    def jacobian(self, q: Floats, v: Floats) -> Floats:
+        """dc/d(q, v) (K, rows, 2n) of one motion, q and v (N + 1, n).
+
+        Raises:
+            NotImplementedError: It is one of controls.
+        """
+        raise NotImplementedError
+
+
+class PlanConstraint(Frozen, ABC):
+    """A hard constraint of a plan. Whoever adds one provides ``bind``.
+
+    Attributes:
+        margin: How many standard deviations of what noise does to it it stays away from its bound; 0 for none.
+    """
+
+    margin: float = 0.0
+    equality: ClassVar[bool] = False
+
+    @abstractmethod
+    def bind(self, horizon: Horizon) -> BoundConstraint:
+        """The constraint on a grid.
+
+        Raises:
+            InputError: It is of another robot, or does not fit the controls.
+        """
+
+    @property
+    def label(self) -> str:
+        """What it is called in reports."""
+        return type(self).__name__
+
+    def __repr__(self) -> str:
+        """All that tells it from others of its kind, to the last digit."""
+        own = {name: value for name, value in vars(self).items() if not isinstance(value, Robot) and name[0] != "_"}
+        told = (f"{name}={_told(value)}" for name, value in own.items() if name != "kinematics")
+        return f"{type(self).__name__}({', '.join(told)})"
+
+
+def _told(value: object) -> str:
+    return repr(value.tolist() if isinstance(value, np.ndarray) else value)
+
+
+def require_robot(constraint: PlanConstraint, robot: object) -> Robot:
+    """``robot``, or an InputError that says whose argument it is."""
+    if not isinstance(robot, Robot):
+        name = type(constraint).__name__
+        raise InputError(f"{name} takes a robot from load_robot, got {type(robot).__name__}")
+    return robot
+
+
+def require_same(constraint: PlanConstraint, own: Robot, horizon: Horizon) -> None:
+    """Refuse a constraint that was made for another robot than the problem's."""
+    robot = horizon.robot
+    if own.joint_names != robot.joint_names or not own.built_like(robot):
+        raise InputError(
+            f"{constraint.label} is for robot {own.name!r} with {own.dof} coordinates, another one than the problem's "
+            f"{robot.name!r} with {robot.dof}, or one of other lengths; make it with scene.robot"
+        )
+
+
+def checked_margin(constraint: PlanConstraint, margin: object) -> float:
+    """A margin in standard deviations as a float >= 0."""
+    number = finite(f"{type(constraint).__name__} margin", margin)
+    if number < 0.0:
+        raise InputError(f"{type(constraint).__name__} margin must be >= 0 [standard deviations], got {number:g}")
+    return number
+
+
+def nodes_after(horizon: Horizon) -> tuple[Integers, Floats]:
+    """All nodes but the first, whose state is given, and their times."""
+    return np.arange(1, horizon.steps + 1), horizon.t[1:]

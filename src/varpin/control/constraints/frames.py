@@ -1,0 +1,315 @@
+"""Where a frame has to be: at a goal in the end, or in or out of a region all the time."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.control.constraints.base import (
+    BoundConstraint,
+    Horizon,
+    Integers,
+    PlanConstraint,
+    checked_margin,
+    nodes_after,
+    require_robot,
+    require_same,
+)
+from varpin.errors import InputError
+from varpin.model import Robot
+from varpin.model.kinematics import FrameKinematics, frame_kinematics
+from varpin.support.checks import as_floats, checked_limits, finite, finite_array, positive
+
+Floats = NDArray[np.float64]
+
+_XYZ = ("x", "y", "z")
+# A tenth of an arm's reach [m] and of a large turn [rad].
+_LENGTH, _ANGLE = 0.1, 0.3
+
+
+class _OfFrame(PlanConstraint):
+    robot: Robot
+    frame: str
+
+    def _take(self, robot: Robot, frame: str) -> None:
+        self.robot = require_robot(self, robot)
+        if not isinstance(frame, str):
+            raise InputError(f"{type(self).__name__} frame must be the name of a frame, got {frame!r}")
+        self.frame = frame
+        self.kinematics = frame_kinematics(robot, frame)
+
+    @property
+    def label(self) -> str:
+        """See :attr:`PlanConstraint.label`."""
+        return f"{type(self).__name__}({self.frame!r})"
+
+
+class ReachFrame(_OfFrame):
+    """p(q) = position and log(rotation' R(q)) = 0 at the last node: a frame ends at a goal.
+
+    The rotation's residual is the vector [rad] from goal to frame in the frame's own axes, at most pi long; a goal half
+    a turn away has no direction to turn in.
+    """
+
+    equality = True
+
+    def __init__(
+        self, robot: Robot, frame: str, position: ArrayLike | None = None, rotation: ArrayLike | None = None
+    ) -> None:
+        """Describe the constraint.
+
+        Args:
+            robot: The robot.
+            frame: Name of the frame.
+            position: Of its origin in the world (3,) [m]; any if left out.
+            rotation: From the frame's axes to the world's, a rotation matrix (3, 3); any if left out.
+
+        Raises:
+            UnknownFrame: The robot has no such frame.
+            InputError: The frame is fixed to the base, there is no goal, or it is no place or no rotation.
+        """
+        self._take(robot, frame)
+        if position is None and rotation is None:
+            raise InputError("ReachFrame takes a position, a rotation or both")
+        self.position = None if position is None else finite_array("ReachFrame position", position, (3,))
+        self.rotation = None
+        if rotation is not None:
+            R = finite_array("ReachFrame rotation", rotation, (3, 3))
+            if np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
+                raise InputError("ReachFrame rotation must be a rotation matrix: R'R = 1 and det R = 1")
+            self.rotation = R
+
+    def bind(self, horizon: Horizon) -> BoundConstraint:
+        """See :meth:`PlanConstraint.bind`."""
+        require_same(self, self.robot, horizon)
+        rows: tuple[str, ...] = () if self.position is None else tuple(f"position {axis}" for axis in _XYZ)
+        rows += () if self.rotation is None else tuple(f"rotation {axis}" for axis in _XYZ)
+        unit = "m and rad" if len(rows) == 6 else "m" if self.rotation is None else "rad"
+        scale = _LENGTH if self.position is not None else _ANGLE
+        return _BoundGoal(self, np.array([horizon.steps]), horizon.t[-1:], rows, unit, scale, self)
+
+
+@dataclass(frozen=True, eq=False)
+class _BoundGoal(BoundConstraint):
+    source: PlanConstraint
+    places: Integers
+    times: Floats
+    rows: tuple[str, ...]
+    unit: str
+    scale: float
+    goal: ReachFrame
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
+        end = q[..., -1, :]
+        R, p = self.goal.kinematics.placements(np.ascontiguousarray(end.reshape(-1, end.shape[-1])))
+        found: Floats = np.concatenate(self._residuals(R, p), axis=1).reshape(*end.shape[:-1], 1, len(self.rows))
+        return found
+
+    def _residuals(self, R: Floats, p: Floats) -> list[Floats]:
+        found = [] if self.goal.position is None else [p - self.goal.position]
+        if self.goal.rotation is not None:
+            turn = scipy.spatial.transform.Rotation.from_matrix(self.goal.rotation.T @ R)
+            found.append(turn.as_rotvec())
+        return found
+
+    def jacobian(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
+        n = q.shape[-1]
+        R, p, J = self.goal.kinematics.jacobians(q[-1:])
+        blocks = [] if self.goal.position is None else [J[0, :3]]
+        if self.goal.rotation is not None:
+            blocks.append(_log_slope(self._residuals(R, p)[-1][0]) @ R[0].T @ J[0, 3:])
+        rows = np.vstack(blocks)
+        return np.hstack([rows, np.zeros((len(rows), n))])[None]
+
+
+def _log_slope(e: Floats) -> Floats:
+    """D log(R) over the body's own turn at the rotation vector e (3,): the inverse of SO(3)'s right Jacobian."""
+    angle = float(np.linalg.norm(e))
+    E = np.array([[0.0, -e[2], e[1]], [e[2], 0.0, -e[0]], [-e[1], e[0], 0.0]])
+    near = angle < 1e-4
+    part = 1.0 / 12.0 + angle**2 / 720.0 if near else 1.0 / angle**2 - 0.5 / (angle * np.tan(0.5 * angle))
+    slope: Floats = np.eye(3) + 0.5 * E + part * E @ E
+    return slope
+
+
+@dataclass(frozen=True, eq=False)
+class _BoundRegion(BoundConstraint):
+    source: PlanConstraint
+    places: Integers
+    times: Floats
+    rows: tuple[str, ...]
+    unit: str
+    scale: float
+    region: _Region
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
+        at = q[..., self.places, :]
+        _, p = self.region.kinematics.placements(np.ascontiguousarray(at.reshape(-1, at.shape[-1])))
+        return self.region.distances(p).reshape(*at.shape[:-1], len(self.rows))
+
+    def jacobian(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
+        _, p, J = self.region.kinematics.jacobians(np.ascontiguousarray(q[self.places]))
+        slopes = self.region.slopes(p) @ J[:, :3]
+        return np.concatenate([slopes, np.zeros_like(slopes)], axis=2)
+
+
+class _Region(_OfFrame):
+    kinematics: FrameKinematics
+
+    @property
+    @abstractmethod
+    def _rows(self) -> tuple[str, ...]:
+        """What each row of c is."""
+
+    @abstractmethod
+    def distances(self, p: Floats) -> Floats:
+        """How far places p (N, 3) are outside of what is allowed, (N, rows) [m]."""
+
+    @abstractmethod
+    def slopes(self, p: Floats) -> Floats:
+        """Derivatives of that (N, rows, 3)."""
+
+    def bind(self, horizon: Horizon) -> BoundConstraint:
+        """See :meth:`PlanConstraint.bind`."""
+        require_same(self, self.robot, horizon)
+        return _BoundRegion(self, *nodes_after(horizon), self._rows, "m", _LENGTH, self)
+
+
+class KeepInHalfSpace(_Region):
+    """normal . p(q) >= offset at every node after the first: a frame's origin stays on one side of a plane."""
+
+    def __init__(self, robot: Robot, frame: str, normal: ArrayLike, offset: float, *, margin: float = 0.0) -> None:
+        """Describe the constraint.
+
+        Args:
+            robot: The robot.
+            frame: Name of the frame.
+            normal: Of the plane (3,), towards the side that is allowed; made of length 1.
+            offset: Of the plane from the world's origin along its normal [m].
+            margin: In standard deviations of what noise does to the distance.
+
+        Raises:
+            UnknownFrame: The robot has no such frame.
+            InputError: The frame is fixed to the base, or the normal has no length.
+        """
+        self._take(robot, frame)
+        given = finite_array("KeepInHalfSpace normal", normal, (3,))
+        length = float(np.linalg.norm(given))
+        if not length > 0.0:
+            raise InputError("KeepInHalfSpace normal must not be zero")
+        self.normal = given / length
+        self.offset = finite("KeepInHalfSpace offset", offset)
+        self.margin = checked_margin(self, margin)
+
+    @property
+    def _rows(self) -> tuple[str, ...]:
+        return ("the plane",)
+
+    def distances(self, p: Floats) -> Floats:
+        """See the base."""
+        found: Floats = self.offset - p @ self.normal[:, None]
+        return found
+
+    def slopes(self, p: Floats) -> Floats:
+        """See the base."""
+        return np.broadcast_to(-self.normal, (len(p), 1, 3))
+
+
+class KeepInBox(_Region):
+    """lower <= p(q) <= upper at every node after the first: a frame's origin stays in a box along the world's axes."""
+
+    def __init__(self, robot: Robot, frame: str, lower: ArrayLike, upper: ArrayLike, *, margin: float = 0.0) -> None:
+        """Describe the constraint.
+
+        Args:
+            robot: The robot.
+            frame: Name of the frame.
+            lower: One number or (3,) in the world, infinite where there is no limit [m].
+            upper: Likewise.
+            margin: In standard deviations of what noise does to the distance.
+
+        Raises:
+            UnknownFrame: The robot has no such frame.
+            InputError: The frame is fixed to the base, or the box has no inside or no side.
+        """
+        self._take(robot, frame)
+        self.limits = checked_limits("KeepInBox", (lower, upper), 3)
+        if not np.isfinite(self.limits).any():
+            raise InputError("KeepInBox has no finite side")
+        self.margin = checked_margin(self, margin)
+        self._sides = [(a, k) for k in (1, 0) for a in range(3) if np.isfinite(self.limits[k, a])]
+
+    @property
+    def _rows(self) -> tuple[str, ...]:
+        return tuple(f"{'upper' if k else 'lower'} side in {_XYZ[a]}" for a, k in self._sides)
+
+    def distances(self, p: Floats) -> Floats:
+        """See the base."""
+        sides = [p[:, a] - self.limits[1, a] if k else self.limits[0, a] - p[:, a] for a, k in self._sides]
+        return np.column_stack(sides)
+
+    def slopes(self, p: Floats) -> Floats:
+        """See the base."""
+        one = np.zeros((len(self._sides), 3))
+        for i, (a, k) in enumerate(self._sides):
+            one[i, a] = 1.0 if k else -1.0
+        return np.broadcast_to(one, (len(p), *one.shape))
+
+
+class _OfSphere(_Region):
+    outside: bool
+
+    def __init__(self, robot: Robot, frame: str, center: ArrayLike, radius: float, *, margin: float = 0.0) -> None:
+        """Describe the constraint.
+
+        Args:
+            robot: The robot.
+            frame: Name of the frame.
+            center: Of the sphere in the world (3,) [m].
+            radius: Of the sphere [m].
+            margin: In standard deviations of what noise does to the distance.
+
+        Raises:
+            UnknownFrame: The robot has no such frame.
+            InputError: The frame is fixed to the base, or the sphere is none.
+        """
+        self._take(robot, frame)
+        name = type(self).__name__
+        self.center = finite_array(f"{name} center", as_floats(f"{name} center", center), (3,))
+        self.radius = positive(f"{name} radius", radius, "m")
+        self.margin = checked_margin(self, margin)
+
+    @property
+    def _rows(self) -> tuple[str, ...]:
+        return ("the sphere",)
+
+    def distances(self, p: Floats) -> Floats:
+        """See the base."""
+        beyond: Floats = np.linalg.norm(p - self.center, axis=1, keepdims=True) - self.radius
+        return -beyond if self.outside else beyond
+
+    def slopes(self, p: Floats) -> Floats:
+        """See the base."""
+        away = p - self.center
+        length = np.linalg.norm(away, axis=1, keepdims=True)
+        # At the centre every way leads out; inside, none is needed.
+        fixed = np.array([0.0, 0.0, 1.0 if self.outside else 0.0])
+        unit = np.where(length > 0.0, away / np.where(length > 0.0, length, 1.0), fixed)
+        found: Floats = (-unit if self.outside else unit)[:, None]
+        return found
+
+
+class KeepInSphere(_OfSphere):
+    """abs(p(q) - center) <= radius at every node after the first: a frame's origin stays in a sphere."""
+
+    outside = False
+
+
+class KeepOutOfSphere(_OfSphere):
+    """abs(p(q) - center) >= radius at every node after the first: a frame's origin stays out of a sphere."""
+
+    outside = True

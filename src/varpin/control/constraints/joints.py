@@ -1,0 +1,253 @@
+"""Limits of joints and of what controls change by, as hard constraints of a plan."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.constraints.base import (
+    BoundConstraint,
+    Horizon,
+    Integers,
+    PlanConstraint,
+    checked_margin,
+    nodes_after,
+    require_robot,
+    require_same,
+)
+from varpin.errors import InputError
+from varpin.model import Robot
+from varpin.support.checks import JointValues, as_floats, control_array, finite_array, named_limits, real
+
+Floats = NDArray[np.float64]
+
+# A tenth of what a joint of unknown range may do.
+_POSITION, _SPEED = 0.1, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _BoundBox(BoundConstraint):
+    source: PlanConstraint
+    places: Integers
+    times: Floats
+    rows: tuple[str, ...]
+    unit: str
+    scale: float
+    in_velocity: bool
+    columns: Integers  # which coordinate each row is of
+    signs: Floats  # 1 for upper limits, -1 for lower ones
+    bounds: Floats  # signs times the limits
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
+        y = (v if self.in_velocity else q)[..., self.places, :]
+        found: Floats = y[..., self.columns] * self.signs - self.bounds
+        return found
+
+    def jacobian(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
+        n = q.shape[-1]
+        one = np.zeros((len(self.rows), 2 * n))
+        one[np.arange(len(self.rows)), self.columns + (n if self.in_velocity else 0)] = self.signs
+        return np.broadcast_to(one, (len(self.places), *one.shape))
+
+
+class _WithinLimits(PlanConstraint):
+    robot: Robot
+    limits: Floats
+    in_velocity: bool
+
+    def __init__(
+        self, robot: Robot, limits: tuple[JointValues, JointValues] | None = None, *, margin: float = 0.0
+    ) -> None:
+        """Describe the constraint.
+
+        Args:
+            robot: The robot.
+            limits: (lower, upper), each one number, (n,) or by joint name, infinite where there is none; the robot's
+                if left out [rad or m; of velocities rad/s or m/s].
+            margin: In standard deviations of what noise does to the joint; see the page on plans within constraints.
+
+        Raises:
+            UnknownJoint: A name that is no joint's.
+            InputError: There is no limit, or an argument has a wrong shape or value.
+        """
+        self.robot = require_robot(self, robot)
+        name = type(self).__name__
+        given = self._own(robot) if limits is None else limits
+        self.limits = named_limits(f"{name} limits", given, robot.joint_names, robot.dof)
+        if not np.isfinite(self.limits).any():
+            raise InputError(f"{name}: robot {robot.name!r} has no such limits; give limits=(lower, upper)")
+        self.margin = checked_margin(self, margin)
+
+    @staticmethod
+    @abstractmethod
+    def _own(robot: Robot) -> tuple[Floats, Floats]:
+        """The robot's limits."""
+
+    def bind(self, horizon: Horizon) -> BoundConstraint:
+        """See :meth:`PlanConstraint.bind`."""
+        require_same(self, self.robot, horizon)
+        columns, signs, bounds, rows = [], [], [], []
+        for sign, side, limits in ((1.0, "upper", self.limits[1]), (-1.0, "lower", self.limits[0])):
+            for c in np.flatnonzero(np.isfinite(limits)):
+                columns.append(int(c))
+                signs.append(sign)
+                bounds.append(sign * limits[c])
+                rows.append(f"{side} limit of {self.robot.joint_names[c]}")
+        ranges = self.limits[1] - self.limits[0]
+        whole = ranges[np.isfinite(ranges) & (ranges > 0.0)]
+        scale = 0.1 * float(np.median(whole)) if whole.size else (_SPEED if self.in_velocity else _POSITION)
+        return _BoundBox(
+            self,
+            *nodes_after(horizon),
+            tuple(rows),
+            "rad/s or m/s" if self.in_velocity else "rad or m",
+            scale,
+            self.in_velocity,
+            np.array(columns),
+            np.array(signs),
+            np.array(bounds),
+        )
+
+
+class WithinJointLimits(_WithinLimits):
+    """lower <= q <= upper at every node after the first: joints stay within their limits.
+
+    ``JointLimitBarrier`` is its soft counterpart, a cost.
+    """
+
+    in_velocity = False
+
+    @staticmethod
+    def _own(robot: Robot) -> tuple[Floats, Floats]:
+        return robot.position_limits
+
+
+class WithinVelocityLimits(_WithinLimits):
+    """lower <= v <= upper at every node after the first: joints stay within their limits of speed.
+
+    ``VelocityLimitBarrier`` is its soft counterpart, a cost.
+    """
+
+    in_velocity = True
+
+    @staticmethod
+    def _own(robot: Robot) -> tuple[Floats, Floats]:
+        return -robot.velocity_limit, robot.velocity_limit
+
+
+@dataclass(frozen=True, eq=False)
+class BoundRate(BoundConstraint):
+    """What changes of the controls may be; rows are those of the greatest changes and then of the least.
+
+    Attributes:
+        period: The time that each control holds [s].
+        hold: Steps that share one control.
+        limit: (m,), infinite where there is none.
+        before: The control before the horizon (m,), or None where the first one is free.
+    """
+
+    source: PlanConstraint
+    places: Integers
+    times: Floats
+    rows: tuple[str, ...]
+    unit: str
+    scale: float
+    period: float
+    hold: int
+    limit: Floats
+    before: Floats | None
+    of_controls = True
+
+    @property
+    def limited(self) -> Integers:
+        """Which controls have a limit."""
+        return np.flatnonzero(np.isfinite(self.limit))
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
+        """See :meth:`BoundConstraint.value`."""
+        return self.of_decisions(u[..., :: self.hold, :])
+
+    def of_decisions(self, u: Floats) -> Floats:
+        """C (..., K, rows) of decisions u (..., R, m)."""
+        first = u[..., :1, :] if self.before is None else np.broadcast_to(self.before, (*u.shape[:-2], 1, u.shape[-1]))
+        rate = np.diff(u, axis=-2, prepend=first)[..., self.places, :] / self.period
+        own, most = rate[..., self.limited], self.limit[self.limited]
+        found: Floats = np.concatenate([own - most, -own - most], axis=-1)
+        return found
+
+
+class WithinControlRate(PlanConstraint):
+    """abs(u_k - u_(k-1)) / T <= limit, T = hold dt: controls change no faster than drives can.
+
+    Controls are held over a decision and jump to the next; the jump over the period is their rate. ``ControlRateCost``
+    is its soft counterpart.
+    """
+
+    limit: JointValues
+    before: JointValues | None
+
+    def __init__(self, limit: JointValues, before: JointValues | None = None) -> None:
+        """Describe the constraint.
+
+        Args:
+            limit: One number, (m,), or by joint name where each control is the force of a joint; infinite where there
+                is none, and for joints that are not named [control/s].
+            before: The control applied before the horizon, one number, (m,) or by joint name, from which the first
+                change counts. Left out, that of a ``ControlRateCost`` in the cost, and without one the first is free.
+
+        Raises:
+            InputError: A limit that is not positive, or NaN.
+        """
+        self.limit = dict(limit) if isinstance(limit, Mapping) else as_floats("WithinControlRate limit", limit)
+        least = [real("WithinControlRate limit", x) for x in limit.values()] if isinstance(limit, Mapping) else None
+        values = np.array(least) if least is not None else np.asarray(self.limit)
+        if not (values > 0.0).all():
+            raise InputError(f"WithinControlRate limit must be > 0 [control/s], got {limit!r}")
+        self.before = before
+
+    def bind(self, horizon: Horizon) -> BoundConstraint:
+        """See :meth:`PlanConstraint.bind`."""
+        name, m, joints = "WithinControlRate", horizon.controls, horizon.control_joints
+        if isinstance(self.limit, Mapping):
+            limit = control_array(f"{name} limit", self.limit, joints, absent=np.inf, read=real)
+        else:
+            limit = np.asarray(self.limit)
+            if limit.shape not in ((), (m,)):
+                raise InputError(f"{name} limit must be one number or have shape ({m},), got {limit.shape}")
+            limit = np.array(np.broadcast_to(limit, (m,)))
+        if not np.isfinite(limit).any():
+            raise InputError(f"{name} limit must be finite for some control")
+        before = horizon.before
+        if self.before is not None:
+            given = self.before
+            if isinstance(given, Mapping):
+                own = control_array(f"{name} before", given, joints)
+            elif np.ndim(given) == 0:
+                own = np.full(m, real(f"{name} before", given))
+            else:
+                own = finite_array(f"{name} before", given, (m,))
+            if before is not None and not np.array_equal(before, own):
+                raise InputError(f"{name} and ControlRateCost must have the same control before")
+            before = own
+        names = joints if joints is not None else tuple(f"control {i}" for i in range(m))
+        limited = np.flatnonzero(np.isfinite(limit))
+        period = float(horizon.t[horizon.hold] - horizon.t[0])
+        decisions = np.arange(0 if before is not None else 1, horizon.steps // horizon.hold)
+        if decisions.size == 0:
+            raise InputError(f"{name}: one decision without a control before has no change")
+        return BoundRate(
+            self,
+            decisions,
+            horizon.t[: -1 : horizon.hold][decisions],
+            tuple(f"{side} rate of {names[i]}" for side in ("upper", "lower") for i in limited),
+            "control/s",
+            0.1 * float(np.median(limit[limited])),
+            period,
+            horizon.hold,
+            limit,
+            before,
+        )

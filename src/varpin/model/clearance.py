@@ -1,0 +1,351 @@
+"""How far links are from each other and from obstacles, with derivatives by the points that are nearest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.errors import InputError, RobotError
+from varpin.model.kinematics import FrameKinematics, frame_kinematics
+from varpin.model.robot import Robot, geometry
+from varpin.model.tree import place_of_frame, z_to
+from varpin.model.urdf import decoded, parsed
+from varpin.support.checks import finite_array, positive
+from varpin.support.frozen import Frozen
+
+Floats = NDArray[np.float64]
+
+coal = pin.coal
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacle(Frozen):
+    """A body that stands in the world. Made by :meth:`sphere`, :meth:`capsule` and :meth:`box`.
+
+    Attributes:
+        name: For messages.
+        begin: One end of its axis (3,) [m]; of a sphere or a box its centre.
+        end: The other end (3,) [m].
+        radius: [m]; 0 of a box.
+        sides: Of a box (3,) [m], else None.
+        rotation: Of a box, its axes in the world (3, 3).
+    """
+
+    name: str
+    begin: Floats
+    end: Floats
+    radius: float
+    sides: Floats | None
+    rotation: Floats
+
+    @classmethod
+    def sphere(cls, center: ArrayLike, radius: float, name: str = "sphere") -> Obstacle:
+        """A ball around ``center`` (3,) [m] of some ``radius`` [m]."""
+        at = finite_array("sphere center", center, (3,))
+        return cls(str(name), at, at, positive("sphere radius", radius, "m"), None, np.eye(3))
+
+    @classmethod
+    def capsule(cls, begin: ArrayLike, end: ArrayLike, radius: float, name: str = "capsule") -> Obstacle:
+        """All that is within ``radius`` [m] of the line from ``begin`` (3,) to ``end`` (3,) [m]."""
+        first, last = finite_array("capsule begin", begin, (3,)), finite_array("capsule end", end, (3,))
+        return cls(str(name), first, last, positive("capsule radius", radius, "m"), None, np.eye(3))
+
+    @classmethod
+    def box(cls, center: ArrayLike, sides: ArrayLike, rotation: ArrayLike | None = None, name: str = "box") -> Obstacle:
+        """A box with ``sides`` (3,) [m] around ``center`` (3,) [m], turned by a ``rotation`` (3, 3)."""
+        at, size = finite_array("box center", center, (3,)), finite_array("box sides", sides, (3,))
+        if not (size > 0.0).all():
+            raise InputError(f"box sides must be > 0 [m], got {size}")
+        R = np.eye(3) if rotation is None else finite_array("box rotation", rotation, (3, 3))
+        if np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
+            raise InputError("box rotation must be a rotation matrix: R'R = 1 and det R = 1")
+        return cls(str(name), at, at, 0.0, size, R)
+
+    def __repr__(self) -> str:
+        if self.sides is not None:
+            return (
+                f"Obstacle.box({self.begin.tolist()}, {self.sides.tolist()}, {self.rotation.tolist()}, {self.name!r})"
+            )
+        if self.begin is self.end:
+            return f"Obstacle.sphere({self.begin.tolist()}, {self.radius!r}, {self.name!r})"
+        return f"Obstacle.capsule({self.begin.tolist()}, {self.end.tolist()}, {self.radius!r}, {self.name!r})"
+
+
+@dataclass(frozen=True, eq=False)
+class _Body:
+    """A capsule or a box, on a link or in the world.
+
+    Attributes:
+        name: Of the link or obstacle.
+        kinematics: Of the link's frame; None in the world.
+        rotation: Of a box, its axes (3, 3).
+    """
+
+    name: str
+    kinematics: FrameKinematics | None
+    begin: Floats
+    end: Floats
+    radius: float
+    sides: Floats | None
+    rotation: Floats
+
+
+class Clearance(Frozen):
+    """Distances of pairs of bodies, links among them. Made by :func:`clearance`."""
+
+    def __init__(self, bodies: Sequence[_Body], pairs: Sequence[tuple[int, int]]) -> None:
+        self._bodies, self._pairs = tuple(bodies), tuple(pairs)
+        self.names = tuple(f"{bodies[i].name} and {bodies[k].name}" for i, k in pairs)
+        self.capsules = {body.name: (body.begin, body.end, body.radius) for body in bodies if body.kinematics}
+
+    def distances(self, q: Floats) -> Floats:
+        """The distance of each pair (N, pairs) [m] at q (N, n); negative where they overlap."""
+        return self._measured(q)[0]
+
+    def slopes(self, q: Floats) -> Floats:
+        """Its derivatives (N, pairs, n), by the points that are nearest to each other."""
+        _, normal, first, second = self._measured(q)
+        N, n = q.shape
+        found = np.zeros((N, len(self._pairs), n))
+        moving = {i for pair in self._pairs for i in pair if self._bodies[i].kinematics is not None}
+        jacobians = {i: self._bodies[i].kinematics.jacobians(q) for i in moving}  # type: ignore[union-attr]
+        for p, pair in enumerate(self._pairs):
+            for i, points, sign in ((pair[0], first[:, p], -1.0), (pair[1], second[:, p], 1.0)):
+                if i in jacobians:
+                    _, origin, J = jacobians[i]
+                    along = sign * normal[:, p]
+                    found[:, p] += np.einsum("Na,Nan->Nn", along, J[:, :3])
+                    found[:, p] += np.einsum("Na,Nan->Nn", np.cross(points - origin, along), J[:, 3:])
+        return found
+
+    def _measured(self, q: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Distances (N, pairs), unit vectors from first to second (N, pairs, 3), and the nearest points of both."""
+        N, P = len(q), len(self._pairs)
+        placed = [self._placed(body, np.ascontiguousarray(q)) for body in self._bodies]
+        d, normal = np.empty((N, P)), np.empty((N, P, 3))
+        first, second = np.empty((N, P, 3)), np.empty((N, P, 3))
+        for p, (i, k) in enumerate(self._pairs):
+            one, other = self._bodies[i], self._bodies[k]
+            measure = _boxed if one.sides is not None or other.sides is not None else _round
+            d[:, p], normal[:, p], first[:, p], second[:, p] = measure(one, other, placed[i], placed[k])
+        return d, normal, first, second
+
+    @staticmethod
+    def _placed(body: _Body, q: Floats) -> tuple[Floats, Floats, Floats]:
+        """Ends of the axis (N, 3) and (N, 3), and the axes of a box (N, 3, 3), in the world."""
+        if body.kinematics is None:
+            ends = (np.broadcast_to(x, (len(q), 3)) for x in (body.begin, body.end))
+            return *ends, np.broadcast_to(body.rotation, (len(q), 3, 3))  # type: ignore[return-value]
+        R, p = body.kinematics.placements(q)
+        return R @ body.begin + p, R @ body.end + p, R @ body.rotation
+
+
+_Placed = tuple[Floats, Floats, Floats]
+
+
+def _round(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Floats, Floats, Floats, Floats]:
+    """Distances of two capsules: of their axes less both radii (Ericson, "Real-time collision detection", 5.1.9)."""
+    p1, p2 = here[0], there[0]
+    d1, d2, r = here[1] - p1, there[1] - p2, p1 - p2
+    a, e, b = ((x * y).sum(axis=1) for x, y in ((d1, d1), (d2, d2), (d1, d2)))
+    c, f = (d1 * r).sum(axis=1), (d2 * r).sum(axis=1)
+    safe_a, safe_e = np.where(a > 0.0, a, 1.0), np.where(e > 0.0, e, 1.0)
+    across = a * e - b * b
+    crossing = across > 1e-12 * safe_a * safe_e
+    s = np.where(crossing, np.clip((b * f - c * e) / np.where(crossing, across, 1.0), 0.0, 1.0), 0.5 * (a > 0.0))
+    t = np.where(e > 0.0, (b * s + f) / safe_e, 0.0)
+    clipped = np.clip(t, 0.0, 1.0)
+    # Where the other's end is nearest, or it is a point, what is nearest to that on the first.
+    again = (clipped != t) | (e == 0.0) | ~crossing
+    s = np.where(again & (a > 0.0), np.clip((b * clipped - c) / safe_a, 0.0, 1.0), s)
+    first, second = p1 + s[:, None] * d1, p2 + clipped[:, None] * d2
+    way = second - first
+    length = np.linalg.norm(way, axis=1)
+    # Axes that meet have no direction that is nearest.
+    unit = np.where(length[:, None] > 0.0, way / np.where(length > 0.0, length, 1.0)[:, None], [0.0, 0.0, 1.0])
+    return (
+        length - one.radius - other.radius,
+        unit,
+        first + one.radius * unit,
+        second - other.radius * unit,
+    )
+
+
+def _boxed(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Floats, Floats, Floats, Floats]:
+    """The same of two bodies of which one is a box, by coal."""
+    N = len(here[0])
+    d, normal, first, second = np.empty(N), np.empty((N, 3)), np.empty((N, 3)), np.empty((N, 3))
+    shapes = [_shape(body) for body in (one, other)]
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    for k in range(N):
+        places = [_place(body, at, k) for body, at in ((one, here), (other, there))]
+        result.clear()
+        d[k] = coal.distance(shapes[0], places[0], shapes[1], places[1], request, result)
+        first[k], second[k] = result.getNearestPoint1(), result.getNearestPoint2()
+        normal[k] = result.normal
+    return d, normal, first, second
+
+
+def _shape(body: _Body) -> Any:
+    if body.sides is not None:
+        return coal.Box(*map(float, body.sides))
+    length = float(np.linalg.norm(body.end - body.begin))
+    return coal.Capsule(body.radius, length) if length > 0.0 else coal.Sphere(body.radius)
+
+
+def _place(body: _Body, at: _Placed, k: int) -> Any:
+    begin, end, R = at[0][k], at[1][k], at[2][k]
+    if body.sides is None:
+        way = end - begin
+        length = float(np.linalg.norm(way))
+        R = z_to(way / length) if length > 0.0 else np.eye(3)
+    return coal.Transform3s(np.ascontiguousarray(R), 0.5 * (begin + end))
+
+
+def clearance(
+    robot: Robot,
+    obstacles: Sequence[Obstacle],
+    *,
+    links: Sequence[str] | None = None,
+    itself: bool = False,
+    srdf: Path | None = None,
+    capsules: Mapping[str, tuple[ArrayLike, ArrayLike, float]] | None = None,
+) -> Clearance:
+    """Links of a robot, each in a capsule, beside obstacles and beside each other.
+
+    Args:
+        robot: The robot.
+        obstacles: Of them the distance of every moving link is taken.
+        links: Which links; all that have shapes or a capsule given if left out.
+        itself: Take distances between links, too, but not of neighbours: links on one joint or on two that follow each
+            other, and those that overlap at q = 0.
+        srdf: A file whose ``disable_collisions`` say which pairs of links never count.
+        capsules: (begin, end, radius) in a link's own axes [m], in place of what is fitted around its shapes.
+
+    Raises:
+        RobotError: A mesh is missing, or the SRDF file cannot be read.
+        InputError: A link has no shape, or nothing is left to keep clear of.
+    """
+    given = dict(capsules or {})
+    fitted = {} if links is not None and set(links) <= set(given) else _vertices(robot)
+    names = list(dict.fromkeys([*fitted, *given])) if links is None else list(links)
+    bodies = []
+    for name in names:
+        body, _, _ = place_of_frame(robot.free_model, name, robot.name)
+        if name in given:
+            begin, end, radius = given[name]
+            shape = (
+                finite_array(f"capsules[{name!r}] begin", begin, (3,)),
+                finite_array(f"capsules[{name!r}] end", end, (3,)),
+                positive(f"capsules[{name!r}] radius", radius, "m"),
+            )
+        elif name in fitted:
+            shape = capsule_around(fitted[name])
+        else:
+            raise InputError(f"link {name!r} of robot {robot.name!r} has no shape; give capsules={{{name!r}: ...}}")
+        # A link that no joint moves stands in the world.
+        if body < 0:
+            _, R, p = place_of_frame(robot.free_model, name, robot.name)
+            bodies.append((body, _Body(name, None, R @ shape[0] + p, R @ shape[1] + p, shape[2], None, np.eye(3))))
+        else:
+            bodies.append((body, _Body(name, frame_kinematics(robot, name), *shape, None, np.eye(3))))
+    parts = [own for _, own in bodies]
+    moving = [i for i, part in enumerate(parts) if part.kinematics is not None]
+    pairs = []
+    if itself:
+        pairs = _of_links(robot, bodies, _disabled(srdf))
+    for obstacle in obstacles:
+        pairs += [(i, len(parts)) for i in moving]
+        own = (obstacle.begin, obstacle.end, obstacle.radius, obstacle.sides, obstacle.rotation)
+        parts.append(_Body(obstacle.name, None, *own))
+    if not pairs:
+        raise InputError(
+            f"robot {robot.name!r} has nothing to keep clear of: give obstacles, or itself=True, and links with shapes "
+            "or capsules"
+        )
+    return Clearance(parts, pairs)
+
+
+def _of_links(
+    robot: Robot, bodies: Sequence[tuple[int, _Body]], disabled: set[frozenset[str]]
+) -> list[tuple[int, int]]:
+    """Pairs of links that are no neighbours."""
+    parent, parts = robot.tree.parent, [own for _, own in bodies]
+    found = []
+    for i, (one, first) in enumerate(bodies):
+        for k, (other, second) in enumerate(bodies[:i]):
+            near = one == other or (one >= 0 and parent[one] == other) or (other >= 0 and parent[other] == one)
+            still = first.kinematics is None and second.kinematics is None
+            if not near and not still and frozenset((first.name, second.name)) not in disabled:
+                found.append((k, i))
+    if not found:
+        return []
+    apart = Clearance(parts, found).distances(np.zeros((1, robot.dof)))[0]
+    return [pair for pair, d in zip(found, apart, strict=True) if d > 0.0]
+
+
+def _disabled(srdf: Path | None) -> set[frozenset[str]]:
+    """Pairs of links that an SRDF file says never collide."""
+    if srdf is None:
+        return set()
+    try:
+        root = parsed(decoded(srdf)[0])
+    except expat.ExpatError as error:
+        raise RobotError(f"{srdf} is not an SRDF: it is not well-formed XML: {error}") from None
+    return {frozenset((e.get("link1", ""), e.get("link2", ""))) for e in root.findall("disable_collisions")}
+
+
+def _vertices(robot: Robot) -> dict[str, Floats]:
+    """Points (N, 3) [m] whose hull holds the shapes of each link, in the link's axes."""
+    found: dict[str, list[Floats]] = {}
+    model = robot.free_model
+    for shape in geometry(robot).geometryObjects:
+        frame = model.frames[shape.parentFrame]
+        place = frame.placement.inverse() * shape.placement
+        own = _corners(shape.geometry) * np.asarray(shape.meshScale)
+        found.setdefault(frame.name, []).append(own @ place.rotation.T + place.translation)
+    return {name: np.vstack(parts) for name, parts in found.items()}
+
+
+def _corners(shape: Any) -> Floats:
+    """Points whose hull holds a shape."""
+    if hasattr(shape, "vertices"):
+        return np.asarray(shape.vertices(), dtype=np.float64).reshape(-1, 3)
+    if isinstance(shape, coal.ConvexBase):
+        return np.array([shape.point(i) for i in range(shape.num_points)])
+    box = shape.computeLocalAABB() or shape.aabb_local
+    ends = np.array([box.min_, box.max_])
+    return np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+
+
+def capsule_around(points: Floats) -> tuple[Floats, Floats, float]:
+    """Ends and radius of a small capsule that holds points (N, 3): the smallest along one of their principal axes."""
+    center = points.mean(axis=0)
+    axes = np.linalg.svd(points - center, full_matrices=False)[2]
+    best: tuple[Floats, Floats, float] | None = None
+    least = np.inf
+    for i, axis in enumerate(axes):
+        across = np.delete(axes, i, axis=0)
+        lateral = (points - center) @ across.T
+        middle = 0.5 * (lateral.min(axis=0) + lateral.max(axis=0))
+        away = np.linalg.norm(lateral - middle, axis=1)
+        radius = float(away.max()) * (1.0 + 1e-12)
+        reach = np.sqrt(np.maximum(radius**2 - away**2, 0.0))
+        along = (points - center) @ axis
+        low, high = float((along + reach).min()), float((along - reach).max())
+        if low > high:
+            low = high = 0.5 * (low + high)
+        volume = radius**2 * (high - low) + 4.0 / 3.0 * radius**3
+        if volume < least:
+            base = center + middle @ across
+            best, least = (base + low * axis, base + high * axis, radius), volume
+    if best is None or not best[2] > 0.0:
+        raise InputError("points of no extent have no capsule around them")
+    return best
