@@ -377,7 +377,7 @@ def simulate(
         )
     _require_memory(scene, steps)
     if callable(controls) or isinstance(controls, OpenLoop):
-        commands = open_loop(np.zeros((0, scene.controls)))
+        commands = open_loop(np.zeros((0, scene.controls)))._replace(hold=period)
     else:
         commands = commands_of(scene, integrator, controls, steps, dt)
     hold = period if law is not None else commands.hold if isinstance(controls, LinearPolicy) else None
@@ -392,39 +392,13 @@ def simulate(
     try:
         while record.steps < steps:
             done = record.steps
-            if law is not None:
-                held = min(1 if stepwise else period, steps - done)
-                u = record.last.u[-1:] if done % period else _decision(law, record)
-                block = open_loop(u)._replace(hold=held)
-            elif isinstance(controls, OpenLoop):
-                block = _sampled(controls, record, 1 if stepwise else min(chunk, steps - done))
-            elif stepwise:
-                block = _next(commands, record)
-            else:
-                first = record.steps // commands.hold
-                before = record.last.u[None, -1] if record.steps else None
-                block = rows(commands, first, first + max(1, chunk // commands.hold), before)
-            drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
-            try:
-                (segment,) = integrator.rollout(scene, state, block, drawn, dt)
-            except CustomForceError as error:
-                now = record.trajectory()
-                raise ForceError(now.steps, float(now.t[-1]), str(error), now) from error
-            except InputError as error:
-                if scene.noise.diffusion is not None:
-                    raise  # of a custom constraint
-                now = record.trajectory()
-                raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
+            block = _next_block(controls, commands, record, 1 if stepwise else chunk, steps - done)
+            segment = _rolled_out(record, state, block)
             record.add(segment, block.within)
             if segment.failure is not None:
-                node = record.trajectory()
-                if hold is not None and check and not scene.constraints:
-                    # What a law has just decided is in no step yet.
-                    last = node.u[:0] if law is None else block.u
-                    decided = np.concatenate([node.u[: node.steps if law is None else done : hold], last])
-                    loop = unstable_loop(scene, node, hold) or outgrown(decided, hold * dt)
-                    node = with_warnings(node, loop)
-                raise StepFailure(node.steps, node.t[-1], segment.failure, node)
+                # What a law has just decided is in no step yet.
+                decided = None if law is None else (done, block.u)
+                raise _step_failure(record, segment.failure, hold if check else None, decided)
             if progress is not None and (done // chunk < record.steps // chunk or record.steps == steps):
                 progress(record.steps, steps)
     except KeyboardInterrupt:
@@ -448,6 +422,57 @@ def simulate(
         raise Interrupted(trajectory)
     announce(logger, scene, dt, found)
     return trajectory
+
+
+def _next_block(controls: Controls | ControlLaw, commands: Commands, record: _Record, most: int, left: int) -> Commands:
+    """Commands of the steps that come next: about ``most`` of the ``left`` ones, in whole intervals unless it is 1."""
+    if callable(controls):
+        decides = record.steps % commands.hold == 0
+        u = _decision(controls, record) if decides else record.last.u[-1:]
+        return open_loop(u)._replace(hold=min(1 if most == 1 else commands.hold, left))
+    if isinstance(controls, OpenLoop):
+        return _sampled(controls, record, min(most, left))
+    if most == 1:
+        return _next(commands, record)
+    first = record.steps // commands.hold
+    before = record.last.u[None, -1] if record.steps else None
+    return rows(commands, first, first + max(1, most // commands.hold), before)
+
+
+def _rolled_out(record: _Record, state: object, block: Commands) -> Segment:
+    """The steps of a block; an error of a user's force or noise has the motion so far."""
+    dw, scene = record.dw, record.scene
+    drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
+    try:
+        (segment,) = record.integrator.rollout(scene, state, block, drawn, record.dt)
+    except CustomForceError as error:
+        now = record.trajectory()
+        raise ForceError(now.steps, float(now.t[-1]), str(error), now) from error
+    except InputError as error:
+        if scene.noise.diffusion is not None:
+            raise  # of a custom constraint
+        now = record.trajectory()
+        raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
+    return segment
+
+
+def _step_failure(
+    record: _Record, failure: Failure, hold: int | None, decided: tuple[int, Floats] | None
+) -> StepFailure:
+    """The error of a step that failed, its motion with a warning where an unstable control loop is the cause.
+
+    Args:
+        record: The motion so far.
+        failure: Of the step.
+        hold: Steps between two decisions of the loop; None where no loop is to be looked at.
+        decided: Of a law the step of its last decision, and that decision (1, m).
+    """
+    node = record.trajectory()
+    if hold is not None and not record.scene.constraints:
+        last, u = (node.steps, node.u[:0]) if decided is None else decided
+        loop = unstable_loop(record.scene, node, hold)
+        node = with_warnings(node, loop or outgrown(np.concatenate([node.u[:last:hold], u]), hold * record.dt))
+    return StepFailure(node.steps, node.t[-1], failure, node)
 
 
 def _times(dt: float | None, steps: int | None, duration: float | None) -> tuple[float, int]:
@@ -511,18 +536,12 @@ def _time_of_wish(dt: float | None, steps: int | None, duration: float | None) -
     return positive("duration", duration, "s")
 
 
-def _chosen(
-    scene: Scene,
-    q0: Floats,
-    v0: Floats,
-    duration: float,
-    tolerance: float | Accuracy,
-    controls: Controls | ControlLaw,
-    integrator: Integrator | None,
-) -> tuple[Integrator, int, Controls, Accuracy, tuple[Finding, ...]]:
-    """Integrator, steps and controls for a tolerance, with the estimate and what is to be said of it."""
-    earlier = tolerance if isinstance(tolerance, Accuracy) else None
-    wish = positive("tolerance", tolerance.tolerance if isinstance(tolerance, Accuracy) else tolerance, "rad or m")
+def _require_choice(scene: Scene, controls: Controls | ControlLaw, integrator: Integrator | None) -> Controls:
+    """The controls; refuses what no tolerance chooses steps for.
+
+    Raises:
+        InputError: Noise, constraints, a control law, or an integrator that chooses its own steps.
+    """
     if scene.processes:
         raise InputError(
             "tolerance is of single motions without noise: leave the noise out of the scene, or give dt and steps"
@@ -536,6 +555,22 @@ def _chosen(
             "a control law is called once every period, in steps, and a tolerance chooses the steps: give dt and "
             "steps with a law, or a varpin.LinearPolicy with a period, or a varpin.OpenLoop(f)"
         )
+    return controls
+
+
+def _chosen(
+    scene: Scene,
+    q0: Floats,
+    v0: Floats,
+    duration: float,
+    tolerance: float | Accuracy,
+    asked: Controls | ControlLaw,
+    integrator: Integrator | None,
+) -> tuple[Integrator, int, Controls, Accuracy, tuple[Finding, ...]]:
+    """Integrator, steps and controls for a tolerance, with the estimate and what is to be said of it."""
+    earlier = tolerance if isinstance(tolerance, Accuracy) else None
+    wish = positive("tolerance", tolerance.tolerance if isinstance(tolerance, Accuracy) else tolerance, "rad or m")
+    controls = _require_choice(scene, asked, integrator)
     members = INTEGRATORS if integrator is None else (integrator,)
     parts = 1
     given: Callable[[Integrator, int], Commands]
