@@ -16,6 +16,7 @@ from varpin.io.scenefile.spec import CONSTRAINTS
 from varpin.mechanics import constraints
 from varpin.mechanics.forces import point_of
 from varpin.mechanics.noise import CompiledFields
+from varpin.mechanics.scene import OF_COUPLINGS, OF_ELEMENTS
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
 
@@ -119,6 +120,14 @@ def test_a_noise_kicks_what_it_says():
     mine = vp.simulate(scene, [0.3, 0.2], [0.0, 0.0], increments=dw[:, : scene.processes], **given)
     theirs = vp.simulate(known, [0.3, 0.2], [0.0, 0.0], increments=dw[:, : known.processes], **given)
     np.testing.assert_allclose(mine.q, theirs.q, atol=1e-14)
+
+
+def test_motions_keep_the_numbers_of_every_kind_of_force():
+    """Kinds of the core that no entry of a scene's values holds would be others in silence."""
+    text = (PAGE.parents[1] / "src" / "core" / "bindings" / "mechanism.cpp").read_text(encoding="utf-8")
+    kinds = set(re.findall(r'kind == "(\w+)"', text))
+    assert {"JointSpring", "JointStop", "FrameLoad"} <= kinds
+    assert kinds == {"JointSpring", "JointDamper", *OF_ELEMENTS, *OF_COUPLINGS}
 
 
 def test_the_page_names_files_that_are_there():
