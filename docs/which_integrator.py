@@ -7,6 +7,7 @@ included. Times are the best of several rounds in which the methods take turns, 
 
     python docs/which_integrator.py                   # rewrites the page and its figures
     python docs/which_integrator.py --quick FOLDER    # shorter, into a folder: the page, its figures, and which.csv
+    python docs/which_integrator.py --redraw          # the figure of plans, from the numbers on the page
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter
 
 import varpin as vp
 from varpin import plots
@@ -418,17 +421,22 @@ def long(scale: Scale) -> tuple[str, Figure]:
 # Optimal control ----------------------------------------------------------------------------------------------------
 
 
+PLAN_COLUMNS = ("start", "integrator", "dt [s]", "solve [ms]", "iterations", "planned cost", "true, open loop",
+                "true, feedback")  # fmt: skip
+PLAN_STARTS = ("on the reference", "off it")
+# The two true costs, in the order of the table's last columns.
+PLAN_MARKS: dict[str, dict[str, Any]] = {
+    "open loop": {"marker": "o", "markersize": 4, "linestyle": "none"},
+    "with feedback": {"marker": "s", "markersize": 9, "linestyle": "none", "markerfacecolor": "none"},
+}
+
+
 def control(scale: Scale) -> tuple[str, Figure]:
     """True cost of the finger's plans against solve time."""
-    figure = Figure(figsize=(10, 4.4), layout="constrained")
-    panels = figure.subplots(1, 2)
-    lines = [
-        "| start | integrator | dt [s] | solve [ms] | iterations | planned cost | true, open loop | true, feedback |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    lines = [f"| {' | '.join(PLAN_COLUMNS)} |", "|" + "---|" * len(PLAN_COLUMNS)]
     # Off the reference most solve times are those of searches that do not converge: once is enough.
-    starts = ((cases.MAIN, 3, 0.0), (cases.VARIATIONS[0], 1, 2e-3))
-    for (setting, repeats, least_step), axes in zip(starts, panels, strict=True):
+    settings = ((cases.MAIN, 3, 0.0), (cases.VARIATIONS[0], 1, 2e-3))
+    for start, (setting, repeats, least_step) in zip(PLAN_STARTS, settings, strict=True):
         members: tuple[tuple[str, Sequence[vp.Integrator]], ...] = (
             ("variational", (vp.ExplicitEuler(), vp.Midpoint())),
             # Running costs at the Gauss points: of fourth order, for who is.
@@ -439,33 +447,41 @@ def control(scale: Scale) -> tuple[str, Figure]:
             problem = cases.problem(setting, None, method, scale.control_steps[0])
             dts = [dt for dt in scale.control_steps if _divides(dt, cases.DURATION) and dt >= least_step]
             runs += vp.optimal_control_tradeoff(problem, integrators, dts, repeats=repeats).runs
-        start = "on the reference" if setting is cases.MAIN else "off it"
         for run in runs:
             costs = (run.planned_cost, run.open_loop_cost, run.closed_loop_cost)
             cells = " | ".join(f"{cost:.5g}" if np.isfinite(cost) else GONE for cost in costs)
             name = name_of_text(run.integrator)
             lines.append(f"| {start} | {name} | {run.dt:g} | {1e3 * run.seconds:.1f} | {run.iterations} | {cells} |")
-        for name in dict.fromkeys(name_of_text(run.integrator) for run in runs):
-            colour, marker, _ = STYLES[name]
-            own = [run for run in runs if name_of_text(run.integrator) == name and run.survived]
-            kinds = (("open_loop_cost", "open loop", colour), ("closed_loop_cost", "with feedback", "none"))
-            for cost, kind, face in kinds:
-                pairs = [(1e3 * run.seconds, getattr(run, cost)) for run in own]
-                pairs = [(x, y) for x, y in pairs if np.isfinite(y)]
-                # No lines: a finer step is not always a slower solve.
-                if pairs:
-                    axes.loglog(
-                        *zip(*pairs, strict=True), color=colour, marker=marker, linestyle="none", markerfacecolor=face,
-                        label=f"{name}, {kind}",
-                    )  # fmt: skip
-        axes.set(xlabel="solve time [ms]", title=f"finger, {start}", ylabel="true cost")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter("")
-        plots.apply_style(axes)
-    handles = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))
-    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    return "\n".join(lines), figure
+    return "\n".join(lines), plans_figure(lines)
+
+
+def plans_figure(lines: Iterable[str]) -> Figure:
+    """A panel for each method and start, from the lines of the table; a measured page can be drawn again."""
+    rows = [[word.strip() for word in line.strip("| \n").split("|")] for line in lines]
+    rows = [row for row in rows if len(row) == len(PLAN_COLUMNS) and row[0] in PLAN_STARTS]
+    names = list(dict.fromkeys(row[1] for row in rows))
+    figure = Figure(figsize=(11, 6), layout="constrained")
+    panels = figure.subplots(len(PLAN_STARTS), len(names), sharex="row", sharey="row", squeeze=False)
+    for start, line_of_panels in zip(PLAN_STARTS, panels, strict=True):
+        for name, axes in zip(names, line_of_panels, strict=True):
+            # No lines: a finer step is not always a slower solve.
+            for column, (label, style) in enumerate(PLAN_MARKS.items(), 6):
+                points = [(float(row[3]), float(row[column])) for row in rows
+                          if row[:2] == [start, name] and row[column] != GONE]  # fmt: skip
+                axes.loglog(
+                    [x for x, _ in points], [y for _, y in points], color=STYLES[name][0], label=label, **style
+                )  # fmt: skip
+            axes.set(title=f"{name}, {start}")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0), numticks=8))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter(NullFormatter())
+            plots.apply_style(axes)
+        line_of_panels[0].set_ylabel("true cost")
+    for axes in panels[-1]:
+        axes.set_xlabel("solve time [ms]")
+    handles = [Line2D([], [], color="black", **style) for style in PLAN_MARKS.values()]
+    figure.legend(handles, list(PLAN_MARKS), loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+    return figure
 
 
 def _divides(dt: float, duration: float) -> bool:
@@ -663,6 +679,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("folder", nargs="?", type=Path, default=DOCS, help="where page and images go; docs if left out")
     parser.add_argument("--quick", action="store_true", help="shorter runs, fewer settings")
+    parser.add_argument("--redraw", action="store_true", help="draw the plans from the page's table, measure nothing")
     options = parser.parse_args(None if arguments is None else list(arguments))
     scale = QUICK if options.quick else FULL
     images = options.folder / "images"
@@ -670,6 +687,9 @@ def main(arguments: Iterable[str] | None = None) -> None:
     page = options.folder / PAGE
     if page.resolve() != (DOCS / PAGE).resolve():
         shutil.copy(DOCS / PAGE, page)
+    if options.redraw:
+        _print(plans_figure(page.read_text(encoding="utf-8").splitlines()), images / "which_control.png")
+        return
     logging.getLogger("varpin").setLevel(logging.ERROR)
     for case in short_cases():
         peers.require_same(case)
@@ -684,14 +704,18 @@ def main(arguments: Iterable[str] | None = None) -> None:
         parts[name], figures[name] = section(scale)
         _tell(name, begin)
     for name, figure in figures.items():
-        figure.set_dpi(110)
-        FigureCanvasAgg(figure).print_png(images / f"which_{name}.png")
+        _print(figure, images / f"which_{name}.png")
     fill(page, parts)
     if options.folder != DOCS:
         with (options.folder / "which.csv").open("w", encoding="utf-8", newline="") as stream:
             writer = csv.writer(stream)
             writer.writerow(["motion", "method", "setting", "error in q [rad]", "time [us]"])
             writer.writerows([motion, p.method, p.setting, p.error, p.microseconds] for motion, p in rows)
+
+
+def _print(figure: Figure, path: Path) -> None:
+    figure.set_dpi(110)
+    FigureCanvasAgg(figure).print_png(path)
 
 
 def _tell(section: str, begin: float) -> None:

@@ -475,7 +475,7 @@ def simulate(
         )
     _require_memory(scene, steps)
     if callable(controls) or isinstance(controls, OpenLoop):
-        commands = open_loop(np.zeros((0, scene.controls)))
+        commands = open_loop(np.zeros((0, scene.controls)))._replace(hold=period)
     else:
         commands = commands_of(scene, integrator, controls, steps, dt)
     hold = period if law is not None else commands.hold if isinstance(controls, LinearPolicy) else None
@@ -494,37 +494,13 @@ def simulate(
     try:
         while record.steps < steps:
             done = record.steps
-            if law is not None:
-                held = min(1 if stepwise else period, steps - done)
-                u = record.last.u[-1:] if done % period else _decision(law, record)
-                block = open_loop(u)._replace(hold=held)
-            elif isinstance(controls, OpenLoop):
-                block = _sampled(controls, record, 1 if stepwise else min(chunk, steps - done))
-            elif stepwise and not linear:
-                block = _next(commands, record)
-            else:
-                first = record.steps // commands.hold
-                before = record.last.u[None, -1] if record.steps else None
-                most = 1 if stepwise else max(1, chunk // commands.hold)
-                block = rows(commands, first, first + most, before)
-            drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
-            try:
-                (segment,) = integrator.rollout(scene, state, block, drawn, dt)
-            except (CustomForceError, CustomConstraintError) as error:
-                raise _raised(error, record) from error
-            except InputError as error:
-                now = record.trajectory()
-                raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
+            block = _next_block(controls, commands, record, 1 if stepwise else chunk, steps - done)
+            segment = _rolled_out(record, state, block)
             record.add(segment, block.within)
             if segment.failure is not None:
-                node = record.trajectory()
-                if hold is not None and check and not scene.constraints:
-                    # What a law has just decided is in no step yet.
-                    last = node.u[:0] if law is None else block.u
-                    decided = np.concatenate([node.u[: node.steps if law is None else done : hold], last])
-                    loop = unstable_loop(scene, node, hold) or outgrown(decided, hold * dt)
-                    node = with_warnings(node, loop)
-                raise StepFailure(node.steps, node.t[-1], named(scene, segment.failure), node)
+                # What a law has just decided is in no step yet.
+                decided = None if law is None else (done, block.u)
+                raise _step_failure(record, segment.failure, hold if check else None, decided)
             if progress is not None and (done // chunk < record.steps // chunk or record.steps == steps):
                 progress(record.steps, steps)
     except KeyboardInterrupt:
@@ -548,6 +524,54 @@ def simulate(
         raise Interrupted(trajectory)
     announce(logger, scene, dt, found)
     return trajectory
+
+
+def _next_block(controls: Controls | ControlLaw, commands: Commands, record: _Record, most: int, left: int) -> Commands:
+    """Commands of the steps that come next: about ``most`` of the ``left`` ones, in whole intervals unless it is 1."""
+    if callable(controls):
+        decides = record.steps % commands.hold == 0
+        u = _decision(controls, record) if decides else record.last.u[-1:]
+        return open_loop(u)._replace(hold=min(1 if most == 1 else commands.hold, left))
+    if isinstance(controls, OpenLoop):
+        return _sampled(controls, record, min(most, left))
+    if most == 1 and not len(commands.places):
+        return _next(commands, record)
+    first = record.steps // commands.hold
+    before = record.last.u[None, -1] if record.steps else None
+    return rows(commands, first, first + max(1, most // commands.hold), before)
+
+
+def _rolled_out(record: _Record, state: object, block: Commands) -> Segment:
+    """The steps of a block; an error of a user's force or noise has the motion so far."""
+    dw, scene = record.dw, record.scene
+    drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
+    try:
+        (segment,) = record.integrator.rollout(scene, state, block, drawn, record.dt)
+    except (CustomForceError, CustomConstraintError) as error:
+        raise _raised(error, record) from error
+    except InputError as error:
+        now = record.trajectory()
+        raise NoiseError(now.steps, float(now.t[-1]), str(error), now) from error.__cause__
+    return segment
+
+
+def _step_failure(
+    record: _Record, failure: Failure, hold: int | None, decided: tuple[int, Floats] | None
+) -> StepFailure:
+    """The error of a step that failed, its motion with a warning where an unstable control loop is the cause.
+
+    Args:
+        record: The motion so far.
+        failure: Of the step.
+        hold: Steps between two decisions of the loop; None where no loop is to be looked at.
+        decided: Of a law the step of its last decision, and that decision (1, m).
+    """
+    node = record.trajectory()
+    if hold is not None and not record.scene.constraints:
+        last, u = (node.steps, node.u[:0]) if decided is None else decided
+        loop = unstable_loop(record.scene, node, hold)
+        node = with_warnings(node, loop or outgrown(np.concatenate([node.u[:last:hold], u]), hold * record.dt))
+    return StepFailure(node.steps, node.t[-1], named(record.scene, failure), node)
 
 
 def _times(dt: float | None, steps: int | None, duration: float | None) -> tuple[float, int]:
@@ -625,18 +649,12 @@ def _usual(scene: Scene, q0: Floats, v0: Floats, dt: float) -> Integrator:
     return _STOPPING if rate > 0.0 else _MIDPOINT
 
 
-def _chosen(
-    scene: Scene,
-    q0: Floats,
-    v0: Floats,
-    duration: float,
-    tolerance: float | Accuracy,
-    controls: Controls | ControlLaw,
-    integrator: Integrator | None,
-) -> tuple[Integrator, int, Controls, Accuracy, tuple[Finding, ...]]:
-    """Integrator, steps and controls for a tolerance, with the estimate and what is to be said of it."""
-    earlier = tolerance if isinstance(tolerance, Accuracy) else None
-    wish = positive("tolerance", tolerance.tolerance if isinstance(tolerance, Accuracy) else tolerance, "rad or m")
+def _require_choice(scene: Scene, controls: Controls | ControlLaw, integrator: Integrator | None) -> Controls:
+    """The controls; refuses what no tolerance chooses steps for.
+
+    Raises:
+        InputError: Noise, constraints, a control law, or an integrator that chooses its own steps.
+    """
     if scene.processes:
         raise InputError(
             "tolerance is of single motions without noise: leave the noise out of the scene, or give dt and steps"
@@ -650,22 +668,58 @@ def _chosen(
             "a control law is called once every period, in steps, and a tolerance chooses the steps: give dt and "
             "steps with a law, or a varpin.LinearPolicy with a period, or a varpin.OpenLoop(f)"
         )
+    return controls
+
+
+def _intervals(policy: LinearPolicy, duration: float) -> int:
+    """How many intervals a policy has over a motion, whose steps a tolerance chooses."""
+    if policy.linear:
+        raise InputError("tolerance chooses dt, and a policy whose controls are linear between nodes takes it: dt=")
+    if policy.period is None:
+        raise InputError("tolerance chooses dt, so a LinearPolicy needs the period of its intervals, period= [s]")
+    parts = len(policy.gains)
+    if abs(parts * policy.period - duration) > 1e-9 * duration:
+        raise InputError(
+            f"the policy has {parts} intervals of {policy.period:g} s, {parts * policy.period:g} s in all, and "
+            f"duration = {duration:g} s"
+        )
+    return parts
+
+
+def _unmet(record: Accuracy, floor: float) -> Finding:
+    """Says that a tolerance is not met, and why."""
+    cause = (
+        f"rounding leaves {floor:.1e}"
+        if record.tolerance < floor
+        else "errors grow along this motion, or its controls and forces jump inside steps"
+    )
+    return Finding(
+        "tolerance not met",
+        f"tolerance = {record.tolerance:g} is not met: the estimated error in q is {record.error:.1e} with "
+        f"{record.integrator} at dt = {record.dt:.4g} s; {cause}",
+    )
+
+
+def _chosen(
+    scene: Scene,
+    q0: Floats,
+    v0: Floats,
+    duration: float,
+    tolerance: float | Accuracy,
+    asked: Controls | ControlLaw,
+    integrator: Integrator | None,
+) -> tuple[Integrator, int, Controls, Accuracy, tuple[Finding, ...]]:
+    """Integrator, steps and controls for a tolerance, with the estimate and what is to be said of it."""
+    earlier = tolerance if isinstance(tolerance, Accuracy) else None
+    wish = positive("tolerance", tolerance.tolerance if isinstance(tolerance, Accuracy) else tolerance, "rad or m")
+    controls = _require_choice(scene, asked, integrator)
     members = INTEGRATORS if integrator is None else (integrator,)
     parts = 1
     given: Callable[[Integrator, int], Commands]
     held = np.zeros((0, 0))
     if isinstance(controls, LinearPolicy):
         policy = controls
-        if controls.linear:
-            raise InputError("tolerance chooses dt, and a policy whose controls are linear between nodes takes it: dt=")
-        if controls.period is None:
-            raise InputError("tolerance chooses dt, so a LinearPolicy needs the period of its intervals, period= [s]")
-        parts = len(controls.gains)
-        if abs(parts * controls.period - duration) > 1e-9 * duration:
-            raise InputError(
-                f"the policy has {parts} intervals of {controls.period:g} s, {parts * controls.period:g} s in all, and "
-                f"duration = {duration:g} s"
-            )
+        parts = _intervals(policy, duration)
         if integrator is None:
             members = tuple(member for member in members if member.variational != (controls.on == "velocity"))
 
@@ -727,20 +781,7 @@ def _chosen(
         if choice.raised is not None:
             raise finely(choice.raised) from choice.raised.error
         raise ToleranceError(wish, duration, choice.steps, choice.error)
-    found: tuple[Finding, ...] = ()
-    if not record.met:
-        cause = (
-            f"rounding leaves {choice.floor:.1e}"
-            if wish < choice.floor
-            else "errors grow along this motion, or its controls and forces jump inside steps"
-        )
-        found = (
-            Finding(
-                "tolerance not met",
-                f"tolerance = {wish:g} is not met: the estimated error in q is {record.error:.1e} with "
-                f"{record.integrator} at dt = {record.dt:.4g} s; {cause}",
-            ),
-        )
+    found = () if record.met else (_unmet(record, choice.floor),)
     if isinstance(controls, FirstOrderHold):
         controls = controls.refined(choice.steps // parts)
     elif not isinstance(controls, LinearPolicy | OpenLoop):

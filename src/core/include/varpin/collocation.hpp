@@ -1,4 +1,5 @@
-// The equation of a collocation step, its Newton iteration and its derivatives. docs/mathematics.md, "Higher order" and
+// The forced discrete Euler-Lagrange equations of a collocation step: their residual r (`residuals_of`), Newton's
+// iteration on it and its derivatives. docs/mathematics.md, "Higher order" and
 // "Structured linearization". The unknowns are the stage velocities V_i (tableau.hpp); with F = f + the forces of the
 // elements (forces.hpp), whose derivatives F_q, F_v and F_f - 1 are diagonal, and of couplings (couplings.hpp), whose
 // F_q and F_v are full in their blocks,
@@ -446,6 +447,7 @@ class Collocation {
     }
 
     // Here and elsewhere, loops over stages whose number the compiler knows to be one are none.
+    // The discrete Euler-Lagrange residual r_i(V) of each stage into `residual`; returns the worst in rounding units.
     [[gnu::always_inline]] inline double residuals_of(const int stages, double h, const Start& start) {
         double worst = 0.0;
         for (int i = 0; i < stages; ++i) {

@@ -1,4 +1,5 @@
-// What acts on single joints besides inertia and gravity: elements, in one list. docs/core.md, "Forces".
+// What acts on single joints besides inertia and gravity: elements, in one list. docs/core.md, "Forces". A new force is
+// a struct here, a name in bindings/mechanism.cpp and a class in mechanics/forces.py: docs/extending.md.
 //
 // An element acts on one coordinate and has one of these or both:
 //

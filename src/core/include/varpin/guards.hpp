@@ -1,8 +1,8 @@
 // When a step is accepted. docs/mathematics.md, "The principal branch".
 //
-// Branch: the step equation has other roots than the one that is connected to h -> 0. There the symmetric part of
-// N = -dr/dv is positive definite; its pivots are compared with those of M, the destabilising term exaggerated. The
-// smallest ratio is no smaller than the least eigenvalue of one in the metric of the other, and has its sign.
+// The branch guard: the step equation has other roots than the one that is connected to h -> 0. There the symmetric
+// part of N = -dr/dv is positive definite; its pivots are compared with those of M, the destabilising term exaggerated.
+// The smallest ratio is no smaller than the least eigenvalue of one in the metric of the other, and has its sign.
 //
 // Energy: |dE - work of the forces| over a substep must be a small part of the energy turned over, for each
 // mechanically independent group. What rides on something far heavier is lost in that balance, so light parts have one

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,15 +16,8 @@ from varpin.integrators import Integrator
 from varpin.io.scenefile.references import Reference
 from varpin.io.scenefile.table import ByName, SceneFileError, Table, suggestion
 from varpin.io.scenefile.terms import Term
-from varpin.mechanics.constraints import (
-    Constraint,
-    Distance,
-    FrameOnFrame,
-    JointTie,
-    PointOnLine,
-    PointOnPlane,
-    PointOnPoint,
-)
+from varpin.mechanics import constraints
+from varpin.mechanics.constraints import Constraint, CustomConstraint
 from varpin.mechanics.forces import (
     Armature,
     CoulombFriction,
@@ -41,6 +35,12 @@ from varpin.support.checks import is_file
 
 if TYPE_CHECKING:
     from varpin.io.scenefile.tables import NoiseKeys, OutputKeys, RobotKeys
+
+
+def word_of(name: str) -> str:
+    """The name of a class as scene files have it: PointOnLine is point_on_line, RungeKutta4 runge_kutta_4."""
+    return re.sub(r"(?<!^)([A-Z0-9])", r"_\1", name).lower()
+
 
 # A motion of seven joints over so many steps takes gigabytes.
 MOST_STEPS = 10**7
@@ -61,14 +61,11 @@ FRAME_FORCES: Mapping[str, type[Force]] = {
     "frame_spring": FrameSpring,
     "frame_wrench": FrameWrench,
 }
-# Of a [[constraint]].
+# Of a [[constraint]]: all that need no function, PointOnLine as point_on_line.
 CONSTRAINTS: Mapping[str, type[Constraint]] = {
-    "distance": Distance,
-    "frame_on_frame": FrameOnFrame,
-    "joint_tie": JointTie,
-    "point_on_line": PointOnLine,
-    "point_on_plane": PointOnPlane,
-    "point_on_point": PointOnPoint,
+    word_of(name): kind
+    for name, kind in sorted(vars(constraints).items())
+    if isinstance(kind, type) and issubclass(kind, Constraint) and kind not in (Constraint, CustomConstraint)
 }
 FIGURES = (".png", ".pdf", ".svg")
 

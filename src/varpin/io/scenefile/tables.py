@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields
 from pathlib import Path
@@ -45,6 +44,7 @@ from varpin.io.scenefile.spec import (
     ForceSpec,
     FrameForceSpec,
     SceneSpec,
+    word_of,
 )
 from varpin.io.scenefile.table import ByName, Table, inside
 from varpin.io.scenefile.terms import TERMS, Term
@@ -337,7 +337,7 @@ _OPTIONS = {
     "kick": Annotated[str, word("left", "split")],
 }
 INTEGRATORS: Mapping[str, Callable[..., Integrator]] = {
-    re.sub(r"(?<!^)([A-Z0-9])", r"_\1", name).lower(): kind for name, kind in BY_NAME.items() if name != "Reference"
+    word_of(name): kind for name, kind in BY_NAME.items() if name != "Reference"
 }
 
 
@@ -386,23 +386,26 @@ _OF_FRAMES = {
 }
 
 
-# What the fields of constraints take; frames of a weld and joints are names alone.
+# What the fields of constraints take beyond what their annotations say.
 _OF_CONSTRAINTS = {
     "a": _POINT,
     "b": _POINT,
-    "axes": TEXT,
-    "coefficients": numbers(),
     "direction": numbers(3),
-    "joint": TEXT,
-    "leader": TEXT,
     "length": number("m", above=0.0),
     "normal": numbers(3),
     "placement": numbers(16),
 }
 
 
+# What a field takes by its annotation, where it has no rule of its own.
+_BY_ANNOTATION = {"Point": _POINT, "str": TEXT, "float": number(), "int": whole(0), "ArrayLike": numbers()}
+
+
 def _keys_of_fields(kind: Any, rules: Mapping[str, Rule]) -> type[Keys]:
-    keys: dict[str, Any] = {item.name: (Annotated[Any, rules[item.name]], _default(item)) for item in fields(kind)}
+    keys: dict[str, Any] = {
+        item.name: (Annotated[Any, rules.get(item.name) or _BY_ANNOTATION[item.type.split(" | ")[0]]], _default(item))
+        for item in fields(kind)
+    }
     return create_model(kind.__name__, __base__=TypedKeys, **keys)
 
 

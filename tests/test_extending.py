@@ -1,0 +1,139 @@
+"""What docs/extending.md says, done: a class of one's own, and nothing else, is enough."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin.core.arrays import Carried, ConstraintRows, Diffusion, Product
+from varpin.integrators import registry
+from varpin.integrators.collocation import Collocation
+from varpin.integrators.tableau import midpoint
+from varpin.io.scenefile.spec import CONSTRAINTS
+from varpin.mechanics import constraints
+from varpin.mechanics.forces import point_of
+from varpin.mechanics.noise import CompiledFields
+from varpin.mechanics.scene import OF_COUPLINGS, OF_ELEMENTS
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Height(constraints.Constraint):
+    """A frame's origin at a height: g = z . x - height."""
+
+    a: str
+    height: float
+
+    def bind(self, robot):
+        body, _, at = point_of("a", self.a, robot)
+        vectors = ((Carried(body, False, tuple(at)),), (Carried(-1, True, (0.0, 0.0, 1.0)),))
+        rows = ConstraintRows(vectors, (Product(0, 1, 1.0, self.height),))
+        return constraints.Bound(rows, (repr(self),))
+
+
+@pytest.fixture(scope="module")
+def guided():
+    robot = vp.planar_chain(3)
+    q = vp.assemble(vp.Scene(robot, constraints=[Height("tip", 0.4)]), [0.3, -0.5, 0.4])
+    return robot, q
+
+
+def test_a_constraint_has_the_value_and_slope_of_its_formula(guided):
+    robot, q = guided
+    scene = vp.Scene(robot, constraints=[Height("tip", 0.4)])
+    q = q + 0.1
+    g, C = scene.constraint_values(q)
+    np.testing.assert_allclose(g, robot.frame_positions(q, "tip")[2] - 0.4, atol=1e-14)
+    h = 1e-6 * np.eye(3)
+    slope = [(robot.frame_positions(q + e, "tip")[2] - robot.frame_positions(q - e, "tip")[2]) / 2e-6 for e in h]
+    np.testing.assert_allclose(C[0], slope, atol=1e-9)
+
+
+def test_a_constraint_moves_as_the_plane_that_it_is(guided):
+    robot, q = guided
+    plane = vp.PointOnPlane("tip", (0.0, 0.0, 0.4), (0.0, 0.0, 1.0))
+    given = {"dt": 1e-2, "steps": 50, "integrator": vp.Gauss(2)}
+    mine, known = (
+        vp.simulate(vp.Scene(robot, constraints=[c]), q, np.zeros(3), **given) for c in (Height("tip", 0.4), plane)
+    )
+    np.testing.assert_allclose(robot.frame_positions(mine.q, "tip")[:, 2], 0.4, atol=1e-12)
+    np.testing.assert_allclose(mine.q, known.q, atol=1e-10)
+    assert np.ptp(mine.q, axis=0).max() > 0.1
+
+
+def test_scene_files_name_every_constraint_without_a_function():
+    kinds = {kind for kind in constraints.Constraint.__subclasses__() if kind.__module__ == constraints.__name__}
+    assert set(CONSTRAINTS.values()) == kinds - {vp.CustomConstraint}
+    assert CONSTRAINTS["point_on_line"] is vp.PointOnLine
+
+
+@dataclass(frozen=True)
+class Quarter(Collocation):
+    """The generalized midpoint rule at a quarter of the step."""
+
+    stages: int = 1
+
+    @property
+    def order(self):
+        return 1
+
+    def _tableau(self):
+        return midpoint(0.25)
+
+    def _times(self):
+        return np.array([0.5])
+
+
+def test_an_integrator_is_a_tableau_and_a_name(monkeypatch):
+    scene = vp.Scene(vp.planar_chain(2))
+    given = {"dt": 1e-2, "steps": 20}
+    mine, known = (
+        vp.simulate(scene, [0.3, 0.2], [0.0, 1.0], integrator=i, **given) for i in (Quarter(), vp.Midpoint(0.25))
+    )
+    np.testing.assert_array_equal(mine.q, known.q)
+    assert vp.check_linearization(scene, [0.3, 0.2], [0.0, 1.0], dt=1e-2, integrator=Quarter()).worst < 1e-9
+    monkeypatch.setattr(registry, "BY_NAME", {**registry.BY_NAME, "Quarter": Quarter})
+    assert registry.integrator_of("Quarter(kick=split)") == Quarter(kick="split")
+
+
+@dataclass(frozen=True)
+class First(vp.Noise):
+    """White noise on the first joint alone."""
+
+    strength: float
+
+    def bind(self, actuation):
+        n, m = actuation.shape
+        field, nothing = self.strength * np.eye(n)[:, :1], np.zeros((n, 1))
+        return CompiledFields(Diffusion(field, np.zeros((n, 1, m)), nothing, nothing))
+
+
+def test_a_noise_kicks_what_it_says():
+    scene = vp.Scene(vp.planar_chain(2), noise=First(0.3))
+    known = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise([0.3, 0.0]))
+    given = {"dt": 1e-2, "steps": 20}
+    dw = np.random.default_rng(0).normal(scale=0.1, size=(20, 2))
+    mine = vp.simulate(scene, [0.3, 0.2], [0.0, 0.0], increments=dw[:, : scene.processes], **given)
+    theirs = vp.simulate(known, [0.3, 0.2], [0.0, 0.0], increments=dw[:, : known.processes], **given)
+    np.testing.assert_allclose(mine.q, theirs.q, atol=1e-14)
+
+
+def test_motions_keep_the_numbers_of_every_kind_of_force():
+    """Kinds of the core that no entry of a scene's values holds would be others in silence."""
+    text = (PAGE.parents[1] / "src" / "core" / "bindings" / "mechanism.cpp").read_text(encoding="utf-8")
+    kinds = set(re.findall(r'kind == "(\w+)"', text))
+    assert {"JointSpring", "JointStop", "FrameLoad"} <= kinds
+    assert kinds == {"JointSpring", "JointDamper", *OF_ELEMENTS, *OF_COUPLINGS}
+
+
+def test_the_page_names_files_that_are_there():
+    root = PAGE.parents[1]
+    text = PAGE.read_text(encoding="utf-8")
+    found = {path.name for path in (root / "src").rglob("*.*")} | {path.name for path in (root / "tests").iterdir()}
+    named = {name.rpartition("/")[2] for name in re.findall(r"`([\w/]+\.(?:py|hpp|cpp))`", text)}
+    assert named
+    assert named <= found
