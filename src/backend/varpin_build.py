@@ -38,8 +38,9 @@ Settings = dict[str, Any] | None
 
 COMPILERS = ("c++", "g++", "clang++")
 # What a build asks of a tool chain, and what zig calls it. Left alone, zig compiles for the very processor it runs on;
-# and it makes its C++ library anew for each level of optimization, that of CMake's own trials among them.
-TOOLS = {"c++": "c++ -mcpu=baseline -O3 -fPIC", "ar": "ar", "ranlib": "ranlib"}
+# and it makes its C++ library, which takes as long as the core, anew for each level of optimization and again for what
+# is stripped: the module is, so CMake's own trials are, too.
+TOOLS = {"c++": "c++ -mcpu=baseline -O3 -fPIC -Wl,-s", "ar": "ar", "ranlib": "ranlib"}
 
 
 def has_compiler() -> bool:
