@@ -38,8 +38,15 @@ Settings = dict[str, Any] | None
 
 COMPILERS = ("c++", "g++", "clang++")
 # What a build asks of a tool chain, and what zig calls it. Left alone, zig compiles for the very processor it runs on;
-# and it makes its C++ library anew for each level of optimization, that of CMake's own trials among them.
+# and it makes its C++ library, which takes as long as the core, anew for each level of optimization.
 TOOLS = {"c++": "c++ -mcpu=baseline -O3 -fPIC", "ar": "ar", "ranlib": "ranlib"}
+# It makes that library again for what is stripped: the module is, so the programs of CMake's own trials are, too.
+SCRIPT = """#!/bin/sh
+case " $* " in
+    *" -c "* | *" -shared "* | *" --version "*) exec "{python}" -m ziglang {command} "$@" ;;
+    *) exec "{python}" -m ziglang {command} {programs} "$@" ;;
+esac
+"""
 
 
 def has_compiler() -> bool:
@@ -68,7 +75,8 @@ def compiler() -> Iterator[None]:
         # CMake takes paths of programs, not commands with arguments.
         for name, subcommand in TOOLS.items():
             script = Path(folder) / name
-            script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang {subcommand} "$@"\n')
+            programs = "-Wl,-s" if name == "c++" else ""
+            script.write_text(SCRIPT.format(python=sys.executable, command=subcommand, programs=programs))
             script.chmod(script.stat().st_mode | stat.S_IXUSR)
         os.environ["CXX"] = str(Path(folder) / "c++")
         tools = f"-DCMAKE_AR={folder}/ar -DCMAKE_RANLIB={folder}/ranlib"

@@ -162,7 +162,9 @@ def in_order(
         for _, future in waiting:
             future.cancel()
         if current is not None:
-            current.shutdown(wait=False, cancel_futures=True)
+            # With nothing left to do, waiting is short. Without it, Python 3.11 replaces a worker that has done its
+            # max_tasks_per_child in a pool that is gone, and hangs when it ends.
+            current.shutdown(wait=not waiting, cancel_futures=True)
 
 
 def _counted(losses: int, error: Exception) -> int:
