@@ -32,6 +32,7 @@ from varpin.io.scenefile.keys import (
     whole,
     word,
 )
+from varpin.io.scenefile.plan_constraints import PLAN_CONSTRAINTS, Kind
 from varpin.io.scenefile.references import Reference, Sine
 from varpin.io.scenefile.spec import (
     CONSTRAINTS,
@@ -44,6 +45,7 @@ from varpin.io.scenefile.spec import (
     CostSpec,
     ForceSpec,
     FrameForceSpec,
+    PlanConstraintSpec,
     SceneSpec,
 )
 from varpin.io.scenefile.table import ByName, Table, inside
@@ -423,6 +425,12 @@ def _cost_keys(name: str, term: Term) -> type[Keys]:
     return create_model(name, __base__=TypedKeys, **own)
 
 
+# [[plan_constraint]]
+def _plan_constraint_keys(name: str, kind: Kind) -> type[Keys]:
+    own: dict[str, Any] = {key: (Annotated[Any, rule], default) for key, (rule, default) in kind.rules.items()}
+    return create_model(name, __base__=TypedKeys, **own)
+
+
 FORCE_KEYS = {name: _force_keys(kind) for name, kind in FORCES.items()} | {
     name: _keys_of_fields(kind, _OF_FRAMES) for name, kind in FRAME_FORCES.items()
 }
@@ -430,6 +438,7 @@ CONSTRAINT_KEYS = {
     name: _keys_of_fields(kind, _OF_CONSTRAINTS | (dict.fromkeys("ab", TEXT) if kind is FrameOnFrame else {}))
     for name, kind in CONSTRAINTS.items()
 }
+PLAN_CONSTRAINT_KEYS = {name: _plan_constraint_keys(name, kind) for name, kind in PLAN_CONSTRAINTS.items()}
 INTEGRATOR_KEYS = {name: _integrator_keys(kind) for name, kind in INTEGRATORS.items()}
 COST_KEYS = {name: _cost_keys(name, term) for name, term in TERMS.items()}
 
@@ -447,6 +456,7 @@ class SceneKeys(Keys):
     springs: SpringKeys = SpringKeys()
     force: tuple[Annotated[Any, typed(FORCE_KEYS)], ...] = ()
     constraint: tuple[Annotated[Any, typed(CONSTRAINT_KEYS)], ...] = ()
+    plan_constraint: tuple[Annotated[Any, typed(PLAN_CONSTRAINT_KEYS)], ...] = ()
     actuation: ActuationKeys = ActuationKeys()
     noise: tuple[NoiseKeys, ...] = ()
     initial: InitialKeys = InitialKeys()
@@ -487,6 +497,10 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
         forces=tuple(force for force in forces if isinstance(force, ForceSpec)),
         frame_forces=tuple(force for force in forces if isinstance(force, FrameForceSpec)),
         constraints=tuple(_constraint(root.table(f"constraint[{k}]"), own) for k, own in enumerate(keys.constraint)),
+        plan_constraints=tuple(
+            PlanConstraintSpec(PLAN_CONSTRAINTS[own.type], _all(own), root.table(f"plan_constraint[{k}]"))
+            for k, own in enumerate(keys.plan_constraint)
+        ),
         actuated=keys.actuation.joints,
         gear=keys.actuation.gear,
         torque_limit=keys.actuation.torque_limit,
@@ -509,6 +523,11 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
 def _given(keys: Keys) -> dict[str, Any]:
     """The keys that a table has, its type apart."""
     return {name: getattr(keys, name) for name in keys.model_fields_set if name != "type"}
+
+
+def _all(keys: Keys) -> dict[str, Any]:
+    """All keys of a table, its type apart, with what they are where they are left out."""
+    return {name: getattr(keys, name) for name in type(keys).model_fields if name != "type"}
 
 
 def _force(table: Table, keys: TypedKeys) -> ForceSpec | FrameForceSpec:
