@@ -33,27 +33,27 @@ def problem(robot, begin, move, constraints, dt=0.04, steps=30):
 
 def tasks():
     """(name, problem)."""
-    for name, (begin, move, frame) in ARMS.items():
+    for name, (start, way, given) in ARMS.items():
         lock = {"panda_finger_joint1": 0.02} if name == "panda" else None
         robot = vp.load_robot(name, lock=lock)
-        begin, move = np.array(begin)[: robot.dof], np.array(move)[: robot.dof]
-        frame = frame or robot.end_effector
-        way = robot.frame_positions(begin + np.linspace(0, 1, 5)[:, None] * move, frame)
+        begin, move = np.array(start)[: robot.dof], np.array(way)[: robot.dof]
+        frame = given or robot.end_effector
+        places = robot.frame_positions(begin + np.linspace(0, 1, 5)[:, None] * move, frame)
         free = vp.solve(problem(robot, begin, move, []), check=False)
         speed = np.abs(free.trajectory.v).max(axis=0)
         rate = np.abs(np.diff(free.trajectory.u, axis=0)).max(axis=0) / 0.04
         top = np.maximum(begin, begin + move) - 0.05 * np.abs(move) + 1e-9
         seen = free.trajectory.q[:, :]
         middle = robot.frame_positions(seen[len(seen) // 2], frame)
-        start = np.linalg.norm(way[0] - middle)
+        reach = np.linalg.norm(places[0] - middle)
         families = {
             "speeds": [vp.WithinVelocityLimits(robot, (-0.8 * speed, 0.8 * speed))],
             "joints": [vp.WithinJointLimits(robot, (np.minimum(begin, begin + move) - 0.2, np.maximum(top, begin)))],
-            "rates and goal": [vp.WithinControlRate(0.8 * rate), vp.ReachFrame(robot, frame, position=way[-1])],
-            "sphere": [vp.KeepOutOfSphere(robot, frame, middle + [0.0, 0.0, 0.02], min(0.06, 0.5 * start))],
+            "rates and goal": [vp.WithinControlRate(0.8 * rate), vp.ReachFrame(robot, frame, position=places[-1])],
+            "sphere": [vp.KeepOutOfSphere(robot, frame, middle + np.eye(3)[2] * 0.02, min(0.06, 0.5 * reach))],
         }
-        obstacle = vp.Obstacle.sphere(middle + [0.0, 0.0, 0.03], 0.03)
-        links = [link for link in vp.KeepClear(robot, [obstacle]).capsules][-1:]
+        obstacle = vp.Obstacle.sphere(middle + np.eye(3)[2] * 0.03, 0.03)
+        links = list(vp.KeepClear(robot, [obstacle]).capsules)[-1:]
         families["obstacle"] = [
             vp.KeepClear(robot, [obstacle], 0.0, links=links),
             vp.WithinVelocityLimits(robot, (-1.5 * speed, 1.5 * speed)),

@@ -57,7 +57,7 @@ class Plan:
     model: Model  # of the cost along the motion
 
     @property
-    def promise(self) -> float:
+    def expected_decrease(self) -> float:
         """Decrease of the expected cost with a full step, by the model."""
         # Without limits the step is the model's minimum, where the curvature takes back half of what the slope gives.
         return -self.slope - 0.5 * self.curvature if self.limited else -0.5 * self.slope
@@ -267,7 +267,7 @@ class _Rows:
             [np.full(s.size, item.equality) for item, s in zip(self.penalties, self.at, strict=True)]
         )
         way, of_held = to - at, np.where(counts, weights, 0.0)
-        least = 0.5 * float(of_held @ flat(self.signed) ** 2) - plan.promise
+        least = 0.5 * float(of_held @ flat(self.signed) ** 2) - plan.expected_decrease
         gap = self.cost + 0.5 * float(of_held @ at**2) - least
 
         def slope(t: float) -> float:
@@ -286,7 +286,7 @@ class _Rows:
 
     def change(self, plan: Plan, held: list[Mask], ahead: list[Floats]) -> tuple[float, float]:
         """By what the piecewise model changes over a plan's whole step, and its slope at the start."""
-        change, slope = -plan.promise, plan.slope
+        change, slope = -plan.expected_decrease, plan.slope
         for item, s, t, now, rows in zip(self.penalties, self.signed, ahead, self.begun, held, strict=True):
             half = 0.5 * item.weight
             before, after = s * s, t * t
@@ -322,11 +322,11 @@ def _within_limits(along: Along, regularization: float, curvature: Floats | None
         if changed >= others:
             plan = None
         held, others = now, changed
-    if plan is not None and plan.promise > 0.0:
+    if plan is not None and plan.expected_decrease > 0.0:
         # Feed-forward parts hold together with the feedback that the others ask for: the slope is that of both.
         slope = float((plan.gradient * _foreseen(along, plan)[1]).sum())
         if slope < 0.0:
-            return replace(plan, slope=slope, curvature=-2.0 * (plan.promise + slope), limited=True)
+            return replace(plan, slope=slope, curvature=-2.0 * (plan.expected_decrease + slope), limited=True)
     nominal = _Limits(along.slack, np.zeros((0, along.running.gradient.shape[1])))
     return _pass(along, regularization, curvature=curvature, limits=nominal)[0]
 
