@@ -84,9 +84,11 @@ def stationarity(task, plan, directions=6):
         pull = [float((r.multipliers * b.value(motion.q, motion.v, motion.u)).sum()) for b, r in parts]
         return np.concatenate([task.shares(motion), pull])
 
+    # Torques that accelerate all joints alike: a light joint takes little.
+    masses = np.array([vp.lagrangian_jet(task.scene, q, 0.0 * q).Lvv for q in plan.trajectory.q[:-1]])
     worst = 0.0
     for _ in range(directions):
-        way = rng.normal(size=u.shape) * np.abs(u).max(axis=0)
+        way = (masses @ rng.normal(size=u.shape)[:, :, None])[:, :, 0]
         slope = (values(u + 1e-5 * way) - values(u - 1e-5 * way)) / 2e-5
         worst = max(worst, abs(slope.sum()) / np.abs(slope).sum())
     return worst
