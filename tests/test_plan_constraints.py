@@ -357,3 +357,80 @@ def test_margins_against_monte_carlo(constraint):
 def test_between_nodes_is_told():
     plan = vp.solve(two_links(FAMILIES["velocities"], steps=12, dt=0.08))
     assert any("between them" in sentence for sentence in plan.warnings)
+
+
+SCENE = """
+[robot]
+source = "ur5"
+[initial]
+q = [0.0, -1.2, 1.4, -1.8, -1.57, 0.0]
+[horizon]
+dt = 0.05
+steps = 10
+[[cost]]
+type = "control"
+[[plan_constraint]]
+type = "velocity_limits"
+lower = -1.0
+upper = { elbow_joint = 0.5 }
+margin = 1.5
+[[plan_constraint]]
+type = "control_rate"
+limit = 500.0
+before = 0.0
+[[plan_constraint]]
+type = "reach_frame"
+frame = "tool0"
+position = [0.5, 0.1, 0.4]
+rotation = [3.1, 0.0, 0.0]
+[[plan_constraint]]
+type = "clearance"
+distance = 0.02
+spheres = [[0.4, 0.2, 0.5, 0.1]]
+capsules = [[0.5, -0.5, 0.0, 0.5, -0.5, 1.0, 0.05]]
+boxes = [[-0.3, 0.2, 0.3, 0.2, 0.3, 0.2]]
+links = ["forearm_link", "wrist_3_link"]
+[[plan_constraint]]
+type = "box"
+frame = "tool0"
+lower = [-1.0, -1.0, 0.0]
+upper = [1.0, 1.0, 1.0]
+[[plan_constraint]]
+type = "half_space"
+frame = "tool0"
+normal = [0.0, 0.0, 1.0]
+offset = 0.05
+[[plan_constraint]]
+type = "outside_sphere"
+frame = "tool0"
+center = [0.4, 0.2, 0.5]
+radius = 0.1
+[[plan_constraint]]
+type = "joint_limits"
+"""
+
+
+def test_scene_files(tmp_path):
+    """Each type becomes the constraint that it names; mistakes are told with their place."""
+    path = tmp_path / "arm.toml"
+    path.write_text(SCENE, encoding="utf-8")
+    made = vp.load_scene(path).problem.constraints
+    speeds, rate, goal, clear, box, plane, sphere, joints = made
+    assert speeds.margin == 1.5
+    assert speeds.limits[1].tolist() == [np.inf, np.inf, 0.5, np.inf, np.inf, np.inf]
+    assert (speeds.limits[0] == -1.0).all()
+    assert rate.before == 0.0
+    assert goal.position.tolist() == [0.5, 0.1, 0.4]
+    assert goal.rotation[2, 2] == pytest.approx(np.cos(3.1))
+    assert clear.pairs == tuple(
+        f"{link} and {what}[0]" for what in ("sphere", "capsule", "box") for link in ("forearm_link", "wrist_3_link")
+    )
+    assert box.limits[0].tolist() == [-1.0, -1.0, 0.0]
+    assert (plane.offset, sphere.radius) == (0.05, 0.1)
+    assert isinstance(joints, vp.WithinJointLimits)
+    path.write_text(SCENE.replace('"forearm_link"', '"forearm"'), encoding="utf-8")
+    with pytest.raises(vp.SceneFileError, match=r"plan_constraint\[3\].*no frame 'forearm'"):
+        vp.load_scene(path)
+    path.write_text(SCENE.replace("limit = 500.0", "limt = 500.0"), encoding="utf-8")
+    with pytest.raises(vp.SceneFileError, match=r"plan_constraint\[1\].limt"):
+        vp.load_scene(path)

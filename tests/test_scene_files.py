@@ -889,8 +889,10 @@ def test_documented_keys_are_those_there_are():
     sections = documented_sections()
     for path in allowed.keys() - free:
         written = set(re.findall(r"\w+", sections[path])) if path else set()
-        # Constraints, which no plan goes with, have a page of their own.
-        assert allowed[path] - {"constraint"} <= written.union(*(keys for place, keys in used if place == path)), path
+        # Constraints of the mechanism, which no plan goes with, and of plans have pages of their own.
+        assert allowed[path] - {"constraint", "plan_constraint"} <= written.union(
+            *(keys for place, keys in used if place == path)
+        ), path
     integrators = set().union(*(kind.model_fields for kind in INTEGRATOR_KEYS.values()))
     assert integrators <= set(re.findall(r"\w+", sections["integrator"]))
     kept = tomllib.loads(references)

@@ -85,7 +85,7 @@ def idle_joints(layout: Layout, scene: Scene) -> Mask:
     A joint at rest that no force acts on in any configuration, and that costs nothing where it is, stays; so do its
     group and what is left out with it. Noise in proportion to controls does nothing to controls that are zero.
     """
-    if scene.constraints:
+    if scene.constraints or layout.spec.plan_constraints:
         return np.zeros(scene.robot.dof, dtype=np.bool_)
     touched = layout.v0 != 0.0
     touched |= _pushed(layout, scene)

@@ -13,7 +13,7 @@ import numpy as np
 
 from varpin.control import OptimalControlProblem, Solution, solve
 from varpin.control.costs import CostError
-from varpin.errors import InputError
+from varpin.errors import InputError, VarpinError
 from varpin.io.scenefile.layout import Layout, holding_controls, lay_out
 from varpin.io.scenefile.references import Timeline
 from varpin.io.scenefile.required import Required, idle_joints, requirements
@@ -81,6 +81,12 @@ class SceneFile:
         if not spec.costs:
             raise spec.root.error("cost", "is missing; a scene to solve has a [[cost]] at least")
         most = layout.control_limit
+        constraints = []
+        for own in spec.plan_constraints:
+            try:
+                constraints.append(own.kind.make(scene.robot, own.given))
+            except VarpinError as error:
+                raise own.table.error("", str(error)) from None
         try:
             return OptimalControlProblem(
                 scene,
@@ -94,6 +100,7 @@ class SceneFile:
                 hold=spec.hold,
                 control_limits=(-most, most),
                 controls=spec.shape,  # type: ignore[arg-type]
+                constraints=constraints,
             )
         except (InputError, CostError) as error:
             raise spec.root.error("cost", str(error)) from None
@@ -151,6 +158,8 @@ class SceneFile:
 
     def _pays_apart(self) -> bool:
         """Whether what planning apart saves in linear algebra is more than what it takes to set the parts up."""
+        if self.spec.plan_constraints:
+            return False
         parts = self.required.parts
         saved = self.robot.dof**3 - sum(len(part) ** 3 for part in parts)
         return len(parts) > 1 and self.spec.steps * saved > _SETUP * len(parts)

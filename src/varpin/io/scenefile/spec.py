@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from varpin.errors import FileError, InputError
 from varpin.integrators import Integrator
+from varpin.io.scenefile.plan_constraints import Kind
 from varpin.io.scenefile.references import Reference
 from varpin.io.scenefile.table import ByName, SceneFileError, Table, suggestion
 from varpin.io.scenefile.terms import Term
@@ -112,6 +113,21 @@ class ConstraintSpec:
 
 
 @dataclass(frozen=True, eq=False)
+class PlanConstraintSpec:
+    """A hard constraint of the plan.
+
+    Attributes:
+        kind: What its type in the file means.
+        given: Its keys.
+        table: Where it stands, for messages.
+    """
+
+    kind: Kind
+    given: Mapping[str, Any]
+    table: Table
+
+
+@dataclass(frozen=True, eq=False)
 class CostSpec:
     """A term of the cost.
 
@@ -157,6 +173,7 @@ class SceneSpec:
         forces: Others on joints.
         frame_forces: Others on frames.
         constraints: What the motion keeps.
+        plan_constraints: What the plan keeps; where there are some, no joint is left out.
         actuated: Joints that are driven; None for all.
         gear: Generalized force per control, by driven joint.
         torque_limit: By driven joint [N m or N]; ``"robot"`` for the robot description's; None for none.
@@ -188,6 +205,7 @@ class SceneSpec:
     forces: tuple[ForceSpec, ...]
     frame_forces: tuple[FrameForceSpec, ...]
     constraints: tuple[ConstraintSpec, ...]
+    plan_constraints: tuple[PlanConstraintSpec, ...]
     actuated: tuple[str, ...] | None
     gear: ByName
     torque_limit: ByName | str | None

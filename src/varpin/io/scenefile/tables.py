@@ -31,6 +31,7 @@ from varpin.io.scenefile.keys import (
     whole,
     word,
 )
+from varpin.io.scenefile.plan_constraints import PLAN_CONSTRAINTS, Kind
 from varpin.io.scenefile.references import Reference, Sine
 from varpin.io.scenefile.spec import (
     CONSTRAINTS,
@@ -43,6 +44,7 @@ from varpin.io.scenefile.spec import (
     CostSpec,
     ForceSpec,
     FrameForceSpec,
+    PlanConstraintSpec,
     SceneSpec,
     word_of,
 )
@@ -428,6 +430,12 @@ def _cost_keys(name: str, term: Term) -> type[Keys]:
     return create_model(name, __base__=TypedKeys, **keys)
 
 
+# [[plan_constraint]]
+def _plan_constraint_keys(name: str, kind: Kind) -> type[Keys]:
+    own: dict[str, Any] = {key: (Annotated[Any, rule], default) for key, (rule, default) in kind.rules.items()}
+    return create_model(name, __base__=TypedKeys, **own)
+
+
 FORCE_KEYS = {name: _force_keys(kind) for name, kind in FORCES.items()} | {
     name: _keys_of_fields(kind, _OF_FRAMES) for name, kind in FRAME_FORCES.items()
 }
@@ -435,6 +443,7 @@ CONSTRAINT_KEYS = {
     name: _keys_of_fields(kind, _OF_CONSTRAINTS | (dict.fromkeys("ab", TEXT) if kind is FrameOnFrame else {}))
     for name, kind in CONSTRAINTS.items()
 }
+PLAN_CONSTRAINT_KEYS = {name: _plan_constraint_keys(name, kind) for name, kind in PLAN_CONSTRAINTS.items()}
 INTEGRATOR_KEYS = {name: _integrator_keys(kind) for name, kind in INTEGRATORS.items()}
 COST_KEYS = {name: _cost_keys(name, term) for name, term in TERMS.items()}
 
@@ -452,6 +461,7 @@ class SceneKeys(Keys):
     springs: SpringKeys = SpringKeys()
     force: tuple[Annotated[Any, typed(FORCE_KEYS)], ...] = ()
     constraint: tuple[Annotated[Any, typed(CONSTRAINT_KEYS)], ...] = ()
+    plan_constraint: tuple[Annotated[Any, typed(PLAN_CONSTRAINT_KEYS)], ...] = ()
     actuation: ActuationKeys = ActuationKeys()
     noise: tuple[NoiseKeys, ...] = ()
     initial: InitialKeys = InitialKeys()
@@ -494,6 +504,10 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
         constraints=tuple(
             _constraint(root.table(f"constraint[{k}]"), entry) for k, entry in enumerate(keys.constraint)
         ),
+        plan_constraints=tuple(
+            PlanConstraintSpec(PLAN_CONSTRAINTS[entry.type], _all(entry), root.table(f"plan_constraint[{k}]"))
+            for k, entry in enumerate(keys.plan_constraint)
+        ),
         actuated=keys.actuation.joints,
         gear=keys.actuation.gear,
         torque_limit=keys.actuation.torque_limit,
@@ -517,6 +531,11 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
 def _given(keys: Keys) -> dict[str, Any]:
     """The keys that a table has, its type apart."""
     return {name: getattr(keys, name) for name in keys.model_fields_set if name != "type"}
+
+
+def _all(keys: Keys) -> dict[str, Any]:
+    """All keys of a table, its type apart, with what they are where they are left out."""
+    return {name: getattr(keys, name) for name in type(keys).model_fields if name != "type"}
 
 
 def _force(table: Table, keys: TypedKeys) -> ForceSpec | FrameForceSpec:
