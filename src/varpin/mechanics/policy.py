@@ -222,16 +222,16 @@ class LinearPolicy(Frozen):
         object.__setattr__(self, "linear", bool(linear))
         if linear and start is None:
             raise InputError("controls that are linear between nodes begin at one: give before, that of the first node")
-        own: Floats | None = None
+        changes: Floats | None = None
         expected: Floats | None = None
         if previous_gains is not None:
-            own = finite_array("previous_gains", previous_gains, (steps, m, m))
+            changes = finite_array("previous_gains", previous_gains, (steps, m, m))
             expected = np.vstack([self.u[:1] if start is None else start[None], self.u[:-1]])[:steps]
             if previous is not None:
                 expected = finite_array("previous", previous, (steps, m))
         elif previous is not None:
             raise InputError("previous is what previous_gains expect: give them too")
-        for name, array in {"previous_gains": own, "previous": expected, "before": start}.items():
+        for name, array in {"previous_gains": changes, "previous": expected, "before": start}.items():
             if array is not None:
                 array.setflags(write=False)
             object.__setattr__(self, name, array)
