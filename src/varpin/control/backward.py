@@ -393,6 +393,7 @@ class Along:
         self.kept: tuple[Linearization, Floats] | None = None
         # What is added to the cost's gradient at its samples (N s, 2n + m): of the noise, where it is differentiated.
         self.added: Floats | float = 0.0
+        self.noise_differentiated = False
 
     @cached_property
     def running(self) -> Expansion:
@@ -403,12 +404,12 @@ class Along:
                 raise CostError(repr(problem.cost), f"its {name} along the motion is not finite")
         return found
 
-    def differentiate_noise(self, plan: Plan) -> None:
-        """Let passes from here on have the whole gradient of what noise adds under the gains of ``plan``."""
+    def differentiate_noise(self, plan: Plan, processes: NDArray[np.bool_]) -> None:
+        """Give passes from here on the whole gradient of what ``processes`` (k,) add under the plan's gains."""
         problem, N = self.problem, self.problem.steps
         lin, velocity = self.linearized(0, N)
         feedback = Feedback(plan.feedback, plan.previous)
-        pull = noise_gradient(problem, self.trajectory, feedback, self.rate)
+        pull = noise_gradient(problem, self.trajectory, feedback, self.rate, processes)
         # A gradient in (x, u) is one in (q, v, u) at the step's first sample.
         rule, x, m = problem.model_rule, 2 * problem.scene.robot.dof, problem.scene.controls
         D = np.zeros((N, x + m, x + m))
@@ -416,7 +417,7 @@ class Along:
         D[:, x:, x:] = np.eye(m)
         added = np.zeros((N, len(rule), x + m))
         added[:, 0] = np.linalg.solve(np.swapaxes(D, 1, 2), pull[:, :, None])[:, :, 0] / (problem.dt * rule[0, 0])
-        self.added = added.reshape(-1, x + m)
+        self.added, self.noise_differentiated = added.reshape(-1, x + m), True
 
     @property
     def slopes(self) -> Floats:

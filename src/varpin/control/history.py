@@ -101,6 +101,7 @@ class SearchState:
         growth: Of the regularization.
         bounded: Whether the line search gives up trials whose steps are cut into many parts.
         cut: Whether it has given up one.
+        whole: Whether the search has come to the whole gradient of what noise adds.
         history: Of the iterations before.
     """
 
@@ -117,6 +118,7 @@ class SearchState:
     bounded: bool
     cut: bool
     history: tuple[Iteration, ...]
+    whole: bool = False
 
     def __repr__(self) -> str:
         return f"SearchState(cost {self.cost:.6g}, after {len(self.history)} iterations)"

@@ -43,7 +43,13 @@ class _Steps:
     kicked: Floats  # (N, 2n, 2n) of the part that is sampled after the kick, in the state there
 
 
-def noise_gradient(problem: OptimalControlProblem, trajectory: Trajectory, feedback: Feedback, rate: Floats) -> Floats:
+def noise_gradient(
+    problem: OptimalControlProblem,
+    trajectory: Trajectory,
+    feedback: Feedback,
+    rate: Floats,
+    processes: NDArray[np.bool_],
+) -> Floats:
     """The gradient (N, 2n + m) of what noise adds, in the state and the control that each step begins with.
 
     Without what a backward pass has of it: the part through the strength of the noise alone.
@@ -53,9 +59,10 @@ def noise_gradient(problem: OptimalControlProblem, trajectory: Trajectory, feedb
         trajectory: The motion.
         feedback: Of a backward pass along it.
         rate: Hessian (R, m, m) of what changes of controls cost, or (0, m, m).
+        processes: Which count (k,).
     """
     n, m, N = problem.scene.robot.dof, problem.scene.controls, problem.steps
-    here = _steps_of(problem, trajectory)
+    here = _steps_of(problem, trajectory, processes)
     W = _values(problem, here, feedback, _end_hessian(problem, trajectory), rate)
     C = _covariances(problem, here, feedback)
     variational = problem.integrator.variational
@@ -77,9 +84,8 @@ def noise_gradient(problem: OptimalControlProblem, trajectory: Trajectory, feedb
                 dx, du = np.zeros((N + 1, 2 * n)), np.zeros((N, m))
                 dx[:-1][own], du[own] = moved[: 2 * n], moved[2 * n :]
                 dx[1:][own] = here.J[own] @ moved
-                shares[own] = _shares(
-                    problem, _steps_of(problem, _moved(trajectory, dx, du, slopes, variational)), W, C
-                )[own]
+                near = _steps_of(problem, _moved(trajectory, dx, du, slopes, variational), processes)
+                shares[own] = _shares(problem, near, W, C)[own]
             change.append(shares)
         found[:, c] = (change[0] - change[1]) / (2.0 * shift[c])
     # The end's own Hessian depends on where it is, too.
@@ -119,7 +125,7 @@ def _moved(trajectory: Trajectory, dx: Floats, du: Floats, slopes: Floats, varia
     return replace(trajectory, q=q, p=trajectory.p + dx[:, n:], v=v, u=trajectory.u + du)
 
 
-def _steps_of(problem: OptimalControlProblem, trajectory: Trajectory) -> _Steps:
+def _steps_of(problem: OptimalControlProblem, trajectory: Trajectory, processes: NDArray[np.bool_]) -> _Steps:
     scene, n, m, N = problem.scene, problem.scene.robot.dof, problem.scene.controls, problem.steps
     x, h, rule, samples = 2 * n, problem.dt, problem.rule, len(problem.rule)
     lin = linearize_steps(scene, trajectory, problem.integrator, problem.q0)
@@ -142,7 +148,8 @@ def _steps_of(problem: OptimalControlProblem, trajectory: Trajectory) -> _Steps:
         cost += weight * np.swapaxes(whole, 1, 2) @ H @ whole
         if nothing[s, 1:].any():
             kicked += weight * np.swapaxes(P, 1, 2) @ H[:, :x, :x] @ P
-    return _Steps(J, lin.G, np.concatenate([lin.Gx, lin.Gu], axis=3), cost, kicked)
+    gz = np.concatenate([lin.Gx, lin.Gu], axis=3)[:, :, processes]
+    return _Steps(J, lin.G[:, :, processes], gz, cost, kicked)
 
 
 def _hessian(problem: OptimalControlProblem, steps: _Steps, W: Floats, k: int | slice) -> Floats:

@@ -95,6 +95,7 @@ def solve(
     progress: Progress | None = None,
     check: bool = True,
     true_cost: float | None = None,
+    noise: Literal["whole", "held"] = "whole",
 ) -> Solution:
     """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
 
@@ -154,6 +155,10 @@ def solve(
             of the plan, ``Solution.refinement`` what it took, or why the wish cannot be met, which is a warning, too.
             Controls that are held over several steps keep their period. ``max_iterations`` is for each step,
             ``time_limit`` for all; Ctrl-C keeps the best plan so far.
+        noise: Which gradient what noise adds has, where its strength depends on the state or the control. ``"whole"``:
+            where the search with ``"held"`` ends, it goes on to the minimum of the expected cost. ``"held"``: without
+            the part through the derivatives of the motion, as in the paper; that has no minimum to end at, and under
+            strong noise can go round in a cycle. With ``second_order`` and within control limits it is held.
 
     Returns:
         The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers, and
@@ -174,6 +179,8 @@ def solve(
         raise InputError(f"backtracking must be in (0, 1), got {backtracking}")
     if not real("regularization", regularization) >= 0.0:
         raise InputError(f"regularization must be >= 0, got {regularization}")
+    if not is_one_of(noise, ("whole", "held")):
+        raise InputError(f"noise must be 'whole' or 'held', got {noise!r}")
     if callback is not None and not callable(callback):
         raise InputError(f"callback must be a function of one Iteration, got {callback!r}")
     if progress is not None and not callable(progress):
@@ -211,12 +218,13 @@ def solve(
                 callback=callback,
                 progress=progress,
                 check=False,
+                noise=noise,
             )
 
         refined = refine(problem, once, positive("true_cost", true_cost, "1"), lambda: deadline - time.perf_counter())
         return looked_at(refined)[0] if check else refined
 
-    search = _Search(problem, second_order, forward, armijo, backtracking, regularization)
+    search = _Search(problem, second_order, forward, armijo, backtracking, regularization, whole_noise=noise == "whole")
     if resume is None:
         search.begin(_first_commands(problem, controls))
     else:
@@ -429,6 +437,7 @@ class _Search:
         regularization: float = 0.0,
         *,
         anew: bool = True,
+        whole_noise: bool = False,
     ) -> None:
         self.problem, self.second_order, self.forward = problem, second_order, forward
         self.armijo, self.backtracking, self.regularization = armijo, backtracking, regularization
@@ -454,6 +463,10 @@ class _Search:
         self.anew = anew  # whether a plan is made for the last motion, too
         self.followed = 0.0  # the length of the last step, if none was
         self.steered = _steered(problem)
+        # Whether the whole gradient of what noise adds is to be followed in the end, and whether it is. Within limits
+        # what it adds jumps where a control meets one and loses its gains: there is no gradient to follow.
+        self.wants_whole = whole_noise and not (second_order or problem.limited) and bool(self.steered.any())
+        self.whole = False
         # Before each line of the log, where searches of several problems and of a controller's ticks may stand.
         robot, begin = problem.scene.robot.name, problem.t0
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {begin:g} s"
@@ -483,6 +496,7 @@ class _Search:
         self.best, self.best_cost, self.best_noise = state.best, state.best_cost, state.best_noise
         self.regularization, self.growth = state.regularization, state.growth
         self.bounded, self.cut = state.bounded, state.cut
+        self.whole = state.whole and self.wants_whole
 
     def _state(self) -> SearchState:
         return SearchState(
@@ -499,6 +513,7 @@ class _Search:
             bounded=self.bounded,
             cut=self.cut,
             history=tuple(self.history),
+            whole=self.whole,
         )
 
     def run(self, tolerance: float, max_iterations: int, deadline: float, report: Callback) -> Status:
@@ -520,7 +535,11 @@ class _Search:
             self._compare_with_best(self.plan)
             if not self.history:
                 self.first = self._at_first()
-            if self._is_there(self.plan, tolerance):
+            there = self._is_there(self.plan, tolerance)
+            if self._turns_whole(there=there):
+                self._take_whole()
+                continue
+            if there:
                 self._note(report, started, passes)
                 self.reason = self._numbers(tolerance)
                 return Status.CONVERGED
@@ -561,6 +580,31 @@ class _Search:
             return self.cost
         stake = self.along.stake
         return stake.free if np.isfinite(stake.free) else stake.moved
+
+    def _turns_whole(self, *, there: bool) -> bool:
+        """Whether the search with held noise is as far as it gets, and goes on with the whole gradient."""
+        if not self.wants_whole or self.whole:
+            return False
+        return there or (len(self.gains) > 1 and self.gains[-1] <= 0.0)
+
+    def _take_whole(self) -> None:
+        """Follow the whole gradient of what noise adds from here on, from the best motion so far."""
+        logger.info("%s: from here on with the whole gradient of what noise adds", self.label)
+        if self.best is not None and self.best is not self.trajectory:
+            self.trajectory, self.cost = self.best, self.best_cost
+            self.shares = self.problem.shares(self.best)
+        # What noise adds is rated otherwise from here on.
+        self.whole, self.best, self.best_cost, self.best_noise, self.above = True, None, np.inf, np.inf, 0.0
+        self.gains, self._around = [], None
+
+    def _differentiate_noise(self, regularization: float) -> int:
+        """Give passes along the motion the whole gradient of what noise adds; how many passes that took."""
+        if not self.whole or self.along.noise_differentiated:
+            return 0
+        plan = backward(self.problem, self.trajectory, regularization, along=self.along)
+        if plan is not None:
+            self.along.differentiate_noise(plan, self.steered)
+        return 1
 
     def _compare_with_best(self, plan: Plan) -> None:
         noise = self._noise(plan)
@@ -697,7 +741,7 @@ class _Search:
         passes = 0
         self.exact = self.second_order if exact is None else exact
         while True:
-            passes += 1
+            passes += 1 + self._differentiate_noise(self.regularization)
             self.plan = backward(self.problem, self.trajectory, self.regularization, self.exact, along=self.along)
             if self.plan is not None:
                 self.planned = self.trajectory, self.regularization, self.exact
@@ -710,6 +754,7 @@ class _Search:
     def _least_regularized(self) -> tuple[Plan | None, float]:
         """The plan at the motion with as little regularization as leaves a minimum, and how much that is."""
         for regularization in (0.0, *10.0 ** np.arange(-6, 11, 2)):
+            self._differentiate_noise(float(regularization))
             for exact in (True, False) if self.second_order and regularization == 0.0 else (False,):
                 plan = backward(self.problem, self.trajectory, float(regularization), exact, along=self.along)
                 if plan is not None:
@@ -791,13 +836,22 @@ class _Search:
                 return _Trial(cut=few or attempt.verdict is Watch.Verdict.cut)
             there = attempt.shares()
             noise = noise_shares(problem, attempt.trajectory(), plan) if problem.scene.processes else added
+            more = self._noise_beyond(attempt.trajectory(), plan) if self.whole else 0.0
         except _LOST as error:
             logger.info("%s: trial of length %g: %s", self.label, step, error)
             return _Trial()
         if not np.isfinite(there).all():
             return _Trial()
         cost = float((there - self.shares).sum())
-        return _Trial(attempt, there, cost, cost + float((noise - added).sum()))
+        return _Trial(attempt, there, cost, cost + float((noise - added).sum()) + more)
+
+    def _noise_beyond(self, trial: Trajectory, plan: Plan) -> float:
+        """What noise adds along a trial beyond what it adds where it acts and costs as along the motion so far."""
+        found = backward(self.problem, trial, self.regularization)
+        if found is None:
+            return np.inf
+        own, held = (noise_shares(self.problem, trial, each, self.steered).sum() for each in (found, plan))
+        return float(own - held)
 
     def _feedback(self, plan: Plan) -> Commands:
         """The commands of trials, but for the feed-forward part that theirs is on top of."""

@@ -49,6 +49,7 @@ class _Search:
     bounded: int
     cut: int
     history: int
+    whole: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +107,7 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
     if state is not None:
         numbers: dict[str, Any] = {name: getattr(state, name) for name in _NUMBERS}
         numbers |= {"bounded": int(state.bounded), "cut": int(state.cut), "history": len(state.history)}
+        numbers["whole"] = int(state.whole)
         search = _Search(prefixes[id(state.trajectory)], gains=np.array(state.gains), **numbers)
         best = None if state.best is None else _Best(prefixes[id(state.best)])
     own = ("search", "best", "refined", "refinement")
@@ -200,6 +202,7 @@ def _search(
         history=history[: state.history],
         bounded=bool(state.bounded),
         cut=bool(state.cut),
+        whole=bool(state.whole),
         **{name: getattr(state, name) for name in _NUMBERS},
     )
 

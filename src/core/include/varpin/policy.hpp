@@ -58,8 +58,8 @@ inline void apply_policy(const Commands& commands, std::ptrdiff_t path, std::ptr
     }
 }
 
-// The controls (stages, m) at the stages of step s of a path, whose rows of u the policy has been applied to; null where
-// they are held over it. Those of a line go into `line`.
+// The controls (stages, m) at the stages of step s of a path, whose rows of u the policy has been applied to; null
+// where they are held over it. Those of a line go into `line`.
 inline const double* stage_controls(const Commands& commands, std::ptrdiff_t path, std::ptrdiff_t s, int stages,
                                     const double* u, std::vector<double>& line) {
     const int m = commands.controls;

@@ -1,0 +1,94 @@
+"""The gradient of what noise adds to the cost of a motion, and plans that follow it."""
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin.control.backward import Along, backward
+
+CONTROL, STATE = vp.ControlNoise(0.3), vp.StateNoise(3.0, center=np.zeros(2))
+
+
+def reach(noise: object, *, steps: int = 6, dt: float = 0.08, rate: float = 0.0, **options: object):
+    cost = vp.ControlCost(0.05) + vp.VelocityCost(0.1)
+    cost += vp.Terminal(vp.TrackingCost([0.5, -0.5], 20.0) + vp.VelocityCost(5.0))
+    if rate:
+        cost += vp.ControlRateCost(rate)
+    scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=noise)
+    return vp.OptimalControlProblem(scene, cost, [0.2, 0.2], [0.0, 0.0], dt=dt, steps=steps, **options)
+
+
+@pytest.mark.parametrize(
+    ("noise", "options"),
+    [
+        (CONTROL, {"integrator": vp.Gauss(2)}),
+        (CONTROL, {"integrator": vp.Midpoint(), "sampling": "midpoint"}),
+        (CONTROL, {"integrator": vp.RungeKutta4()}),
+        (CONTROL, {"integrator": vp.Gauss(2), "hold": 2}),
+        (CONTROL, {"integrator": vp.Gauss(2), "hold": 3, "rate": 1e-2, "sampling": "start"}),
+        (STATE, {"integrator": vp.Gauss(2)}),
+        (STATE, {"integrator": vp.Gauss(2, kick="split")}),
+        (STATE, {"integrator": vp.RungeKutta4()}),
+        (vp.AdditiveNoise(0.5), {"integrator": vp.Gauss(2)}),
+    ],
+)
+def test_it_is_that_of_the_expected_cost(noise: object, options: dict) -> None:
+    """By differences of the cost and the noise's share, each with a backward pass of its own."""
+    problem = reach(noise, **options)
+    u = 2.0 * np.random.default_rng(0).normal(size=(problem.decisions, 2))
+
+    def made(controls: np.ndarray):
+        motion = problem.simulate(np.repeat(controls, problem.hold, axis=0))
+        plan = backward(problem, motion, 0.0)
+        return problem.cost_of(motion) + plan.noise, motion, plan
+
+    _, motion, plan = made(u)
+    along = Along(problem, motion)
+    along.differentiate_noise(plan, np.ones(problem.scene.processes, dtype=bool))
+    whole, step, found = backward(problem, motion, 0.0, along=along).gradient, 1e-4, np.empty_like(u)
+    for index in np.ndindex(u.shape):
+        away = np.zeros_like(u)
+        away[index] = step
+        near, far = (made(u + k * away)[0] - made(u - k * away)[0] for k in (1, 2))
+        found[index] = (8.0 * near - far) / (12.0 * step)
+    np.testing.assert_allclose(whole, found, atol=2e-8 * np.abs(found).max())
+    assert np.abs(plan.gradient - found).max() > 1e-3 * np.abs(found).max()
+
+
+@pytest.mark.parametrize("noise", [CONTROL, STATE])
+def test_plans_end_at_the_minimum_of_the_expected_cost(noise: object) -> None:
+    problem = reach(noise, steps=12, dt=0.05, integrator=vp.Gauss(2))
+    held, whole = (vp.solve(problem, noise=mode, tolerance=1e-11, check=False) for mode in ("held", "whole"))
+    assert held.status.converged
+    assert whole.status.converged
+    assert whole.expected_cost < (1.0 - 1e-5) * held.expected_cost
+    # No controls nearby are expected to cost less.
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        u = whole.controls + 1e-2 * rng.normal(size=whole.controls.shape)
+        motion = problem.simulate(u)
+        assert problem.cost_of(motion) + backward(problem, motion, 0.0).noise > whole.expected_cost
+    start = np.abs(vp.solve(problem, max_iterations=0, check=False).gradient).max()
+    assert np.abs(whole.gradient).max() < 1e-4 * start
+
+
+def test_the_prediction_is_that_of_paths_where_noise_is_small() -> None:
+    plan = vp.solve(reach(vp.ControlNoise(0.03), steps=12, dt=0.05, integrator=vp.Gauss(2)), check=False)
+    found = plan.monte_carlo(4000, rng=0)
+    assert abs(found.cost - plan.expected_cost) < 4.0 * found.standard_error + 1e-3 * plan.cost
+    assert plan.noise_cost > 2.0 * found.standard_error
+
+
+def test_where_it_stays_held() -> None:
+    """Within limits, and for noise of constant strength beside another."""
+    limited = reach(CONTROL, integrator=vp.Gauss(2), control_limits=(-5.0, 5.0))
+    held, whole = (vp.solve(limited, noise=mode, check=False) for mode in ("held", "whole"))
+    np.testing.assert_array_equal(held.controls, whole.controls)
+    both = vp.solve(reach(CONTROL + vp.AdditiveNoise(5.0), integrator=vp.Gauss(2)), tolerance=1e-11, check=False)
+    one = vp.solve(reach(CONTROL, integrator=vp.Gauss(2)), tolerance=1e-11, check=False)
+    np.testing.assert_allclose(both.controls, one.controls, atol=1e-4)
+
+
+def test_a_wrong_choice() -> None:
+    with pytest.raises(vp.InputError, match="noise must be 'whole' or 'held'"):
+        vp.solve(reach(CONTROL), noise="some")
