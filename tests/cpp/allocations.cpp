@@ -160,7 +160,7 @@ bool allocates_nothing(const varpin::Mechanism& mechanism) {
     using varpin::Subject;
     const varpin::CostTerms costs{.dof = n,
                                   .controls = n,
-                                  .frames = {{links, tip}, {.links = links, .own = {}, .center = true}},
+                                  .frames = {{links, tip}, {.links = links, .offset = {}, .center = true}},
                                   .terms = {{Subject::entries, 3, 0, three, {0.0, 0.0, 0.0}},
                                             {Subject::excess, 3, n, three, {0.1, 0.1, 0.1, 0.2, 0.2, 0.2}},
                                             {Subject::position, 3, 0, three, {0.0, 0.0, 0.0}},
