@@ -564,19 +564,16 @@ def test_integrators_that_keep_no_constraints_refuse_them(integrator):
 def test_what_knows_no_constraints_refuses_them():
     scene, q, v = loop("four-bar")
     motion = vp.simulate(scene, q, v, dt=1e-2, steps=3)
-    cost = vp.ControlCost(1.0)
+    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0), q, v, dt=1e-2, steps=3)
     tries = [
         lambda: vp.second_order(scene, motion, np.ones(6)),
-        lambda: vp.simulate_ensemble(scene, q, v, dt=1e-2, steps=2, paths=3, rng=0),
-        lambda: vp.OptimalControlProblem(scene, cost, q, v, dt=1e-2, steps=3),
-        lambda: vp.Plant(scene),
+        lambda: vp.solve(problem, second_order=True),
+        lambda: vp.optimal_control_tradeoff(problem),
         lambda: vp.work_precision(scene, q, v, duration=0.1),
         lambda: vp.advise(scene, q, v, duration=0.1),
         lambda: vp.check_linearization(scene, q, v, dt=1e-2),
         lambda: vp.discrete_lagrangian(scene, q, q, 1e-2),
         lambda: vp.simulate(scene, q, v, duration=0.1, tolerance=1e-3),
-        lambda: scene.holding_torque(q),
-        lambda: scene.holding_controls(q),
     ]
     for attempt in tries:
         with pytest.raises(vp.InputError, match="does not take scenes with constraints"):
@@ -690,6 +687,13 @@ def test_scene_files_have_constraints(tmp_path):
     np.testing.assert_allclose(
         motion.q, vp.simulate(scene, q, np.zeros(6), dt=2e-3, steps=10, integrator=vp.Gauss(2)).q
     )
+    goal = (q + 0.05).tolist()
+    cost = '[[cost]]\ntype = "control"\nweight = 0.01\n'
+    cost += f'[[cost]]\ntype = "tracking"\nterminal = true\nweight = 10.0\n[cost.reference]\noffset = {goal}\n'
+    path.write_text(path.read_text() + cost)
+    plan = vp.load_scene(path).solve(tolerance=1e-4)
+    assert plan.status.converged
+    assert np.abs(scene.core.constraints(plan.trajectory.q)[0]).max() < 1e-12
     for change, words in (
         (("tool0", "tol0"), r"constraint\[0\].*no frame 'tol0'"),
         (("length = 0.7", "length = -1"), r"constraint\[2\].length"),

@@ -5,6 +5,7 @@ Equation (O1) of docs/mathematics.md.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -27,14 +28,18 @@ from varpin.errors import InputError
 from varpin.integrators import Gauss, Integrator
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy, OpenLoop
-from varpin.mechanics.scene import Scene, closest_controls, refuse_constraints, require_scene
-from varpin.simulation.run import simulate
+from varpin.mechanics.scene import Scene, closest_controls, require_scene, tangent_basis
+from varpin.simulation.run import on_constraints, simulate
+from varpin.simulation.soundness import announce
 from varpin.support.checks import JointValues, count, is_one_of, joint_array, named_limits, positive, real
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
 from varpin.trajectory import Trajectory, require_motion
 
 Floats = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
 Sampling = Literal["midpoint", "gauss", "start"]
 
 
@@ -65,7 +70,8 @@ class OptimalControlProblem(Frozen):
     Attributes:
         scene: The scene, its noise included.
         cost: Running and terminal costs.
-        q0: Initial configuration (n,) [rad or m]; it may be given by joint name.
+        q0: Initial configuration (n,) [rad or m]; it may be given by joint name. Where the scene has constraints, a
+            small miss is corrected, as :func:`varpin.simulate` does.
         v0: Initial velocity (n,) [rad/s or m/s]; the same.
         dt: Time step [s].
         steps: N.
@@ -123,9 +129,9 @@ class OptimalControlProblem(Frozen):
             InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
                 reference that does not fit the problem's grid, or limits that leave a control nothing.
             CostError: A reference that is a function fails.
+            AssemblyError: The scene's constraints cannot be kept next to q0.
         """
         n, m = require_scene(scene).robot.dof, scene.controls
-        refuse_constraints(scene, "OptimalControlProblem")
         if not isinstance(cost, Cost):
             raise InputError(f"cost must be a cost, for example varpin.TrackingCost(...), got {type(cost).__name__}")
         dt, steps, hold = positive("dt", dt, "s"), count("steps", steps, least=1), count("hold", hold, least=1)
@@ -144,11 +150,15 @@ class OptimalControlProblem(Frozen):
             t0 + times, dt * steps, steps, n, m, t0, scene.robot.joint_names, scene.control_joints, scene.robot
         )
         running, terminal = bind_cost(cost, t0 + times, points)
+        at, rate = joint_array("q0", q0, scene.robot.joint_names), joint_array("v0", v0, scene.robot.joint_names)
+        if scene.constraints:
+            at, rate, moved = on_constraints(scene, at, rate)
+            announce(logger, scene, dt, moved)
         values = {
             "scene": scene,
             "cost": cost,
-            "q0": joint_array("q0", q0, scene.robot.joint_names),
-            "v0": joint_array("v0", v0, scene.robot.joint_names),
+            "q0": at,
+            "v0": rate,
             "dt": dt,
             "steps": steps,
             "integrator": default_integrator() if integrator is None else integrator,
@@ -250,7 +260,11 @@ class OptimalControlProblem(Frozen):
         for name, given in (("q0", q0), ("v0", v0)):
             if given is not None:
                 own[name] = joint_array(name, given, names)
-                own[name].setflags(write=False)
+        if own and scene.constraints:
+            at = {"q0": self.q0, "v0": self.v0, **own}
+            own["q0"], own["v0"], _ = on_constraints(scene, at["q0"], at["v0"])
+        for array in own.values():
+            array.setflags(write=False)
         if before is not None:
             own["cost"] = with_control_before(self.cost, before)
             own["rate"] = control_rate(own["cost"], scene.controls, scene.control_joints)
@@ -303,12 +317,16 @@ class OptimalControlProblem(Frozen):
         """
         n, m, R = self.scene.robot.dof, self.scene.controls, self.decisions
         jet = lagrangian_jet(self.scene, self.q0, np.zeros(n))
-        rates = np.abs(np.linalg.eigvals(np.linalg.solve(jet.Lvv, jet.Lqq)))
-        omega = 2.0 * float(np.sqrt(rates.max())) + 1.0 / self.duration
+        along = tangent_basis(self.scene, self.q0)
+        inertia, bend = (along.T @ x @ along for x in (jet.Lvv, self._static_curvature(jet.Lqq)))
+        rates = np.abs(np.linalg.eigvals(np.linalg.solve(inertia, bend)))
+        omega = 2.0 * float(np.sqrt(rates.max(initial=0.0))) + 1.0 / self.duration
         gains = np.zeros((R, m, 2 * n))
-        if np.linalg.matrix_rank(self.scene.actuation) == n and omega * self.dt * self.hold <= 0.25:
+        driven = along.T @ self.scene.actuation
+        if np.linalg.matrix_rank(driven) == len(driven) and omega * self.dt * self.hold <= 0.25:
             in_v = np.eye(n) if self.integrator.variational else jet.Lvv
-            gains[:] = -np.linalg.pinv(self.scene.actuation) @ np.hstack([omega**2 * jet.Lvv, 2.0 * omega * in_v])
+            wanted = np.hstack([omega**2 * jet.Lvv, 2.0 * omega * in_v])
+            gains[:] = -np.linalg.pinv(driven) @ (along.T @ wanted)
         u = np.tile(self.holding_controls(), (R, 1))
         return LinearPolicy(
             u,
@@ -321,6 +339,17 @@ class OptimalControlProblem(Frozen):
             joints=self.scene.control_joints,
             servos=self.scene.servo_joints,
         )
+
+    def _static_curvature(self, Lqq: Floats) -> Floats:
+        """L_qq - y . g_qq, y the constraints' forces where the robot is held at q0 at rest."""
+        if not self.scene.constraints:
+            return Lqq
+        scene, q = self.scene, self.q0
+        (C,) = scene.core.constraints(q[None])[2]
+        left = scene.actuation @ self.holding_controls() - scene.static_pull(q)
+        y = np.linalg.lstsq(C.T, left, rcond=1e-9)[0]
+        curvature: Floats = Lqq - scene.core.constraint_curvature(q, y, np.zeros(q.size))[0]
+        return curvature
 
     def samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
         """Where running costs are taken, the s samples of a step one after another.

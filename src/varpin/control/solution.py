@@ -17,7 +17,7 @@ from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution_file import read, write
-from varpin.control.verification import Verification, verify
+from varpin.control.verification import Verification, accurate, verify
 from varpin.errors import InputError
 from varpin.linearization import velocity_at_nodes
 from varpin.mechanics.policy import LinearPolicy
@@ -286,6 +286,8 @@ class Solution(Frozen):
     ) -> Verification:
         """Replay the plan through an accurate integration of the continuous system: classical Runge-Kutta, Simpson.
 
+        Under constraints it is ``Gauss(3)``, of order 6, which keeps them.
+
         Main args:
             tolerance: On the relative change of the cost when the substeps are doubled.
             max_substeps: Of one step of the plan; where they do not reach the tolerance, ``accuracy`` says so.
@@ -295,11 +297,12 @@ class Solution(Frozen):
         """
         positive("tolerance", tolerance, "1")
         count("max_substeps", max_substeps, least=2)
+        x: Literal["momentum", "velocity"] = "momentum" if accurate(self.problem).variational else "velocity"
         return verify(
             self.problem,
             self.trajectory,
             self.cost,
-            lambda substeps: self.policy_on("velocity", substeps),
+            lambda substeps: self.policy_on(x, substeps),
             status=self.status,
             tolerance=tolerance,
             max_substeps=max_substeps,

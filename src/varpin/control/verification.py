@@ -13,7 +13,7 @@ from varpin.control.costs import BoundSum
 from varpin.control.history import Status
 from varpin.control.problem import OptimalControlProblem, bind_cost
 from varpin.core.arrays import Commands
-from varpin.integrators import Integrator, RungeKutta4
+from varpin.integrators import Gauss, Integrator, RungeKutta4
 from varpin.integrators.base import open_loop
 from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.run import rollout
@@ -78,7 +78,7 @@ class Verification:
     @property
     def _untold(self) -> str:
         return (
-            f"these costs say nothing of the plan: with {self.substeps} Runge-Kutta steps in one of the plan's they "
+            f"these costs say nothing of the plan: with {self.substeps} accurate steps in one of the plan's they "
             f"still change by {percent(self.accuracy)}. Dampers or dry friction are too fast for it; simulate the "
             "plan's policy with varpin.Radau(3) in small steps instead, or give max_substeps"
         )
@@ -143,7 +143,9 @@ def verify(
     max_substeps: int,
     progress: Callable[[int, int], None] | None,
 ) -> Verification:
-    """Hold a plan, and its policy on (q, v) for a number of substeps, against accurate integrations.
+    """Hold a plan, and its policy for a number of substeps, against accurate integrations.
+
+    The policy is on (q, v), and under constraints on (q, p).
 
     The substeps double until neither cost changes by more than ``tolerance`` of itself.
     """
@@ -156,7 +158,10 @@ def verify(
         opened = accurate_cost(problem, blind._replace(hold=problem.hold * substeps), substeps, costs)
         fed = policy(substeps)
         feedback = fed.commands(
-            problem.steps * substeps, problem.scene.controls, problem.scene.robot.dof, variational=False
+            problem.steps * substeps,
+            problem.scene.controls,
+            problem.scene.robot.dof,
+            variational=accurate(problem).variational,
         )
         closed = accurate_cost(problem, feedback, substeps, costs)
         changes = [
@@ -192,6 +197,11 @@ def _fine_costs(problem: OptimalControlProblem, substeps: int) -> tuple[BoundSum
     return bind_cost(problem.cost, problem.t0 + times, problem.running.points)
 
 
+def accurate(problem: OptimalControlProblem) -> Integrator:
+    """What a plan is held against: classical Runge-Kutta; under constraints ``Gauss(3)``, which keeps them."""
+    return Gauss(stages=3) if problem.scene.constraints else RungeKutta4()
+
+
 def accurate_cost(
     problem: OptimalControlProblem,
     commands: Commands,
@@ -201,11 +211,11 @@ def accurate_cost(
 ) -> tuple[float, Floats]:
     """True cost under given commands, and the end configuration; NaN where the motion runs away.
 
-    In ``substeps`` steps, an even number, of the integrator, :class:`RungeKutta4` if left out, for each of the plan's.
+    In ``substeps`` steps, an even number, of the integrator, :func:`accurate` if left out, for each of the plan's.
     """
     scene, h = problem.scene, problem.dt / substeps
     n, m = scene.robot.dof, scene.controls
-    motion, failure = rollout(scene, integrator or RungeKutta4(), problem.q0, problem.v0, commands, h)
+    motion, failure = rollout(scene, integrator or accurate(problem), problem.q0, problem.v0, commands, h)
     if failure is not None:
         return np.nan, np.full(n, np.nan)
     running, terminal = _fine_costs(problem, substeps) if costs is None else costs
@@ -221,7 +231,7 @@ def accurate_cost(
 def _defect(problem: OptimalControlProblem, trajectory: Trajectory, substeps: int) -> float:
     """Largest distance in q between the plan's steps and accurate ones from the same nodes."""
     scene, h, n = problem.scene, problem.dt / substeps, problem.scene.robot.dof
-    integrator = RungeKutta4()
+    integrator = accurate(problem)
     state, _ = integrator.start(scene, trajectory.q[:-1].copy(), trajectory.v[:-1].copy())
     # Every step is a path of its own, with its own control handed over as a force.
     commands = open_loop(np.zeros((1, scene.controls)))._replace(hold=substeps)

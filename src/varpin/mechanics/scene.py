@@ -80,6 +80,9 @@ OF_COUPLINGS = ("FrameLoad", "FrameWrench", "FrameSpring", "FrameLengthSpring", 
 # The same of constraints.
 OF_CONSTRAINTS = ("constraints.between", "constraints.ties", "constraints.custom")
 OF_FORCES = (*OF_ELEMENTS, *OF_COUPLINGS, *OF_CONSTRAINTS)
+# What a configuration that is said to keep constraints may miss them by, and a start to be moved onto them unasked
+# [m or rad]; and the singular values, relative to the largest, of rows that depend on others.
+_OFF, CORRECTED, _DEPENDENT = 1e-6, 0.02, 1e-9
 # So many joints are told of with numbers.
 _NAMED = 7
 _OF_JOINTS = ("damping", "stiffness", "rest", "armature")
@@ -468,16 +471,22 @@ class Scene(Frozen):
         """The generalized forces (n,) that hold the robot at rest at ``q`` [N m or N].
 
         Against gravity and springs, the gradient of the potential energy, -L_q(q, 0), and against wrenches on frames.
+        Constraints take what is normal to them; of the forces that hold the robot together with them, the smallest.
 
         Args:
-            q: Configuration, (n,) or by joint name [rad or m].
+            q: Configuration, (n,) or by joint name [rad or m]; it keeps the constraints.
 
         Raises:
-            InputError: A wrong shape, or a value that is not finite.
+            InputError: A wrong shape, a value that is not finite, or a configuration off the constraints.
             UnknownJoint: ``q`` names a joint that is no coordinate of the robot.
         """
-        refuse_constraints(self, "Scene.holding_torque")
         at = joint_array("q", q, self.robot.joint_names)
+        along = tangent_basis(self, at)
+        return along @ (along.T @ self.static_pull(at))
+
+    def static_pull(self, q: Floats) -> Floats:
+        """What holds the robot at rest at ``q`` (n,) without constraints (n,)."""
+        at = np.asarray(q, dtype=np.float64)
         _, Lq, *_ = self.core.jet(at, np.zeros_like(at))
         acts = self.couplings or self.custom is not None
         wrenches = self.core.coupled_forces(at[None], np.zeros((1, at.size)))[0][0] if acts else 0.0
@@ -500,7 +509,8 @@ class Scene(Frozen):
         still = at[None], np.zeros((1, at.size))
         # Wrenches on frames are in both.
         drives = self.core.forces(*still, force[None])[0][0] - self.core.coupled_forces(*still)[0][0]
-        left = torque - force - drives
+        along = tangent_basis(self, at)
+        left = along @ (along.T @ (torque - force - drives))
         # Where nothing pulls, rounding leaves a trace of the weights' own moments, those at a metre say.
         weight = float(self.robot.tree.mass.sum() * np.linalg.norm(self.gravity))
         if (np.abs(left) > 1e-9 * (np.abs(torque).max() + weight)).any():
@@ -547,7 +557,7 @@ def refuse_constraints(scene: Scene, what: str) -> None:
     if scene.constraints:
         names = ", ".join(dict.fromkeys(type(own).__name__ for own in scene.constraints))
         raise InputError(
-            f"{what} does not take scenes with constraints, and this one has {names}: simulate and linearize do, with "
+            f"{what} does not take scenes with constraints, and this one has {names}: motions and plans do, with "
             "varpin.Midpoint() or varpin.Gauss(stages)"
         )
 
@@ -557,10 +567,33 @@ def closest_controls(scene: Scene, q: Floats) -> Floats:
 
     Those of a servo as if it had no effort limit.
     """
-    torque = scene.holding_torque(q)
+    torque = scene.static_pull(q)
     for own in of_kind(scene.elements, "PositionServo"):
         torque[own.coordinate] += own.values[0] * q[own.coordinate]
-    return np.asarray(np.linalg.lstsq(scene.actuation, torque, rcond=None)[0], dtype=np.float64)
+    if not scene.constraints:
+        return np.asarray(np.linalg.lstsq(scene.actuation, torque, rcond=None)[0], dtype=np.float64)
+    along = tangent_basis(scene, q, CORRECTED)
+    return np.asarray(np.linalg.lstsq(along.T @ scene.actuation, along.T @ torque, rcond=1e-9)[0], dtype=np.float64)
+
+
+def tangent_basis(scene: Scene, q: Floats, off: float = _OFF) -> Floats:
+    """An orthonormal basis (n, f) of the velocities that constraints allow at ``q`` (n,); all of them without any.
+
+    Raises:
+        InputError: The configuration misses the constraints by more than ``off`` [m or rad].
+    """
+    if not scene.constraints:
+        return np.eye(q.size)
+    g, C = scene.constraint_values(q)
+    worst = int(np.argmax(np.abs(g)))
+    if not abs(g[worst]) <= off:
+        raise InputError(
+            f"q misses {scene.constraint_labels[worst]} by {abs(g[worst]):.4g} m or rad: varpin.assemble(scene, q) "
+            "looks for the nearest configuration that keeps the constraints"
+        )
+    _, sizes, basis = np.linalg.svd(C)
+    rank = int((sizes > _DEPENDENT * sizes[0]).sum())
+    return np.ascontiguousarray(basis[rank:].T)
 
 
 def same(one: Floats, other: Floats) -> bool:

@@ -18,7 +18,7 @@ from varpin.integrators.within import Times, changing
 from varpin.mechanics.assembly import along_constraints, assemble, missed
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop, takes
-from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
+from varpin.mechanics.scene import CORRECTED, Scene, refuse_constraints, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.simulation import limits
 from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstable_loop
@@ -49,8 +49,8 @@ logger = logging.getLogger(__name__)
 _CHUNK = 30_000
 # What steps where no integrator is given.
 _MIDPOINT = Midpoint()
-# What a start may miss constraints by to be moved onto them unasked, and what of that is not spoken of [rad or m].
-_CORRECTED, _UNSAID = 0.02, 1e-9
+# What a start may be moved by onto constraints without a word [rad or m].
+_UNSAID = 1e-9
 # Steps at which a function of time is held against steps of half the length, and the share by which it may be off.
 _LOOKS, _ALIKE = 16, 0.05
 # Parts of a motion that are kept one by one.
@@ -357,7 +357,7 @@ def simulate(
     accuracy: Accuracy | None = None
     wished: tuple[Finding, ...] = ()
     if scene.constraints:
-        q0, v0, wished = _on_constraints(scene, q0, v0)
+        q0, v0, wished = on_constraints(scene, q0, v0)
     if tolerance is not None:
         span = _time_of_wish(dt, steps, duration)
         chosen = _chosen(scene, q0, v0, span, tolerance, controls, integrator)
@@ -472,7 +472,7 @@ def _times(dt: float | None, steps: int | None, duration: float | None) -> tuple
     return dt, steps
 
 
-def _on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats, tuple[Finding, ...]]:
+def on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats, tuple[Finding, ...]]:
     """The nearest state that keeps the constraints, and by how much it is another, if that is to be said.
 
     Raises:
@@ -480,7 +480,7 @@ def _on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Float
         AssemblyError: They cannot be kept next to q0.
     """
     label, miss = missed(scene, q0)
-    if miss > _CORRECTED:
+    if miss > CORRECTED:
         raise InputError(
             f"q0 misses {label} by {miss:.4g} m or rad: varpin.assemble(scene, q0) looks for the nearest configuration "
             "that keeps the constraints"
@@ -641,7 +641,7 @@ def _told(
     scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None, *, check: bool
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
     """A whole motion with what is to be said of it; ``hold`` is the period of its feedback in steps, None for none."""
-    if check and not scene.constraints:
+    if check:
         return examined_in_loop(scene, integrator, trajectory, hold)
     found = evident(scene, integrator, trajectory)
     return with_warnings(trajectory, found), found
