@@ -689,7 +689,7 @@ def test_scene_files_have_constraints(tmp_path):
     )
     goal = (q + 0.05).tolist()
     cost = '[[cost]]\ntype = "control"\nweight = 0.01\n'
-    cost += f'[[cost]]\ntype = "tracking"\nterminal = true\nweight = 10.0\n[cost.reference]\noffset = {goal}\n'
+    cost += f'[[cost]]\ntype = "tracking"\nterminal = true\nweight = 10.0\n[cost.reference]\noffset = {goal}\nsines = []\n'
     path.write_text(path.read_text() + cost)
     plan = vp.load_scene(path).solve(tolerance=1e-4)
     assert plan.status.converged
