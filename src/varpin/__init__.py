@@ -72,6 +72,7 @@ from varpin.mechanics.policy import OpenLoop as OpenLoop
 from varpin.mechanics.scene import Scene as Scene
 from varpin.model import Payload as Payload
 from varpin.model import Robot as Robot
+from varpin.model import combine as combine
 from varpin.model import load_robot as load_robot
 from varpin.model import planar_chain as planar_chain
 from varpin.model import robot_names as robot_names

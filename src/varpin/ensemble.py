@@ -317,10 +317,10 @@ def _per_path(name: str, value: JointValues, paths: int, joints: Sequence[str]) 
 
 def without_geometry(scene: Scene) -> Scene:
     """The scene without shapes that came with its robot: no simulation needs them, and meshes are large to send."""
-    if scene.robot.visuals is None:
+    if scene.robot.visuals is None and not scene.robot.parts:
         return scene
     bare = copy.copy(scene)
-    vars(bare)["robot"] = dataclasses.replace(scene.robot, visuals=None)
+    vars(bare)["robot"] = dataclasses.replace(scene.robot, visuals=None, parts=())
     return bare
 
 

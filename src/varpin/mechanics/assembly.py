@@ -19,13 +19,16 @@ _ROUNDING = 256.0 * np.finfo(np.float64).eps
 # Most corrections of Newton's method, most trials of Levenberg's and Marquardt's, the least part of the way that is
 # followed at once, and the longest step [rad or m].
 _MOST, _MOST_TRIALS, _SHORTEST, _LONGEST = 12, 200, 1e-3, 0.5
+# Where nothing is found, places around the start to search from, and the standard deviation of the last [rad or m].
+_PLACES, _FARTHEST = 20, 1.0
 
 
 def assemble(scene: Scene, q: JointValues) -> Floats:
     """The configuration (n,) nearest to ``q`` that keeps a scene's constraints [rad or m].
 
     Nearest in the metric of the kinetic energy at ``q``, where light joints move more than heavy ones, among those that
-    a continuous way leads to; where that way is lost, another one that keeps them.
+    a continuous way leads to; where that way is lost, another one that keeps them, if need be sought from twenty places
+    around ``q`` (the same ones every time).
 
     Args:
         scene: The scene.
@@ -43,7 +46,13 @@ def assemble(scene: Scene, q: JointValues) -> Floats:
     root = _root_of_mass(scene, start)
     followed = _followed(scene, start, root)
     found = _polished(scene, _reached(scene, start, root) if followed is None else followed, root)
-    _require_kept(scene, found)
+    try:
+        _require_kept(scene, found)
+    except AssemblyError:
+        around = _reached_around(scene, start, root)
+        if around is None:
+            raise
+        return around
     return found
 
 
@@ -146,6 +155,19 @@ def _reached(scene: Scene, q: Floats, root: Floats) -> Floats:
             if damping > 1e12:
                 break
     return q
+
+
+def _reached_around(scene: Scene, start: Floats, root: Floats) -> Floats | None:
+    """Some q that keeps the constraints, sought from places around ``start``, farther and farther away."""
+    rng = np.random.default_rng(0)
+    for size in np.linspace(0.1, _FARTHEST, _PLACES):
+        q = _polished(scene, _reached(scene, start + size * rng.normal(size=start.size), root), root)
+        try:
+            _require_kept(scene, q)
+        except AssemblyError:
+            continue
+        return q
+    return None
 
 
 def _polished(scene: Scene, q: Floats, root: Floats) -> Floats:
