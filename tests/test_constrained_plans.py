@@ -161,6 +161,9 @@ def test_a_five_bar_reaches_from_a_cold_start_and_holds():
     assert plan.status.converged
     assert not plan.warnings
     assert np.abs(plan.trajectory.q[-1] - goal).max() < 0.01
+    again = problem.simulate(plan.policy)
+    np.testing.assert_allclose(plan.trajectory.constraint_forces, again.constraint_forces, rtol=0, atol=1e-6)
+    assert plan.trajectory.constraint_labels == problem.scene.constraint_labels
     seen = plan.verify()
     assert max(abs(seen.closed_loop_loss), abs(seen.open_loop_loss)) < 1e-8
     assert seen.defect < 1e-10

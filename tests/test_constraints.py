@@ -455,6 +455,24 @@ def test_a_weld_that_is_turned_round_is_none():
     assert np.cos(vp.assemble(scene, [closed + 3.0])[0] - closed) == pytest.approx(1.0, abs=1e-14)
     with pytest.raises(vp.AssemblyError, match="FrameOnFrame"):
         vp.assemble(vp.Scene(robot, constraints=vp.FrameOnFrame("joint1", "universe", POSE)), [0.3])
+    # They vanish at a third of a turn about a diagonal, too.
+    arm, start = vp.load_robot("ur5"), np.array([0.2, -1.2, 1.5, -0.3, 1.4, 0.1])
+    place = frame_placement(arm, start, "tool0")
+    third = place.copy()
+    third[:3] = place[[2, 0, 1]]
+    third[:3, 3] = place[:3, 3]
+    scene = vp.Scene(arm, constraints=vp.FrameOnFrame("tool0", "universe", third))
+    assert np.abs(scene.constraint_values(start)[0]).max() < 1e-12
+    with pytest.raises(vp.AssemblyError, match=r"FrameOnFrame.* by 1\.571"):
+        vp.simulate(scene, start, np.zeros(6), dt=1e-2, steps=1)
+    q = vp.assemble(scene, start)
+    np.testing.assert_allclose(frame_placement(arm, q, "tool0"), third, atol=1e-12)
+
+
+def frame_placement(robot, q, frame):
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.configuration(q))
+    return data.oMf[robot.model.getFrameId(frame)].homogeneous
 
 
 @pytest.mark.parametrize("ground", [1.01, 1.1])

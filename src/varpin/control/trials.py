@@ -37,6 +37,7 @@ class Attempt:
     written: Nodes
     halvings: Bytes
     values: Floats
+    impulses: Floats  # of the constraints (N, c)
     failure: Failure | None
     verdict: Watch.Verdict
 
@@ -70,6 +71,8 @@ class Attempt:
             joint_names=scene.robot.joint_names,
             statistics=statistics_of(self.written, 0, done, self.halvings),
             scene_values=scene.values,
+            constraint_forces=self.impulses[:done] / own.problem.dt,
+            constraint_labels=scene.constraint_labels,
         )
 
 
@@ -127,5 +130,6 @@ class Trials:
         watch = Watch(terms.core, problem.rule, q, v, u, values)
         watch.ask(self._weight, most, self._third, parts)
         state = integrator.fork(self._state)
-        failure, halvings = integrator.watched(scene, state, commands, problem.dt, nodes, watch)
-        return Attempt(self, (q, v, p, energy), u, nodes, halvings, values, failure, watch.verdict)
+        impulses = np.zeros((N, len(scene.constraint_order)))
+        failure, halvings = integrator.watched(scene, state, commands, problem.dt, nodes, watch, impulses)
+        return Attempt(self, (q, v, p, energy), u, nodes, halvings, values, impulses, failure, watch.verdict)

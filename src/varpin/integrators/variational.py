@@ -217,11 +217,18 @@ class Variational(Integrator):
         return found
 
     def watched(
-        self, scene: Scene, state: VariationalRun, commands: Commands, dt: float, nodes: Nodes, watch: Watch
+        self,
+        scene: Scene,
+        state: VariationalRun,
+        commands: Commands,
+        dt: float,
+        nodes: Nodes,
+        watch: Watch,
+        impulses: Floats | None = None,
     ) -> tuple[Failure | None, Bytes]:
         """See :meth:`Integrator.watched`."""
         if scene.noise.diffusion is None or isinstance(state.paths, ConstrainedRollout):
-            return super().watched(scene, state, commands, dt, nodes, watch)
+            return super().watched(scene, state, commands, dt, nodes, watch, impulses)
         state.paths.roll(dt, contiguous(commands), scene.silence, scene.no_drift, nodes, watch)
         done = int(nodes.done[0])
         return failure_of(nodes, 0, done, REASONS), parts_of(nodes, 0, done, state.paths.halvings)

@@ -43,16 +43,21 @@ def assemble(scene: Scene, q: JointValues) -> Floats:
     start = joint_array("q", q, require_scene(scene).robot.joint_names)
     if not scene.constraints:
         return start
-    root = _root_of_mass(scene, start)
-    followed = _followed(scene, start, root)
-    found = _polished(scene, _reached(scene, start, root) if followed is None else followed, root)
     try:
-        _require_kept(scene, found)
+        return nearest(scene, start)
     except AssemblyError:
-        around = _reached_around(scene, start, root)
+        around = _reached_around(scene, start, _root_of_mass(scene, start))
         if around is None:
             raise
         return around
+
+
+def nearest(scene: Scene, q: Floats) -> Floats:
+    """:func:`assemble` from ``q`` (n,) alone, with the errors of that."""
+    root = _root_of_mass(scene, q)
+    followed = _followed(scene, q, root)
+    found = _polished(scene, _reached(scene, q, root) if followed is None else followed, root)
+    _require_kept(scene, found)
     return found
 
 
@@ -191,6 +196,7 @@ def _require_kept(scene: Scene, q: Floats) -> None:
             tree = scene.robot.tree
             both = [place_on_body(tree, q[None], body, np.array(at))[0] for at in (along, (0.0, 0.0, 0.0))]
             ends.append(both[0] - both[1])
-        if not ends[0] @ ends[1] > 0.0:
+        # The rows vanish at half a turn about an axis and at a third of one about the diagonals, too: 1, -1 or 0 there.
+        if not ends[0] @ ends[1] > 0.5:
             weld = next(label for label in scene.bound_constraints.labels if label.startswith("FrameOnFrame"))
-            raise AssemblyError(weld.rpartition(" ")[0], float(np.arccos(np.clip(ends[0] @ ends[1], -1.0, 1.0))), q)
+            raise AssemblyError(weld.rsplit(" ", 2)[0], float(np.arccos(np.clip(ends[0] @ ends[1], -1.0, 1.0))), q)

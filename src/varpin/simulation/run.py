@@ -15,7 +15,7 @@ from varpin.errors import InputError, UnknownJoint, VarpinError
 from varpin.integrators import Integrator, Midpoint, Reference, Segment, integrator_of
 from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
 from varpin.integrators.within import Times, changing
-from varpin.mechanics.assembly import along_constraints, assemble, missed
+from varpin.mechanics.assembly import along_constraints, missed, nearest
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop, takes
 from varpin.mechanics.scene import CORRECTED, Scene, refuse_constraints, require_scene
@@ -485,7 +485,7 @@ def on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats
             f"q0 misses {label} by {miss:.4g} m or rad: varpin.assemble(scene, q0) looks for the nearest configuration "
             "that keeps the constraints"
         )
-    q = assemble(scene, q0)
+    q = nearest(scene, q0)
     v = along_constraints(scene, q, v0)
     moved, turned = float(np.abs(q - q0).max()), float(np.abs(v - v0).max())
     words = []
