@@ -41,11 +41,6 @@ struct BoundRollout {
     Out view(std::vector<double>& values) const {
         return Out(values.data(), {static_cast<std::size_t>(own.paths()), static_cast<std::size_t>(own.dof())});
     }
-
-    void require_paths(const NodeArrays& nodes) const {
-        if (nodes.paths() != static_cast<std::size_t>(own.paths()))
-            throw std::invalid_argument("the nodes are not those of as many paths");
-    }
 };
 
 void require_rows(const Mechanism& mechanism, const In<2>& q, const In<2>& v, const In<2>& force) {
@@ -137,22 +132,18 @@ BoundRollout rollout(SharedMechanism mechanism, ExplicitMethod method, In<2> q, 
 
 bool first_nodes(BoundRollout& rollout, nb::handle nodes) {
     const NodeArrays arrays(*rollout.mechanism, nodes);
-    rollout.require_paths(arrays);
+    arrays.require_paths(static_cast<std::size_t>(rollout.own.paths()));
     if (arrays.steps() < 1) throw std::invalid_argument("there is no room for the first nodes");
     return rollout.own.first_nodes(arrays.view());
 }
 
 void roll(BoundRollout& rollout, double dt, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes,
           HeldWatch* watch) {
-    const Mechanism& mechanism = *rollout.mechanism;
-    const NodeArrays to(mechanism, nodes);
-    rollout.require_paths(to);
-    const CommandArrays by(mechanism, commands, to.paths(), to.steps(), rollout.own.places());
-    const double* dw = increments_of(mechanism, increments, to);
-    const double* more = drift_of(mechanism, drift, to);
-    Watch* watching = watch ? watch->of(to.paths(), to.steps()) : nullptr;
-    nb::gil_scoped_release release;
-    rollout.own.roll(dt, by.view(), dw, more, to.view(), watching);
+    ExplicitRollout& own = rollout.own;
+    roll_paths(*rollout.mechanism, static_cast<std::size_t>(own.paths()), own.places(), commands, increments, drift,
+               nodes, [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
+                   own.roll(dt, by, dw, more, to, watch ? watch->of(to) : nullptr);
+               });
 }
 
 }  // namespace

@@ -1,7 +1,11 @@
 // A watch that keeps the arrays it looks at.
 #pragma once
 
+#include <cstdint>
+#include <stdexcept>
+
 #include "arrays.hpp"
+#include "varpin/nodes.hpp"
 #include "varpin/watch.hpp"
 
 namespace varpin::border {
@@ -24,8 +28,9 @@ class HeldWatch {
     }
 
     // For a rollout of one path over as many steps.
-    Watch* of(std::size_t paths, std::size_t steps) {
-        if (paths != 1 || steps != u_.shape(0)) throw std::invalid_argument("a watch is for one path of as many steps");
+    Watch* of(const Nodes& nodes) {
+        if (nodes.paths != 1 || nodes.steps != static_cast<std::int64_t>(u_.shape(0)))
+            throw std::invalid_argument("a watch is for one path of as many steps");
         return &own;
     }
 

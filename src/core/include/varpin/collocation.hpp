@@ -113,6 +113,13 @@ class Collocation {
     std::vector<double> weight;              // (s) of the force at each stage, in what derivatives in f are taken in
     bool weighted = false;                   // whether any of them is not 1
 
+    // Let derivatives in f be in a force that grows over the step from 0 to f, of which this solves a part; `begin` and
+    // `share` in units of the step.
+    void weigh_ramp(double begin, double share) {
+        weighted = true;
+        for (int i = 0; i < stages; ++i) weight[i] = begin + share * tableau.c[i];
+    }
+
     // Solve the step equation from the guess in V.
     //
     // The first factorization is kept at least until a second correction shows how fast it contracts, and for as long

@@ -87,25 +87,12 @@ class Constraints {
     Constraints(std::vector<VectorSum> vectors, std::vector<ProductRow> products, std::vector<TieRow> ties,
                 std::vector<CustomRows> customs, const std::vector<Body>& bodies, int dof)
         : products_(std::move(products)), ties_(std::move(ties)), customs_(std::move(customs)), n_(dof) {
-        std::vector<int> own(bodies.size(), -1);
-        const auto take = [&](auto& self, int body) -> int {
-            if (body < 0) return -1;
-            if (own[body] < 0) {
-                Body link = bodies[body];
-                link.parent = self(self, link.parent);
-                own[body] = links_.size();
-                links_.bodies.push_back(link);
-            }
-            return own[body];
-        };
+        LinkCollector collector(bodies, links_);
         for (VectorSum& sum : vectors) {
             Joined joined{std::move(sum), {}};
             for (CarriedVector& part : joined.sum.parts) {
-                part.body = take(take, part.body);
-                std::vector<int> path;
-                for (int j = part.body; j >= 0; j = links_.bodies[j].parent) path.push_back(j);
-                std::reverse(path.begin(), path.end());
-                joined.paths.push_back(std::move(path));
+                part.body = collector.take(part.body);
+                joined.paths.push_back(links_.path(part.body));
             }
             vectors_.push_back(std::move(joined));
         }
@@ -311,16 +298,12 @@ class Constraints {
             w.reach[a] += length(x);
             for (int j : vectors_[a].paths[part]) {
                 const Body& link = links_.bodies[j];
+                if (own.direction && link.prismatic) continue;
                 const Vec3<double>& axis = w.at[j].rotation.z;
-                ConstraintJet::Lever lever{link.coordinate, {}, {}};
-                if (link.prismatic) {
-                    if (own.direction) continue;
-                    lever.shift = (side * link.ratio) * axis;
-                } else {
-                    const Vec3<double> arm = own.direction ? x : x - w.at[j].position;
-                    lever.turn = link.ratio * axis;
-                    lever.shift = (side * link.ratio) * cross(axis, arm);
-                }
+                const Motion<double> gives =
+                    own.direction ? Motion<double>{cross(axis, x), axis} : given_by(link, w.at[j], x);
+                const ConstraintJet::Lever lever{link.coordinate, link.ratio * gives.angular,
+                                                 (side * link.ratio) * gives.linear};
                 slope[link.coordinate] += lever.shift;
                 const double moved = length(lever.shift);
                 size[link.coordinate] += moved;

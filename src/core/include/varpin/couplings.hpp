@@ -154,27 +154,15 @@ class Couplings {
     Couplings() = default;
     // Between points of some bodies, parents first.
     Couplings(const std::vector<CoupledElement>& couplings, const std::vector<Body>& bodies) {
-        std::vector<int> own(bodies.size(), -1);
-        const auto take = [&](auto& self, int body) -> int {
-            if (body < 0) return -1;
-            if (own[body] < 0) {
-                Body link = bodies[body];
-                link.parent = self(self, link.parent);
-                own[body] = links_.size();
-                links_.bodies.push_back(link);
-            }
-            return own[body];
-        };
+        LinkCollector collector(bodies, links_);
         for (CoupledElement coupling : couplings) {
             Joined joined;
             std::visit(
                 [&](auto& element) {
                     Anchor* const anchors[2] = {&element.a, &element.b};
                     for (int point = 0; point < 2; ++point) {
-                        anchors[point]->body = take(take, anchors[point]->body);
-                        for (int j = anchors[point]->body; j >= 0; j = links_.bodies[j].parent)
-                            joined.path[point].push_back(j);
-                        std::reverse(joined.path[point].begin(), joined.path[point].end());
+                        anchors[point]->body = collector.take(anchors[point]->body);
+                        joined.path[point] = links_.path(anchors[point]->body);
                     }
                     if constexpr (!has_potential<std::decay_t<decltype(element)>>) pushes_ = true;
                 },
@@ -312,14 +300,9 @@ class Couplings {
             if (point == 0) room.rotation = room.at[body].rotation;
             for (int j : joined.path[point]) {
                 const Body& link = links_.bodies[j];
-                const Vec3<T>& axis = room.at[j].rotation.z;
                 const double side = point == 0 ? link.ratio : -link.ratio;
-                if (link.prismatic) {
-                    room.arms.push_back({link.coordinate, point, side * axis, {}});
-                } else {
-                    room.arms.push_back(
-                        {link.coordinate, point, side * cross(axis, x - room.at[j].position), link.ratio * axis});
-                }
+                const Motion<T> gives = given_by(link, room.at[j], x);
+                room.arms.push_back({link.coordinate, point, side * gives.linear, link.ratio * gives.angular});
             }
         }
     }
