@@ -41,6 +41,7 @@ from varpin.mechanics.constraints import CustomConstraint as CustomConstraint
 from varpin.mechanics.constraints import Distance as Distance
 from varpin.mechanics.constraints import FrameOnFrame as FrameOnFrame
 from varpin.mechanics.constraints import JointTie as JointTie
+from varpin.mechanics.constraints import KinematicInput as KinematicInput
 from varpin.mechanics.constraints import PointOnLine as PointOnLine
 from varpin.mechanics.constraints import PointOnPlane as PointOnPlane
 from varpin.mechanics.constraints import PointOnPoint as PointOnPoint

@@ -226,9 +226,10 @@ def simulate_ensemble(
     integrator = Midpoint() if integrator is None else integrator
     if not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
-    if controls is None and scene.servo_joints:
+    if controls is None and (scene.servo_joints or scene.inputs):
         if (start[0] != start[0][0]).any():
-            raise InputError("controls are needed: the scene has servos, and the paths begin at different positions")
+            positions = "the scene has servos or inputs, and the paths begin at different positions"
+            raise InputError(f"controls are needed: {positions}")
         controls = scene.command_at(start[0][0])
     start, moved = _onto_constraints(scene, start)
     commands = commands_of(scene, integrator, controls, steps, dt)

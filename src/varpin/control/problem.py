@@ -28,7 +28,7 @@ from varpin.errors import InputError
 from varpin.integrators import Gauss, Integrator
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy, OpenLoop
-from varpin.mechanics.scene import Scene, closest_controls, require_scene, tangent_basis
+from varpin.mechanics.scene import Scene, closest_controls, refuse_inputs, require_scene, tangent_basis
 from varpin.simulation.run import on_constraints, simulate
 from varpin.simulation.soundness import announce
 from varpin.support.checks import JointValues, count, is_one_of, joint_array, named_limits, positive, real
@@ -132,6 +132,7 @@ class OptimalControlProblem(Frozen):
             AssemblyError: The scene's constraints cannot be kept next to q0.
         """
         n, m = require_scene(scene).robot.dof, scene.controls
+        refuse_inputs(scene, "OptimalControlProblem")
         if not isinstance(cost, Cost):
             raise InputError(f"cost must be a cost, for example varpin.TrackingCost(...), got {type(cost).__name__}")
         dt, steps, hold = positive("dt", dt, "s"), count("steps", steps, least=1), count("hold", hold, least=1)

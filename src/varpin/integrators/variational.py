@@ -157,6 +157,9 @@ class Variational(Integrator):
             raise InputError(f"{self} keeps no constraints")
         if scene.processes and self.left < 1.0:
             raise InputError("kick='split' does not go with constraints: take kick='left'")
+        noise = scene.noise.diffusion
+        if scene.inputs and (noise is None or noise.control.any()):
+            raise InputError("noise that depends on the controls does not go with a KinematicInput")
         if scene.noise.velocity_dependent:
             raise InputError("noise whose fields depend on the velocity does not go with constraints")
         return places

@@ -70,6 +70,19 @@ def along_constraints(scene: Scene, q: Floats, v: Floats) -> Floats:
     return v
 
 
+def dependent_input(scene: Scene, q: Floats) -> str | None:
+    """The label of a joint moved by hand that the other constraints do not leave free at ``q`` (n,), if one is."""
+    root = _root_of_mass(scene, q)
+    _, C = _values(scene, q)
+    rows = [row for row in (C @ root.T) if row.any()]
+    for row, c in scene.inputs.items():
+        with_it = [*rows, np.eye(q.size)[c] @ root.T]
+        if np.linalg.matrix_rank(np.array(with_it), tol=None) <= (np.linalg.matrix_rank(np.array(rows)) if rows else 0):
+            return scene.bound_constraints.labels[row]
+        rows = with_it
+    return None
+
+
 def missed(scene: Scene, q: Floats) -> tuple[str, float]:
     """The constraint that misses by most at ``q`` (n,), and by how much [m or rad]."""
     g, _ = _values(scene, q)
@@ -78,7 +91,9 @@ def missed(scene: Scene, q: Floats) -> tuple[str, float]:
 
 
 def _values(scene: Scene, q: Floats) -> tuple[Floats, Floats]:
+    """G and C, zero for joints that are moved by hand: they are wherever they are."""
     g, _, C = scene.core.constraints(np.ascontiguousarray(q[None]))
+    g[:, list(scene.inputs)], C[:, list(scene.inputs)] = 0.0, 0.0
     return g[0], C[0]
 
 
@@ -184,7 +199,8 @@ def _polished(scene: Scene, q: Floats, root: Floats) -> Floats:
 
 
 def _require_kept(scene: Scene, q: Floats) -> None:
-    g, scale, _ = (part[0] for part in scene.core.constraints(q[None]))
+    scale = scene.core.constraints(q[None])[1][0]
+    g, _ = _values(scene, q)
     wrong = np.abs(g) > _ROUNDING * np.maximum(scale, 1.0) * q.size
     if wrong.any() or not np.isfinite(g).all():
         label, miss = missed(scene, q)

@@ -203,6 +203,7 @@ class Scene(Frozen):
         values["constraints"] = constraints_of(constraints)
         bound, order = joined([own.bind(robot) for own in values["constraints"]])
         values |= {"bound_constraints": bound, "constraint_order": order, "announced": set()}
+        _require_positions(robot, values["actuation"], values["elements"], bound)
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
@@ -318,7 +319,18 @@ class Scene(Frozen):
         """
         at = joint_array("q", q, self.robot.joint_names)
         g, _, C = self.core.constraints(at[None])
+        g[:, list(self.inputs)] = 0.0
         return g[0, self.constraint_order], C[0, self.constraint_order]
+
+    @cached_property
+    def inputs(self) -> Mapping[int, int]:
+        """Joints that are moved by hand: the coordinate of each by the core's row of its :class:`KinematicInput`."""
+        rows = self.bound_constraints.rows
+        return {
+            len(rows.products) + k: tie.follower
+            for k, tie in enumerate(rows.ties)
+            if tie.follower == tie.leader and not tie.coefficients
+        }
 
     @property
     def _gear(self) -> Floats:
@@ -351,10 +363,12 @@ class Scene(Frozen):
         return tuple(self.robot.joint_names[own.coordinate] for own in of_kind(self.elements, "PositionServo"))
 
     def command_at(self, q: Floats) -> Floats:
-        """The controls (m,) that stand for none at q (n,): no forces, and servos that stay where they are."""
+        """The controls (m,) that stand for none at q (n,): no forces; servos and inputs stay where they are."""
         command = np.zeros(self.controls)
         for own in of_kind(self.elements, "PositionServo"):
             command[int(np.argmax(np.abs(self.actuation[own.coordinate])))] = q[own.coordinate]
+        for c in self.inputs.values():
+            command[int(np.argmax(self.actuation[c]))] = q[c]
         return command
 
     @property
@@ -562,6 +576,20 @@ def refuse_constraints(scene: Scene, what: str) -> None:
         )
 
 
+def refuse_inputs(scene: Scene, what: str) -> None:
+    """Refuse a scene with joints that are moved by hand where that is not known.
+
+    Raises:
+        InputError: It has some.
+    """
+    if scene.inputs:
+        names = ", ".join(scene.robot.joint_names[c] for c in scene.inputs.values())
+        raise InputError(
+            f"{what} does not take scenes with a KinematicInput, and this one has some of {names}: simulate, "
+            "simulate_ensemble and linearize do, with controls that are rows (N, m)"
+        )
+
+
 def closest_controls(scene: Scene, q: Floats) -> Floats:
     """The controls (m,) whose forces come closest to what holds the robot at ``q`` (n,); of several, the smallest.
 
@@ -573,7 +601,10 @@ def closest_controls(scene: Scene, q: Floats) -> Floats:
     if not scene.constraints:
         return np.asarray(np.linalg.lstsq(scene.actuation, torque, rcond=None)[0], dtype=np.float64)
     along = tangent_basis(scene, q, CORRECTED)
-    return np.asarray(np.linalg.lstsq(along.T @ scene.actuation, along.T @ torque, rcond=1e-9)[0], dtype=np.float64)
+    found = np.linalg.lstsq(along.T @ scene.actuation, along.T @ torque, rcond=1e-9)[0]
+    for c in scene.inputs.values():
+        found[np.argmax(scene.actuation[c])] = q[c]
+    return np.asarray(found, dtype=np.float64)
 
 
 def tangent_basis(scene: Scene, q: Floats, off: float = _OFF) -> Floats:
@@ -740,6 +771,24 @@ def _refuse_trembling_angles(noise: Noise | Sequence[Noise] | None, elements: Se
             f"ControlNoise is in proportion to forces, and the control of joint {robot.joint_names[servos[0]]!r} is "
             "the position of its servo: take AdditiveNoise"
         )
+
+
+def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Element], bound: Bound) -> None:
+    """Refuse a KinematicInput whose joint has no control of its own, or a servo besides."""
+    served = {own.coordinate for own in of_kind(elements, "PositionServo")}
+    for tie in bound.rows.ties:
+        if tie.follower != tie.leader or tie.coefficients:
+            continue
+        c, name = tie.follower, robot.joint_names[tie.follower]
+        if c in served:
+            raise InputError(f"joint {name!r} has both a PositionServo and a KinematicInput")
+        drives = np.flatnonzero(actuation[c])
+        alone = len(drives) == 1 and actuation[c, drives[0]] == 1.0 and np.count_nonzero(actuation[:, drives[0]]) == 1
+        if not alone:
+            raise InputError(
+                f"the KinematicInput of joint {name!r} needs a control of its own, its position: under this actuation "
+                "none is; name the joint in the actuation, or give it a column with a 1"
+            )
 
 
 def _served(robot: Robot, actuation: Floats, elements: Sequence[Element]) -> Floats:

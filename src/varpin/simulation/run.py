@@ -15,10 +15,10 @@ from varpin.errors import InputError, UnknownJoint, VarpinError
 from varpin.integrators import Integrator, Midpoint, Reference, Segment, integrator_of
 from varpin.integrators.base import Failure, join, open_loop, rows, steps_of
 from varpin.integrators.within import Times, changing
-from varpin.mechanics.assembly import along_constraints, missed, nearest
+from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop, takes
-from varpin.mechanics.scene import CORRECTED, Scene, refuse_constraints, require_scene
+from varpin.mechanics.scene import CORRECTED, Scene, refuse_constraints, refuse_inputs, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.simulation import limits
 from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstable_loop
@@ -352,7 +352,7 @@ def simulate(
     q0, v0 = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
     if integrator is not None and not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
-    if controls is None and scene.servo_joints:
+    if controls is None and (scene.servo_joints or scene.inputs):
         controls = scene.command_at(q0)
     accuracy: Accuracy | None = None
     wished: tuple[Finding, ...] = ()
@@ -368,6 +368,8 @@ def simulate(
     period = count("period", period, least=1)
     integrator = _MIDPOINT if integrator is None else integrator
     law = controls if callable(controls) else None
+    if callable(controls) or isinstance(controls, OpenLoop):
+        refuse_inputs(scene, "simulate with a function of time or a law")
     if law is not None:
         _require_law(law)
     elif period != 1:
@@ -486,6 +488,8 @@ def on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats
             "that keeps the constraints"
         )
     q = nearest(scene, q0)
+    if (twice := dependent_input(scene, q)) is not None:
+        raise InputError(f"{twice} moves a joint that the other constraints and inputs move already at q0")
     v = along_constraints(scene, q, v0)
     moved, turned = float(np.abs(q - q0).max()), float(np.abs(v - v0).max())
     words = []
@@ -682,6 +686,8 @@ def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps:
         InputError: The array is neither (steps, m) nor (m,), or not finite; the policy is for something else; a law.
         ControlError: The function of an OpenLoop failed; it holds no trajectory.
     """
+    if isinstance(controls, LinearPolicy | OpenLoop | FirstOrderHold):
+        refuse_inputs(scene, f"a {type(controls).__name__}")
     if isinstance(controls, LinearPolicy):
         if controls.joints is not None and controls.joints != scene.control_joints:
             raise InputError(

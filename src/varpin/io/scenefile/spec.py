@@ -20,6 +20,7 @@ from varpin.mechanics.constraints import (
     Distance,
     FrameOnFrame,
     JointTie,
+    KinematicInput,
     PointOnLine,
     PointOnPlane,
     PointOnPoint,
@@ -63,6 +64,7 @@ FRAME_FORCES: Mapping[str, type[Force]] = {
 }
 # Of a [[constraint]].
 CONSTRAINTS: Mapping[str, type[Constraint]] = {
+    "kinematic_input": KinematicInput,
     "distance": Distance,
     "frame_on_frame": FrameOnFrame,
     "joint_tie": JointTie,
