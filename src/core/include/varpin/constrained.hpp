@@ -86,6 +86,7 @@ class ConstrainedStepper {
           push_size(stages * n),
           unit(n) {
         mass_jet.M.resize(entries(n, n));
+        equation.every_kind = !mechanism.constraints.driven().empty();
         for (int i = 0; i < stages; ++i) {
             for (int k = 0; k < stages; ++k) weight[i * stages + k] = 1.0 - at[k * stages + i] / tableau.b[i];
         }
