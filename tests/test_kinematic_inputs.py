@@ -90,20 +90,20 @@ def crank(**options):
 
 def test_a_crank_drives_its_loop():
     scene, q, v = crank(damping=0.2)
-    t = np.linspace(0.0, 0.5, 101)
+    t = np.linspace(0.0, 0.5, 501)
     path = q[0] + v[0] * t + 0.2 * np.sin(4.0 * t) ** 2
-    motion = vp.simulate(scene, q, v, dt=5e-3, steps=100, controls=path[1:, None], integrator=vp.Gauss(2))
+    motion = vp.simulate(scene, q, v, dt=1e-3, steps=500, controls=path[1:, None], integrator=vp.Gauss(2))
     np.testing.assert_allclose(motion.q[:, 0], path, atol=1e-12)
     g, C = zip(*(scene.constraint_values(x) for x in motion.q), strict=True)
     assert np.abs(g).max() < 1e-13
     # No freedom is left: work and energy balance, v and the force are those of the crank alone.
     assert max(np.abs((c @ x)[:2]).max() for c, x in zip(C, motion.v, strict=True)) < 1e-11
     power = motion.constraint_forces[:, 2] * np.diff(path)
-    friction = 0.2 * 0.5 * ((motion.v[:-1] ** 2 + motion.v[1:] ** 2).sum(axis=1) * 5e-3)
+    friction = 0.2 * 0.5 * ((motion.v[:-1] ** 2 + motion.v[1:] ** 2).sum(axis=1) * 1e-3)
     np.testing.assert_allclose(np.cumsum(power - friction), motion.energy[1:] - motion.energy[0], atol=0.02)
 
 
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(3)])
+@pytest.mark.parametrize("integrator", [vp.Midpoint(guard=None), vp.Gauss(2, guard=None), vp.Gauss(3, guard=None)])
 @pytest.mark.parametrize("links", [3, 4])
 def test_linearizations_are_the_slopes_of_steps(integrator, links):
     """In states along the constraints and in the position at the step's end."""
@@ -123,7 +123,6 @@ def test_linearizations_are_the_slopes_of_steps(integrator, links):
         rate = rate - np.linalg.pinv(C) @ (C @ rate)
         p = vp.lagrangian_jet(scene, at, rate).Lv
         moved = vp.simulate(scene, at, rate, dt=4e-3, steps=1, controls=u[:1] + du, integrator=integrator)
-        assert moved.statistics.substeps[0] == 1
         return np.append(at, p), np.append(moved.q[1], moved.p[1])
 
     rng = np.random.default_rng(0)
@@ -139,14 +138,14 @@ def test_linearizations_are_the_slopes_of_steps(integrator, links):
 
 def test_split_steps_are_linearized_in_their_parts():
     scene, q, v = crank(links=4)
-    u = np.array([[q[0] + 0.9]])
-    motion = vp.simulate(scene, q, v, dt=0.3, steps=1, controls=u, check=False)
+    u = np.array([[q[0] + 0.3]])
+    motion = vp.simulate(scene, q, v, dt=0.15, steps=1, controls=u, check=False)
     assert motion.statistics.substeps[0] > 1
     np.testing.assert_allclose(motion.q[1, 0], u[0, 0], atol=1e-13)
     B = vp.linearize(scene, motion).B[0, :, 0]
     slope = 0.0
     for k, w in WEIGHTS.items():
-        ends = [vp.simulate(scene, q, v, dt=0.3, steps=1, controls=u + s * k * 1e-3, check=False) for s in (1, -1)]
+        ends = [vp.simulate(scene, q, v, dt=0.15, steps=1, controls=u + s * k * 1e-3, check=False) for s in (1, -1)]
         assert all((end.statistics.substeps == motion.statistics.substeps).all() for end in ends)
         ahead, behind = (np.append(end.q[1], end.p[1]) for end in ends)
         slope = slope + w / 1e-3 * (ahead - behind)
