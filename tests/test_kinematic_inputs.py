@@ -152,6 +152,15 @@ def test_split_steps_are_linearized_in_their_parts():
     np.testing.assert_allclose(B, slope, atol=1e-8 * np.abs(slope).max())
 
 
+def test_a_mechanism_without_freedom_may_turn_round():
+    """Where it does, the energy that it takes is tiny, and no balance of it is asked for."""
+    scene, q, _ = crank()
+    path = q[0] + 0.3 * (1.0 - np.cos(np.pi * 0.01 * np.arange(301)))
+    motion = vp.simulate(scene, q, np.zeros(3), dt=0.01, steps=300, controls=path[1:, None])
+    np.testing.assert_allclose(motion.q[:, 0], path, atol=1e-12)
+    np.testing.assert_allclose(motion.q[200], q, atol=1e-9)
+
+
 def test_noise_does_not_move_what_is_moved_by_hand():
     scene, q, v = crank(links=4, noise=vp.AdditiveNoise(0.3))
     path = q[0] + v[0] * np.linspace(0.0, 0.2, 21)

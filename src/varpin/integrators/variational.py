@@ -171,6 +171,12 @@ class Variational(Integrator):
     def _guards(self) -> Guards:
         return _of_core(self.guard, *self._shares())
 
+    def _guards_of(self, scene: Scene) -> Guards:
+        """Those of a scene with constraints: what moves a joint by hand gives and takes energy as it likes."""
+        if self.guard is None or not scene.inputs:
+            return self._guards()
+        return _of_core(replace(self.guard, energy_balance=_ANY_ENERGY, energy_budget=_ANY_ENERGY))
+
     def _guards_again(self, trajectory: Trajectory) -> Guards:
         """When the parts of a motion's steps are accepted that are taken again at dw = 0.
 
@@ -190,7 +196,7 @@ class Variational(Integrator):
         rollout: VariationalRollout | ConstrainedRollout
         if scene.constraints:
             rollout = ConstrainedRollout(
-                scene.core, self._tableau(), self._places(scene), float(self.tolerance), self._guards(), len(q0)
+                scene.core, self._tableau(), self._places(scene), float(self.tolerance), self._guards_of(scene), len(q0)
             )
         else:
             rollout = VariationalRollout(
