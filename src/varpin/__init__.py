@@ -42,6 +42,7 @@ from varpin.mechanics.constraints import CustomConstraintError as CustomConstrai
 from varpin.mechanics.constraints import Distance as Distance
 from varpin.mechanics.constraints import FrameOnFrame as FrameOnFrame
 from varpin.mechanics.constraints import JointTie as JointTie
+from varpin.mechanics.constraints import KinematicInput as KinematicInput
 from varpin.mechanics.constraints import PointOnLine as PointOnLine
 from varpin.mechanics.constraints import PointOnPlane as PointOnPlane
 from varpin.mechanics.constraints import PointOnPoint as PointOnPoint
@@ -73,6 +74,7 @@ from varpin.mechanics.policy import OpenLoop as OpenLoop
 from varpin.mechanics.scene import Scene as Scene
 from varpin.model import Payload as Payload
 from varpin.model import Robot as Robot
+from varpin.model import combine as combine
 from varpin.model import load_robot as load_robot
 from varpin.model import planar_chain as planar_chain
 from varpin.model import robot_names as robot_names

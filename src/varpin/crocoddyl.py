@@ -25,6 +25,7 @@ from varpin.integrators.base import open_loop
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy
+from varpin.mechanics.scene import refuse_constraints
 from varpin.simulation.run import StepFailure, rollout
 from varpin.trajectory import Trajectory
 
@@ -52,6 +53,7 @@ class StepModel(crocoddyl.ActionModelAbstract):
     def __init__(self, problem: OptimalControlProblem, step: int) -> None:
         if problem.constraints:
             raise InputError("hard constraints of a plan have no counterpart in crocoddyl: make them costs")
+        refuse_constraints(problem.scene, "The adapter for crocoddyl")
         n, m = problem.scene.robot.dof, problem.scene.controls
         super().__init__(crocoddyl.StateVector(2 * n), m, 0)
         self._problem = problem
@@ -158,7 +160,8 @@ def shooting_problem(problem: OptimalControlProblem) -> crocoddyl.ShootingProble
     The actions are Python objects, so leave ``nthreads`` at 1.
 
     Raises:
-        InputError: Controls that are held over several steps, or whose changes cost something.
+        InputError: Controls that are held over several steps, or whose changes cost something; a scene with
+            constraints.
     """
     if problem.rate is not None:
         raise InputError("crocoddyl's actions know no control but their own: leave the ControlRateCost out")

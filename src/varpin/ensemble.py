@@ -22,10 +22,10 @@ from varpin.integrators import Integrator, Midpoint, Segment
 from varpin.integrators.base import Failure, rows
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
+from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import Children, children
 from varpin.simulation.loop_stability import examined_in_loop
-from varpin.simulation.run import Motions, commands_of, located
+from varpin.simulation.run import Motions, commands_of, located, on_constraints
 from varpin.simulation.soundness import Finding, announce
 from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
 from varpin.support.executors import executing, in_order
@@ -213,10 +213,11 @@ def simulate_ensemble(
     Raises:
         InputError: Wrong shapes, values that are not finite, or a scene whose noise the core cannot evaluate.
         ForceError: A function of a :class:`varpin.CustomForce` failed in a path, which it names and holds so far.
+        AssemblyError: The scene's constraints cannot be kept next to q0.
         VarpinError: Every path failed, or workers get lost again and again.
         EnsembleInterrupted: Ctrl-C; holds the paths that were done. It is a KeyboardInterrupt.
     """
-    refuse_constraints(require_scene(scene), "simulate_ensemble")
+    require_scene(scene)
     dt, steps, paths = positive("dt", dt, "s"), count("steps", steps), count("paths", paths, least=1)
     _require_memory(scene, steps, paths, store=store)
     start = [_per_path(name, value, paths, scene.robot.joint_names) for name, value in (("q0", q0), ("v0", v0))]
@@ -228,10 +229,12 @@ def simulate_ensemble(
     integrator = Midpoint() if integrator is None else integrator
     if not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
-    if controls is None and scene.servo_joints:
+    if controls is None and (scene.servo_joints or scene.inputs):
         if (start[0] != start[0][0]).any():
-            raise InputError("controls are needed: the scene has servos, and the paths begin at different positions")
+            positions = "the scene has servos or inputs, and the paths begin at different positions"
+            raise InputError(f"controls are needed: {positions}")
         controls = scene.command_at(start[0][0])
+    start, moved = _onto_constraints(scene, start)
     commands = commands_of(scene, integrator, controls, steps, dt)
     if len(commands.places):
         raise InputError("an ensemble takes controls that are held; those of the policy are linear between nodes")
@@ -252,9 +255,26 @@ def simulate_ensemble(
             raise EnsembleInterrupted(sums.ensemble((*sums.lost(), *seen))) from None
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
-    found = (*_alike(scene, start), *sums.lost(), *found)
+    found = (*moved, *_alike(scene, start), *sums.lost(), *found)
     announce(logger, scene, dt, found)
     return sums.ensemble(found)
+
+
+def _onto_constraints(scene: Scene, start: Sequence[Floats]) -> tuple[list[Floats], tuple[Finding, ...]]:
+    """Starts (P, n) that keep the constraints, and what was changed in the first that was another."""
+    q0, v0 = start
+    if not scene.constraints:
+        return [q0, v0], ()
+    if (q0 == q0[0]).all() and (v0 == v0[0]).all():
+        q, v, found = on_constraints(scene, q0[0], v0[0])
+        return [np.broadcast_to(q, q0.shape), np.broadcast_to(v, v0.shape)], found
+    moved = [on_constraints(scene, q, v) for q, v in zip(q0, v0, strict=True)]
+    told = (
+        tuple(Finding(own.kind, f"path {path}: {own.sentence}") for own in found)
+        for path, (_, _, found) in enumerate(moved)
+        if found
+    )
+    return [np.array([q for q, _, _ in moved]), np.array([v for _, v, _ in moved])], next(told, ())
 
 
 def _alike(scene: Scene, start: Sequence[Floats]) -> tuple[Finding, ...]:
@@ -303,10 +323,10 @@ def _per_path(name: str, value: JointValues, paths: int, joints: Sequence[str]) 
 
 def without_geometry(scene: Scene) -> Scene:
     """The scene without shapes that came with its robot: no simulation needs them, and meshes are large to send."""
-    if scene.robot.visuals is None:
+    if scene.robot.visuals is None and not scene.robot.parts:
         return scene
     bare = copy.copy(scene)
-    vars(bare)["robot"] = dataclasses.replace(scene.robot, visuals=None)
+    vars(bare)["robot"] = dataclasses.replace(scene.robot, visuals=None, parts=())
     return bare
 
 

@@ -16,7 +16,7 @@ from varpin.control.costs import CostError
 from varpin.errors import InputError
 from varpin.integrators import Gauss, Integrator
 from varpin.integrators.base import Failure
-from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
+from varpin.mechanics.scene import Scene, refuse_inputs, require_scene
 from varpin.simulation.chatter import alternation
 from varpin.simulation.loop_stability import examined_in_loop
 from varpin.simulation.run import Interrupted, StepFailure, noise_forgotten, simulate
@@ -50,7 +50,7 @@ class Plant:
     substeps: int = 10
 
     def __post_init__(self) -> None:
-        refuse_constraints(require_scene(self.scene), "Plant")
+        refuse_inputs(require_scene(self.scene), "Plant")
         if not isinstance(self.integrator, Integrator):
             raise InputError(f"integrator must be one of varpin's, got {self.integrator!r}")
         count("substeps", self.substeps, least=1)

@@ -5,6 +5,7 @@ Equation (O1) of docs/mathematics.md.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -29,15 +30,19 @@ from varpin.errors import InputError
 from varpin.integrators import Gauss, Integrator, Radau
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy, OpenLoop
-from varpin.mechanics.scene import Scene, closest_controls, refuse_constraints, require_scene
+from varpin.mechanics.scene import Scene, closest_controls, refuse_inputs, require_scene, tangent_basis
 from varpin.simulation.friction import rate_at_rest
-from varpin.simulation.run import simulate
+from varpin.simulation.run import on_constraints, simulate
+from varpin.simulation.soundness import announce
 from varpin.support.checks import JointValues, count, is_one_of, joint_array, named_limits, positive, real
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
 from varpin.trajectory import Trajectory, require_motion
 
 Floats = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
 Sampling = Literal["midpoint", "gauss", "start"]
 Shape = Literal["held", "linear"]
 
@@ -75,7 +80,8 @@ class OptimalControlProblem(Frozen):
     Attributes:
         scene: The scene, its noise included.
         cost: Running and terminal costs.
-        q0: Initial configuration (n,) [rad or m]; it may be given by joint name.
+        q0: Initial configuration (n,) [rad or m]; it may be given by joint name. Where the scene has constraints, a
+            small miss is corrected, as :func:`varpin.simulate` does.
         v0: Initial velocity (n,) [rad/s or m/s]; the same.
         dt: Time step [s].
         steps: N.
@@ -145,9 +151,10 @@ class OptimalControlProblem(Frozen):
                 with ``hold``, in a scene with noise or with constraints; constraints that are no plan constraints or
                 of another robot.
             CostError: A reference that is a function fails.
+            AssemblyError: The scene's constraints cannot be kept next to q0.
         """
         n, m = require_scene(scene).robot.dof, scene.controls
-        refuse_constraints(scene, "OptimalControlProblem")
+        refuse_inputs(scene, "OptimalControlProblem")
         if not isinstance(cost, Cost):
             raise InputError(f"cost must be a cost, for example varpin.TrackingCost(...), got {type(cost).__name__}")
         dt, steps, hold = positive("dt", dt, "s"), count("steps", steps, least=1), count("hold", hold, least=1)
@@ -172,7 +179,10 @@ class OptimalControlProblem(Frozen):
             t0 + times, dt * steps, steps, n, m, t0, scene.robot.joint_names, scene.control_joints, scene.robot
         )
         running, terminal = bind_cost(cost, t0 + times, points)
-        begin = joint_array("q0", q0, scene.robot.joint_names)
+        at, speed = joint_array("q0", q0, scene.robot.joint_names), joint_array("v0", v0, scene.robot.joint_names)
+        if scene.constraints:
+            at, speed, moved = on_constraints(scene, at, speed)
+            announce(logger, scene, dt, moved)
         rate = control_rate(cost, m, scene.control_joints)
         given = _constraints(constraints)
         if given and controls == "linear":
@@ -180,11 +190,11 @@ class OptimalControlProblem(Frozen):
         values = {
             "scene": scene,
             "cost": cost,
-            "q0": begin,
-            "v0": joint_array("v0", v0, scene.robot.joint_names),
+            "q0": at,
+            "v0": speed,
             "dt": dt,
             "steps": steps,
-            "integrator": integrator_for(scene, begin, dt) if integrator is None else integrator,
+            "integrator": integrator_for(scene, at, dt) if integrator is None else integrator,
             "sampling": sampling,
             "hold": hold,
             "t0": t0,
@@ -295,7 +305,11 @@ class OptimalControlProblem(Frozen):
         for name, given in (("q0", q0), ("v0", v0)):
             if given is not None:
                 changed[name] = joint_array(name, given, names)
-                changed[name].setflags(write=False)
+        if changed and scene.constraints:
+            at = {"q0": self.q0, "v0": self.v0, **changed}
+            changed["q0"], changed["v0"], _ = on_constraints(scene, at["q0"], at["v0"])
+        for array in changed.values():
+            array.setflags(write=False)
         if before is not None:
             changed["cost"] = with_control_before(self.cost, before)
             changed["rate"] = control_rate(changed["cost"], scene.controls, scene.control_joints)
@@ -368,14 +382,18 @@ class OptimalControlProblem(Frozen):
         """
         n, m, R = self.scene.robot.dof, self.scene.controls, self.decisions
         jet = lagrangian_jet(self.scene, self.q0, np.zeros(n))
-        rates = np.abs(np.linalg.eigvals(np.linalg.solve(jet.Lvv, jet.Lqq)))
-        omega = 2.0 * float(np.sqrt(rates.max())) + 1.0 / self.duration
+        along = tangent_basis(self.scene, self.q0)
+        inertia, bend = (along.T @ x @ along for x in (jet.Lvv, self._static_curvature(jet.Lqq)))
+        rates = np.abs(np.linalg.eigvals(np.linalg.solve(inertia, bend)))
+        omega = 2.0 * float(np.sqrt(rates.max(initial=0.0))) + 1.0 / self.duration
         if self.linear:
             R = self.steps
         gains = np.zeros((R, m, 2 * n))
-        if np.linalg.matrix_rank(self.scene.actuation) == n and omega * self.dt * self.hold <= 0.25:
+        driven = along.T @ self.scene.actuation
+        if np.linalg.matrix_rank(driven) == len(driven) and omega * self.dt * self.hold <= 0.25:
             in_v = np.eye(n) if self.integrator.variational else jet.Lvv
-            gains[:] = -np.linalg.pinv(self.scene.actuation) @ np.hstack([omega**2 * jet.Lvv, 2.0 * omega * in_v])
+            wanted = np.hstack([omega**2 * jet.Lvv, 2.0 * omega * in_v])
+            gains[:] = -np.linalg.pinv(driven) @ (along.T @ wanted)
         u = np.tile(self.holding_controls(), (R, 1))
         return LinearPolicy(
             u,
@@ -398,6 +416,17 @@ class OptimalControlProblem(Frozen):
     def control_rows(self, trajectory: Trajectory) -> Floats:
         """The controls of a motion as :meth:`samples` takes them."""
         return trajectory.u_nodes if self.linear else trajectory.u
+
+    def _static_curvature(self, Lqq: Floats) -> Floats:
+        """L_qq - y . g_qq, y the constraints' forces where the robot is held at q0 at rest."""
+        if not self.scene.constraints:
+            return Lqq
+        scene, q = self.scene, self.q0
+        (C,) = scene.core.constraints(q[None])[2]
+        left = scene.actuation @ self.holding_controls() - scene.static_pull(q)
+        y = np.linalg.lstsq(C.T, left, rcond=1e-9)[0]
+        curvature: Floats = Lqq - scene.core.constraint_curvature(q, y, np.zeros(q.size))[0]
+        return curvature
 
     def samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
         """Where running costs are taken, the s samples of a step one after another.

@@ -322,6 +322,8 @@ class Solution(Frozen):
         Costs are integrated by Simpson's rule, the motion by the classical Runge-Kutta method, or by ``Radau(3)`` where
         dampers, dry friction or servos are much faster than the plan's step.
 
+        Under constraints it is ``Gauss(3)``, of order 6, which keeps them.
+
         Main args:
             tolerance: On the relative change of the cost when the substeps are doubled.
             max_substeps: Of one step of the plan; where they do not reach the tolerance, ``accuracy`` says so.

@@ -37,6 +37,7 @@ class Attempt:
     written: Nodes
     halvings: Bytes
     values: Floats
+    impulses: Floats  # of the constraints (N, c)
     failure: Failure | None
     verdict: Watch.Verdict
     line: Lines | None = None  # its controls, where they are linear between nodes
@@ -77,6 +78,8 @@ class Attempt:
             scene_values=scene.values,
             u_stages=np.zeros((done, 0, scene.controls)) if self.line is None else self.line.stages[:done],
             u_nodes=np.zeros((done + 1, 0)) if self.line is None else self.line.nodes[: done + 1],
+            constraint_forces=self.impulses[:done] / own.problem.dt,
+            constraint_labels=scene.constraint_labels,
         )
 
 
@@ -136,23 +139,37 @@ class Trials:
         watch = Watch(terms.core, problem.rule, q, v, u, values)
         watch.ask(self._weight, most, self._third, parts)
         state = integrator.fork(self._state)
-        failure, halvings = integrator.watched(scene, state, commands, problem.dt, nodes, watch)
-        return Attempt(self, (q, v, p, energy), u, nodes, halvings, values, failure, watch.verdict)
+        impulses = np.zeros((N, len(scene.constraint_order)))
+        failure, halvings = integrator.watched(scene, state, commands, problem.dt, nodes, watch, impulses)
+        return Attempt(self, (q, v, p, energy), u, nodes, halvings, values, impulses, failure, watch.verdict)
 
     def _on_lines(
         self, commands: Commands, integrator: Integrator, into: tuple[Floats, Floats, Floats, Floats], nodes: Nodes
     ) -> Attempt:
         """The motion under controls that are linear between nodes; nothing ends it early."""
-        (segment,) = integrator.rollout(
-            self.problem.scene, integrator.fork(self._state), commands, self.problem.scene.silence, self.problem.dt
-        )
-        done, own = len(segment.u), segment.statistics
+        scene = self.problem.scene
+        (segment,) = integrator.rollout(scene, integrator.fork(self._state), commands, scene.silence, self.problem.dt)
+        done, statistics = len(segment.u), segment.statistics
         for array, found in zip(into, (segment.q, segment.v, segment.p, segment.energy), strict=True):
             array[1 : done + 1] = found
-        nodes.tally[0, :done] = np.stack([own.newton_iterations, own.jets, own.sweeps, own.substeps], axis=1)
-        nodes.quality[0, :done] = np.stack([own.residual, own.branch_margin, own.energy_defect], axis=1)
+        nodes.tally[0, :done] = np.stack(
+            [statistics.newton_iterations, statistics.jets, statistics.sweeps, statistics.substeps], axis=1
+        )
+        nodes.quality[0, :done] = np.stack(
+            [statistics.residual, statistics.branch_margin, statistics.energy_defect], axis=1
+        )
         nodes.done[0] = done
         line = lines(commands, segment.u, self.problem.integrator.stage_times)
+        impulses = np.zeros((done, 0)) if segment.impulses is None else segment.impulses
         return Attempt(
-            self, into, segment.u, nodes, own.halvings, np.zeros((0, 0)), segment.failure, Watch.Verdict.going, line
+            self,
+            into,
+            segment.u,
+            nodes,
+            statistics.halvings,
+            np.zeros((0, 0)),
+            impulses,
+            segment.failure,
+            Watch.Verdict.going,
+            line,
         )

@@ -15,7 +15,7 @@ from varpin.control.history import Status
 from varpin.control.problem import OptimalControlProblem, bind_cost
 from varpin.core import fastest_damping
 from varpin.core.arrays import Commands
-from varpin.integrators import Integrator, Radau, RungeKutta4
+from varpin.integrators import Gauss, Integrator, Radau, RungeKutta4
 from varpin.integrators.base import open_line, open_loop
 from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.friction import rate_at_rest
@@ -161,7 +161,7 @@ def verify(
     not get there, for dampers or dry friction are too fast for it, an L-stable one does it again.
     """
     fast = _fast(problem, plan) or problem.dt * rate_at_rest(problem.scene, problem.q0) >= _STABLE * max_substeps
-    members = (_FAST,) if fast else (_USUAL, _FAST)
+    members = (accurate(problem),) if problem.scene.constraints else (_FAST,) if fast else (_USUAL, _FAST)
     for integrator in members:
         found = _against(
             problem,
@@ -252,6 +252,11 @@ def _fine_costs(problem: OptimalControlProblem, substeps: int) -> tuple[BoundSum
     return bind_cost(problem.cost, problem.t0 + times, problem.running.points)
 
 
+def accurate(problem: OptimalControlProblem) -> Integrator:
+    """What a plan is held against: classical Runge-Kutta; under constraints ``Gauss(3)``, which keeps them."""
+    return Gauss(stages=3) if problem.scene.constraints else RungeKutta4()
+
+
 def accurate_cost(
     problem: OptimalControlProblem,
     commands: Commands,
@@ -261,11 +266,11 @@ def accurate_cost(
 ) -> tuple[float, Floats]:
     """True cost under given commands, and the end configuration; NaN where the motion runs away.
 
-    In ``substeps`` steps, an even number, of the integrator, :class:`RungeKutta4` if left out, for each of the plan's.
+    In ``substeps`` steps, an even number, of the integrator, :func:`accurate` if left out, for each of the plan's.
     """
     scene, h = problem.scene, problem.dt / substeps
     n, m = scene.robot.dof, scene.controls
-    motion, failure = rollout(scene, integrator or _USUAL, problem.q0, problem.v0, commands, h)
+    motion, failure = rollout(scene, integrator or accurate(problem), problem.q0, problem.v0, commands, h)
     if failure is not None:
         return np.nan, np.full(n, np.nan)
     running, terminal = _fine_costs(problem, substeps) if costs is None else costs

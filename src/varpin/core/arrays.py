@@ -79,7 +79,7 @@ class Product(NamedTuple):
 
 
 class Tied(NamedTuple):
-    """The constraint q_follower - sum_k coefficients_k q_leader^k."""
+    """The constraint q_follower - sum_k coefficients_k q_leader^k; a joint alone, without any, is moved by hand."""
 
     follower: int
     leader: int

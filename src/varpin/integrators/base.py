@@ -160,9 +160,18 @@ class Integrator(ABC):
         return [join(segments)]
 
     def watched(
-        self, scene: Scene, state: Any, commands: Commands, dt: float, nodes: Nodes, watch: Watch
+        self,
+        scene: Scene,
+        state: Any,
+        commands: Commands,
+        dt: float,
+        nodes: Nodes,
+        watch: Watch,
+        impulses: Floats | None = None,
     ) -> tuple[Failure | None, Bytes]:
         """:meth:`rollout` of one path without noise into ``nodes``, which ends where the ``watch`` ends it.
+
+        Those of constraints (N, c) go into ``impulses``, if it is given.
 
         Returns why it failed, if it did, and the halvings of the steps that were not taken whole.
         """
@@ -179,6 +188,8 @@ class Integrator(ABC):
             nodes.tally[0, taken] = np.stack(
                 [statistics.newton_iterations, statistics.jets, statistics.sweeps, statistics.substeps], axis=1
             )
+            if impulses is not None and segment.impulses is not None:
+                impulses[taken] = segment.impulses
             nodes.quality[0, taken] = np.stack(
                 [statistics.residual, statistics.branch_margin, statistics.energy_defect], axis=1
             )

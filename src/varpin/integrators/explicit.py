@@ -106,11 +106,18 @@ class _Explicit(Integrator):
         return segments_of(nodes, REASONS)
 
     def watched(
-        self, scene: Scene, state: ExplicitRun, commands: Commands, dt: float, nodes: Nodes, watch: Watch
+        self,
+        scene: Scene,
+        state: ExplicitRun,
+        commands: Commands,
+        dt: float,
+        nodes: Nodes,
+        watch: Watch,
+        impulses: Floats | None = None,
     ) -> tuple[Failure | None, Bytes]:
         """See :meth:`Integrator.watched`."""
         if scene.noise.diffusion is None:
-            return super().watched(scene, state, commands, dt, nodes, watch)
+            return super().watched(scene, state, commands, dt, nodes, watch, impulses)
         state.paths.roll(dt, contiguous(commands), scene.silence, scene.no_drift, nodes, watch)
         return failure_of(nodes, 0, int(nodes.done[0]), REASONS), np.zeros(0, dtype=np.uint8)
 

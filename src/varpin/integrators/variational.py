@@ -158,6 +158,9 @@ class Variational(Integrator):
             raise InputError(f"{self} keeps no constraints")
         if scene.processes and self.left < 1.0:
             raise InputError("kick='split' does not go with constraints: take kick='left'")
+        noise = scene.noise.diffusion
+        if scene.inputs and (noise is None or noise.control.any()):
+            raise InputError("noise that depends on the controls does not go with a KinematicInput")
         if scene.noise.velocity_dependent:
             raise InputError("noise whose fields depend on the velocity does not go with constraints")
         return places
@@ -168,6 +171,12 @@ class Variational(Integrator):
 
     def _guards(self) -> Guards:
         return _of_core(self.guard, *self._shares())
+
+    def _guards_of(self, scene: Scene) -> Guards:
+        """Those of a scene with constraints: what moves a joint by hand gives and takes energy as it likes."""
+        if self.guard is None or not scene.inputs:
+            return self._guards()
+        return _of_core(replace(self.guard, energy_balance=_ANY_ENERGY, energy_budget=_ANY_ENERGY))
 
     def _guards_again(self, trajectory: Trajectory) -> Guards:
         """When the parts of a motion's steps are accepted that are taken again at dw = 0.
@@ -189,7 +198,7 @@ class Variational(Integrator):
         rollout: VariationalRollout | ConstrainedRollout
         if scene.constraints:
             rollout = ConstrainedRollout(
-                scene.core, self._tableau(), self._places(scene), float(self.tolerance), self._guards(), len(q0)
+                scene.core, self._tableau(), self._places(scene), float(self.tolerance), self._guards_of(scene), len(q0)
             )
         else:
             rollout = VariationalRollout(
@@ -219,11 +228,18 @@ class Variational(Integrator):
         return found
 
     def watched(
-        self, scene: Scene, state: VariationalRun, commands: Commands, dt: float, nodes: Nodes, watch: Watch
+        self,
+        scene: Scene,
+        state: VariationalRun,
+        commands: Commands,
+        dt: float,
+        nodes: Nodes,
+        watch: Watch,
+        impulses: Floats | None = None,
     ) -> tuple[Failure | None, Bytes]:
         """See :meth:`Integrator.watched`."""
         if scene.noise.diffusion is None or isinstance(state.paths, ConstrainedRollout):
-            return super().watched(scene, state, commands, dt, nodes, watch)
+            return super().watched(scene, state, commands, dt, nodes, watch, impulses)
         state.paths.roll(dt, contiguous(commands), scene.silence, scene.no_drift, nodes, watch)
         done = int(nodes.done[0])
         return failure_of(nodes, 0, done, REASONS), parts_of(nodes, 0, done, state.paths.halvings)

@@ -19,13 +19,16 @@ _ROUNDING = 256.0 * np.finfo(np.float64).eps
 # Most corrections of Newton's method, most trials of Levenberg's and Marquardt's, the least part of the way that is
 # followed at once, and the longest step [rad or m].
 _MOST, _MOST_TRIALS, _SHORTEST, _LONGEST = 12, 200, 1e-3, 0.5
+# Where nothing is found, places around the start to search from, and the standard deviation of the last [rad or m].
+_PLACES, _FARTHEST = 20, 1.0
 
 
 def assemble(scene: Scene, q: JointValues) -> Floats:
     """The configuration (n,) nearest to ``q`` that keeps a scene's constraints [rad or m].
 
     Nearest in the metric of the kinetic energy at ``q``, where light joints move more than heavy ones, among those that
-    a continuous way leads to; where that way is lost, another one that keeps them.
+    a continuous way leads to; where that way is lost, another one that keeps them, if need be sought from twenty places
+    around ``q`` (the same ones every time).
 
     Args:
         scene: The scene.
@@ -40,9 +43,20 @@ def assemble(scene: Scene, q: JointValues) -> Floats:
     start = joint_array("q", q, require_scene(scene).robot.joint_names)
     if not scene.constraints:
         return start
-    root = _root_of_mass(scene, start)
-    followed = _followed(scene, start, root)
-    found = _polished(scene, _reached(scene, start, root) if followed is None else followed, root)
+    try:
+        return nearest(scene, start)
+    except AssemblyError:
+        around = _reached_around(scene, start, _root_of_mass(scene, start))
+        if around is None:
+            raise
+        return around
+
+
+def nearest(scene: Scene, q: Floats) -> Floats:
+    """:func:`assemble` from ``q`` (n,) alone, with the errors of that."""
+    root = _root_of_mass(scene, q)
+    followed = _followed(scene, q, root)
+    found = _polished(scene, _reached(scene, q, root) if followed is None else followed, root)
     _require_kept(scene, found)
     return found
 
@@ -56,6 +70,19 @@ def along_constraints(scene: Scene, q: Floats, v: Floats) -> Floats:
     return v
 
 
+def dependent_input(scene: Scene, q: Floats) -> str | None:
+    """The label of a joint moved by hand that the other constraints do not leave free at ``q`` (n,), if one is."""
+    root = _root_of_mass(scene, q)
+    _, C = _values(scene, q)
+    rows = [row for row in (C @ root.T) if row.any()]
+    for row, c in scene.inputs.items():
+        with_it = [*rows, np.eye(q.size)[c] @ root.T]
+        if np.linalg.matrix_rank(np.array(with_it), tol=None) <= (np.linalg.matrix_rank(np.array(rows)) if rows else 0):
+            return scene.bound_constraints.labels[row]
+        rows = with_it
+    return None
+
+
 def missed(scene: Scene, q: Floats) -> tuple[str, float]:
     """The constraint that misses by most at ``q`` (n,), and by how much [m or rad]."""
     g, _ = _values(scene, q)
@@ -64,7 +91,9 @@ def missed(scene: Scene, q: Floats) -> tuple[str, float]:
 
 
 def _values(scene: Scene, q: Floats) -> tuple[Floats, Floats]:
+    """G and C, zero for joints that are moved by hand: they are wherever they are."""
     g, _, C = scene.core.constraints(np.ascontiguousarray(q[None]))
+    g[:, list(scene.inputs)], C[:, list(scene.inputs)] = 0.0, 0.0
     return g[0], C[0]
 
 
@@ -148,6 +177,19 @@ def _reached(scene: Scene, q: Floats, root: Floats) -> Floats:
     return q
 
 
+def _reached_around(scene: Scene, start: Floats, root: Floats) -> Floats | None:
+    """Some q that keeps the constraints, sought from places around ``start``, farther and farther away."""
+    rng = np.random.default_rng(0)
+    for size in np.linspace(0.1, _FARTHEST, _PLACES):
+        q = _polished(scene, _reached(scene, start + size * rng.normal(size=start.size), root), root)
+        try:
+            _require_kept(scene, q)
+        except AssemblyError:
+            continue
+        return q
+    return None
+
+
 def _polished(scene: Scene, q: Floats, root: Floats) -> Floats:
     """To rounding."""
     for _ in range(4):
@@ -157,7 +199,8 @@ def _polished(scene: Scene, q: Floats, root: Floats) -> Floats:
 
 
 def _require_kept(scene: Scene, q: Floats) -> None:
-    g, scale, _ = (part[0] for part in scene.core.constraints(q[None]))
+    scale = scene.core.constraints(q[None])[1][0]
+    g, _ = _values(scene, q)
     wrong = np.abs(g) > _ROUNDING * np.maximum(scale, 1.0) * q.size
     if wrong.any() or not np.isfinite(g).all():
         label, miss = missed(scene, q)
@@ -169,6 +212,7 @@ def _require_kept(scene: Scene, q: Floats) -> None:
             tree = scene.robot.tree
             both = [place_on_body(tree, q[None], body, np.array(at))[0] for at in (along, (0.0, 0.0, 0.0))]
             ends.append(both[0] - both[1])
-        if not ends[0] @ ends[1] > 0.0:
+        # The rows vanish at half a turn about an axis and at a third of one about the diagonals, too: 1, -1 or 0 there.
+        if not ends[0] @ ends[1] > 0.5:
             weld = next(label for label in scene.bound_constraints.labels if label.startswith("FrameOnFrame"))
-            raise AssemblyError(weld.rpartition(" ")[0], float(np.arccos(np.clip(ends[0] @ ends[1], -1.0, 1.0))), q)
+            raise AssemblyError(weld.rsplit(" ", 2)[0], float(np.arccos(np.clip(ends[0] @ ends[1], -1.0, 1.0))), q)

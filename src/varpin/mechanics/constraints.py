@@ -238,6 +238,28 @@ class JointTie(Constraint):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+class KinematicInput(Constraint):
+    """A joint that is moved by hand: its control is where it is at the end of a step, and its force follows.
+
+    Within a step it moves at a constant rate from where it is. Row k of the controls has its position [rad or m] at
+    node k + 1, in place of a force; the actuation gives it a control of its own with a 1, as it does where it is left
+    out. ``Trajectory.constraint_forces`` has the force on the joint, its mean over each step [N m or N].
+
+    Attributes:
+        joint: The joint's name.
+    """
+
+    joint: str
+
+    def bind(self, robot: Robot) -> Bound:
+        """See :meth:`Constraint.bind`."""
+        if self.joint not in robot.joint_names:
+            raise UnknownJoint(str(self.joint), robot.joint_names, "KinematicInput")
+        c = robot.coordinate(self.joint)
+        return Bound(ConstraintRows(ties=(Tied(c, c, ()),)), (f"{self!r}",))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class CustomConstraint(Constraint):
     """Constraints of one's own. Its forces go with its rows: the joints feel jacobian' force.
 

@@ -81,6 +81,9 @@ OF_COUPLINGS = ("FrameLoad", "FrameWrench", "FrameSpring", "FrameLengthSpring", 
 # The same of constraints.
 OF_CONSTRAINTS = ("constraints.between", "constraints.ties", "constraints.custom")
 OF_FORCES = (*OF_ELEMENTS, *OF_COUPLINGS, *OF_CONSTRAINTS)
+# What a configuration that is said to keep constraints may miss them by, and a start to be moved onto them unasked
+# [m or rad]; and the singular values, relative to the largest, of rows that depend on others.
+_OFF, CORRECTED, _DEPENDENT = 1e-6, 0.02, 1e-9
 # So many joints are told of with numbers.
 _NAMED = 7
 _OF_JOINTS = ("damping", "stiffness", "rest", "armature")
@@ -201,6 +204,7 @@ class Scene(Frozen):
         values["constraints"] = constraints_of(constraints)
         bound, order = joined([constraint.bind(robot) for constraint in values["constraints"]])
         values |= {"bound_constraints": bound, "constraint_order": order, "announced": set()}
+        _require_positions(robot, values["actuation"], values["elements"], bound)
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
@@ -316,7 +320,18 @@ class Scene(Frozen):
         """
         at = joint_array("q", q, self.robot.joint_names)
         g, _, C = self.core.constraints(at[None])
+        g[:, list(self.inputs)] = 0.0
         return g[0, self.constraint_order], C[0, self.constraint_order]
+
+    @cached_property
+    def inputs(self) -> Mapping[int, int]:
+        """Joints that are moved by hand: the coordinate of each by the core's row of its :class:`KinematicInput`."""
+        rows = self.bound_constraints.rows
+        return {
+            len(rows.products) + k: tie.follower
+            for k, tie in enumerate(rows.ties)
+            if tie.follower == tie.leader and not tie.coefficients
+        }
 
     @property
     def _gear(self) -> Floats:
@@ -349,10 +364,12 @@ class Scene(Frozen):
         return tuple(self.robot.joint_names[servo.coordinate] for servo in of_kind(self.elements, "PositionServo"))
 
     def command_at(self, q: Floats) -> Floats:
-        """The controls (m,) that stand for none at q (n,): no forces, and servos that stay where they are."""
+        """The controls (m,) that stand for none at q (n,): no forces; servos and inputs stay where they are."""
         command = np.zeros(self.controls)
         for servo in of_kind(self.elements, "PositionServo"):
             command[int(np.argmax(np.abs(self.actuation[servo.coordinate])))] = q[servo.coordinate]
+        for c in self.inputs.values():
+            command[int(np.argmax(self.actuation[c]))] = q[c]
         return command
 
     @property
@@ -477,16 +494,22 @@ class Scene(Frozen):
         """The generalized forces (n,) that hold the robot at rest at ``q`` [N m or N].
 
         Against gravity and springs, the gradient of the potential energy, -L_q(q, 0), and against wrenches on frames.
+        Constraints take what is normal to them; of the forces that hold the robot together with them, the smallest.
 
         Args:
-            q: Configuration, (n,) or by joint name [rad or m].
+            q: Configuration, (n,) or by joint name [rad or m]; it keeps the constraints.
 
         Raises:
-            InputError: A wrong shape, or a value that is not finite.
+            InputError: A wrong shape, a value that is not finite, or a configuration off the constraints.
             UnknownJoint: ``q`` names a joint that is no coordinate of the robot.
         """
-        refuse_constraints(self, "Scene.holding_torque")
         at = joint_array("q", q, self.robot.joint_names)
+        along = tangent_basis(self, at)
+        return along @ (along.T @ self.static_pull(at))
+
+    def static_pull(self, q: Floats) -> Floats:
+        """What holds the robot at rest at ``q`` (n,) without constraints (n,)."""
+        at = np.asarray(q, dtype=np.float64)
         _, Lq, *_ = self.core.jet(at, np.zeros_like(at))
         acts = self.couplings or self.custom is not None
         wrenches = self.core.coupled_forces(at[None], np.zeros((1, at.size)))[0][0] if acts else 0.0
@@ -509,7 +532,8 @@ class Scene(Frozen):
         still = at[None], np.zeros((1, at.size))
         # Wrenches on frames are in both.
         drives = self.core.forces(*still, force[None])[0][0] - self.core.coupled_forces(*still)[0][0]
-        left = torque - force - drives
+        along = tangent_basis(self, at)
+        left = along @ (along.T @ (torque - force - drives))
         # Where nothing pulls, rounding leaves a trace of the weights' own moments, those at a metre say.
         weight = float(self.robot.tree.mass.sum() * np.linalg.norm(self.gravity))
         if (np.abs(left) > 1e-9 * (np.abs(torque).max() + weight)).any():
@@ -563,8 +587,22 @@ def refuse_constraints(scene: Scene, what: str) -> None:
     if scene.constraints:
         names = ", ".join(dict.fromkeys(type(constraint).__name__ for constraint in scene.constraints))
         raise InputError(
-            f"{what} does not take scenes with constraints, and this one has {names}: simulate and linearize do, with "
+            f"{what} does not take scenes with constraints, and this one has {names}: motions and plans do, with "
             "varpin.Midpoint() or varpin.Gauss(stages)"
+        )
+
+
+def refuse_inputs(scene: Scene, what: str) -> None:
+    """Refuse a scene with joints that are moved by hand where that is not known.
+
+    Raises:
+        InputError: It has some.
+    """
+    if scene.inputs:
+        names = ", ".join(scene.robot.joint_names[c] for c in scene.inputs.values())
+        raise InputError(
+            f"{what} does not take scenes with a KinematicInput, and this one has some of {names}: simulate, "
+            "simulate_ensemble and linearize do, with controls that are rows (N, m)"
         )
 
 
@@ -573,10 +611,36 @@ def closest_controls(scene: Scene, q: Floats) -> Floats:
 
     Those of a servo as if it had no effort limit.
     """
-    torque = scene.holding_torque(q)
+    torque = scene.static_pull(q)
     for servo in of_kind(scene.elements, "PositionServo"):
         torque[servo.coordinate] += servo.values[0] * q[servo.coordinate]
-    return np.asarray(np.linalg.lstsq(scene.actuation, torque, rcond=None)[0], dtype=np.float64)
+    if not scene.constraints:
+        return np.asarray(np.linalg.lstsq(scene.actuation, torque, rcond=None)[0], dtype=np.float64)
+    along = tangent_basis(scene, q, CORRECTED)
+    found = np.linalg.lstsq(along.T @ scene.actuation, along.T @ torque, rcond=1e-9)[0]
+    for c in scene.inputs.values():
+        found[np.argmax(scene.actuation[c])] = q[c]
+    return np.asarray(found, dtype=np.float64)
+
+
+def tangent_basis(scene: Scene, q: Floats, off: float = _OFF) -> Floats:
+    """An orthonormal basis (n, f) of the velocities that constraints allow at ``q`` (n,); all of them without any.
+
+    Raises:
+        InputError: The configuration misses the constraints by more than ``off`` [m or rad].
+    """
+    if not scene.constraints:
+        return np.eye(q.size)
+    g, C = scene.constraint_values(q)
+    worst = int(np.argmax(np.abs(g)))
+    if not abs(g[worst]) <= off:
+        raise InputError(
+            f"q misses {scene.constraint_labels[worst]} by {abs(g[worst]):.4g} m or rad: varpin.assemble(scene, q) "
+            "looks for the nearest configuration that keeps the constraints"
+        )
+    _, sizes, basis = np.linalg.svd(C)
+    rank = int((sizes > _DEPENDENT * sizes[0]).sum())
+    return np.ascontiguousarray(basis[rank:].T)
 
 
 def same(one: Floats, other: Floats) -> bool:
@@ -723,6 +787,24 @@ def _refuse_trembling_angles(noise: Noise | Sequence[Noise] | None, elements: Se
             f"ControlNoise is in proportion to forces, and the control of joint {robot.joint_names[servos[0]]!r} is "
             "the position of its servo: take AdditiveNoise"
         )
+
+
+def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Element], bound: Bound) -> None:
+    """Refuse a KinematicInput whose joint has no control of its own, or a servo besides."""
+    served = {own.coordinate for own in of_kind(elements, "PositionServo")}
+    for tie in bound.rows.ties:
+        if tie.follower != tie.leader or tie.coefficients:
+            continue
+        c, name = tie.follower, robot.joint_names[tie.follower]
+        if c in served:
+            raise InputError(f"joint {name!r} has both a PositionServo and a KinematicInput")
+        drives = np.flatnonzero(actuation[c])
+        alone = len(drives) == 1 and actuation[c, drives[0]] == 1.0 and np.count_nonzero(actuation[:, drives[0]]) == 1
+        if not alone:
+            raise InputError(
+                f"the KinematicInput of joint {name!r} needs a control of its own, its position: under this actuation "
+                "none is; name the joint in the actuation, or give it a column with a 1"
+            )
 
 
 def _served(robot: Robot, actuation: Floats, elements: Sequence[Element]) -> Floats:

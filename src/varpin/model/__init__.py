@@ -1,6 +1,7 @@
 """Robots: found, parsed, locked and laid out as the flat tree that the core runs on."""
 
 from varpin.model.chain import planar_chain as planar_chain
+from varpin.model.combination import combine as combine
 from varpin.model.payload import Payload as Payload
 from varpin.model.robot import Robot as Robot
 from varpin.model.robot import build_robot as build_robot

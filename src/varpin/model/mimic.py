@@ -200,15 +200,19 @@ def rebuild(
     order: Sequence[int],
     joint_of: Callable[[int], pin.JointModel],
     root: Sequence[tuple[str, pin.JointModel]] = (),
+    onto: pin.Model | None = None,
+    prefix: str = "",
 ) -> pin.Model:
     """``model`` with its joints added again in ``order``, each as ``joint_of`` gives it.
 
     Links, frames, limits and armature go along. The universe is not in ``order``. Joints of ``root``, by name, carry
-    one another, and the last of them what stood in the universe.
+    one another, and the last of them what stood in the universe. Where a model is given to put it ``onto``, it stands
+    in that one's universe, after what is there; names of joints and frames get a ``prefix``.
     """
-    new = pin.Model()
-    new.name = model.name
-    new.gravity = model.gravity
+    new = pin.Model() if onto is None else onto
+    if onto is None:
+        new.name = model.name
+        new.gravity = model.gravity
     new_index = {0: 0}
     for name, kind in root:
         new_index[0] = new.addJoint(new_index[0], kind, pin.SE3.Identity(), name)
@@ -216,7 +220,7 @@ def rebuild(
     for joint in order:
         source = joint_of(joint)
         new_index[joint] = new.addJoint(
-            new_index[model.parents[joint]], source, model.jointPlacements[joint], model.names[joint]
+            new_index[model.parents[joint]], source, model.jointPlacements[joint], prefix + model.names[joint]
         )
         new.appendBodyToJoint(new_index[joint], model.inertias[joint], pin.SE3.Identity())
         old, copy = model.joints[joint], new.joints[new_index[joint]]
@@ -243,7 +247,7 @@ def rebuild(
         if index not in frames:
             frames[index] = new.addFrame(
                 pin.Frame(
-                    frame.name,
+                    prefix + frame.name,
                     new_index[frame.parentJoint],
                     frames.get(frame.parentFrame, frames[0]),
                     frame.placement,

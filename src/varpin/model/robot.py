@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -42,6 +42,15 @@ Floats = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
 
+class Part(NamedTuple):
+    """A robot within a combined one."""
+
+    robot: "Robot"
+    prefix: str  # of the names of its joints and frames
+    shift: int  # from the index of a joint of its own to that in the combined model
+    place: pin.SE3  # of its world
+
+
 @dataclass(frozen=True, eq=False)
 class Robot(Frozen):
     """An arm in generalized coordinates. Made by :func:`load_robot`.
@@ -64,6 +73,7 @@ class Robot(Frozen):
         package_dirs: Where its meshes are looked up.
         visuals: Geometry that came with a RobotWrapper, locked like the model, or None.
         group_states: What :meth:`posture` reads.
+        parts: The robots that it was combined of, see :func:`combine`; none for any other.
     """
 
     name: str
@@ -79,6 +89,7 @@ class Robot(Frozen):
     package_dirs: tuple[str, ...] = field(default=(), repr=False)
     visuals: pin.GeometryModel | None = field(default=None, repr=False)
     group_states: tuple[Posture, ...] = field(default=(), repr=False)
+    parts: tuple[Part, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
         held = f", {len(self.locked)} locked" if self.locked else ""
@@ -539,6 +550,8 @@ def geometry(robot: Robot) -> pin.GeometryModel:
     Raises:
         RobotError: A mesh is missing or cannot be read; the message names it.
     """
+    if robot.parts:
+        return _of_parts(robot, [geometry(part.robot) for part in robot.parts])
     if robot.visuals is not None:
         return robot.visuals
     if robot.mjcf is not None and robot.expanded is not None:
@@ -558,6 +571,14 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
         The shapes of the links that can be read; and by name of each other link, its joint in ``free_model`` and what
         is wrong with it: of meshes that are not there, all of them together.
     """
+    if robot.parts:
+        found = [readable_geometry(part.robot) for part in robot.parts]
+        faults_of_links = {
+            part.prefix + name: (joint + part.shift if joint else 0, what)
+            for part, (_, faulty) in zip(robot.parts, found, strict=True)
+            for name, (joint, what) in faulty.items()
+        }
+        return _of_parts(robot, [shapes for shapes, _ in found]), faults_of_links
     if robot.mjcf is not None:
         try:
             return geometry(robot), {}
@@ -592,6 +613,23 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
     if urdf.root is None:
         missing = {frame.name: (frame.parentJoint, problem) for frame in _links(robot.free_model)}
     return found, missing
+
+
+def _of_parts(robot: Robot, shapes: Sequence[pin.GeometryModel]) -> pin.GeometryModel:
+    """The shapes of each part of a combined robot on its joints."""
+    together, model = pin.GeometryModel(), robot.free_model
+    for part, own in zip(robot.parts, shapes, strict=True):
+        for given in own.geometryObjects:
+            shape = given.copy()
+            link = part.robot.free_model.frames[given.parentFrame]
+            shape.name = part.prefix + given.name
+            shape.parentFrame = model.getFrameId(part.prefix + link.name, link.type) if given.parentFrame else 0
+            if given.parentJoint:
+                shape.parentJoint = given.parentJoint + part.shift
+            else:
+                shape.placement = part.place * given.placement
+            together.addGeometryObject(shape)
+    return together
 
 
 def _links(model: pin.Model) -> list[pin.Frame]:

@@ -85,4 +85,7 @@ def _efforts(scene: Scene, trajectory: Trajectory) -> Floats:
     for stage in range(trajectory.u_stages.shape[1]):
         at_stage = drive_forces(scene.elements, q, v, trajectory.u_stages[:, stage] @ scene.actuation.T)
         forces = np.where(np.abs(at_stage) > np.abs(forces), at_stage, forces)
+    # Controls of joints that are moved by hand are positions.
+    for row, c in scene.inputs.items():
+        forces[:, c] = trajectory.constraint_forces[:, int(np.argmax(scene.constraint_order == row))]
     return forces

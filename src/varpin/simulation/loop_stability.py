@@ -157,7 +157,7 @@ def examined_in_loop(
     ``hold`` is the period of the loop in steps, None without feedback.
     """
     trajectory, found = examined(scene, integrator, trajectory)
-    if hold is not None:
+    if hold is not None and not scene.constraints:
         loop = unstable_loop(scene, trajectory, hold) or _flipping(scene, trajectory, hold)
         found = (*(loop or _cycling(scene, trajectory, hold)), *found)
     return with_warnings(trajectory, found), found

@@ -17,11 +17,11 @@ from varpin.errors import InputError, UnknownJoint, VarpinError
 from varpin.integrators import Integrator, Midpoint, Radau, Reference, Segment, integrator_of
 from varpin.integrators.base import Failure, join, lines, open_loop, rows, steps_of
 from varpin.integrators.within import Times, changing
-from varpin.mechanics.assembly import along_constraints, assemble, missed
+from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop, takes
-from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
+from varpin.mechanics.scene import CORRECTED, Scene, refuse_constraints, refuse_inputs, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.simulation import limits
 from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstable_loop
@@ -54,8 +54,8 @@ _CHUNK = 30_000
 # rule's velocities lag and ring. Of more joints than so many nobody asks, for that takes as long as a motion.
 _MIDPOINT, _STOPPING = Midpoint(), Radau(3)
 _RINGS, _ASKED = 1.0, 200
-# What a start may miss constraints by to be moved onto them unasked, and what of that is not spoken of [rad or m].
-_CORRECTED, _UNSAID = 0.02, 1e-9
+# What a start may be moved by onto constraints without a word [rad or m].
+_UNSAID = 1e-9
 # Steps at which a function of time is held against steps of half the length, and the share by which it may be off.
 _LOOKS, _ALIKE = 16, 0.05
 # Steps in one of a run in which a function failed, for where it does.
@@ -450,12 +450,12 @@ def simulate(
     q0, v0 = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
     if integrator is not None and not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
-    if controls is None and scene.servo_joints:
+    if controls is None and (scene.servo_joints or scene.inputs):
         controls = scene.command_at(q0)
     accuracy: Accuracy | None = None
     wished: tuple[Finding, ...] = ()
     if scene.constraints:
-        q0, v0, wished = _on_constraints(scene, q0, v0)
+        q0, v0, wished = on_constraints(scene, q0, v0)
     if tolerance is not None:
         span = _time_of_wish(dt, steps, duration)
         chosen = _chosen(scene, q0, v0, span, tolerance, controls, integrator)
@@ -466,6 +466,8 @@ def simulate(
     period = count("period", period, least=1)
     integrator = _usual(scene, q0, v0, dt) if integrator is None else integrator
     law = controls if callable(controls) else None
+    if callable(controls) or isinstance(controls, OpenLoop):
+        refuse_inputs(scene, "simulate with a function of time or a law")
     if law is not None:
         _require_law(law)
     elif period != 1:
@@ -596,7 +598,7 @@ def _times(dt: float | None, steps: int | None, duration: float | None) -> tuple
     return dt, steps
 
 
-def _on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats, tuple[Finding, ...]]:
+def on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats, tuple[Finding, ...]]:
     """The nearest state that keeps the constraints, and by how much it is another, if that is to be said.
 
     Raises:
@@ -604,12 +606,14 @@ def _on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Float
         AssemblyError: They cannot be kept next to q0.
     """
     label, miss = missed(scene, q0)
-    if miss > _CORRECTED:
+    if miss > CORRECTED:
         raise InputError(
             f"q0 misses {label} by {miss:.4g} m or rad: varpin.assemble(scene, q0) looks for the nearest configuration "
             "that keeps the constraints"
         )
-    q = assemble(scene, q0)
+    q = nearest(scene, q0)
+    if (twice := dependent_input(scene, q)) is not None:
+        raise InputError(f"{twice} moves a joint that the other constraints and inputs move already at q0")
     v = along_constraints(scene, q, v0)
     shift, turned = float(np.abs(q - q0).max()), float(np.abs(v - v0).max())
     words = []
@@ -813,7 +817,7 @@ def _told(
     scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None, *, check: bool
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
     """A whole motion with what is to be said of it; ``hold`` is the period of its feedback in steps, None for none."""
-    if check and not scene.constraints:
+    if check:
         return examined_in_loop(scene, integrator, trajectory, hold)
     found = evident(scene, integrator, trajectory)
     return with_warnings(trajectory, found), found
@@ -854,6 +858,8 @@ def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps:
         InputError: The array is neither (steps, m) nor (m,), or not finite; the policy is for something else; a law.
         ControlError: The function of an OpenLoop failed; it holds no trajectory.
     """
+    if isinstance(controls, LinearPolicy | OpenLoop | FirstOrderHold):
+        refuse_inputs(scene, f"a {type(controls).__name__}")
     if isinstance(controls, LinearPolicy):
         if controls.joints is not None and controls.joints != scene.control_joints:
             raise InputError(

@@ -96,7 +96,13 @@ class Finding:
 
 
 def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Trajectory, tuple[Finding, ...]]:
-    """A motion with its energy balance, if the integrator keeps none, and its warnings; and what was found."""
+    """A motion with its energy balance, if the integrator keeps none, and its warnings; and what was found.
+
+    Of a motion under constraints it is what its record tells: no step is taken again.
+    """
+    if scene.constraints:
+        found = evident(scene, integrator, trajectory)
+        return with_warnings(trajectory, found), found
     if not integrator.variational:
         defects = energy_defects(scene, integrator, trajectory)
         defects.setflags(write=False)

@@ -280,8 +280,9 @@ class Collocation {
     }
 
     // How many of q0, p0 and f have columns to be solved for: with one stage the force acts in proportion to the
-    // momentum.
-    int kinds() const { return stages == 1 ? 2 : 3; }
+    // momentum, unless something else is in a force's place.
+    int kinds() const { return stages == 1 && !every_kind ? 2 : 3; }
+    bool every_kind = false;
 
     // What a force on coordinate c does to the one stage, in units of what a momentum does.
     double by_momentum(double h, int c) const { return h * (weight[0] * tableau.force[0] + changed(0, c)); }

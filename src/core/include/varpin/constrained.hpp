@@ -42,11 +42,13 @@ struct ConstraintBasis {
 struct ConstrainedState {
     ConstrainedState(const Mechanism& mechanism, int stages)
         : path(mechanism, stages),
+          rate(mechanism.constraints.rows()),
           impulse(mechanism.constraints.rows()),
           past_impulse(stages * mechanism.constraints.rows()) {}
     PathState path;
     int rank = -1;                     // of the constraints, for the whole rollout
     int weakest = 0;                   // the constraint row that a failed step would name
+    std::vector<double> rate;          // (m) of rows whose joint is moved by hand, at the node; zero of others
     std::vector<double> impulse;       // (m) of the last step, negative Lam added up [N s or N m s]
     std::vector<double> past_impulse;  // (s, m) Lam of the last whole step
     std::vector<double> impulses;      // (steps, m) of the last roll
@@ -84,6 +86,7 @@ class ConstrainedStepper {
           push_size(stages * n),
           unit(n) {
         mass_jet.M.resize(entries(n, n));
+        equation.every_kind = !mechanism.constraints.driven().empty();
         for (int i = 0; i < stages; ++i) {
             for (int k = 0; k < stages; ++k) weight[i * stages + k] = 1.0 - at[k * stages + i] / tableau.b[i];
         }
@@ -103,6 +106,9 @@ class ConstrainedStepper {
     Effort effort;                       // of the last step
     std::vector<std::uint8_t> halvings;  // of each part of the last step; none if it was taken whole
 
+    // A joint that is moved by hand goes at a constant rate to where its entry of the step's force says that it is at
+    // the end. Its row of the constraints is g = q - (that motion), and no force acts on it but the row's.
+
     // Put a path at (q, p), p brought onto the tangent space; false where M(q) is not positive definite.
     bool begin_at(const double* q, const double* p, ConstrainedState& state, bool project = true) {
         PathState& path = state.path;
@@ -118,7 +124,8 @@ class ConstrainedStepper {
         state.rank = -1;
         if (!look_at(state)) return false;
         state.rank = here.rank();
-        if (project) absorb(path);
+        for (const DrivenRow& own : mechanism.constraints.driven()) state.rate[own.row] = path.v[own.coordinate];
+        if (project) absorb(state);
         for (int i = 0; i < n; ++i) unit[i] = path.place[i].place.high;
         if (!energy_guard.node(unit.data(), path.momentum.data(), path.v.data())) return false;
         energy_guard.begin(unit.data(), path.momentum.data(), path.v.data(), path.energies);
@@ -148,7 +155,7 @@ class ConstrainedStepper {
             path.momentum[i] = path.p[i].high;
             unit[i] = path.place[i].place.high;
         }
-        absorb(path);
+        absorb(state);
         energy_guard.kicked(unit.data(), path.momentum.data(), path.v.data(), path.energies);
     }
 
@@ -157,6 +164,7 @@ class ConstrainedStepper {
         stride = varies ? n : 0;
         std::copy(own, own + (varies ? stages * n : n), force.begin());
         if (varies) given = force;
+        take_goals();
     }
 
     // One whole step, in as many substeps as the guards ask for; as VariationalStepper::step.
@@ -200,6 +208,7 @@ class ConstrainedStepper {
     Outcome from_guess(double h, const double* V, ConstrainedState& state) {
         std::copy(V, V + stages * n, equation.V.begin());
         std::fill(impulse.begin(), impulse.end(), 0.0);
+        share = 1.0;
         return attempt(h, state);
     }
 
@@ -237,6 +246,7 @@ class ConstrainedStepper {
                 } else {
                     constant_force(mechanism, extra, u + s * controls, force.data());
                 }
+                take_goals();
                 const Outcome outcome = step(h, state);
                 record_effort(effort, nodes, row);
                 nodes.ended[p] = static_cast<std::int64_t>(outcome);
@@ -262,6 +272,9 @@ class ConstrainedStepper {
         for (int row = 0; equation.kinds() == 2 && row < n; ++row) {
             for (int c = 0; c < n; ++c) dV[row * w + 2 * n + c] = equation.by_momentum(h, c) * dV[row * w + n + c];
         }
+        for (const DrivenRow& own : mechanism.constraints.driven()) {
+            for (int i = 0; i < wide; ++i) dV[i * w + 2 * n + own.coordinate] = 0.0;
+        }
         bend_points();
         columns.assign(entries(size, w), 0.0);
         for (int i = 0; i < wide; ++i) {
@@ -275,8 +288,12 @@ class ConstrainedStepper {
         for (int k = 0; k < stages; ++k) {
             for (int a = 0; a < r; ++a) {
                 const int row = here.order[a];
-                for (int c = 0; c < n; ++c)
-                    columns[(wide + k * r + a) * w + c] = -row_scale[row] * point[k].C[row * n + c] / h;
+                double* own = &columns[(wide + k * r + a) * w];
+                for (int c = 0; c < n; ++c) own[c] = -row_scale[row] * point[k].C[row * n + c] / h;
+                const int c = mechanism.constraints.driven_by(row);
+                if (c < 0) continue;
+                own[2 * n + c] = row_scale[row] * way_to(k + 1) / h;
+                own[c] += row_scale[row] * (1.0 - way_to(k + 1)) / h;
             }
         }
         std::vector<double> sorted(columns.size());
@@ -309,7 +326,7 @@ class ConstrainedStepper {
             }
         }
         std::swap(here, origin);
-        project_derivatives(path, end);
+        project_derivatives(h, path, end);
     }
 
     ConstraintBasis here, there;  // at the start of the substep that was solved last, and at its end
@@ -325,6 +342,8 @@ class ConstrainedStepper {
     static constexpr double stagnation = 100.0;
     static constexpr int most_corrections = 12;
 
+    double share = 1.0;          // of what is left of a step, that the next part of it is
+    std::vector<double> goal;    // of each joint that is moved by hand, at the end of the step
     std::vector<double> given;   // (s, n) force at the stages of the whole step, where it varies
     std::vector<double> line;    // (s, m) controls there, where they are linear
     std::vector<double> at;      // (s + 1, s) t_kj
@@ -335,6 +354,7 @@ class ConstrainedStepper {
     std::vector<double> impulse;       // (s, m) Lam_k, zero for rows that are left out
     std::vector<double> total;         // (m)
     std::vector<double> last;          // (m) Lam_s
+    std::vector<double> rate;          // (m) of joints that are moved by hand, in the part
     std::vector<double> Qk, scaled, row_scale, y, bent, pushed, push_size, unit;
     std::vector<double> block, saddle, right, solution;
     std::vector<int> rows;
@@ -353,7 +373,7 @@ class ConstrainedStepper {
     // The last impulse: M dv1 + C1' dLam = dp - (L_vq + Lam . g_qq) dq1, C1 dv1 = -(g_qq v1) dq1, and dp1 = M dv1 +
     // L_vq dq1.
     template <class End>
-    void project_derivatives(const PathState& path, const End& end) {
+    void project_derivatives(double h, const PathState& path, const End& end) {
         const int r = there.rank();
         for (int i = 0; i < n; ++i) unit[i] = path.place[i].place.high;
         Jet<double>& jet = equation.stage[0];
@@ -370,6 +390,8 @@ class ConstrainedStepper {
             whiten(there, z.data(), z.data());
             for (int k = 0; k < r; ++k) {
                 double own = -inner(&bend[there.order[k] * n], dq.data());
+                const int moved = mechanism.constraints.driven_by(there.order[k]);
+                if (moved >= 0) own += share / h * ((c == 2 * n + moved) - (c == moved));
                 for (int j = 0; j < k; ++j) own -= there.R[j * r + k] * along[j];
                 along[k] = own / there.R[k * r + k];
             }
@@ -484,12 +506,35 @@ class ConstrainedStepper {
     }
     double norm(const double* a) const { return std::sqrt(inner(a, a)); }
 
-    // Lam (m) with C M^-1 (p - C' Lam) = 0, of the basis' rows; zero of others.
-    void find_impulse(const ConstraintBasis& basis, const double* p, double* Lam) {
+    // The goals of joints that are moved by hand, out of the step's force.
+    void take_goals() {
+        const std::vector<DrivenRow>& driven = mechanism.constraints.driven();
+        goal.resize(driven.size());
+        for (std::size_t d = 0; d < driven.size(); ++d) {
+            goal[d] = force[driven[d].coordinate];
+            force[driven[d].coordinate] = 0.0;
+        }
+    }
+
+    // How much of the way from here to its goal such a joint has gone at Lobatto point k of the part.
+    double way_to(int k) const {
+        double place = 0.0;
+        for (int j = 0; j < stages; ++j) place += at[k * stages + j];
+        return share * place;
+    }
+
+    // Lam (m) with C M^-1 (p - C' Lam) = rate, of the basis' rows; zero of others.
+    void find_impulse(const ConstraintBasis& basis, const double* p, const double* rate, double* Lam) {
         const int r = basis.rank();
         std::vector<double> white(n), along(r);
         whiten(basis, p, white.data());
-        for (int k = 0; k < r; ++k) along[k] = inner(&basis.Q[k * n], white.data());
+        std::vector<double> wanted(r);
+        for (int k = 0; k < r; ++k) {
+            double own = rate[basis.order[k]];
+            for (int j = 0; j < k; ++j) own -= basis.R[j * r + k] * wanted[j];
+            wanted[k] = own / basis.R[k * r + k];
+            along[k] = inner(&basis.Q[k * n], white.data()) - wanted[k];
+        }
         std::fill(Lam, Lam + m, 0.0);
         for (int k = r - 1; k >= 0; --k) {
             double own = along[k];
@@ -499,9 +544,10 @@ class ConstrainedStepper {
     }
 
     // Take from a momentum what is normal to the constraints at the path's node, whose basis is `here`.
-    void absorb(PathState& path) {
+    void absorb(ConstrainedState& state) {
+        PathState& path = state.path;
         for (int again = 0; again < 2; ++again) {
-            find_impulse(here, path.momentum.data(), total.data());
+            find_impulse(here, path.momentum.data(), state.rate.data(), total.data());
             for (int c = 0; c < n; ++c) {
                 path.p[c] = path.p[c].plus(-across(here.jet, total.data(), c));
                 path.momentum[c] = path.p[c].high;
@@ -553,6 +599,11 @@ class ConstrainedStepper {
             if (!(margin > 0.0)) return Outcome::fold;
         }
         advance(h, path);
+        rate.assign(m, 0.0);
+        for (std::size_t d = 0; d < goal.size(); ++d) {
+            const DrivenRow& own = mechanism.constraints.driven()[d];
+            rate[own.row] = share * (goal[d] - path.place[own.coordinate].place.high) / h;
+        }
         for (int i = 0; i < n; ++i) unit[i] = trial.place[i].place.high;
         if (!find_basis(unit.data(), state.rank, there)) return Outcome::singular;
         if (!(there.least > near_toggle) && there.rank() > 0) {
@@ -562,10 +613,11 @@ class ConstrainedStepper {
         last.assign(m, 0.0);
         for (int again = 0; again < 2; ++again) {
             for (int i = 0; i < n; ++i) y[i] = trial.p[i].high;
-            find_impulse(there, y.data(), total.data());
+            find_impulse(there, y.data(), rate.data(), total.data());
             for (int c = 0; c < n; ++c) trial.p[c] = trial.p[c].plus(-across(there.jet, total.data(), c));
             for (int r = 0; r < m; ++r) last[r] += total[r];
         }
+        for (const DrivenRow& own : mechanism.constraints.driven()) add_work(own, path);
         const Outcome outcome = energy_guard.settle(guards, tableau, path.energies, path.place, path.v, trial);
         if (outcome != Outcome::solved) return outcome;
         effort.branch_margin = std::min(effort.branch_margin, margin);
@@ -577,6 +629,7 @@ class ConstrainedStepper {
         }
         std::swap(path.place, trial.place);
         std::swap(path.p, trial.p);
+        state.rate = rate;
         std::swap(origin, here);
         here = there;
         bool turned = false;
@@ -637,6 +690,7 @@ class ConstrainedStepper {
 
     // Where the force varies: bring it to the stages of a part of the step.
     void bring_force(double begin, int level) {
+        share = length_of(1.0, level) / (1.0 - begin);
         if (stride == 0) return;
         bring_to_part(tableau, n, given.data(), begin, length_of(1.0, level), force.data());
     }
@@ -647,6 +701,17 @@ class ConstrainedStepper {
         return sum;
     }
 
+    // What moves a joint by hand does this work: its impulses, the first of which meets the velocity before it, too.
+    void add_work(const DrivenRow& own, const PathState& path) {
+        const double after = rate[own.row], first = 0.5 * (path.v[own.coordinate] + after);
+        for (int k = 0; k <= stages; ++k) {
+            const double Lam = k < stages ? impulse[k * m + own.row] : last[own.row];
+            const double work = -Lam * (k == 0 ? first : after);
+            trial.work[own.coordinate] += work;
+            trial.magnitude[own.coordinate] += std::abs(work);
+        }
+    }
+
     void visit_points(double h, const Start& start) {
         for (int k = 1; k <= stages; ++k) {
             for (int c = 0; c < n; ++c) {
@@ -655,6 +720,13 @@ class ConstrainedStepper {
                 Qk[c] = start.place[c].place.high + (start.place[c].place.low + h * sum);
             }
             mechanism.constraints.at(Qk.data(), point[k - 1]);
+            for (std::size_t d = 0; d < goal.size(); ++d) {
+                const DrivenRow& own = mechanism.constraints.driven()[d];
+                const Place& from = start.place[own.coordinate];
+                const double left = goal[d] - from.place.high;
+                point[k - 1].g[own.row] = Qk[own.coordinate] - (from.place.high + (from.place.low + way_to(k) * left));
+                point[k - 1].scale[own.row] = std::abs(Qk[own.coordinate]) + std::abs(left);
+            }
         }
     }
 

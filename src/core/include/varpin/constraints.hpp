@@ -43,11 +43,17 @@ struct ProductRow {
     double constant = 0.0;
 };
 
-// q_follower - sum_k coefficients_k q_leader^k.
+// q_follower - sum_k coefficients_k q_leader^k. A joint that leads itself, without coefficients, is moved by hand.
 struct TieRow {
     int follower = 0;
     int leader = 0;
     std::vector<double> coefficients;
+};
+
+// The row of a joint that is moved by hand: q - (where it is to be), of which the core knows the second.
+struct DrivenRow {
+    int row = 0;
+    int coordinate = 0;
 };
 
 // A function of q with several rows.
@@ -98,10 +104,20 @@ class Constraints {
         }
         rows_ = static_cast<int>(products_.size() + ties_.size());
         for (const CustomRows& own_rows : customs_) rows_ += own_rows.rows;
+        driven_by_.assign(rows_, -1);
+        for (std::size_t k = 0; k < ties_.size(); ++k) {
+            if (ties_[k].follower != ties_[k].leader || !ties_[k].coefficients.empty()) continue;
+            driven_.push_back({static_cast<int>(products_.size() + k), ties_[k].follower});
+            driven_by_[driven_.back().row] = driven_.back().coordinate;
+        }
     }
 
     // m: products first, then ties, then functions.
     int rows() const { return rows_; }
+
+    // Rows of joints that are moved by hand; and the coordinate that a row moves, -1 if it does not.
+    const std::vector<DrivenRow>& driven() const { return driven_; }
+    int driven_by(int row) const { return driven_by_[row]; }
 
     // g and C at q.
     void at(const double* q, ConstraintJet& w) const {
@@ -250,6 +266,8 @@ class Constraints {
     std::vector<Joined> vectors_;
     std::vector<ProductRow> products_;
     std::vector<TieRow> ties_;
+    std::vector<DrivenRow> driven_;
+    std::vector<int> driven_by_;
     std::vector<CustomRows> customs_;
     int n_ = 0;
     int rows_ = 0;

@@ -157,8 +157,11 @@ def requirements(layout: Layout, whole: Layout, idle: Sequence[str], scene: Scen
     names, group = layout.robot.joint_names, scene.group
     parts = [tuple(name for name, g in zip(names, group, strict=True) if g == label) for label in np.unique(group)]
     together = ", ".join(sorted({term.spec.kind for term in layout.costs if term.spec.term.space == "robot"}))
-    if together or len(parts) == 1:
-        coupled = f"the cost has a term on the whole robot ({together})" if together and len(parts) > 1 else ""
+    why = f"the cost has a term on the whole robot ({together})" if together else ""
+    if scene.constraints and not why:
+        why = "the scene has constraints"
+    if why or len(parts) == 1:
+        coupled = why if len(parts) > 1 else ""
         parts = [names]
     else:
         coupled = ""

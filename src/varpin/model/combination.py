@@ -1,0 +1,118 @@
+"""Several robots as one tree: two arms that carry an object together, an arm beside a table that moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import chain
+from types import MappingProxyType
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from varpin.errors import InputError
+from varpin.model.additions import on_base
+from varpin.model.mimic import Tie, rebuild, tied_model
+from varpin.model.robot import Part, Robot
+from varpin.model.sources import Description
+from varpin.model.tree import flatten
+
+
+def combine(
+    *robots: Robot,
+    placements: Sequence[ArrayLike | pin.SE3 | None] | None = None,
+    prefixes: Sequence[str] | None = None,
+) -> Robot:
+    """Several robots as one, whose coordinates are those of the first, then those of the second, and so on.
+
+    Nothing joins them but what a scene adds: a :class:`varpin.FrameOnFrame` between a frame of each closes the loop of
+    two arms that hold one object. Limits, damping, friction, armature, mimic joints, shapes and postures go along.
+
+        left, right = vp.load_robot("ur5"), vp.load_robot("ur5")
+        pair = vp.combine(left, right, placements=[None, facing], prefixes=["left_", "right_"])
+
+    Args:
+        robots: Two at least; one may be given twice.
+        placements: Where the world of each robot stands in the new one, a transform (4, 4) [m], a ``pin.SE3``, or None
+            for where it is; left out, where they are.
+        prefixes: What comes before the names of the joints and frames of each robot. Left out, nothing where no name is
+            there twice; else the robots' own names, or ``a_``, ``b_`` ... where those are alike.
+
+    Raises:
+        InputError: Fewer than two robots, placements or prefixes of another number, a placement that is no rotation and
+            translation, or names that are still there twice.
+    """
+    if len(robots) < 2 or not all(isinstance(robot, Robot) for robot in robots):
+        raise InputError("combine takes two robots or more, as varpin.load_robot makes them")
+    if placements is None:
+        placements = [None] * len(robots)
+    if isinstance(placements, str | pin.SE3) or len(placements) != len(robots):
+        raise InputError(f"placements must be one for each of {len(robots)} robots")
+    if any(isinstance(place, str) for place in placements):
+        raise InputError("placements are transforms: a base that moves is given to load_robot, base='planar'")
+    given = _prefixes(robots) if prefixes is None else tuple(prefixes)
+    if isinstance(prefixes, str) or len(given) != len(robots) or not all(isinstance(word, str) for word in given):
+        raise InputError(f"prefixes must be one word for each of {len(robots)} robots, got {prefixes!r}")
+    if twice := _twice(robots, given):
+        raise InputError(f"with the prefixes {given} the name {twice[0]!r} is there twice")
+    model, ties, parts = pin.Model(), [], []
+    model.gravity = robots[0].model.gravity
+    for robot, place, prefix in zip(robots, placements, given, strict=True):
+        own = robot.free_model if place is None else on_base(Description(robot.name, robot.free_model), place).model
+        shift = model.njoints - 1
+        rebuild(own, range(1, own.njoints), own.joints.__getitem__, onto=model, prefix=prefix)
+        ties += [Tie(tie.follower + shift, tie.leader + shift, tie.ratio, tie.offset) for tie in robot.ties]
+        moved = pin.SE3.Identity() if place is None else pin.SE3(_homogeneous(place))
+        parts.append(Part(robot, prefix, shift, moved))
+    model.name = "+".join(robot.name for robot in robots)
+    followers = {tie.follower for tie in ties}
+    coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
+    pairs = list(zip(robots, given, strict=True))
+    return Robot(
+        name=model.name,
+        model=tied_model(model, ties),
+        joint_names=tuple(model.names[joint] for joint in coordinates),
+        free_model=model,
+        ties=tuple(ties),
+        tree=flatten(model, tuple(ties), coordinates),
+        locked=MappingProxyType({word + name: at for robot, word in pairs for name, at in robot.locked.items()}),
+        package_dirs=tuple(dict.fromkeys(chain.from_iterable(robot.package_dirs for robot in robots))),
+        group_states=tuple(
+            replace(
+                state, group=word + state.group, positions=tuple((word + joint, at) for joint, at in state.positions)
+            )
+            for robot, word in pairs
+            for state in robot.group_states
+        ),
+        parts=tuple(parts),
+    )
+
+
+def _homogeneous(place: ArrayLike | pin.SE3) -> ArrayLike:
+    return place.homogeneous if isinstance(place, pin.SE3) else np.asarray(place, dtype=np.float64)
+
+
+def _names(robot: Robot) -> set[str]:
+    return {*list(robot.free_model.names)[1:], *(frame.name for frame in list(robot.free_model.frames)[1:])}
+
+
+def _twice(robots: Sequence[Robot], prefixes: Sequence[str]) -> list[str]:
+    """Names that several robots have."""
+    seen: set[str] = set()
+    twice = []
+    for robot, prefix in zip(robots, prefixes, strict=True):
+        own = {prefix + name for name in _names(robot)}
+        twice += sorted(own & seen)
+        seen |= own
+    return twice
+
+
+def _prefixes(robots: Sequence[Robot]) -> tuple[str, ...]:
+    """None where no name is there twice, else the robots' names, or letters."""
+    if not _twice(robots, [""] * len(robots)):
+        return ("",) * len(robots)
+    names = tuple(f"{robot.name}_" for robot in robots)
+    if len(set(names)) == len(names) and not _twice(robots, names):
+        return names
+    return tuple(f"{chr(ord('a') + k)}_" if k < 26 else f"r{k}_" for k in range(len(robots)))

@@ -1,0 +1,85 @@
+"""What closed loops must hold to: energy over long times, time reversal, and no silent wrong motion in odd loops."""
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin.mechanics.assembly import along_constraints
+
+
+def four_bar(**options):
+    scene = vp.Scene(vp.planar_chain(3), constraints=vp.PointOnPoint("tip", (1.3, 0.0, 0.2), axes="xz"), **options)
+    q = vp.assemble(scene, [-1.5, 1.5, 1.5])
+    return scene, q, along_constraints(scene, q, np.array([1.0, 0.0, 0.0]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("integrator", "amplitude"), [(vp.Midpoint(), 1.0), (vp.Gauss(2), 1e-2)])
+def test_energy_has_no_trend_over_a_thousand_seconds(integrator, amplitude):
+    scene, q, v = four_bar()
+    # In whole steps: where some are split, energy walks at random.
+    motion = vp.simulate(scene, q, v, dt=5e-3, steps=200_000, integrator=integrator, check=False)
+    assert motion.statistics.split_steps == 0
+    error = motion.energy - motion.energy[0]
+    slope = np.polyfit(motion.t, error, 1)[0]
+    assert np.abs(error).max() < amplitude
+    assert abs(slope) * 1000.0 < 0.1 * np.ptp(error)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(3)])
+def test_motions_go_back_the_way_they_came(integrator):
+    scene, q, v = four_bar()
+    there = vp.simulate(scene, q, v, dt=5e-3, steps=100, integrator=integrator)
+    back = vp.simulate(scene, there.q[-1], -there.v[-1], dt=5e-3, steps=100, integrator=integrator)
+    np.testing.assert_allclose(back.q[::-1], there.q, atol=1e-10)
+    np.testing.assert_allclose(-back.v[::-1], there.v, atol=1e-9)
+
+
+def odd_loops(count):
+    """Loops that are nearly flat, closed twice, welded, geared or started off their constraints."""
+    rng = np.random.default_rng(5)
+    for _ in range(count):
+        links = int(rng.integers(2, 6))
+        robot = vp.planar_chain(links)
+        reach = rng.choice([links - 1e-6, links - 1e-3, links - 0.05, 0.5 * links, 0.1, links + 0.1])
+        angle = rng.uniform(-np.pi, np.pi)
+        place = reach * np.array([np.cos(angle), 0.0, np.sin(angle)])
+        loops = [vp.PointOnPoint("tip", place, axes=str(rng.choice(["xz", "xyz", "z"])))]
+        more = int(rng.integers(0, 4))
+        if more == 1:
+            loops.append(vp.PointOnPoint("tip", place, axes="x"))
+        elif more == 2:
+            loops.append(vp.JointTie("joint2", "joint1", [0.0, float(rng.normal())]))
+        elif more == 3:
+            loops.append(vp.Distance("tip", (0.0, 0.0, 0.0), max(reach, 0.1)))
+        yield vp.Scene(robot, constraints=loops), rng.normal(size=links), rng
+
+
+@pytest.mark.parametrize("count", [20, pytest.param(200, marks=pytest.mark.slow)])
+def test_odd_loops_move_rightly_or_say_that_they_do_not(count):
+    told, right, wrong = 0, 0, []
+    for number, (scene, start, rng) in enumerate(odd_loops(count)):
+        n = scene.robot.dof
+        try:
+            q = vp.assemble(scene, start)
+            off = rng.choice([0.0, 1e-3, 0.1, 1.0]) * rng.normal(size=n)
+            v = along_constraints(scene, q, rng.normal(size=n))
+            motion = vp.simulate(scene, q + off, v, dt=5e-3, steps=40, integrator=vp.Gauss(2))
+        except (vp.AssemblyError, vp.InputError, vp.StepFailure):
+            told += 1
+            continue
+        g, _, C = scene.core.constraints(motion.q)
+        kept = np.abs(g).max() < 1e-10 and np.abs(np.einsum("kmn,kn->km", C, motion.v)).max() < 1e-8
+        try:
+            fine = vp.simulate(scene, motion.q[0], motion.v[0], dt=5e-4, steps=400, integrator=vp.Gauss(3), check=False)
+        except vp.StepFailure:
+            # Nearer to where it has no unique continuation the finer motion sees more.
+            fine = None
+        away = 0.0 if fine is None else np.abs(fine.q[::10] - motion.q).max()
+        if kept and (away < 1e-2 or motion.warnings):
+            right += 1
+        else:
+            wrong.append((number, kept, away, scene))
+    assert not wrong
+    assert right > count / 5
+    assert told > count / 10

@@ -1,0 +1,278 @@
+"""Plans, ensembles and controllers of scenes with constraints: a dense KKT solve, SciPy, and simulations."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+
+import varpin as vp
+from varpin.core import ForwardDynamics
+from varpin.mechanics.assembly import along_constraints
+
+MASSES, STIFFNESS, DAMPING = np.array([1.0, 2.0, 0.7]), np.array([3.0, 0.0, 5.0]), np.array([0.4, 0.2, 0.3])
+ACTUATION = np.array([[1.0, 0.0], [0.0, 0.5], [0.3, -1.0]])
+ROW = np.array([[1.0, -1.5, 0.5]])
+
+
+def rails():
+    """Three masses on rails with springs and dampers, one linear constraint, and two forces."""
+    model = pin.Model()
+    for k, mass in enumerate(MASSES):
+        place = pin.SE3(np.eye(3), np.array([0.0, float(k), 0.0]))
+        joint = model.addJoint(0, pin.JointModelPX(), place, f"slide{k}")
+        model.appendBodyToJoint(joint, pin.Inertia.FromSphere(mass, 0.1), pin.SE3.Identity())
+    tie = vp.CustomConstraint(1, lambda q: ROW @ q - 0.2, lambda _: ROW, lambda _q, _w: np.zeros((3, 3)))
+    return vp.Scene(
+        vp.load_robot(model),
+        gravity=False,
+        stiffness=STIFFNESS,
+        damping=DAMPING,
+        actuation=ACTUATION,
+        constraints=tie,
+    )
+
+
+def kkt(problem, tracked, weights, speeds, effort, end):
+    """Controls and nodes of the quadratic program that the midpoint rule makes of it, by one dense solve."""
+    N, h, n, m = problem.steps, problem.dt, 3, 2
+    M, K, D, C = np.diag(MASSES), np.diag(STIFFNESS), np.diag(DAMPING), ROW
+    block = n + 1 + n + 1 + n + m  # V, Lam_0, p1, Lam_1, q1, u
+    size = N * block
+    H, g, rows, right = np.zeros((size, size)), np.zeros(size), [], []
+    before = {"q": problem.q0, "p": M @ problem.v0}
+    for k in range(N):
+        at = {name: slice(k * block + first, k * block + last) for name, first, last in PARTS}
+
+        def row(count, terms, constant, k=k):
+            A, c = np.zeros((count, size)), np.array(constant, dtype=float)
+            for name, matrix in terms:
+                where, step = (name, k) if name[1:] != "0" else (name[0] + "1", k - 1)
+                if step < 0:
+                    c = c - matrix @ before[name[0]]
+                    continue
+                first, last = next(part[1:] for part in PARTS if part[0] == where)
+                A[:, step * block + first : step * block + last] += matrix
+            rows.append(A)
+            right.append(c)
+
+        inside = [("q0", -K), ("V", -0.5 * h * K - D), ("u", ACTUATION)]
+        row(
+            n,
+            [("V", -M), ("p0", np.eye(n)), ("a", -C.T)] + [(name, 0.5 * h * x) for name, x in inside],
+            np.zeros(n),
+        )
+        row(
+            n,
+            [("p1", -np.eye(n)), ("p0", np.eye(n)), ("a", -C.T), ("b", -C.T)] + [(name, h * x) for name, x in inside],
+            np.zeros(n),
+        )
+        row(n, [("q1", -np.eye(n)), ("q0", np.eye(n)), ("V", h * np.eye(n))], np.zeros(n))
+        row(1, [("q1", C)], [0.2])
+        row(1, [("p1", C @ np.linalg.inv(M))], [0.0])
+        # The running cost at the midpoint, q1 - h V / 2.
+        S = np.zeros((n, size))
+        S[:, at["q1"]], S[:, at["V"]] = np.eye(n), -0.5 * h * np.eye(n)
+        H += 2.0 * h * S.T @ np.diag(weights) @ S
+        g -= 2.0 * h * S.T @ (weights * tracked)
+        H[at["V"], at["V"]] += 2.0 * h * np.diag(speeds)
+        H[at["u"], at["u"]] += 2.0 * h * effort * np.eye(m)
+    H[at["q1"], at["q1"]] += 2.0 * np.diag(end)
+    g[at["q1"]] -= 2.0 * end * tracked
+    A, c = np.vstack(rows), np.concatenate(right)
+    z = np.linalg.solve(np.block([[H, A.T], [A, np.zeros((len(A), len(A)))]]), np.concatenate([-g, c]))[:size]
+    z = z.reshape(N, block)
+    return tuple(z[:, first:last] for name, first, last in PARTS if name in ("q1", "p1", "u"))
+
+
+PARTS = (("V", 0, 3), ("a", 3, 4), ("p1", 4, 7), ("b", 7, 8), ("q1", 8, 11), ("u", 11, 13))
+
+
+def test_a_linear_quadratic_plan_is_that_of_a_dense_solve():
+    scene = rails()
+    q0 = vp.assemble(scene, [0.1, 0.2, 0.3])
+    v0 = along_constraints(scene, q0, np.array([0.3, -0.5, 0.2]))
+    goal, weights, speeds, end = np.array([1.0, 0.2, -0.4]), [4.0, 2.0, 1.0], [0.1, 0.2, 0.3], [30.0, 10.0, 20.0]
+    cost = (
+        vp.TrackingCost(goal, weights)
+        + vp.VelocityCost(speeds)
+        + vp.ControlCost(0.05)
+        + vp.Terminal(vp.TrackingCost(goal, end))
+    )
+    problem = vp.OptimalControlProblem(
+        scene, cost, q0, v0, dt=0.05, steps=20, integrator=vp.Midpoint(), sampling="midpoint"
+    )
+    plan = vp.solve(problem, np.zeros(2), tolerance=1e-14)
+    assert plan.status.converged
+    p, q, u = kkt(problem, goal, *(np.array(x) for x in (weights, speeds)), 0.05, np.array(end))
+    np.testing.assert_allclose(plan.trajectory.u, u, rtol=0, atol=1e-12 * np.abs(u).max())
+    np.testing.assert_allclose(plan.trajectory.q[1:], q, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(plan.trajectory.p[1:], p, rtol=0, atol=1e-12)
+    # And its gains are those of the same program from another start along the constraints, and from one across them.
+    moved = along_constraints(scene, q0, np.array([0.01, 0.02, -0.03]))
+    other = problem.at(q0=q0 + moved, v0=v0)
+    _, _, there = kkt(other, goal, *(np.array(x) for x in (weights, speeds)), 0.05, np.array(end))
+    change = plan.gains[0] @ np.append(moved, np.zeros(3))
+    np.testing.assert_allclose(u[0] + change, there[0], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(plan.gains[0][:, 3:] @ ROW[0], 0.0, atol=1e-10)
+
+
+def five_bar(**options):
+    """Two driven cranks of 1 m whose rods meet: four joints, two degrees of freedom."""
+    drives = np.zeros((4, 2))
+    drives[0, 0] = drives[3, 1] = 1.0
+    closed = vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="xz")
+    scene = vp.Scene(vp.planar_chain(4), constraints=closed, actuation=drives, damping=0.1, **options)
+    return scene, vp.assemble(scene, [-1.0, 1.0, 1.0, 1.0])
+
+
+def reach(integrator=None, limits=None, **options):
+    scene, q0 = five_bar(**options)
+    goal = vp.assemble(scene, q0 + 0.3 * np.eye(4)[0])
+    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(goal, 1e3) + vp.VelocityCost(10.0))
+    still = np.zeros(4)
+    problem = vp.OptimalControlProblem(
+        scene, cost, q0, still, dt=0.02, steps=50, integrator=integrator, control_limits=limits
+    )
+    return problem, goal
+
+
+def index_reduced(scene, q, v, u, dt):
+    """The end of a motion under held controls (N, m): M a + C' y = f, C a = -(g_qq v) v, by DOP853."""
+    free = vp.Scene(scene.robot, damping=scene.damping)
+    dynamics, n = ForwardDynamics(free.core), q.size
+    x = np.append(q, v)
+
+    def rate(_, x, torque):
+        slope, _ = dynamics.rate(x, torque)
+        (C,), M = scene.core.constraints(x[None, :n])[2], vp.lagrangian_jet(free, x[:n], x[n:]).Lvv
+        bent = scene.core.constraint_curvature(x[:n], np.zeros(len(C)), x[n:])[1] @ x[n:]
+        inverse = np.linalg.solve(M, C.T)
+        return np.append(x[n:], slope[n:] - inverse @ np.linalg.solve(C @ inverse, C @ slope[n:] + bent))
+
+    for row in u:
+        torque = scene.actuation @ row
+        x = solve_ivp(rate, (0.0, dt), x, "DOP853", rtol=1e-11, atol=1e-11, args=(torque,)).y[:, -1]
+    return x[:n], x[n:]
+
+
+def test_a_five_bar_reaches_from_a_cold_start_and_holds():
+    problem, goal = reach()
+    plan = vp.solve(problem)
+    assert plan.status.converged
+    assert not plan.warnings
+    assert np.abs(plan.trajectory.q[-1] - goal).max() < 0.01
+    again = problem.simulate(plan.policy)
+    np.testing.assert_allclose(plan.trajectory.constraint_forces, again.constraint_forces, rtol=0, atol=1e-6)
+    assert plan.trajectory.constraint_labels == problem.scene.constraint_labels
+    seen = plan.verify()
+    assert max(abs(seen.closed_loop_loss), abs(seen.open_loop_loss)) < 1e-8
+    assert seen.defect < 1e-10
+    q, v = index_reduced(problem.scene, problem.q0, problem.v0, plan.trajectory.u, problem.dt)
+    np.testing.assert_allclose(plan.trajectory.q[-1], q, atol=1e-8)
+    np.testing.assert_allclose(plan.trajectory.v[-1], v, atol=1e-7)
+    g, _, C = problem.scene.core.constraints(plan.trajectory.q)
+    assert np.abs(g).max() < 1e-13
+    assert np.abs(np.einsum("kmn,kn->km", C, plan.trajectory.v)).max() < 1e-12
+
+
+def test_plans_keep_torque_limits_and_gradients_are_those_of_the_rollout():
+    problem, _ = reach(vp.Midpoint(), (-80.0, 80.0))
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged
+    assert np.abs(plan.trajectory.u).max() == 80.0
+    # The gradient at some other controls, against differences of the cost.
+    u = np.tile(problem.holding_controls(), (50, 1)) + np.random.default_rng(0).normal(size=(50, 2))
+    there = vp.solve(problem.at(), u, max_iterations=0, check=False)
+    for k, c in ((0, 0), (7, 1), (49, 0)):
+        costs = []
+        for sign in (1.0, -1.0):
+            moved = u.copy()
+            moved[k, c] += sign * 1e-3
+            costs.append(problem.cost_of(problem.simulate(moved)))
+        assert there.gradient[k, c] == pytest.approx((costs[0] - costs[1]) / 2e-3, rel=1e-6)
+
+
+def test_holding_controls_leave_a_closed_loop_at_rest():
+    scene, q0 = five_bar()
+    u = scene.holding_controls(q0)
+    motion = vp.simulate(scene, q0, np.zeros(4), dt=0.01, steps=5, controls=u)
+    np.testing.assert_allclose(motion.q, np.broadcast_to(q0, (6, 4)), atol=1e-12)
+    torque = scene.holding_torque(q0)
+    assert np.linalg.norm(torque) < np.linalg.norm(scene.actuation @ u)
+    every = vp.Scene(scene.robot, constraints=scene.constraints)
+    motion = vp.simulate(every, q0, np.zeros(4), dt=0.01, steps=5, controls=torque)
+    np.testing.assert_allclose(motion.q, np.broadcast_to(q0, (6, 4)), atol=1e-12)
+    with pytest.raises(vp.InputError, match=r"q misses PointOnPoint.*assemble"):
+        scene.holding_torque(q0 + 0.1)
+    one = vp.Scene(scene.robot, constraints=scene.constraints, actuation=scene.actuation[:, :1])
+    with pytest.raises(vp.InputError, match="no controls hold the robot"):
+        one.holding_controls(q0)
+
+
+def test_plans_begin_on_the_constraints(caplog):
+    scene, q0 = five_bar()
+    cost = vp.ControlCost(1.0)
+    problem = vp.OptimalControlProblem(scene, cost, q0 + 1e-3, np.ones(4), dt=0.02, steps=5)
+    assert "onto the constraints" in caplog.text
+    assert "v0 was changed" in caplog.text
+    assert np.abs(scene.constraint_values(problem.q0)[0]).max() < 1e-14
+    moved = problem.at(q0=q0 - 1e-3)
+    assert np.abs(scene.constraint_values(moved.q0)[0]).max() < 1e-14
+    assert np.abs(scene.constraint_values(moved.q0)[1] @ moved.v0).max() < 1e-13
+    with pytest.raises(vp.InputError, match=r"q0 misses .*assemble"):
+        problem.at(q0=q0 + 0.3)
+
+
+def test_an_ensemble_under_a_plan_is_what_its_model_says():
+    """Mean and covariance of the closed loop, in closed form and by simulation, and the expected cost."""
+    problem, _ = reach(vp.Midpoint(), noise=vp.AdditiveNoise(0.05))
+    plan = vp.solve(problem, check=False)
+    scene, steps, dt = problem.scene, problem.steps, problem.dt
+    paths = vp.simulate_ensemble(
+        scene, problem.q0, problem.v0, dt=dt, steps=steps, paths=500, rng=0, controls=plan.policy, store=False
+    )
+    lin = vp.linearize(scene, plan.trajectory)
+    P = np.zeros((8, 8))
+    for k in range(steps):
+        A = lin.A[k] + lin.B[k] @ plan.gains[k]
+        P = A @ P @ A.T + dt * lin.G[k] @ lin.G[k].T
+    deviation = np.sqrt(np.diag(P))
+    found = paths.statistics
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance[-1])), deviation, rtol=0.13)
+    center = np.append(plan.trajectory.q[-1], plan.trajectory.p[-1])
+    assert (np.abs(found.mean[-1] - center) < 5.0 * deviation / np.sqrt(500)).all()
+    by_moments = plan.monte_carlo(300, rng=1)
+    assert abs(by_moments.cost - by_moments.predicted) < 4.0 * by_moments.standard_error
+    again = vp.simulate_ensemble(
+        scene, problem.q0, problem.v0, dt=dt, steps=steps, paths=40, rng=0, controls=plan.policy, workers=1
+    )
+    other = vp.simulate_ensemble(
+        scene, problem.q0, problem.v0, dt=dt, steps=steps, paths=40, rng=0, controls=plan.policy, workers=2
+    )
+    np.testing.assert_array_equal(again.q, other.q)
+    g = scene.core.constraints(again.q.reshape(-1, 4))[0]
+    assert np.abs(g).max() < 1e-12
+    child = np.random.default_rng(0).spawn(1)[0]
+    single = vp.simulate(scene, problem.q0, problem.v0, dt=dt, steps=steps, controls=plan.policy, rng=child)
+    np.testing.assert_array_equal(again.q[0], single.q)
+
+
+def test_paths_may_begin_at_different_places_along_the_constraints(caplog):
+    scene, q0 = five_bar(noise=vp.AdditiveNoise(0.05))
+    starts = np.array([q0, q0 + 1e-3])
+    found = vp.simulate_ensemble(scene, starts, np.zeros(4), dt=0.01, steps=3, paths=2, rng=0)
+    assert "path 1: q0 was moved" in caplog.text
+    assert np.abs(scene.core.constraints(found.q[:, 0])[0]).max() < 1e-14
+
+
+def test_a_controller_keeps_a_closed_loop_on_its_way():
+    scene, q0 = five_bar()
+    goal = vp.assemble(scene, q0 + 0.15 * np.eye(4)[0])
+    cost = vp.TrackingCost(goal, 100.0) + vp.VelocityCost(1.0) + vp.ControlCost(1e-4, scene.holding_controls(goal))
+    problem = vp.OptimalControlProblem(scene, cost, q0, np.zeros(4), dt=0.02, steps=20, integrator=vp.Midpoint())
+    heavier = vp.Scene(
+        scene.robot, constraints=scene.constraints, actuation=scene.actuation, damping=0.5, noise=vp.AdditiveNoise(0.02)
+    )
+    run = vp.Mpc(problem).run(vp.Plant(heavier, substeps=2), duration=0.8, rng=0)
+    assert np.abs(run.motion.q[-1] - goal).max() < 0.05
+    assert np.abs(scene.core.constraints(run.motion.q)[0]).max() < 1e-12

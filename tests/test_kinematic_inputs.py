@@ -1,0 +1,203 @@
+"""Joints that are moved by hand: against SciPy with their accelerations given, inverse dynamics, and differences."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import varpin as vp
+from varpin.mechanics.assembly import along_constraints
+
+WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+
+
+def swing(t):
+    return 0.3 + 0.4 * np.sin(3.0 * t)
+
+
+def prescribed(scene, q0, v0, t, path, rate, acceleration):
+    """(q, v, torque) of a chain whose first joint moves along a path, by DOP853: the other rows of M a = L_q - ..."""
+    n = q0.size
+
+    def dynamics(now, x):
+        q, v = x[:n].copy(), x[n:].copy()
+        q[0], v[0] = path(now), rate(now)
+        jet = vp.lagrangian_jet(scene, q, v)
+        bias = jet.Lq - jet.Lvq @ v
+        a = np.zeros(n)
+        a[0] = acceleration(now)
+        a[1:] = np.linalg.solve(jet.Lvv[1:, 1:], bias[1:] - jet.Lvv[1:, 0] * a[0])
+        return np.append(v, a), jet.Lvv[0] @ a - bias[0]
+
+    found = solve_ivp(
+        lambda now, x: dynamics(now, x)[0], (0.0, t[-1]), np.append(q0, v0), "DOP853", rtol=1e-11, atol=1e-11, t_eval=t
+    )
+    return found.y[:n].T, np.array([dynamics(now, x)[1] for now, x in zip(t, found.y.T, strict=True)])
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)])
+def test_a_driven_joint_follows_its_positions_and_the_rest_swings(integrator):
+    scene = vp.Scene(vp.planar_chain(3), actuation=["joint1"], constraints=vp.KinematicInput("joint1"))
+    q0, v0 = np.array([swing(0.0), 0.5, -0.4]), np.array([1.2, 0.0, 0.0])
+    errors = []
+    for steps in (100, 200):
+        t = np.linspace(0.0, 1.0, steps + 1)
+        motion = vp.simulate(
+            scene, q0, v0, dt=1.0 / steps, steps=steps, controls=swing(t[1:, None]), integrator=integrator
+        )
+        np.testing.assert_allclose(motion.q[1:, 0], swing(t[1:]), atol=1e-14)
+        np.testing.assert_allclose(motion.v[1:, 0], np.diff(swing(t)) * steps, atol=1e-11)
+        q, torque = prescribed(
+            vp.Scene(scene.robot), q0, v0, t, swing, lambda t: 1.2 * np.cos(3.0 * t), lambda t: -3.6 * np.sin(3.0 * t)
+        )
+        assert motion.constraint_labels == ("KinematicInput(joint='joint1')",)
+        # Each impulse belongs to a node, where the rate changes: halves of two steps are the torque there.
+        force = motion.constraint_forces[:, 0]
+        errors.append([np.abs(motion.q - q).max(), np.abs(force[5:-5] - 0.5 * (torque[5:-6] + torque[6:-5])).max()])
+    ratio = np.array(errors[0]) / np.array(errors[1])
+    assert errors[1][0] < 1e-3
+    assert 3.3 < ratio[0] < 4.7
+    assert errors[1][1] < 0.02 * np.abs(torque).max() + 1e-9
+    assert ratio[1] > 1.7
+
+
+def test_a_joint_that_goes_on_steadily_needs_the_torque_of_inverse_dynamics():
+    robot = vp.planar_chain(2)
+    scene = vp.Scene(robot, constraints=[vp.KinematicInput(name) for name in robot.joint_names])
+    v = np.array([0.7, -1.1])
+    t = np.linspace(0.0, 1.0, 1001)
+    path = np.array([0.2, 0.5]) + t[:, None] * v
+    motion = vp.simulate(scene, path[0], v, dt=1e-3, steps=1000, controls=path[1:], integrator=vp.Gauss(2))
+    np.testing.assert_allclose(motion.q, path, atol=1e-12)
+    free = vp.Scene(robot)
+    middle = 0.5 * (path[:-1] + path[1:])
+    wanted = []
+    for q in middle:
+        jet = vp.lagrangian_jet(free, q, v)
+        wanted.append(jet.Lvq @ v - jet.Lq)
+    np.testing.assert_allclose(motion.constraint_forces, wanted, atol=1e-4)
+
+
+def crank(**options):
+    """A four-bar whose crank is moved by hand: no freedom is left; with a fourth link one is."""
+    links = options.pop("links", 3)
+    loop = vp.PointOnPoint("tip", (1.3, 0.0, 0.2), axes="xz")
+    robot = vp.planar_chain(links)
+    scene = vp.Scene(robot, actuation=["joint1"], constraints=[loop, vp.KinematicInput("joint1")], **options)
+    free = vp.Scene(robot, constraints=loop)
+    q = vp.assemble(free, [-1.5, 1.5, 1.5, 0.3][:links])
+    return scene, q, along_constraints(free, q, np.array([1.0, 0.0, 0.0, 0.5][:links]))
+
+
+def test_a_crank_drives_its_loop():
+    scene, q, v = crank(damping=0.2)
+    t = np.linspace(0.0, 0.5, 501)
+    path = q[0] + v[0] * t + 0.2 * np.sin(4.0 * t) ** 2
+    motion = vp.simulate(scene, q, v, dt=1e-3, steps=500, controls=path[1:, None], integrator=vp.Gauss(2))
+    np.testing.assert_allclose(motion.q[:, 0], path, atol=1e-12)
+    g, C = zip(*(scene.constraint_values(x) for x in motion.q), strict=True)
+    assert np.abs(g).max() < 1e-13
+    # No freedom is left: work and energy balance, v and the force are those of the crank alone.
+    assert max(np.abs((c @ x)[:2]).max() for c, x in zip(C, motion.v, strict=True)) < 1e-11
+    power = motion.constraint_forces[:, 2] * np.diff(path)
+    friction = 0.2 * 0.5 * ((motion.v[:-1] ** 2 + motion.v[1:] ** 2).sum(axis=1) * 1e-3)
+    np.testing.assert_allclose(np.cumsum(power - friction), motion.energy[1:] - motion.energy[0], atol=0.02)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(guard=None), vp.Gauss(2, guard=None), vp.Gauss(3, guard=None)])
+@pytest.mark.parametrize("links", [3, 4])
+def test_linearizations_are_the_slopes_of_steps(integrator, links):
+    """In states along the constraints and in the position at the step's end."""
+    scene, q, v = crank(links=links, damping=0.3)
+    fixed = vp.Scene(scene.robot, constraints=scene.constraints[:1])
+    u = np.array([[q[0] + 0.004], [q[0] + 0.01]])
+    motion = vp.simulate(scene, q, v, dt=4e-3, steps=2, controls=u, integrator=integrator)
+    lin = vp.linearize(scene, motion)
+
+    def step(dq, dv, du):
+        at = q + dq
+        for _ in range(6):
+            g, C = fixed.constraint_values(at)
+            at = at - np.linalg.pinv(C) @ g
+        C = fixed.constraint_values(at)[1]
+        rate = v + dv
+        rate = rate - np.linalg.pinv(C) @ (C @ rate)
+        p = vp.lagrangian_jet(scene, at, rate).Lv
+        moved = vp.simulate(scene, at, rate, dt=4e-3, steps=1, controls=u[:1] + du, integrator=integrator)
+        return np.append(at, p), np.append(moved.q[1], moved.p[1])
+
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        dq, dv, du = rng.normal(size=links), rng.normal(size=links), 0.2 * rng.normal()
+        size, into, out = 3e-4, 0.0, 0.0
+        for k, w in WEIGHTS.items():
+            ahead, behind = (step(s * k * size * dq, s * k * size * dv, s * k * size * du) for s in (1, -1))
+            into = into + w / size * (ahead[0] - behind[0])
+            out = out + w / size * (ahead[1] - behind[1])
+        np.testing.assert_allclose(lin.A[0] @ into + lin.B[0, :, 0] * du, out, atol=1e-8 * np.abs(out).max())
+
+
+def test_split_steps_are_linearized_in_their_parts():
+    scene, q, v = crank(links=4)
+    u = np.array([[q[0] + 0.3]])
+    motion = vp.simulate(scene, q, v, dt=0.15, steps=1, controls=u, check=False)
+    assert motion.statistics.substeps[0] > 1
+    np.testing.assert_allclose(motion.q[1, 0], u[0, 0], atol=1e-13)
+    B = vp.linearize(scene, motion).B[0, :, 0]
+    slope = 0.0
+    for k, w in WEIGHTS.items():
+        ends = [vp.simulate(scene, q, v, dt=0.15, steps=1, controls=u + s * k * 1e-3, check=False) for s in (1, -1)]
+        assert all((end.statistics.substeps == motion.statistics.substeps).all() for end in ends)
+        ahead, behind = (np.append(end.q[1], end.p[1]) for end in ends)
+        slope = slope + w / 1e-3 * (ahead - behind)
+    np.testing.assert_allclose(B, slope, atol=1e-8 * np.abs(slope).max())
+
+
+def test_a_mechanism_without_freedom_may_turn_round():
+    """Where it does, the energy that it takes is tiny, and no balance of it is asked for."""
+    scene, q, _ = crank()
+    path = q[0] + 0.3 * (1.0 - np.cos(np.pi * 0.01 * np.arange(301)))
+    motion = vp.simulate(scene, q, np.zeros(3), dt=0.01, steps=300, controls=path[1:, None])
+    np.testing.assert_allclose(motion.q[:, 0], path, atol=1e-12)
+    np.testing.assert_allclose(motion.q[200], q, atol=1e-9)
+
+
+def test_noise_does_not_move_what_is_moved_by_hand():
+    scene, q, v = crank(links=4, noise=vp.AdditiveNoise(0.3))
+    path = q[0] + v[0] * np.linspace(0.0, 0.2, 21)
+    paths = vp.simulate_ensemble(scene, q, v, dt=0.01, steps=20, paths=5, rng=0, controls=path[1:, None])
+    np.testing.assert_allclose(paths.q[:, :, 0], np.broadcast_to(path, (5, 21)), atol=1e-12)
+    assert np.ptp(paths.q[:, -1, 1]) > 1e-4
+    still = vp.simulate(scene, q, np.zeros(4), dt=0.01, steps=3, increments=0.0)
+    np.testing.assert_allclose(still.q[:, 0], q[0], atol=1e-14)
+
+
+def test_what_does_not_know_inputs_refuses_them():
+    scene, q, v = crank()
+    robot, loop = scene.robot, scene.constraints[0]
+    hand = vp.KinematicInput("joint1")
+    policy = vp.LinearPolicy(np.zeros((3, 1)), np.zeros((3, 1, 6)), np.zeros((3, 6)), on="momentum")
+    tries = [
+        lambda: vp.OptimalControlProblem(scene, vp.ControlCost(1.0), q, v, dt=0.01, steps=3),
+        lambda: vp.Plant(scene),
+        lambda: vp.simulate(scene, q, v, dt=0.01, steps=3, controls=lambda t, q, v: [0.0]),
+        lambda: vp.simulate(scene, q, v, dt=0.01, steps=3, controls=vp.OpenLoop(lambda t: [0.0])),
+        lambda: vp.simulate(scene, q, v, dt=0.01, steps=3, controls=policy),
+    ]
+    for attempt in tries:
+        with pytest.raises(vp.InputError, match="does not take scenes with a KinematicInput"):
+            attempt()
+    two = [loop, hand, vp.KinematicInput("joint2")]
+    with pytest.raises(vp.InputError, match=r"KinematicInput\(joint='joint2'\) moves a joint that .* move already"):
+        vp.simulate(vp.Scene(robot, constraints=two), q, v, dt=0.01, steps=3)
+    with pytest.raises(vp.InputError, match="does not take scenes with constraints"):
+        vp.simulate(scene, q, v, dt=0.01, steps=3, integrator=vp.RungeKutta4())
+    noisy = vp.Scene(robot, constraints=[loop, hand], noise=vp.ControlNoise(0.1))
+    with pytest.raises(vp.InputError, match="depends on the controls does not go with a KinematicInput"):
+        vp.simulate(noisy, q, v, dt=0.01, steps=3, rng=0)
+    for actuation in (["joint2"], 2.0 * np.eye(3), np.ones((3, 1))):
+        with pytest.raises(vp.InputError, match="needs a control of its own"):
+            vp.Scene(robot, constraints=hand, actuation=actuation)
+    with pytest.raises(vp.InputError, match="both a PositionServo and a KinematicInput"):
+        vp.Scene(robot, constraints=hand, forces=[vp.PositionServo({"joint1": 10.0}, {"joint1": 1.0})])
+    with pytest.raises(vp.UnknownJoint):
+        vp.Scene(robot, constraints=vp.KinematicInput("joint9"))
