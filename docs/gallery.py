@@ -1,4 +1,4 @@
-"""Pictures and figures of docs/gallery.md: each bundled scene solved, replayed in Chromium, and drawn.
+"""Pictures and figures of docs/gallery.md: each bundled scene solved, replayed in Chromium, and drawn; and examples.
 
 Needs ``pip install "varpin[video]" pillow``, Chromium and chromedriver.
 
@@ -8,12 +8,14 @@ Needs ``pip install "varpin[video]" pillow``, Chromium and chromedriver.
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import imageio.v3
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -157,6 +159,14 @@ SHOTS = {
     "talos_wave": Shot(1.2, joints, (-50.0, 21.0, 1.1)),
 }
 
+# Examples: when they are shown [s], the second time where they draw no figure; and from where.
+EXAMPLES: dict[str, tuple[float, float, tuple[float, float, float] | None]] = {
+    "ur5_servos": (0.5, 0.5, (20.0, 25.0, 1.1)),
+    "panda_stop": (1.5, 1.5, (-50.0, 21.0, 1.15)),
+    "kinova_door": (4.5, 4.5, (130.0, 25.0, 1.2)),
+    "tiago_reach": (0.0, 3.0, (-50.0, 21.0, 1.2)),
+}
+
 _VIEW = """
 const [azimuth, elevation, nearer] = arguments;
 const path = ["Cameras", "default", "rotated", "<object>"];
@@ -196,9 +206,30 @@ def row(scene: vp.SceneFile, plan: vp.Solution) -> str:
     return f"| [{spec.name}](#{spec.name.replace('_', '-')}) | {size} | {numbers} |"
 
 
+def draw_example(name: str) -> None:
+    """Run an example, and write its replay's picture beside its figure, or beside a later picture."""
+    first, later, view = EXAMPLES[name]
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run([sys.executable, HERE.parent / "examples" / f"{name}.py"], cwd=folder, check=True)
+        out = Path(folder, "out")
+        script = [] if view is None else [(_VIEW, view)]
+        pictures = list(film_frames(out / f"{name}.html", np.array([first, later]), SIZE, script))
+        drawn = out / f"{name}.png"
+        if drawn.exists():
+            pictures[1] = imageio.v3.imread(drawn)
+    figure = Figure(figsize=(12.0, 4.5), layout="constrained")
+    for part, picture in zip(figure.subfigures(1, 2), pictures, strict=True):
+        axes = part.add_axes((0.0, 0.0, 1.0, 1.0))
+        axes.imshow(picture)
+        axes.axis("off")
+    FigureCanvasAgg(figure).print_png(HERE / "images" / f"gallery_{name}.png")
+
+
 def main() -> None:
     """Draw what was asked for; of all scenes, the table, too."""
-    names = sys.argv[1:] or list(SHOTS)
+    for name in [name for name in sys.argv[1:] or list(EXAMPLES) if name in EXAMPLES]:
+        draw_example(name)
+    names = [name for name in sys.argv[1:] or list(SHOTS) if name not in EXAMPLES]
     assert set(SHOTS) == set(scenes())
     lines = ["| scene | joints computed | steps | cost | iterations | true cost |", "|---|---|---|---|---|---|"]
     for name in names:

@@ -122,11 +122,16 @@ def row_of(found: dict[str, Any]) -> Row:
     return Row(**{**found, "told": tuple(found["told"])})
 
 
+def _local(sentence: str) -> str:
+    """A sentence without where packages are installed."""
+    return re.sub(r"/\S*site-packages/(\S*/robots/)?", "", sentence)
+
+
 def lacked(row: Row) -> str:
     """What the log told, each kind of sentence once and how often."""
     kinds: dict[str, int] = {}
     for sentence in row.told:
-        short = next((words for pattern, words in KINDS if re.search(pattern, sentence)), sentence[:60])
+        short = next((words for pattern, words in KINDS if re.search(pattern, sentence)), _local(sentence)[:60])
         kinds[short] = kinds.get(short, 0) + 1
     return "; ".join(f"{short} ({count})" if count > 1 else short for short, count in kinds.items())
 
@@ -149,7 +154,7 @@ def table(found: list[tuple[str, Row]]) -> list[str]:
     """Rows of the page."""
     lines = ["| file | joints | what it lacked, or what was told | verdict |", "|---|---|---|---|"]
     for name, row in found:
-        verdict = "all" if row.stage == "all" else f"{row.stage}: {row.why[:240]}"
+        verdict = "all" if row.stage == "all" else f"{row.stage}: {_local(row.why)[:240]}"
         joints = row.joints or ""
         lines.append(f"| `{name}` | {joints} | {lacked(row)} | {verdict.replace('|', '/')} |")
     return lines

@@ -79,3 +79,65 @@ def test_who_integrates_where_nobody_is_named(load):
     )
     rubbing = vp.Scene(load("ur5"), forces=[vp.CoulombFriction(1.0)])
     assert vp.simulate(rubbing, np.zeros(6), np.ones(6), dt=1e-2, steps=1).integrator == "Radau(stages=3)"
+
+
+START = np.array([0.0, -1.2, 1.4, -1.0, -1.57, 0.0])
+
+
+def served(robot, frequency, effort=np.inf):
+    """A UR5 on servos of a natural frequency [Hz] at a posture, damped by 0.7."""
+    rate, mass = 2.0 * np.pi * frequency, np.diag(vp.lagrangian_jet(vp.Scene(robot), START, np.zeros(6)).Lvv)
+    return vp.Scene(robot, forces=[vp.PositionServo(mass * rate**2, 1.4 * mass * rate, effort)])
+
+
+@pytest.mark.parametrize("frequency", [20, 100, 500, 2000, 5000])
+def test_steps_of_servos_of_any_stiffness(load, frequency):
+    """Commands that jump, at a step of 5 ms: the end by Radau in finer steps, and where each servo sags to."""
+    robot = load("ur5")
+    scene = served(robot, frequency)
+    goal = START + np.array([0.05, -0.04, 0.03, 0.05, -0.05, 0.1])
+    rows = np.repeat([goal, START + 0.02, goal], 20, axis=0)
+    finer = {"dt": 5e-3 / 16, "steps": 960, "controls": np.repeat(rows, 16, axis=0), "integrator": vp.Radau(3)}
+    end = vp.simulate(scene, START, np.zeros(6), **finer, check=False).q[-1]
+    if frequency >= 100:
+        stiffness = scene.actuation.diagonal()
+        np.testing.assert_allclose(end, goal - scene.holding_torque(end) / stiffness, atol=1e-6)
+    for integrator in (None, vp.Midpoint(), vp.Gauss(2), vp.Gauss(3), vp.Gauss(4), vp.Radau(2)):
+        options = {"dt": 5e-3, "steps": 60, "controls": rows, "integrator": integrator}
+        motion = vp.simulate(scene, START, np.zeros(6), **options)
+        # The midpoint rule is A-stable only: what a jump excites far above its step's rate rings on, and it says so.
+        rings = isinstance(integrator, vp.Midpoint) and frequency > 100
+        assert np.abs(motion.q[-1] - end).max() <= (1e-2 if rings else 1e-3)
+        assert not rings or any("damping is faster than the step" in told for told in motion.warnings)
+    for integrator in (vp.RungeKutta4(), vp.SemiImplicitEuler()):
+        if frequency >= 100:
+            with pytest.raises(vp.StepFailure):
+                vp.simulate(scene, START, np.zeros(6), dt=5e-3, steps=60, controls=rows, integrator=integrator)
+
+
+@pytest.mark.parametrize("frequency", [20, 500, 5000])
+def test_servos_at_their_limits(load, frequency):
+    """Commands beyond the motors for a while: within 5 % of their way, or told that steps are coarse."""
+    robot = load("ur5")
+    scene = served(robot, frequency, 0.3 * robot.effort_limit)
+    goal = START + np.array([0.3, 0.1, -0.1, 0.0, 0.0, 0.0])
+    rows = np.tile(goal, (100, 1))
+    finer = {"dt": 5e-3 / 64, "steps": 6400, "controls": goal, "integrator": vp.Radau(3)}
+    fine = vp.simulate(scene, START, np.zeros(6), **finer, check=False)
+    assert np.abs(drive_forces(scene.elements, fine.q[:-1], fine.v[:-1], fine.u @ scene.actuation)).max() > 0.29 * 150.0
+    for integrator in (None, vp.Midpoint(), vp.Gauss(2), vp.Gauss(4)):
+        motion = vp.simulate(scene, START, np.zeros(6), dt=5e-3, steps=100, controls=rows, integrator=integrator)
+        way = np.ptp(fine.q, axis=0).max()
+        near = np.abs(motion.q - fine.q[::64]).max() <= 0.05 * way
+        assert near or any("is coarse for" in told or "faster than the step" in told for told in motion.warnings)
+
+
+@pytest.mark.parametrize("integrator", [None, vp.Midpoint(), vp.Gauss(2), vp.Gauss(4)], ids=str)
+def test_smooth_commands_of_a_servo_of_100_hertz_take_whole_steps(load, integrator):
+    scene = served(load("ur5"), 100.0)
+    swing = np.array([0.3, 0.15, -0.15, 0.1, 0.06, 0.3])
+    commands = vp.OpenLoop(lambda t: START + swing * (1.0 - np.cos(2.0 * t)))
+    options = {"dt": 5e-3, "steps": 200, "controls": commands, "integrator": integrator}
+    motion = vp.simulate(scene, START, np.zeros(6), **options)
+    assert motion.statistics.split_steps == 0
+    assert (motion.statistics.substeps == 1).all()

@@ -25,7 +25,7 @@ from varpin.mechanics.scene import CORRECTED, Scene, refuse_constraints, refuse_
 from varpin.mechanics.wiener import wiener_increments
 from varpin.simulation import limits
 from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstable_loop
-from varpin.simulation.refinement import INTEGRATORS, SENSIBLE
+from varpin.simulation.refinement import INTEGRATORS, SENSIBLE, first_steps
 from varpin.simulation.soundness import Finding, announce, evident, with_warnings
 from varpin.simulation.tolerance import Motion, Raised, choose
 from varpin.support.checks import (
@@ -54,6 +54,8 @@ _CHUNK = 30_000
 # rule's velocities lag and ring. Of more joints than so many nobody asks, for that takes as long as a motion.
 _MIDPOINT, _STOPPING = Midpoint(), Radau(3)
 _RINGS, _ASKED = 1.0, 200
+# Who may be chosen for a tolerance as well, where something damps faster than the coarsest steps by this factor.
+_STIFF, _FAR = (Radau(3), Radau(4)), 4.0
 # What a start may be moved by onto constraints without a word [rad or m].
 _UNSAID = 1e-9
 # Steps at which a function of time is held against steps of half the length, and the share by which it may be off.
@@ -413,8 +415,8 @@ def simulate(
             the state of that node, and what it returns is held over the period.
         period: Of a control law, in steps.
         integrator: If left out, :class:`Midpoint` with alpha = 1/2; or ``Radau(3)`` where, at the start, dampers, dry
-            friction or servos are faster than the step, and there is neither noise nor a constraint; with a tolerance,
-            the cheapest that there is.
+            friction or servos are faster than the step, and there is neither noise nor a constraint nor a CustomForce;
+            with a tolerance, the cheapest that there is.
 
     Other Args:
         rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero, and a
@@ -644,13 +646,26 @@ def _usual(scene: Scene, q0: Floats, v0: Floats, dt: float) -> Integrator:
 
     Under noise the midpoint rule is right in law where Radau's methods would take noise for what is to be stopped.
     """
-    if scene.constraints or scene.processes or not scene.dissipates or len(q0) > _ASKED:
+    if scene.constraints or scene.processes:
         return _MIDPOINT
-    # At rest dry friction is fastest; the commands of servos are where they do not saturate.
+    return _STOPPING if _damps_faster(scene, q0, v0, _RINGS / dt) else _MIDPOINT
+
+
+def _candidates(scene: Scene, q0: Floats, v0: Floats, duration: float) -> tuple[Integrator, ...]:
+    """Who may be chosen for a tolerance: Radau's methods, too, where something damps far faster than the arm moves."""
+    moves = first_steps(scene, q0, v0, duration, 1) / duration
+    return INTEGRATORS + (_STIFF if _damps_faster(scene, q0, v0, _FAR * moves) else ())
+
+
+def _damps_faster(scene: Scene, q0: Floats, v0: Floats, rate: float) -> bool:
+    """Whether dampers, dry friction or servos are faster than a rate [1/s] at the start, or would be at rest there."""
+    # Forces of one's own are called by the motion alone, which says where they fail.
+    if not scene.dissipates or scene.custom is not None or len(q0) > _ASKED:
+        return False
+    # At rest dry friction is fastest; servos do not saturate where they are.
     velocities = np.array([v0, np.zeros_like(v0)])
     forces = np.tile(scene.actuation @ scene.command_at(q0), (2, 1))
-    rate = fastest_damping(scene.core, np.tile(q0, (2, 1)), velocities, forces, _RINGS / dt)
-    return _STOPPING if rate > 0.0 else _MIDPOINT
+    return fastest_damping(scene.core, np.tile(q0, (2, 1)), velocities, forces, rate) > 0.0
 
 
 def _require_choice(scene: Scene, controls: Controls | ControlLaw, integrator: Integrator | None) -> Controls:
@@ -717,7 +732,7 @@ def _chosen(
     earlier = tolerance if isinstance(tolerance, Accuracy) else None
     wish = positive("tolerance", tolerance.tolerance if isinstance(tolerance, Accuracy) else tolerance, "rad or m")
     controls = _require_choice(scene, asked, integrator)
-    members = INTEGRATORS if integrator is None else (integrator,)
+    members = _candidates(scene, q0, v0, duration) if integrator is None else (integrator,)
     parts = 1
     given: Callable[[Integrator, int], Commands]
     held = np.zeros((0, 0))
