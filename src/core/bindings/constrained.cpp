@@ -9,7 +9,7 @@
 
 #include "arrays.hpp"
 #include "registrations.hpp"
-#include "rollout_arrays.hpp"
+#include "rollout.hpp"
 
 namespace varpin::border {
 
@@ -23,111 +23,54 @@ std::vector<double> places_of(const Tableau& tableau, In<2> places) {
     return {places.data(), places.data() + places.size()};
 }
 
-// As VariationalRollout.
-class ConstrainedRollout {
+struct ConstrainedStepping : ConstrainedStepper {
+    using ConstrainedStepper::ConstrainedStepper;
+
+    void kick(const double* impulse, ConstrainedState& state) {
+        look_at(state);
+        ConstrainedStepper::kick(impulse, state);
+    }
+};
+
+class ConstrainedRollout : public Rollout<ConstrainedStepping, ConstrainedState> {
   public:
     ConstrainedRollout(const Mechanism& mechanism, const Tableau& tableau, In<2> places, double tolerance,
                        const Guards& guards, std::size_t paths)
-        : stepper_(
-              std::make_shared<ConstrainedStepper>(mechanism, tableau, places_of(tableau, places), tolerance, guards)),
-          guards_(guards),
-          states_(paths, ConstrainedState(mechanism, tableau.stages)) {}
+        : Rollout(mechanism, tableau, guards, paths,
+                  std::make_shared<ConstrainedStepping>(mechanism, tableau, places_of(tableau, places), tolerance,
+                                                        guards)) {}
 
-    ConstrainedRollout fork(const Guards& guards) const {
-        ConstrainedRollout copy = *this;
-        copy.guards_ = guards;
-        return copy;
-    }
-
-    bool begin(In<2> q, In<2> v) {
-        const std::size_t n = size();
-        require(q, "q", {states_.size(), n});
-        require(v, "v", {states_.size(), n});
-        nb::gil_scoped_release release;
-        for (std::size_t i = 0; i < states_.size(); ++i) {
-            if (!stepper_->begin(q.data() + i * n, v.data() + i * n, states_[i])) return false;
-        }
-        return true;
-    }
+    ConstrainedRollout fork(const Guards& guards) const { return forked(*this, guards); }
 
     void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes) {
-        const Mechanism& mechanism = stepper_->mechanism;
-        const NodeArrays written(mechanism, nodes);
-        if (written.paths() != states_.size())
-            throw std::invalid_argument("there is not one row of nodes for each path");
-        const CommandArrays given_commands(mechanism, commands, written.paths(), written.steps(), stepper_->stages);
-        const double* dw = increments_of(mechanism, increments, written);
-        const double* extra = drift_of(mechanism, drift, written);
-        nb::gil_scoped_release release;
-        stepper_->guards = guards_;
-        stepper_->roll(h, given_commands.view(), dw, extra, states_, written.view());
+        roll_paths(*mechanism_, states_.size(), stages_, commands, increments, drift, nodes,
+                   [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
+                       stepping_->guards = guards_;
+                       stepping_->roll(h, by, dw, more, states_, to);
+                   });
     }
-
-    void kick(In<2> impulse) {
-        require(impulse, "impulse", {states_.size(), size()});
-        for (std::size_t i = 0; i < states_.size(); ++i) {
-            stepper_->look_at(states_[i]);
-            stepper_->kick(impulse.data() + i * size(), states_[i]);
-        }
-    }
-
-    // Configurations, momenta, velocities (P, n) and energies (P).
-    std::tuple<Out, Out, Out, Out> nodes() const {
-        const std::size_t n = size(), P = states_.size();
-        double *q = nullptr, *p = nullptr, *v = nullptr, *energy = nullptr;
-        const Out Q = array_for(q, {P, n}), MV = array_for(p, {P, n}), V = array_for(v, {P, n});
-        const Out E = array_for(energy, {P});
-        for (std::size_t i = 0; i < P; ++i) {
-            const PathState& path = states_[i].path;
-            std::copy(path.q.begin(), path.q.end(), q + i * n);
-            std::copy(path.momentum.begin(), path.momentum.end(), p + i * n);
-            std::copy(path.v.begin(), path.v.end(), v + i * n);
-            energy[i] = path.energies.total();
-        }
-        return {Q, MV, V, E};
-    }
-
-    BytesOut halvings(std::size_t path) const { return array_of(state(path).path.halvings); }
 
     // Of every step of a path in its last roll (steps, m): what the constraints gave, C' times it.
     Out impulses(std::size_t path) const {
-        const auto m = static_cast<std::size_t>(stepper_->m);
+        const auto m = static_cast<std::size_t>(stepping_->m);
         const std::vector<double>& all = state(path).impulses;
         return array_of(all.data(), {all.size() / m, m});
     }
 
     // The row of the constraints that depended most on the others where a path was last.
     int weakest(std::size_t path) const { return state(path).weakest; }
-
-  private:
-    std::shared_ptr<ConstrainedStepper> stepper_;
-    Guards guards_;
-    std::vector<ConstrainedState> states_;
-
-    std::size_t size() const { return static_cast<std::size_t>(stepper_->n); }
-    const ConstrainedState& state(std::size_t path) const {
-        if (path >= states_.size()) throw std::invalid_argument("there is no such path");
-        return states_[path];
-    }
 };
 
-// As variational_derivatives.
 std::tuple<Out, Out, std::int64_t, std::size_t> constrained_derivatives(
     const Mechanism& mechanism, const Tableau& tableau, In<2> places, double tolerance, const Guards& guards, double h,
     In<2> q, In<2> p, In<3> force, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp) {
     const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
-    const std::size_t N = at.N, n = at.n, stages = static_cast<std::size_t>(tableau.stages);
-    require(guess, "guess", {N, stages, n});
-    double *Jx = nullptr, *Jf = nullptr;
-    const Out X = array_for(Jx, {N, 2 * n, 2 * n}), F = array_for(Jf, {N, 2 * n, n});
     ConstrainedLinearization work(mechanism, tableau, places_of(tableau, places), tolerance, guards);
     work.varies = at.varies;
     work.ramp = ramp;
-    const auto [outcome, done] = each_step(N, [&](std::size_t s) {
-        return work.first(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
-                          Jx + s * 4 * n * n, Jf + s * 2 * n * n);
+    return derivatives_of(at, tableau, guess, [&](std::size_t s, const double* next, double* Jx, double* Jf) {
+        return work.first(h, at.q(s), at.p(s), next, at.force(s), at.halvings(s), Jx, Jf);
     });
-    return {X, F, static_cast<std::int64_t>(outcome), done};
 }
 
 }  // namespace

@@ -51,6 +51,9 @@ class NodeArrays {
 
     std::size_t paths() const { return q.shape(0); }
     std::size_t steps() const { return q.shape(1); }
+    void require_paths(std::size_t wanted) const {
+        if (paths() != wanted) throw std::invalid_argument("the nodes are not those of as many paths");
+    }
     Nodes view() const {
         return {static_cast<std::int64_t>(paths()),
                 static_cast<std::int64_t>(steps()),
@@ -140,6 +143,20 @@ inline const double* increments_of(const Mechanism& mechanism, const In<3>& incr
 inline const double* drift_of(const Mechanism& mechanism, const In<3>& drift, const NodeArrays& nodes) {
     const auto n = static_cast<std::size_t>(mechanism.dof());
     return given(drift, "drift", {nodes.paths(), nodes.steps(), n}) ? drift.data() : nullptr;
+}
+
+// Roll `paths` paths by the commands into the nodes: move(commands, increments, drift, nodes) without the interpreter's
+// lock, once everything is checked. `stages` are those at which controls may change within a step.
+template <class Move>
+void roll_paths(const Mechanism& mechanism, std::size_t paths, int stages, nb::handle commands, const In<3>& increments,
+                const In<3>& drift, nb::handle nodes, const Move& move) {
+    const NodeArrays to(mechanism, nodes);
+    to.require_paths(paths);
+    const CommandArrays by(mechanism, commands, paths, to.steps(), stages);
+    const double* dw = increments_of(mechanism, increments, to);
+    const double* more = drift_of(mechanism, drift, to);
+    nb::gil_scoped_release release;
+    move(by.view(), dw, more, to.view());
 }
 
 // The arrays that N steps are taken again from.

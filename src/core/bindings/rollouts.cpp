@@ -7,6 +7,7 @@
 
 #include "arrays.hpp"
 #include "registrations.hpp"
+#include "rollout.hpp"
 #include "rollout_arrays.hpp"
 #include "stepping.hpp"
 #include "watched.hpp"
@@ -39,105 +40,40 @@ Guards guards_of(bool active, double branch_margin, double energy_balance, doubl
     return {active, branch_margin, energy_balance, energy_budget, most_halvings};
 }
 
-// P paths with the work arrays of a step; forks share them, so only one of them moves at a time.
-class VariationalRollout {
+// The step with the sizes that the compiler knows, if it knows those of the mechanism.
+std::shared_ptr<Stepping> stepping_of(const Mechanism& mechanism, const Tableau& tableau, double tolerance,
+                                      const Guards& guards, double left, Solver solver) {
+    if (auto small = small_stepping(mechanism, tableau, tolerance, guards, left, solver)) return small;
+    return std::make_shared<SteppingOf<int, int>>(mechanism, tableau, tolerance, guards, left, solver);
+}
+
+class VariationalRollout : public Rollout<Stepping, PathState> {
   public:
     VariationalRollout(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
                        double left, std::size_t paths, Solver solver)
-        : mechanism_(&mechanism),
-          stepping_(small_stepping(mechanism, tableau, tolerance, guards, left, solver)),
-          guards_(guards),
-          stages_(tableau.stages),
-          states_(paths, PathState(mechanism, tableau.stages)) {
-        if (!stepping_)
-            stepping_ = std::make_shared<SteppingOf<int, int>>(mechanism, tableau, tolerance, guards, left, solver);
+        : Rollout(mechanism, tableau, guards, paths, stepping_of(mechanism, tableau, tolerance, guards, left, solver)) {
     }
 
-    VariationalRollout fork(const Guards& guards) const {
-        VariationalRollout copy = *this;
-        copy.guards_ = guards;
-        return copy;
-    }
-
-    // Put each path at its row of q and v (P, n); false where an M(q) is not positive definite.
-    bool begin(In<2> q, In<2> v) {
-        const std::size_t n = size();
-        require(q, "q", {states_.size(), n});
-        require(v, "v", {states_.size(), n});
-        nb::gil_scoped_release release;
-        for (std::size_t i = 0; i < states_.size(); ++i) {
-            if (!stepping_->begin(q.data() + i * n, v.data() + i * n, states_[i])) return false;
-        }
-        return true;
-    }
+    VariationalRollout fork(const Guards& guards) const { return forked(*this, guards); }
 
     void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes, HeldWatch* watch) {
-        const Mechanism& mechanism = *mechanism_;
-        const NodeArrays written(mechanism, nodes);
-        if (written.paths() != states_.size())
-            throw std::invalid_argument("there is not one row of nodes for each path");
-        const CommandArrays given_commands(mechanism, commands, written.paths(), written.steps(), stages_);
-        const double* dw = increments_of(mechanism, increments, written);
-        const double* extra = drift_of(mechanism, drift, written);
-        Watch* watching = watch ? watch->of(written.paths(), written.steps()) : nullptr;
-        nb::gil_scoped_release release;
-        stepping_->roll(guards_, h, given_commands.view(), dw, extra, states_, written.view(), watching);
+        roll_paths(*mechanism_, states_.size(), stages_, commands, increments, drift, nodes,
+                   [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
+                       Watch* watching = watch ? watch->of(to) : nullptr;
+                       stepping_->roll(guards_, h, by, dw, more, states_, to, watching);
+                   });
     }
-
-    // Add an impulse (P, n) to the momenta.
-    void kick(In<2> impulse) {
-        require(impulse, "impulse", {states_.size(), size()});
-        for (std::size_t i = 0; i < states_.size(); ++i) stepping_->kick(impulse.data() + i * size(), states_[i]);
-    }
-
-    // Configurations, momenta, velocities (P, n) and energies (P).
-    std::tuple<Out, Out, Out, Out> nodes() const {
-        const std::size_t n = size(), P = states_.size();
-        double *q = nullptr, *p = nullptr, *v = nullptr, *energy = nullptr;
-        const Out Q = array_for(q, {P, n}), MV = array_for(p, {P, n}), V = array_for(v, {P, n});
-        const Out E = array_for(energy, {P});
-        for (std::size_t i = 0; i < P; ++i) {
-            std::copy(states_[i].q.begin(), states_[i].q.end(), q + i * n);
-            std::copy(states_[i].momentum.begin(), states_[i].momentum.end(), p + i * n);
-            std::copy(states_[i].v.begin(), states_[i].v.end(), v + i * n);
-            energy[i] = states_[i].energies.total();
-        }
-        return {Q, MV, V, E};
-    }
-
-    // Of each part of every step of a path in its last roll that was not taken whole.
-    BytesOut halvings(std::size_t path) const {
-        if (path >= states_.size()) throw std::invalid_argument("there is no such path");
-        return array_of(states_[path].halvings);
-    }
-
-  private:
-    const Mechanism* mechanism_;
-    std::shared_ptr<Stepping> stepping_;
-    Guards guards_;
-    int stages_;
-    std::vector<PathState> states_;
-
-    std::size_t size() const { return static_cast<std::size_t>(mechanism_->dof()); }
 };
 
-// d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n) of each step, f constant over it or a ramp up to f; how
-// it ended and how many were done.
 std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(
     const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards, double h, In<2> q,
     In<2> p, In<3> force, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp, Solver solver) {
     const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
-    const std::size_t N = at.N, n = at.n, stages = static_cast<std::size_t>(tableau.stages);
-    require(guess, "guess", {N, stages, n});
-    double *Jx = nullptr, *Jf = nullptr;
-    const Out X = array_for(Jx, {N, 2 * n, 2 * n}), F = array_for(Jf, {N, 2 * n, n});
     std::unique_ptr<Differentiation> work = small_differentiation(mechanism, tableau, tolerance, guards, solver);
     if (!work) work = std::make_unique<DifferentiationOf<int, int>>(mechanism, tableau, tolerance, guards, solver);
-    const auto [outcome, done] = each_step(N, [&](std::size_t s) {
-        return work->first(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.varies, ramp,
-                           at.halvings(s), Jx + s * 4 * n * n, Jf + s * 2 * n * n, at.past(s));
+    return derivatives_of(at, tableau, guess, [&](std::size_t s, const double* next, double* Jx, double* Jf) {
+        return work->first(h, at.q(s), at.p(s), next, at.force(s), at.varies, ramp, at.halvings(s), Jx, Jf, at.past(s));
     });
-    return {X, F, static_cast<std::int64_t>(outcome), done};
 }
 
 // z . d2(q1, p1)/d(q0, p0, f)2 of each step (N, 3n, 3n), for the rows of z (N, 2n).

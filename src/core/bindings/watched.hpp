@@ -1,7 +1,11 @@
 // A watch that keeps the arrays it looks at.
 #pragma once
 
+#include <cstdint>
+#include <stdexcept>
+
 #include "arrays.hpp"
+#include "varpin/nodes.hpp"
 #include "varpin/watch.hpp"
 
 namespace varpin::border {
@@ -14,7 +18,7 @@ class HeldWatch {
           v_(v),
           u_(u),
           values_(values),
-          own(costs, rule.data(), rule.shape(0), q.data(), v.data(), u.data(), values.data()) {
+          core(costs, rule.data(), rule.shape(0), q.data(), v.data(), u.data(), values.data()) {
         const std::size_t N = u.shape(0), n = static_cast<std::size_t>(costs.dof);
         require(rule, "rule", {rule.shape(0), 9});
         require(q, "q", {N + 1, n});
@@ -24,14 +28,15 @@ class HeldWatch {
     }
 
     // For a rollout of one path over as many steps.
-    Watch* of(std::size_t paths, std::size_t steps) {
-        if (paths != 1 || steps != u_.shape(0)) throw std::invalid_argument("a watch is for one path of as many steps");
-        return &own;
+    Watch* of(const Nodes& nodes) {
+        if (nodes.paths != 1 || nodes.steps != static_cast<std::int64_t>(u_.shape(0)))
+            throw std::invalid_argument("a watch is for one path of as many steps");
+        return &core;
     }
 
     bool after(std::size_t step, std::int64_t parts) {
         if (step >= u_.shape(0)) throw std::invalid_argument("there is no such step");
-        return own.after(static_cast<std::ptrdiff_t>(step), parts);
+        return core.after(static_cast<std::ptrdiff_t>(step), parts);
     }
 
   private:
@@ -39,7 +44,7 @@ class HeldWatch {
     InOut<2> values_;
 
   public:
-    Watch own;
+    Watch core;
 };
 
 }  // namespace varpin::border

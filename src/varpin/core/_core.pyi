@@ -158,8 +158,26 @@ class Watch:
     @property
     def verdict(self) -> Verdict: ...
 
-class VariationalRollout:
-    """Paths of a variational integrator, and the work arrays of a step."""
+class _Rollout:
+    """What the rollouts of variational integrators have in common; of this file alone.
+
+    Paths and the work arrays of a step, which forks share: one of them moves at a time.
+    """
+
+    def begin(self, q: Floats, v: Floats) -> bool:
+        """Put each path at its row of q and v (P, n); False where an M(q) is not positive definite."""
+
+    def kick(self, impulse: Floats) -> None:
+        """Add an impulse (P, n) to the momenta; constraints absorb what is normal to them."""
+
+    def nodes(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """Configurations, momenta and velocities (P, n), and energies (P,)."""
+
+    def halvings(self, path: int) -> Bytes:
+        """Of each part of every step of a path in its last roll that was not taken whole, step after step."""
+
+class VariationalRollout(_Rollout):
+    """Paths without constraints."""
 
     def __init__(
         self,
@@ -172,10 +190,7 @@ class VariationalRollout:
         solver: Solver = Solver.automatic,
     ) -> None: ...
     def fork(self, guards: Guards) -> VariationalRollout:
-        """The paths as they stand, to move on by themselves; work arrays are shared, so one moves at a time."""
-
-    def begin(self, q: Floats, v: Floats) -> bool:
-        """Put each path at its row of q and v (P, n); False where an M(q) is not positive definite."""
+        """The paths as they stand, to move on by themselves."""
 
     def roll(
         self,
@@ -191,38 +206,17 @@ class VariationalRollout:
         One path alone may be under a watch, which may end it.
         """
 
-    def kick(self, impulse: Floats) -> None:
-        """Add an impulse (P, n) to the momenta."""
-
-    def nodes(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """Configurations, momenta and velocities (P, n), and energies (P,)."""
-
-    def halvings(self, path: int) -> Bytes:
-        """Of each part of every step of a path in its last roll that was not taken whole, step after step."""
-
-class ConstrainedRollout:
-    """Paths of a variational integrator under constraints; as VariationalRollout."""
+class ConstrainedRollout(_Rollout):
+    """Paths under constraints."""
 
     def __init__(
         self, mechanism: Mechanism, tableau: Tableau, places: Floats, tolerance: float, guards: Guards, paths: int
     ) -> None: ...
     def fork(self, guards: Guards) -> ConstrainedRollout:
-        """The paths as they stand, to move on by themselves; work arrays are shared, so one moves at a time."""
-
-    def begin(self, q: Floats, v: Floats) -> bool:
-        """Put each path at its row of q and v (P, n); False where an M(q) is not positive definite."""
+        """The paths as they stand, to move on by themselves."""
 
     def roll(self, dt: float, commands: Commands, increments: Floats, drift: Floats, nodes: Nodes) -> None:
         """Take the steps that the commands are for, and write them into the nodes; named tuples of arrays."""
-
-    def kick(self, impulse: Floats) -> None:
-        """Add an impulse (P, n) to the momenta; constraints absorb what is normal to them."""
-
-    def nodes(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """Configurations, momenta, velocities (P, n) and energies (P,)."""
-
-    def halvings(self, path: int) -> Bytes:
-        """Of each part of every step of a path in its last roll that was not taken whole."""
 
     def impulses(self, path: int) -> Floats:
         """What the constraints gave in each step of a path in its last roll (steps, c): dg/dq' times it."""

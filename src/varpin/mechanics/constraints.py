@@ -19,9 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.core.arrays import Carried, ConstraintRows, CustomRows, Product, Tied
 from varpin.errors import InputError, UnknownJoint
-from varpin.mechanics.forces import Point, kept, point_of, shown
+from varpin.mechanics.forces import Point, kept, point_of, require_movable, shown
 from varpin.model import Robot
-from varpin.support.checks import as_floats, count, finite, finite_array, positive
+from varpin.support.checks import as_floats, count, finite, finite_array, positive, tuple_of
 from varpin.support.frozen import Frozen
 
 Floats = NDArray[np.float64]
@@ -335,13 +335,7 @@ def constraints_of(given: Constraint | Sequence[Constraint]) -> tuple[Constraint
     Raises:
         InputError: It is none of them.
     """
-    found = (given,) if isinstance(given, Constraint) else given
-    if isinstance(found, str) or not isinstance(found, Sequence):
-        raise InputError(f"constraints must be a list of varpin's constraints, got {type(given).__name__}")
-    for own in found:
-        if not isinstance(own, Constraint):
-            raise InputError(f"constraints must be a list of varpin's constraints, got {own!r} in it")
-    return tuple(found)
+    return tuple_of("constraints", given, Constraint)
 
 
 def joined(bound: Sequence[Bound]) -> tuple[Bound, NDArray[np.int64]]:
@@ -391,11 +385,7 @@ def _unit(name: str, value: ArrayLike) -> Floats:
 
 
 def _require_movable(own: Constraint, a: int, b: int, robot: Robot) -> None:
-    if a < 0 and b < 0:
-        raise InputError(
-            f"{type(own).__name__}: both ends are fixed, in the world or to the base of robot {robot.name!r}: no joint "
-            "moves one"
-        )
+    require_movable(own, a, b, robot)
     if a == b:
         raise InputError(f"{type(own).__name__}: both ends are on one body, and no joint moves one against the other")
 

@@ -23,7 +23,7 @@ from varpin.core.arrays import Coupling, Element
 from varpin.errors import InputError, UnknownJoint
 from varpin.model import Robot
 from varpin.model.tree import place_of_frame
-from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array
+from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array, tuple_of
 from varpin.support.frozen import Frozen
 
 Floats = NDArray[np.float64]
@@ -404,14 +404,19 @@ def point_of(name: str, point: Any, robot: Robot) -> tuple[int, Floats, Floats]:
     return body, turned, at + turned @ place
 
 
+def require_movable(owner: object, a: int, b: int, robot: Robot) -> None:
+    """Refuse what acts between bodies ``a`` and ``b``, as :func:`point_of` has them, if no joint moves either."""
+    if a < 0 and b < 0:
+        raise InputError(
+            f"{type(owner).__name__}: both ends are fixed, in the world or to the base of robot {robot.name!r}: no "
+            "joint moves one"
+        )
+
+
 def _ends_of(force: FrameSpring | FrameDamper, robot: Robot) -> tuple[tuple[int, int], tuple[float, ...]]:
     """The bodies at both ends, and the places on them one after the other."""
     (a, _, here), (b, _, there) = point_of("a", force.a, robot), point_of("b", force.b, robot)
-    if a < 0 and b < 0:
-        raise InputError(
-            f"{type(force).__name__}: both ends are fixed, in the world or to the base of robot {robot.name!r}: no "
-            "joint moves one"
-        )
+    require_movable(force, a, b, robot)
     return (a, b), (*here.tolist(), *there.tolist())
 
 
@@ -473,13 +478,7 @@ def forces_of(given: Force | Sequence[Force]) -> tuple[Force, ...]:
     Raises:
         InputError: It is none of them.
     """
-    forces = (given,) if isinstance(given, Force) else given
-    if isinstance(forces, str) or not isinstance(forces, Sequence):
-        raise InputError(f"forces must be a list of varpin's forces, got {type(given).__name__}")
-    for force in forces:
-        if not isinstance(force, Force):
-            raise InputError(f"forces must be a list of varpin's forces, got {force!r} in it")
-    return tuple(forces)
+    return tuple_of("forces", given, Force)
 
 
 def not_negative(name: str, value: JointValues, robot: Robot) -> Floats:

@@ -32,6 +32,21 @@ def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
     return require_finite(name, array)
 
 
+def tuple_of(name: str, given: Any, kind: type) -> tuple[Any, ...]:
+    """``given``, one of a kind of varpin's objects or a sequence of them, as a tuple; the kind's plural is ``name``.
+
+    Raises:
+        InputError: It is none of them, or one of them is not.
+    """
+    found = (given,) if isinstance(given, kind) else given
+    if isinstance(found, str) or not isinstance(found, Sequence):
+        raise InputError(f"{name} must be a list of varpin's {name}, got {type(given).__name__}")
+    for own in found:
+        if not isinstance(own, kind):
+            raise InputError(f"{name} must be a list of varpin's {name}, got {own!r} in it")
+    return tuple(found)
+
+
 def broadcast_array(name: str, value: object, size: int) -> Floats:
     """``value``, one number or (size,), as a new float array (size,).
 

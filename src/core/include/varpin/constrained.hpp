@@ -19,6 +19,7 @@
 #include "varpin/collocation.hpp"
 #include "varpin/constraints.hpp"
 #include "varpin/guards.hpp"
+#include "varpin/substeps.hpp"
 #include "varpin/variational.hpp"
 
 namespace varpin {
@@ -161,35 +162,21 @@ class ConstrainedStepper {
     // One whole step, in as many substeps as the guards ask for; as VariationalStepper::step.
     Outcome step(double h, ConstrainedState& state) {
         effort = {};
-        halvings.clear();
         std::fill(state.impulse.begin(), state.impulse.end(), 0.0);
         PathState& path = state.path;
-        int level = std::max(path.level - 1, 0), deepest = level;
-        bool extrapolated = level == 0 && path.known > 0;
-        std::int64_t place = 0;  // in units of h / 2^level
-        while (place < (std::int64_t{1} << level)) {
+        const int level = std::max(path.level - 1, 0);
+        const auto take = [&](int level, double begin, bool extrapolated) {
             if (extrapolated) {
                 extrapolate(state);
             } else {
                 guess(path);
             }
-            bring_force(VariationalStepper<>::length_of(static_cast<double>(place), level), level);
-            const Outcome outcome = attempt(VariationalStepper<>::length_of(h, level), state);
-            if (outcome == Outcome::solved) {
-                if (level > 0) halvings.push_back(static_cast<std::uint8_t>(level));
-                ++place;
-                if (level > 0 && place % 2 == 0) {
-                    --level;
-                    place /= 2;
-                }
-            } else if (!(extrapolated && outcome != Outcome::energy)) {
-                if (level >= guards.most_halvings) return outcome;
-                ++level;
-                place *= 2;
-            }
-            deepest = std::max(deepest, level);
-            extrapolated = false;
-        }
+            bring_force(begin, level);
+            return attempt(length_of(h, level), state);
+        };
+        const auto [outcome, deepest] =
+            divide(level, level == 0 && path.known > 0, guards.most_halvings, halvings, take);
+        if (outcome != Outcome::solved) return outcome;
         path.level = deepest;
         path.known = 0;
         if (deepest == 0) {
@@ -206,7 +193,7 @@ class ConstrainedStepper {
     Outcome part(double h, int level, double begin, ConstrainedState& state) {
         bring_force(begin, level);
         guess(state.path);
-        return attempt(VariationalStepper<>::length_of(h, level), state);
+        return attempt(length_of(h, level), state);
     }
 
     // A whole step from a guess (s, n) next to its root.
@@ -649,7 +636,7 @@ class ConstrainedStepper {
     // Where the force varies: bring it to the stages of a part of the step.
     void bring_force(double begin, int level) {
         if (stride == 0) return;
-        bring_to_part(tableau, n, given.data(), begin, VariationalStepper<>::length_of(1.0, level), force.data());
+        bring_to_part(tableau, n, given.data(), begin, length_of(1.0, level), force.data());
     }
 
     double mass_diagonal(int c) const {
@@ -913,8 +900,7 @@ class ConstrainedLinearization {
         : stepper(mechanism, tableau, places, tolerance, guards),
           n(mechanism.dof()),
           state(mechanism, tableau.stages),
-          link(4 * n * n),
-          link_f(2 * n * n) {}
+          chained(n) {}
 
     Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
                   std::span<const std::uint8_t> halvings, double* Jx, double* Jf) {
@@ -924,23 +910,21 @@ class ConstrainedLinearization {
             Outcome outcome = stepper.from_guess(h, guess, state);
             if (outcome != Outcome::solved) outcome = stepper.part(h, 0, 0.0, state);
             if (outcome == Outcome::solved) {
-                weigh(0.0, 1.0);
+                if (ramp) stepper.equation.weigh_ramp(0.0, 1.0);
                 stepper.derivatives(h, state.path, Jx, Jf);
                 return outcome;
             }
             if (!stepper.guards.active) return outcome;
         }
-        std::fill(Jx, Jx + 4 * n * n, 0.0);
-        std::fill(Jf, Jf + 2 * n * n, 0.0);
-        for (int i = 0; i < 2 * n; ++i) Jx[i * 2 * n + i] = 1.0;
-        if (halvings.empty()) return part(h, 0, 0.0, Jx, Jf);
-        double begin = 0.0;
-        for (const std::uint8_t level : halvings) {
-            const Outcome outcome = part(h, level, begin, Jx, Jf);
+        chained.begin(Jx, Jf);
+        return parts_again(halvings, stepper.guards.halvings_again(), [&](int level, double begin) {
+            const Outcome outcome = stepper.part(h, level, begin, state);
             if (outcome != Outcome::solved) return outcome;
-            begin += VariationalStepper<>::length_of(1.0, level);
-        }
-        return Outcome::solved;
+            if (ramp) stepper.equation.weigh_ramp(begin, length_of(1.0, level));
+            stepper.derivatives(length_of(h, level), state.path, chained.part.data(), chained.part_f.data());
+            chained.follow(Jx, Jf);
+            return outcome;
+        });
     }
 
     // As of VariationalLinearization.
@@ -950,41 +934,7 @@ class ConstrainedLinearization {
     ConstrainedStepper stepper;
     int n;
     ConstrainedState state;
-    std::vector<double> link, link_f;
-
-    // The weights of the stages' forces in a part of the step, both in units of the step.
-    void weigh(double begin, double share) {
-        if (!ramp) return;
-        stepper.equation.weighted = true;
-        for (int i = 0; i < stepper.stages; ++i) stepper.equation.weight[i] = begin + share * stepper.tableau.c[i];
-    }
-
-    // A part, in halves where guards refuse it; its derivatives follow those before.
-    Outcome part(double h, int level, double begin, double* Jx, double* Jf) {
-        const Outcome outcome = stepper.part(h, level, begin, state);
-        if (outcome != Outcome::solved) {
-            if (!stepper.guards.active || level >= stepper.guards.most_halvings) return outcome;
-            const Outcome half = part(h, level + 1, begin, Jx, Jf);
-            if (half != Outcome::solved) return half;
-            return part(h, level + 1, begin + VariationalStepper<>::length_of(1.0, level + 1), Jx, Jf);
-        }
-        weigh(begin, VariationalStepper<>::length_of(1.0, level));
-        stepper.derivatives(VariationalStepper<>::length_of(h, level), state.path, link.data(), link_f.data());
-        const auto times = [&](double* right, int width) {
-            std::vector<double> product(2 * n * width);
-            for (int i = 0; i < 2 * n; ++i) {
-                for (int j = 0; j < 2 * n; ++j) {
-                    for (int c = 0; c < width; ++c)
-                        product[i * width + c] += link[i * 2 * n + j] * right[j * width + c];
-                }
-            }
-            std::copy(product.begin(), product.end(), right);
-        };
-        times(Jx, 2 * n);
-        times(Jf, n);
-        for (int i = 0; i < 2 * n * n; ++i) Jf[i] += link_f[i];
-        return Outcome::solved;
-    }
+    ChainedDerivatives chained;
 };
 
 }  // namespace varpin

@@ -167,7 +167,7 @@ struct Arm {
 
 // Work arrays; Couplings::fit makes room in them, at their first use at the latest.
 template <class T>
-struct CouplingRoom {
+struct CouplingWorkspace {
     std::vector<PlacementOf<T>> at;
     std::vector<Arm<T>> arms;
     std::vector<Vec3<T>> change;  // of the velocity of d with the coordinate of each arm
@@ -180,27 +180,15 @@ class Couplings {
     Couplings() = default;
     // Between points of some bodies, parents first.
     Couplings(const std::vector<CoupledElement>& couplings, const std::vector<Body>& bodies) {
-        std::vector<int> own(bodies.size(), -1);
-        const auto take = [&](auto& self, int body) -> int {
-            if (body < 0) return -1;
-            if (own[body] < 0) {
-                Body link = bodies[body];
-                link.parent = self(self, link.parent);
-                own[body] = links_.size();
-                links_.bodies.push_back(link);
-            }
-            return own[body];
-        };
+        LinkCollector collector(bodies, links_);
         for (CoupledElement coupling : couplings) {
             Joined joined;
             std::visit(
                 [&](auto& element) {
                     Anchor* const anchors[2] = {&element.a, &element.b};
                     for (int point = 0; point < 2; ++point) {
-                        anchors[point]->body = take(take, anchors[point]->body);
-                        for (int j = anchors[point]->body; j >= 0; j = links_.bodies[j].parent)
-                            joined.path[point].push_back(j);
-                        std::reverse(joined.path[point].begin(), joined.path[point].end());
+                        anchors[point]->body = collector.take(anchors[point]->body);
+                        joined.path[point] = links_.path(anchors[point]->body);
                     }
                     if constexpr (!has_potential<std::decay_t<decltype(element)>>) pushes_ = true;
                 },
@@ -223,26 +211,26 @@ class Couplings {
     bool pushes() const { return pushes_; }
 
     template <class T>
-    void fit(CouplingRoom<T>& room) const {
-        room.at.resize(links_.bodies.size());
-        room.arms.reserve(most_arms_);
-        room.change.reserve(most_arms_);
+    void fit(CouplingWorkspace<T>& workspace) const {
+        workspace.at.resize(links_.bodies.size());
+        workspace.arms.reserve(most_arms_);
+        workspace.change.reserve(most_arms_);
     }
 
     // Calls visit(arms, VectorPotential, scale, magnitude) for each that has a potential, at q: `scale` of the terms
     // that cancel in V_d, `magnitude` of those that make up the energy.
     template <class T, class Visit>
-    void potentials(const T* q, CouplingRoom<T>& room, const Visit& visit) const {
-        place_all(q, room);
+    void potentials(const T* q, CouplingWorkspace<T>& workspace, const Visit& visit) const {
+        update_placements(q, workspace);
         for (const Joined& joined : joined_) {
             std::visit(
                 [&](const auto& element) {
                     if constexpr (has_potential<std::decay_t<decltype(element)>>) {
-                        write_arms(element, joined, room);
-                        const VectorPotential<T> own = element.potential(room.place[0] - room.place[1]);
-                        const double far = detail::size_of(room.place[0]) + detail::size_of(room.place[1]);
-                        visit(std::as_const(room.arms), own, element.scale(far),
-                              std::abs(value_of(own.energy)) + detail::size_of(own.slope) * far);
+                        write_arms(element, joined, workspace);
+                        const VectorPotential<T> potential = element.potential(workspace.place[0] - workspace.place[1]);
+                        const double far = detail::size_of(workspace.place[0]) + detail::size_of(workspace.place[1]);
+                        visit(std::as_const(workspace.arms), potential, element.scale(far),
+                              std::abs(value_of(potential.energy)) + detail::size_of(potential.slope) * far);
                     }
                 },
                 joined.element);
@@ -251,28 +239,30 @@ class Couplings {
 
     // Adds -V_qq of a potential to a matrix (n, n).
     template <class T>
-    static void subtract_curvature(const std::vector<Arm<T>>& arms, const VectorPotential<T>& own, int n, T* Lqq) {
+    static void subtract_curvature(const std::vector<Arm<T>>& arms, const VectorPotential<T>& potential, int n,
+                                   T* Lqq) {
         for (const Arm<T>& i : arms) {
-            const Vec3<T> stiff = own.curvature * i.linear;
+            const Vec3<T> stiff = potential.curvature * i.linear;
             for (const Arm<T>& j : arms) Lqq[i.coordinate * n + j.coordinate] -= dot(stiff, j.linear);
         }
-        turning(arms, own.slope, [&](int i, int j, const T& term) { Lqq[i * n + j] -= term; });
+        turning(arms, potential.slope, [&](int i, int j, const T& term) { Lqq[i * n + j] -= term; });
     }
 
     // Adds the forces beside those of potentials to `out` (n), and writes their derivatives in q and v (n, n), which
     // may be null.
     template <class T>
-    void add_forces(int n, const T* q, const T* v, CouplingRoom<T>& room, JointForce<T>* out, T* by_q, T* by_v) const {
+    void add_forces(int n, const T* q, const T* v, CouplingWorkspace<T>& workspace, JointForce<T>* out, T* by_q,
+                    T* by_v) const {
         for (T* matrix : {by_q, by_v}) {
             if (matrix) std::fill(matrix, matrix + n * n, T{});
         }
-        place_all(q, room);
+        update_placements(q, workspace);
         for (const Joined& joined : joined_) {
             std::visit(
                 [&](const auto& element) {
                     if constexpr (!has_potential<std::decay_t<decltype(element)>>) {
-                        write_arms(element, joined, room);
-                        push(element, n, v, room, out, by_q, by_v);
+                        write_arms(element, joined, workspace);
+                        push(element, n, v, workspace, out, by_q, by_v);
                     }
                 },
                 joined.element);
@@ -282,7 +272,7 @@ class Couplings {
 
   private:
     template <class Element>
-    static constexpr bool has_potential = requires(const Element& own) { own.potential(Vec3<double>{}); };
+    static constexpr bool has_potential = requires(const Element& element) { element.potential(Vec3<double>{}); };
 
     struct Joined {
         CoupledElement element;
@@ -320,33 +310,29 @@ class Couplings {
     }
 
     template <class T>
-    void place_all(const T* q, CouplingRoom<T>& room) const {
-        fit(room);
-        place(links_, q, room.at.data());
+    void update_placements(const T* q, CouplingWorkspace<T>& workspace) const {
+        fit(workspace);
+        place(links_, q, workspace.at.data());
     }
 
     template <class T, class Element>
-    void write_arms(const Element& element, const Joined& joined, CouplingRoom<T>& room) const {
-        room.arms.clear();
+    void write_arms(const Element& element, const Joined& joined, CouplingWorkspace<T>& workspace) const {
+        workspace.arms.clear();
         const Anchor* const anchors[2] = {&element.a, &element.b};
         for (int point = 0; point < 2; ++point) {
             const auto& [body, place, direction] = *anchors[point];
-            Vec3<T>& x = room.place[point];
+            Vec3<T>& x = workspace.place[point];
             x = {T(place.x), T(place.y), T(place.z)};
             if (body < 0) continue;
-            x = room.at[body].rotation * place;
-            if (!direction) x += room.at[body].position;
-            if (point == 0) room.rotation = room.at[body].rotation;
+            x = workspace.at[body].rotation * place;
+            if (!direction) x += workspace.at[body].position;
+            if (point == 0) workspace.rotation = workspace.at[body].rotation;
             for (int j : joined.path[point]) {
                 const Body& link = links_.bodies[j];
-                const Vec3<T>& axis = room.at[j].rotation.z;
                 const double side = point == 0 ? link.ratio : -link.ratio;
-                if (link.prismatic) {
-                    room.arms.push_back({link.coordinate, point, direction ? Vec3<T>{} : side * axis, {}});
-                } else {
-                    const Vec3<T> from = direction ? x : x - room.at[j].position;
-                    room.arms.push_back({link.coordinate, point, side * cross(axis, from), link.ratio * axis});
-                }
+                const Motion<T> gives = given_by(link, workspace.at[j], x);
+                const Vec3<T> linear = direction ? cross(gives.angular, x) : gives.linear;
+                workspace.arms.push_back({link.coordinate, point, side * linear, link.ratio * gives.angular});
             }
         }
     }
@@ -364,9 +350,9 @@ class Couplings {
     }
 
     template <class T>
-    static void push(const FrameDamper& own, int n, const T* v, CouplingRoom<T>& room, JointForce<T>* out, T* by_q,
-                     T* by_v) {
-        const auto& arms = room.arms;
+    static void push(const FrameDamper& damper, int n, const T* v, CouplingWorkspace<T>& workspace, JointForce<T>* out,
+                     T* by_q, T* by_v) {
+        const auto& arms = workspace.arms;
         Vec3<T> rate{};
         double rates = 0.0;
         for (const Arm<T>& arm : arms) {
@@ -374,46 +360,46 @@ class Couplings {
             rate += share;
             rates += detail::size_of(share);
         }
-        const Vec3<T> drag = detail::entrywise(own.damping, rate);
+        const Vec3<T> drag = detail::entrywise(damper.damping, rate);
         for (const Arm<T>& arm : arms) {
             JointForce<T>& at = out[arm.coordinate];
             at.value += -dot(drag, arm.linear);
-            at.scale += detail::size_of(own.damping) * rates * detail::size_of(arm.linear);
+            at.scale += detail::size_of(damper.damping) * rates * detail::size_of(arm.linear);
         }
         if (!arms.empty()) out[arms[0].coordinate].lost += value_of(dot(drag, rate));
         if (by_v) {
             for (const Arm<T>& i : arms) {
-                const Vec3<T> damped = detail::entrywise(own.damping, i.linear);
+                const Vec3<T> damped = detail::entrywise(damper.damping, i.linear);
                 for (const Arm<T>& j : arms) by_v[i.coordinate * n + j.coordinate] -= dot(damped, j.linear);
             }
         }
         if (!by_q) return;
         turning(arms, drag, [&](int i, int j, const T& term) { by_q[i * n + j] -= term; });
         // d(J v)/dq_j = w_j x sum of l_i v_i from j on + (sum of w_i v_i before j) x l_j
-        room.change.assign(arms.size(), Vec3<T>{});
+        workspace.change.assign(arms.size(), Vec3<T>{});
         Vec3<T> before{}, beyond{};
         for (std::size_t j = 0; j < arms.size(); ++j) {
             if (j > 0 && arms[j].point != arms[j - 1].point) before = {};
-            room.change[j] = cross(before, arms[j].linear);
+            workspace.change[j] = cross(before, arms[j].linear);
             before += v[arms[j].coordinate] * arms[j].angular;
         }
         for (std::size_t j = arms.size(); j-- > 0;) {
             if (j + 1 < arms.size() && arms[j].point != arms[j + 1].point) beyond = {};
             beyond += v[arms[j].coordinate] * arms[j].linear;
-            room.change[j] += cross(arms[j].angular, beyond);
+            workspace.change[j] += cross(arms[j].angular, beyond);
         }
         for (const Arm<T>& i : arms) {
-            const Vec3<T> damped = detail::entrywise(own.damping, i.linear);
+            const Vec3<T> damped = detail::entrywise(damper.damping, i.linear);
             for (std::size_t j = 0; j < arms.size(); ++j)
-                by_q[i.coordinate * n + arms[j].coordinate] -= dot(damped, room.change[j]);
+                by_q[i.coordinate * n + arms[j].coordinate] -= dot(damped, workspace.change[j]);
         }
     }
 
     // With w_i taken negative for b, dw_j/dq_i = w_i x w_j for i above j alone, and so is what each turns of the rate.
     template <class T>
-    static void push(const FrameTurnDamper& own, int n, const T* v, CouplingRoom<T>& room, JointForce<T>* out, T* by_q,
-                     T* by_v) {
-        const auto& arms = room.arms;
+    static void push(const FrameTurnDamper& damper, int n, const T* v, CouplingWorkspace<T>& workspace,
+                     JointForce<T>* out, T* by_q, T* by_v) {
+        const auto& arms = workspace.arms;
         const auto signed_axis = [](const Arm<T>& arm) { return (arm.point == 0 ? 1.0 : -1.0) * arm.angular; };
         Vec3<T> rate{};
         double rates = 0.0;
@@ -422,31 +408,31 @@ class Couplings {
             rate += share;
             rates += detail::size_of(share);
         }
-        const Vec3<T> drag = detail::entrywise(own.damping, rate);
+        const Vec3<T> drag = detail::entrywise(damper.damping, rate);
         for (const Arm<T>& arm : arms) {
             JointForce<T>& at = out[arm.coordinate];
             at.value += -dot(drag, signed_axis(arm));
-            at.scale += detail::size_of(own.damping) * rates * detail::size_of(arm.angular);
+            at.scale += detail::size_of(damper.damping) * rates * detail::size_of(arm.angular);
         }
         if (!arms.empty()) out[arms[0].coordinate].lost += value_of(dot(drag, rate));
         if (by_v) {
             for (const Arm<T>& i : arms) {
-                const Vec3<T> damped = detail::entrywise(own.damping, signed_axis(i));
+                const Vec3<T> damped = detail::entrywise(damper.damping, signed_axis(i));
                 for (const Arm<T>& j : arms) by_v[i.coordinate * n + j.coordinate] -= dot(damped, signed_axis(j));
             }
         }
         if (!by_q) return;
-        room.change.assign(arms.size(), Vec3<T>{});
+        workspace.change.assign(arms.size(), Vec3<T>{});
         Vec3<T> beyond{};
         for (std::size_t j = arms.size(); j-- > 0;) {
             if (j + 1 < arms.size() && arms[j].point != arms[j + 1].point) beyond = {};
-            room.change[j] = cross(arms[j].angular, beyond);
+            workspace.change[j] = cross(arms[j].angular, beyond);
             beyond += v[arms[j].coordinate] * signed_axis(arms[j]);
         }
         for (std::size_t i = 0; i < arms.size(); ++i) {
-            const Vec3<T> axis = signed_axis(arms[i]), damped = detail::entrywise(own.damping, axis);
+            const Vec3<T> axis = signed_axis(arms[i]), damped = detail::entrywise(damper.damping, axis);
             for (std::size_t j = 0; j < arms.size(); ++j) {
-                T term = dot(damped, room.change[j]);
+                T term = dot(damped, workspace.change[j]);
                 if (j < i && arms[j].point == arms[i].point) term += dot(drag, cross(arms[j].angular, axis));
                 by_q[arms[i].coordinate * n + arms[j].coordinate] -= term;
             }
@@ -454,19 +440,20 @@ class Couplings {
     }
 
     template <class T>
-    static void push(const FrameWrench& own, int n, const T*, CouplingRoom<T>& room, JointForce<T>* out, T* by_q, T*) {
-        const auto& arms = room.arms;
-        Vec3<T> force{T(own.force.x), T(own.force.y), T(own.force.z)};
-        Vec3<T> moment{T(own.moment.x), T(own.moment.y), T(own.moment.z)};
-        if (own.carried) {
-            force = room.rotation * own.force;
-            moment = room.rotation * own.moment;
+    static void push(const FrameWrench& wrench, int n, const T*, CouplingWorkspace<T>& workspace, JointForce<T>* out,
+                     T* by_q, T*) {
+        const auto& arms = workspace.arms;
+        Vec3<T> force{T(wrench.force.x), T(wrench.force.y), T(wrench.force.z)};
+        Vec3<T> moment{T(wrench.moment.x), T(wrench.moment.y), T(wrench.moment.z)};
+        if (wrench.carried) {
+            force = workspace.rotation * wrench.force;
+            moment = workspace.rotation * wrench.moment;
         }
         for (const Arm<T>& arm : arms) {
             JointForce<T>& at = out[arm.coordinate];
             at.value += dot(force, arm.linear) + dot(moment, arm.angular);
-            at.scale += detail::size_of(own.force) * detail::size_of(arm.linear) +
-                        detail::size_of(own.moment) * detail::size_of(arm.angular);
+            at.scale += detail::size_of(wrench.force) * detail::size_of(arm.linear) +
+                        detail::size_of(wrench.moment) * detail::size_of(arm.angular);
         }
         if (!by_q) return;
         turning(arms, force, [&](int i, int j, const T& term) { by_q[i * n + j] += term; });
@@ -475,7 +462,7 @@ class Couplings {
                 const Vec3<T>& turn = arms[j].angular;
                 T term{};
                 if (j < i) term += dot(moment, cross(turn, arms[i].angular));
-                if (own.carried) {
+                if (wrench.carried) {
                     term += dot(arms[i].linear, cross(turn, force)) + dot(arms[i].angular, cross(turn, moment));
                 }
                 by_q[arms[i].coordinate * n + arms[j].coordinate] += term;

@@ -29,6 +29,38 @@ struct Links {
     int dof = 0;
 
     int size() const { return static_cast<int>(bodies.size()); }
+
+    // The bodies on the way from the root to one of them, and that one.
+    std::vector<int> path(int body) const {
+        std::vector<int> out;
+        for (int j = body; j >= 0; j = bodies[j].parent) out.push_back(j);
+        std::reverse(out.begin(), out.end());
+        return out;
+    }
+};
+
+// Collects some bodies of a tree into links.
+class LinkCollector {
+  public:
+    LinkCollector(const std::vector<Body>& bodies, Links& links)
+        : bodies_(bodies), links_(links), own_(bodies.size(), -1) {}
+
+    // The place of a body among the links, into which it comes behind all its ancestors; -1 is the world.
+    int take(int body) {
+        if (body < 0) return -1;
+        if (own_[body] < 0) {
+            Body link = bodies_[body];
+            link.parent = take(link.parent);
+            own_[body] = links_.size();
+            links_.bodies.push_back(link);
+        }
+        return own_[body];
+    }
+
+  private:
+    const std::vector<Body>& bodies_;
+    Links& links_;
+    std::vector<int> own_;
 };
 
 // The placement of every body at q.
@@ -58,9 +90,10 @@ void place(const Links& links, const T* q, PlacementOf<T>* at) {
 }
 
 // The velocity that a joint gives to a point which it carries, per unit of its rate, in world axes.
-inline Motion<double> given_by(const Body& link, const Placement& at, const Vec3<double>& point) {
-    const Vec3<double>& axis = at.rotation.z;
-    return link.prismatic ? Motion<double>{axis, {}} : Motion<double>{cross(axis, point - at.position), axis};
+template <class T>
+Motion<T> given_by(const Body& link, const PlacementOf<T>& at, const Vec3<T>& point) {
+    const Vec3<T>& axis = at.rotation.z;
+    return link.prismatic ? Motion<T>{axis, {}} : Motion<T>{cross(axis, point - at.position), axis};
 }
 
 // The Jacobian (6, n) of a frame at a point that the last body carries: linear over angular velocity in world axes.

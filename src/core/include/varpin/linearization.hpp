@@ -16,6 +16,7 @@
 #include <span>
 #include <vector>
 
+#include "varpin/substeps.hpp"
 #include "varpin/variational.hpp"
 
 namespace varpin {
@@ -35,9 +36,7 @@ class VariationalLinearization {
           from_p(n),
           dV(entries(stages * n, 3 * n)),
           dQ(entries(n, 3 * n)),
-          link(entries(2 * n, 2 * n)),
-          link_f(entries(2 * n, n)),
-          product(entries(2 * n, 2 * n)),
+          chained(n),
           multiplier(stages * n),
           slope(stages * n),
           direction(mechanism.tree),
@@ -62,16 +61,16 @@ class VariationalLinearization {
         if (halvings.empty() && !stepper.guards.active) {
             const Outcome outcome = root(h, q, p, guess, force, past);
             if (outcome == Outcome::solved) {
-                weigh(0.0, 1.0);
+                if (ramp) stepper.step_equation.weigh_ramp(0.0, 1.0);
                 stepper.step_equation.derivatives(h, dV, Jx, Jf);
             }
             return outcome;
         }
-        identity(Jx, Jf);
+        chained.begin(Jx, Jf);
         return parts(h, q, p, force, halvings, [&](double begin, double length) {
-            weigh(begin, length / h);
-            stepper.step_equation.derivatives(length, dV, link.data(), link_f.data());
-            chain(Jx, Jf);
+            if (ramp) stepper.step_equation.weigh_ramp(begin, length / h);
+            part_derivatives(length);
+            chained.follow(Jx, Jf);
         });
     }
 
@@ -93,27 +92,27 @@ class VariationalLinearization {
         if (halvings.empty() && !stepper.guards.active) {
             const Outcome outcome = root(h, q, p, guess, force, past);
             if (outcome != Outcome::solved) return outcome;
-            stepper.step_equation.derivatives(h, dV, link.data(), link_f.data());
+            part_derivatives(h);
             add_curvature(h, z, nullptr, H);
             return Outcome::solved;
         }
         std::vector<Substep> trail;
         std::vector<double> Jx(4 * n * n), Jf(2 * n * n), back(z, z + 2 * n), before(2 * n);
-        identity(Jx.data(), Jf.data());
+        chained.begin(Jx.data(), Jf.data());
         const Outcome outcome = parts(h, q, p, force, halvings, [&](double begin, double length) {
             trail.push_back({from, from_p, stepper.step_equation.V, begin, length, joined(Jx, Jf)});
-            stepper.step_equation.derivatives(length, dV, link.data(), link_f.data());
-            chain(Jx.data(), Jf.data());
+            part_derivatives(length);
+            chained.follow(Jx.data(), Jf.data());
         });
         if (outcome != Outcome::solved) return outcome;
         for (std::size_t k = trail.size(); k-- > 0;) {
             const Outcome again = root_of(h, trail[k]);
             if (again != Outcome::solved) return again;
-            stepper.step_equation.derivatives(trail[k].length, dV, link.data(), link_f.data());
+            part_derivatives(trail[k].length);
             add_curvature(trail[k].length, back.data(), trail[k].start.data(), H);
             for (int c = 0; c < 2 * n; ++c) {
                 before[c] = 0.0;
-                for (int r = 0; r < 2 * n; ++r) before[c] += link[r * 2 * n + c] * back[r];
+                for (int r = 0; r < 2 * n; ++r) before[c] += chained.part[r * 2 * n + c] * back[r];
             }
             std::swap(before, back);
         }
@@ -142,7 +141,7 @@ class VariationalLinearization {
     std::vector<Compensated> from_p;
     std::vector<double> dV;  // (s, n, 3n)
     std::vector<double> dQ;  // (n, 3n) of one stage
-    std::vector<double> link, link_f, product;
+    ChainedDerivatives chained;
     std::vector<double> multiplier, slope;  // (s, n)
     Jet<Dual> direction;
     std::vector<Dual> at_q, at_v;
@@ -196,61 +195,18 @@ class VariationalLinearization {
                   std::span<const std::uint8_t> halvings, const Visit& visit) {
         stepper.take_force(force, varies);
         if (!stepper.begin_at(q, p, state)) return Outcome::singular;
-        if (halvings.empty()) return part(h, 0, 0.0, visit);
-        double begin = 0.0;
-        for (const std::uint8_t level : halvings) {
-            const Outcome outcome = part(h, level, begin, visit);
-            if (outcome != Outcome::solved) return outcome;
-            begin += VariationalStepper<>::length_of(1.0, level);
-        }
-        return Outcome::solved;
-    }
-
-    template <class Visit>
-    Outcome part(double h, int level, double begin, const Visit& visit) {
-        from = state.place;
-        from_p = state.p;
-        const Outcome outcome = stepper.part(h, level, begin, state);
-        if (outcome == Outcome::solved) {
-            visit(begin, stepper.length_of(h, level));
+        return parts_again(halvings, stepper.guards.halvings_again(), [&](int level, double begin) {
+            from = state.place;
+            from_p = state.p;
+            const Outcome outcome = stepper.part(h, level, begin, state);
+            if (outcome == Outcome::solved) visit(begin, length_of(h, level));
             return outcome;
-        }
-        if (!stepper.guards.active || level >= stepper.guards.most_halvings) return outcome;
-        const Outcome half = part(h, level + 1, begin, visit);
-        if (half != Outcome::solved) return half;
-        return part(h, level + 1, begin + VariationalStepper<>::length_of(1.0, level + 1), visit);
+        });
     }
 
-    // The weights of the stages' forces in a part of the step, both in units of the step.
-    void weigh(double begin, double share) {
-        if (!ramp) return;
-        stepper.step_equation.weighted = true;
-        for (int i = 0; i < stages; ++i) stepper.step_equation.weight[i] = begin + share * stepper.tableau.c[i];
-    }
-
-    void identity(double* Jx, double* Jf) const {
-        std::fill(Jx, Jx + 4 * n * n, 0.0);
-        std::fill(Jf, Jf + 2 * n * n, 0.0);
-        for (int i = 0; i < 2 * n; ++i) Jx[i * 2 * n + i] = 1.0;
-    }
-
-    // Let the part whose derivatives stand in `link` and `link_f` follow those before.
-    void chain(double* Jx, double* Jf) {
-        const int x = 2 * n;
-        const auto times = [&](const double* right, int columns) {
-            std::fill(product.begin(), product.begin() + x * columns, 0.0);
-            for (int i = 0; i < x; ++i) {
-                for (int j = 0; j < x; ++j) {
-                    const double factor = link[i * x + j];
-                    if (factor == 0.0) continue;
-                    for (int c = 0; c < columns; ++c) product[i * columns + c] += factor * right[j * columns + c];
-                }
-            }
-        };
-        times(Jx, x);
-        std::copy(product.begin(), product.end(), Jx);
-        times(Jf, n);
-        for (int i = 0; i < x * n; ++i) Jf[i] = product[i] + link_f[i];
+    // Of the part whose root is in the stepper.
+    void part_derivatives(double length) {
+        stepper.step_equation.derivatives(length, dV, chained.part.data(), chained.part_f.data());
     }
 
     std::vector<double> joined(const std::vector<double>& Jx, const std::vector<double>& Jf) const {

@@ -12,6 +12,7 @@
 #include "varpin/guards.hpp"
 #include "varpin/nodes.hpp"
 #include "varpin/policy.hpp"
+#include "varpin/substeps.hpp"
 #include "varpin/watch.hpp"
 
 namespace varpin {
@@ -161,39 +162,23 @@ class VariationalStepper {
         if (stride != 0) bring_to_part(tableau, n, given.data(), begin, share, force.data());
     }
 
-    // One whole step with the force that was taken, in as many substeps as the guards ask for.
-    //
-    // The first attempt starts from the extrapolated past, the others from the current velocity. A failed attempt
-    // halves the substep, unless only the guess may be to blame; after a success at an even place it is doubled again.
+    // One whole step with the force that was taken, in as many substeps as the guards ask for. The first attempt starts
+    // from the extrapolated past, the others from the current velocity.
     Outcome step(double h, PathState& state) {
         effort = {};
-        halvings.clear();
-        int level = std::max(state.level - 1, 0), deepest = level;
-        bool extrapolated = level == 0 && state.known > 0;
-        std::int64_t place = 0;  // in units of h / 2^level
-        while (place < (std::int64_t{1} << level)) {
+        const int level = std::max(state.level - 1, 0);
+        const auto take = [&](int level, double begin, bool extrapolated) {
             if (extrapolated) {
                 extrapolate(h, state);
             } else {
                 guess_velocity(state);
             }
-            force_in_part(length_of(static_cast<double>(place), level), length_of(1.0, level));
-            const Outcome outcome = attempt(length_of(h, level), state, false);
-            if (outcome == Outcome::solved) {
-                if (level > 0) halvings.push_back(static_cast<std::uint8_t>(level));
-                ++place;
-                if (level > 0 && place % 2 == 0) {
-                    --level;
-                    place /= 2;
-                }
-            } else if (!(extrapolated && outcome != Outcome::energy)) {
-                if (level >= guards.most_halvings) return outcome;
-                ++level;
-                place *= 2;
-            }
-            deepest = std::max(deepest, level);
-            extrapolated = false;
-        }
+            force_in_part(begin, length_of(1.0, level));
+            return attempt(length_of(h, level), state, false);
+        };
+        const auto [outcome, deepest] =
+            divide(level, level == 0 && state.known > 0, guards.most_halvings, halvings, take);
+        if (outcome != Outcome::solved) return outcome;
         state.level = deepest;
         if (deepest > 0) {
             state.known = 0;
@@ -210,8 +195,6 @@ class VariationalStepper {
         guess_velocity(state);
         return attempt(length_of(h, level), state, true);
     }
-
-    static double length_of(double h, int level) { return h / static_cast<double>(std::int64_t{1} << level); }
 
     // Steps of every path from where it stands. Writes into `nodes` the node after each step, what was applied in it
     // and what it took. A path that fails stops there; nodes.ended and nodes.done say how and where. `increments` of
