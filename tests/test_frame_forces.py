@@ -26,6 +26,10 @@ ROBOTS = {
 }
 
 
+# A rotation about no axis of any frame.
+TURNED = pin.rpy.rpyToMatrix(0.4, -0.7, 1.1)
+
+
 def robot_of(name):
     make, tip, other = ROBOTS[name]
     return make(), tip, other
@@ -73,6 +77,20 @@ def spins(robot, frame, q):
     return np.stack([turn[2, 1], turn[0, 2], turn[1, 0]])
 
 
+def axes_of(robot, at, q):
+    """The axes (..., 3, 3) of an end of a force; the world's for a place there."""
+    if not isinstance(at, str | tuple):
+        return np.eye(3) + 0.0 * q[..., :1, None]
+    return placed(robot, at if isinstance(at, str) else at[0], q)[0]
+
+
+def turns(robot, at, q):
+    """Angular velocities (3, n) of an end."""
+    if not isinstance(at, str | tuple):
+        return np.zeros((3, q.size))
+    return spins(robot, at if isinstance(at, str) else at[0], q)
+
+
 def energy(robot, force, q):
     """The potential energy of one force at complex q (..., n)."""
     if isinstance(force, vp.FrameWrench):
@@ -80,6 +98,13 @@ def energy(robot, force, q):
     if isinstance(force, vp.FrameDamper):
         return 0.0 * q[..., 0]
     d = point(robot, force.a, q) - point(robot, force.b, q)
+    if force.rotational_stiffness is not None:
+        # By the trace: k about each axis has the weight (k_1 + k_2 + k_3) / 2 - k_i.
+        k = np.broadcast_to(force.rotational_stiffness, 3)
+        rest = np.eye(3) if force.rest_rotation is None else force.rest_rotation
+        E = np.swapaxes(axes_of(robot, force.b, q) @ rest, -1, -2) @ axes_of(robot, force.a, q)
+        turning = ((k.sum() / 2 - k) * (1.0 - np.diagonal(E, axis1=-2, axis2=-1))).sum(-1)
+        return turning + 0.5 * (force.stiffness * (d - force.rest) ** 2).sum(-1)
     if force.rest.ndim == 0 and force.rest > 0.0:
         return 0.5 * force.stiffness * (np.sqrt((d**2).sum(-1)) - force.rest) ** 2
     return 0.5 * (force.stiffness * (d - force.rest) ** 2).sum(-1)
@@ -94,7 +119,9 @@ def push(robot, force, q, v):
         return J.T @ R @ f + W.T @ R @ m if force.axes == "frame" else W.T @ m
     if isinstance(force, vp.FrameDamper):
         J = jacobian(robot, force.a, q) - jacobian(robot, force.b, q)
-        return -J.T @ (force.damping * (J @ v))
+        W = turns(robot, force.a, q) - turns(robot, force.b, q)
+        turning = 0.0 if force.rotational_damping is None else force.rotational_damping
+        return -J.T @ (force.damping * (J @ v)) - W.T @ (turning * (W @ v))
     return np.zeros_like(q)
 
 
@@ -110,6 +137,13 @@ def forces(tip, other, scale=1.0):
         vp.FrameSpring([1.2, -0.9, 1.1], other, 6.0 * s, 0.7),
         vp.FrameDamper(tip, other, 0.6 * s),
         vp.FrameDamper((other, [0.1, 0.0, 0.0]), [0.0, 0.0, 0.0], s * np.array([0.3, 0.0, 0.5])),
+        vp.FrameSpring(tip, other, 3.0 * s, rotational_stiffness=2.0 * s),
+        vp.FrameSpring(
+            [0.3, 0.2, 0.1], tip, 0.0, rotational_stiffness=s * np.array([1.0, 5.0, 0.5]), rest_rotation=TURNED
+        ),
+        vp.FrameSpring((tip, [0.0, 0.1, 0.0]), [0.0, 0.1, 0.2], s, rotational_stiffness=s * np.array([2.0, 2.5, 3.0])),
+        vp.FrameDamper(tip, other, 0.2 * s, 0.4 * s),
+        vp.FrameDamper([0.0, 0.0, 0.0], tip, 0.0, s * np.array([0.3, 0.1, 0.5])),
     ]
 
 
@@ -118,7 +152,7 @@ def state(robot):
     return rng.normal(size=robot.dof), rng.normal(size=robot.dof)
 
 
-@pytest.mark.parametrize("kind", range(8))
+@pytest.mark.parametrize("kind", range(13))
 @pytest.mark.parametrize("name", ROBOTS)
 def test_each_against_its_formula(name, kind):
     robot, tip, other = robot_of(name)
@@ -402,6 +436,21 @@ def test_plans_with_a_spring_on_the_tool():
         (lambda: vp.FrameSpring("tool0", [0, 0, 0], -1.0), "stiffness must be >= 0"),
         (lambda: vp.FrameSpring("tool0", [0, 0, 0], 1.0, -0.1), "rest must be a length >= 0"),
         (lambda: vp.FrameSpring("tool0", [0, 0, 0], [1, 1, 1], 0.1), "one stiffness"),
+        (
+            lambda: vp.FrameSpring("tool0", [0, 0, 0], 1.0, rotational_stiffness=-1.0),
+            "rotational_stiffness must be >= 0",
+        ),
+        (lambda: vp.FrameSpring("tool0", [0, 0, 0], 1.0, rest_rotation=np.eye(3)), "there is none"),
+        (
+            lambda: vp.FrameSpring("tool0", [0, 0, 0], 1.0, 0.0, 1.0, np.diag([1.0, 1.0, -1.0])),
+            "rest_rotation must be a rotation matrix",
+        ),
+        (
+            lambda: vp.FrameSpring("tool0", [0, 0, 0], 1.0, 0.0, 1.0, 2.0 * np.eye(3)),
+            "rest_rotation must be a rotation",
+        ),
+        (lambda: vp.FrameSpring("base_link", [0, 0, 0], 0.0, 0.0, 1.0), "both ends are fixed"),
+        (lambda: vp.FrameDamper("tool0", [0, 0, 0], 1.0, np.nan), "rotational_damping must be >= 0"),
         (lambda: vp.FrameDamper(("tool0", [0, 0]), [0, 0, 0], 1.0), r"must have shape \(3,\)"),
         (lambda: vp.FrameDamper("tool0", [0, 0, 0], [1, np.inf, 1]), "damping must be >= 0"),
     ],
@@ -426,3 +475,51 @@ def test_a_wrench_of_the_frame_keeps_no_energy():
     robot = vp.load_robot("ur5")
     assert vp.Scene(robot, forces=vp.FrameSpring("tool0", [0.5, 0.0, 0.4], 10.0)).conservative
     assert not vp.Scene(robot, forces=vp.FrameWrench("tool0", [1.0, 0, 0, 0, 0, 0], "frame")).conservative
+
+
+def test_turning_has_a_known_energy_and_moment():
+    """One joint that turns frame a about the spring's axis: k (1 - cos angle), and no singularity at half a turn."""
+    robot, k, at = vp.planar_chain(1), 3.0, 0.4
+    rest = placed(robot, "joint1", np.array([at]))[0]
+    scene = vp.Scene(
+        robot,
+        gravity=False,
+        damping=0.0,
+        forces=vp.FrameSpring("joint1", [0, 0, 0], 0.0, rotational_stiffness=k, rest_rotation=rest),
+    )
+    bare = vp.Scene(robot, gravity=False, damping=0.0)
+    for angle in (0.0, 1e-9, 0.5, 2.0, np.pi - 1e-6, np.pi, 4.0):
+        one, two = (vp.lagrangian_jet(own, [at + angle], [0.0]) for own in (scene, bare))
+        held = two.L - one.L
+        assert held == pytest.approx(k * (1.0 - np.cos(angle)), rel=1e-12, abs=1e-15)
+        assert one.Lq[0] == pytest.approx(-k * np.sin(angle), rel=1e-12, abs=1e-15)
+        assert one.Lqq[0, 0] == pytest.approx(-k * np.cos(angle), rel=1e-12, abs=1e-14)
+
+
+def test_stiffness_about_each_axis():
+    """At rest the curvature is that of three springs of turning, about the axes of frame a."""
+    robot, tip, other = robot_of("ur5")
+    q, k = state(robot)[0], np.array([1.0, 5.0, 0.5])
+    rest = placed(robot, other, q)[0].T @ placed(robot, tip, q)[0]
+    scene = vp.Scene(robot, damping=0.0, forces=vp.FrameSpring(tip, other, 0.0, 0.0, k, rest))
+    added = vp.lagrangian_jet(vp.Scene(robot, damping=0.0), q, 0 * q).Lqq - vp.lagrangian_jet(scene, q, 0 * q).Lqq
+    W = placed(robot, tip, q)[0].T @ (turns(robot, tip, q) - turns(robot, other, q))
+    np.testing.assert_allclose(added, W.T @ (k[:, None] * W), atol=1e-12 * k.max())
+
+
+def test_a_tool_that_a_spring_holds_in_place_and_turned():
+    """Six springs and six dampers at the tool: the arm comes to rest where frame a is as it is to be."""
+    robot, tip, _ = robot_of("ur5")
+    q = np.array([0.3, -1.2, 1.4, -0.4, 0.5, 0.2])
+    R, x = placed(robot, tip, q)
+    forces_ = [
+        vp.FrameSpring(tip, x, 2000.0, rotational_stiffness=200.0, rest_rotation=R),
+        vp.FrameDamper(tip, x, 400.0, 40.0),
+    ]
+    scene = vp.Scene(robot, gravity=False, damping=0.0, forces=forces_)
+    start = q + 0.2 * np.array([1.0, -1.0, 1.0, 0.5, -1.0, 1.0])
+    motion = vp.simulate(scene, start, np.zeros(6), dt=5e-3, steps=800, integrator=vp.Radau(2))
+    end, place = placed(robot, tip, motion.q[-1])
+    np.testing.assert_allclose(place, x, atol=1e-4)
+    np.testing.assert_allclose(end, R, atol=1e-3)
+    assert np.diff(motion.energy).max() <= 1e-9 * motion.energy[0]

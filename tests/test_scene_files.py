@@ -233,11 +233,14 @@ a = "link_3.0"
 b = { frame = "link_7.0", place = [0.0, 0.0, 0.01] }
 stiffness = 5.0
 rest = [0.0, 0.01, 0.0]
+rotational_stiffness = 0.02
+rest_rotation = [0, -1, 0, 1, 0, 0, 0, 0, 1]
 [[force]]
 type = "frame_damper"
 a = "link_3.0"
 b = [0.0, 0.1, 0.1]
 damping = [0.1, 0.2, 0.3]
+rotational_damping = 0.01
 [[force]]
 type = "frame_wrench"
 frame = "link_7.0"
@@ -255,8 +258,10 @@ def test_forces_on_frames_of_a_scene_are_those_written_in_python(tmp_path):
     path = write(tmp_path, ON_FRAMES.replace("[horizon]", more))
     file = vp.load_scene(path)
     forces = [
-        vp.FrameSpring("link_3.0", ("link_7.0", [0.0, 0.0, 0.01]), 5.0, [0.0, 0.01, 0.0]),
-        vp.FrameDamper("link_3.0", [0.0, 0.1, 0.1], [0.1, 0.2, 0.3]),
+        vp.FrameSpring(
+            "link_3.0", ("link_7.0", [0.0, 0.0, 0.01]), 5.0, [0.0, 0.01, 0.0], 0.02, [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+        ),
+        vp.FrameDamper("link_3.0", [0.0, 0.1, 0.1], [0.1, 0.2, 0.3], 0.01),
         vp.FrameWrench("link_7.0", [0.01, 0.0, 0.02, 0.0, 1e-3, 0.0], "frame"),
     ]
     assert file.robot.dof == 8
@@ -264,7 +269,7 @@ def test_forces_on_frames_of_a_scene_are_those_written_in_python(tmp_path):
     assert file.required.parts == (file.robot.joint_names,)
     assert file.required.terms["other forces"] == "frame_damper, frame_spring, frame_wrench"
     whole = vp.load_scene(path, required_only=False)
-    assert len(whole.scene.couplings) == 4
+    assert len(whole.scene.couplings) == 8
     own = [whole.robot.joint_names.index(name) for name in file.robot.joint_names]
     np.testing.assert_allclose(file.simulate().q, whole.simulate().q[:, own], rtol=1e-10, atol=1e-13)
 

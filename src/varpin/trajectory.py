@@ -413,6 +413,9 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
     """Motions at one dt, each of which begins where the one before ended, as one that begins when the first does.
 
     Their warnings, each in the times of its own part, are left out.
+
+    Raises:
+        InputError: Their controls change within steps at other stages.
     """
     first = parts[0]
     steps = sum(part.steps for part in parts)
@@ -422,8 +425,18 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
     }
     # At the node where two motions meet each may have a control of its own.
     arrays["u_nodes"] = np.zeros((steps + 1, 0))
-    of_steps = ("u", "u_stages", "dw", "constraint_forces")
+    of_steps = ("u", "dw", "constraint_forces")
     arrays |= {name: np.concatenate([getattr(part, name) for part in parts]) for name in of_steps}
+    stages = sorted({part.u_stages.shape[1] for part in parts} - {0})
+    if len(stages) > 1:
+        raise InputError(
+            f"motions whose controls change within steps are chained only where all have them at as many stages, got "
+            f"{' and '.join(map(str, stages))}"
+        )
+    # Controls that are constant over a step are so at its stages.
+    within = [part.u_stages if part.u_stages.shape[1] or not stages else part.u[:, None].repeat(stages[0], axis=1)
+           for part in parts]  # fmt: skip
+    arrays["u_stages"] = np.concatenate(within)
     return replace(
         first,
         t=first.t[0] + np.arange(steps + 1) * first.dt,

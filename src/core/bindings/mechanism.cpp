@@ -70,12 +70,15 @@ CoupledElement coupling_of(const std::string& kind, int a, int b, const std::vec
                                         " numbers, not " + std::to_string(values.size()));
     };
     const auto vector = [&](std::size_t at) { return Vec3<double>{values[at], values[at + 1], values[at + 2]}; };
-    const auto from = [&] { return Anchor{a, vector(0)}; };
-    const auto to = [&] { return Anchor{b, vector(3)}; };
+    const bool direction = kind == "FrameTurnSpring";
+    const auto from = [&] { return Anchor{a, vector(0), direction}; };
+    const auto to = [&] { return Anchor{b, vector(3), direction}; };
     if (kind == "FrameLoad") return require_numbers(3), FrameLoad{from(), to(), vector(6)};
     if (kind == "FrameSpring") return require_numbers(6), FrameSpring{from(), to(), vector(6), vector(9)};
     if (kind == "FrameLengthSpring") return require_numbers(2), FrameLengthSpring{from(), to(), values[6], values[7]};
     if (kind == "FrameDamper") return require_numbers(3), FrameDamper{from(), to(), vector(6)};
+    if (kind == "FrameTurnSpring") return require_numbers(1), FrameTurnSpring{from(), to(), values[6]};
+    if (kind == "FrameTurnDamper") return require_numbers(3), FrameTurnDamper{from(), to(), vector(6)};
     if (kind == "FrameWrench")
         return require_numbers(7), FrameWrench{from(), to(), vector(6), vector(9), values[12] != 0.0};
     throw std::invalid_argument("there is no coupling of kind " + kind);

@@ -269,7 +269,7 @@ class Mpc:
 
         Main args:
             plant: None for the problem's own scene, integrated more finely.
-            duration: Of the run [s], rounded to whole ticks.
+            duration: Of the run [s]; in whole ticks, one at least, and a warning says so where it is not.
             rng: Generator or seed of the plant's noise; without it there is none, of which a noisy plant has a warning.
 
         Other Args:
@@ -333,6 +333,7 @@ class Mpc:
         motion, found = examined_in_loop(plant.scene, plant.integrator, chained(parts), plant.substeps)
         found = (*noise_forgotten(plant.scene, rng), *found, *_alternating(motion, plant.substeps))
         found = (*found, *_behind(seconds, self.period), *_late(late, self.budget))
+        found = (*found, *_whole_ticks(duration, ticks, self.period))
         announce(logger, plant.scene, dt, found)
         again = {(finding.kind, finding.joint) for finding in found}
         first = [finding.sentence for finding in of_plan if (finding.kind, finding.joint) not in again]
@@ -349,6 +350,17 @@ class Mpc:
                 *(finding.sentence for finding in found),
             ),
         )
+
+
+def _whole_ticks(duration: float, ticks: int, period: float) -> tuple[Finding, ...]:
+    """Says if a run takes another time than was asked for."""
+    if abs(ticks * period - duration) <= 1e-9 * duration:
+        return ()
+    sentence = (
+        f"duration = {duration:g} s is no whole number of ticks of {period:g} s: the run has {ticks}, "
+        f"{ticks * period:g} s"
+    )
+    return (Finding("rounded duration", sentence),)
 
 
 def _so_far(plant: Plant, parts: Sequence[Trajectory]) -> Trajectory:

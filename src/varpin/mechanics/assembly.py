@@ -16,6 +16,8 @@ Floats = NDArray[np.float64]
 _DEPENDENT = 1e-9
 # A row is kept if it misses by so many rounding units of the terms that cancel in it.
 _ROUNDING = 256.0 * np.finfo(np.float64).eps
+# Misses below which rounding decides which of two is the smaller [m or rad].
+_POLISHED = 1e-12
 # Most corrections of Newton's method, most trials of Levenberg's and Marquardt's, the least part of the way that is
 # followed at once, and the longest step [rad or m].
 _MOST, _MOST_TRIALS, _SHORTEST, _LONGEST = 12, 200, 1e-3, 0.5
@@ -191,10 +193,14 @@ def _reached_around(scene: Scene, start: Floats, root: Floats) -> Floats | None:
 
 
 def _polished(scene: Scene, q: Floats, root: Floats) -> Floats:
-    """To rounding."""
+    """To rounding; where that leads away, for the constraints cannot be kept here, not at all."""
+    g, C = _values(scene, q)
     for _ in range(4):
-        g, C = _values(scene, q)
-        q = q - _shift(g, C, root)
+        nearer = q - _shift(g, C, root)
+        g_there, C_there = _values(scene, nearer)
+        if not np.abs(g_there).max() <= max(np.abs(g).max(), _POLISHED):
+            break
+        q, g, C = nearer, g_there, C_there
     return q
 
 

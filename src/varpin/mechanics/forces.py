@@ -31,6 +31,9 @@ Floats = NDArray[np.float64]
 FramePoint: TypeAlias = str | tuple[str, ArrayLike]
 Point: TypeAlias = FramePoint | ArrayLike
 
+# How far a rotation matrix may be from one.
+_ROTATION = 1e-9
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Force(Frozen, ABC):
@@ -283,25 +286,57 @@ class FrameWrench(Force):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FrameSpring(Force):
-    """A linear spring between two points, part of the potential energy.
+    """A linear spring between two points, and one that resists turning, part of the potential energy.
 
     With d = x_a - x_b in world axes the energy is 1/2 sum of stiffness (d - rest)^2 over the axes; with a number > 0
     for ``rest``, 1/2 stiffness (``|d|`` - rest)^2, whose force has no direction at d = 0, and is none there.
+
+    With E = R_0' R_b' R_a, by which frame a has turned from its rest R_0 in b, and the stiffnesses k about the axes of
+    a, the energy of turning is the sum of g_i (1 - E_ii), g_i = (k_1 + k_2 + k_3) / 2 - k_i; with one stiffness k,
+    k (3 - tr E) / 2. That is k (1 - cos angle), k angle^2 / 2 for small angles, smooth at all of them; its moment
+    k sin(angle) is largest at a quarter turn and none at half a turn, where the equilibrium is unstable.
 
     Attributes:
         a: The one end: a frame's name, (name, place in the frame's axes), or a place in the world (3,) [m].
         b: The other end.
         stiffness: >= 0, one number or along each axis of the world (3,) [N/m].
         rest: Where it is slack: d in world axes (3,), or a length >= 0 [m].
+        rotational_stiffness: >= 0, one number or about each axis of frame a (3,) [N m/rad]; left out, none.
+        rest_rotation: R_0, the axes of frame a in those of b where turning is slack, a rotation matrix (3, 3); left
+            out, they are the same. A place in the world has the axes of the world.
     """
 
     a: Point
     b: Point
     stiffness: ArrayLike
     rest: ArrayLike = 0.0
+    rotational_stiffness: ArrayLike | None = None
+    rest_rotation: ArrayLike | None = None
 
     def bind(self, robot: Robot) -> tuple[Coupling, ...]:
         """See :meth:`Force.bind`."""
+        return (*self._of_points(robot), *self._of_turning(robot))
+
+    def _of_turning(self, robot: Robot) -> tuple[Coupling, ...]:
+        """One spring between each axis of frame a and where it is at rest."""
+        rest = np.eye(3) if self.rest_rotation is None else finite_array("rest_rotation", self.rest_rotation, (3, 3))
+        if not (np.abs(rest.T @ rest - np.eye(3)).max() <= _ROTATION and np.linalg.det(rest) > 0.0):
+            raise InputError(f"rest_rotation must be a rotation matrix, got {shown(rest)}")
+        if self.rotational_stiffness is None:
+            if self.rest_rotation is not None:
+                raise InputError("rest_rotation is of a rotational_stiffness, and there is none")
+            return ()
+        about = _along_axes("rotational_stiffness", self.rotational_stiffness)
+        (a, here, _), (b, there, _) = point_of("a", self.a, robot), point_of("b", self.b, robot)
+        _ends_of(self, robot)
+        weights, slack = 0.5 * about.sum() - about, there @ rest
+        return tuple(
+            Coupling("FrameTurnSpring", a, b, (*here[:, i].tolist(), *slack[:, i].tolist(), float(weights[i])))
+            for i in range(3)
+            if weights[i]
+        )
+
+    def _of_points(self, robot: Robot) -> tuple[Coupling, ...]:
         bodies, places = _ends_of(self, robot)
         stiffness = _along_axes("stiffness", self.stiffness)
         rest = as_floats("rest", self.rest)
@@ -321,21 +356,33 @@ class FrameSpring(Force):
 class FrameDamper(Force):
     """A viscous damper between two points: the force -damping (v_a - v_b) on a, and its opposite on b.
 
+    And of their turning: the moment -rotational_damping (w_a - w_b) on a's body, w being angular velocities in world
+    axes, and its opposite on b's.
+
     Attributes:
         a: The one end, as of :class:`FrameSpring`.
         b: The other end.
         damping: >= 0, one number or along each axis of the world (3,) [N s/m].
+        rotational_damping: >= 0, one number or along each axis of the world (3,) [N m s/rad]; left out, none.
     """
 
     a: Point
     b: Point
     damping: ArrayLike
+    rotational_damping: ArrayLike | None = None
 
     def bind(self, robot: Robot) -> tuple[Coupling, ...]:
         """See :meth:`Force.bind`."""
         bodies, places = _ends_of(self, robot)
-        damping = _along_axes("damping", self.damping)
-        return (Coupling("FrameDamper", *bodies, (*places, *damping.tolist())),) if damping.any() else ()
+        found = []
+        for kind, name, given in (
+            ("FrameDamper", "damping", self.damping),
+            ("FrameTurnDamper", "rotational_damping", self.rotational_damping),
+        ):
+            damping = np.zeros(3) if given is None else _along_axes(name, given)
+            if damping.any():
+                found.append(Coupling(kind, *bodies, (*places, *damping.tolist())))
+        return tuple(found)
 
 
 def point_of(name: str, point: Any, robot: Robot) -> tuple[int, Floats, Floats]:
@@ -417,12 +464,12 @@ def dissipates(element: Element | Coupling) -> bool:
     """Whether an element or a coupling turns energy into heat."""
     if element.kind == "JointStop":
         return element.values[3] > 0.0
-    return element.kind in ("JointDamper", "CoulombFriction", "PositionServo", "FrameDamper")
+    return element.kind in ("JointDamper", "CoulombFriction", "PositionServo", "FrameDamper", "FrameTurnDamper")
 
 
 def keeps_energy(coupling: Coupling) -> bool:
     """Whether a coupling is part of the potential energy."""
-    return coupling.kind in ("FrameLoad", "FrameSpring", "FrameLengthSpring")
+    return coupling.kind in ("FrameLoad", "FrameSpring", "FrameLengthSpring", "FrameTurnSpring")
 
 
 def forces_of(given: Force | Sequence[Force]) -> tuple[Force, ...]:

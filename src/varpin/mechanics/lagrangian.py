@@ -119,7 +119,11 @@ def _coupled(scene: Scene, model: pin.Model, full_q: Floats, G: Floats) -> tuple
             continue
         d, J, H = np.zeros(3), np.zeros((3, n)), np.zeros((n, 3, n))
         numbers = np.array(coupling.values)
-        for side, body, at_body in ((1.0, coupling.a, numbers[:3]), (-1.0, coupling.b, numbers[3:6])):
+        ends = [(1.0, coupling.a, numbers[:3]), (-1.0, coupling.b, numbers[3:6])]
+        if coupling.kind == "FrameTurnSpring":
+            # Directions are from the origins of their bodies.
+            ends += [(-side, body, np.zeros(3)) for side, body, _ in ends]
+        for side, body, at_body in ends:
             if body < 0:
                 d += side * at_body
                 continue
@@ -148,6 +152,8 @@ def _between(kind: str, numbers: Floats, d: Floats) -> tuple[float, Floats, Floa
     if kind == "FrameSpring":
         stiffness, stretch = numbers[:3], d - numbers[3:]
         return float(0.5 * stiffness @ stretch**2), stiffness * stretch, np.diag(stiffness)
+    if kind == "FrameTurnSpring":
+        return float(0.5 * numbers[0] * d @ d), numbers[0] * d, numbers[0] * np.eye(3)
     (stiffness, length), far = numbers, float(np.linalg.norm(d))
     if far == 0.0:
         return float(0.5 * stiffness * length**2), np.zeros(3), np.zeros((3, 3))

@@ -64,7 +64,9 @@ VALUES = {
     "FrameWrench": "forces on frames are others",
     "FrameSpring": "springs between frames are others",
     "FrameLengthSpring": "springs between frames are others",
+    "FrameTurnSpring": "springs between frames are others",
     "FrameDamper": "dampers between frames are others",
+    "FrameTurnDamper": "dampers between frames are others",
     "functions": "forces that are functions are others",
     "constraints.between": "constraints between frames are others",
     "constraints.ties": "ties of joints are others",
@@ -77,7 +79,9 @@ VALUES = {
 # Kinds of forces that have an entry of their own, a row of the coordinate and the numbers for each element.
 OF_ELEMENTS = ("CoulombFriction", "JointStop", "PositionServo")
 # The same of couplings, with the bodies of both ends; entries are there only if couplings are.
-OF_COUPLINGS = ("FrameLoad", "FrameWrench", "FrameSpring", "FrameLengthSpring", "FrameDamper")
+OF_COUPLINGS = (
+    "FrameLoad", "FrameWrench", "FrameSpring", "FrameLengthSpring", "FrameTurnSpring", "FrameDamper", "FrameTurnDamper",
+)  # fmt: skip
 # The same of constraints.
 OF_CONSTRAINTS = ("constraints.between", "constraints.ties", "constraints.custom")
 OF_FORCES = (*OF_ELEMENTS, *OF_COUPLINGS, *OF_CONSTRAINTS)

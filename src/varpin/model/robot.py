@@ -41,6 +41,9 @@ Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
+# How far outside its limits a joint may be locked without a word [rad or m].
+_OUTSIDE = 1e-6
+
 
 class Part(NamedTuple):
     """A robot within a combined one."""
@@ -220,10 +223,8 @@ class Robot(Frozen):
     @property
     def unbounded(self) -> NDArray[np.bool_]:
         """Which coordinates (n,) are angles without limits."""
-        index = joint_index(self.model)
-        slides = np.array([joint_axis(self.model, index[name])[0] for name in self.joint_names])
         lower, upper = self.position_limits
-        return ~slides & np.isinf(lower) & np.isinf(upper)
+        return ~self.slides & np.isinf(lower) & np.isinf(upper)
 
     @cached_property
     def position_limits(self) -> tuple[Floats, Floats]:
@@ -264,9 +265,9 @@ class Robot(Frozen):
 
     @cached_property
     def slides(self) -> NDArray[np.bool_]:
-        """Which coordinates make a body slide (n,), the follower of a mimic joint too."""
-        sliding = np.zeros(self.dof, dtype=bool)
-        sliding[self.tree.coordinate[self.tree.prismatic > 0]] = True
+        """Which coordinates (n,) are in [m], those of joints that slide; what mimics a joint has no say."""
+        index = joint_index(self.model)
+        sliding = np.array([joint_axis(self.model, index[name])[0] for name in self.joint_names], dtype=bool)
         sliding.setflags(write=False)
         return sliding
 
@@ -532,6 +533,12 @@ def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
     if position.shape != (size,):
         raise InputError(f"{name} must have {size} value(s), got shape {position.shape}")
     require_finite(name, position)
+    if kind.nv == 1 and kind.nq == 1:
+        low, high = (float(limits[kind.idx_q]) for limits in (model.lowerPositionLimit, model.upperPositionLimit))
+        if low < high and not low - _OUTSIDE <= position[0] <= high + _OUTSIDE:
+            logger.warning(
+                "%s = %g holds the joint outside its limits, %g and %g [rad or m]", name, position[0], low, high
+            )
     if kind.nv > 1:
         reference = pin.neutral(model)
         reference[kind.idx_q : kind.idx_q + kind.nq] = position

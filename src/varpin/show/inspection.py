@@ -490,10 +490,13 @@ def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | Non
             )
         elif joint.lower >= joint.upper:
             yield f"joint {joint.name!r} has no room to move: limits {joint.lower:g} and {joint.upper:g} {joint.unit}"
-    if q is not None:
-        for name, at, low, high in zip(robot.joint_names, q, *robot.position_limits, strict=True):
-            if low < high and not low <= at <= high:
-                yield f"q puts joint {name!r} at {at:g}, outside its limits {low:g} and {high:g}"
+    at_zero = q is None
+    for name, at, low, high in zip(
+        robot.joint_names, np.zeros(robot.dof) if q is None else q, *robot.position_limits, strict=True
+    ):
+        if low < high and not low <= at <= high:
+            where = f"q = 0 is no posture of joint {name!r}: it is" if at_zero else f"q puts joint {name!r} at {at:g},"
+            yield f"{where} outside its limits {low:g} and {high:g}"
 
 
 def _mimic_warnings(robot: Robot, urdf: Urdf | None, joints: Sequence[JointReport], *, tied: bool) -> Iterator[str]:

@@ -395,12 +395,7 @@ def _slides(trajectory: Trajectory, robot: Robot | None) -> NDArray[np.bool_] | 
             f"robot {robot.name!r} has joints {', '.join(robot.joint_names)}; "
             f"the trajectory has {', '.join(trajectory.joint_names)}"
         )
-    slides = np.zeros(robot.dof, dtype=bool)
-    followers = {tie.follower - 1 for tie in robot.ties}
-    for body, coordinate in enumerate(robot.tree.coordinate):
-        if body not in followers:
-            slides[coordinate] = robot.tree.prismatic[body]
-    return slides
+    return robot.slides
 
 
 def _labels(names: Sequence[str], units: tuple[str, str], slides: NDArray[np.bool_] | None) -> tuple[list[str], str]:

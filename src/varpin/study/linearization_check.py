@@ -20,6 +20,8 @@ Floats = NDArray[np.float64]
 
 # Central differences of eighth order.
 _WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+# Relative errors up to which derivatives are right, and from which on they are wrong.
+_RIGHT, _NEAR = 1e-6, 1e-3
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,33 @@ class LinearizationCheck:
     @property
     def worst(self) -> float:
         """The largest error relative to its norm."""
-        return max(error / norm if norm > 0.0 else error for error, norm in (self.A, self.B, self.G))
+        return max(map(_relative, (self.A, self.B, self.G)))
+
+    @property
+    def holds(self) -> bool:
+        """Whether the derivatives are those of the step, to six digits."""
+        return self.worst <= _RIGHT
+
+    @property
+    def verdict(self) -> str:
+        """What to make of it, in words."""
+        if self.holds:
+            return f"the derivatives are those of the step, to {self.worst:.0e} of their size"
+        parts = {"A": self.A, "B": self.B, "G": self.G}
+        wrong = ", ".join(name for name, part in parts.items() if not _relative(part) <= _RIGHT)
+        if self.worst <= _NEAR:
+            return (
+                f"{wrong} and the differences agree to {self.worst:.0e} alone: another step= of the differences tells "
+                "which of them is off, as does a smaller dt"
+            )
+        return f"{wrong} is not the derivative of the step: it is off by {self.worst:.1e} of its size"
+
+    def __str__(self) -> str:
+        rows = [
+            f"{name}  error {error:.1e} of {norm:.3g}" if norm > 0.0 else f"{name}  error {error:.1e}, and none is 0"
+            for name, (error, norm) in (("A", self.A), ("B", self.B), ("G", self.G))
+        ]
+        return "\n".join([*rows, self.verdict])
 
 
 def check_linearization(
@@ -100,6 +128,11 @@ def check_linearization(
         B=_compare(lin.B[0], lambda y: take(x, y, zero), u, step, rows, np.ones(m)),
         G=_compare(lin.G[0], lambda y: take(x, u, y), zero, step, rows, np.ones(k)),
     )
+
+
+def _relative(part: tuple[float, float]) -> float:
+    error, norm = part
+    return error / norm if norm > 0.0 else error
 
 
 def _compare(

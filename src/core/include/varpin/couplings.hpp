@@ -6,8 +6,11 @@
 // i above j alone. A coupling is one of
 //
 //     potential(d)   an energy V(d), part of the Lagrangian: V_q = J' V_d,  V_qq = J' V_dd J + V_d . d(J)/dq
-//     a damper       F = -J' D J v
+//     a damper       F = -J' D J v; or on angular velocities, J having the w_i in the place of the l_i
 //     a wrench       F_i = l_i . f + w_i . m, constant in the world's axes or in those of a's body
+//
+// In the place of points there may be directions, unit vectors that bodies carry: d is their difference, and l_i = w_i
+// x the direction. |d|^2 / 2 = 1 - cos of the angle between them.
 #pragma once
 
 #include <algorithm>
@@ -28,10 +31,12 @@
 
 namespace varpin {
 
-// A point in the axes of the body that carries it, from its joint; of the world where there is none, -1.
+// A point in the axes of the body that carries it, from its joint; of the world where there is none, -1. Or a
+// direction.
 struct Anchor {
     int body = -1;
-    Vec3<double> place{};  // [m]
+    Vec3<double> place{};  // [m]; of a direction 1
+    bool direction = false;
 };
 
 namespace detail {
@@ -116,6 +121,26 @@ struct FrameDamper {
     Vec3<double> damping{};  // [N s/m]
 };
 
+// A spring between a direction of a's body and one of b's, along which it is slack: V = stiffness (1 - cos) of the
+// angle. Three of them, for the axes of a frame, resist all turning. The stiffness may be negative, their sums are not.
+struct FrameTurnSpring {
+    Anchor a, b;
+    double stiffness = 0.0;  // [N m]
+
+    template <class T>
+    VectorPotential<T> potential(const Vec3<T>& d) const {
+        const T stiff(stiffness), none{};
+        return {0.5 * stiffness * dot(d, d), stiffness * d, {stiff, none, stiff, none, none, stiff}};
+    }
+    double scale(double far) const { return std::abs(stiffness) * far; }
+};
+
+// A damper of the angular velocity of a's body against b's, along the world's axes.
+struct FrameTurnDamper {
+    Anchor a, b;
+    Vec3<double> damping{};  // [N m s/rad]
+};
+
 // A constant wrench at a; b is the world's origin.
 struct FrameWrench {
     Anchor a, b;
@@ -124,7 +149,8 @@ struct FrameWrench {
     bool carried = false;   // in the axes of a's body, and not in the world's
 };
 
-using CoupledElement = std::variant<FrameLoad, FrameSpring, FrameLengthSpring, FrameDamper, FrameWrench>;
+using CoupledElement =
+    std::variant<FrameLoad, FrameSpring, FrameLengthSpring, FrameTurnSpring, FrameDamper, FrameTurnDamper, FrameWrench>;
 
 // A force F (n) on all coordinates that code outside of the core evaluates at q and v (n), and where they are not null
 // dF/dq and dF/dv (n, n).
@@ -294,17 +320,19 @@ class Couplings {
         workspace.arms.clear();
         const Anchor* const anchors[2] = {&element.a, &element.b};
         for (int point = 0; point < 2; ++point) {
-            const auto& [body, place] = *anchors[point];
+            const auto& [body, place, direction] = *anchors[point];
             Vec3<T>& x = workspace.place[point];
             x = {T(place.x), T(place.y), T(place.z)};
             if (body < 0) continue;
-            x = workspace.at[body].position + workspace.at[body].rotation * place;
+            x = workspace.at[body].rotation * place;
+            if (!direction) x += workspace.at[body].position;
             if (point == 0) workspace.rotation = workspace.at[body].rotation;
             for (int j : joined.path[point]) {
                 const Body& link = links_.bodies[j];
                 const double side = point == 0 ? link.ratio : -link.ratio;
                 const Motion<T> gives = given_by(link, workspace.at[j], x);
-                workspace.arms.push_back({link.coordinate, point, side * gives.linear, link.ratio * gives.angular});
+                const Vec3<T> linear = direction ? cross(gives.angular, x) : gives.linear;
+                workspace.arms.push_back({link.coordinate, point, side * linear, link.ratio * gives.angular});
             }
         }
     }
@@ -364,6 +392,50 @@ class Couplings {
             const Vec3<T> damped = detail::entrywise(damper.damping, i.linear);
             for (std::size_t j = 0; j < arms.size(); ++j)
                 by_q[i.coordinate * n + arms[j].coordinate] -= dot(damped, workspace.change[j]);
+        }
+    }
+
+    // With w_i taken negative for b, dw_j/dq_i = w_i x w_j for i above j alone, and so is what each turns of the rate.
+    template <class T>
+    static void push(const FrameTurnDamper& damper, int n, const T* v, CouplingWorkspace<T>& workspace,
+                     JointForce<T>* out, T* by_q, T* by_v) {
+        const auto& arms = workspace.arms;
+        const auto signed_axis = [](const Arm<T>& arm) { return (arm.point == 0 ? 1.0 : -1.0) * arm.angular; };
+        Vec3<T> rate{};
+        double rates = 0.0;
+        for (const Arm<T>& arm : arms) {
+            const Vec3<T> share = v[arm.coordinate] * signed_axis(arm);
+            rate += share;
+            rates += detail::size_of(share);
+        }
+        const Vec3<T> drag = detail::entrywise(damper.damping, rate);
+        for (const Arm<T>& arm : arms) {
+            JointForce<T>& at = out[arm.coordinate];
+            at.value += -dot(drag, signed_axis(arm));
+            at.scale += detail::size_of(damper.damping) * rates * detail::size_of(arm.angular);
+        }
+        if (!arms.empty()) out[arms[0].coordinate].lost += value_of(dot(drag, rate));
+        if (by_v) {
+            for (const Arm<T>& i : arms) {
+                const Vec3<T> damped = detail::entrywise(damper.damping, signed_axis(i));
+                for (const Arm<T>& j : arms) by_v[i.coordinate * n + j.coordinate] -= dot(damped, signed_axis(j));
+            }
+        }
+        if (!by_q) return;
+        workspace.change.assign(arms.size(), Vec3<T>{});
+        Vec3<T> beyond{};
+        for (std::size_t j = arms.size(); j-- > 0;) {
+            if (j + 1 < arms.size() && arms[j].point != arms[j + 1].point) beyond = {};
+            workspace.change[j] = cross(arms[j].angular, beyond);
+            beyond += v[arms[j].coordinate] * signed_axis(arms[j]);
+        }
+        for (std::size_t i = 0; i < arms.size(); ++i) {
+            const Vec3<T> axis = signed_axis(arms[i]), damped = detail::entrywise(damper.damping, axis);
+            for (std::size_t j = 0; j < arms.size(); ++j) {
+                T term = dot(damped, workspace.change[j]);
+                if (j < i && arms[j].point == arms[i].point) term += dot(drag, cross(arms[j].angular, axis));
+                by_q[arms[i].coordinate * n + arms[j].coordinate] -= term;
+            }
         }
     }
 

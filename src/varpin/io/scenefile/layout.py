@@ -408,9 +408,7 @@ def times_of(spec: SceneSpec) -> Floats:
 
 
 def _refuse_degrees(table: Table, name: str, values: Floats, robot: Robot) -> None:
-    slides = np.zeros(robot.dof, dtype=np.bool_)
-    slides[robot.tree.coordinate[robot.tree.prismatic != 0]] = True
-    for joint, value, slide in zip(robot.joint_names, values.tolist(), slides.tolist(), strict=True):
+    for joint, value, slide in zip(robot.joint_names, values.tolist(), robot.slides.tolist(), strict=True):
         if not slide and degrees_for_radians(value):
             raise table.error(name, f"{value:g} of {joint!r} looks like degrees: angles are in rad")
 

@@ -386,6 +386,9 @@ _OF_FRAMES = {
     "stiffness": _along("N/m"),
     "damping": _along("N s/m"),
     "rest": _along("m"),
+    "rotational_stiffness": _along("N m/rad"),
+    "rotational_damping": _along("N m s/rad"),
+    "rest_rotation": numbers(9),
 }
 
 
@@ -543,6 +546,8 @@ def _force(table: Table, keys: TypedKeys) -> ForceSpec | FrameForceSpec:
     if keys.type in FORCES:
         return ForceSpec(FORCES[keys.type], _given(keys), table)
     given = {name: _point(value) for name, value in _given(keys).items()}
+    if "rest_rotation" in given:
+        given["rest_rotation"] = [given["rest_rotation"][row : row + 3] for row in range(0, 9, 3)]
     return FrameForceSpec(FRAME_FORCES[keys.type](**given), table)
 
 

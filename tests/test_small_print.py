@@ -1,0 +1,105 @@
+"""What is said where something is taken in another way than it was asked for, or looks right and is not."""
+
+import logging
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin.show.inspection import inspect_robot
+from varpin.trajectory import chained
+
+GRIPPER = """<robot name="gripper">
+<link name="base"/>
+<link name="a"><inertial><origin xyz="0.1 0 0"/><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0"
+ixz="0" iyz="0"/></inertial></link>
+<link name="b"><inertial><mass value="0.1"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/>
+</inertial></link>
+<joint name="turns" type="revolute"><parent link="base"/><child link="a"/><axis xyz="0 1 0"/>
+<limit lower="0.5" upper="1.5" velocity="1" effort="10"/></joint>
+<joint name="follows" type="prismatic"><parent link="base"/><child link="b"/><axis xyz="1 0 0"/>
+<limit lower="-1" upper="1" velocity="1" effort="10"/><mimic joint="turns" multiplier="0.1"/></joint>
+</robot>"""
+
+
+@pytest.fixture
+def gripper(tmp_path):
+    path = tmp_path / "gripper.urdf"
+    path.write_text(GRIPPER)
+    return path
+
+
+def test_a_leader_that_turns_is_an_angle_whatever_follows(gripper):
+    robot = vp.load_robot(gripper)
+    assert robot.tree.prismatic.any()
+    assert robot.slides.tolist() == [False]
+    motion = vp.simulate(vp.Scene(robot, gravity=False), [1.0], [3.0], dt=1e-2, steps=40)
+    assert any(" rad above 1.5 " in sentence for sentence in motion.warnings)
+
+
+def test_inspection_says_where_zero_is_outside_the_limits(gripper):
+    robot = vp.load_robot(gripper)
+    told = [sentence for sentence in inspect_robot(robot).warnings if "outside its limits" in sentence]
+    assert told == ["q = 0 is no posture of joint 'turns': it is outside its limits 0.5 and 1.5"]
+    assert not [sentence for sentence in inspect_robot(robot, q=[1.0]).warnings if "outside its limits" in sentence]
+
+
+def test_joints_locked_outside_their_limits_are_told_of(gripper, caplog):
+    with caplog.at_level(logging.WARNING):
+        vp.load_robot("panda", lock={"panda_joint4": -1.0})
+        assert "outside its limits" not in caplog.text
+        vp.load_robot("panda", lock={"panda_joint4": 1.0})
+    assert "lock['panda_joint4'] = 1 holds the joint outside its limits, -3.07" in caplog.text
+
+
+def mpc():
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=0.1)
+    cost = vp.TrackingCost([0.2], 10.0) + vp.ControlCost(1e-2)
+    return vp.Mpc(vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=0.05, steps=5), iterations=1)
+
+
+def test_runs_that_last_another_time_say_so():
+    told = [sentence for sentence in mpc().run(duration=0.12).warnings if "duration" in sentence]
+    assert told == ["duration = 0.12 s is no whole number of ticks of 0.05 s: the run has 2, 0.1 s"]
+    assert not [sentence for sentence in mpc().run(duration=0.1).warnings if "duration" in sentence]
+
+
+def test_a_checked_linearization_has_a_verdict():
+    chain, q, v = vp.planar_chain(2), [0.3, -0.2], [1.0, 0.5]
+    good = vp.check_linearization(vp.Scene(chain, damping=0.1), q, v, dt=1e-2)
+    assert good.holds
+    assert str(good).splitlines()[-1].startswith("the derivatives are those of the step")
+    coarse = vp.check_linearization(vp.Scene(chain, damping=0.1), q, v, dt=1e-2, step=1.0)
+    assert not coarse.holds
+    assert "another step=" in str(coarse) or "is not the derivative" in str(coarse)
+    wrong = type(good)(A=good.A, B=(0.5, 1.0), G=good.G)
+    assert str(wrong).splitlines()[-1] == "B is not the derivative of the step: it is off by 5.0e-01 of its size"
+
+
+@pytest.mark.parametrize(
+    "constraint", [vp.PointOnPoint("joint3", (5.0, 0.0, 0.0)), vp.Distance("joint3", (0.0, 0.0, 4.0), 0.5)], ids=repr
+)
+def test_an_assembly_that_cannot_be_names_a_place_nearby(constraint):
+    """A target out of reach: polishing to rounding must not lead away from where the search ended."""
+    with pytest.raises(vp.AssemblyError) as info:
+        vp.assemble(vp.Scene(vp.planar_chain(3), constraints=constraint), [0.3, 0.4, 0.2])
+    assert np.abs(info.value.q).max() < 10.0
+    assert info.value.miss < 3.8
+
+
+def test_motions_of_several_kinds_of_controls_are_chained():
+    """Controls that are constant over a step stand at its stages, too; other stages are refused."""
+    scene = vp.Scene(vp.planar_chain(1))
+    given = {"dt": 1e-2, "steps": 5, "check": False}
+    held = vp.simulate(scene, [0.1], [0.0], controls=[1.0], integrator=vp.Gauss(2), **given)
+    ramp = vp.OpenLoop(lambda t: [t])
+    two, three = (
+        vp.simulate(scene, held.q[-1], held.v[-1], controls=ramp, integrator=vp.Gauss(stages), **given)
+        for stages in (2, 3)
+    )
+    both = chained([held, two])
+    assert both.u_stages.shape == (10, 2, 1)
+    assert (both.u_stages[:5] == 1.0).all()
+    np.testing.assert_array_equal(both.u_stages[5:], two.u_stages)
+    with pytest.raises(vp.InputError, match="got 2 and 3"):
+        chained([two, three])
