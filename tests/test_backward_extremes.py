@@ -195,7 +195,7 @@ def test_both_forms_agree_where_digits_are_plenty(name, foresight, regularizatio
         assert 0.0 < held.mean() < 1.0
         at_limits = np.isclose(np.abs(motion.u[:: problem.hold] + plain.feedforward), 0.5)
         assert at_limits[held].all()
-    for field in ("feedforward", "feedback", "gradient", "spread", "slope", "curvature", "noise", "promise"):
+    for field in ("feedforward", "feedback", "gradient", "spread", "slope", "curvature", "noise", "expected_decrease"):
         right = getattr(plain, field)
         near = 1e-9 * np.abs(right).max(initial=0.0)
         np.testing.assert_allclose(getattr(roots, field), right, rtol=0, atol=near, err_msg=field)

@@ -152,7 +152,7 @@ def test_one_plan_solves_a_linear_quadratic_problem_with_limits(hold, rate, root
     assert ((sol.controls == lower) | (sol.controls == upper)).sum() >= 2
     first = sol.history[0]
     assert first.step == 1.0
-    np.testing.assert_allclose(first.decrease, first.promised_decrease, rtol=1e-9)
+    np.testing.assert_allclose(first.decrease, first.expected_decrease, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("effort", "speed"), [(1.0, 1.0), (0.1, 0.0)], ids=["on the way", "at the end alone"])

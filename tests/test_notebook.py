@@ -164,7 +164,7 @@ def test_plans_show_how_the_search_went(objects):
     assert row(shown, "status") == ["converged"]
     assert row(shown, "cost") == [f"{plan.cost:.6g}, and {plan.noise_cost:.4g} by noise"]
     rows = Reader(shown).rows
-    (head,) = [k for k, cells in enumerate(rows) if "promise" in cells]
+    (head,) = [k for k, cells in enumerate(rows) if "expected" in cells]
     assert [cells[:2] for cells in rows[head + 1 :]] == [[str(x.index), f"{x.cost:.6e}"] for x in plan.history]
 
 

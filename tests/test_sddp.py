@@ -585,10 +585,10 @@ def test_quadratic_convergence(sampling, hold):
     assert newton.status is gauss.status is vp.Status.CONVERGED
     assert newton.cost == pytest.approx(gauss.cost, rel=1e-12)
     assert newton.iterations <= 0.6 * gauss.iterations
-    promised = np.log([item.promised_decrease / newton.cost for item in newton.history])
+    promised = np.log([item.expected_decrease / newton.cost for item in newton.history])
     assert promised[-1] < np.log(1e-15)
     assert promised[-1] / promised[-2] > 1.6
-    linear = np.log([item.promised_decrease / gauss.cost for item in gauss.history])
+    linear = np.log([item.expected_decrease / gauss.cost for item in gauss.history])
     assert linear[-1] / linear[-2] < 1.1
     np.testing.assert_allclose(newton.controls, gauss.controls, rtol=0, atol=1e-5 * np.abs(gauss.controls).max())
 
@@ -897,7 +897,7 @@ def test_reason_gives_the_numbers_behind_the_status():
     sol = vp.solve(reach_problem(0.02), tolerance=1e-6)
     assert sol.status is vp.Status.CONVERGED
     promise, tolerance = (float(part) for part in re.findall(r"\d\.\de[+-]\d\d", sol.reason))
-    assert promise == pytest.approx(sol.history[-1].promised_decrease, rel=0.06)
+    assert promise == pytest.approx(sol.history[-1].expected_decrease, rel=0.06)
     assert tolerance == pytest.approx(1e-6 * sol.cost, rel=0.06)
     assert promise <= tolerance
     short = vp.solve(reach_problem(0.02), max_iterations=1)
@@ -1028,10 +1028,21 @@ def test_history_and_callback():
     assert sol.iterations == sum(item.rollouts > 0 for item in seen)
     assert seen[-1].gradient == np.abs(sol.gradient).max()
     lines = sol.table().splitlines()
-    assert lines[0].split() == ["iter", "cost", "noise", "cost", "promise", "decrease", "grad", "reg", "step", "rolls"]
+    assert lines[0].split() == [
+        "iter",
+        "cost",
+        "noise",
+        "cost",
+        "expected",
+        "decrease",
+        "grad",
+        "reg",
+        "step",
+        "rollouts",
+    ]
     assert all(len(line) == len(lines[0]) for line in lines[: len(seen) + 1])
     assert lines[len(seen) + 1 :] == [sol.status.value, f"({sol.reason})"]
-    for column in ("cost", "noise cost", "promise", "decrease", "grad", "reg", "step", "rolls"):
+    for column in ("cost", "noise cost", "expected", "decrease", "grad", "reg", "step", "rollouts"):
         assert f"\n    {column:11}" in vp.Solution.__doc__
     # Without noise what a step brings is the difference of two motions' costs.
     assert [item.decrease for item in seen[1:]] == pytest.approx([a - b for a, b in pairwise(costs)])
@@ -1039,7 +1050,7 @@ def test_history_and_callback():
     # On a linear-quadratic problem the promise is kept.
     first = vp.solve(small(), max_iterations=1).history[0]
     before = vp.solve(small(), max_iterations=0).cost
-    assert before - first.cost == pytest.approx(first.promised_decrease, rel=1e-9)
+    assert before - first.cost == pytest.approx(first.expected_decrease, rel=1e-9)
 
 
 def test_warm_starts():

@@ -212,7 +212,7 @@ def test_a_stalled_search_gives_numbers_that_agree():
         promise, share = numbers(sol.reason)
         assert promise > share
         # The promise is that of the motion that is returned, not of some regularization.
-        assert promise == pytest.approx(backward(sol.problem, sol.trajectory, 0.0).promise, rel=0.06)
+        assert promise == pytest.approx(backward(sol.problem, sol.trajectory, 0.0).expected_decrease, rel=0.06)
     gained = re.match(r"15 iterations have lowered the expected cost by (\S+);", sol.reason)
     assert float(gained[1]) <= share
     costs = [item.cost for item in sol.history]

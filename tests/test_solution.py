@@ -380,7 +380,7 @@ def test_a_policy_is_refused_by_integrators_on_the_other_state_and_turned_where_
     # Warm-started from the plan, the search has next to nothing to do.
     again = vp.solve(other, plan)
     assert again.status is vp.Status.CONVERGED
-    assert again.history[0].promised_decrease < 1e-2 * again.cost
+    assert again.history[0].expected_decrease < 1e-2 * again.cost
     # There and back again.
     turned = dataclasses.replace(plan, problem=other, gains=plan.policy_on("velocity").gains.copy())
     back = turned.policy_on("momentum")

@@ -16,7 +16,7 @@ from varpin.integrators import explicit, variational
 from varpin.integrators.base import open_loop
 from varpin.model.chain import rod_chain
 from varpin.simulation import limits
-from varpin.simulation.accuracy import CLOSE, WRONG_MOTION, WRONG_POSITION, WRONG_VELOCITY, Place, places
+from varpin.simulation.accuracy import CLOSE, WRONG_MOTION, WRONG_POSITION, WRONG_VELOCITY, Window, examined_nodes
 from varpin.simulation.chatter import alternation
 from varpin.simulation.soundness import (
     CAUTION,
@@ -285,14 +285,14 @@ def test_where_errors_come_close_to_wrong_one_looks_closer(monkeypatch):
     """At evenly spread nodes that were not looked from; nowhere else, and not where errors are small."""
     looked = []
 
-    def spy(scene, trajectory, step, at=Place.at):
+    def spy(scene, trajectory, step, at=Window.at):
         looked.append(step)
         return at(scene, trajectory, step)
 
-    monkeypatch.setattr(Place, "at", spy)
+    monkeypatch.setattr(Window, "at", spy)
     for z, close in ((0.05, False), (0.15, True)):
         scene, motion = oscillator(z, vp.SemiImplicitEuler(), steps=640, check=False)
-        usual = places(scene, motion)
+        usual = examined_nodes(scene, motion)
         looked.clear()
         error = motion_error(scene, vp.SemiImplicitEuler(), motion)
         assert CLOSE < error.worst < CAUTION if close else error.worst < CLOSE

@@ -86,15 +86,15 @@ class StepModel(crocoddyl.ActionModelAbstract):
         if problem.integrator.variational:
             velocity = velocity_at_nodes(scene, motion.q, motion.v)
             nodes[1], nodes[3] = velocity[0] @ before, velocity[1] @ after
-        own = self._running.expand(*problem.samples(motion.q, motion.v, control[None]))
+        expansion = self._running.expand(*problem.samples(motion.q, motion.v, control[None]))
         gradient, hessian = np.zeros(2 * n + m), np.zeros((2 * n + m, 2 * n + m))
         for i, row in enumerate(problem.rule):
             J = np.vstack(
                 [sum(row[begin + c] * node for c, node in enumerate(nodes)) for begin in (1, 5)]
                 + [np.eye(m, 2 * n + m, 2 * n)]
             )
-            gradient += self._weight * J.T @ own.gradient[i]
-            hessian += self._weight * J.T @ own.hessian[min(i, len(own.hessian) - 1)] @ J
+            gradient += self._weight * J.T @ expansion.gradient[i]
+            hessian += self._weight * J.T @ expansion.hessian[min(i, len(expansion.hessian) - 1)] @ J
         data.Fx, data.Fu = A, B
         data.Lx, data.Lu = gradient[: 2 * n], gradient[2 * n :]
         data.Lxx, data.Lxu, data.Luu = hessian[: 2 * n, : 2 * n], hessian[: 2 * n, 2 * n :], hessian[2 * n :, 2 * n :]
@@ -137,13 +137,13 @@ class EndModel(crocoddyl.ActionModelAbstract):
         """Its derivatives."""
         n, scene = self._problem.scene.robot.dof, self._problem.scene
         q, v = _configuration_and_velocity(self._problem, x)
-        own = self._problem.terminal.expand(q[None], v[None], self._no_control)
+        expansion = self._problem.terminal.expand(q[None], v[None], self._no_control)
         J = np.eye(2 * n)
         if self._problem.integrator.variational:
             J[n:] = velocity_at_nodes(scene, q[None], v[None])[0]
         data.Fx = np.eye(2 * n)
-        data.Lx = J.T @ own.gradient[0, : 2 * n]
-        data.Lxx = J.T @ own.hessian[0, : 2 * n, : 2 * n] @ J
+        data.Lx = J.T @ expansion.gradient[0, : 2 * n]
+        data.Lxx = J.T @ expansion.hessian[0, : 2 * n, : 2 * n] @ J
 
     @property
     def _no_control(self) -> Floats:

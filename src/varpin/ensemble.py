@@ -29,7 +29,7 @@ from varpin.simulation.soundness import Finding, announce
 from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
 from varpin.support.executors import executing, in_order
 from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, said, table
+from varpin.support.markup import facts, table, warning_count
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -127,17 +127,17 @@ class Ensemble(Frozen):
     warnings: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        return f"Ensemble({self._size()}{said(self.warnings)})"
+        return f"Ensemble({self._size()}{warning_count(self.warnings)})"
 
     def __str__(self) -> str:
         return "\n".join([f"Ensemble({self._size()})", *(f"warning: {warning}" for warning in self.warnings)])
 
     def _repr_html_(self) -> str:
-        own, half = self.statistics, self.statistics.mean.shape[1] // 2
-        deviation = np.sqrt(np.diagonal(own.covariance[-1]))
-        rows = [(j, float(own.mean[-1, j]), float(deviation[j])) for j in range(half)]
+        moments, half = self.statistics, self.statistics.mean.shape[1] // 2
+        deviation = np.sqrt(np.diagonal(moments.covariance[-1]))
+        rows = [(j, float(moments.mean[-1, j]), float(deviation[j])) for j in range(half)]
         head = ("coordinate", "mean of q in the end [rad or m]", "standard deviation")
-        energy = f"{own.energy_mean[-1]:.4g} +- {own.energy_deviation[-1]:.2g} in the end"
+        energy = f"{moments.energy_mean[-1]:.4g} +- {moments.energy_deviation[-1]:.2g} in the end"
         warned = [("warning", warning) for warning in self.warnings]
         return facts("Ensemble", [("of", self._size()), ("energy [J]", energy), *warned], table(head, rows))
 
@@ -430,19 +430,19 @@ class _Chunk:
     """Paths in groups, each with its integrator state and generators, which go through blocks of nodes together."""
 
     def __init__(self, task: Task) -> None:
-        self.task, own = task, task.shared
-        self.shared, self.paths = own, len(task.q0)
-        n, m, N = own.scene.robot.dof, own.scene.controls, own.steps
+        self.task, shared = task, task.shared
+        self.shared, self.paths = shared, len(task.q0)
+        n, m, N = shared.scene.robot.dof, shared.scene.controls, shared.steps
         self.groups = [slice(a, min(a + _GROUP, self.paths)) for a in range(0, self.paths, _GROUP)]
-        self.generators = own.seeds.generators(task.first, task.first + self.paths)
+        self.generators = shared.seeds.generators(task.first, task.first + self.paths)
         # The control before, of each path; before the first there is none, if the policy does not say.
-        self.before = [np.repeat(own.commands.before, group.stop - group.start, axis=0) for group in self.groups]
+        self.before = [np.repeat(shared.commands.before, group.stop - group.start, axis=0) for group in self.groups]
         self.alive = np.ones(self.paths, dtype=bool)
         self.nodes = np.zeros(self.paths, dtype=np.int64)
         self.split = np.zeros(self.paths, dtype=np.int64)
         self.most_energy, self.fastest = np.full((2, self.paths), -np.inf)
         self.failures: list[PathFailure] = []
-        block = max(1, _BLOCK // (self.paths * (2 * n + 1)) // own.commands.hold) * own.commands.hold
+        block = max(1, _BLOCK // (self.paths * (2 * n + 1)) // shared.commands.hold) * shared.commands.hold
         self.length = min(N, block)
         # Nodes of a block, paths last: statistics run over them.
         self.block = np.empty((max(1, self.length), 2 * n + 1, self.paths))
@@ -467,17 +467,17 @@ class _Chunk:
 
     def part(self) -> Part:
         """All steps."""
-        task, own = self.task, self.shared
+        task, shared = self.task, self.shared
         states = []
         for group in self.groups:
-            state, first = own.integrator.start(own.scene, task.q0[group], task.v0[group])
+            state, first = shared.integrator.start(shared.scene, task.q0[group], task.v0[group])
             states.append(state)
-            self._put(0, group, first, [1] * len(first))
+            self._store(0, group, first, [1] * len(first))
         self._reduce(0, np.ones(self.paths, dtype=np.int64))
-        for begin in range(0, own.steps, max(1, self.length)):
-            end = min(own.steps, begin + self.length)
+        for begin in range(0, shared.steps, max(1, self.length)):
+            end = min(shared.steps, begin + self.length)
             done = np.concatenate(
-                [self._advance(number, states[number], begin, end) for number in range(len(self.groups))]
+                [self._run_group(number, states[number], begin, end) for number in range(len(self.groups))]
             )
             self._reduce(begin + 1, done)
         extremes = {
@@ -497,20 +497,20 @@ class _Chunk:
             bounds=self.bounds,
         )
 
-    def _advance(self, number: int, state: object, begin: int, end: int) -> Integers:
+    def _run_group(self, number: int, state: object, begin: int, end: int) -> Integers:
         """Steps begin .. end of a group: how many each path did; one that has failed does none."""
-        own, group = self.shared, self.groups[number]
-        hold = own.commands.hold
-        decisions = rows(own.commands, begin // hold, end // hold, self.before[number])
-        increments = np.empty((group.stop - group.start, end - begin, own.scene.processes))
+        shared, group = self.shared, self.groups[number]
+        hold = shared.commands.hold
+        decisions = rows(shared.commands, begin // hold, end // hold, self.before[number])
+        increments = np.empty((group.stop - group.start, end - begin, shared.scene.processes))
         for drawn, child in zip(increments, self.generators[group], strict=True):
             child.standard_normal(out=drawn)
-        increments *= np.sqrt(own.dt)
-        segments = own.integrator.rollout(own.scene, state, decisions, increments, own.dt)
+        increments *= np.sqrt(shared.dt)
+        segments = shared.integrator.rollout(shared.scene, state, decisions, increments, shared.dt)
         alive = self.alive[group]
         done = [len(segment.q) * int(still) for segment, still in zip(segments, alive, strict=True)]
-        self._put(begin + 1, group, segments, done)
-        lost = np.full(own.scene.controls, np.nan)
+        self._store(begin + 1, group, segments, done)
+        lost = np.full(shared.scene.controls, np.nan)
         self.before[number] = np.array([segment.u[-1] if len(segment.u) else lost for segment in segments])
         for i, (k, segment) in enumerate(zip(done, segments, strict=True)):
             if not alive[i]:
@@ -524,7 +524,7 @@ class _Chunk:
         self.alive[path] = False
         self.failures.append(PathFailure(self.task.first + path, step, failure.reason))
 
-    def _put(self, first: int, group: slice, segments: list[Segment], done: list[int]) -> None:
+    def _store(self, first: int, group: slice, segments: list[Segment], done: list[int]) -> None:
         """Nodes of a group from node ``first`` on, ``done[i]`` of its i-th path."""
         n, momentum = self.shared.scene.robot.dof, self.shared.integrator.variational
         self.nodes[group] += done
@@ -564,19 +564,19 @@ class _Chunk:
             inside = done >= end
             span = block[begin:end] if inside.all() else np.compress(inside, block[begin:end], axis=2)
             nodes = slice(first + begin, first + end)
-            own, mean = self.moments, span.mean(axis=2)
+            moments, mean = self.moments, span.mean(axis=2)
             deviation = span - mean[:, :, None]
-            own.mean[nodes], own.count[nodes] = mean, span.shape[2]
-            own.squares[nodes] = np.einsum("jaP,jbP->jab", deviation[:, :-1], deviation[:, :-1])
-            own.energy[nodes] = np.einsum("jP,jP->j", deviation[:, -1], deviation[:, -1])
+            moments.mean[nodes], moments.count[nodes] = mean, span.shape[2]
+            moments.squares[nodes] = np.einsum("jaP,jbP->jab", deviation[:, :-1], deviation[:, :-1])
+            moments.energy[nodes] = np.einsum("jP,jP->j", deviation[:, -1], deviation[:, -1])
             begin = end
 
 
 def counted(x: Floats, least: Floats, width: Floats, bins: int, counts: NDArray[np.uint16], bounds: Floats) -> None:
     """Count x (k, 2n, C) in bins from ``least`` on, ``width`` wide each (k, 2n), and find its bounds (2, k, 2n)."""
-    place = np.floor((x - least[:, :, None]) / width[:, :, None])
-    there = ~np.isnan(place)
-    index = np.clip(np.where(there, place, 0.0), -1, bins).astype(np.int64) + 1
+    position = np.floor((x - least[:, :, None]) / width[:, :, None])
+    there = ~np.isnan(position)
+    index = np.clip(np.where(there, position, 0.0), -1, bins).astype(np.int64) + 1
     index += (bins + 2) * np.arange(width.size).reshape(*width.shape, 1)
     counts.reshape(-1)[:] = np.bincount(index[there], minlength=counts.size)
     bounds[0], bounds[1] = np.fmin.reduce(x, axis=2, initial=np.inf), np.fmax.reduce(x, axis=2, initial=-np.inf)
@@ -662,23 +662,23 @@ class _Sums:
 
     def ensemble(self, found: Sequence[Finding]) -> Ensemble:
         """Of the paths that were taken in, with what is to be said of them."""
-        own, n2 = self.moments, 2 * self.shared.scene.robot.dof
-        assert own is not None
-        there = own.count > 0
-        degrees = np.maximum(own.count - 1, 1)
+        moments, n2 = self.moments, 2 * self.shared.scene.robot.dof
+        assert moments is not None
+        there = moments.count > 0
+        degrees = np.maximum(moments.count - 1, 1)
         quantiles, errors = self._quantiles()
         stored = {name: array[: self.done] for name, array in self.stored.items()}
         return Ensemble(
             t=np.arange(self.shared.steps + 1, dtype=np.float64) * self.shared.dt,
             statistics=EnsembleStatistics(
-                mean=np.where(there[:, None], own.mean[:, :n2], np.nan),
-                covariance=np.where(there[:, None, None], own.squares / degrees[:, None, None], np.nan),
+                mean=np.where(there[:, None], moments.mean[:, :n2], np.nan),
+                covariance=np.where(there[:, None, None], moments.squares / degrees[:, None, None], np.nan),
                 levels=self.levels,
                 quantiles=quantiles,
                 quantile_errors=errors,
-                energy_mean=np.where(there, own.mean[:, n2], np.nan),
-                energy_deviation=np.where(there, np.sqrt(own.energy / degrees), np.nan),
-                count=own.count,
+                energy_mean=np.where(there, moments.mean[:, n2], np.nan),
+                energy_deviation=np.where(there, np.sqrt(moments.energy / degrees), np.nan),
+                count=moments.count,
             ),
             q=stored.get("q"),
             v=stored.get("v"),
@@ -764,12 +764,12 @@ class _Histogram:
         """The value (2n,) of so many less than it, and what it is off by at most; ``below`` are cumulated counts."""
         (least, width), bins = self.grid[0][:, node], self.grid[1]
         first, last = self.bounds[:, node]
-        place = np.argmax(below > rank[:, None], axis=1)
+        bin_of = np.argmax(below > rank[:, None], axis=1)
         rows = np.arange(len(rank))
-        inside = np.maximum(self.counts[node][rows, place], 1)
-        share = (rank + 0.5 - (below[rows, place] - inside)) / inside
-        begin = np.where(place == 0, first, least + (place - 1) * width)
-        end = np.where(place == bins + 1, last, least + place * width)
+        inside = np.maximum(self.counts[node][rows, bin_of], 1)
+        share = (rank + 0.5 - (below[rows, bin_of] - inside)) / inside
+        begin = np.where(bin_of == 0, first, least + (bin_of - 1) * width)
+        end = np.where(bin_of == bins + 1, last, least + bin_of * width)
         # The extremes are known themselves.
         begin, end = np.maximum(begin, first), np.minimum(end, last)
         begin = np.where(rank >= below[:, -1] - 1, last, begin)
@@ -821,10 +821,10 @@ def _found(tasks: Sequence[Task], looks: Iterable[tuple[Finding, ...]]) -> tuple
 
 def _look(task: Task) -> tuple[Finding, ...]:
     """What is to be said of one path."""
-    own = task.shared
-    (generator,) = own.seeds.generators(task.first, task.first + 1)
-    drawn = generator.standard_normal((own.steps, own.scene.processes)) * np.sqrt(own.dt)
-    motions = Motions(own.scene, own.integrator, task.q0[0], task.v0[0], own.dt)
-    motion, _ = motions.under(own.commands, increments=drawn)
-    hold = own.commands.hold if len(own.commands.gains) else None
-    return examined_in_loop(own.scene, own.integrator, motion, hold)[1]
+    shared = task.shared
+    (generator,) = shared.seeds.generators(task.first, task.first + 1)
+    drawn = generator.standard_normal((shared.steps, shared.scene.processes)) * np.sqrt(shared.dt)
+    motions = Motions(shared.scene, shared.integrator, task.q0[0], task.v0[0], shared.dt)
+    motion, _ = motions.under(shared.commands, increments=drawn)
+    hold = shared.commands.hold if len(shared.commands.gains) else None
+    return examined_in_loop(shared.scene, shared.integrator, motion, hold)[1]

@@ -96,8 +96,8 @@ class Linearization:
         """The deviation (..., 2n) one step on, from dx (..., 2n), du (..., m) and increments dw (..., k)."""
         x, u, w = (np.asarray(value, dtype=float) for value in (dx, du, dw))
         noise = self.G[j] + np.einsum("aib,...b->...ai", self.Gx[j], x) + np.einsum("aib,...b->...ai", self.Gu[j], u)
-        moved: Floats = x @ self.A[j].T + u @ self.B[j].T + np.einsum("...ai,...i->...a", noise, w)
-        return moved
+        dx1: Floats = x @ self.A[j].T + u @ self.B[j].T + np.einsum("...ai,...i->...a", noise, w)
+        return dx1
 
 
 def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | None = None) -> Linearization:
@@ -329,9 +329,9 @@ def _drift_derivatives(
             for c in range(point[slot].size):
                 for shift, weight in weights.items():
                     for sign in (1.0, -1.0):
-                        moved = [x.copy() for x in point]
-                        moved[slot][c] += sign * shift * size
-                        drift = diffusion_and_drift(scene, moved[0], moved[1], moved[2], start)[1]
+                        shifted = [x.copy() for x in point]
+                        shifted[slot][c] += sign * shift * size
+                        drift = diffusion_and_drift(scene, shifted[0], shifted[1], shifted[2], start)[1]
                         target[j, :, offset + c] += sign * weight / size * drift
     if variational:
         rates = velocity_at_nodes(scene, trajectory.q[:-1], trajectory.v[:-1])

@@ -20,7 +20,7 @@ from varpin.mechanics.scene import OF_FORCES, VALUES, Scene, differences, same
 from varpin.model import Robot
 from varpin.support.checks import path_like
 from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, said, table
+from varpin.support.markup import facts, table, warning_count
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -120,7 +120,7 @@ def _add_up(counts: Integers, halvings: Bytes) -> bool:
 def joined(statistics: Sequence[StepStatistics]) -> StepStatistics:
     """Of steps that follow each other."""
     names = (item.name for item in fields(StepStatistics))
-    return StepStatistics(**{name: np.concatenate([getattr(own, name) for own in statistics]) for name in names})
+    return StepStatistics(**{name: np.concatenate([getattr(part, name) for part in statistics]) for name in names})
 
 
 @dataclass(frozen=True)
@@ -280,11 +280,11 @@ class Trajectory(Frozen):
         reached = f", estimated error {self.accuracy.error:.1e}" if self.accuracy is not None else ""
         return (
             f"Trajectory({self.robot}: {len(self.joint_names)} joints, {self.steps} steps of {self.dt:g} s, "
-            f"{self.integrator}{flag}{reached}{said(self.warnings)})"
+            f"{self.integrator}{flag}{reached}{warning_count(self.warnings)})"
         )
 
     def _repr_html_(self) -> str:
-        own = self.statistics
+        statistics = self.statistics
         rows: list[tuple[str, object]] = [
             ("steps", f"{self.steps} of {self.dt:g} s, {self.duration:g} s in all"),
             ("integrator", self.integrator),
@@ -293,12 +293,12 @@ class Trajectory(Frozen):
         ]
         if self.accuracy is not None:
             rows.append(("estimated error in q [rad or m]", f"{self.accuracy.error:.2g}"))
-        if own.energy_defect.any():
-            rows.append(("of it, what no force accounts for [J]", f"{np.abs(own.energy_defect).max():.3g}"))
-        if own.newton_iterations.any():
-            rows.append(("Newton iterations", f"{own.newton_iterations.mean():.2f} a step"))
-        if own.split_steps:
-            rows.append(("split by the guards", f"{own.split_steps} steps"))
+        if statistics.energy_defect.any():
+            rows.append(("of it, what no force accounts for [J]", f"{np.abs(statistics.energy_defect).max():.3g}"))
+        if statistics.newton_iterations.any():
+            rows.append(("Newton iterations", f"{statistics.newton_iterations.mean():.2f} a step"))
+        if statistics.split_steps:
+            rows.append(("split by the guards", f"{statistics.split_steps} steps"))
         rows += [("warning", warning) for warning in self.warnings]
         ends = zip(self.joint_names, self.q[0], self.q[-1], self.q.min(axis=0), self.q.max(axis=0), strict=True)
         speeds = np.abs(self.v).max(axis=0)
@@ -395,10 +395,10 @@ def _with_accuracy(members: Mapping[str, Any], prefix: str) -> Mapping[str, Any]
     numbers = members.get(f"{prefix}accuracy")
     if numbers is None or numbers.shape != (4,) or numbers.dtype != np.float64:
         return members
-    own = {name: members.get(prefix + name) for name in ("integrator", "dt")}
-    own |= dict(zip(("tolerance", "error"), numbers[:2], strict=True))
-    own |= dict(zip(("search_steps", "search_evaluations"), numbers[2:].astype(np.int64), strict=True))
-    return {**members, **{f"{prefix}accuracy.{name}": np.asarray(value) for name, value in own.items()}}
+    accuracy = {name: members.get(prefix + name) for name in ("integrator", "dt")}
+    accuracy |= dict(zip(("tolerance", "error"), numbers[:2], strict=True))
+    accuracy |= dict(zip(("search_steps", "search_evaluations"), numbers[2:].astype(np.int64), strict=True))
+    return {**members, **{f"{prefix}accuracy.{name}": np.asarray(value) for name, value in accuracy.items()}}
 
 
 def chained(parts: Sequence[Trajectory]) -> Trajectory:

@@ -40,14 +40,14 @@ std::size_t add_center(CostTerms& costs, const Links& links) {
     return costs.frames.size() - 1;
 }
 
-void add_term(CostTerms& costs, Subject subject, int place, In<2> weight, In<2> target, Integers<1> directions) {
+void add_term(CostTerms& costs, Subject subject, int index, In<2> weight, In<2> target, Integers<1> directions) {
     const std::size_t size = weight.shape(0);
     const bool entries = subject == Subject::entries || subject == Subject::excess;
     const int last = entries ? costs.size() - static_cast<int>(size) : static_cast<int>(costs.frames.size()) - 1;
-    if (place < 0 || place > last) throw std::invalid_argument("the term is of what is not there");
+    if (index < 0 || index > last) throw std::invalid_argument("the term is of what is not there");
     const bool measures = subject == Subject::manipulability;
     if (!entries) {
-        if (costs.frames[place].center && subject != Subject::position)
+        if (costs.frames[index].center && subject != Subject::position)
             throw std::invalid_argument("a centre of mass has a position and no more");
         if (size != (subject == Subject::twist ? 6u : measures ? 1u : 3u))
             throw std::invalid_argument("a weight of a wrong size");
@@ -62,7 +62,7 @@ void add_term(CostTerms& costs, Subject subject, int place, In<2> weight, In<2> 
         if (row < 0 || row > 5) throw std::invalid_argument("directions are rows of a Jacobian");
     costs.terms.push_back({subject,
                            static_cast<int>(size),
-                           place,
+                           index,
                            {weight.data(), weight.data() + weight.size()},
                            {target.data(), target.data() + target.size()},
                            rows});
@@ -99,8 +99,8 @@ std::tuple<Out, Out> expand(const CostTerms& costs, In<2> q, In<2> v, In<2> u) {
         CostSample sample(costs);
         for (std::size_t s = 0; s < matrices; ++s) sample.add_constant_hessian(H + s * size * size);
         for (std::size_t s = 0; s < rows; ++s) {
-            double* own = H + (matrices > 1 ? s * size * size : 0);
-            sample.expand(&q(s, 0), &v(s, 0), u.data() + s * u.shape(1), s, g + s * size, own);
+            double* hessian = H + (matrices > 1 ? s * size * size : 0);
+            sample.expand(&q(s, 0), &v(s, 0), u.data() + s * u.shape(1), s, g + s * size, hessian);
         }
     }
     return {gradient, hessian};
@@ -126,9 +126,9 @@ std::tuple<Out, Out> expand_steps(const CostTerms& costs, In<2> rule, In<2> q, I
                          at_v.data());
             for (std::size_t k = 0; k < samples; ++k) {
                 const std::size_t s = step * samples + k;
-                double* own = H + (matrices > 1 ? s * size * size : 0);
+                double* hessian = H + (matrices > 1 ? s * size * size : 0);
                 sample.expand(at_q.data() + k * n, at_v.data() + k * n, u.data() + step * u.shape(1), s, g + s * size,
-                              own);
+                              hessian);
             }
         }
     }
@@ -197,7 +197,7 @@ void register_costs(nb::module_& m) {
         .def_static("make", &terms_for, "dof"_a, "controls"_a)
         .def("add_frame", &add_frame, "links"_a, "turned"_a, "shifted"_a)
         .def("add_center", &add_center, "links"_a)
-        .def("add_term", &add_term, "subject"_a, "place"_a, "weight"_a, "target"_a, "directions"_a)
+        .def("add_term", &add_term, "subject"_a, "index"_a, "weight"_a, "target"_a, "directions"_a)
         .def("values", &values, "q"_a, "v"_a, "u"_a)
         .def("expand", &expand, "q"_a, "v"_a, "u"_a)
         .def("expand_steps", &expand_steps, "rule"_a, "q"_a, "v"_a, "u"_a);
@@ -212,14 +212,14 @@ void register_costs(nb::module_& m) {
         .def(
             "ask",
             [](HeldWatch& watch, double weight, double most, std::ptrdiff_t from, double most_parts) {
-                watch.own.weight = weight;
-                watch.own.most = most;
-                watch.own.from = from;
-                watch.own.most_parts = most_parts;
+                watch.core.weight = weight;
+                watch.core.most = most;
+                watch.core.from = from;
+                watch.core.most_parts = most_parts;
             },
             "weight"_a, "most"_a, "after"_a, "parts"_a)
         .def("after", &HeldWatch::after, "step"_a, "parts"_a)
-        .def_prop_ro("verdict", [](const HeldWatch& watch) { return watch.own.verdict; });
+        .def_prop_ro("verdict", [](const HeldWatch& watch) { return watch.core.verdict; });
     m.def("change_values", &change_values, "weight"_a, "before"_a, "u"_a);
     m.def("expand_changes", &expand_changes, "weight"_a, "before"_a, "u"_a);
     m.def("sample_steps", &samples, "rule"_a, "q"_a, "v"_a);

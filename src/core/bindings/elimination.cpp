@@ -65,12 +65,12 @@ class BoundElimination {
     }
 
   private:
-    template <class Own>
-    static std::tuple<Out, Out, double, bool> solved(Own& own, const double* b, double* x, double* y, const Out& X,
-                                                     const Out& Y) {
-        own.solve(b, x);
-        own.change_of_slope(x, y);
-        return {X, Y, own.kinetic_size(x), true};
+    template <class Matrix>
+    static std::tuple<Out, Out, double, bool> solved(Matrix& matrix, const double* b, double* x, double* y,
+                                                     const Out& X, const Out& Y) {
+        matrix.solve(b, x);
+        matrix.change_of_slope(x, y);
+        return {X, Y, matrix.kinetic_size(x), true};
     }
 
     std::size_t n_;

@@ -24,22 +24,22 @@ using SharedMechanism = std::shared_ptr<Mechanism>;
 
 // What works on a mechanism, and keeps it alive.
 struct BoundDynamics {
-    BoundDynamics(SharedMechanism of, Solver solver) : mechanism(std::move(of)), own(*mechanism, false, solver) {}
+    BoundDynamics(SharedMechanism of, Solver solver) : mechanism(std::move(of)), core(*mechanism, false, solver) {}
 
     SharedMechanism mechanism;
-    ForwardDynamics own;
+    ForwardDynamics core;
 };
 
 struct BoundRollout {
     BoundRollout(SharedMechanism of, ExplicitMethod method, const In<2>& q, const In<2>& v)
         : mechanism(std::move(of)),
-          own(*mechanism, method, static_cast<std::int64_t>(q.shape(0)), q.data(), v.data()) {}
+          core(*mechanism, method, static_cast<std::int64_t>(q.shape(0)), q.data(), v.data()) {}
 
     SharedMechanism mechanism;
-    ExplicitRollout own;
+    ExplicitRollout core;
 
     Out view(std::vector<double>& values) const {
-        return Out(values.data(), {static_cast<std::size_t>(own.paths()), static_cast<std::size_t>(own.dof())});
+        return Out(values.data(), {static_cast<std::size_t>(core.paths()), static_cast<std::size_t>(core.dof())});
     }
 };
 
@@ -51,25 +51,25 @@ void require_rows(const Mechanism& mechanism, const In<2>& q, const In<2>& v, co
 
 // The rate (v, a) of x = (q, v) under a force, and whether the mass matrix is positive definite.
 std::tuple<Out, bool> rate(BoundDynamics& dynamics, In<1> x, In<1> force) {
-    const auto n = static_cast<std::size_t>(dynamics.own.dof());
+    const auto n = static_cast<std::size_t>(dynamics.core.dof());
     require(x, "x", {2 * n});
     require(force, "force", {n});
     double* values = nullptr;
     const Out out = array_for(values, {2 * n});
-    const bool regular = dynamics.own.at(x.data(), x.data() + n);
+    const bool regular = dynamics.core.at(x.data(), x.data() + n);
     std::copy(x.data() + n, x.data() + 2 * n, values);
-    dynamics.own.acceleration(force.data(), values + n);
+    dynamics.core.acceleration(force.data(), values + n);
     return {out, regular};
 }
 
 // Momentum and energy at x = (q, v), and whether the mass matrix is positive definite.
 std::tuple<Out, double, bool> node(BoundDynamics& dynamics, In<1> x) {
-    const auto n = static_cast<std::size_t>(dynamics.own.dof());
+    const auto n = static_cast<std::size_t>(dynamics.core.dof());
     require(x, "x", {2 * n});
     double* p = nullptr;
     const Out momentum = array_for(p, {n});
-    const bool regular = dynamics.own.at(x.data(), x.data() + n);
-    const double energy = dynamics.own.energy(x.data() + n, p);
+    const bool regular = dynamics.core.at(x.data(), x.data() + n);
+    const double energy = dynamics.core.energy(x.data() + n, p);
     return {momentum, energy, regular};
 }
 
@@ -132,17 +132,17 @@ BoundRollout rollout(SharedMechanism mechanism, ExplicitMethod method, In<2> q, 
 
 bool first_nodes(BoundRollout& rollout, nb::handle nodes) {
     const NodeArrays arrays(*rollout.mechanism, nodes);
-    arrays.require_paths(static_cast<std::size_t>(rollout.own.paths()));
+    arrays.require_paths(static_cast<std::size_t>(rollout.core.paths()));
     if (arrays.steps() < 1) throw std::invalid_argument("there is no room for the first nodes");
-    return rollout.own.first_nodes(arrays.view());
+    return rollout.core.first_nodes(arrays.view());
 }
 
 void roll(BoundRollout& rollout, double dt, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes,
           HeldWatch* watch) {
-    ExplicitRollout& own = rollout.own;
-    roll_paths(*rollout.mechanism, static_cast<std::size_t>(own.paths()), own.places(), commands, increments, drift,
+    ExplicitRollout& core = rollout.core;
+    roll_paths(*rollout.mechanism, static_cast<std::size_t>(core.paths()), core.places(), commands, increments, drift,
                nodes, [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
-                   own.roll(dt, by, dw, more, to, watch ? watch->of(to) : nullptr);
+                   core.roll(dt, by, dw, more, to, watch ? watch->of(to) : nullptr);
                });
 }
 
@@ -169,9 +169,9 @@ void register_explicit(nb::module_& m) {
     nb::class_<BoundRollout>(m, "ExplicitRollout")
         .def_static("start", &rollout, "mechanism"_a, "method"_a, "q"_a, "v"_a)
         .def_prop_ro(
-            "q", [](BoundRollout& rollout) { return rollout.view(rollout.own.q); }, nb::rv_policy::reference_internal)
+            "q", [](BoundRollout& rollout) { return rollout.view(rollout.core.q); }, nb::rv_policy::reference_internal)
         .def_prop_ro(
-            "v", [](BoundRollout& rollout) { return rollout.view(rollout.own.v); }, nb::rv_policy::reference_internal)
+            "v", [](BoundRollout& rollout) { return rollout.view(rollout.core.v); }, nb::rv_policy::reference_internal)
         .def("copy", [](const BoundRollout& rollout) { return BoundRollout(rollout); })
         .def("first_nodes", &first_nodes, "nodes"_a)
         .def("roll", &roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a, "watch"_a.none() = nb::none());

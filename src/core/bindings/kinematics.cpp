@@ -44,11 +44,11 @@ std::tuple<Out, Out, Out> place_frame(const Links& links, In<2> turned, In<1> sh
               jacobians = array_for(J, {jacobian ? rows : 0, 6, n});
     {
         nb::gil_scoped_release release;
-        const Placement own{rotation_at(turned.data()), {shifted(0), shifted(1), shifted(2)}};
+        const Placement offset{rotation_at(turned.data()), {shifted(0), shifted(1), shifted(2)}};
         std::vector<Placement> at(count);
         for (std::size_t s = 0; s < rows; ++s) {
             place(links, q.data() + s * n, at.data());
-            const Placement frame = at.back() * own;
+            const Placement frame = at.back() * offset;
             write(frame.rotation, R + 9 * s);
             write(frame.position, p + 3 * s);
             if (jacobian) frame_jacobian(links, at.data(), frame.position, J + 6 * n * s);

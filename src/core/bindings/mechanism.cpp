@@ -36,11 +36,11 @@ Element made(int coordinate, const std::vector<double>& values, Numbers Kind::*.
     if (values.size() != sizeof...(members))
         throw std::invalid_argument("an element has " + std::to_string(sizeof...(members)) + " numbers, not " +
                                     std::to_string(values.size()));
-    Kind own;
-    own.coordinate = coordinate;
+    Kind element;
+    element.coordinate = coordinate;
     auto value = values.begin();
-    ((own.*members = *value++), ...);
-    return own;
+    ((element.*members = *value++), ...);
+    return element;
 }
 
 Element element_of(const std::string& kind, int coordinate, const std::vector<double>& values) {
@@ -90,9 +90,9 @@ using NamedConstraints = std::tuple<std::vector<NamedVector>, std::vector<std::t
 
 // A Python function that is called without the interpreter's lock held.
 std::shared_ptr<nb::object> held(const nb::object& function) {
-    return {new nb::object(function), [](nb::object* own) {
+    return {new nb::object(function), [](nb::object* owned) {
                 nb::gil_scoped_acquire acquire;
-                delete own;
+                delete owned;
             }};
 }
 
@@ -294,13 +294,13 @@ Out velocity_slopes(const Mechanism& mechanism, In<2> q, In<2> v) {
     const int size = mechanism.dof();
     for (std::size_t s = 0; s < rows; ++s) {
         lagrangian_jet(mechanism, q.data() + s * n, v.data() + s * n, w);
-        double* own = slopes + s * 2 * n * n;
+        double* slope = slopes + s * 2 * n * n;
         for (std::size_t i = 0; i < n; ++i) {
-            for (std::size_t j = 0; j < n; ++j) own[i * 2 * n + j] = -w.A[i * n + j];
-            own[i * 2 * n + n + i] = 1.0;
+            for (std::size_t j = 0; j < n; ++j) slope[i * 2 * n + j] = -w.A[i * n + j];
+            slope[i * 2 * n + n + i] = 1.0;
         }
         for (const Block& block : mechanism.tree.blocks) {
-            double* first = own + static_cast<std::size_t>(block.begin) * 2 * n;
+            double* first = slope + static_cast<std::size_t>(block.begin) * 2 * n;
             if (factor_ldl(w.M.data(), size, block)) {
                 solve_ldl_rows(w.M.data(), size, block, first, 2 * size, 2 * size);
             } else {
@@ -323,13 +323,14 @@ std::tuple<Out, Out, Out, Out> forces(const Mechanism& mechanism, In<2> q, In<2>
     const Out value = array_for(of[0], {rows, n}), by_q = array_for(of[1], {rows, n}),
               by_v = array_for(of[2], {rows, n}), lost = array_for(of[3], {rows, n});
     std::vector<JointForce<double>> sum(n);
-    CouplingRoom<double> room;
+    CouplingWorkspace<double> workspace;
     for (std::size_t s = 0; s < rows; ++s) {
-        sum_forces(mechanism, q.data() + s * n, v.data() + s * n, f.data() + s * n, sum.data(), room,
+        sum_forces(mechanism, q.data() + s * n, v.data() + s * n, f.data() + s * n, sum.data(), workspace,
                    static_cast<double*>(nullptr), static_cast<double*>(nullptr));
         for (std::size_t c = 0; c < n; ++c) {
-            const JointForce<double>& own = sum[c];
-            for (int i = 0; i < 4; ++i) of[i][s * n + c] = std::array{own.value, own.by_q, own.by_v, own.lost}[i];
+            const JointForce<double>& force = sum[c];
+            for (int i = 0; i < 4; ++i)
+                of[i][s * n + c] = std::array{force.value, force.by_q, force.by_v, force.lost}[i];
         }
     }
     return {value, by_q, by_v, lost};
@@ -343,10 +344,10 @@ std::tuple<Out, Out, Out> coupled_forces(const Mechanism& mechanism, In<2> q, In
     double *value = nullptr, *by_q = nullptr, *by_v = nullptr;
     const Out F = array_for(value, {rows, n}), Fq = array_for(by_q, {rows, n, n}), Fv = array_for(by_v, {rows, n, n});
     std::vector<JointForce<double>> sum(n);
-    CouplingRoom<double> room;
+    CouplingWorkspace<double> workspace;
     for (std::size_t s = 0; s < rows; ++s) {
         std::fill(sum.begin(), sum.end(), JointForce<double>{});
-        mechanism.couplings.add_forces(static_cast<int>(n), q.data() + s * n, v.data() + s * n, room, sum.data(),
+        mechanism.couplings.add_forces(static_cast<int>(n), q.data() + s * n, v.data() + s * n, workspace, sum.data(),
                                        by_q + s * n * n, by_v + s * n * n);
         for (std::size_t c = 0; c < n; ++c) value[s * n + c] = sum[c].value;
     }

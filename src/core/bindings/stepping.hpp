@@ -30,19 +30,19 @@ template <class Size, class Stages>
 struct SteppingOf final : Stepping {
     SteppingOf(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards, double left,
                Solver solver)
-        : own(mechanism, tableau, tolerance, guards, left, solver) {}
+        : core(mechanism, tableau, tolerance, guards, left, solver) {}
 
-    VariationalStepper<Size, Stages> own;
+    VariationalStepper<Size, Stages> core;
 
-    bool begin(const double* q, const double* v, PathState& state) override { return own.begin(q, v, state); }
+    bool begin(const double* q, const double* v, PathState& state) override { return core.begin(q, v, state); }
     void kick(const double* impulse, PathState& state) override {
-        own.look_at(state);
-        own.kick(impulse, state);
+        core.look_at(state);
+        core.kick(impulse, state);
     }
     void roll(const Guards& guards, double h, const Commands& commands, const double* increments, const double* drift,
               std::vector<PathState>& states, const Nodes& nodes, Watch* watch) override {
-        own.guards = guards;
-        own.roll(h, commands, increments, drift, states, nodes, watch);
+        core.guards = guards;
+        core.roll(h, commands, increments, drift, states, nodes, watch);
     }
 };
 
@@ -50,15 +50,15 @@ template <class Size, class Stages>
 struct DifferentiationOf final : Differentiation {
     DifferentiationOf(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
                       Solver solver)
-        : own(mechanism, tableau, tolerance, guards, solver) {}
+        : core(mechanism, tableau, tolerance, guards, solver) {}
 
-    VariationalLinearization<Size, Stages> own;
+    VariationalLinearization<Size, Stages> core;
 
     Outcome first(double h, const double* q, const double* p, const double* guess, const double* force, bool varies,
                   bool ramp, std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past) override {
-        own.varies = varies;
-        own.ramp = ramp;
-        return own.first(h, q, p, guess, force, halvings, Jx, Jf, past);
+        core.varies = varies;
+        core.ramp = ramp;
+        return core.first(h, q, p, guess, force, halvings, Jx, Jf, past);
     }
 };
 

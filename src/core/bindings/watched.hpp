@@ -18,7 +18,7 @@ class HeldWatch {
           v_(v),
           u_(u),
           values_(values),
-          own(costs, rule.data(), rule.shape(0), q.data(), v.data(), u.data(), values.data()) {
+          core(costs, rule.data(), rule.shape(0), q.data(), v.data(), u.data(), values.data()) {
         const std::size_t N = u.shape(0), n = static_cast<std::size_t>(costs.dof);
         require(rule, "rule", {rule.shape(0), 9});
         require(q, "q", {N + 1, n});
@@ -31,12 +31,12 @@ class HeldWatch {
     Watch* of(const Nodes& nodes) {
         if (nodes.paths != 1 || nodes.steps != static_cast<std::int64_t>(u_.shape(0)))
             throw std::invalid_argument("a watch is for one path of as many steps");
-        return &own;
+        return &core;
     }
 
     bool after(std::size_t step, std::int64_t parts) {
         if (step >= u_.shape(0)) throw std::invalid_argument("there is no such step");
-        return own.after(static_cast<std::ptrdiff_t>(step), parts);
+        return core.after(static_cast<std::ptrdiff_t>(step), parts);
     }
 
   private:
@@ -44,7 +44,7 @@ class HeldWatch {
     InOut<2> values_;
 
   public:
-    Watch own;
+    Watch core;
 };
 
 }  // namespace varpin::border

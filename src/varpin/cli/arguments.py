@@ -116,7 +116,7 @@ def integrator_asked_for(request: argparse.Namespace) -> Integrator:
     text = (request.integrator or "Midpoint").strip()
     name, bracket, rest = text.partition("(")
     # runge_kutta_4, RUNGEKUTTA4 and semi-implicit-euler are as good as the names of the classes.
-    plain = {_letters(own): own for own in BY_NAME}
+    plain = {_letters(member): member for member in BY_NAME}
     if _letters(name) not in plain:
         matches = difflib.get_close_matches(_letters(name), plain, n=1)
         hint = f"did you mean {plain[matches[0]]}? " if matches else ""
@@ -127,7 +127,7 @@ def integrator_asked_for(request: argparse.Namespace) -> Integrator:
         if value is None:
             continue
         if option not in options_of(type(integrator)):
-            owner = next(own for own, kind in BY_NAME.items() if option in options_of(kind))
+            owner = next(member for member, kind in BY_NAME.items() if option in options_of(kind))
             raise InputError(f"--{option} is an option of {owner}, not of {type(integrator).__name__}")
         integrator = replace(integrator, **{option: value})  # type: ignore[type-var]
     return integrator

@@ -27,11 +27,11 @@ def add_outputs(parser: argparse.ArgumentParser, what: str) -> None:
     outputs = parser.add_argument_group("outputs")
     outputs.add_argument("--save", type=Path, metavar="NPZ", help=f"write the {what}, for {what.title()}.load")
     outputs.add_argument("--plot", type=Path, metavar="PNG", help="draw an overview, as png, pdf or svg")
-    add_shown(outputs)
+    add_replay_options(outputs)
     outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
 
 
-def add_shown(outputs: argparse._ActionsContainer) -> None:
+def add_replay_options(outputs: argparse._ActionsContainer) -> None:
     """Options for the files that show a motion."""
     outputs.add_argument("--html", type=Path, metavar="HTML", help="write a replay that any browser opens")
     outputs.add_argument(

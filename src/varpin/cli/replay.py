@@ -15,7 +15,7 @@ from rich.console import Console
 
 from varpin.cli.arguments import add_robot_options, names_scene, robot_options
 from varpin.cli.console import say
-from varpin.cli.outputs import Output, add_shown, replays_of, write_all
+from varpin.cli.outputs import Output, add_replay_options, replays_of, write_all
 from varpin.control import solution_trajectory
 from varpin.errors import FileError, InputError, RobotNotFound
 from varpin.io.archive import read_format
@@ -44,7 +44,7 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
     add_robot_options(parser)
     outputs = parser.add_argument_group("outputs")
     outputs.add_argument("--open", action="store_true", help="open a window; what is done if no file is asked for")
-    add_shown(outputs)
+    add_replay_options(outputs)
     outputs.add_argument("--ghost", type=Path, metavar="NPZ", help="a second motion of the robot, drawn translucent")
     outputs.add_argument("--frames", nargs="+", default=[], metavar="FRAME", help="draw frames as triads")
     outputs.add_argument("--torques", action="store_true", help="colour links by the torques of their joints")

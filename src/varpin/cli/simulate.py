@@ -171,13 +171,14 @@ def _summary(trajectory: Trajectory, asked: int | None, wall_time: float, driven
     of = f" of {asked}" if asked is not None and steps < asked else ""
     add_row(table, "steps", f"{steps}{of}, {trajectory.dt:g} s each, {trajectory.duration:g} s in all")
     add_row(table, "wall time", f"{wall_time:.3g} s")
-    if (own := trajectory.accuracy) is not None:
-        met = "" if own.met else ", not"
+    if (accuracy := trajectory.accuracy) is not None:
+        met = "" if accuracy.met else ", not"
         add_row(
             table,
             "estimated error in q",
-            f"{own.error:.2g} rad or m{met} within {own.tolerance:g}; finding out took {own.search_steps} steps",
-            style="" if own.met else "bold yellow",
+            f"{accuracy.error:.2g} rad or m{met} within {accuracy.tolerance:g}; "
+            f"finding out took {accuracy.search_steps} steps",
+            style="" if accuracy.met else "bold yellow",
         )
     if steps:
         newton, split = statistics.newton_iterations, statistics.split_steps

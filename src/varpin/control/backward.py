@@ -51,7 +51,7 @@ class Plan:
     model: Model  # of the cost along the motion
 
     @property
-    def promise(self) -> float:
+    def expected_decrease(self) -> float:
         """Decrease of the expected cost with a full step, by the model."""
         # Without limits the step is the model's minimum, where the curvature takes back half of what the slope gives.
         return -self.slope - 0.5 * self.curvature if self.limited else -0.5 * self.slope
@@ -182,11 +182,11 @@ def _within_limits(along: Along, regularization: float, curvature: Floats | None
         if changed >= others:
             plan = None
         held, others = now, changed
-    if plan is not None and plan.promise > 0.0:
+    if plan is not None and plan.expected_decrease > 0.0:
         # Feed-forward parts hold together with the feedback that the others ask for: the slope is that of both.
         slope = float((plan.gradient * _foreseen(along, plan)[1]).sum())
         if slope < 0.0:
-            return replace(plan, slope=slope, curvature=-2.0 * (plan.promise + slope), limited=True)
+            return replace(plan, slope=slope, curvature=-2.0 * (plan.expected_decrease + slope), limited=True)
     nominal = _Limits(along.slack, np.zeros((0, along.running.gradient.shape[1])))
     return _pass(along, regularization, curvature=curvature, limits=nominal)[0]
 

@@ -87,8 +87,8 @@ def at_stake(problem: OptimalControlProblem, trajectory: Trajectory, model: Mode
         free += factor * float(could.sum())
         moved += factor * float(np.minimum(could, does).sum())
     if problem.rate is not None:
-        own = float(problem.rate.value(trajectory.u[:: problem.hold], problem.period))
-        free, moved = free + own, moved + own
+        rate = float(problem.rate.value(trajectory.u[:: problem.hold], problem.period))
+        free, moved = free + rate, moved + rate
     return Stake(free, moved)
 
 

@@ -137,7 +137,7 @@ def _unfinished(solution: Solution) -> list[Finding]:
     ended = solution.status in (Status.STALLED, Status.INDEFINITE, Status.NOT_DIFFERENTIABLE)
     if not (cut or ended) or not history:
         return []
-    promised = history[-1].promised_decrease
+    promised = history[-1].expected_decrease
     # What promises next to nothing is as good as the best.
     if solution.status is Status.STALLED and promised <= _LITTLE * abs(solution.cost):
         return []

@@ -48,7 +48,7 @@ class Iteration:
         index: From 0.
         cost: Of the motion it ended with, without noise.
         noise_cost: What noise adds to the cost of the motion it began with.
-        promised_decrease: Of the expected cost, by the quadratic model with a full step.
+        expected_decrease: Of the expected cost, by the quadratic model with a full step.
         decrease: Of the expected cost by the step taken, with the plan's model of the noise; 0 if none was.
         step: Length of the step taken, in (0, 1]; 0 if none was.
         regularization: Relative to the diagonal of Quu.
@@ -62,7 +62,7 @@ class Iteration:
     index: int
     cost: float
     noise_cost: float
-    promised_decrease: float
+    expected_decrease: float
     decrease: float
     step: float
     regularization: float
@@ -71,12 +71,12 @@ class Iteration:
     rollouts: int
     seconds: float
 
-    HEADER = "iter         cost   noise cost   promise  decrease      grad      reg      step  rolls"
+    HEADER = "iter         cost   noise cost  expected  decrease      grad      reg      step  rollouts"
 
     def __str__(self) -> str:
         return (
-            f"{self.index:4d} {self.cost:12.6e} {self.noise_cost:12.4e} {self.promised_decrease:9.2e} "
-            f"{self.decrease:9.2e} {self.gradient:9.2e} {self.regularization:8.1e} {self.step:9.2e} {self.rollouts:6d}"
+            f"{self.index:4d} {self.cost:12.6e} {self.noise_cost:12.4e} {self.expected_decrease:9.2e} "
+            f"{self.decrease:9.2e} {self.gradient:9.2e} {self.regularization:8.1e} {self.step:9.2e} {self.rollouts:9d}"
         )
 
 

@@ -35,7 +35,7 @@ from varpin.simulation.soundness import Finding, announce
 from varpin.support.checks import count
 from varpin.support.executors import executing, in_order
 from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, said
+from varpin.support.markup import facts, warning_count
 
 Floats = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ class MonteCarlo:
     def __repr__(self) -> str:
         gap = f"MonteCarlo(cost {self.cost:.6g} +- {self.standard_error:.1e}, predicted {self.predicted:.6g}"
         lost = f", {self.failures} failed" if self.failures else ""
-        return f"{gap}, {self.paths} paths{lost}{said(self.warnings)})"
+        return f"{gap}, {self.paths} paths{lost}{warning_count(self.warnings)})"
 
     def _repr_html_(self) -> str:
         rows: list[tuple[str, object]] = [
@@ -205,14 +205,14 @@ def _sent(problem: OptimalControlProblem) -> OptimalControlProblem:
 
 def _tasks(problem: OptimalControlProblem, shared: Shared, q0: Floats, v0: Floats) -> Iterator[_Chunk]:
     for first, last in chunks(shared.steps, len(q0)):
-        own = Task(shared, first, q0[first:last].copy(), v0[first:last].copy(), store=True, moments=False)
-        yield _Chunk(problem, own)
+        task = Task(shared, first, q0[first:last].copy(), v0[first:last].copy(), store=True, moments=False)
+        yield _Chunk(problem, task)
 
 
 def _together(chunk: _Chunk) -> _Costs:
     part = simulate_paths(chunk.task)
-    own = part.stored
-    return _Costs(chunk.problem.costs(own["q"], own["v"], own["u"]), part.extremes)
+    stored = part.stored
+    return _Costs(chunk.problem.costs(stored["q"], stored["v"], stored["u"]), part.extremes)
 
 
 def _alone(given: _Alone) -> _Costs:

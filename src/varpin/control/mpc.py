@@ -23,7 +23,7 @@ from varpin.simulation.run import Interrupted, StepFailure, noise_forgotten, sim
 from varpin.simulation.soundness import Finding, announce, evident, with_warnings
 from varpin.support.checks import JointValues, control_values, count, positive, real
 from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, said
+from varpin.support.markup import facts, warning_count
 from varpin.trajectory import Trajectory, chained
 
 Floats = NDArray[np.float64]
@@ -111,7 +111,7 @@ class MpcRun(Frozen):
         return int(self.late.sum())
 
     def __repr__(self) -> str:
-        return f"MpcRun({str(self).splitlines()[0]}{said(self.warnings)})"
+        return f"MpcRun({str(self).splitlines()[0]}{warning_count(self.warnings)})"
 
     @property
     def _planning(self) -> str:

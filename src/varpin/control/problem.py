@@ -226,7 +226,7 @@ class OptimalControlProblem(Frozen):
             if abs(steps * dt - self.duration) > 1e-9 * self.duration:
                 raise InputError(f"the horizon of {self.duration:g} s is no multiple of dt = {dt:g} s")
         if all(option is None for option in (dt, steps, integrator, sampling, hold)):
-            return self._moved(q0, v0, t0, before)
+            return self._restarted(q0, v0, t0, before)
         return OptimalControlProblem(
             self.scene,
             self.cost if before is None else with_control_before(self.cost, before),
@@ -241,36 +241,36 @@ class OptimalControlProblem(Frozen):
             control_limits=(self.control_limits[0], self.control_limits[1]),
         )
 
-    def _moved(
+    def _restarted(
         self, q0: JointValues | None, v0: JointValues | None, t0: float | None, before: JointValues | None
     ) -> OptimalControlProblem:
         """The problem on the same grid: only what a state or a time can change is made anew."""
         scene, names = self.scene, self.scene.robot.joint_names
-        own: dict[str, Any] = {}
+        changed: dict[str, Any] = {}
         for name, given in (("q0", q0), ("v0", v0)):
             if given is not None:
-                own[name] = joint_array(name, given, names)
-                own[name].setflags(write=False)
+                changed[name] = joint_array(name, given, names)
+                changed[name].setflags(write=False)
         if before is not None:
-            own["cost"] = with_control_before(self.cost, before)
-            own["rate"] = control_rate(own["cost"], scene.controls, scene.control_joints)
+            changed["cost"] = with_control_before(self.cost, before)
+            changed["rate"] = control_rate(changed["cost"], scene.controls, scene.control_joints)
         if t0 is not None and real("t0", t0) != self.t0:
-            own["t0"] = t0 = real("t0", t0)
+            changed["t0"] = t0 = real("t0", t0)
             times = t0 + _times(_rule(self.sampling, self.dt)[0], self.steps, self.dt)
             points = replace(self.running.points, t=times, t0=t0)
-            own["running"], own["terminal"] = bind_cost(self.cost, times, points, (self.running, self.terminal))
-        moved = object.__new__(type(self))
+            changed["running"], changed["terminal"] = bind_cost(self.cost, times, points, (self.running, self.terminal))
+        problem = object.__new__(type(self))
         # Past the dataclass, which refuses assignments.
-        vars(moved).update(vars(self) | own)
-        return moved
+        vars(problem).update(vars(self) | changed)
+        return problem
 
     def differs(self, other: OptimalControlProblem) -> str:
         """In words, what of two problems differs that can be told without comparing costs; empty if nothing."""
-        own, its = self.scene.robot, other.scene.robot
-        if own.joint_names != its.joint_names:
-            return f"joints {', '.join(its.joint_names)}, not {', '.join(own.joint_names)}"
-        if not np.array_equal(own.tree.mass, its.tree.mass):
-            return f"links of {its.tree.mass.sum():.6g} kg, not {own.tree.mass.sum():.6g} kg"
+        robot, its = self.scene.robot, other.scene.robot
+        if robot.joint_names != its.joint_names:
+            return f"joints {', '.join(its.joint_names)}, not {', '.join(robot.joint_names)}"
+        if not np.array_equal(robot.tree.mass, its.tree.mass):
+            return f"links of {its.tree.mass.sum():.6g} kg, not {robot.tree.mass.sum():.6g} kg"
         for name in ("dt", "steps", "hold", "sampling", "q0", "v0", "integrator", "control_limits"):
             mine, theirs = getattr(self, name), getattr(other, name)
             if not np.array_equal(mine, theirs):
@@ -278,9 +278,9 @@ class OptimalControlProblem(Frozen):
         for name in ("gravity", "damping", "stiffness", "rest", "armature", "actuation"):
             if not np.array_equal(getattr(self.scene, name), getattr(other.scene, name)):
                 return f"another {name}"
-        forces = [sorted([*own.elements, *own.couplings], key=repr) for own in (self.scene, other.scene)]
-        own_code = [own.custom.parts if own.custom else () for own in (self.scene, other.scene)]
-        functions = [[(part.f, part.derivatives) for part in parts] for parts in own_code]
+        forces = [sorted([*scene.elements, *scene.couplings], key=repr) for scene in (self.scene, other.scene)]
+        custom = [scene.custom.parts if scene.custom else () for scene in (self.scene, other.scene)]
+        functions = [[(part.f, part.derivatives) for part in parts] for parts in custom]
         if forces[0] != forces[1] or functions[0] != functions[1]:
             return "other forces"
         return ""
@@ -458,9 +458,11 @@ def bind_cost(
     at, end = (replace(horizon, t=t) for t in (times, np.array([horizon.t0 + horizon.duration])))
     terms = [term for term in cost.terms if not is_control_rate(term)]
     sums = []
-    for place, points in enumerate((at, end)):
-        own = [term for term in terms if isinstance(term, Terminal) == bool(place)]
-        before = (None,) * len(own) if known is None else known[place].parts
-        parts = (term.bind(points) if old is None or term.timed else old for term, old in zip(own, before, strict=True))
+    for at_end, points in enumerate((at, end)):
+        chosen = [term for term in terms if isinstance(term, Terminal) == bool(at_end)]
+        before = (None,) * len(chosen) if known is None else known[at_end].parts
+        parts = (
+            term.bind(points) if old is None or term.timed else old for term, old in zip(chosen, before, strict=True)
+        )
         sums.append(BoundSum(tuple(parts), points))
     return sums[0], sums[1]

@@ -539,7 +539,7 @@ class _Search:
 
     def _is_there(self, plan: Plan, tolerance: float) -> bool:
         least = tolerance * _NOTHING * self.first
-        if self.problem.cost.nonnegative and plan.promise > tolerance * self.cost + least:
+        if self.problem.cost.nonnegative and plan.expected_decrease > tolerance * self.cost + least:
             # Of squares no more is at stake than they cost.
             return False
         if not self.steered.any() and self.along.stake.free <= least:
@@ -569,17 +569,17 @@ class _Search:
 
         Regularization makes promises smaller; it must not pass for an optimum.
         """
-        if self.plan is None or not self.plan.promise <= bound:
+        if self.plan is None or not self.plan.expected_decrease <= bound:
             return False
         if self.regularization > 0.0:
             plan, least = self._least_regularized()
-            if plan is None or least > _LITTLE or not plan.promise <= bound:
+            if plan is None or least > _LITTLE or not plan.expected_decrease <= bound:
                 return False
             self.plan = plan
         return True
 
     def _promised(self) -> str:
-        return f"the model promises a decrease of {np.nan if self.plan is None else self.plan.promise:.1e}"
+        return f"the model promises a decrease of {np.nan if self.plan is None else self.plan.expected_decrease:.1e}"
 
     def _numbers(self, tolerance: float, *, afresh: bool = False) -> str:
         """What the status rests on; ``afresh`` with as little regularization as the model needs."""
@@ -600,7 +600,7 @@ class _Search:
             index=len(self.history),
             cost=self.cost,
             noise_cost=self.plan.noise,
-            promised_decrease=self.plan.promise,
+            expected_decrease=self.plan.expected_decrease,
             decrease=0.0 if step is None else step.decrease,
             step=0.0 if step is None else step.length,
             regularization=self.regularization,

@@ -23,7 +23,7 @@ from varpin.linearization import velocity_at_nodes
 from varpin.mechanics.policy import LinearPolicy
 from varpin.support.checks import JointValues, count, is_one_of, positive
 from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, folded, listed, said, table
+from varpin.support.markup import facts, folded, listed, table, warning_count
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -65,12 +65,12 @@ class Solution(Frozen):
     iter       Its number, from 0.
     cost       Of the motion it ended with, without noise.
     noise cost What noise adds to the cost of the motion it began with, by the solver's model.
-    promise    The decrease of the expected cost that the quadratic model promises for a full step.
-    decrease   What the step taken brought; near the promise where the model is good.
+    expected   The decrease of the expected cost by the quadratic model for a full step.
+    decrease   What the step taken brought; near the expected one where the model is good.
     grad       Largest entry of the expected cost's gradient in the controls.
     reg        Regularization, relative to the diagonal of Quu; 0 where the model needs none.
     step       Length of the step taken, in (0, 1]; 0 where none was, as at the end.
-    rolls      Motions that the line search tried.
+    rollouts   Motions that the line search tried.
     ========== =====================================================================================
 
     ``print(plan.verify())`` tells what the plan costs on the continuous robot, ``print(plan.monte_carlo(200, rng=0))``
@@ -148,7 +148,7 @@ class Solution(Frozen):
 
     def __repr__(self) -> str:
         noise = f" + {self.noise_cost:.4g} by noise" if self.noise_cost else ""
-        ended = f"{self.iterations} iterations, {self.status.value}{said(self.warnings)}"
+        ended = f"{self.iterations} iterations, {self.status.value}{warning_count(self.warnings)}"
         return f"Solution(cost {self.cost:.6g}{noise}, {ended})"
 
     def __str__(self) -> str:
@@ -175,9 +175,9 @@ class Solution(Frozen):
         rows += [("warning", warning) for warning in self.warnings]
         most = np.abs(motion.u).max(axis=0, initial=0.0)
         rows.append(("largest controls", listed(f"{value:.4g}" for value in most)))
-        columns = ("", "cost", "noise cost", "promise", "decrease", "gradient", "regularization", "step", "rollouts")
+        columns = ("", "cost", "noise cost", "expected", "decrease", "gradient", "regularization", "step", "rollouts")
         history = [
-            (x.index, f"{x.cost:.6e}", *map(float, (x.noise_cost, x.promised_decrease, x.decrease, x.gradient)),
+            (x.index, f"{x.cost:.6e}", *map(float, (x.noise_cost, x.expected_decrease, x.decrease, x.gradient)),
              x.regularization, x.step, x.rollouts)
             for x in self.history
         ]  # fmt: skip
@@ -220,25 +220,25 @@ class Solution(Frozen):
         """
         if not 0 <= count("decisions", decisions) < len(self.gains):
             raise InputError(f"decisions must be from 0 to {len(self.gains) - 1}, got {decisions}")
-        own = self.policy
+        policy = self.policy
         rows = np.minimum(np.arange(len(self.gains)) + decisions, len(self.gains) - 1)
-        u, previous_gains, previous = own.u[rows], None, None
-        if own.previous_gains is not None and own.previous is not None:
+        u, previous_gains, previous = policy.u[rows], None, None
+        if policy.previous_gains is not None and policy.previous is not None:
             # What is repeated expects itself before.
-            previous_gains, previous = own.previous_gains[rows], np.vstack([own.previous[rows[:1]], u[:-1]])
+            previous_gains, previous = policy.previous_gains[rows], np.vstack([policy.previous[rows[:1]], u[:-1]])
         return LinearPolicy(
             u,
-            own.gains[rows],
-            own.reference[rows],
-            own.hold,
-            own.on,
-            (own.limits[0], own.limits[1]),
+            policy.gains[rows],
+            policy.reference[rows],
+            policy.hold,
+            policy.on,
+            (policy.limits[0], policy.limits[1]),
             previous_gains=previous_gains,
             previous=previous,
             before=before,
-            period=own.period,
-            joints=own.joints,
-            servos=own.servos,
+            period=policy.period,
+            joints=policy.joints,
+            servos=policy.servos,
         )
 
     def policy_on(self, x: Literal["momentum", "velocity"], substeps: int = 1) -> LinearPolicy:

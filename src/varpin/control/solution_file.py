@@ -134,23 +134,23 @@ def _search(
     problem: OptimalControlProblem,
 ) -> SearchState | None:
     """Where the search stood; its motions may be among those that are read already."""
-    own = plan.search
-    if own is None:
+    state = plan.search
+    if state is None:
         return None
     best = None if plan.best is None else plan.best.motion
-    for prefix in (own.motion, best):
+    for prefix in (state.motion, best):
         if prefix is not None and prefix not in motions:
             motions[prefix] = _motion(source, members, prefix, problem)
-    if not 0 <= own.history <= len(history):
-        raise FileError(f"{source}: search.history is {own.history}, where 0 to {len(history)} belongs")
+    if not 0 <= state.history <= len(history):
+        raise FileError(f"{source}: search.history is {state.history}, where 0 to {len(history)} belongs")
     return SearchState(
-        trajectory=motions[own.motion],
+        trajectory=motions[state.motion],
         best=None if best is None else motions[best],
-        gains=tuple(own.gains.tolist()),
-        history=history[: own.history],
-        bounded=bool(own.bounded),
-        cut=bool(own.cut),
-        **{name: getattr(own, name) for name in _NUMBERS},
+        gains=tuple(state.gains.tolist()),
+        history=history[: state.history],
+        bounded=bool(state.bounded),
+        cut=bool(state.cut),
+        **{name: getattr(state, name) for name in _NUMBERS},
     )
 
 

@@ -92,20 +92,20 @@ class Verification:
         ]
 
     def _repr_html_(self) -> str:
-        shown = [row if np.isfinite(row[1]) else (row[0], "runs away", "", "") for row in self._rows]
+        rows = [row if np.isfinite(row[1]) else (row[0], "runs away", "", "") for row in self._rows]
         head = ("", "cost", "loss", "end off by [rad or m]")
-        said = [
+        facts_ = [
             ("how to read it", _READING if self.told else self._untold),
             ("a step is off by", f"{self.defect:.2e} rad or m"),
             *([] if self.status.converged else [("the plan is unfinished", self.status.value)]),
         ]
-        return facts("Verification on the continuous system", said, table(head, shown))
+        return facts("Verification on the continuous system", facts_, table(head, rows))
 
     def __str__(self) -> str:
         lines = [f"{'':16}{'cost':>14}{'loss':>12}  end off by [rad or m]"]
         for name, cost, loss, gap in self._rows:
-            shown = (f"{cost:14.6e}{loss:>12}  {gap}" if np.isfinite(cost) else f"{'runs away':>14}").rstrip()
-            lines.append(f"{name:16}{shown}")
+            values = (f"{cost:14.6e}{loss:>12}  {gap}" if np.isfinite(cost) else f"{'runs away':>14}").rstrip()
+            lines.append(f"{name:16}{values}")
         good = f"{self.accuracy:.0e}" if np.isfinite(self.accuracy) else "nothing: no motion stays"
         return "\n".join(
             [

@@ -67,9 +67,9 @@ class Segment:
     def part(self, steps: int) -> Segment:
         """The first steps, as views."""
         values = {name: getattr(self, name)[:steps] for name in _ARRAYS}
-        own = {item.name: getattr(self.statistics, item.name)[:steps] for item in fields(StepStatistics)}
+        statistics = {item.name: getattr(self.statistics, item.name)[:steps] for item in fields(StepStatistics)}
         impulses = None if self.impulses is None else self.impulses[:steps]
-        return Segment(**values, statistics=StepStatistics(**own), failure=None, impulses=impulses)
+        return Segment(**values, statistics=StepStatistics(**statistics), failure=None, impulses=impulses)
 
 
 class Integrator(ABC):
@@ -173,16 +173,20 @@ class Integrator(ABC):
         for begin, end in zip([0, *ends], ends, strict=False):
             block = rows(commands, begin, end, nodes.u[0, done - 1 : done] if done else None)
             segment = self.rollout(scene, state, block, scene.silence, dt)[0]
-            own, taken = segment.statistics, slice(done, done + len(segment.u))
+            statistics, taken = segment.statistics, slice(done, done + len(segment.u))
             for name in _ARRAYS:
                 getattr(nodes, name)[0, taken] = getattr(segment, name)
-            nodes.tally[0, taken] = np.stack([own.newton_iterations, own.jets, own.sweeps, own.substeps], axis=1)
-            nodes.quality[0, taken] = np.stack([own.residual, own.branch_margin, own.energy_defect], axis=1)
-            for step, parts in enumerate(own.substeps.tolist()):
+            nodes.tally[0, taken] = np.stack(
+                [statistics.newton_iterations, statistics.jets, statistics.sweeps, statistics.substeps], axis=1
+            )
+            nodes.quality[0, taken] = np.stack(
+                [statistics.residual, statistics.branch_margin, statistics.energy_defect], axis=1
+            )
+            for step, parts in enumerate(statistics.substeps.tolist()):
                 done = nodes.done[0] = taken.start + step + 1
                 if not watch.after(taken.start + step, parts):
-                    return None, np.concatenate([*halvings, own.part(0, step + 1).halvings])
-            halvings.append(own.halvings)
+                    return None, np.concatenate([*halvings, statistics.part(0, step + 1).halvings])
+            halvings.append(statistics.halvings)
             if segment.failure is not None:
                 return segment.failure, np.concatenate(halvings)
         return None, np.concatenate(halvings)
@@ -290,12 +294,12 @@ def diffusion_and_drift(scene: Scene, q: Floats, v: Floats, u: Floats, start: Fl
 
     The drift is (1/2) sum_i (dF_i/dv) M^-1 F_i [N m or N]: it vanishes where no field depends on the velocity.
     """
-    own = scene.noise.fields(q[None], v[None], u[None], start)
-    F = own.F[0]
-    if own.Fv is None:
+    diffusion = scene.noise.fields(q[None], v[None], u[None], start)
+    F = diffusion.F[0]
+    if diffusion.Fv is None:
         return F, np.zeros_like(q)
     M = lagrangian_jet(scene, q, v).Lvv
-    return F, 0.5 * np.einsum("ikj,jk->i", own.Fv[0], np.linalg.solve(M, F))
+    return F, 0.5 * np.einsum("ikj,jk->i", diffusion.Fv[0], np.linalg.solve(M, F))
 
 
 def drifts(scene: Scene, trajectory: Trajectory) -> Floats:

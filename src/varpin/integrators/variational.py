@@ -122,8 +122,8 @@ class Variational(Integrator):
 
     def same_map(self, other: Integrator) -> bool:
         """See :meth:`Integrator.same_map`: guards decide which steps are cut, not what a step is."""
-        own, others = ({k: v for k, v in vars(x).items() if k not in ("guard", "tolerance")} for x in (self, other))
-        return type(self) is type(other) and own == others
+        mine, others = ({k: v for k, v in vars(x).items() if k not in ("guard", "tolerance")} for x in (self, other))
+        return type(self) is type(other) and mine == others
 
     def __post_init__(self) -> None:
         if not (self.guard is None or isinstance(self.guard, Guard)):
@@ -307,9 +307,9 @@ class Variational(Integrator):
 
     def _steps(self, scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
         """What the core takes every step at dw = 0 again from, by the names of its arguments."""
-        own = trajectory.statistics
-        damage = own.damage()
-        if damage is None and (own.substeps < 1).any():
+        statistics = trajectory.statistics
+        damage = statistics.damage()
+        if damage is None and (statistics.substeps < 1).any():
             damage = "statistics.substeps holds numbers of parts that no step has"
         if damage is not None:
             raise InputError(f"the trajectory is damaged: {damage}")
@@ -319,8 +319,8 @@ class Variational(Integrator):
             "q": trajectory.q[:-1],
             "p": trajectory.p[:-1],
             "force": force,
-            "substeps": own.substeps,
-            "halvings": own.halvings,
+            "substeps": statistics.substeps,
+            "halvings": statistics.halvings,
         }
         return {
             "mechanism": scene.core,
@@ -363,13 +363,13 @@ def _constrained(scene: Scene, paths: ConstrainedRollout, i: int, segment: Segme
 
 @functools.lru_cache(maxsize=256)
 def _of_core(asked: Guard | None, balance: float = 1.0, budget: float = 1.0) -> Guards:
-    own = asked or Guard(max_halvings=0)
+    guard = asked or Guard(max_halvings=0)
     return Guards.make(
         active=asked is not None,
-        branch_margin=float(own.branch_margin),
-        energy_balance=balance * float(own.energy_balance),
-        energy_budget=budget * float(own.energy_budget),
-        most_halvings=int(own.max_halvings),
+        branch_margin=float(guard.branch_margin),
+        energy_balance=balance * float(guard.energy_balance),
+        energy_budget=budget * float(guard.energy_budget),
+        most_halvings=int(guard.max_halvings),
     )
 
 

@@ -183,7 +183,7 @@ def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
         elif isinstance(value, Mapping):
             members |= {f"{name}.{key}": array for key, array in value.items()}
         elif row := _row(hint):
-            columns = [own.name for own in fields(row)]
+            columns = [column.name for column in fields(row)]
             members |= {f"{name}.{key}": np.array([getattr(entry, key) for entry in value]) for key in columns}
         else:
             members[name] = np.array(value, dtype=np.str_) if hint == tuple[str, ...] else value
@@ -230,7 +230,9 @@ class _Builder:
         for item in fields(kind):
             key, hint = _entry(item), _required(hints[item.name])
             name = prefix + key
-            below = {own.removeprefix(f"{name}."): members[own] for own in members if own.startswith(f"{name}.")}
+            below = {
+                member.removeprefix(f"{name}."): members[member] for member in members if member.startswith(f"{name}.")
+            }
             if is_dataclass(hint) and below:
                 tables[key] = self.tables(hint, members, f"{name}.")
             elif name in members:
@@ -238,11 +240,11 @@ class _Builder:
             elif typing.get_origin(hint) is Mapping:
                 tables[key] = below
             elif (row := _row(hint)) and below:
-                columns = {own.name: below[own.name] for own in fields(row) if own.name in below}
-                for own, array in columns.items():
+                columns = {member.name: below[member.name] for member in fields(row) if member.name in below}
+                for member, array in columns.items():
                     if array.ndim != 1 or array.size != next(iter(columns.values())).size:
                         raise self.error(
-                            f"{name}.{own}", f"{array.dtype} {array.shape}", "a list as long as the others"
+                            f"{name}.{member}", f"{array.dtype} {array.shape}", "a list as long as the others"
                         )
                 rows = zip(*(array.tolist() for array in columns.values()), strict=True)
                 tables[key] = [dict(zip(columns, row, strict=True)) for row in rows]
@@ -305,7 +307,7 @@ class _Builder:
             raise self.error(entry, reprlib.repr(value), "a list" if kinds[-1] is ... else f"a list of {len(kinds)}")
         wanted = [kinds[0]] * len(value) if kinds[-1] is ... else kinds
         pairs = enumerate(zip(wanted, value, strict=True))
-        return tuple(self.build(kind, own, f"{entry}[{index}]") for index, (kind, own) in pairs)
+        return tuple(self.build(kind, item, f"{entry}[{index}]") for index, (kind, item) in pairs)
 
     def _scalar(self, kind: Any, value: Any, entry: str) -> Any:
         if issubclass(kind, Enum):
@@ -349,8 +351,8 @@ def _required(hint: Any) -> Any:
     """What an annotation allows beside None."""
     if typing.get_origin(hint) not in (UnionType, typing.Union):
         return hint
-    (own,) = (option for option in typing.get_args(hint) if option is not NoneType)
-    return own
+    (option,) = (option for option in typing.get_args(hint) if option is not NoneType)
+    return option
 
 
 def _row(hint: Any) -> Any:

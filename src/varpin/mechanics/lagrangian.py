@@ -102,9 +102,9 @@ def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
     Lqq = G.T @ rigid_body_Lqq(model, full_q, full_v) @ G - np.diag(scene.stiffness) + np.diag(curvature)
     potential = pin.computePotentialEnergy(model, data, full_q) + energy
     springs = of_kind(scene.elements, "JointSpring")
-    potential += sum(0.5 * own.values[0] * (q[own.coordinate] - own.values[1]) ** 2 for own in springs)
-    held, pull, bend = _coupled(scene, model, full_q, G)
-    potential, Lq, Lqq = potential + held, Lq - pull, Lqq - bend
+    potential += sum(0.5 * spring.values[0] * (q[spring.coordinate] - spring.values[1]) ** 2 for spring in springs)
+    coupled, pull, bend = _coupled(scene, model, full_q, G)
+    potential, Lq, Lqq = potential + coupled, Lq - pull, Lqq - bend
     return LagrangianJet(float(0.5 * v @ Lvv @ v - potential), Lq, Lvv @ v, Lqq, G.T @ A @ G, Lvv)
 
 
@@ -114,27 +114,27 @@ def _coupled(scene: Scene, model: pin.Model, full_q: Floats, G: Floats) -> tuple
     data = model.createData()
     pin.forwardKinematics(model, data, full_q)
     energy, slope, curvature = 0.0, np.zeros(n), np.zeros((n, n))
-    for own in scene.couplings:
-        if not keeps_energy(own):
+    for coupling in scene.couplings:
+        if not keeps_energy(coupling):
             continue
         d, J, H = np.zeros(3), np.zeros((3, n)), np.zeros((n, 3, n))
-        numbers = np.array(own.values)
-        for side, body, place in ((1.0, own.a, numbers[:3]), (-1.0, own.b, numbers[3:6])):
+        numbers = np.array(coupling.values)
+        for side, body, at_body in ((1.0, coupling.a, numbers[:3]), (-1.0, coupling.b, numbers[3:6])):
             if body < 0:
-                d += side * place
+                d += side * at_body
                 continue
             joint = body + 1
-            point = pin.SE3(np.eye(3), z_to(joint_axis(model, joint)[1]) @ place)
+            point = pin.SE3(np.eye(3), z_to(joint_axis(model, joint)[1]) @ at_body)
             here = data.oMi[joint] * point
             d += side * here.translation
             for i, rates in enumerate(G.T):
                 pin.computeForwardKinematicsDerivatives(model, data, full_q, rates, np.zeros(model.nv))
                 by_q, by_v = pin.getFrameVelocityDerivatives(model, data, joint, point, pin.LOCAL)
-                moved = by_v[:3] @ rates
-                J[:, i] += side * here.rotation @ moved
+                velocity = by_v[:3] @ rates
+                J[:, i] += side * here.rotation @ velocity
                 # What turns the frame turns its velocity.
-                H[i] += side * here.rotation @ (by_q[:3] + np.cross(by_v[3:].T, moved).T) @ G
-        own_energy, force, stiff = _between(own.kind, numbers[6:], d)
+                H[i] += side * here.rotation @ (by_q[:3] + np.cross(by_v[3:].T, velocity).T) @ G
+        own_energy, force, stiff = _between(coupling.kind, numbers[6:], d)
         energy += own_energy
         slope += J.T @ force
         curvature += J.T @ stiff @ J + np.einsum("irj,r->ij", H, force)
@@ -166,11 +166,11 @@ def _stops(scene: Scene, q: Floats) -> tuple[float, Floats, Floats]:
     # The integrals of s(y) = 3 y^2 - 2 y^3 over the first width, and the first and second of them at its end.
     rise = np.polynomial.Polynomial([0.0, 0.0, 3.0, -2.0])
     once, twice = rise.integ(), rise.integ(2)
-    for own in scene.elements:
-        if own.kind != "JointStop":
+    for element in scene.elements:
+        if element.kind != "JointStop":
             continue
-        lower, upper, stiffness, _, width = own.values
-        c = own.coordinate
+        lower, upper, stiffness, _, width = element.values
+        c = element.coordinate
         side = 1.0 if q[c] > upper else -1.0
         y = max(q[c] - upper, lower - q[c], 0.0) / width
         past, y = max(y - 1.0, 0.0), min(y, 1.0)

@@ -132,13 +132,13 @@ class CompiledFields(BoundNoise):
 
     def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:  # noqa: ARG002
         """See :meth:`BoundNoise.fields`."""
-        own = self.arrays
-        n, k = own.constant.shape
-        offset = q[:, :, None] - np.where(np.isnan(own.center), start[:, None], own.center)
-        F = own.constant + np.einsum("ikm,Nm->Nik", own.control, u) + own.quadratic * offset**2
+        arrays = self.arrays
+        n, k = arrays.constant.shape
+        offset = q[:, :, None] - np.where(np.isnan(arrays.center), start[:, None], arrays.center)
+        F = arrays.constant + np.einsum("ikm,Nm->Nik", arrays.control, u) + arrays.quadratic * offset**2
         Fq = np.zeros((len(q), n, k, n))
-        Fq[:, np.arange(n), :, np.arange(n)] = np.moveaxis(2.0 * own.quadratic * offset, 1, 0)
-        return Fields(F, Fq, None, np.broadcast_to(own.control, (len(q), *own.control.shape)))
+        Fq[:, np.arange(n), :, np.arange(n)] = np.moveaxis(2.0 * arrays.quadratic * offset, 1, 0)
+        return Fields(F, Fq, None, np.broadcast_to(arrays.control, (len(q), *arrays.control.shape)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,10 +160,10 @@ class CompositeFields(BoundNoise):
     @property
     def diffusion(self) -> Diffusion | None:
         """One set of arrays, where every part has them."""
-        own = [part.diffusion for part in self.parts]
-        if any(fields is None for fields in own):
+        diffusions = [part.diffusion for part in self.parts]
+        if any(fields is None for fields in diffusions):
             return None
-        columns = zip(*(fields for fields in own if fields is not None), strict=True)
+        columns = zip(*(fields for fields in diffusions if fields is not None), strict=True)
         return Diffusion(*(np.concatenate(arrays, axis=1) for arrays in columns))
 
     def curvature(self, weight: Floats) -> Floats:
@@ -171,7 +171,7 @@ class CompositeFields(BoundNoise):
         ends = np.cumsum([part.processes for part in self.parts])
         columns = np.split(weight, ends[:-1], axis=2)
         total: Floats = sum(
-            (part.curvature(own) for part, own in zip(self.parts, columns, strict=True)),
+            (part.curvature(column) for part, column in zip(self.parts, columns, strict=True)),
             np.zeros((len(weight), weight.shape[1], weight.shape[1])),
         )
         return total
@@ -402,12 +402,10 @@ class CustomFields(BoundNoise):
         """dF/d(point[slot][j]) (n, k) by differences of fourth order."""
         total = np.zeros((self.n, self.processes))
         for shift, weight in ((1e-3, 8.0), (-1e-3, -8.0), (2e-3, -1.0), (-2e-3, 1.0)):
-            moved = [x.copy() for x in point]
-            moved[slot][0, j] += shift
-            total += (
-                weight
-                * self._evaluate("field", self.noise.field, [(moved[0][0], moved[1][0], moved[2][0])], total.shape)[0]
-            )
+            shifted = [x.copy() for x in point]
+            shifted[slot][0, j] += shift
+            q, v, u = (x[0] for x in shifted)
+            total += weight * self._evaluate("field", self.noise.field, [(q, v, u)], total.shape)[0]
         return total / 12e-3
 
 

@@ -212,16 +212,16 @@ class LinearPolicy(Frozen):
             )
         object.__setattr__(self, "limits", named_limits("limits", limits, names, m))
         start = None if before is None else control_values("before", before, names, m)
-        own: Floats | None = None
+        changes: Floats | None = None
         expected: Floats | None = None
         if previous_gains is not None:
-            own = finite_array("previous_gains", previous_gains, (steps, m, m))
+            changes = finite_array("previous_gains", previous_gains, (steps, m, m))
             expected = np.vstack([self.u[:1] if start is None else start[None], self.u[:-1]])[:steps]
             if previous is not None:
                 expected = finite_array("previous", previous, (steps, m))
         elif previous is not None:
             raise InputError("previous is what previous_gains expect: give them too")
-        for name, array in {"previous_gains": own, "previous": expected, "before": start}.items():
+        for name, array in {"previous_gains": changes, "previous": expected, "before": start}.items():
             if array is not None:
                 array.setflags(write=False)
             object.__setattr__(self, name, array)

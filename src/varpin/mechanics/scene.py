@@ -198,7 +198,7 @@ class Scene(Frozen):
         _refuse_trembling_angles(noise, values["elements"], robot)
         values["noise"] = bind(noise, values["actuation"], robot.joint_names)
         values["constraints"] = constraints_of(constraints)
-        bound, order = joined([own.bind(robot) for own in values["constraints"]])
+        bound, order = joined([constraint.bind(robot) for constraint in values["constraints"]])
         values |= {"bound_constraints": bound, "constraint_order": order, "announced": set()}
         for name, value in values.items():
             if isinstance(value, np.ndarray):
@@ -214,7 +214,7 @@ class Scene(Frozen):
         parts = [f"gravity {self.gravity.tolist()}" if self.gravity.any() else "no gravity"]
         parts += [name for name in ("damping", "stiffness") if getattr(self, name).any()]
         parts += [name for name, _ in self._other_forces()]
-        parts += [type(own).__name__ for own in self.constraints]
+        parts += [type(constraint).__name__ for constraint in self.constraints]
         return f"Scene({self.robot.name}: {', '.join(parts)}, {self.controls} controls)"
 
     def _repr_html_(self) -> str:
@@ -232,7 +232,7 @@ class Scene(Frozen):
             ("damping [N m s/rad or N s/m]", of(self.damping)),
             ("springs [N m/rad or N/m]", of(self.stiffness)),
             *((f"{name} on", listed(acting)) for name, acting in self._other_forces()),
-            *(("constraint", repr(own)) for own in self.constraints),
+            *(("constraint", repr(constraint)) for constraint in self.constraints),
             ("driven", f"{listed(driven)} by {self.controls} controls" if driven else "none"),
             ("noise", f"{self.processes} processes" if self.processes else "none"),
         ]
@@ -243,14 +243,14 @@ class Scene(Frozen):
         acting: dict[str, dict[str, None]] = {}
         for force in self.forces:
             if not isinstance(force, JointSpring | JointDamper):
-                own = acting.setdefault(type(force).__name__, {})
+                joints = acting.setdefault(type(force).__name__, {})
                 if isinstance(force, CustomForce):
-                    own |= dict.fromkeys(self.robot.joint_names)
+                    joints |= dict.fromkeys(self.robot.joint_names)
                     continue
-                own |= dict.fromkeys(self.robot.joint_names[c] for c in self._moved(force.bind(self.robot)))
+                joints |= dict.fromkeys(self.robot.joint_names[c] for c in self._moved_by(force.bind(self.robot)))
         return [(kind, list(joints)) for kind, joints in acting.items()]
 
-    def _moved(self, bound: Sequence[Element | Coupling]) -> list[int]:
+    def _moved_by(self, bound: Sequence[Element | Coupling]) -> list[int]:
         """The coordinates that forces act on."""
         found: set[int] = set()
         for each in bound:
@@ -263,8 +263,8 @@ class Scene(Frozen):
     @property
     def dissipates(self) -> bool:
         """Whether anything turns energy into heat."""
-        own = any(map(dissipates, self.elements)) or any(map(dissipates, self.couplings))
-        return own or self.custom is not None
+        damped = any(map(dissipates, self.elements)) or any(map(dissipates, self.couplings))
+        return damped or self.custom is not None
 
     @property
     def conservative(self) -> bool:
@@ -278,8 +278,8 @@ class Scene(Frozen):
         if self.custom is not None:
             # Nobody knows which joints the function joins.
             group[:] = 0
-        for own in self.couplings:
-            together = np.unique(group[self._moved([own])])
+        for coupling in self.couplings:
+            together = np.unique(group[self._moved_by([coupling])])
             group[np.isin(group, together)] = together[0]
         for coordinates in self._constrained():
             together = np.unique(group[coordinates])
@@ -301,7 +301,7 @@ class Scene(Frozen):
     @property
     def constraint_labels(self) -> tuple[str, ...]:
         """What each row of the constraints is (c,), in words."""
-        return tuple(self.bound_constraints.labels[place] for place in self.constraint_order)
+        return tuple(self.bound_constraints.labels[row] for row in self.constraint_order)
 
     def constraint_values(self, q: JointValues) -> tuple[Floats, Floats]:
         """g(q) (c,) [m or rad] and dg/dq (c, n) of the constraints.
@@ -321,8 +321,8 @@ class Scene(Frozen):
     def _gear(self) -> Floats:
         """Force (n,) of a control that is one joint's alone: 1, or the stiffness of its servo."""
         gear = np.ones(self.robot.dof)
-        for own in of_kind(self.elements, "PositionServo"):
-            gear[own.coordinate] = own.values[0]
+        for servo in of_kind(self.elements, "PositionServo"):
+            gear[servo.coordinate] = servo.values[0]
         return gear
 
     @property
@@ -345,13 +345,13 @@ class Scene(Frozen):
     @cached_property
     def servo_joints(self) -> tuple[str, ...]:
         """The joints whose control is the position that a servo goes to."""
-        return tuple(self.robot.joint_names[own.coordinate] for own in of_kind(self.elements, "PositionServo"))
+        return tuple(self.robot.joint_names[servo.coordinate] for servo in of_kind(self.elements, "PositionServo"))
 
     def command_at(self, q: Floats) -> Floats:
         """The controls (m,) that stand for none at q (n,): no forces, and servos that stay where they are."""
         command = np.zeros(self.controls)
-        for own in of_kind(self.elements, "PositionServo"):
-            command[int(np.argmax(np.abs(self.actuation[own.coordinate])))] = q[own.coordinate]
+        for servo in of_kind(self.elements, "PositionServo"):
+            command[int(np.argmax(np.abs(self.actuation[servo.coordinate])))] = q[servo.coordinate]
         return command
 
     @property
@@ -363,11 +363,11 @@ class Scene(Frozen):
     def core(self) -> Core:
         """The scene as the compiled core takes it; without fields that only Python can evaluate."""
         tree, fields = self.robot.tree, self.diffusion
-        own = {name: getattr(tree, name) for name in _TREE}
+        values = {name: getattr(tree, name) for name in _TREE}
         if self.constraints:
-            own |= self._of_constrained_tree()
+            values |= self._of_constrained_tree()
         return Core.make(
-            **own,
+            **values,
             group=self.group,
             groups=int(self.group.max()) + 1,
             ends=np.array([self.robot.dof]) if self.constraints else block_ends(self.group),
@@ -430,25 +430,33 @@ class Scene(Frozen):
         Of the noise, strengths (n, k), for which its share of the controls is summed up; nothing of a
         :class:`varpin.CustomNoise`.
         """
-        tree, own = self.robot.tree, {name: getattr(self, name) for name in ("gravity", "damping", "stiffness", "rest")}
-        own |= {"actuation": self.actuation, "armature": self.armature, "center": tree.center, "inertia": tree.inertia}
+        tree, values = (
+            self.robot.tree,
+            {name: getattr(self, name) for name in ("gravity", "damping", "stiffness", "rest")},
+        )
+        values |= {
+            "actuation": self.actuation,
+            "armature": self.armature,
+            "center": tree.center,
+            "inertia": tree.inertia,
+        }
         for kind in OF_ELEMENTS:
             rows = [(each.coordinate, *each.values) for each in of_kind(self.elements, kind)]
-            own[kind] = np.array(rows) if rows else np.zeros((0, 0))
+            values[kind] = np.array(rows) if rows else np.zeros((0, 0))
         for kind in OF_COUPLINGS:
             if ends := [(each.a, each.b, *each.values) for each in self.couplings if each.kind == kind]:
-                own[kind] = np.array(ends, dtype=np.float64)
+                values[kind] = np.array(ends, dtype=np.float64)
         if self.custom is not None:
             # Of functions nothing but how many there are.
-            own["functions"] = np.array([float(len(self.custom.parts))])
-        own |= _numbers_of(self.bound_constraints.rows)
-        own |= {"rotation": tree.rotation, "translation": tree.translation}
-        own |= {"ratio": tree.ratio, "offset": tree.offset}
+            values["functions"] = np.array([float(len(self.custom.parts))])
+        values |= _numbers_of(self.bound_constraints.rows)
+        values |= {"rotation": tree.rotation, "translation": tree.translation}
+        values |= {"ratio": tree.ratio, "offset": tree.offset}
         if self.noise.diffusion is not None:
             fields = self.noise.diffusion
-            own |= {"noise.constant": fields.constant, "noise.control": np.linalg.norm(fields.control, axis=2)}
-            own |= {"noise.quadratic": fields.quadratic, "noise.center": fields.center}
-        return MappingProxyType(own)
+            values |= {"noise.constant": fields.constant, "noise.control": np.linalg.norm(fields.control, axis=2)}
+            values |= {"noise.quadratic": fields.quadratic, "noise.center": fields.center}
+        return MappingProxyType(values)
 
     @cached_property
     def silence(self) -> Floats:
@@ -519,10 +527,10 @@ def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
         table = []
         for product in rows.products:
             numbers = [product.factor, product.constant]
-            for own in (rows.vectors[product.x], rows.vectors[product.y]):
-                for part in own:
+            for factor in (rows.vectors[product.x], rows.vectors[product.y]):
+                for part in factor:
                     numbers += [part.body, float(part.direction), *part.place]
-                numbers += [-2.0, 0.0, 0.0, 0.0, 0.0] * (2 - len(own))
+                numbers += [-2.0, 0.0, 0.0, 0.0, 0.0] * (2 - len(factor))
             table.append(numbers)
         found["constraints.between"] = np.array(table)
     if rows.ties:
@@ -534,7 +542,7 @@ def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
             ]
         )
     if rows.customs:
-        found["constraints.custom"] = np.array([[float(own.rows)] for own in rows.customs])
+        found["constraints.custom"] = np.array([[float(factor.rows)] for factor in rows.customs])
     return found
 
 
@@ -545,7 +553,7 @@ def refuse_constraints(scene: Scene, what: str) -> None:
         InputError: The scene has constraints.
     """
     if scene.constraints:
-        names = ", ".join(dict.fromkeys(type(own).__name__ for own in scene.constraints))
+        names = ", ".join(dict.fromkeys(type(constraint).__name__ for constraint in scene.constraints))
         raise InputError(
             f"{what} does not take scenes with constraints, and this one has {names}: simulate and linearize do, with "
             "varpin.Midpoint() or varpin.Gauss(stages)"
@@ -558,8 +566,8 @@ def closest_controls(scene: Scene, q: Floats) -> Floats:
     Those of a servo as if it had no effort limit.
     """
     torque = scene.holding_torque(q)
-    for own in of_kind(scene.elements, "PositionServo"):
-        torque[own.coordinate] += own.values[0] * q[own.coordinate]
+    for servo in of_kind(scene.elements, "PositionServo"):
+        torque[servo.coordinate] += servo.values[0] * q[servo.coordinate]
     return np.asarray(np.linalg.lstsq(scene.actuation, torque, rcond=None)[0], dtype=np.float64)
 
 
@@ -652,10 +660,10 @@ def _tell_of_friction(robot: Robot, *, damped: bool, rubs: bool) -> None:
 
 def _by_joint(robot: Robot, values: Floats) -> str:
     """Numbers that are not zero, by joint, a few of them."""
-    own = [f"{name!r} {value:g}" for name, value in zip(robot.joint_names, values, strict=True) if value]
-    if len(own) == robot.dof and np.ptp(values) == 0.0:
+    named = [f"{name!r} {value:g}" for name, value in zip(robot.joint_names, values, strict=True) if value]
+    if len(named) == robot.dof and np.ptp(values) == 0.0:
         return f"{values[0]:g} at every joint"
-    return ", ".join(own[:_NAMED]) + (f" and {len(own) - _NAMED} more" if len(own) > _NAMED else "")
+    return ", ".join(named[:_NAMED]) + (f" and {len(named) - _NAMED} more" if len(named) > _NAMED else "")
 
 
 def _forces(
@@ -678,16 +686,16 @@ def _forces(
     elements = [each for each in bound if isinstance(each, Element)]
     own_code = tuple(force for force in given if isinstance(force, CustomForce))
     total = {kind: np.zeros(robot.dof) for kind in ("JointDamper", "JointSpring", "Armature")}
-    for own in elements:
-        if own.kind in total:
-            total[own.kind][own.coordinate] += own.values[0]
+    for element in elements:
+        if element.kind in total:
+            total[element.kind][element.coordinate] += element.values[0]
     for c in np.flatnonzero(total["JointSpring"]):
-        springs = [own.values for own in of_kind(elements, "JointSpring") if own.coordinate == c]
+        springs = [element.values for element in of_kind(elements, "JointSpring") if element.coordinate == c]
         first = springs[0][1]
-        slack[c] = first + sum(own * (place - first) for own, place in springs) / total["JointSpring"][c]
+        slack[c] = first + sum(stiffness * (rest - first) for stiffness, rest in springs) / total["JointSpring"][c]
     return {
         "forces": given,
-        "elements": tuple(own for own in elements if own.kind != "Armature"),
+        "elements": tuple(element for element in elements if element.kind != "Armature"),
         "couplings": tuple(each for each in bound if isinstance(each, Coupling)),
         "custom": CustomForces(own_code) if own_code else None,
         "damping": total["JointDamper"],
@@ -701,7 +709,7 @@ def _refuse_trembling_angles(noise: Noise | Sequence[Noise] | None, elements: Se
     """Refuse noise in proportion to controls that are positions: where an angle is 0 says nothing of a drive."""
     given = noise if isinstance(noise, Sequence) else [noise]
     models = [term for model in given for term in (model.terms if isinstance(model, NoiseSum) else [model])]
-    servos = [own.coordinate for own in of_kind(elements, "PositionServo")]
+    servos = [servo.coordinate for servo in of_kind(elements, "PositionServo")]
     if servos and any(isinstance(model, ControlNoise) for model in models):
         raise InputError(
             f"ControlNoise is in proportion to forces, and the control of joint {robot.joint_names[servos[0]]!r} is "
@@ -717,8 +725,8 @@ def _served(robot: Robot, actuation: Floats, elements: Sequence[Element]) -> Flo
     """
     servos = of_kind(elements, "PositionServo")
     scaled = actuation.copy()
-    for own in servos:
-        c, name = own.coordinate, robot.joint_names[own.coordinate]
+    for servo in servos:
+        c, name = servo.coordinate, robot.joint_names[servo.coordinate]
         if sum(other.coordinate == c for other in servos) > 1:
             raise InputError(f"joint {name!r} has two position servos")
         drives = np.flatnonzero(actuation[c])
@@ -728,7 +736,7 @@ def _served(robot: Robot, actuation: Floats, elements: Sequence[Element]) -> Flo
                 f"the position servo of joint {name!r} needs a control of its own: under this actuation none is the "
                 "joint's alone, with share 1"
             )
-        scaled[c, drives[0]] = own.values[0]
+        scaled[c, drives[0]] = servo.values[0]
     return scaled
 
 

@@ -107,11 +107,11 @@ def children(rng: np.random.Generator | int, number: int) -> Children:
     seed = parent.seed_seq
     if not isinstance(seed, np.random.SeedSequence):
         raise InputError(f"rng must be seeded by a numpy SeedSequence, to have a child for each path; got {seed!r}")
-    own = Children(type(parent), seed.entropy, tuple(seed.spawn_key), seed.pool_size, seed.n_children_spawned)
+    children = Children(type(parent), seed.entropy, tuple(seed.spawn_key), seed.pool_size, seed.n_children_spawned)
     if isinstance(rng, np.random.Generator):
         for first in range(0, number, _AT_ONCE):
             seed.spawn(min(_AT_ONCE, number - first))
-    return own
+    return children
 
 
 def coarsen(increments: ArrayLike, factor: int = 2) -> Floats:

@@ -34,7 +34,7 @@ def on_base(description: Description, base: Base) -> Description:
         if base != "planar":
             raise InputError(f"base must be 'planar', a transform (4, 4) or a pin.SE3, got {base!r}")
         return _on_plane(description)
-    return _placed(description, _transform(base))
+    return _on_base(description, _transform(base))
 
 
 def _transform(base: ArrayLike | pin.SE3) -> pin.SE3:
@@ -50,19 +50,19 @@ def _transform(base: ArrayLike | pin.SE3) -> pin.SE3:
     return pin.SE3(u @ v, matrix[:3, 3])
 
 
-def _placed(description: Description, place: pin.SE3) -> Description:
+def _on_base(description: Description, base: pin.SE3) -> Description:
     model = description.model.copy()
     for joint in range(1, model.njoints):
         if model.parents[joint] == 0:
-            model.jointPlacements[joint] = place * model.jointPlacements[joint]
+            model.jointPlacements[joint] = base * model.jointPlacements[joint]
     for frame in list(model.frames)[1:]:
         if frame.parentJoint == 0:
-            frame.placement = place * frame.placement
-    model.inertias[0] = place.act(model.inertias[0])
+            frame.placement = base * frame.placement
+    model.inertias[0] = base.act(model.inertias[0])
     visuals = None if description.visuals is None else description.visuals.copy()
     for shape in visuals.geometryObjects if visuals is not None else ():
         if shape.parentJoint == 0:
-            shape.placement = place * shape.placement
+            shape.placement = base * shape.placement
     return replace(description, model=model, visuals=visuals)
 
 
@@ -96,21 +96,21 @@ def with_rotors(
     if armature is None:
         return
     names = tuple(model.names[joint] for joint in coordinates)
-    own = np.array([model.armature[model.joints[joint].idx_v] for joint in coordinates])
+    armatures = np.array([model.armature[model.joints[joint].idx_v] for joint in coordinates])
     if isinstance(armature, Mapping):
         for name, number in armature.items():
             value = finite(f"armature[{name!r}]", number)
             if name in names:
-                own[names.index(name)] = value
+                armatures[names.index(name)] = value
             elif name not in others:
                 raise UnknownJoint(str(name), names, "armature")
     else:
-        own = broadcast_array("armature", armature, len(names))
-    if (own < 0.0).any():
-        worst = int(np.argmin(own))
-        raise InputError(f"armature of joint {names[worst]!r} must be >= 0 [kg m^2 or kg], got {own[worst]:g}")
+        armatures = broadcast_array("armature", armature, len(names))
+    if (armatures < 0.0).any():
+        worst = int(np.argmin(armatures))
+        raise InputError(f"armature of joint {names[worst]!r} must be >= 0 [kg m^2 or kg], got {armatures[worst]:g}")
     values = np.array(model.armature)
-    values[[model.joints[joint].idx_v for joint in coordinates]] = own
+    values[[model.joints[joint].idx_v for joint in coordinates]] = armatures
     model.armature = values
 
 

@@ -56,18 +56,18 @@ def rod_chain(
         raise InputError("lengths and masses must be >= 0")
     model = pin.Model()
     model.name = f"chain{links}"
-    place = pin.SE3(np.eye(3), finite_array("base", base, (3,)))
+    placement = pin.SE3(np.eye(3), finite_array("base", base, (3,)))
     joint = 0
     if rail is not None:
-        joint = model.addJoint(joint, pin.JointModelPX(), place, "rail")
+        joint = model.addJoint(joint, pin.JointModelPX(), placement, "rail")
         model.appendBodyToJoint(joint, pin.Inertia(rail, np.zeros(3), np.zeros((3, 3))), pin.SE3.Identity())
-        place = pin.SE3.Identity()
+        placement = pin.SE3.Identity()
     for k, (length, mass) in enumerate(zip(sizes, weights, strict=True)):
         across = mass * length**2 / 12.0
         rod = pin.Inertia(mass, np.array([0.5 * length, 0.0, 0.0]), np.diag([0.0, across, across]))
-        joint = model.addJoint(joint, pin.JointModelRY(), place, f"joint{k + 1}")
+        joint = model.addJoint(joint, pin.JointModelRY(), placement, f"joint{k + 1}")
         model.appendBodyToJoint(joint, rod, pin.SE3.Identity())
-        place = pin.SE3(np.eye(3), np.array([length, 0.0, 0.0]))
+        placement = pin.SE3(np.eye(3), np.array([length, 0.0, 0.0]))
     model.armature = np.full(model.nv, armature)
-    model.addFrame(pin.Frame("tip", joint, 0, place, pin.FrameType.OP_FRAME))
+    model.addFrame(pin.Frame("tip", joint, 0, placement, pin.FrameType.OP_FRAME))
     return load_robot(model)

@@ -98,13 +98,13 @@ class FrameKinematics(Frozen):
 
     def placements(self, q: Floats) -> tuple[Floats, Floats]:
         """World rotations (N, 3, 3) and positions (N, 3) [m] at q (N, n)."""
-        return self._placed(q, jacobian=False)[:2]
+        return self._placements(q, jacobian=False)[:2]
 
     def jacobians(self, q: Floats) -> tuple[Floats, Floats, Floats]:
         """:meth:`placements`, and the frame's Jacobian (N, 6, n): linear over angular velocity in world axes, in v."""
-        return self._placed(q, jacobian=True)
+        return self._placements(q, jacobian=True)
 
-    def _placed(self, q: Floats, *, jacobian: bool) -> tuple[Floats, Floats, Floats]:
+    def _placements(self, q: Floats, *, jacobian: bool) -> tuple[Floats, Floats, Floats]:
         return self.links.core.place_frame(self.rotation, self.translation, np.ascontiguousarray(q), jacobian)
 
 

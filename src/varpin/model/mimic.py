@@ -151,9 +151,9 @@ def depth_first(model: pin.Model, ties: Sequence[Tie]) -> list[int]:
 
 def reordered(model: pin.Model, ties: Sequence[Tie], order: Sequence[int]) -> tuple[pin.Model, tuple[Tie, ...]]:
     """``model`` and ``ties`` with the joints in another order."""
-    place = {joint: k + 1 for k, joint in enumerate(order)}
-    moved = tuple(Tie(place[tie.follower], place[tie.leader], tie.ratio, tie.offset) for tie in ties)
-    return rebuild(model, order, lambda joint: model.joints[joint]), moved
+    new_index = {joint: k + 1 for k, joint in enumerate(order)}
+    new_ties = tuple(Tie(new_index[tie.follower], new_index[tie.leader], tie.ratio, tie.offset) for tie in ties)
+    return rebuild(model, order, lambda joint: model.joints[joint]), new_ties
 
 
 def untied_model(model: pin.Model) -> tuple[pin.Model, tuple[Tie, ...]]:
@@ -209,17 +209,17 @@ def rebuild(
     new = pin.Model()
     new.name = model.name
     new.gravity = model.gravity
-    place = {0: 0}
+    new_index = {0: 0}
     for name, kind in root:
-        place[0] = new.addJoint(place[0], kind, pin.SE3.Identity(), name)
-    new.appendBodyToJoint(place[0], model.inertias[0], pin.SE3.Identity())
+        new_index[0] = new.addJoint(new_index[0], kind, pin.SE3.Identity(), name)
+    new.appendBodyToJoint(new_index[0], model.inertias[0], pin.SE3.Identity())
     for joint in order:
         source = joint_of(joint)
-        place[joint] = new.addJoint(
-            place[model.parents[joint]], source, model.jointPlacements[joint], model.names[joint]
+        new_index[joint] = new.addJoint(
+            new_index[model.parents[joint]], source, model.jointPlacements[joint], model.names[joint]
         )
-        new.appendBodyToJoint(place[joint], model.inertias[joint], pin.SE3.Identity())
-        old, copy = model.joints[joint], new.joints[place[joint]]
+        new.appendBodyToJoint(new_index[joint], model.inertias[joint], pin.SE3.Identity())
+        old, copy = model.joints[joint], new.joints[new_index[joint]]
         if old.nq == copy.nq:
             for limits in ("lowerPositionLimit", "upperPositionLimit"):
                 getattr(new, limits)[copy.idx_q : copy.idx_q + copy.nq] = getattr(model, limits)[
@@ -236,7 +236,7 @@ def rebuild(
     for joint in range(1, len(root) + 1):
         new_frames[0] = frames[0] = new.addJointFrame(joint, new_frames[0])
     for joint in order:
-        new_frames[joint] = new.addJointFrame(place[joint], new_frames[model.parents[joint]])
+        new_frames[joint] = new.addJointFrame(new_index[joint], new_frames[model.parents[joint]])
         if joint in old_frames:
             frames[old_frames[joint]] = new_frames[joint]
     for index, frame in enumerate(model.frames):
@@ -244,7 +244,7 @@ def rebuild(
             frames[index] = new.addFrame(
                 pin.Frame(
                     frame.name,
-                    place[frame.parentJoint],
+                    new_index[frame.parentJoint],
                     frames.get(frame.parentFrame, frames[0]),
                     frame.placement,
                     frame.type,

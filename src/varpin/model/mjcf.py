@@ -92,27 +92,27 @@ class _Reader:
         name = element.get("class", childclass)
         if name not in self.classes:
             raise self.fault(f"<{element.tag}> {element.get('name', '')!r}: there is no default class {name!r}")
-        own = self.turned(element)
+        attributes = self.turned(element)
         given = self.classes[name].get(element.tag, {})
-        if any(key in own for key in _ROTATIONS):
+        if any(key in attributes for key in _ROTATIONS):
             given = {key: value for key, value in given.items() if key not in _ROTATIONS}
-        return ET.Element(element.tag, {**given, **own})
+        return ET.Element(element.tag, {**given, **attributes})
 
     def turned(self, element: ET.Element) -> dict[str, str]:
         """The attributes of an element, its rotation in a form that Pinocchio reads as MuJoCo does."""
-        own = {key: value for key, value in element.items() if key not in ("class", "childclass")}
-        for key in own:
+        attributes = {key: value for key, value in element.items() if key not in ("class", "childclass")}
+        for key in attributes:
             if element.tag in ("body", "frame", "geom", "inertial", "joint") and key in _SIZES:
                 self.numbers(element, key, _SIZES[key])
         unit = self.angle_unit
-        if "axisangle" in own:
+        if "axisangle" in attributes:
             *axis, angle = self.numbers(element, "axisangle", (4,))
             length = np.linalg.norm(axis)
             if length == 0.0:
                 raise self.fault(f"<{element.tag}> {element.get('name', '')!r}: the axis of its axisangle is 0")
-            del own["axisangle"]
-            own["quat"] = _quaternion(pin.AngleAxis(unit * angle, np.array(axis) / length).matrix())
-        elif "euler" in own:
+            del attributes["axisangle"]
+            attributes["quat"] = _quaternion(pin.AngleAxis(unit * angle, np.array(axis) / length).matrix())
+        elif "euler" in attributes:
             sequence = self.compiler.get("eulerseq", "xyz")
             if len(sequence) != 3 or set(sequence.lower()) - set("xyz"):
                 raise self.fault(f"eulerseq is {sequence!r}, where three of x, y and z belong")
@@ -120,9 +120,9 @@ class _Reader:
             for letter, angle in zip(sequence, self.numbers(element, "euler", (3,)), strict=True):
                 turn = pin.AngleAxis(unit * angle, np.eye(3)["xyz".index(letter.lower())]).matrix()
                 rotation = rotation @ turn if letter.islower() else turn @ rotation
-            del own["euler"]
-            own["quat"] = _quaternion(rotation)
-        return own
+            del attributes["euler"]
+            attributes["quat"] = _quaternion(rotation)
+        return attributes
 
 
 def is_mjcf(path: Path) -> bool:
@@ -266,13 +266,13 @@ def _classes(root: ET.Element, reader: _Reader) -> dict[str, dict[str, dict[str,
     classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
 
     def read(element: ET.Element, name: str, around: Mapping[str, Mapping[str, str]]) -> None:
-        own = {tag: dict(values) for tag, values in around.items()}
+        defaults = {tag: dict(values) for tag, values in around.items()}
         for part in element:
             if part.tag != "default":
-                own.setdefault(part.tag, {}).update(reader.turned(part))
-        classes[name] = own
+                defaults.setdefault(part.tag, {}).update(reader.turned(part))
+        classes[name] = defaults
         for part in element.findall("default"):
-            read(part, part.get("class", ""), own)
+            read(part, part.get("class", ""), defaults)
 
     for top in root.findall("default"):
         read(top, "main", classes["main"])

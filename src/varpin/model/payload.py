@@ -69,14 +69,14 @@ def carry(model: pin.Model, payload: Sequence[Payload], robot: str) -> None:
         UnknownFrame: The model has no such frame.
         InputError: The frame does not move.
     """
-    for load in payload:
-        if not isinstance(load, Payload):
-            raise InputError(f"payload must be of varpin.Payload, got {type(load).__name__}")
+    for part in payload:
+        if not isinstance(part, Payload):
+            raise InputError(f"payload must be of varpin.Payload, got {type(part).__name__}")
         names = [frame.name for frame in model.frames]
-        if load.frame not in names:
-            raise UnknownFrame(load.frame, names, robot)
-        frame = model.frames[names.index(load.frame)]
+        if part.frame not in names:
+            raise UnknownFrame(part.frame, names, robot)
+        frame = model.frames[names.index(part.frame)]
         if frame.parentJoint == 0:
-            raise InputError(f"payload of robot {robot!r}: frame {load.frame!r} is part of the base, which carries it")
-        body = pin.Inertia(float(load.mass), np.array(load.center, dtype=float), load.moments())
+            raise InputError(f"payload of robot {robot!r}: frame {part.frame!r} is part of the base, which carries it")
+        body = pin.Inertia(float(part.mass), np.array(part.center, dtype=float), part.moments())
         model.appendBodyToJoint(frame.parentJoint, body, frame.placement)

@@ -149,10 +149,10 @@ class Robot(Frozen):
         groups = ", ".join(state.group for state in found)
         if group is not None and not (found := [state for state in found if state.group == group]):
             raise InputError(f"posture {name!r} is one of the groups {groups}; there is none of group {group!r}")
-        placed: dict[str, float] = {}
+        positions: dict[str, float] = {}
         for joint, position in (entry for state in found for entry in state.positions):
             if joint in self.joint_names:
-                if placed.setdefault(joint, position) != position:
+                if positions.setdefault(joint, position) != position:
                     raise InputError(
                         f"the postures {name!r} put joint {joint!r} in two places: give group=, of {groups}"
                     )
@@ -261,13 +261,13 @@ class Robot(Frozen):
 
     def built_like(self, other: "Robot") -> bool:
         """Whether another robot's joints lie as this one's do, but for rounding; masses may differ."""
-        own, its = self.tree, other.tree
-        if self is other or own is its:
+        mine, its = self.tree, other.tree
+        if self is other or mine is its:
             return True
         exact = ("parent", "prismatic", "coordinate")
         near = ("rotation", "translation", "ratio", "offset")
-        return all(np.array_equal(getattr(own, name), getattr(its, name)) for name in exact) and all(
-            np.allclose(getattr(own, name), getattr(its, name), rtol=1e-6, atol=1e-9) for name in near
+        return all(np.array_equal(getattr(mine, name), getattr(its, name)) for name in exact) and all(
+            np.allclose(getattr(mine, name), getattr(its, name), rtol=1e-6, atol=1e-9) for name in near
         )
 
     @property
@@ -616,13 +616,13 @@ def _on_joints(robot: Robot, full: pin.Model, visuals: pin.GeometryModel) -> pin
             shape.parentJoint = index[name]
         elif not shape.parentJoint:
             # What the file has in the world stands, or moves, with the robot's base.
-            moved = robot.free_model.frames[frame]
-            shape.placement = moved.placement * link.placement.inverse() * shape.placement
-            shape.parentJoint = moved.parentJoint
+            joint_frame = robot.free_model.frames[frame]
+            shape.placement = joint_frame.placement * link.placement.inverse() * shape.placement
+            shape.parentJoint = joint_frame.parentJoint
         else:
-            moved = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.FIXED_JOINT)]
-            shape.placement = moved.placement * shape.placement
-            shape.parentJoint = moved.parentJoint
+            joint_frame = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.FIXED_JOINT)]
+            shape.placement = joint_frame.placement * shape.placement
+            shape.parentJoint = joint_frame.parentJoint
         shape.parentFrame = frame
     return visuals
 
@@ -643,12 +643,12 @@ def check_inertia(robot: Robot) -> None:
                 f"the mass matrix of robot {robot.name!r} is not finite at q = {q}: masses, inertias, distances or "
                 "mimic multipliers are beyond the range of floating-point numbers"
             )
-        own = np.diag(M)
-        if not (own > 0.0).all():
-            negative = bool((own < 0.0).any())
-            wrong = own < 0.0 if negative else own == 0.0
+        inertia = np.diag(M)
+        if not (inertia > 0.0).all():
+            negative = bool((inertia < 0.0).any())
+            wrong = inertia < 0.0 if negative else inertia == 0.0
             raise SingularMassMatrix(np.array(robot.joint_names)[wrong].tolist(), q, negative=negative)
-        scale = np.sqrt(own)
+        scale = np.sqrt(inertia)
         values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
         rounding = robot.dof * np.finfo(float).eps
         if values[0] <= rounding:

@@ -251,8 +251,8 @@ def _of_example(name: str, folders: tuple[str, ...], *, mimic: bool) -> Descript
 def _of_downloaded(name: str, folders: tuple[str, ...], arguments: Mapping[str, object], *, mimic: bool) -> Description:
     found = robot_descriptions.download(name)
     folders = (*folders, *found.package_dirs)
-    own = {**found.xacro_args, **arguments}
-    description = _of_file(found.path, name, folders, own, found.packages, mimic=mimic)
+    xacro_args = {**found.xacro_args, **arguments}
+    description = _of_file(found.path, name, folders, xacro_args, found.packages, mimic=mimic)
     if found.srdf is None:
         return description
     postures = _postures(found.srdf, folders, {**found.srdf_args, **arguments}, found.packages)

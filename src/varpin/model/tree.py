@@ -180,10 +180,12 @@ def place_of_frame(model: pin.Model, frame: str, robot: str) -> tuple[int, Float
 
 def coordinate_armature(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...]) -> Floats:
     """Armature (n,) seen by each coordinate: its own and its followers', by the square of their ratios."""
-    own = np.asarray(model.armature, dtype=float)
-    armature = np.array([own[model.joints[joint].idx_v] for joint in coordinates])
+    of_model = np.asarray(model.armature, dtype=float)
+    armature = np.array([of_model[model.joints[joint].idx_v] for joint in coordinates])
     for tie in ties:
-        armature[coordinates.index(tie.leader)] += tie.ratio * tie.ratio * float(own[model.joints[tie.follower].idx_v])
+        armature[coordinates.index(tie.leader)] += (
+            tie.ratio * tie.ratio * float(of_model[model.joints[tie.follower].idx_v])
+        )
     if not (np.isfinite(armature).all() and (armature >= 0.0).all()):
         raise RobotError(f"armature must be finite and >= 0, got {armature}")
     return armature
@@ -269,24 +271,24 @@ def light_parts(
         carries = about @ on_way
         light = carries < LIGHT * np.diag(carries)[:, None]
     carrier = np.full(bodies, -1)  # the light part a body is in
-    loads, rows = [], []
+    joints, rows = [], []
     movers = np.zeros((bodies, dof))
     movers[np.arange(bodies), coordinate] = 1.0
-    moved = on_way.T.astype(float) @ movers  # [j, c]: how many bodies that joint j carries coordinate c moves
-    elsewhere = movers.sum(axis=0) - moved
+    movable = on_way.T.astype(float) @ movers  # [j, c]: how many bodies that joint j carries coordinate c moves
+    elsewhere = movers.sum(axis=0) - movable
     for j in range(bodies):
         if parent[j] < 0:
             continue
         carrier[j] = carrier[parent[j]]
-        if ((moved[j] > 0) & (elsewhere[j] > 0)).any():  # a mimic joint elsewhere moves along
+        if ((movable[j] > 0) & (elsewhere[j] > 0)).any():  # a mimic joint elsewhere moves along
             continue
         above = np.flatnonzero(on_way[j])[:-1]
         if light[above[carrier[above] == carrier[j]], j].any():
             carrier[j] = j
-            loads.append(j)
-            rows.append(moved[j] > 0)
-    shape = (len(loads), dof)
-    return np.array(loads, dtype=np.int64), np.array(rows, dtype=np.int64).reshape(shape)
+            joints.append(j)
+            rows.append(movable[j] > 0)
+    shape = (len(joints), dof)
+    return np.array(joints, dtype=np.int64), np.array(rows, dtype=np.int64).reshape(shape)
 
 
 def periodic_coordinates(coordinate: Integers, prismatic: Integers, ratio: Floats, dof: int) -> Integers:
@@ -356,11 +358,11 @@ def tree_mass_matrix(tree: Tree, q: Floats) -> Floats:
     lever = np.zeros((bodies, 3, 3))  # across a centre of mass
     lever[:, [2, 0, 1], [1, 2, 0]] = center
     lever -= lever.transpose(0, 2, 1)
-    own = tree.inertia[:, [[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
+    about_center = tree.inertia[:, [[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
     m = tree.mass[:, None, None]
     inertia = np.empty((bodies, 6, 6))
     inertia[:, :3, :3], inertia[:, :3, 3:], inertia[:, 3:, :3] = m * np.eye(3), -m * lever, m * lever
-    inertia[:, 3:, 3:] = rotation @ own @ rotation.transpose(0, 2, 1) - m * lever @ lever
+    inertia[:, 3:, 3:] = rotation @ about_center @ rotation.transpose(0, 2, 1) - m * lever @ lever
     for j in range(bodies - 1, -1, -1):
         if tree.parent[j] >= 0:
             inertia[tree.parent[j]] += inertia[j]
@@ -378,10 +380,10 @@ def _turn(angle: float) -> Floats:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def place_on_body(tree: Tree, q: Floats, body: int, place: Floats) -> Floats:
+def place_on_body(tree: Tree, q: Floats, body: int, point_on_body: Floats) -> Floats:
     """Where a place (3,) on a body is in the world (N, 3) [m], at configurations q (N, n)."""
     at = q[:, tree.coordinate] * tree.ratio + tree.offset
-    point = np.broadcast_to(place, (len(q), 3))
+    point = np.broadcast_to(point_on_body, (len(q), 3))
     while body >= 0:
         if tree.prismatic[body]:
             point = point + np.stack([np.zeros(len(q)), np.zeros(len(q)), at[:, body]], axis=1)

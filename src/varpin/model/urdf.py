@@ -351,8 +351,8 @@ def _inertial(link: ET.Element, remarks: list[str]) -> Inertial | None:
         fault = "its <inertial> has no <mass>"
     elif value is None:
         fault = f"its mass is {reprlib.repr(mass.get('value'))}, no finite number"
-    place = np.zeros((2, 3))
-    for row, entry in zip(place, ("xyz", "rpy"), strict=True):
+    xyz_rpy = np.zeros((2, 3))
+    for row, entry in zip(xyz_rpy, ("xyz", "rpy"), strict=True):
         words = ("0 0 0" if origin is None else origin.get(entry, "0 0 0")).split()
         numbers = [number for word in words if (number := _finite(word)) is not None]
         if len(words) == len(numbers) == 3:
@@ -371,10 +371,10 @@ def _inertial(link: ET.Element, remarks: list[str]) -> Inertial | None:
         fault = "no <inertia>" if moments is None else fault
         remarks.append(f"link {name!r}: its <inertial> has {fault}: it is a point mass, as Pinocchio reads it")
     xx, xy, xz, yy, yz, zz = numbers_given or np.zeros(6)
-    turn = pin.rpy.rpyToMatrix(*place[1])
-    own = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    turn = pin.rpy.rpyToMatrix(*xyz_rpy[1])
+    matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     with np.errstate(over="ignore", invalid="ignore"):
-        return Inertial(name, value, place[0], turn @ own @ turn.T)
+        return Inertial(name, value, xyz_rpy[0], turn @ matrix @ turn.T)
 
 
 def _words(moments: ET.Element | None) -> dict[str, str]:
@@ -446,8 +446,8 @@ def _looks(
     for link in root.findall("link"):
         part = ET.SubElement(small, "link", _named(link))
         for k, visual in enumerate(link.findall("visual") if only in (None, link.get("name")) else ()):
-            own = visual.find("material")
-            material = own if own is None or len(own) else shared.get(own.get("name"), own)
+            declared = visual.find("material")
+            material = declared if declared is None or len(declared) else shared.get(declared.get("name"), declared)
             texture = None if material is None else material.find("texture")
             if texture is not None and texture.get("filename"):
                 # Pinocchio's name of the shape.
@@ -456,7 +456,7 @@ def _looks(
             plain.extend(
                 _with_places(child, urdf, package_dirs)
                 for child in visual
-                if child is not own or (material is not None and _has_color(material))
+                if child is not declared or (material is not None and _has_color(material))
             )
     small.extend(root.findall("joint"))
     return small, textures
@@ -466,11 +466,11 @@ def _with_places(part: ET.Element, urdf: Urdf, package_dirs: Sequence[str]) -> E
     """A part of a visual, a mesh in it by its absolute path."""
     if part.find("mesh") is None:
         return part
-    placed = copy.deepcopy(part)
-    for mesh in placed.iterfind("mesh"):
+    resolved = copy.deepcopy(part)
+    for mesh in resolved.iterfind("mesh"):
         file = mesh.get("filename", "")
         mesh.set("filename", str(_located(file, urdf.path, package_dirs) or file))
-    return placed
+    return resolved
 
 
 def _has_color(material: ET.Element) -> bool:
@@ -484,13 +484,13 @@ def _located(name: str, urdf: Path, package_dirs: Sequence[str]) -> Path | None:
     """The file that a URDF names; None if it is not there."""
     scheme, separator, rest = name.partition("://")
     if not separator:
-        places = [urdf.parent / name, Path(name)]
+        paths = [urdf.parent / name, Path(name)]
     elif scheme == "file":
-        places = [Path(rest)]
+        paths = [Path(rest)]
     else:
         # Gazebo writes model:// for package://.
-        places = [Path(folder, rest) for folder in _places(package_dirs)] if scheme in ("package", "model") else []
-    return next((place.absolute() for place in places if place.is_file()), None)
+        paths = [Path(folder, rest) for folder in _places(package_dirs)] if scheme in ("package", "model") else []
+    return next((path.absolute() for path in paths if path.is_file()), None)
 
 
 def _places(package_dirs: Sequence[str]) -> list[str]:

@@ -24,7 +24,7 @@ from varpin.model.urdf import Urdf, read_urdf
 from varpin.show.inspection_tables import parts_of
 from varpin.support.checks import JointValues, joint_array
 from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, folded, said, table
+from varpin.support.markup import facts, folded, table, warning_count
 from varpin.support.tables import plain
 
 Floats = NDArray[np.float64]
@@ -147,9 +147,8 @@ class RobotReport(Frozen):
     warnings: tuple[str, ...]
 
     def __repr__(self) -> str:
-        return (
-            f"RobotReport({self.robot.name}: {len(self.joints)} joints, {len(self.links)} links{said(self.warnings)})"
-        )
+        warned = warning_count(self.warnings)
+        return f"RobotReport({self.robot.name}: {len(self.joints)} joints, {len(self.links)} links{warned})"
 
     def __str__(self) -> str:
         return plain(parts_of(self))
@@ -474,11 +473,11 @@ def _matrix_warnings(robot: Robot, scaled: float) -> Iterator[str]:
 
 def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | None) -> Iterator[str]:
     bounded = [joint for joint in joints if joint.kind in ("revolute", "prismatic")]
-    moved = [joint for joint in joints if joint.kind != "mimic"]
+    driven = [joint for joint in joints if joint.kind != "mimic"]
     missing = {
         "position": [joint.name for joint in bounded if np.isinf(joint.lower) or np.isinf(joint.upper)],
-        "velocity": [joint.name for joint in moved if np.isinf(joint.velocity) or joint.velocity == 0.0],
-        "effort": [joint.name for joint in moved if np.isinf(joint.effort) or joint.effort == 0.0],
+        "velocity": [joint.name for joint in driven if np.isinf(joint.velocity) or joint.velocity == 0.0],
+        "effort": [joint.name for joint in driven if np.isinf(joint.effort) or joint.effort == 0.0],
     }
     for what, names in missing.items():
         if names:

@@ -98,9 +98,9 @@ def plot_controls(
     if labels is None and controls == len(trajectory.joint_names) and not any(served):
         names, unit = _labels(trajectory.joint_names, ("N m", "N"), slides)
     elif controls and all(served):
-        what, own = "commanded position", np.array([joint for joint in joints if joint is not None])
-        plain = [trajectory.joint_names[joint] for joint in own] if labels is None else labels
-        names, unit = _labels(plain, ("rad", "m"), None if slides is None else slides[own])
+        what, commanded = "commanded position", np.array([joint for joint in joints if joint is not None])
+        plain = [trajectory.joint_names[joint] for joint in commanded] if labels is None else labels
+        names, unit = _labels(plain, ("rad", "m"), None if slides is None else slides[commanded])
     else:
         every = labels is None and controls == len(trajectory.joint_names)
         plain = trajectory.joint_names if every else (labels or [f"u{i + 1}" for i in range(controls)])
@@ -309,8 +309,8 @@ def _plot_trade(
     figure, axes = _axes(axes)
     names = list(dict.fromkeys(name for name, _, _ in points))
     for name, style in zip(names, _styles(len(names)), strict=True):
-        own = [(seconds, value) for label, seconds, value in points if label == name]
-        axes.plot(*zip(*own, strict=True), label=name, marker="o", markersize=4, **style)
+        curve = [(seconds, value) for label, seconds, value in points if label == name]
+        axes.plot(*zip(*curve, strict=True), label=name, marker="o", markersize=4, **style)
     axes.plot(
         *zip(*front, strict=True),
         label=front_name,

@@ -74,7 +74,7 @@ class MotionError:
 
 
 @dataclass(frozen=True)
-class Place:
+class Window:
     """A node of a motion from which on it is judged, and how far.
 
     Attributes:
@@ -92,8 +92,8 @@ class Place:
     varied: Floats
 
     @classmethod
-    def at(cls, scene: Scene, trajectory: Trajectory, step: int) -> Place:
-        """The place at a node."""
+    def at(cls, scene: Scene, trajectory: Trajectory, step: int) -> Window:
+        """The window that begins at a node."""
         ahead = slice(step, step + HORIZON + 1)
         q, v = trajectory.q[ahead], trajectory.v[ahead]
         span, whole = _periods(scene, q, v)
@@ -146,23 +146,23 @@ class Place:
         return MotionError(self.step, joint, float(position[joint]), float(velocity[joint]), float(motion[joint]))
 
 
-def grown(plain: Floats, moved: Floats, disturbance: float) -> int:
+def grown(plain: Floats, disturbed: Floats, disturbance: float) -> int:
     """Steps, one at least, until two motions' q (K + 1, n), apart by a disturbance at first, are apart out of hand."""
     with np.errstate(over="ignore", invalid="ignore"):
-        apart = ~(np.abs(moved - plain).max(axis=1) <= PREDICTABLE * disturbance)
+        apart = ~(np.abs(disturbed - plain).max(axis=1) <= PREDICTABLE * disturbance)
     return max(1, int(apart.argmax())) if apart.any() else len(plain) - 1
 
 
 def disturbance(trajectory: Trajectory, step: int, count: int) -> tuple[float, float]:
     """What is added to q and v at a node to see whether the motion of the steps after it can be told."""
     nodes = trajectory.q[step : step + count + 1]
-    moved = DISTURBANCE * max(1.0, float(np.abs(trajectory.q[step]).max()))
+    shift = DISTURBANCE * max(1.0, float(np.abs(trajectory.q[step]).max()))
     # In v, by what the same part of the motion has.
-    way = max(float(np.ptp(nodes, axis=0).max()), moved)
-    return moved, DISTURBANCE * float(np.abs(trajectory.v[step : step + count + 1]).max()) / max(1.0, way)
+    way = max(float(np.ptp(nodes, axis=0).max()), shift)
+    return shift, DISTURBANCE * float(np.abs(trajectory.v[step : step + count + 1]).max()) / max(1.0, way)
 
 
-def places(scene: Scene, trajectory: Trajectory) -> Integers:
+def examined_nodes(scene: Scene, trajectory: Trajectory) -> Integers:
     """The nodes that a motion is looked at from (K,).
 
     The start, the places where velocities change most, some spread over the motion, and the steps with most of the
@@ -171,11 +171,11 @@ def places(scene: Scene, trajectory: Trajectory) -> Integers:
     # Where a joint goes to and fro within the first steps, what comes after is to be looked at, too.
     v, steps = trajectory.v, trajectory.steps
     seen = np.zeros(steps, dtype=bool)
-    seen[: min(FIRST, int(Place.at(scene, trajectory, 0).judged.min()))] = True
+    seen[: min(FIRST, int(Window.at(scene, trajectory, 0).judged.min()))] = True
     found = [0, *blows(v, WINDOW, seen)]
-    for place in np.linspace(0, max(0, steps - WINDOW), _SPREAD + 1)[1:].astype(np.int64):
-        if not seen[place : place + WINDOW].all():
-            found.append(int(place))
+    for node in np.linspace(0, max(0, steps - WINDOW), _SPREAD + 1)[1:].astype(np.int64):
+        if not seen[node : node + WINDOW].all():
+            found.append(int(node))
     # Single steps that are worse than others, as a whole one is among steps in parts.
     jumps = np.abs(np.diff(trajectory.statistics.energy_defect, prepend=0.0))
     found += np.argsort(-np.nan_to_num(jumps, nan=np.inf), kind="stable")[:_JUMPS].tolist()
@@ -288,11 +288,11 @@ def _units(
     end = step + span + 1
     # Joints are alike in short motions, which no joint goes to and fro in.
     for first, last in set(zip(begin.tolist(), end.tolist(), strict=True)):
-        own = (begin == first) & (end == last)
-        q, v = trajectory.q[:last, own], trajectory.v[:last, own]
-        way[own] = np.maximum(np.ptp(q[first:], axis=0), _REST * np.ptp(q, axis=0))
-        speed[own] = np.maximum(np.abs(v[first:]).max(axis=0), _REST * np.abs(v).max(axis=0))
-        change[own] = changed(v[first:])
+        alike = (begin == first) & (end == last)
+        q, v = trajectory.q[:last, alike], trajectory.v[:last, alike]
+        way[alike] = np.maximum(np.ptp(q[first:], axis=0), _REST * np.ptp(q, axis=0))
+        speed[alike] = np.maximum(np.abs(v[first:]).max(axis=0), _REST * np.abs(v).max(axis=0))
+        change[alike] = changed(v[first:])
     way, speed = noticed(scene, way, speed, light_speed(inertia, change), trajectory.dt * span.astype(np.float64))
     tiny = np.finfo(np.float64).tiny
     return np.maximum(way, tiny), np.maximum(speed, tiny)

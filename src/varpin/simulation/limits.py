@@ -80,6 +80,6 @@ def _efforts(scene: Scene, trajectory: Trajectory) -> Floats:
     forces = drive_forces(scene.elements, q, v, trajectory.u @ scene.actuation.T)
     # Where controls change within a step, the largest of its stages counts.
     for stage in range(trajectory.u_stages.shape[1]):
-        own = drive_forces(scene.elements, q, v, trajectory.u_stages[:, stage] @ scene.actuation.T)
-        forces = np.where(np.abs(own) > np.abs(forces), own, forces)
+        at_stage = drive_forces(scene.elements, q, v, trajectory.u_stages[:, stage] @ scene.actuation.T)
+        forces = np.where(np.abs(at_stage) > np.abs(forces), at_stage, forces)
     return forces

@@ -255,10 +255,10 @@ def _clips(scene: Scene, x: Floats, u: Floats, side: NDArray[np.int64], k: int, 
 
     Fewer ways than twice the unknowns of a law say nothing: some law would give them by chance (Cover 1965).
     """
-    own = np.tile(scene.actuation[:, k] != 0.0, 2)
+    driven = np.tile(scene.actuation[:, k] != 0.0, 2)
     return any(
         ways >= 2 * (columns.sum() + 1) and _clipped_law(x[:, columns], u[:, k], side[:, k])
-        for columns in (own, np.ones_like(own))
+        for columns in (driven, np.ones_like(driven))
     )
 
 
@@ -408,14 +408,14 @@ def _by_theory(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Findi
     # Away from an equilibrium only what a slow motion cannot be taken for.
     if not rests and (np.abs(np.angle(multiplier)) < _TURNS or growth < _FAST):
         return ()
-    place = "its equilibrium q" if rests else "q"
+    where = "its equilibrium q" if rests else "q"
     stable = next((period / 2**k for k in range(1, 8) if np.abs(loop.multiplier(period / 2**k)) < 1.0), None)
     advice = "take lower gains" if stable is None else f"with a period of {stable:g} s or lower gains it is stable"
     return (
         Finding(
             KIND,
             f"the control loop is unstable at its period of {period:g} s: each multiplies deviations by {growth:.4g} "
-            f"(linearized at {place} = [{', '.join(f'{value:.4g}' for value in loop.q)}]); {advice}",
+            f"(linearized at {where} = [{', '.join(f'{value:.4g}' for value in loop.q)}]); {advice}",
         ),
     )
 
@@ -469,8 +469,8 @@ def fitted_law(scene: Scene, x: Floats, u: Floats, spare: int = 4) -> Law | None
     near = x[int(np.argmin(change)), :n]
     nodes = max(_NODES, 2 * n)
     if len(x) > 2 * nodes:
-        moved = np.argpartition(change, -nodes)[-nodes:]
-        chosen = np.unique(np.concatenate([moved, np.linspace(0, len(x) - 1, nodes).astype(np.int64)]))
+        largest = np.argpartition(change, -nodes)[-nodes:]
+        chosen = np.unique(np.concatenate([largest, np.linspace(0, len(x) - 1, nodes).astype(np.int64)]))
         x, u, weight = x[chosen], u[chosen], weight[chosen]
     unit = _spread(x, weight)
     gains = _affine(x, u, weight, spare)

@@ -95,7 +95,7 @@ class Method:
         self.doubted = False
         self.open = True
         self._next = first
-        self._idle, self._shown = 0, False
+        self._idle, self._order_seen = 0, False
 
     @property
     def last(self) -> Sample:
@@ -141,10 +141,10 @@ class Method:
         self.errors, self.bounded = np.full(len(whole), np.nan), np.ones(len(whole), dtype=bool)
         if not whole:
             return
-        own = self.own_limit()
-        if own is not None:
-            self.errors[:] = [distance(sample.q, own[0]) for sample in whole]
-            self.errors[-1] = own[1]
+        found = self.own_limit()
+        if found is not None:
+            self.errors[:] = [distance(sample.q, found[0]) for sample in whole]
+            self.errors[-1] = found[1]
             self.bounded[:] = False
         if limit is not None:
             away = np.array([distance(sample.q, limit) for sample in whole])
@@ -170,8 +170,8 @@ class Method:
 
     def note_stagnation(self) -> None:
         """Close the method where halving its step has ceased to help after it had shown its order."""
-        self._shown = self._shown or (self.regular and self.errors[-1] < _SMALL)
-        known = self._shown and len(self.errors) > 1 and not self.bounded[-1]
+        self._order_seen = self._order_seen or (self.regular and self.errors[-1] < _SMALL)
+        known = self._order_seen and len(self.errors) > 1 and not self.bounded[-1]
         slow = known and not self.errors[-1] < 0.7 * self.errors[-2]
         self._idle = self._idle + 1 if slow else 0
         if self._idle >= _STUCK:
@@ -275,13 +275,13 @@ class Search:
 
     def limits(self) -> list[tuple[Floats, float]]:
         """Motions that methods point to, each with its uncertainty [rad or m]."""
-        return [own for own in (method.own_limit() for method in self.methods) if own is not None]
+        return [limit for limit in (method.own_limit() for method in self.methods) if limit is not None]
 
     def judge(self) -> None:
         """Errors of all runs, by the best end that is known."""
         limits = self.limits()
         if limits:
-            self.limit, self.uncertainty = min(limits, key=lambda own: own[1])
+            self.limit, self.uncertainty = min(limits, key=lambda limit: limit[1])
             self.floor = ROUNDING * max(1.0, float(np.abs(self.limit).max()))
         for method in self.methods:
             method.judge(self.limit, self.uncertainty)

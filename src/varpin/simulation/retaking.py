@@ -77,11 +77,11 @@ class Again:
         step: int,
         count: int,
         parts: int,
-        moved: tuple[float, float] = (0.0, 0.0),
+        shift: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         self.q, self.v = np.full((2, count + 1, scene.robot.dof), np.nan)
         # ``moved`` is added to q and v at first.
-        self.q[0], self.v[0] = trajectory.q[step] + moved[0], trajectory.v[step] + moved[1]
+        self.q[0], self.v[0] = trajectory.q[step] + shift[0], trajectory.v[step] + shift[1]
         self.done, self.ended = 0, count == 0
         self._scene, self._method, self._trajectory, self._step = scene, method, trajectory, step
         self._count, self._parts, self._times = count, parts, times
@@ -94,21 +94,21 @@ class Again:
         """Take some more steps; left out, as many as there are already."""
         scene, trajectory, method, parts, begin = self._scene, self._trajectory, self._method, self._parts, self.done
         end = min(self._count, begin + (max(begin, _FIRST) if steps is None else steps))
-        own = slice(self._step + begin, self._step + end)
+        taken = slice(self._step + begin, self._step + end)
         drawn = scene.silence
         if trajectory.dw.any() and scene.noise.diffusion is not None:
             drawn = np.zeros((1, (end - begin) * parts, trajectory.dw.shape[1]))
             if isinstance(method, ExplicitEuler):
                 # Its kicks come after the step.
-                drawn[0, parts - 1 :: parts] = trajectory.dw[own]
+                drawn[0, parts - 1 :: parts] = trajectory.dw[taken]
             else:
-                drawn[0, ::parts] += method.left * trajectory.dw[own]
-                drawn[0, parts - 1 :: parts] += (1.0 - method.left) * trajectory.dw[own]
+                drawn[0, ::parts] += method.left * trajectory.dw[taken]
+                drawn[0, parts - 1 :: parts] += (1.0 - method.left) * trajectory.dw[taken]
         # Impulses of noise depend on the controls, too.
-        commands = open_loop(np.repeat(trajectory.u[own], parts, axis=0))
+        commands = open_loop(np.repeat(trajectory.u[taken], parts, axis=0))
         if trajectory.u_stages.shape[1]:
             at = method.stage_times
-            commands = changing(in_parts(trajectory.u_stages[own], self._times, parts, at), at)
+            commands = changing(in_parts(trajectory.u_stages[taken], self._times, parts, at), at)
         no_drift = np.zeros((0, 0, scene.robot.dof))
         (segment,) = method.rollout_compiled(scene, self._state, commands, drawn, no_drift, trajectory.dt / parts)
         done = len(segment.q) // parts

@@ -487,11 +487,11 @@ def _on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Float
         )
     q = assemble(scene, q0)
     v = along_constraints(scene, q, v0)
-    moved, turned = float(np.abs(q - q0).max()), float(np.abs(v - v0).max())
+    shift, turned = float(np.abs(q - q0).max()), float(np.abs(v - v0).max())
     words = []
-    if moved > _UNSAID:
+    if shift > _UNSAID:
         words.append(
-            f"q0 was moved by up to {moved:.3g} rad or m onto the constraints (it missed {label} by {miss:.3g})"
+            f"q0 was moved by up to {shift:.3g} rad or m onto the constraints (it missed {label} by {miss:.3g})"
         )
     if turned > _UNSAID * max(1.0, float(np.abs(v0).max())):
         words.append(f"v0 was changed by up to {turned:.3g} rad/s or m/s, to what the constraints allow")
@@ -582,7 +582,7 @@ def _chosen(
     if earlier is not None:
         known = integrator_of(earlier.integrator)
         # The user's own guard and tolerance, where the integrator is given.
-        same = known if integrator is None else next((own for own in members if own.same_map(known)), None)
+        same = known if integrator is None else next((member for member in members if member.same_map(known)), None)
         if same is not None:
             first = same, earlier.dt
     choice = choose(motion, members, wish, first)
@@ -771,13 +771,13 @@ def _on_lines(u: Floats, times: Times) -> Commands:
 
 def _sampled(controls: OpenLoop, record: _Record, steps: int) -> Commands:
     """Controls of the next steps, or of those before the first for which the function fails."""
-    own = controls, record.scene, record.integrator, record.dt
+    inputs = controls, record.scene, record.integrator, record.dt
     try:
-        return _evaluated(*own, range(record.steps, record.steps + steps), record)
+        return _evaluated(*inputs, range(record.steps, record.steps + steps), record)
     except ControlError as error:
         if error.step == record.steps:
             raise
-        return _evaluated(*own, range(record.steps, error.step), record)
+        return _evaluated(*inputs, range(record.steps, error.step), record)
 
 
 def _evaluated(
@@ -792,9 +792,9 @@ def _evaluated(
     times = integrator.stage_times
     found = np.empty((len(steps), max(len(times), 1), scene.controls))
     for k, step in enumerate(steps):
-        for i, place in enumerate(times or (0.5,)):
-            time = (step + place) * dt
-            if k > 0 and i == 0 and place == 0.0 and times[-1] == 1.0:
+        for i, fraction in enumerate(times or (0.5,)):
+            time = (step + fraction) * dt
+            if k > 0 and i == 0 and fraction == 0.0 and times[-1] == 1.0:
                 found[k, 0] = found[k - 1, -1]
                 continue
             found[k, i] = _called("OpenLoop: f(t)", partial(controls.f, time), scene, step, time, record)

@@ -31,13 +31,13 @@ from varpin.simulation.accuracy import (
     WRONG_MOTION,
     WRONG_VELOCITY,
     MotionError,
-    Place,
+    Window,
     between,
     blows,
     disturbance,
+    examined_nodes,
     grown,
     inertias,
-    places,
 )
 from varpin.simulation.chatter import RUN, Alternation, alternation
 from varpin.simulation.limits import left as limits_left
@@ -51,7 +51,7 @@ Integers = NDArray[np.int64]
 CAUTION = 0.95
 # Estimates from fewer steps than a period has are spoken of from this part of what is wrong on.
 _UNSETTLED = 0.7
-# An error below which nothing more is asked of a place, and from which on more places are looked at, in units of what
+# An error below which nothing more is asked of a window, and from which on more places are looked at, in units of what
 # is wrong: from others than those looked at first it may be three times as large.
 _SMALL, _NEAR = 0.2, 0.35
 # How far off a motion is of which no more is needed, in units of its way. Ways that are none [rad or m].
@@ -121,15 +121,15 @@ def alternating(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
 
 def _does_so_in_smaller_steps(scene: Scene, integrator: Integrator, trajectory: Trajectory, found: Alternation) -> bool:
     """Whether a stretch of alternating velocities alternates alike when its first steps are halved."""
-    place, count = found.first, RUN + 1
-    parts = 2 * int(np.maximum(trajectory.statistics.substeps[place : place + count], 1).max())
+    first, count = found.first, RUN + 1
+    parts = 2 * int(np.maximum(trajectory.statistics.substeps[first : first + count], 1).max())
     if isinstance(integrator, Reference) or count * parts > max(4 * FIRST, int(trajectory.statistics.substeps.sum())):
         return False
-    again = taken_again(scene, integrator, trajectory, integrator.stage_times, place, count, parts)
+    again = taken_again(scene, integrator, trajectory, integrator.stage_times, first, count, parts)
     if again is None:
         return False
-    own = np.diff(trajectory.v[place : place + count + 1, found.joint], n=2)
-    return bool(np.abs(np.diff(again[1][:, found.joint], n=2) - own).sum() <= 0.5 * np.abs(own).sum())
+    bends = np.diff(trajectory.v[first : first + count + 1, found.joint], n=2)
+    return bool(np.abs(np.diff(again[1][:, found.joint], n=2) - bends).sum() <= 0.5 * np.abs(bends).sum())
 
 
 def with_warnings(trajectory: Trajectory, found: Iterable[Finding]) -> Trajectory:
@@ -272,23 +272,23 @@ def _balances(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> l
     _, turned, worked = _turnover(scene, trajectory)
     some = np.unique(np.linspace(1, trajectory.steps, _NODES).astype(np.int64))
     for group in range(groups):
-        own = scene.group == group
-        scale = float(turned[own].sum() + worked[own].sum())
-        found.append((some, _defects_of(scene, integrator, trajectory, own)[some], scale))
+        joints = scene.group == group
+        scale = float(turned[joints].sum() + worked[joints].sum())
+        found.append((some, _defects_of(scene, integrator, trajectory, joints)[some], scale))
     return found
 
 
-def _defects_of(scene: Scene, integrator: Integrator, trajectory: Trajectory, own: NDArray[np.bool_]) -> Floats:
+def _defects_of(scene: Scene, integrator: Integrator, trajectory: Trajectory, joints: NDArray[np.bool_]) -> Floats:
     """What the energy of some joints is off by (N + 1,) [J]; they move by themselves. Zero but at some nodes."""
     kicked, given = _kicks(scene, trajectory)
     work, heat = _works(scene, integrator, trajectory, kicked)
-    gained = np.append(0.0, np.cumsum((work - heat + given)[:, own].sum(axis=1)))
-    kinetic = 0.5 * (trajectory.p * trajectory.v)[:, own].sum(axis=1)
+    gained = np.append(0.0, np.cumsum((work - heat + given)[:, joints].sum(axis=1)))
+    kinetic = 0.5 * (trajectory.p * trajectory.v)[:, joints].sum(axis=1)
     off = np.zeros(trajectory.steps + 1)
     still, rest = np.zeros(scene.robot.dof), trajectory.q[0]
     first = lagrangian_jet(scene, rest, still).L
     for node in np.unique(np.linspace(1, trajectory.steps, _NODES).astype(np.int64)):
-        potential = first - lagrangian_jet(scene, np.where(own, trajectory.q[node], rest), still).L
+        potential = first - lagrangian_jet(scene, np.where(joints, trajectory.q[node], rest), still).L
         off[node] = kinetic[node] - kinetic[0] + potential - gained[node]
     return off
 
@@ -464,10 +464,10 @@ def _windows_under(
     times: int,
 ) -> tuple[Floats, Floats] | None:
     """Windows of a motion whose controls change within steps, by another method, or in steps of twice the length."""
-    at, own, found = other.stage_times, integrator.stage_times, []
+    at, mine, found = other.stage_times, integrator.stage_times, []
     for begin in begins:
         values = trajectory.u_stages[begin : begin + length]
-        commands = changing(in_parts(values, own, 1, at) if times == 1 else in_pairs(values, own, at), at)
+        commands = changing(in_parts(values, mine, 1, at) if times == 1 else in_pairs(values, mine, at), at)
         node = slice(begin, begin + 1)
         drift = np.zeros((0, 0, scene.robot.dof))
         again = other.motions(scene, trajectory.q[node], trajectory.v[node], commands, drift, times * trajectory.dt)
@@ -494,7 +494,7 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     if not fastest > _STILL:
         return None
     other = finer(integrator, trajectory, damped=bool(_fast_damping(scene, trajectory)), pulled=pulled)
-    first = places(scene, trajectory)
+    first = examined_nodes(scene, trajectory)
     inertia = inertias(scene, trajectory.q[first])
     # Steps whose error is known to be small.
     small = np.zeros(trajectory.steps, dtype=np.bool_)
@@ -506,13 +506,13 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
         for step in chosen.tolist():
             if seen[step] or (chosen is first and small[step:].all()):
                 continue
-            place = Place.at(scene, trajectory, step)
-            if chosen is first and small[step : step + int(place.judged.max())].all():
+            window = Window.at(scene, trajectory, step)
+            if chosen is first and small[step : step + int(window.judged.max())].all():
                 continue
-            look = _look(scene, integrator, trajectory, place, inertia, other, left)
+            look = _look(scene, integrator, trajectory, window, inertia, other, left)
             if look is None:
                 continue
-            near = min(_NEAR_BY, int(place.judged.max()) // 8)
+            near = min(_NEAR_BY, int(window.judged.max()) // 8)
             seen[max(0, step - near) : step + near + 1] = True
             left -= look.work
             if worst is None or look.error.worst > worst.worst:
@@ -533,7 +533,7 @@ def spoken_of(error: MotionError) -> bool:
 
 @dataclass(frozen=True)
 class _Look:
-    """An estimate of the error at one place.
+    """An estimate of the error at one window.
 
     Attributes:
         error: The error.
@@ -550,27 +550,27 @@ def _look(
     scene: Scene,
     integrator: Integrator,
     trajectory: Trajectory,
-    place: Place,
+    window: Window,
     inertia: Floats,
     other: Finer,
     most: int,
 ) -> _Look | None:
-    """The error at one place, by so many steps at most; None where none can be told."""
+    """The error at one window, by so many steps at most; None where none can be told."""
     times = integrator.stage_times
-    judged = int(place.judged.max())
-    taken = np.maximum(trajectory.statistics.substeps[place.step : place.step + judged], 1)
+    judged = int(window.judged.max())
+    taken = np.maximum(trajectory.statistics.substeps[window.step : window.step + judged], 1)
     # Where guards took steps in parts, they are as short as these.
     parts = other.parts * int(2 ** np.ceil(np.log2(taken.mean())))
     # Twice, for whether that motion can be told takes as many steps again.
     count = min(judged, max(1, most // (2 * parts)))
-    q, v = (values[place.step : place.step + count + 1] for values in (trajectory.q, trajectory.v))
+    q, v = (values[window.step : window.step + count + 1] for values in (trajectory.q, trajectory.v))
     if scene.noise.diffusion is None and trajectory.dw.any():
         # Kicks that only Python knows are left out of both.
-        plain = taken_again(scene, integrator, trajectory, times, place.step, count, parts // other.parts)
+        plain = taken_again(scene, integrator, trajectory, times, window.step, count, parts // other.parts)
         if plain is None:
             return None
         q, v = plain
-    again = Again(scene, other.method, trajectory, times, place.step, count, parts)
+    again = Again(scene, other.method, trajectory, times, window.step, count, parts)
     far = _FAR * float(np.ptp(q, axis=0).max())
     # What is far off is wrong or cannot be told, and no more is needed of it.
     while not again.ended and np.abs(again.q[again.done] - q[again.done]).max() <= far:
@@ -582,18 +582,18 @@ def _look(
         off = [np.abs(a - b) / (1.0 - other.left) for a, b in ((q, again.q), (v, again.v))]
     # A part of a period stands for the whole only if no steps are left for the rest.
     cut = known < count
-    error = place.error(scene, trajectory, inertia, (off[0][: known + 1], off[1][: known + 1]), cut=cut)
+    error = window.error(scene, trajectory, inertia, (off[0][: known + 1], off[1][: known + 1]), cut=cut)
     if not error.worst < _SMALL:
-        moved = disturbance(trajectory, place.step, known)
-        beside = Again(scene, other.method, trajectory, times, place.step, known, parts, moved)
+        shift = disturbance(trajectory, window.step, known)
+        beside = Again(scene, other.method, trajectory, times, window.step, known, parts, shift)
         told = 0
         while not beside.ended and told == beside.done:
             beside.go_on()
-            told = grown(again.q[: beside.done + 1], beside.q[: beside.done + 1], moved[0])
+            told = grown(again.q[: beside.done + 1], beside.q[: beside.done + 1], shift[0])
         work += beside.done * parts
         if told < known:
             known, cut = max(1, told), True
-            error = place.error(scene, trajectory, inertia, (off[0][: known + 1], off[1][: known + 1]), cut=True)
+            error = window.error(scene, trajectory, inertia, (off[0][: known + 1], off[1][: known + 1]), cut=True)
     if max(float(np.ptp(x[: known + 1], axis=0).max()) for x in (q, again.q)) < _SHORTEST:
         return None
     return _Look(replace(error, settled=cut or count == judged), known, work)

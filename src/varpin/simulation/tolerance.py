@@ -100,9 +100,9 @@ class _Runs:
             nodes = done + 1 + np.arange(len(last.q))
             kept = nodes % stride == 0
             q[nodes[kept] // stride - 1] = last.q[kept]
-            own = last.statistics
-            evaluations += int(own.sweeps.sum() + own.jets.sum())
-            pure = last.failure is None and own.split_steps == 0
+            statistics = last.statistics
+            evaluations += int(statistics.sweeps.sum() + statistics.jets.sum())
+            pure = last.failure is None and statistics.split_steps == 0
             done += steps_of(block)
         self.steps += done
         self.evaluations += evaluations
@@ -119,7 +119,7 @@ class _Wish(Search):
 
     def limits(self) -> list[tuple[Floats, float]]:
         """See :meth:`Search.limits`; where no method shows its order, what differences that shrink point to."""
-        return super().limits() or [own for own in map(_rough_limit, self.methods) if own is not None]
+        return super().limits() or [limit for limit in map(_rough_limit, self.methods) if limit is not None]
 
     def checked(self, choice: Found, tolerance: float) -> Found:
         """See :meth:`Search.checked`; errors at all nodes."""

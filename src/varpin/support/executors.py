@@ -36,8 +36,8 @@ def executing(executor: Executor | None, workers: int | None) -> Iterator[Execut
     if executor is None:
         with ThreadPoolExecutor(
             count("workers", (os.cpu_count() or 1) if workers is None else workers, least=1)
-        ) as own:
-            yield own
+        ) as pool:
+            yield pool
         return
     if workers is not None:
         raise InputError("give workers, a number of threads, or executor, which has workers of its own; not both")
@@ -102,7 +102,7 @@ def in_order(
         Exception: Whatever ``function`` raises.
     """
     work: _Guarded[Task, Result] = _Guarded(function)
-    own: Executor | None = None
+    current: Executor | None = None
     waiting: deque[tuple[Task, Future[Result | _Raised]]] = deque()
     left, losses = iter(tasks), 0
 
@@ -115,15 +115,15 @@ def in_order(
 
     def renew(error: BrokenExecutor) -> None:
         """Go on in a new pool with all that the broken one has not done."""
-        nonlocal executor, own, losses
+        nonlocal executor, current, losses
         executor, losses = _renewed(executor, error), _counted(losses, error)
-        if own is not None:
-            own.shutdown(wait=False, cancel_futures=True)
-        own = executor
+        if current is not None:
+            current.shutdown(wait=False, cancel_futures=True)
+        current = executor
         try:
-            for place, (task, future) in enumerate(waiting):
+            for index, (task, future) in enumerate(waiting):
                 if not future.done() or future.cancelled() or future.exception() is not None:
-                    waiting[place] = task, executor.submit(work, task)
+                    waiting[index] = task, executor.submit(work, task)
         except BrokenExecutor as again:
             renew(again)
 
@@ -144,7 +144,7 @@ def in_order(
             except (pickle.PicklingError, AttributeError, TypeError) as error:
                 raise InputError(
                     f"what the workers need cannot be sent to them: {error}; functions must be importable there, "
-                    "defined at the top of a module and not in place"
+                    "defined at the top of a module and not in index"
                 ) from error
             except BrokenExecutor as error:
                 renew(error)
@@ -161,8 +161,8 @@ def in_order(
     finally:
         for _, future in waiting:
             future.cancel()
-        if own is not None:
-            own.shutdown(wait=False, cancel_futures=True)
+        if current is not None:
+            current.shutdown(wait=False, cancel_futures=True)
 
 
 def _counted(losses: int, error: Exception) -> int:

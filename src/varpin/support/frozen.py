@@ -31,9 +31,13 @@ class Frozen:
             for name, value in vars(kind).items()
             if isinstance(value, cached_property)
         }
-        own = {name: value for name, value in vars(self).items() if name not in cached}
-        views = {name: dict(value) for name, value in own.items() if isinstance(value, MappingProxyType)}
-        return {"values": own | views, "views": tuple(views), "writable": {name: _writable(own[name]) for name in own}}
+        values = {name: value for name, value in vars(self).items() if name not in cached}
+        views = {name: dict(value) for name, value in values.items() if isinstance(value, MappingProxyType)}
+        return {
+            "values": values | views,
+            "views": tuple(views),
+            "writable": {name: _writable(values[name]) for name in values},
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         values = {name: _restored(value, state["writable"][name]) for name, value in state["values"].items()}

@@ -62,7 +62,7 @@ def _text(value: object) -> str:
     return html.escape(f"{value:.4g}" if isinstance(value, float) else str(value))
 
 
-def said(warnings: Sequence[str]) -> str:
+def warning_count(warnings: Sequence[str]) -> str:
     """How many warnings there are, for one line; nothing if there are none."""
     return f", {len(warnings)} warning{'s' * (len(warnings) > 1)}" if warnings else ""
 

@@ -96,11 +96,11 @@ class BackwardPass {
             Cz[c] = c < x ? 0.0 : costate[c];
         }
         for (int i = 0; i < x; ++i) {
-            const double* __restrict own = step.J[i];
+            const double* __restrict row_of_J = step.J[i];
             double* __restrict magnitude = terms.data();
-            for (int c = 0; c < size; ++c) magnitude[c] += std::abs(own[c]) * scale[i];
-            add_row(gradient[i], own, Qz);
-            add_row(costate[i], own, Cz);
+            for (int c = 0; c < size; ++c) magnitude[c] += std::abs(row_of_J[c]) * scale[i];
+            add_row(gradient[i], row_of_J, Qz);
+            add_row(costate[i], row_of_J, Cz);
         }
         for (int c = x; c < size; ++c) terms[c] = std::sqrt(terms[c] * terms[c] + scale[c] * scale[c]);
         Q.clear();
@@ -178,7 +178,7 @@ class BackwardPass {
         mirror(S, x);
         for (int i = 0; i < x; ++i) std::copy_n(S[i], x, spread + i * x);
         for (int w = 0; w < steps.processes; ++w) {
-            const bool depends = step.load_process(steps, s, w);
+            const bool depends = step.read_process(steps, s, w);
             std::fill_n(row.begin(), x, 0.0);
             for (int i = 0; i < x; ++i) add_row(step.jump[i], S[i], row, x);
             for (int i = 0; i < x; ++i) found.noise += 0.5 * step.jump[i] * row[i];
@@ -284,10 +284,10 @@ class BackwardPass {
         for (int i = 0; i < m; ++i) largest = std::max(largest, std::abs(Q[x + i][x + i]));
         for (int i = 0; i < m; ++i) {
             std::copy_n(Q[x + i] + x, m, &Quu[i * m]);
-            double& own = Quu[i * m + i];
-            own += regularization * std::abs(own);
-            if (largest > 0.0 && own == 0.0 && is_idle(i)) own = largest;
-            if (!(own > 0.0)) return false;
+            double& pivot = Quu[i * m + i];
+            pivot += regularization * std::abs(pivot);
+            if (largest > 0.0 && pivot == 0.0 && is_idle(i)) pivot = largest;
+            if (!(pivot > 0.0)) return false;
         }
         return true;
     }
@@ -317,8 +317,8 @@ class BackwardPass {
                 const double entry = Q[x + i][x + j];
                 moved += entry * k[j];
                 const double* __restrict other = K[j];
-                double* __restrict own = rest[i];
-                for (int c = 0; c < x; ++c) own[c] += entry * other[c];
+                double* __restrict row = rest[i];
+                for (int c = 0; c < x; ++c) row[c] += entry * other[c];
             }
             found.slope += Qz[x + i] * k[i];
             found.curvature += k[i] * moved;

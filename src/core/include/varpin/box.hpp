@@ -77,9 +77,9 @@ class BoxMinimum {
         int first = -1;
         for (int i = 0; i < m; ++i) {
             if (held[i]) continue;
-            const double room = std::abs((step[i] < 0.0 ? least[i] : greatest[i]) - x[i]);
-            if (std::abs(step[i]) * length > room) {
-                length = room / std::abs(step[i]);
+            const double distance = std::abs((step[i] < 0.0 ? least[i] : greatest[i]) - x[i]);
+            if (std::abs(step[i]) * length > distance) {
+                length = distance / std::abs(step[i]);
                 first = i;
             }
         }

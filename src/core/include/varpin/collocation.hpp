@@ -80,7 +80,7 @@ class Collocation {
             coupled_v.resize(stages * n * n);
         }
         if (known || stages > StageElimination::most_stages || !eliminates(mechanism, solver, stages)) {
-            make_room();
+            allocate();
             return;
         }
         element_curvature.resize(stages * n);
@@ -192,13 +192,13 @@ class Collocation {
 
     // What the elements add to the pivot of coordinate c: -(by_rate F_v + by_place F_q) averaged over the step, and
     // where no jet has the curvature of their potentials, that with F_q.
-    double stiffening(int c, double by_rate, double by_place) const {
+    double stiffening(int c, double by_rate, double by_position) const {
         if (!mechanism.forces.any()) return 0.0;
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
-            const JointForce<double>& own = acting[i * n + c];
-            const double in_place = own.by_q + (eliminated() ? element_curvature[i * n + c] : 0.0);
-            total -= tableau.b[i] * (by_rate * own.by_v + by_place * in_place);
+            const JointForce<double>& force = acting[i * n + c];
+            const double by_own_q = force.by_q + (eliminated() ? element_curvature[i * n + c] : 0.0);
+            total -= tableau.b[i] * (by_rate * force.by_v + by_position * by_own_q);
         }
         return total;
     }
@@ -206,12 +206,13 @@ class Collocation {
     bool coupled() const { return !coupled_q.empty(); }
 
     // The same of couplings at an entry of the symmetric part.
-    [[gnu::noinline]] double coupled_stiffening(int r, int c, double by_rate, double by_place) const {
+    [[gnu::noinline]] double coupled_stiffening(int r, int c, double by_rate, double by_position) const {
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
             const int one = (i * n + r) * n + c, other = (i * n + c) * n + r;
-            total -= 0.5 * tableau.b[i] *
-                     (by_rate * (coupled_v[one] + coupled_v[other]) + by_place * (coupled_q[one] + coupled_q[other]));
+            total -=
+                0.5 * tableau.b[i] *
+                (by_rate * (coupled_v[one] + coupled_v[other]) + by_position * (coupled_q[one] + coupled_q[other]));
         }
         return total;
     }
@@ -347,14 +348,14 @@ class Collocation {
     }
 
     // For matrices and their factors.
-    void make_room() {
+    void allocate() {
         int size = 0, largest = 0;
         for (const Block& block : blocks_of(mechanism.tree, n)) {
-            const int own = stages * (block.end - block.begin);
-            size = entries(1, std::int64_t{size} + entries(own, own));
-            largest = std::max(largest, own);
+            const int unknowns = stages * (block.end - block.begin);
+            size = entries(1, std::int64_t{size} + entries(unknowns, unknowns));
+            largest = std::max(largest, unknowns);
         }
-        for (Jet<double, Size>& jet : stage) jet.make_room();
+        for (Jet<double, Size>& jet : stage) jet.allocate();
         lu.resize(size);
         order.resize(stages * n);
         change.resize(stages * largest);
@@ -363,7 +364,7 @@ class Collocation {
 
     // Matrices too at an iterate that elimination had no need of them for.
     void write_jets() {
-        if (lu.empty()) make_room();
+        if (lu.empty()) allocate();
         for (int i = 0; i < stages; ++i) lagrangian_jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
         take_over();
     }
@@ -409,21 +410,21 @@ class Collocation {
         if (!eliminated()) return;
         std::fill(element_curvature.begin(), element_curvature.end(), 0.0);
         for (int i = 0; i < stages; ++i) {
-            double* own = &element_curvature[i * n];
+            double* curvature = &element_curvature[i * n];
             mechanism.forces.potentials(
-                &Q[i * n], [own](int c, const Potential<double>& element) { own[c] += element.curvature; });
+                &Q[i * n], [curvature](int c, const Potential<double>& element) { curvature[c] += element.curvature; });
         }
     }
 
     // What the elements add to N_im of coordinate c: by F, and where `potentials` are not in jets, by those too.
     double element_entry(double h, int i, int m, int c, bool potentials) const {
-        double by_place = 0.0;
+        double by_position = 0.0;
         for (int j = 0; j < stages; ++j) {
             double share = tableau.force[i * stages + j] * acting[j * n + c].by_q;
             if (potentials) share += tableau.gradient[i * stages + j] * element_curvature[j * n + c];
-            by_place += tableau.a[j * stages + m] * share;
+            by_position += tableau.a[j * stages + m] * share;
         }
-        return -h * tableau.force[i * stages + m] * acting[m * n + c].by_v - h * h * by_place;
+        return -h * tableau.force[i * stages + m] * acting[m * n + c].by_v - h * h * by_position;
     }
 
     void write_diagonal(double h) {
@@ -482,20 +483,20 @@ class Collocation {
         for (int r = 0; r < width; ++r) {
             const int row = block.begin + r;
             for (int j = 0; j < stages; ++j) {
-                double* own = &change[j * size];
+                double* row_change = &change[j * size];
                 for (int m = 0; m < stages; ++m) {
                     const double factor = h * tableau.a[j * stages + m];
                     const double* curvature = &stage[j].Lqq[row * n + block.begin];
-                    for (int c = 0; c < width; ++c) own[m * width + c] = factor * curvature[c];
+                    for (int c = 0; c < width; ++c) row_change[m * width + c] = factor * curvature[c];
                 }
-                for (int c = 0; c < width; ++c) own[j * width + c] += stage[j].A[(block.begin + c) * n + row];
+                for (int c = 0; c < width; ++c) row_change[j * width + c] += stage[j].A[(block.begin + c) * n + row];
             }
             for (int i = 0; i < stages; ++i) {
                 double* __restrict line = matrix + (i * width + r) * size;
                 for (int j = 0; j < stages; ++j) {
                     const double factor = h * tableau.gradient[i * stages + j];
-                    const double* __restrict own = &change[j * size];
-                    for (int k = 0; k < size; ++k) line[k] -= factor * own[k];
+                    const double* __restrict row_change = &change[j * size];
+                    for (int k = 0; k < size; ++k) line[k] -= factor * row_change[k];
                 }
                 for (int j = 0; j < stages; ++j) {
                     const double factor = h * tableau.a[i * stages + j];
@@ -531,12 +532,12 @@ class Collocation {
     [[gnu::noinline]] void add_coupled_row(double h, int i, int m, int row, Block block, double* line) const {
         const int width = block.end - block.begin;
         const double by_rate = h * tableau.force[i * stages + m];
-        const double* own = &coupled_v[(m * n + row) * n + block.begin];
-        for (int c = 0; c < width; ++c) line[c] -= by_rate * own[c];
+        const double* coupled = &coupled_v[(m * n + row) * n + block.begin];
+        for (int c = 0; c < width; ++c) line[c] -= by_rate * coupled[c];
         for (int j = 0; j < stages; ++j) {
-            const double by_place = h * h * tableau.a[j * stages + m] * tableau.force[i * stages + j];
-            own = &coupled_q[(j * n + row) * n + block.begin];
-            for (int c = 0; c < width; ++c) line[c] -= by_place * own[c];
+            const double by_position = h * h * tableau.a[j * stages + m] * tableau.force[i * stages + j];
+            coupled = &coupled_q[(j * n + row) * n + block.begin];
+            for (int c = 0; c < width; ++c) line[c] -= by_position * coupled[c];
         }
     }
 
@@ -748,10 +749,10 @@ class Collocation {
             for (int c = block.begin; c < block.end; ++c) {
                 double by_q = 0.0, by_p = 0.0, by_f = 0.0, bend = 0.0;
                 for (int i = 0; i < stages; ++i) {
-                    const double* own = &dV[(i * n + r) * 3 * n + c];
-                    by_q += tableau.b[i] * own[0];
-                    by_p += tableau.b[i] * own[n];
-                    by_f += tableau.b[i] * own[2 * n];
+                    const double* dV_entry = &dV[(i * n + r) * 3 * n + c];
+                    by_q += tableau.b[i] * dV_entry[0];
+                    by_p += tableau.b[i] * dV_entry[n];
+                    by_f += tableau.b[i] * dV_entry[2 * n];
                     bend += tableau.b[i] * curvature(i, r, c);
                 }
                 q[c] = h * by_q + (r == c ? 1.0 : 0.0);

@@ -113,37 +113,37 @@ class Constraints {
         std::fill(w.C.begin(), w.C.end(), 0.0);
         std::fill(w.size.begin(), w.size.end(), 0.0);
         int r = 0;
-        for (const ProductRow& own : products_) {
-            const Vec3<double>&X = w.value[own.x], &Y = w.value[own.y];
-            w.g[r] = own.factor * dot(X, Y) - own.constant;
-            w.scale[r] = std::abs(own.factor) * (w.reach[own.x] * length(Y) + length(X) * w.reach[own.y]) +
-                         std::abs(own.constant);
-            const Vec3<double>*Xs = &w.slope[own.x * n_], *Ys = &w.slope[own.y * n_];
-            const double *X_size = &w.slope_size[own.x * n_], *Y_size = &w.slope_size[own.y * n_];
+        for (const ProductRow& product : products_) {
+            const Vec3<double>&X = w.value[product.x], &Y = w.value[product.y];
+            w.g[r] = product.factor * dot(X, Y) - product.constant;
+            w.scale[r] = std::abs(product.factor) * (w.reach[product.x] * length(Y) + length(X) * w.reach[product.y]) +
+                         std::abs(product.constant);
+            const Vec3<double>*Xs = &w.slope[product.x * n_], *Ys = &w.slope[product.y * n_];
+            const double *X_size = &w.slope_size[product.x * n_], *Y_size = &w.slope_size[product.y * n_];
             for (int c = 0; c < n_; ++c) {
-                w.C[r * n_ + c] = own.factor * (dot(Xs[c], Y) + dot(X, Ys[c]));
-                w.size[r * n_ + c] = std::abs(own.factor) * (X_size[c] * length(Y) + length(X) * Y_size[c]);
+                w.C[r * n_ + c] = product.factor * (dot(Xs[c], Y) + dot(X, Ys[c]));
+                w.size[r * n_ + c] = std::abs(product.factor) * (X_size[c] * length(Y) + length(X) * Y_size[c]);
             }
             ++r;
         }
-        for (const TieRow& own : ties_) {
-            const double leader = q[own.leader];
-            double total = 0.0, slope = 0.0, size = std::abs(q[own.follower]);
-            for (std::size_t k = own.coefficients.size(); k-- > 0;) {
+        for (const TieRow& tie : ties_) {
+            const double leader = q[tie.leader];
+            double total = 0.0, slope = 0.0, size = std::abs(q[tie.follower]);
+            for (std::size_t k = tie.coefficients.size(); k-- > 0;) {
                 slope = slope * leader + total;
-                total = total * leader + own.coefficients[k];
+                total = total * leader + tie.coefficients[k];
                 size = std::max(size, std::abs(total));
             }
-            w.g[r] = q[own.follower] - total;
+            w.g[r] = q[tie.follower] - total;
             w.scale[r] = size;
-            w.C[r * n_ + own.follower] += 1.0;
-            w.C[r * n_ + own.leader] -= slope;
+            w.C[r * n_ + tie.follower] += 1.0;
+            w.C[r * n_ + tie.leader] -= slope;
             for (int c = 0; c < n_; ++c) w.size[r * n_ + c] = std::abs(w.C[r * n_ + c]);
             ++r;
         }
-        for (const CustomRows& own : customs_) {
-            own.value(q, &w.g[r], &w.C[r * n_]);
-            for (int k = r; k < r + own.rows; ++k) {
+        for (const CustomRows& custom : customs_) {
+            custom.value(q, &w.g[r], &w.C[r * n_]);
+            for (int k = r; k < r + custom.rows; ++k) {
                 double size = 0.0;
                 for (int c = 0; c < n_; ++c) {
                     w.size[k * n_ + c] = std::abs(w.C[k * n_ + c]);
@@ -151,7 +151,7 @@ class Constraints {
                 }
                 w.scale[k] = size;
             }
-            r += own.rows;
+            r += custom.rows;
         }
     }
 
@@ -159,12 +159,12 @@ class Constraints {
     void add_curvature(const double* weights, double factor, ConstraintJet& w, double* H) const {
         std::fill(w.weight.begin(), w.weight.end(), Vec3<double>{});
         int r = 0;
-        for (const ProductRow& own : products_) {
-            const double scale = factor * weights[r++] * own.factor;
+        for (const ProductRow& product : products_) {
+            const double scale = factor * weights[r++] * product.factor;
             if (scale == 0.0) continue;
-            w.weight[own.x] += scale * w.value[own.y];
-            w.weight[own.y] += scale * w.value[own.x];
-            const Vec3<double>*X = &w.slope[own.x * n_], *Y = &w.slope[own.y * n_];
+            w.weight[product.x] += scale * w.value[product.y];
+            w.weight[product.y] += scale * w.value[product.x];
+            const Vec3<double>*X = &w.slope[product.x * n_], *Y = &w.slope[product.y * n_];
             for (int i = 0; i < n_; ++i) {
                 for (int j = 0; j < n_; ++j) H[i * n_ + j] += scale * (dot(X[i], Y[j]) + dot(X[j], Y[i]));
             }
@@ -183,17 +183,17 @@ class Constraints {
                 }
             }
         }
-        for (const TieRow& own : ties_) {
-            const double leader = w.at_q[own.leader];
+        for (const TieRow& tie : ties_) {
+            const double leader = w.at_q[tie.leader];
             double bend = 0.0;
-            for (std::size_t k = own.coefficients.size(); k-- > 2;)
-                bend = bend * leader + static_cast<double>(k * (k - 1)) * own.coefficients[k];
-            H[own.leader * n_ + own.leader] -= factor * weights[r++] * bend;
+            for (std::size_t k = tie.coefficients.size(); k-- > 2;)
+                bend = bend * leader + static_cast<double>(k * (k - 1)) * tie.coefficients[k];
+            H[tie.leader * n_ + tie.leader] -= factor * weights[r++] * bend;
         }
-        for (const CustomRows& own : customs_) {
-            own.bending(w.at_q.data(), weights + r, w.custom.data());
+        for (const CustomRows& custom : customs_) {
+            custom.bending(w.at_q.data(), weights + r, w.custom.data());
             for (int i = 0; i < n_ * n_; ++i) H[i] += factor * w.custom[i];
-            r += own.rows;
+            r += custom.rows;
         }
     }
 
@@ -207,9 +207,9 @@ class Constraints {
             for (std::size_t part = 0; part < vectors_[a].sum.parts.size(); ++part, ++leg) {
                 const auto& levers = w.levers[leg];
                 Vec3<double> before{}, beyond{};
-                for (const auto& own : levers) {
-                    w.moved[a * n_ + own.coordinate] += cross(before, own.shift);
-                    before += v[own.coordinate] * own.turn;
+                for (const auto& lever : levers) {
+                    w.moved[a * n_ + lever.coordinate] += cross(before, lever.shift);
+                    before += v[lever.coordinate] * lever.turn;
                 }
                 for (std::size_t j = levers.size(); j-- > 0;) {
                     beyond += v[levers[j].coordinate] * levers[j].shift;
@@ -219,12 +219,12 @@ class Constraints {
             }
         }
         int r = 0;
-        for (const ProductRow& own : products_) {
-            const Vec3<double>*X = &w.slope[own.x * n_], *Y = &w.slope[own.y * n_];
-            const Vec3<double>*Xm = &w.moved[own.x * n_], *Ym = &w.moved[own.y * n_];
+        for (const ProductRow& product : products_) {
+            const Vec3<double>*X = &w.slope[product.x * n_], *Y = &w.slope[product.y * n_];
+            const Vec3<double>*Xm = &w.moved[product.x * n_], *Ym = &w.moved[product.y * n_];
             for (int c = 0; c < n_; ++c) {
-                out[r * n_ + c] = own.factor * (dot(Xm[c], w.value[own.y]) + dot(w.weight[own.x], Y[c]) +
-                                                dot(X[c], w.weight[own.y]) + dot(w.value[own.x], Ym[c]));
+                out[r * n_ + c] = product.factor * (dot(Xm[c], w.value[product.y]) + dot(w.weight[product.x], Y[c]) +
+                                                    dot(X[c], w.weight[product.y]) + dot(w.value[product.x], Ym[c]));
             }
             ++r;
         }
@@ -285,23 +285,23 @@ class Constraints {
         w.reach[a] = 0.0;
         const auto& parts = vectors_[a].sum.parts;
         for (std::size_t part = 0; part < parts.size(); ++part, ++leg) {
-            const CarriedVector& own = parts[part];
+            const CarriedVector& carried = parts[part];
             const double side = part == 0 ? 1.0 : -1.0;
             auto& levers = w.levers[leg];
             levers.clear();
-            Vec3<double> x = own.place;
-            if (own.body >= 0) {
-                x = w.at[own.body].rotation * own.place;
-                if (!own.direction) x += w.at[own.body].position;
+            Vec3<double> x = carried.place;
+            if (carried.body >= 0) {
+                x = w.at[carried.body].rotation * carried.place;
+                if (!carried.direction) x += w.at[carried.body].position;
             }
             w.value[a] += side * x;
             w.reach[a] += length(x);
             for (int j : vectors_[a].paths[part]) {
                 const Body& link = links_.bodies[j];
-                if (own.direction && link.prismatic) continue;
+                if (carried.direction && link.prismatic) continue;
                 const Vec3<double>& axis = w.at[j].rotation.z;
                 const Motion<double> gives =
-                    own.direction ? Motion<double>{cross(axis, x), axis} : given_by(link, w.at[j], x);
+                    carried.direction ? Motion<double>{cross(axis, x), axis} : given_by(link, w.at[j], x);
                 const ConstraintJet::Lever lever{link.coordinate, link.ratio * gives.angular,
                                                  (side * link.ratio) * gives.linear};
                 slope[link.coordinate] += lever.shift;
@@ -309,7 +309,7 @@ class Constraints {
                 size[link.coordinate] += moved;
                 // A place is known no better than the joints that lead to it.
                 w.reach[a] += moved * std::abs(q[link.coordinate]);
-                if (!own.direction) w.reach[a] += length(link.translation);
+                if (!carried.direction) w.reach[a] += length(link.translation);
                 levers.push_back(lever);
             }
         }

@@ -13,11 +13,11 @@
 
 namespace varpin {
 
-// A frame that stands at `own` in the last of some bodies. Or, in the place of one, the centre of mass of all of them:
+// A frame that stands at `offset` in the last of some bodies. Or, in the place of one, the centre of mass of all of them:
 // it has a position and no more.
 struct CostFrame {
     Links links;
-    Placement own;
+    Placement offset;
     bool center = false;
 };
 
@@ -34,7 +34,7 @@ constexpr std::size_t target_width(Subject subject, std::size_t size) {
 struct CostTerm {
     Subject subject = Subject::entries;
     int size = 0;                   // of r
-    int place = 0;                  // the first of its entries in z, or the index of its frame
+    int index = 0;                  // the first of its entries in z, or the index of its frame
     std::vector<double> weight;     // (r, r) symmetric
     std::vector<double> target;     // (T, target_width); sample s has row s % T
     std::vector<int> directions{};  // which rows of the frame's Jacobian its manipulability is of
@@ -79,8 +79,8 @@ class CostSample {
         for (const CostTerm& term : costs.terms) {
             most = std::max(most, static_cast<std::size_t>(term.size));
             const bool measures = term.subject == Subject::manipulability;
-            if (measures || term.subject == Subject::twist) frames_[term.place].moves = true;
-            if (measures) dexterity_.make_room(static_cast<int>(term.directions.size()), costs.dof);
+            if (measures || term.subject == Subject::twist) frames_[term.index].moves = true;
+            if (measures) dexterity_.allocate(static_cast<int>(term.directions.size()), costs.dof);
         }
         gives_.resize(bodies);
         loads_.resize(bodies);
@@ -100,7 +100,7 @@ class CostSample {
         for (const CostTerm& term : costs_.terms) {
             weigh(term, row);
             if (term.subject == Subject::entries) {
-                for (int i = 0; i < term.size; ++i) gradient[term.place + i] += 2.0 * weighted_[i];
+                for (int i = 0; i < term.size; ++i) gradient[term.index + i] += 2.0 * weighted_[i];
                 continue;
             }
             if (term.subject == Subject::excess) {
@@ -140,7 +140,7 @@ class CostSample {
             if (term.subject != Subject::entries) continue;
             for (int i = 0; i < term.size; ++i) {
                 for (int k = 0; k < term.size; ++k)
-                    hessian[(term.place + i) * costs_.size() + term.place + k] += 2.0 * term.weight[i * term.size + k];
+                    hessian[(term.index + i) * costs_.size() + term.index + k] += 2.0 * term.weight[i * term.size + k];
             }
         }
     }
@@ -168,7 +168,7 @@ class CostSample {
         std::copy_n(v, n, z_.begin() + n);
         std::copy_n(u, costs_.controls, z_.begin() + 2 * n);
         for (std::size_t f = 0; f < frames_.size(); ++f) {
-            const auto& [links, own, center] = costs_.frames[f];
+            const auto& [links, offset, center] = costs_.frames[f];
             FrameAt& here = frames_[f];
             place(links, q, here.joints.data());
             if (center) {
@@ -176,7 +176,7 @@ class CostSample {
                 here.placement.position = center_of_mass(links, here.joints.data(), loads_.data(), J);
                 continue;
             }
-            here.placement = here.joints.back() * own;
+            here.placement = here.joints.back() * offset;
             if (slopes || here.moves)
                 frame_jacobian(links, here.joints.data(), here.placement.position, here.jacobian.data());
         }
@@ -192,18 +192,18 @@ class CostSample {
         const std::size_t width = target_width(term.subject, static_cast<std::size_t>(term.size));
         const double* target = term.target.data() + (row % (term.target.size() / width)) * width;
         if (term.subject == Subject::entries) {
-            for (int i = 0; i < term.size; ++i) error_[i] = z_[term.place + i] - target[i];
+            for (int i = 0; i < term.size; ++i) error_[i] = z_[term.index + i] - target[i];
             return;
         }
         if (term.subject == Subject::excess) {
             for (int i = 0; i < term.size; ++i) {
-                const double y = z_[term.place + i], least = target[i], most = target[term.size + i];
+                const double y = z_[term.index + i], least = target[i], most = target[term.size + i];
                 // What is no number stays none.
                 error_[i] = y > most ? y - most : y < least ? y - least : y - y;
             }
             return;
         }
-        const FrameAt& frame = frames_[term.place];
+        const FrameAt& frame = frames_[term.index];
         if (term.subject == Subject::manipulability) {
             const double lack = target[0] - dexterity_.measure(frame.jacobian.data(), term.directions, costs_.dof);
             error_[0] = lack <= 0.0 ? 0.0 : lack;
@@ -235,8 +235,8 @@ class CostSample {
     void add_excess(const CostTerm& term, double* gradient, double* hessian) const {
         for (int i = 0; i < term.size; ++i) {
             if (error_[i] == 0.0) continue;
-            gradient[term.place + i] += 2.0 * weighted_[i];
-            double* row = hessian + (term.place + i) * costs_.size() + term.place;
+            gradient[term.index + i] += 2.0 * weighted_[i];
+            double* row = hessian + (term.index + i) * costs_.size() + term.index;
             for (int k = 0; k < term.size; ++k)
                 if (error_[k] != 0.0) row[k] += 2.0 * term.weight[i * term.size + k];
         }
@@ -244,7 +244,7 @@ class CostSample {
 
     // J (r, columns) of a term on a frame, after its residual.
     void differentiate(const CostTerm& term, int columns) {
-        const FrameAt& frame = frames_[term.place];
+        const FrameAt& frame = frames_[term.index];
         const int n = costs_.dof;
         if (term.subject == Subject::position) {
             std::copy_n(frame.jacobian.begin(), 3 * n, J_.begin());
@@ -263,7 +263,7 @@ class CostSample {
         } else {
             std::fill(J_.begin(), J_.end(), 0.0);
             for (int i = 0; i < 6; ++i) std::copy_n(frame.jacobian.begin() + i * n, n, J_.begin() + i * columns + n);
-            twist_in_q(costs_.frames[term.place].links, frame, columns);
+            twist_in_q(costs_.frames[term.index].links, frame, columns);
         }
     }
 
@@ -281,12 +281,12 @@ class CostSample {
         Vec3<double> before{};
         for (int j = 0; j < links.size(); ++j) {
             const Body& link = links.bodies[j];
-            const Motion<double>& own = gives_[j];
+            const Motion<double>& twist = gives_[j];
             const double rate = link.ratio * v[link.coordinate];
-            const Vec3<double> linear = cross(own.angular, ahead.linear) + cross(before, own.linear);
-            before = before + rate * own.angular;
-            ahead = {ahead.linear - rate * own.linear, ahead.angular - rate * own.angular};
-            const Vec3<double> angular = cross(own.angular, ahead.angular);
+            const Vec3<double> linear = cross(twist.angular, ahead.linear) + cross(before, twist.linear);
+            before = before + rate * twist.angular;
+            ahead = {ahead.linear - rate * twist.linear, ahead.angular - rate * twist.angular};
+            const Vec3<double> angular = cross(twist.angular, ahead.angular);
             const double slopes[6] = {linear.x, linear.y, linear.z, angular.x, angular.y, angular.z};
             for (int i = 0; i < 6; ++i) J_[i * columns + link.coordinate] += link.ratio * slopes[i];
         }
@@ -294,7 +294,7 @@ class CostSample {
 
     // The derivative of what a manipulability w lacks, -sum dw/dJ . dJ/dq, into the first row of J.
     void lack_in_q(const CostTerm& term, const FrameAt& frame) {
-        const Links& links = costs_.frames[term.place].links;
+        const Links& links = costs_.frames[term.index].links;
         const double* W = dexterity_.slope();
         const auto weight = [&](const Body& link) {
             double parts[6] = {};
@@ -313,10 +313,10 @@ class CostSample {
         Vec3<double> from_here{}, beyond{};
         for (int i = links.size() - 1; i >= 0; --i) {
             const Body& link = links.bodies[i];
-            const Force<double> own = weight(link);
-            from_here += cross(gives_[i].linear, own.linear);
+            const Force<double> wrench = weight(link);
+            from_here += cross(gives_[i].linear, wrench.linear);
             J_[link.coordinate] -= link.ratio * dot(gives_[i].angular, from_here + beyond);
-            beyond += cross(gives_[i].angular, own.angular);
+            beyond += cross(gives_[i].angular, wrench.angular);
         }
     }
 };

@@ -141,7 +141,7 @@ struct Arm {
 
 // Work arrays; Couplings::fit makes room in them, at their first use at the latest.
 template <class T>
-struct CouplingRoom {
+struct CouplingWorkspace {
     std::vector<PlacementOf<T>> at;
     std::vector<Arm<T>> arms;
     std::vector<Vec3<T>> change;  // of the velocity of d with the coordinate of each arm
@@ -185,26 +185,26 @@ class Couplings {
     bool pushes() const { return pushes_; }
 
     template <class T>
-    void fit(CouplingRoom<T>& room) const {
-        room.at.resize(links_.bodies.size());
-        room.arms.reserve(most_arms_);
-        room.change.reserve(most_arms_);
+    void fit(CouplingWorkspace<T>& workspace) const {
+        workspace.at.resize(links_.bodies.size());
+        workspace.arms.reserve(most_arms_);
+        workspace.change.reserve(most_arms_);
     }
 
     // Calls visit(arms, VectorPotential, scale, magnitude) for each that has a potential, at q: `scale` of the terms
     // that cancel in V_d, `magnitude` of those that make up the energy.
     template <class T, class Visit>
-    void potentials(const T* q, CouplingRoom<T>& room, const Visit& visit) const {
-        place_all(q, room);
+    void potentials(const T* q, CouplingWorkspace<T>& workspace, const Visit& visit) const {
+        update_placements(q, workspace);
         for (const Joined& joined : joined_) {
             std::visit(
                 [&](const auto& element) {
                     if constexpr (has_potential<std::decay_t<decltype(element)>>) {
-                        write_arms(element, joined, room);
-                        const VectorPotential<T> own = element.potential(room.place[0] - room.place[1]);
-                        const double far = detail::size_of(room.place[0]) + detail::size_of(room.place[1]);
-                        visit(std::as_const(room.arms), own, element.scale(far),
-                              std::abs(value_of(own.energy)) + detail::size_of(own.slope) * far);
+                        write_arms(element, joined, workspace);
+                        const VectorPotential<T> potential = element.potential(workspace.place[0] - workspace.place[1]);
+                        const double far = detail::size_of(workspace.place[0]) + detail::size_of(workspace.place[1]);
+                        visit(std::as_const(workspace.arms), potential, element.scale(far),
+                              std::abs(value_of(potential.energy)) + detail::size_of(potential.slope) * far);
                     }
                 },
                 joined.element);
@@ -213,28 +213,30 @@ class Couplings {
 
     // Adds -V_qq of a potential to a matrix (n, n).
     template <class T>
-    static void subtract_curvature(const std::vector<Arm<T>>& arms, const VectorPotential<T>& own, int n, T* Lqq) {
+    static void subtract_curvature(const std::vector<Arm<T>>& arms, const VectorPotential<T>& potential, int n,
+                                   T* Lqq) {
         for (const Arm<T>& i : arms) {
-            const Vec3<T> stiff = own.curvature * i.linear;
+            const Vec3<T> stiff = potential.curvature * i.linear;
             for (const Arm<T>& j : arms) Lqq[i.coordinate * n + j.coordinate] -= dot(stiff, j.linear);
         }
-        turning(arms, own.slope, [&](int i, int j, const T& term) { Lqq[i * n + j] -= term; });
+        turning(arms, potential.slope, [&](int i, int j, const T& term) { Lqq[i * n + j] -= term; });
     }
 
     // Adds the forces beside those of potentials to `out` (n), and writes their derivatives in q and v (n, n), which
     // may be null.
     template <class T>
-    void add_forces(int n, const T* q, const T* v, CouplingRoom<T>& room, JointForce<T>* out, T* by_q, T* by_v) const {
+    void add_forces(int n, const T* q, const T* v, CouplingWorkspace<T>& workspace, JointForce<T>* out, T* by_q,
+                    T* by_v) const {
         for (T* matrix : {by_q, by_v}) {
             if (matrix) std::fill(matrix, matrix + n * n, T{});
         }
-        place_all(q, room);
+        update_placements(q, workspace);
         for (const Joined& joined : joined_) {
             std::visit(
                 [&](const auto& element) {
                     if constexpr (!has_potential<std::decay_t<decltype(element)>>) {
-                        write_arms(element, joined, room);
-                        push(element, n, v, room, out, by_q, by_v);
+                        write_arms(element, joined, workspace);
+                        push(element, n, v, workspace, out, by_q, by_v);
                     }
                 },
                 joined.element);
@@ -244,7 +246,7 @@ class Couplings {
 
   private:
     template <class Element>
-    static constexpr bool has_potential = requires(const Element& own) { own.potential(Vec3<double>{}); };
+    static constexpr bool has_potential = requires(const Element& element) { element.potential(Vec3<double>{}); };
 
     struct Joined {
         CoupledElement element;
@@ -282,27 +284,27 @@ class Couplings {
     }
 
     template <class T>
-    void place_all(const T* q, CouplingRoom<T>& room) const {
-        fit(room);
-        place(links_, q, room.at.data());
+    void update_placements(const T* q, CouplingWorkspace<T>& workspace) const {
+        fit(workspace);
+        place(links_, q, workspace.at.data());
     }
 
     template <class T, class Element>
-    void write_arms(const Element& element, const Joined& joined, CouplingRoom<T>& room) const {
-        room.arms.clear();
+    void write_arms(const Element& element, const Joined& joined, CouplingWorkspace<T>& workspace) const {
+        workspace.arms.clear();
         const Anchor* const anchors[2] = {&element.a, &element.b};
         for (int point = 0; point < 2; ++point) {
             const auto& [body, place] = *anchors[point];
-            Vec3<T>& x = room.place[point];
+            Vec3<T>& x = workspace.place[point];
             x = {T(place.x), T(place.y), T(place.z)};
             if (body < 0) continue;
-            x = room.at[body].position + room.at[body].rotation * place;
-            if (point == 0) room.rotation = room.at[body].rotation;
+            x = workspace.at[body].position + workspace.at[body].rotation * place;
+            if (point == 0) workspace.rotation = workspace.at[body].rotation;
             for (int j : joined.path[point]) {
                 const Body& link = links_.bodies[j];
                 const double side = point == 0 ? link.ratio : -link.ratio;
-                const Motion<T> gives = given_by(link, room.at[j], x);
-                room.arms.push_back({link.coordinate, point, side * gives.linear, link.ratio * gives.angular});
+                const Motion<T> gives = given_by(link, workspace.at[j], x);
+                workspace.arms.push_back({link.coordinate, point, side * gives.linear, link.ratio * gives.angular});
             }
         }
     }
@@ -320,9 +322,9 @@ class Couplings {
     }
 
     template <class T>
-    static void push(const FrameDamper& own, int n, const T* v, CouplingRoom<T>& room, JointForce<T>* out, T* by_q,
-                     T* by_v) {
-        const auto& arms = room.arms;
+    static void push(const FrameDamper& damper, int n, const T* v, CouplingWorkspace<T>& workspace, JointForce<T>* out,
+                     T* by_q, T* by_v) {
+        const auto& arms = workspace.arms;
         Vec3<T> rate{};
         double rates = 0.0;
         for (const Arm<T>& arm : arms) {
@@ -330,55 +332,56 @@ class Couplings {
             rate += share;
             rates += detail::size_of(share);
         }
-        const Vec3<T> drag = detail::entrywise(own.damping, rate);
+        const Vec3<T> drag = detail::entrywise(damper.damping, rate);
         for (const Arm<T>& arm : arms) {
             JointForce<T>& at = out[arm.coordinate];
             at.value += -dot(drag, arm.linear);
-            at.scale += detail::size_of(own.damping) * rates * detail::size_of(arm.linear);
+            at.scale += detail::size_of(damper.damping) * rates * detail::size_of(arm.linear);
         }
         if (!arms.empty()) out[arms[0].coordinate].lost += value_of(dot(drag, rate));
         if (by_v) {
             for (const Arm<T>& i : arms) {
-                const Vec3<T> damped = detail::entrywise(own.damping, i.linear);
+                const Vec3<T> damped = detail::entrywise(damper.damping, i.linear);
                 for (const Arm<T>& j : arms) by_v[i.coordinate * n + j.coordinate] -= dot(damped, j.linear);
             }
         }
         if (!by_q) return;
         turning(arms, drag, [&](int i, int j, const T& term) { by_q[i * n + j] -= term; });
         // d(J v)/dq_j = w_j x sum of l_i v_i from j on + (sum of w_i v_i before j) x l_j
-        room.change.assign(arms.size(), Vec3<T>{});
+        workspace.change.assign(arms.size(), Vec3<T>{});
         Vec3<T> before{}, beyond{};
         for (std::size_t j = 0; j < arms.size(); ++j) {
             if (j > 0 && arms[j].point != arms[j - 1].point) before = {};
-            room.change[j] = cross(before, arms[j].linear);
+            workspace.change[j] = cross(before, arms[j].linear);
             before += v[arms[j].coordinate] * arms[j].angular;
         }
         for (std::size_t j = arms.size(); j-- > 0;) {
             if (j + 1 < arms.size() && arms[j].point != arms[j + 1].point) beyond = {};
             beyond += v[arms[j].coordinate] * arms[j].linear;
-            room.change[j] += cross(arms[j].angular, beyond);
+            workspace.change[j] += cross(arms[j].angular, beyond);
         }
         for (const Arm<T>& i : arms) {
-            const Vec3<T> damped = detail::entrywise(own.damping, i.linear);
+            const Vec3<T> damped = detail::entrywise(damper.damping, i.linear);
             for (std::size_t j = 0; j < arms.size(); ++j)
-                by_q[i.coordinate * n + arms[j].coordinate] -= dot(damped, room.change[j]);
+                by_q[i.coordinate * n + arms[j].coordinate] -= dot(damped, workspace.change[j]);
         }
     }
 
     template <class T>
-    static void push(const FrameWrench& own, int n, const T*, CouplingRoom<T>& room, JointForce<T>* out, T* by_q, T*) {
-        const auto& arms = room.arms;
-        Vec3<T> force{T(own.force.x), T(own.force.y), T(own.force.z)};
-        Vec3<T> moment{T(own.moment.x), T(own.moment.y), T(own.moment.z)};
-        if (own.carried) {
-            force = room.rotation * own.force;
-            moment = room.rotation * own.moment;
+    static void push(const FrameWrench& wrench, int n, const T*, CouplingWorkspace<T>& workspace, JointForce<T>* out,
+                     T* by_q, T*) {
+        const auto& arms = workspace.arms;
+        Vec3<T> force{T(wrench.force.x), T(wrench.force.y), T(wrench.force.z)};
+        Vec3<T> moment{T(wrench.moment.x), T(wrench.moment.y), T(wrench.moment.z)};
+        if (wrench.carried) {
+            force = workspace.rotation * wrench.force;
+            moment = workspace.rotation * wrench.moment;
         }
         for (const Arm<T>& arm : arms) {
             JointForce<T>& at = out[arm.coordinate];
             at.value += dot(force, arm.linear) + dot(moment, arm.angular);
-            at.scale += detail::size_of(own.force) * detail::size_of(arm.linear) +
-                        detail::size_of(own.moment) * detail::size_of(arm.angular);
+            at.scale += detail::size_of(wrench.force) * detail::size_of(arm.linear) +
+                        detail::size_of(wrench.moment) * detail::size_of(arm.angular);
         }
         if (!by_q) return;
         turning(arms, force, [&](int i, int j, const T& term) { by_q[i * n + j] += term; });
@@ -387,7 +390,7 @@ class Couplings {
                 const Vec3<T>& turn = arms[j].angular;
                 T term{};
                 if (j < i) term += dot(moment, cross(turn, arms[i].angular));
-                if (own.carried) {
+                if (wrench.carried) {
                     term += dot(arms[i].linear, cross(turn, force)) + dot(arms[i].angular, cross(turn, moment));
                 }
                 by_q[arms[i].coordinate * n + arms[j].coordinate] += term;

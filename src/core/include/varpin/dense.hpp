@@ -230,10 +230,10 @@ inline void solve_lu_rows(const double* lu, int n, Block block, double* x, int c
     const auto of_row = [&](int i) { return [=](int j) { return lu[i * n + j]; }; };
     for (int i = block.begin; i < block.end; ++i) subtract_rows(row(i), columns, block.begin, i, of_row(i), row);
     for (int i = block.end - 1; i >= block.begin; --i) {
-        double* own = row(i);
-        subtract_rows(own, columns, i + 1, block.end, of_row(i), row);
+        double* solved_row = row(i);
+        subtract_rows(solved_row, columns, i + 1, block.end, of_row(i), row);
         const double inverse = 1.0 / lu[i * n + i];
-        for (int c = 0; c < columns; ++c) own[c] *= inverse;
+        for (int c = 0; c < columns; ++c) solved_row[c] *= inverse;
     }
 }
 
@@ -245,10 +245,10 @@ inline void solve_ldl_rows(const double* ldl, int n, Block block, double* x, int
         subtract_rows(row(i), columns, block.begin, i, [&](int j) { return ldl[i * n + j]; }, row);
     }
     for (int i = block.end - 1; i >= block.begin; --i) {
-        double* __restrict own = row(i);
+        double* __restrict solved_row = row(i);
         const double inverse = 1.0 / ldl[i * n + i];
-        for (int c = 0; c < columns; ++c) own[c] *= inverse;
-        subtract_rows(own, columns, i + 1, block.end, [&](int j) { return ldl[j * n + i]; }, row);
+        for (int c = 0; c < columns; ++c) solved_row[c] *= inverse;
+        subtract_rows(solved_row, columns, i + 1, block.end, [&](int j) { return ldl[j * n + i]; }, row);
     }
 }
 

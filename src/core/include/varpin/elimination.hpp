@@ -108,7 +108,7 @@ struct Pairs {
 };
 // y = a + s b
 template <int size>
-void put_sum(const double* a, double s, const double* b, double* y) {
+void write_sum(const double* a, double s, const double* b, double* y) {
     const Pair factor{s, s};
     for (int c = 0; c < size; c += 2) put_pair(pair_at(a + c) + factor * pair_at(b + c), y + c);
 }
@@ -228,8 +228,8 @@ class ArticulatedBodies {
 
     // Take M at q, with a jet that potential energies stay in; false at a pivot that is not positive.
     bool at(const Mechanism& mechanism, const double* q, Jet<double>& jet) {
-        const auto enter = [&](int j) { place(j, tree_->bodies[j].ratio * jet.body[j].axis, jet.body[j].inertia); };
-        inertias(mechanism, q, jet, enter, [](int) {});
+        const auto visit = [&](int j) { place(j, tree_->bodies[j].ratio * jet.body[j].axis, jet.body[j].inertia); };
+        inertias(mechanism, q, jet, visit, [](int) {});
         for (int j = tree_->size() - 1; j >= 0; --j) {
             if (!eliminate(j)) return false;
         }
@@ -248,25 +248,25 @@ class ArticulatedBodies {
     // nothing in the loop over bodies is a call takes a tenth off a step.
     [[gnu::flatten]] bool eliminate(int j) {
         const Body& link = tree_->bodies[j];
-        State& own = body_[j];
+        State& state = body_[j];
         if (tied_) {
-            detail::write(own.inertia * detail::motion_at(own.axis), tied_->u());
-            return tied_->eliminate(j, tree_->armature.data(), [&own](double* X, int width) {
-                detail::add_inertia(1.0, detail::InertiaRows(own.inertia), width, X);
+            detail::write(state.inertia * detail::motion_at(state.axis), tied_->u());
+            return tied_->eliminate(j, tree_->armature.data(), [&state](double* X, int width) {
+                detail::add_inertia(1.0, detail::InertiaRows(state.inertia), width, X);
             });
         }
         double* X = inertia_.of(j);
-        detail::write(own.inertia * detail::motion_at(own.axis), own.u);
-        detail::add_symmetric_product<6>(X, own.axis, own.u);
-        own.pivot = tree_->armature[link.coordinate] + detail::product<6>(own.axis, own.u);
-        if (!(own.pivot > 0.0)) return false;
-        const double inverse = 1.0 / own.pivot;
-        for (int r = 0; r < 6; ++r) own.answer[r] = own.u[r] * inverse;
+        detail::write(state.inertia * detail::motion_at(state.axis), state.u);
+        detail::add_symmetric_product<6>(X, state.axis, state.u);
+        state.pivot = tree_->armature[link.coordinate] + detail::product<6>(state.axis, state.u);
+        if (!(state.pivot > 0.0)) return false;
+        const double inverse = 1.0 / state.pivot;
+        for (int r = 0; r < 6; ++r) state.answer[r] = state.u[r] * inverse;
         if (link.parent < 0) return true;
-        const detail::InertiaRows inertia(own.inertia);
+        const detail::InertiaRows inertia(state.inertia);
         detail::replace<6, detail::Kept::upper>(
-            own.answer, detail::Pairs<6>(own.u), [&](Pair rest, int r, int c) { return rest + inertia.at[r][c / 2]; },
-            X);
+            state.answer, detail::Pairs<6>(state.u),
+            [&](Pair rest, int r, int c) { return rest + inertia.at[r][c / 2]; }, X);
         if (link.origin) detail::keep_linear_rows<6>(X);
         inertia_.hand_on(j, link.parent);
         return true;
@@ -281,23 +281,23 @@ class ArticulatedBodies {
         if (tied_) return tied_->solve(b, x, share);
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
-            const State& own = body_[j];
+            const State& state = body_[j];
             double* z = force_.of(j);
             const int c = link.coordinate;
-            const double left = b[c] - detail::product<6>(own.axis, z);
-            x[c] = left / own.pivot;
+            const double left = b[c] - detail::product<6>(state.axis, z);
+            x[c] = left / state.pivot;
             if (share) share[c] = 0.5 * left * x[c];
             if (link.parent < 0) continue;
-            detail::put_sum<6>(z, left, own.answer, z);
+            detail::write_sum<6>(z, left, state.answer, z);
             if (link.origin) detail::keep_linear<6>(z);
             force_.hand_on(j, link.parent);
         }
         for (int j = 0; j < tree_->size(); ++j) {
             const Body& link = tree_->bodies[j];
-            const State& own = body_[j];
+            const State& state = body_[j];
             const double* above = &motion_[6 * (link.parent + 1)];  // still, where there is none
-            x[link.coordinate] -= detail::product<6>(own.answer, above);
-            detail::put_sum<6>(above, x[link.coordinate], own.axis, &motion_[6 * (j + 1)]);
+            x[link.coordinate] -= detail::product<6>(state.answer, above);
+            detail::write_sum<6>(above, x[link.coordinate], state.axis, &motion_[6 * (j + 1)]);
         }
     }
 
@@ -327,21 +327,21 @@ struct EliminatedBody {
     static EliminatedBody of(const Mechanism& mechanism, int j, const Jet<double>& jet) {
         const Body& link = mechanism.tree.bodies[j];
         const auto& here = jet.body[j];
-        EliminatedBody own;
-        own.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
-        own.axis = link.ratio * here.axis;
-        own.rate = link.ratio * here.axis_rate;
-        own.turned = cross(own.axis, here.momentum);
-        own.lifted = cross(mechanism.gravity,
-                           here.inertia.mass * own.axis.linear + cross(own.axis.angular, here.inertia.moment));
-        return own;
+        EliminatedBody made;
+        made.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
+        made.axis = link.ratio * here.axis;
+        made.rate = link.ratio * here.axis_rate;
+        made.turned = cross(made.axis, here.momentum);
+        made.lifted = cross(mechanism.gravity,
+                            here.inertia.mass * made.axis.linear + cross(made.axis.angular, here.inertia.moment));
+        return made;
     }
 
     // The body's entry of (A' + L_qq y) x where the coordinate's y x is `own`, bodies move by `moved` and `above`, nine
     // entries each, and z is what those it carries have left; adds its own to that.
-    double change_of_slope(double own, const double* moved, const double* above, double* z) const {
+    double change_of_slope(double rate_of_x, const double* moved, const double* above, double* z) const {
         double added[10];
-        detail::write_padded(inertia * detail::motion_at(moved) + own * turned, own * lifted, added);
+        detail::write_padded(inertia * detail::motion_at(moved) + rate_of_x * turned, rate_of_x * lifted, added);
         for (int r = 0; r < 9; ++r) z[r] += added[r];
         const Force<double> force{{z[0], z[1], z[2]}, {z[3], z[4], z[5]}};
         const Vec3<double> lift{z[6], z[7], z[8]}, turn{above[6], above[7], above[8]};
@@ -366,26 +366,26 @@ class Elimination {
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
             const EliminatedBody& state = body_[j];
-            Factors& own = factors_[j];
+            Factors& factors = factors_[j];
             const Motion<double> row = state.axis + (-behind) * state.rate, column = state.axis + ahead * state.rate;
-            detail::write_padded(row, behind * state.axis.angular, own.row);
-            detail::write_padded(column, ahead * state.axis.angular, own.column);
-            detail::write_padded(state.inertia * column + ahead * state.turned, ahead * state.lifted, own.u);
-            detail::write_padded(state.inertia * row + (-behind) * state.turned, behind * state.lifted, own.l);
+            detail::write_padded(row, behind * state.axis.angular, factors.row);
+            detail::write_padded(column, ahead * state.axis.angular, factors.column);
+            detail::write_padded(state.inertia * column + ahead * state.turned, ahead * state.lifted, factors.u);
+            detail::write_padded(state.inertia * row + (-behind) * state.turned, behind * state.lifted, factors.l);
             double* X = matrix_.of(j);
-            detail::add_product<width>(X, own.column, own.u);
-            own.pivot = diagonal[link.coordinate] + detail::product<width>(own.row, own.u);
-            if (!(own.pivot > 0.0)) return false;
+            detail::add_product<width>(X, factors.column, factors.u);
+            factors.pivot = diagonal[link.coordinate] + detail::product<width>(factors.row, factors.u);
+            if (!(factors.pivot > 0.0)) return false;
             if (link.parent < 0) {
-                std::fill(own.l, own.l + width, 0.0);
+                std::fill(factors.l, factors.l + width, 0.0);
                 continue;
             }
-            detail::add_transposed_product<width>(X, own.row, own.l);
-            const double inverse = 1.0 / own.pivot;
-            for (double& entry : own.l) entry *= inverse;
+            detail::add_transposed_product<width>(X, factors.row, factors.l);
+            const double inverse = 1.0 / factors.pivot;
+            for (double& entry : factors.l) entry *= inverse;
             const detail::InertiaRows inertia(state.inertia);
             detail::replace<width, detail::Kept::all>(
-                own.u, detail::Pairs<width>(own.l),
+                factors.u, detail::Pairs<width>(factors.l),
                 [&](Pair rest, int r, int c) { return r < 6 && c < 6 ? rest + inertia.at[r][c / 2] : rest; }, X);
             if (link.origin) detail::keep_linear_rows<width>(X);
             matrix_.hand_on(j, link.parent);
@@ -397,21 +397,21 @@ class Elimination {
     void solve(const double* b, double* x) {
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
-            const Factors& own = factors_[j];
+            const Factors& factors = factors_[j];
             double* z = force_.of(j);
-            const double t = (b[link.coordinate] - detail::product<width>(own.row, z)) / own.pivot;
+            const double t = (b[link.coordinate] - detail::product<width>(factors.row, z)) / factors.pivot;
             x[link.coordinate] = t;
             if (link.parent < 0) continue;
-            detail::put_sum<width>(z, t, own.u, z);
+            detail::write_sum<width>(z, t, factors.u, z);
             if (link.origin) detail::keep_linear<width>(z);
             force_.hand_on(j, link.parent);
         }
         for (int j = 0; j < tree_->size(); ++j) {
             const Body& link = tree_->bodies[j];
-            const Factors& own = factors_[j];
+            const Factors& factors = factors_[j];
             const double* above = motion_above(j);
-            x[link.coordinate] -= detail::product<width>(own.l, above);
-            detail::put_sum<width>(above, x[link.coordinate], own.column, &motion_[width * (j + 1)]);
+            x[link.coordinate] -= detail::product<width>(factors.l, above);
+            detail::write_sum<width>(above, x[link.coordinate], factors.column, &motion_[width * (j + 1)]);
         }
     }
 
@@ -421,8 +421,8 @@ class Elimination {
             const Body& link = tree_->bodies[j];
             double* z = force_.of(j);
             const double* moved = motion_.data() + width * (j + 1);
-            const double own = ahead_ * x[link.coordinate];
-            y[link.coordinate] = body_[j].change_of_slope(own, moved, motion_above(j), z);
+            const double rate_of_x = ahead_ * x[link.coordinate];
+            y[link.coordinate] = body_[j].change_of_slope(rate_of_x, moved, motion_above(j), z);
             if (link.parent < 0) continue;
             if (link.origin) detail::keep_linear<width>(z);
             force_.hand_on(j, link.parent);

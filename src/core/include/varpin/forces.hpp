@@ -193,11 +193,11 @@ struct PositionServo {
     JointForce<T> force(T q, T v, T f) const {
         const T back = -(stiffness * q + damping * v), wanted = f + back;
         const double scale = std::abs(stiffness * value_of(q)) + std::abs(damping * value_of(v));
-        const double own = std::abs(value_of(wanted));
-        if (own <= straight * effort)
+        const double wanted_effort = std::abs(value_of(wanted));
+        if (wanted_effort <= straight * effort)
             return {back, T(-stiffness), T(-damping), T(0.0), scale, damping * value_of(v) * value_of(v)};
         const double side = value_of(wanted) > 0.0 ? 1.0 : -1.0, past = (1.0 - straight) * effort;
-        if (own >= effort + past)
+        if (wanted_effort >= effort + past)
             return {T(side * effort) - f, T(0.0), T(0.0), T(-1.0), scale + effort + std::abs(value_of(f)), 0.0};
         const T over = side * wanted - T(straight * effort), slope = T(1.0) - (0.5 / past) * over;
         const T drive = side * (T(straight * effort) + over - (0.25 / past) * (over * over));
@@ -219,7 +219,7 @@ class Forces {
   public:
     Forces() = default;
     Forces(const std::vector<Element>& elements) {
-        for (const Element& element : elements) std::visit([this](const auto& own) { add(own); }, element);
+        for (const Element& element : elements) std::visit([this](const auto& element) { add(element); }, element);
     }
 
     bool any() const { return any_; }
@@ -233,8 +233,9 @@ class Forces {
     // Calls visit(coordinate, Potential) for each element that has one, at q (n).
     template <class T, class Visit>
     void potentials(const T* q, const Visit& visit) const {
-        each([&](const auto& own) {
-            if constexpr (requires { own.potential(T{}); }) visit(own.coordinate, own.potential(q[own.coordinate]));
+        each([&](const auto& element) {
+            if constexpr (requires { element.potential(T{}); })
+                visit(element.coordinate, element.potential(q[element.coordinate]));
         });
     }
 
@@ -243,10 +244,10 @@ class Forces {
     void sum(int n, const T* q, const T* v, const T* f, JointForce<T>* out) const {
         if (!any_) return;
         std::fill(out, out + n, JointForce<T>{});
-        each([&](const auto& own) {
-            const int c = own.coordinate;
-            if constexpr (requires { own.force(T{}, T{}); }) out[c] += own.force(q[c], v[c]);
-            if constexpr (requires { own.force(T{}, T{}, T{}); }) out[c] += own.force(q[c], v[c], f[c]);
+        each([&](const auto& element) {
+            const int c = element.coordinate;
+            if constexpr (requires { element.force(T{}, T{}); }) out[c] += element.force(q[c], v[c]);
+            if constexpr (requires { element.force(T{}, T{}, T{}); }) out[c] += element.force(q[c], v[c], f[c]);
         });
     }
 
@@ -255,9 +256,9 @@ class Forces {
 
     // Turns the constant forces f (n) into what such elements make of them at q and v (n).
     void drive(const double* q, const double* v, double* f) const {
-        each([&](const auto& own) {
-            const int c = own.coordinate;
-            if constexpr (requires { own.force(0.0, 0.0, 0.0); }) f[c] += own.force(q[c], v[c], f[c]).value;
+        each([&](const auto& element) {
+            const int c = element.coordinate;
+            if constexpr (requires { element.force(0.0, 0.0, 0.0); }) f[c] += element.force(q[c], v[c], f[c]).value;
         });
     }
 
@@ -276,20 +277,21 @@ class Forces {
     bool drives_ = false;
 
     template <class Kind>
-    void add(const Kind& own) {
-        std::get<std::vector<Kind>>(kinds_).push_back(own);
+    void add(const Kind& element) {
+        std::get<std::vector<Kind>>(kinds_).push_back(element);
         any_ = true;
-        linear_ = linear_ && own.linear();
-        if constexpr (requires { own.force(0.0, 0.0, 0.0); }) drives_ = true;
+        linear_ = linear_ && element.linear();
+        if constexpr (requires { element.force(0.0, 0.0, 0.0); }) drives_ = true;
         if (!Kind::anchored) return;
-        if (!anchors(own.coordinate)) anchored_.resize(std::max<std::size_t>(anchored_.size(), own.coordinate + 1));
-        anchored_[own.coordinate] = 1;
+        if (!anchors(element.coordinate))
+            anchored_.resize(std::max<std::size_t>(anchored_.size(), element.coordinate + 1));
+        anchored_[element.coordinate] = 1;
     }
 
     template <class Visit>
     void each(const Visit& visit) const {
         const auto list = [&](const auto& kind) {
-            for (const auto& own : kind) visit(own);
+            for (const auto& element : kind) visit(element);
         };
         std::apply([&](const auto&... kind) { (list(kind), ...); }, kinds_);
     }

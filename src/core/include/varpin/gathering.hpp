@@ -47,14 +47,14 @@ struct Ties {
                 }
                 return false;
             };
-            int& own = slot[c];
-            for (own = 0; own < slots && meets(taken[own]);) ++own;
-            if (own == slots) {
+            int& chosen = slot[c];
+            for (chosen = 0; chosen < slots && meets(taken[chosen]);) ++chosen;
+            if (chosen == slots) {
                 taken.emplace_back(tree.size() + 1);
                 ++slots;
             }
-            for (std::size_t k = 0; k < bordered.size(); ++k) taken[own][k] |= bordered[k];
-            ending_[top + 1].push_back({c, own, moved[c][0]});
+            for (std::size_t k = 0; k < bordered.size(); ++k) taken[chosen][k] |= bordered[k];
+            ending_[top + 1].push_back({c, chosen, moved[c][0]});
         }
     }
 
@@ -118,9 +118,9 @@ class Gathered {
 
     // What body j has of those it carries.
     double* of(int j) {
-        double* own = of_again(j);
-        if (order_->leaf[j]) std::fill(own, own + entries_, 0.0);
-        return own;
+        double* entries = of_again(j);
+        if (order_->leaf[j]) std::fill(entries, entries + entries_, 0.0);
+        return entries;
     }
     double* of_again(int j) { return at_.data() + order_->place[j] * entries_; }
     // What all have left that stands on the ground, where there are ties.
@@ -128,9 +128,9 @@ class Gathered {
     // Body j is done with: its parent goes on with what it leaves, or adds that to its own.
     void hand_on(int j, int parent) {
         if (!order_->joins[j]) return;
-        const double* own = of_again(j);
+        const double* entries = of_again(j);
         double* __restrict up = parent < 0 ? of_ground() : of_again(parent);
-        for (int k = 0; k < entries_; ++k) up[k] += own[k];
+        for (int k = 0; k < entries_; ++k) up[k] += entries[k];
     }
 
   private:

@@ -66,9 +66,9 @@ struct PartLedger {
 // Energies of a path at its last node.
 struct Energies {
     explicit Energies(const Tree& tree) : group(tree.groups), share(tree.dof()), part(tree.light_parts.size()) {
-        for (PartLedger& own : part) {
-            own.Lq.resize(tree.dof());
-            own.Lv.resize(tree.dof());
+        for (PartLedger& ledger : part) {
+            ledger.Lq.resize(tree.dof());
+            ledger.Lv.resize(tree.dof());
         }
     }
     std::vector<Ledger> group;
@@ -77,12 +77,12 @@ struct Energies {
 
     double total() const {
         double sum = 0.0;
-        for (const Ledger& own : group) sum += own.kinetic + own.potential;
+        for (const Ledger& ledger : group) sum += ledger.kinetic + ledger.potential;
         return sum;
     }
     double defect() const {
         double sum = 0.0;
-        for (const Ledger& own : group) sum += std::abs(own.defect);
+        for (const Ledger& ledger : group) sum += std::abs(ledger.defect);
         return sum;
     }
 };
@@ -107,7 +107,7 @@ class EnergyGuard {
           n(mechanism.dof()),
           jet(mechanism.tree, false),
           kinetic(mechanism.tree.groups),
-          moved(mechanism.tree.groups),
+          turnover(mechanism.tree.groups),
           work(mechanism.tree.groups),
           lost(mechanism.tree.groups),
           magnitude(mechanism.tree.groups),
@@ -188,12 +188,12 @@ class EnergyGuard {
     // The momentum has been kicked: velocity and energy come along, and no error is entered.
     void kicked(const double* q, const double* p, double* v, Energies& energies) {
         velocity(p, v);
-        find_moved(energies);
+        find_turnover(energies);
         for (int r = 0; r < mechanism.tree.groups; ++r) {
             energies.group[r].kinetic = kinetic[r];
-            energies.group[r].most = std::max(energies.group[r].most, moved[r]);
+            energies.group[r].most = std::max(energies.group[r].most, turnover[r]);
         }
-        enter_shares(0.0, energies);
+        update_shares(0.0, energies);
         light_parts(q, p, v);
         for (std::size_t r = 0; r < part.size(); ++r) {
             part[r].defect = energies.part[r].defect;
@@ -225,11 +225,12 @@ class EnergyGuard {
                     detail::subtract_scaled(inertia, -tableau.b[s], &step.stage[s].M[i * n], block.begin, i + 1);
                 std::copy(inertia + block.begin, inertia + i + 1, line + block.begin);
                 for (int s = 0; s < step.stages; ++s) {
-                    const Jet<double, Size>& own = step.stage[s];
-                    detail::subtract_scaled(line, exaggerated * tableau.b[s], &own.Lqq[i * n], block.begin, i + 1);
+                    const Jet<double, Size>& jet_here = step.stage[s];
+                    detail::subtract_scaled(line, exaggerated * tableau.b[s], &jet_here.Lqq[i * n], block.begin, i + 1);
                     if (tableau.skew == 0.0) continue;
                     const double twist = h * tableau.skew * tableau.b[s];
-                    for (int j = block.begin; j <= i; ++j) line[j] += twist * (own.A[i * n + j] + own.A[j * n + i]);
+                    for (int j = block.begin; j <= i; ++j)
+                        line[j] += twist * (jet_here.A[i * n + j] + jet_here.A[j * n + i]);
                 }
                 if (step.coupled()) {
                     for (int j = block.begin; j <= i; ++j)
@@ -251,7 +252,7 @@ class EnergyGuard {
             trial.momentum[i] = trial.p[i].high;
         }
         if (!node(trial.at.data(), trial.momentum.data(), trial.v.data())) return Outcome::singular;
-        find_moved(energies);
+        find_turnover(energies);
         const Tree& tree = mechanism.tree;
         std::fill(work.begin(), work.end(), 0.0);
         std::fill(lost.begin(), lost.end(), 0.0);
@@ -277,28 +278,28 @@ class EnergyGuard {
             }
             std::copy(part.begin(), part.end(), energies.part.begin());
         }
-        for (int r = 0; r < tree.groups; ++r) enter(energies.group[r], r);
-        enter_shares(fade, energies);
+        for (int r = 0; r < tree.groups; ++r) update_ledger(energies.group[r], r);
+        update_shares(fade, energies);
         return Outcome::solved;
     }
 
   private:
     static constexpr bool known = !std::is_same_v<Size, int>;
-    static constexpr double fade = 1.0 / 256.0;  // by which a substep forgets how far kinetic energies have varied
-    static constexpr double rounding = 1e-12;    // of the magnitudes that make up an energy or a work
-    static constexpr double part_room = 4.0;     // times the limits of whole groups: the trapezoidal rule errs too
-    static constexpr double least_room = 0.02;   // is always left, or a full ledger could never be worked off
+    static constexpr double fade = 1.0 / 256.0;     // by which a substep forgets how far kinetic energies have varied
+    static constexpr double rounding = 1e-12;       // of the magnitudes that make up an energy or a work
+    static constexpr double part_factor = 4.0;      // times the limits of whole groups: the trapezoidal rule errs too
+    static constexpr double least_fraction = 0.02;  // is always left, or a full ledger could never be worked off
 
     struct Limit {
         double balance = 0.0;
         double budget = 0.0;
 
         // The largest error over a substep. An error that adds to those before it has less room the fuller the ledger.
-        double of(double error, double defect, double moved, double exchanged, double most) const {
-            double limit = balance * (moved + exchanged);
+        double of(double error, double defect, double turnover, double exchanged, double most) const {
+            double limit = balance * (turnover + exchanged);
             if (std::abs(defect + error) > std::abs(defect)) {
-                const double room = budget * std::max({most, moved, exchanged});
-                if (room > 0.0) limit *= std::max(least_room, 1.0 - std::abs(defect) / room);
+                const double margin = budget * std::max({most, turnover, exchanged});
+                if (margin > 0.0) limit *= std::max(least_fraction, 1.0 - std::abs(defect) / margin);
             }
             return limit;
         }
@@ -308,36 +309,37 @@ class EnergyGuard {
     [[no_unique_address]] Size n;
     Jet<double, Size> jet;
     std::optional<ArticulatedBodies> articulated;
-    std::vector<double> ldl;             // (n, n) factors of M, unless bodies are articulated
-    std::vector<double> kinetic, moved;  // of each group [J]
-    std::vector<double> work, lost;      // of each group over the substep, and by friction [J]
-    std::vector<double> magnitude;       // of each group, as of Trial
-    std::vector<double> share;           // (n)
-    std::vector<double> diagonal;        // (n) of the branch guard
+    std::vector<double> ldl;                // (n, n) factors of M, unless bodies are articulated
+    std::vector<double> kinetic, turnover;  // of each group [J]
+    std::vector<double> work, lost;         // of each group over the substep, and by friction [J]
+    std::vector<double> magnitude;          // of each group, as of Trial
+    std::vector<double> share;              // (n)
+    std::vector<double> diagonal;           // (n) of the branch guard
     std::vector<double> curved, mass;  // (n, n) of the branch guard, unless the step equation is solved by elimination
     std::vector<PartLedger> part;      // of the node that is tried
 
     // The kinetic energy that a coordinate may be said to turn over. Its share counts as far as it has varied of late:
     // a heavy wheel that turns on and on would else leave room for any error of what it carries.
     double varied(const Energies& energies, int i) const {
-        const Share& own = energies.share[i];
-        return std::min(std::max(own.now, share[i]), std::max(own.largest, share[i]) - std::min(own.least, share[i]));
+        const Share& range = energies.share[i];
+        return std::min(std::max(range.now, share[i]),
+                        std::max(range.largest, share[i]) - std::min(range.least, share[i]));
     }
 
-    void find_moved(const Energies& energies) {
-        std::fill(moved.begin(), moved.end(), 0.0);
-        for (int i = 0; i < n; ++i) moved[mechanism.tree.group[i]] += varied(energies, i);
-        for (std::size_t r = 0; r < moved.size(); ++r)
-            moved[r] = std::min(moved[r], std::max(kinetic[r], energies.group[r].kinetic));
+    void find_turnover(const Energies& energies) {
+        std::fill(turnover.begin(), turnover.end(), 0.0);
+        for (int i = 0; i < n; ++i) turnover[mechanism.tree.group[i]] += varied(energies, i);
+        for (std::size_t r = 0; r < turnover.size(); ++r)
+            turnover[r] = std::min(turnover[r], std::max(kinetic[r], energies.group[r].kinetic));
     }
 
-    void enter_shares(double forget, Energies& energies) const {
+    void update_shares(double forget, Energies& energies) const {
         for (int i = 0; i < n; ++i) {
-            Share& own = energies.share[i];
+            Share& range = energies.share[i];
             const double now = share[i];
-            own.now = now;
-            own.least = std::min(own.least + forget * (now - own.least), now);
-            own.largest = std::max(own.largest + forget * (now - own.largest), now);
+            range.now = now;
+            range.least = std::min(range.least + forget * (now - range.least), now);
+            range.largest = std::max(range.largest + forget * (now - range.largest), now);
         }
     }
 
@@ -353,15 +355,16 @@ class EnergyGuard {
         if (stiffly_accurate && std::abs(error) <= lost[r]) return true;
         const double exchanged = std::abs(jet.potential[r] - ledger.potential) + std::abs(work[r]);
         const double scale = jet.potential_scale[r];
-        const double room = rounding * (scale + kinetic[r] + magnitude[r]) + 1e-3 * off_middle * scale + nothing;
-        return std::abs(error) <= limit.of(error, ledger.defect, moved[r], exchanged, ledger.most) + room;
+        const double rounding_margin =
+            rounding * (scale + kinetic[r] + magnitude[r]) + 1e-3 * off_middle * scale + nothing;
+        return std::abs(error) <= limit.of(error, ledger.defect, turnover[r], exchanged, ledger.most) + rounding_margin;
     }
 
     // Enter an accepted substep. What friction takes, it takes of the errors too.
-    void enter(Ledger& ledger, int r) const {
+    void update_ledger(Ledger& ledger, int r) const {
         double defect = ledger.defect + error_of(ledger, r);
         if (lost[r] > 0.0) defect *= std::max(0.0, 1.0 - lost[r] / (lost[r] + std::max(kinetic[r], ledger.kinetic)));
-        ledger = {kinetic[r], jet.potential[r], defect, std::max(ledger.most, moved[r])};
+        ledger = {kinetic[r], jet.potential[r], defect, std::max(ledger.most, turnover[r])};
     }
 
     // Whether a body is `top` or hangs on it; parents come first.
@@ -379,50 +382,50 @@ class EnergyGuard {
         first_order(mechanism, q, v, jet);
         for (std::size_t r = 0; r < part.size(); ++r) {
             const LightPart& light = tree.light_parts[r];
-            PartLedger& own = part[r];
+            PartLedger& ledger = part[r];
             const auto& top = jet.body[light.body];
             const int carrier = tree.bodies[light.body].parent;
             const double carried = 0.5 * dot(jet.body[carrier].velocity, top.momentum);
             // Of what carries the part's origin up and down the carrier's L_q is spared too.
-            own.potential = -dot(g, top.inertia.moment);
-            own.scale = strength * detail::norm1(top.inertia.moment) + std::abs(carried);
+            ledger.potential = -dot(g, top.inertia.moment);
+            ledger.scale = strength * detail::norm1(top.inertia.moment) + std::abs(carried);
             for (int b = light.body; b < tree.size(); ++b) {
                 const Body& link = tree.bodies[b];
                 if (!link.origin || !below(b, light.body)) continue;
                 const auto& there = jet.body[b];
                 // Moments past an origin are about it, and it slides.
                 if (b > light.body) {
-                    own.potential -= dot(g, there.inertia.moment);
-                    own.scale += strength * detail::norm1(there.inertia.moment);
+                    ledger.potential -= dot(g, there.inertia.moment);
+                    ledger.scale += strength * detail::norm1(there.inertia.moment);
                 }
                 if (link.prismatic) {
                     const double slid = link.ratio * q[link.coordinate] + link.offset;
-                    own.potential -= there.inertia.mass * slid * dot(g, there.axis.linear);
-                    own.scale += strength * there.inertia.mass * std::abs(slid);
+                    ledger.potential -= there.inertia.mass * slid * dot(g, there.axis.linear);
+                    ledger.scale += strength * there.inertia.mass * std::abs(slid);
                 }
             }
-            own.jacobi = -carried;
-            std::fill(own.Lq.begin(), own.Lq.end(), 0.0);
-            std::fill(own.Lv.begin(), own.Lv.end(), 0.0);
+            ledger.jacobi = -carried;
+            std::fill(ledger.Lq.begin(), ledger.Lq.end(), 0.0);
+            std::fill(ledger.Lv.begin(), ledger.Lv.end(), 0.0);
             for (int c = 0; c < n; ++c) {
                 if (!light.carried[c]) continue;
-                own.jacobi += 0.5 * p[c] * v[c];
-                own.scale += std::abs(p[c] * v[c]);
+                ledger.jacobi += 0.5 * p[c] * v[c];
+                ledger.scale += std::abs(p[c] * v[c]);
             }
             mechanism.forces.potentials(q, [&](int c, const Potential<double>& element) {
                 if (!light.carried[c]) return;
-                own.potential += element.energy;
-                own.scale += element.magnitude(q[c]);
+                ledger.potential += element.energy;
+                ledger.scale += element.magnitude(q[c]);
             });
             // A coupling that moves the part is part of its Lagrangian, and moves with others too.
             mechanism.couplings.potentials(
                 q, jet.couplings, [&](const auto& arms, const auto& coupling, double, double size) {
                     const auto carried = [&](const Arm<double>& arm) { return light.carried[arm.coordinate] != 0; };
                     if (std::none_of(arms.begin(), arms.end(), carried)) return;
-                    own.potential += coupling.energy;
-                    own.scale += size;
+                    ledger.potential += coupling.energy;
+                    ledger.scale += size;
                     for (const Arm<double>& arm : arms) {
-                        if (!carried(arm)) own.Lq[arm.coordinate] -= dot(coupling.slope, arm.linear);
+                        if (!carried(arm)) ledger.Lq[arm.coordinate] -= dot(coupling.slope, arm.linear);
                     }
                 });
             const Force<double> weight{top.inertia.mass * g, cross(top.inertia.moment, g)};
@@ -431,10 +434,10 @@ class EnergyGuard {
                 const auto& there = jet.body[a];
                 double slope = dot(there.axis_rate, top.momentum);
                 if (!(link.origin && link.prismatic)) slope += dot(there.axis, weight);
-                own.Lq[link.coordinate] += link.ratio * slope;
-                own.Lv[link.coordinate] += link.ratio * dot(there.axis, top.momentum);
+                ledger.Lq[link.coordinate] += link.ratio * slope;
+                ledger.Lv[link.coordinate] += link.ratio * dot(there.axis, top.momentum);
             }
-            own.jacobi += own.potential;
+            ledger.jacobi += ledger.potential;
         }
     }
 
@@ -442,7 +445,7 @@ class EnergyGuard {
     bool part_balanced(const Limit& limit, const Energies& energies, const std::vector<Place>& from,
                        const std::vector<double>& from_v, const Trial& trial, std::size_t r) {
         const PartLedger& old = energies.part[r];
-        PartLedger& own = part[r];
+        PartLedger& ledger = part[r];
         double work = 0.0, drive = 0.0, exchanged = 0.0, turned = 0.0, magnitude = 0.0;
         for (int c = 0; c < n; ++c) {
             if (mechanism.tree.light_parts[r].carried[c]) {
@@ -452,18 +455,19 @@ class EnergyGuard {
                 continue;
             }
             const Compensated &now = trial.place[c].place, &then = from[c].place;
-            const double by_place = 0.5 * (old.Lq[c] + own.Lq[c]) * ((now.high - then.high) + (now.low - then.low));
-            const double by_rate = 0.5 * (old.Lv[c] + own.Lv[c]) * (trial.v[c] - from_v[c]);
-            drive += by_place + by_rate;
-            exchanged += std::abs(by_place) + std::abs(by_rate);
+            const double by_position =
+                0.5 * (old.Lq[c] + ledger.Lq[c]) * ((now.high - then.high) + (now.low - then.low));
+            const double by_rate = 0.5 * (old.Lv[c] + ledger.Lv[c]) * (trial.v[c] - from_v[c]);
+            drive += by_position + by_rate;
+            exchanged += std::abs(by_position) + std::abs(by_rate);
         }
-        const double error = (own.jacobi - old.jacobi) - work + drive;
-        exchanged += std::abs(own.potential - old.potential) + std::abs(work);
-        const double most = limit.of(error, old.defect, turned, exchanged, part_room * old.most);
-        own.defect = old.defect + error;
-        own.most = std::max(old.most, turned);
+        const double error = (ledger.jacobi - old.jacobi) - work + drive;
+        exchanged += std::abs(ledger.potential - old.potential) + std::abs(work);
+        const double most = limit.of(error, old.defect, turned, exchanged, part_factor * old.most);
+        ledger.defect = old.defect + error;
+        ledger.most = std::max(old.most, turned);
         return std::abs(error) <=
-               part_room * most + rounding * (old.scale + own.scale + exchanged + magnitude) + nothing;
+               part_factor * most + rounding * (old.scale + ledger.scale + exchanged + magnitude) + nothing;
     }
 };
 

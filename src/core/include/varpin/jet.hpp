@@ -100,10 +100,10 @@ struct Jet {
           potential_scale(tree.groups),
           Lq_scale(dof),
           Lv_scale(dof) {
-        if (matrices) make_room();
+        if (matrices) allocate();
     }
 
-    void make_room() {
+    void allocate() {
         for (auto* matrix : {&M, &A, &Lqq}) matrix->resize(entries(dof, dof));
     }
 
@@ -113,7 +113,7 @@ struct Jet {
     std::vector<T> potential;  // of each group [J]
     std::vector<T> Lq, Lv, M, A, Lqq;
     std::vector<double> potential_scale, Lq_scale, Lv_scale;  // sums of the magnitudes that make them up
-    CouplingRoom<T> couplings;
+    CouplingWorkspace<T> couplings;
 
     T total_potential() const {
         T sum{};
@@ -182,17 +182,17 @@ template <class Size>
     const Body& link = tree.bodies[j];
     auto& here = w.body[j];
     const double rate = std::abs(link.ratio * v[link.coordinate]);
-    Magnitudes& own = here.magnitude;
-    own.velocity = norm1(here.axis.linear) * rate;
-    own.turning = norm1(here.axis.angular) * rate;
+    Magnitudes& magnitude = here.magnitude;
+    magnitude.velocity = norm1(here.axis.linear) * rate;
+    magnitude.turning = norm1(here.axis.angular) * rate;
     if (link.parent >= 0) {
-        own.velocity += w.body[link.parent].magnitude.velocity;
-        own.turning += w.body[link.parent].magnitude.turning;
+        magnitude.velocity += w.body[link.parent].magnitude.velocity;
+        magnitude.turning += w.body[link.parent].magnitude.turning;
     }
-    own.moment = norm1(here.inertia.moment);
-    own.momentum = link.mass * own.velocity + own.turning * own.moment;
-    own.spin = (link.inertia.xx + link.inertia.yy + link.inertia.zz) * own.turning;
-    if (link.mass > 0.0) own.spin += own.moment / link.mass * own.momentum;
+    magnitude.moment = norm1(here.inertia.moment);
+    magnitude.momentum = link.mass * magnitude.velocity + magnitude.turning * magnitude.moment;
+    magnitude.spin = (link.inertia.xx + link.inertia.yy + link.inertia.zz) * magnitude.turning;
+    if (link.mass > 0.0) magnitude.spin += magnitude.moment / link.mass * magnitude.momentum;
 }
 
 // Gravity's potential energy of what an origin carries: of its moments, and of all masses' shift.
@@ -222,12 +222,13 @@ template <class T, class Size>
     w.Lv[c] += link.ratio * dot(here.axis, here.momentum);
     w.Lq[c] += link.ratio * (dot(here.axis_rate, here.momentum) + dot(here.axis, weight));
     if constexpr (Jet<T, Size>::scaled) {
-        const Magnitudes& own = here.magnitude;
+        const Magnitudes& magnitude = here.magnitude;
         const Magnitudes up = link.parent >= 0 ? w.body[link.parent].magnitude : Magnitudes{};
         const double shift = norm1(here.axis.linear), turn = norm1(here.axis.angular);
-        const double Lv_scale = shift * own.momentum + turn * own.spin;
-        double Lq_scale = (up.turning * shift + up.velocity * turn) * own.momentum + up.turning * turn * own.spin;
-        Lq_scale += norm1(g) * (here.inertia.mass * shift + turn * own.moment);
+        const double Lv_scale = shift * magnitude.momentum + turn * magnitude.spin;
+        double Lq_scale =
+            (up.turning * shift + up.velocity * turn) * magnitude.momentum + up.turning * turn * magnitude.spin;
+        Lq_scale += norm1(g) * (here.inertia.mass * shift + turn * magnitude.moment);
         w.Lv_scale[c] += std::abs(link.ratio) * Lv_scale;
         w.Lq_scale[c] += std::abs(link.ratio) * Lq_scale;
     }
@@ -281,11 +282,12 @@ void project_mass(const Tree& tree, int j, Jet<T, Size>& w) {
 
 // Hand what body j carries on to its parent. Above an origin all slide: they see masses and linear momenta alone.
 template <class T>
-[[gnu::always_inline]] inline void pass_inertia(const Body& link, const Inertia<T>& own, Inertia<T>& up, bool second) {
-    up.mass += own.mass;
+[[gnu::always_inline]] inline void pass_inertia(const Body& link, const Inertia<T>& carried, Inertia<T>& up,
+                                                bool second) {
+    up.mass += carried.mass;
     if (link.origin) return;
-    up.moment += own.moment;
-    if (second) up.second += own.second;
+    up.moment += carried.moment;
+    if (second) up.second += carried.second;
 }
 
 template <class T, class Size>
@@ -326,30 +328,33 @@ void clear_blocks(const Tree& tree, Size n, std::vector<T>& matrix) {
 // The couplings' potential energy, and its derivatives up to an order. Inlined it would slow down sweeps without any.
 template <class T, class Size>
 [[gnu::noinline]] void add_couplings(const Mechanism& mechanism, const T* q, Jet<T, Size>& w, int order) {
-    mechanism.couplings.potentials(q, w.couplings, [&](const auto& arms, const auto& own, double scale, double size) {
-        const int group = mechanism.tree.group[arms.front().coordinate];
-        w.potential[group] += own.energy;
-        if constexpr (Jet<T, Size>::scaled) w.potential_scale[group] += size;
-        if (order == 0) return;
-        for (const Arm<T>& arm : arms) {
-            w.Lq[arm.coordinate] += -dot(own.slope, arm.linear);
-            if constexpr (Jet<T, Size>::scaled) w.Lq_scale[arm.coordinate] += scale * norm1(arm.linear);
-        }
-        if (order > 1) Couplings::subtract_curvature(arms, own, w.dof, w.Lqq.data());
-    });
+    mechanism.couplings.potentials(q, w.couplings,
+                                   [&](const auto& arms, const auto& potential, double scale, double size) {
+                                       const int group = mechanism.tree.group[arms.front().coordinate];
+                                       w.potential[group] += potential.energy;
+                                       if constexpr (Jet<T, Size>::scaled) w.potential_scale[group] += size;
+                                       if (order == 0) return;
+                                       for (const Arm<T>& arm : arms) {
+                                           w.Lq[arm.coordinate] += -dot(potential.slope, arm.linear);
+                                           if constexpr (Jet<T, Size>::scaled)
+                                               w.Lq_scale[arm.coordinate] += scale * norm1(arm.linear);
+                                       }
+                                       if (order > 1)
+                                           Couplings::subtract_curvature(arms, potential, w.dof, w.Lqq.data());
+                                   });
 }
 
 // The elements' potential energy, and its derivatives up to an order.
 template <class T, class Size>
 void add_elements(const Mechanism& mechanism, const T* q, Jet<T, Size>& w, int order) {
-    mechanism.forces.potentials(q, [&](int c, const Potential<T>& own) {
+    mechanism.forces.potentials(q, [&](int c, const Potential<T>& potential) {
         const int group = mechanism.tree.group[c];
-        w.potential[group] += own.energy;
-        if (order > 0) w.Lq[c] += own.force;
-        if (order > 1) w.Lqq[c * w.dof + c] += own.curvature;
+        w.potential[group] += potential.energy;
+        if (order > 0) w.Lq[c] += potential.force;
+        if (order > 1) w.Lqq[c * w.dof + c] += potential.curvature;
         if constexpr (Jet<T, Size>::scaled) {
-            w.potential_scale[group] += std::abs(own.energy);
-            if (order > 0) w.Lq_scale[c] += own.scale;
+            w.potential_scale[group] += std::abs(potential.energy);
+            if (order > 0) w.Lq_scale[c] += potential.scale;
         }
     });
     if (mechanism.couplings.any()) add_couplings(mechanism, q, w, order);
@@ -436,8 +441,8 @@ void first_order(const Mechanism& mechanism, const double* q, const double* v, J
 
 // The potential energy at q alone. `enter` sees each body placed with its inertia by itself, the first one first; then
 // `project` each with the inertia of all it carries, the last one first.
-template <class Size, class Enter, class Project>
-void inertias(const Mechanism& mechanism, const double* q, Jet<double, Size>& w, const Enter& enter,
+template <class Size, class Visit, class Project>
+void inertias(const Mechanism& mechanism, const double* q, Jet<double, Size>& w, const Visit& visit,
               const Project& project) {
     const Tree& tree = mechanism.tree;
     const int bodies = bodies_of(tree, w.dof);
@@ -448,7 +453,7 @@ void inertias(const Mechanism& mechanism, const double* q, Jet<double, Size>& w,
         auto& here = w.body[j];
         detail::place(tree, j, q, w);
         here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
-        enter(j);
+        visit(j);
     }
     for (int j = bodies - 1; j >= 0; --j) {
         const Body& link = tree.bodies[j];

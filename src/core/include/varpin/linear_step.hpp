@@ -52,8 +52,8 @@ class LinearStep {
             for (int i = 0; i < n; ++i) {
                 double* __restrict out = D[half * n + i];
                 const double* __restrict places = J[i];
-                const double* __restrict own = speeds[i];
-                for (int c = 0; c < size; ++c) out[c] = of.q1 * places[c] + of.v1 * own[c];
+                const double* __restrict speed = speeds[i];
+                for (int c = 0; c < size; ++c) out[c] = of.q1 * places[c] + of.v1 * speed[c];
                 add_node(of.q0, of.v0, before, i, out);
             }
         }
@@ -70,7 +70,7 @@ class LinearStep {
     }
 
     // The jump of process w, and F; false where F is zero.
-    bool load_process(const ExpandedSteps& steps, std::ptrdiff_t s, int w) {
+    bool read_process(const ExpandedSteps& steps, std::ptrdiff_t s, int w) {
         const int m = size - x;
         bool depends = false;
         for (int i = 0; i < x; ++i) {

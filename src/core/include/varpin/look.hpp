@@ -172,8 +172,8 @@ inline Turnover turnover(const Mechanism& mechanism, const Record& record, doubl
     double work = 0.0;
     for (std::size_t k = 0; k + 1 < nodes; ++k) {
         std::fill(force.begin(), force.end(), 0.0);
-        for (const Transmission& own : mechanism.actuation)
-            force[own.coordinate] += own.ratio * record.u[k * m + own.control];
+        for (const Transmission& transmission : mechanism.actuation)
+            force[transmission.coordinate] += transmission.ratio * record.u[k * m + transmission.control];
         if (mechanism.forces.drives()) {
             for (int c = 0; c < n; ++c) {
                 const double before = record.q[k * n + c], after = record.q[(k + 1) * n + c];
@@ -227,8 +227,9 @@ inline Glance glance(const Mechanism& mechanism, const Record& record, const std
     std::vector<double> force(n);
     for (const std::size_t node : {std::size_t{0}, steps}) {
         std::fill(force.begin(), force.end(), 0.0);
-        for (const Transmission& own : mechanism.actuation)
-            force[own.coordinate] += own.ratio * record.u[std::min(node, steps - 1) * m + own.control];
+        for (const Transmission& transmission : mechanism.actuation)
+            force[transmission.coordinate] +=
+                transmission.ratio * record.u[std::min(node, steps - 1) * m + transmission.control];
         seen.pulled =
             seen.pulled || pulls_fast(inertias, {record.q + node * n, record.v + node * n, force.data(), 1}, record.h);
     }
@@ -265,8 +266,8 @@ inline bool agree_in_doubled_steps(const Mechanism& mechanism, const double* q, 
         for (int c = 0; c < n; ++c) largest[int{slides[c]}] = larger(largest[int{slides[c]}], unit[c]);
         for (int c = 0; c < n; ++c) {
             const double least = allowed.light * energy / root[c] * time;
-            const double own = larger(unit[c], std::min(allowed.little * largest[int{slides[c]}], least));
-            if (!(off[c] <= part * own)) return false;
+            const double size = larger(unit[c], std::min(allowed.little * largest[int{slides[c]}], least));
+            if (!(off[c] <= part * size)) return false;
         }
         return true;
     };
@@ -284,10 +285,10 @@ inline bool agree_in_doubled_steps(const Mechanism& mechanism, const double* q, 
             }
         }
         for (std::size_t k = 0; k < length / 2; ++k) {
-            const std::size_t row = (w * (length / 2) + k) * n, own = 2 * (k + 1) * n;
+            const std::size_t row = (w * (length / 2) + k) * n, whole = 2 * (k + 1) * n;
             for (int c = 0; c < n; ++c) {
-                off_q[c] = larger(off_q[c], std::abs(again_q[row + c] - first_q[own + c]));
-                off_v[c] = larger(off_v[c], std::abs(again_v[row + c] - first_v[own + c]));
+                off_q[c] = larger(off_q[c], std::abs(again_q[row + c] - first_q[whole + c]));
+                off_v[c] = larger(off_v[c], std::abs(again_v[row + c] - first_v[whole + c]));
             }
         }
         inertias.at(first_q);

@@ -14,7 +14,7 @@ namespace varpin {
 class Manipulability {
   public:
     // For up to `rows` rows of `columns`, rows <= columns.
-    void make_room(int rows, int columns) {
+    void allocate(int rows, int columns) {
         const std::size_t size = static_cast<std::size_t>(rows) * static_cast<std::size_t>(columns);
         if (L_.size() >= size) return;
         for (std::vector<double>* array : {&L_, &normals_, &slope_}) array->resize(size);
@@ -45,19 +45,19 @@ class Manipulability {
 
     // Turns row k so that nothing is left of it beyond its diagonal entry, which is returned.
     double reflect(int k) {
-        double* own = L_.data() + k * columns_;
+        double* row = L_.data() + k * columns_;
         double* normal = normals_.data() + k * columns_;
         double square = 0.0;
-        for (int c = k; c < columns_; ++c) square += own[c] * own[c];
-        const double length = std::sqrt(square), end = own[k] > 0.0 ? -length : length;
-        std::copy_n(own, columns_, normal);
+        for (int c = k; c < columns_; ++c) square += row[c] * row[c];
+        const double length = std::sqrt(square), end = row[k] > 0.0 ? -length : length;
+        std::copy_n(row, columns_, normal);
         std::fill(normal, normal + k, 0.0);
         normal[k] -= end;
         // |own - end e_k|^2 / 2
-        const double half = length * (length + std::abs(own[k])), scale = half > 0.0 ? 1.0 / std::sqrt(half) : 0.0;
+        const double half = length * (length + std::abs(row[k])), scale = half > 0.0 ? 1.0 / std::sqrt(half) : 0.0;
         for (int c = k; c < columns_; ++c) normal[c] *= scale;
         for (int i = k + 1; i < rows_; ++i) apply(k, L_.data() + i * columns_);
-        own[k] = end;
+        row[k] = end;
         return end;
     }
 

@@ -36,9 +36,9 @@ inline void triangularize(double* a, int rows, int columns, int leading, double*
         for (int i = k + 1; i < rows; ++i) {
             double* __restrict row = a + i * columns;
             row[k] /= first;
-            const double own = row[k];
-            if (own == 0.0) continue;
-            for (int j = k + 1; j < columns; ++j) work[j] += own * row[j];
+            const double entry = row[k];
+            if (entry == 0.0) continue;
+            for (int j = k + 1; j < columns; ++j) work[j] += entry * row[j];
         }
         for (int j = k + 1; j < columns; ++j) {
             work[j] *= factor;
@@ -46,10 +46,10 @@ inline void triangularize(double* a, int rows, int columns, int leading, double*
         }
         for (int i = k + 1; i < rows; ++i) {
             double* __restrict row = a + i * columns;
-            const double own = row[k];
+            const double entry = row[k];
             row[k] = 0.0;
-            if (own == 0.0) continue;
-            for (int j = k + 1; j < columns; ++j) row[j] -= own * work[j];
+            if (entry == 0.0) continue;
+            for (int j = k + 1; j < columns; ++j) row[j] -= entry * work[j];
         }
         top[k] = end;
     }

@@ -28,10 +28,10 @@ struct Commands {
 inline void apply_policy(const Commands& commands, std::ptrdiff_t path, std::ptrdiff_t s, int n, const double* first,
                          const double* second, double* u) {
     const int m = commands.controls;
-    double* own = u + s * m;
-    const double* last = s > 0 ? own - m : commands.before ? commands.before + path * m : nullptr;
+    double* decision = u + s * m;
+    const double* last = s > 0 ? decision - m : commands.before ? commands.before + path * m : nullptr;
     if (s % commands.hold != 0) {
-        for (int c = 0; c < m; ++c) own[c] = last[c];
+        for (int c = 0; c < m; ++c) decision[c] = last[c];
         return;
     }
     const std::ptrdiff_t r = s / commands.hold;
@@ -51,14 +51,15 @@ inline void apply_policy(const Commands& commands, std::ptrdiff_t path, std::ptr
         // Neither comparison is true of NaN, which stays.
         if (total < commands.least[c]) total = commands.least[c];
         if (total > commands.greatest[c]) total = commands.greatest[c];
-        own[c] = total;
+        decision[c] = total;
     }
 }
 
 // The force drift + B u that is constant over a step; drift (n) is null for none.
 inline void constant_force(const Mechanism& mechanism, const double* drift, const double* u, double* force) {
     for (int r = 0; r < mechanism.dof(); ++r) force[r] = drift ? drift[r] : 0.0;
-    for (const Transmission& own : mechanism.actuation) force[own.coordinate] += own.ratio * u[own.control];
+    for (const Transmission& transmission : mechanism.actuation)
+        force[transmission.coordinate] += transmission.ratio * u[transmission.control];
 }
 
 // The same at each of `stages` stages, whose controls are the rows of u, into the rows of force (stages, n).
@@ -90,8 +91,8 @@ inline void diffusion_centers(const Mechanism& mechanism, const double* q, doubl
     const int k = fields.processes;
     for (int i = 0; i < mechanism.dof(); ++i) {
         for (int w = 0; w < k; ++w) {
-            const double own = fields.center[i * k + w];
-            center[i * k + w] = std::isnan(own) ? q[i] : own;
+            const double given = fields.center[i * k + w];
+            center[i * k + w] = std::isnan(given) ? q[i] : given;
         }
     }
 }

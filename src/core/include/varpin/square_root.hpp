@@ -86,11 +86,11 @@ class RootPass {
           before(size),
           gradient(size),
           terms(size),
-          own(m),
+          control_norm(m),
           weight(m),
           Qu(m),
           pulled(m),
-          moved(m),
+          Ruu_k(m),
           forced(m),
           H(m * m),
           K(m * size),
@@ -116,8 +116,8 @@ class RootPass {
             const bool decides = s % hold == 0;
             stack.reset(decides && steps.rate ? size + m + 1 : size + 1);
             carry(steps, s, steps.rate || (s + 1) % hold != 0);
-            kicked.reset(x);
-            if (steps.processes > 0) kick(std::sqrt(h));
+            noise_root.reset(x);
+            if (steps.processes > 0) add_value_to_noise_root(std::sqrt(h));
             add_running_cost(h, steps, s, running);
             if (steps.processes > 0) add_noise(steps, s, gains.spread + s * x * x);
             linear.swap(before);
@@ -175,9 +175,9 @@ class RootPass {
     }
 
     // Rows N of what a jump of the state meets: first the value, then the samples after it. S = N'N.
-    void kick(double factor) {
+    void add_value_to_noise_root(double factor) {
         for (int i = 0; i < root.rows(); ++i) {
-            double* row = kicked.push();
+            double* row = noise_root.push();
             for (int c = 0; c < x; ++c) row[c] = factor * root[i][c];
         }
     }
@@ -200,7 +200,7 @@ class RootPass {
             expand_gradient(weight, steps.gradient_at(point), gradient);
             if (steps.processes == 0 || !step.expand_after(at)) continue;
             for (int i = 0; i < size; ++i) {
-                double* row = kicked.push();
+                double* row = noise_root.push();
                 for (int j = 0; j < x; ++j) {
                     const double entry = h * std::sqrt(at.weight) * L[i * size + j];
                     for (int c = 0; c < x; ++c) row[c] += entry * step.P[j][c];
@@ -216,24 +216,24 @@ class RootPass {
     }
 
     void add_noise(const ExpandedSteps& steps, std::ptrdiff_t s, double* spread) {
-        kicked.triangularize(x);
+        noise_root.triangularize(x);
         std::fill_n(spread, x * x, 0.0);
         for (int l = 0; l < x; ++l) {
             for (int i = 0; i < x; ++i) {
-                for (int j = 0; j < x; ++j) spread[i * x + j] += kicked[l][i] * kicked[l][j];
+                for (int j = 0; j < x; ++j) spread[i * x + j] += noise_root[l][i] * noise_root[l][j];
             }
         }
         for (int w = 0; w < steps.processes; ++w) {
-            const bool depends = step.load_process(steps, s, w);
+            const bool depends = step.read_process(steps, s, w);
             for (int i = 0; i < x; ++i) {
                 double jump = 0.0;
-                for (int j = 0; j < x; ++j) jump += kicked[i][j] * step.jump[j];
+                for (int j = 0; j < x; ++j) jump += noise_root[i][j] * step.jump[j];
                 found.noise += 0.5 * jump * jump;
                 if (!depends) continue;
                 double* row = stack.push();
                 for (int j = 0; j < x; ++j) {
-                    add_to_row(kicked[i][j], step.F[j], row);
-                    add_row(jump * kicked[i][j], step.F[j], gradient);
+                    add_to_row(noise_root[i][j], step.F[j], row);
+                    add_row(jump * noise_root[i][j], step.F[j], gradient);
                 }
                 shift(stack.rows() - 1) = jump;
             }
@@ -256,14 +256,14 @@ class RootPass {
     bool decide(double regularization, const ExpandedSteps& steps, std::ptrdiff_t r, const Squares& change,
                 const Gains& gains) {
         if (steps.rate) add_change(change, steps.pull + r * m, r);
-        column_norms(stack, 0, own.data(), m);
+        column_norms(stack, 0, control_norm.data(), m);
         column_norms(stack, m, terms.data(), x);
         const int others = stack.width() - 1 - m;  // x, and the control before
         stack.triangularize(m + others);
         if (!std::all_of(stack[0], stack[m + others],
                          [](double entry) { return std::abs(entry) < std::numeric_limits<double>::infinity(); }))
             return false;
-        const double largest = m > 0 ? *std::max_element(own.begin(), own.end()) : 0.0;
+        const double largest = m > 0 ? *std::max_element(control_norm.begin(), control_norm.end()) : 0.0;
         if (!(largest > 0.0)) return false;
         for (int i = 0; i < m; ++i) {
             Qu[i] = linear[x + i];
@@ -277,10 +277,10 @@ class RootPass {
             std::copy_n(&K[i * others], x, gains.feedback + (r * m + i) * x);
             if (steps.rate) std::copy_n(&K[i * others + x], m, gains.previous + (r * m + i) * m);
             gains.control_gradient[r * m + i] = costate[x + i];
-            moved[i] = 0.0;
-            for (int j = i; j < m; ++j) moved[i] += stack[i][j] * k[j];
+            Ruu_k[i] = 0.0;
+            for (int j = i; j < m; ++j) Ruu_k[i] += stack[i][j] * k[j];
             found.slope += Qu[i] * k[i];
-            found.curvature += moved[i] * moved[i];
+            found.curvature += Ruu_k[i] * Ruu_k[i];
         }
         // What no control takes away. Without regularization and limits it is zero, but for rounding.
         const bool whole = regular && std::none_of(box.held.begin(), box.held.end(), [](char held) { return held; });
@@ -308,8 +308,8 @@ class RootPass {
     bool regularize(double regularization, double largest) {
         bool regular = true;
         for (int i = 0; i < m; ++i) {
-            const bool idle = own[i] == 0.0 && Qu[i] == 0.0;
-            weight[i] = idle ? largest : std::sqrt(regularization) * own[i];
+            const bool idle = control_norm[i] == 0.0 && Qu[i] == 0.0;
+            weight[i] = idle ? largest : std::sqrt(regularization) * control_norm[i];
             regular = regular && weight[i] == 0.0;
         }
         firm.reset(stack.width());
@@ -358,8 +358,10 @@ class RootPass {
             const double pivot = std::abs(U[i][i]);
             const int control = free[i];
             if (!(pivot > 0.0)) return false;
-            const bool idle = own[control] == 0.0 && Qu[control] == 0.0;
-            if (!idle) found.loss = std::max(found.loss, epsilon * std::max(scale[x + control], own[control]) / pivot);
+            const bool idle = control_norm[control] == 0.0 && Qu[control] == 0.0;
+            if (!idle)
+                found.loss =
+                    std::max(found.loss, epsilon * std::max(scale[x + control], control_norm[control]) / pivot);
         }
         solve_free(count, others, k);
         if (slack && !ahead) {
@@ -401,7 +403,7 @@ class RootPass {
             for (int j = i; j < m; ++j) {
                 for (int c = 0; c < others; ++c) row[c] += stack[i][j] * K[j * others + c];
             }
-            row[size] += moved[i];
+            row[size] += Ruu_k[i];
         }
         std::copy_n(terms.begin(), x, scale.begin());
     }
@@ -440,15 +442,15 @@ class RootPass {
     // Work arrays of a step.
     LinearStep step;
     RowStack stack;                // of what adds up to the cost in (u, x, ...)
-    RowStack kicked;               // (., x) N
+    RowStack noise_root;           // (., x) N
     std::vector<double> before;    // (size) the next `linear`
     std::vector<double> gradient;  // (size) the next costate
     std::vector<double> terms;     // (size) the next scale
     // And of a decision.
-    RowStack firm, U;                         // rows of the controls, regularized; of the free ones
-    std::vector<double> own, weight;          // (m) norms of the controls' columns; regularization
-    std::vector<double> Qu, pulled;           // gradient, also where the state is expected
-    std::vector<double> moved, forced, H, K;  // R_uu k; U'^-1 linear; (m, m); (m, others)
+    RowStack firm, U;                          // rows of the controls, regularized; of the free ones
+    std::vector<double> control_norm, weight;  // (m) norms of the controls' columns; regularization
+    std::vector<double> Qu, pulled;            // gradient, also where the state is expected
+    std::vector<double> Ruu_k, forced, H, K;   // R_uu k; U'^-1 linear; (m, m); (m, others)
     std::vector<int> free;
     BoxMinimum box;
 };

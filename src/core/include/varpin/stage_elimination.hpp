@@ -60,13 +60,13 @@ class StageElimination {
             double* kept = slot < 0 ? small_.data() : z + at(slot);
             if (slot < 0) std::fill(small_.begin(), small_.end(), 0.0);
             for (int i = 0; i < stages_; ++i) kept[i] += detail::product(width_, factors(j).row + i * width_, z);
-            if (slot < 0) settle(c, j, b, z, x);
+            if (slot < 0) substitute(c, j, b, z, x);
             if (link.parent < 0 && ties().slots == 0) continue;
-            settle_ties(j, b, z, x);
+            substitute_ties(j, b, z, x);
             if (link.origin) detail::keep_linear(bodies_, 9, z);
             force_.hand_on(j, link.parent);
         }
-        if (ties().slots > 0) settle_ties(-1, b, force_.of_ground(), x);
+        if (ties().slots > 0) substitute_ties(-1, b, force_.of_ground(), x);
         move_ties(-1, x);
         for (int j = 0; j < tree_->size(); ++j) {
             const Body& link = tree_->bodies[j];
@@ -91,9 +91,10 @@ class StageElimination {
             for (int c = 0; c < stages_; ++c) {
                 const EliminatedBody& state = state_[j * stages_ + c];
                 const double *moved = motion(j) + 9 * c, *above = motion(link.parent) + 9 * c;
-                double own = 0.0;
-                for (int m = 0; m < stages_; ++m) own += h_ * tableau_->a[c * stages_ + m] * x[m * n + link.coordinate];
-                y[c * n + link.coordinate] += state.change_of_slope(own, moved, above, z + 9 * c);
+                double rate_of_x = 0.0;
+                for (int m = 0; m < stages_; ++m)
+                    rate_of_x += h_ * tableau_->a[c * stages_ + m] * x[m * n + link.coordinate];
+                y[c * n + link.coordinate] += state.change_of_slope(rate_of_x, moved, above, z + 9 * c);
             }
             if (link.parent < 0) continue;
             if (link.origin) detail::keep_linear(bodies_, 9, z);
@@ -105,16 +106,16 @@ class StageElimination {
     double kinetic_size(const double* x) {
         double total = 0.0;
         for (int c = 0; c < stages_; ++c) {
-            const double* own = x + c * tree_->dof();
+            const double* x_stage = x + c * tree_->dof();
             double size = 0.0;
             for (int j = 0; j < tree_->size(); ++j) {
                 const Body& link = tree_->bodies[j];
                 const EliminatedBody& state = state_[j * stages_ + c];
-                twist_[j] = own[link.coordinate] * state.axis;
+                twist_[j] = x_stage[link.coordinate] * state.axis;
                 if (link.parent >= 0) twist_[j] += twist_[link.parent];
                 size += dot(twist_[j], state.inertia * twist_[j]);
             }
-            for (int k = 0; k < tree_->dof(); ++k) size += tree_->armature[k] * own[k] * own[k];
+            for (int k = 0; k < tree_->dof(); ++k) size += tree_->armature[k] * x_stage[k] * x_stage[k];
             total += tableau_->b[c] * size;
         }
         return total;
@@ -144,12 +145,12 @@ class StageElimination {
             const auto add_curved = [&](double* X, int width) {
                 for (int c = 0; c < stages_; ++c) {
                     const double b = tableau_->b[c];
-                    double* own = X + 12 * c * (width + 1);
-                    detail::add_inertia(b, inertia(j, c), width, own);
-                    detail::add_inertia(-b * k, inertia(j, c), width, own + 6 * (width + 1));
+                    double* block = X + 12 * c * (width + 1);
+                    detail::add_inertia(b, inertia(j, c), width, block);
+                    detail::add_inertia(-b * k, inertia(j, c), width, block + 6 * (width + 1));
                     if (coupling == 0.0) continue;
-                    detail::add_inertia(b * coupling, inertia(j, c), width, own + 6);
-                    detail::add_inertia(b * coupling, inertia(j, c), width, own + 6 * width);
+                    detail::add_inertia(b * coupling, inertia(j, c), width, block + 6);
+                    detail::add_inertia(b * coupling, inertia(j, c), width, block + 6 * width);
                 }
             };
             if (!masses_.eliminate(j, tree_->armature.data(), add_masses)) return 0.0;
@@ -189,9 +190,9 @@ class StageElimination {
 
     int factor_size() const { return 4 * stages_ * width_ + stages_ * stages_; }
     Factors factors(int j) {
-        double* own = factors_.data() + j * factor_size();
+        double* at = factors_.data() + j * factor_size();
         const int size = stages_ * width_;
-        return {own, own + size, own + 2 * size, own + 3 * size, own + 4 * size};
+        return {at, at + size, at + 2 * size, at + 3 * size, at + 4 * size};
     }
     double* motion(int j) { return motion_.data() + width_ * (j + 1); }
 
@@ -201,31 +202,32 @@ class StageElimination {
 
     void eliminate(int j) {
         const Body& link = tree_->bodies[j];
-        const Factors own = factors(j);
-        write_rows(j, own);
+        const Factors factors_here = factors(j);
+        write_rows(j, factors_here);
         double* X = matrix_.of(j);
         for (int r = 0; r < width_; ++r) {
             const double* line = X + r * width_;
             for (int m = 0; m < stages_; ++m) {
-                own.u[m * width_ + r] += detail::product(width_, line, own.column + m * width_);
-                detail::add_scaled(width_, own.row[m * width_ + r], line, own.l + m * width_);
+                factors_here.u[m * width_ + r] += detail::product(width_, line, factors_here.column + m * width_);
+                detail::add_scaled(width_, factors_here.row[m * width_ + r], line, factors_here.l + m * width_);
             }
         }
         for (int i = 0; i < stages_; ++i) {
             for (int m = 0; m < stages_; ++m)
-                lu_[i * stages_ + m] = detail::product(width_, own.row + i * width_, own.u + m * width_);
+                lu_[i * stages_ + m] =
+                    detail::product(width_, factors_here.row + i * width_, factors_here.u + m * width_);
         }
         const int slot = ties().slot[link.coordinate];
         if (slot < 0) {
-            take_out(link.coordinate, own, X);
+            take_out(link.coordinate, factors_here, X);
             if (sign_ == 0 || (link.parent < 0 && ties().slots == 0)) return;
         } else {
             for (int m = 0; m < stages_; ++m) {
-                for (int r = 0; r < width_; ++r) X[r * width_ + at(slot) + m] += own.u[m * width_ + r];
+                for (int r = 0; r < width_; ++r) X[r * width_ + at(slot) + m] += factors_here.u[m * width_ + r];
             }
             for (int i = 0; i < stages_; ++i) {
                 double* line = X + (at(slot) + i) * width_;
-                detail::add_scaled(width_, 1.0, own.l + i * width_, line);
+                detail::add_scaled(width_, 1.0, factors_here.l + i * width_, line);
                 detail::add_scaled(stages_, 1.0, &lu_[i * stages_], line + at(slot));
             }
         }
@@ -238,60 +240,61 @@ class StageElimination {
     void eliminate_ties(int j, double* X) {
         for (const Ties::Tied& tied : ties().ending(j)) {
             if (sign_ == 0) return;
-            const Factors own = factors(tied.body);
+            const Factors factors_here = factors(tied.body);
             const int slot = at(tied.slot);
             for (int i = 0; i < stages_; ++i) {
                 const double* line = X + (slot + i) * width_;
                 std::copy(line + slot, line + slot + stages_, &lu_[i * stages_]);
-                std::copy(line, line + width_, own.l + i * width_);
-                for (int r = 0; r < width_; ++r) own.u[i * width_ + r] = X[r * width_ + slot + i];
+                std::copy(line, line + width_, factors_here.l + i * width_);
+                for (int r = 0; r < width_; ++r) factors_here.u[i * width_ + r] = X[r * width_ + slot + i];
             }
             for (int i = 0; i < stages_; ++i) {
-                for (double* x : {own.u, own.l}) std::fill_n(x + i * width_ + slot, stages_, 0.0);
+                for (double* x : {factors_here.u, factors_here.l}) std::fill_n(x + i * width_ + slot, stages_, 0.0);
             }
-            take_out(tied.coordinate, own, X);
+            take_out(tied.coordinate, factors_here, X);
             detail::clear_slot(slot, stages_, width_, X);
         }
     }
 
     // Eliminate coordinate c with its u, l and, but for its diagonal, D; takes the sign of D's determinant into sign_.
-    void take_out(int c, const Factors& own, double* X) {
+    void take_out(int c, const Factors& factors_here, double* X) {
         for (int k = 0; k < stages_ * stages_; ++k) lu_[k] += diagonal_[k * tree_->dof() + c];
         const int sign = factor_lu_pivoting(lu_.data(), stages_, rows_.data());
         sign_ = stages_ == 1 ? std::max(sign, 0) : sign_ * sign;
         if (sign_ == 0) return;
-        invert(own.inverse);
+        invert(factors_here.inverse);
         for (int r = 0; r < width_; ++r) {
-            for (int i = 0; i < stages_; ++i) small_[i] = own.l[i * width_ + r];
+            for (int i = 0; i < stages_; ++i) small_[i] = factors_here.l[i * width_ + r];
             for (int m = 0; m < stages_; ++m) {
                 double total = 0.0;
-                for (int i = 0; i < stages_; ++i) total += own.inverse[m * stages_ + i] * small_[i];
-                own.l[m * width_ + r] = total;
+                for (int i = 0; i < stages_; ++i) total += factors_here.inverse[m * stages_ + i] * small_[i];
+                factors_here.l[m * width_ + r] = total;
             }
         }
         for (int r = 0; r < width_; ++r) {
             for (int m = 0; m < stages_; ++m)
-                detail::add_scaled(width_, -own.u[m * width_ + r], own.l + m * width_, X + r * width_);
+                detail::add_scaled(width_, -factors_here.u[m * width_ + r], factors_here.l + m * width_,
+                                   X + r * width_);
         }
     }
 
     // t = D^-1 (b - small_) of coordinate c into x, and what it leaves.
-    void settle(int c, int body, const double* b, double* z, double* x) {
+    void substitute(int c, int body, const double* b, double* z, double* x) {
         const int n = tree_->dof();
-        const Factors own = factors(body);
+        const Factors factors_here = factors(body);
         for (int i = 0; i < stages_; ++i) small_[i] = b[i * n + c] - small_[i];
         for (int m = 0; m < stages_; ++m) {
             double t = 0.0;
-            for (int i = 0; i < stages_; ++i) t += own.inverse[m * stages_ + i] * small_[i];
+            for (int i = 0; i < stages_; ++i) t += factors_here.inverse[m * stages_ + i] * small_[i];
             x[m * n + c] = t;
-            detail::add_scaled(width_, t, own.u + m * width_, z);
+            detail::add_scaled(width_, t, factors_here.u + m * width_, z);
         }
     }
-    void settle_ties(int j, const double* b, double* z, double* x) {
+    void substitute_ties(int j, const double* b, double* z, double* x) {
         for (const Ties::Tied& tied : ties().ending(j)) {
             double* kept = z + at(tied.slot);
             std::copy(kept, kept + stages_, small_.begin());
-            settle(tied.coordinate, tied.body, b, z, x);
+            substitute(tied.coordinate, tied.body, b, z, x);
             std::fill(kept, kept + stages_, 0.0);
         }
     }
@@ -311,7 +314,7 @@ class StageElimination {
     }
 
     // Rows and columns of body j, and u and l as far as they are its own.
-    void write_rows(int j, const Factors& own) const {
+    void write_rows(int j, const Factors& factors_here) const {
         for (int i = 0; i < stages_; ++i) {
             for (int c = 0; c < stages_; ++c) {
                 const EliminatedBody& state = state_[j * stages_ + c];
@@ -321,12 +324,13 @@ class StageElimination {
                 const int at = i * width_ + 9 * c;
                 const Motion<double> row = there * state.axis + (-behind) * state.rate;
                 const Motion<double> column = there * state.axis + ahead * state.rate;
-                detail::write(row, behind * state.axis.angular, own.row + at);
-                detail::write(column, ahead * state.axis.angular, own.column + at);
-                detail::write(state.inertia * column + ahead * state.turned, ahead * state.lifted, own.u + at);
-                detail::write(state.inertia * row + (-behind) * state.turned, behind * state.lifted, own.l + at);
+                detail::write(row, behind * state.axis.angular, factors_here.row + at);
+                detail::write(column, ahead * state.axis.angular, factors_here.column + at);
+                detail::write(state.inertia * column + ahead * state.turned, ahead * state.lifted, factors_here.u + at);
+                detail::write(state.inertia * row + (-behind) * state.turned, behind * state.lifted,
+                              factors_here.l + at);
             }
-            for (double* x : {own.row, own.column, own.u, own.l})
+            for (double* x : {factors_here.row, factors_here.column, factors_here.u, factors_here.l})
                 std::fill(x + i * width_ + bodies_, x + (i + 1) * width_, 0.0);
         }
     }

@@ -82,16 +82,16 @@ class SymmetricElimination {
         double* X = matrix_.of(j);
         std::fill(u_.begin() + size_, u_.end(), 0.0);
         for (int r = 0; r < width_; ++r) detail::add_scaled(width_, row(j)[r], X + r * width_, u_.data());
-        const double own = detail::product(width_, row(j), u_.data());
+        const double along_axis = detail::product(width_, row(j), u_.data());
         const int slot = ties.slot[link.coordinate];
         if (slot < 0) {
-            if (!take_out(link.coordinate, j, diagonal[link.coordinate] + own, X)) return false;
+            if (!take_out(link.coordinate, j, diagonal[link.coordinate] + along_axis, X)) return false;
             if (link.parent < 0 && ties.slots == 0) return true;
         } else {
             const int at = size_ + slot;
             for (int r = 0; r < width_; ++r) X[r * width_ + at] += u_[r];
             detail::add_scaled(width_, 1.0, u_.data(), X + at * width_);
-            X[at * width_ + at] += own;
+            X[at * width_ + at] += along_axis;
         }
         add_own(X, width_);
         if (!take_out_ties(j, diagonal, X)) return false;
@@ -104,16 +104,16 @@ class SymmetricElimination {
 
     // x with the matrix times x = b, and shares of 1/2 b . x, as of ArticulatedBodies.
     void solve(const double* b, double* x, double* share) {
-        const auto settle = [&](int c, int body, double left, double* z) {
+        const auto substitute = [&](int c, int body, double left, double* z) {
             x[c] = left / pivot_[c];
             if (share) share[c] = 0.5 * left * x[c];
             detail::add_scaled(width_, left, answer(body), z);
         };
-        const auto settle_ties = [&](int j, double* z) {
+        const auto substitute_ties = [&](int j, double* z) {
             for (const Ties::Tied& tied : order_->ties.ending(j)) {
-                double& own = z[size_ + tied.slot];
-                settle(tied.coordinate, tied.body, b[tied.coordinate] - own, z);
-                own = 0.0;
+                double& tied_force = z[size_ + tied.slot];
+                substitute(tied.coordinate, tied.body, b[tied.coordinate] - tied_force, z);
+                tied_force = 0.0;
             }
         };
         for (int j = tree_->size() - 1; j >= 0; --j) {
@@ -122,15 +122,15 @@ class SymmetricElimination {
             const double along = detail::product(width_, row(j), z);
             const int c = link.coordinate, slot = order_->ties.slot[c];
             if (slot < 0) {
-                settle(c, j, b[c] - along, z);
+                substitute(c, j, b[c] - along, z);
             } else {
                 z[size_ + slot] += along;
             }
-            settle_ties(j, z);
+            substitute_ties(j, z);
             if (link.origin) detail::keep_linear(size_, 6, z);
             force_.hand_on(j, link.parent);
         }
-        if (order_->ties.slots > 0) settle_ties(-1, force_.of_ground());
+        if (order_->ties.slots > 0) substitute_ties(-1, force_.of_ground());
         move_ties(-1, motion_.data(), x);
         for (int j = 0; j < tree_->size(); ++j) {
             const Body& link = tree_->bodies[j];

@@ -89,12 +89,12 @@ struct Mechanism {
 // are none. Of couplings its derivatives are diagonal no more: they go into by_q and by_v (n, n), which may be null.
 template <class T>
 void sum_forces(const Mechanism& mechanism, const T* q, const T* v, const T* f, JointForce<T>* out,
-                CouplingRoom<T>& room, T* by_q, T* by_v) {
+                CouplingWorkspace<T>& workspace, T* by_q, T* by_v) {
     const int n = mechanism.dof();
     mechanism.forces.sum(n, q, v, f, out);
     if (!mechanism.couplings.pushes()) return;
     if (!mechanism.forces.any()) std::fill(out, out + n, JointForce<T>{});
-    mechanism.couplings.add_forces(n, q, v, room, out, by_q, by_v);
+    mechanism.couplings.add_forces(n, q, v, workspace, out, by_q, by_v);
 }
 
 }  // namespace varpin

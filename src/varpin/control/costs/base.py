@@ -259,8 +259,8 @@ class BoundSum(BoundCost):
         """See :meth:`BoundCost.value`."""
         compiled, *others = self.shares(q, v, u)
         total: Floats = compiled.sum(axis=-1)
-        for own in others:
-            total += own
+        for values in others:
+            total += values
         return total
 
     def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
@@ -268,16 +268,16 @@ class BoundSum(BoundCost):
         terms, others = self._sorted
         gradient, hessian = terms.expand(q, v, u)
         for part in others:
-            own = part.expand(q, v, u)
+            expansion = part.expand(q, v, u)
             # A cost of one's own may be anything, and NumPy would broadcast it.
-            (N, size), found = gradient.shape, (np.shape(own.gradient), np.shape(own.hessian))
+            (N, size), found = gradient.shape, (np.shape(expansion.gradient), np.shape(expansion.hessian))
             if found not in [((N, size), (rows, size, size)) for rows in (1, N)]:
                 raise CostError(
                     type(part).__name__,
                     f"its expansion has shapes {found}, where {(N, size)} and {(N, size, size)} belong",
                 )
-            gradient += own.gradient
-            hessian = hessian + own.hessian
+            gradient += expansion.gradient
+            hessian = hessian + expansion.hessian
         return Expansion(gradient, hessian)
 
 
@@ -320,8 +320,8 @@ class _BoundScaled(BoundCost):
         return self.factor * self.cost.value(q, v, u)
 
     def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
-        own = self.cost.expand(q, v, u)
-        return Expansion(self.factor * own.gradient, self.factor * own.hessian)
+        expansion = self.cost.expand(q, v, u)
+        return Expansion(self.factor * expansion.gradient, self.factor * expansion.hessian)
 
     def add_to(self, terms: Terms, factor: float) -> bool:
         return self.cost.add_to(terms, self.factor * factor)

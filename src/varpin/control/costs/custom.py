@@ -45,8 +45,8 @@ class CustomCost(Cost):
     check: bool = False
 
     def __repr__(self) -> str:
-        own = getattr(self.function, "__name__", type(self.function).__name__)
-        return f"CustomCost({own})" if self.name == "CustomCost" else f"CustomCost({self.name!r})"
+        function = getattr(self.function, "__name__", type(self.function).__name__)
+        return f"CustomCost({function})" if self.name == "CustomCost" else f"CustomCost({self.name!r})"
 
     def __post_init__(self) -> None:
         for name in ("function", "derivatives"):
@@ -117,18 +117,18 @@ class _BoundCustom(BoundCost):
         # it is zero, over lengths of 1000 steps.
         size = np.abs(self._call(self.points.t, *self._blocks(z))).max(initial=0.0)
         size = max(size, 1e6 * float((second * h[:, None] * h).max(initial=0.0)))
-        for name, derivative, expected, room in (
+        for name, derivative, expected, tolerance in (
             ("gradient", given.gradient, found.gradient, 1e-6 * first.max(axis=0) + 1e-11 * size / h),
             ("Hessian", given.hessian, found.hessian, 1e-4 * second.max(axis=0) + 1e-12 * size / (h[:, None] * h)),
         ):
-            own = np.broadcast_to(derivative, expected.shape)
+            claimed = np.broadcast_to(derivative, expected.shape)
             # Not "greater": differences that are NaN must not pass.
-            off = ~(np.abs(own - expected) <= room)
+            off = ~(np.abs(claimed - expected) <= tolerance)
             if off.any():
                 where = tuple(int(i) for i in np.argwhere(off)[0])
                 raise CostError(
                     self.cost.name,
-                    f"{name}{list(where)} from derivatives(t, q, v, u) is {own[where]:.6g}, but differences of the "
+                    f"{name}{list(where)} from derivatives(t, q, v, u) is {claimed[where]:.6g}, but differences of the "
                     f"function give {expected[where]:.6g}, at t = {self.points.t[where[0]]:.6g} s",
                 )
 

@@ -51,8 +51,8 @@ class ControlRateCost(Cost):
             self.before = start
 
     def __repr__(self) -> str:
-        start = "" if self.before is None else f", before={_shown(self.before)}"
-        return f"ControlRateCost(weight={_shown(self.weight)}{start})"
+        start = "" if self.before is None else f", before={_plain(self.before)}"
+        return f"ControlRateCost(weight={_plain(self.weight)}{start})"
 
     @property
     def of_controls(self) -> bool:
@@ -73,7 +73,7 @@ class ControlRateCost(Cost):
         raise InputError(f"{self!r} must be a term of a problem's cost, scaled or not, and no part of another")
 
 
-def _shown(values: Floats | Mapping[str, float]) -> object:
+def _plain(values: Floats | Mapping[str, float]) -> object:
     return dict(values) if isinstance(values, Mapping) else values.tolist()
 
 
@@ -127,10 +127,10 @@ def control_rate(cost: Cost, controls: int, joints: Sequence[str] | None = None)
     name = "ControlRateCost"
     weight = np.zeros((controls, controls))
     for factor, term in terms:
-        own = term.weight
-        if isinstance(own, Mapping):
-            own = checked_weight(name, control_array(f"{name} weight", own, joints))
-        weight += factor * weight_matrix(name, own, controls)
+        entries = term.weight
+        if isinstance(entries, Mapping):
+            entries = checked_weight(name, control_array(f"{name} weight", entries, joints))
+        weight += factor * weight_matrix(name, entries, controls)
     starts: list[Floats | None] = []
     for _, term in terms:
         start = term.before

@@ -19,7 +19,7 @@ class Terms:
 
     def __init__(self, dof: int, controls: int) -> None:
         self._core = CostTerms.make(dof, controls)
-        self._places: dict[bytes, int] = {}
+        self._indices: dict[bytes, int] = {}
         self._count = 0
 
     @property
@@ -33,9 +33,9 @@ class Terms:
         return self._count
 
     def _add(
-        self, subject: Subject, place: int, weight: Floats, target: Floats, directions: Integers = _NO_DIRECTIONS
+        self, subject: Subject, index: int, weight: Floats, target: Floats, directions: Integers = _NO_DIRECTIONS
     ) -> None:
-        self._core.add_term(subject, place, weight, target, directions)
+        self._core.add_term(subject, index, weight, target, directions)
         self._count += 1
 
     def add_entries(self, begin: int, weight: Floats, target: Floats) -> None:
@@ -49,23 +49,23 @@ class Terms:
 
     def add_frame(self, subject: Subject, frame: FrameKinematics, weight: Floats, target: Floats) -> None:
         """Weight . r^2 with r the ``subject`` of a frame beside its target; those of orientations are (N, 9)."""
-        self._add(subject, self._place_of(frame), weight, target)
+        self._add(subject, self._index_of(frame), weight, target)
 
     def add_manipulability(self, frame: FrameKinematics, directions: Integers, weight: Floats, least: float) -> None:
         """Weight (1, 1) . (least - w)^2 where w < least, of some rows of a frame's Jacobian."""
-        self._add(Subject.manipulability, self._place_of(frame), weight, np.array([[least]]), directions)
+        self._add(Subject.manipulability, self._index_of(frame), weight, np.array([[least]]), directions)
 
     def add_center(self, links: Links, weight: Floats, target: Floats) -> None:
         """Weight . (c - target)^2 with c the bodies' centre of mass."""
-        if links.key not in self._places:
-            self._places[links.key] = self._core.add_center(links.core)
-        self._add(Subject.position, self._places[links.key], weight, target)
+        if links.key not in self._indices:
+            self._indices[links.key] = self._core.add_center(links.core)
+        self._add(Subject.position, self._indices[links.key], weight, target)
 
-    def _place_of(self, frame: FrameKinematics) -> int:
+    def _index_of(self, frame: FrameKinematics) -> int:
         # The frame of several terms is placed once.
-        if frame.key not in self._places:
-            self._places[frame.key] = self._core.add_frame(frame.links.core, frame.rotation, frame.translation)
-        return self._places[frame.key]
+        if frame.key not in self._indices:
+            self._indices[frame.key] = self._core.add_frame(frame.links.core, frame.rotation, frame.translation)
+        return self._indices[frame.key]
 
     def values(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """The value of each term (..., N, terms) at q (..., N, n), v (..., N, n) and u (..., N, m)."""

@@ -111,9 +111,9 @@ def numbers(length: int | None = None, unit: str = "") -> Rule:
 
 def values(unit: str = "", *, least: float | None = None, **others: Any) -> Rule:
     """One number for all, a list of one for each, or a table by name; or what ``others`` allow."""
-    own = Annotated[float, number(unit, least=least)]
+    scalar = Annotated[float, number(unit, least=least)]
     what = f"a number for all, a list, or a table by name{_unit(unit)}"
-    return either(what, **{"number": own, "list": tuple[own, ...], "table": dict[str, own], **others})
+    return either(what, **{"number": scalar, "list": tuple[scalar, ...], "table": dict[str, scalar], **others})
 
 
 def either(what: str, shape: Callable[[Any], str] | None = None, **kinds: Any) -> Rule:

@@ -55,7 +55,7 @@ class CostTerm:
     spec: CostSpec
     weight: Floats
     target: Timeline | None
-    hold: Floats | None
+    holding_q: Floats | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,10 +128,10 @@ class Layout:
             stiffness=self.stiffness[keep],
             rest=self.rest[keep],
             forces=tuple(
-                JointForces(own.kind, {name: values[keep] for name, values in own.values.items()})
-                for own in self.forces
+                JointForces(force.kind, {name: values[keep] for name, values in force.values.items()})
+                for force in self.forces
             ),
-            frame_forces=tuple(own for own in self.frame_forces if _has_moving_end(own, robot)),
+            frame_forces=tuple(force for force in self.frame_forces if _has_moving_end(force, robot)),
             constraints=self.constraints,
             q0=self.q0[keep],
             v0=self.v0[keep],
@@ -147,7 +147,7 @@ class Layout:
     @property
     def served(self) -> NDArray[np.bool_]:
         """Which joints (n,) have a servo: their control is a position."""
-        servos = [own.values["stiffness"] > 0.0 for own in self.forces if own.kind is PositionServo]
+        servos = [force.values["stiffness"] > 0.0 for force in self.forces if force.kind is PositionServo]
         return np.asarray(np.any([np.zeros(self.robot.dof, dtype=np.bool_), *servos], axis=0))
 
     @property
@@ -155,14 +155,14 @@ class Layout:
         """Of controls (m,), infinite where there is none: of positions none, the torque limit is their servo's."""
         return np.where(self.served[self.actuated], np.inf, self.torque_limit / np.abs(self.gear))
 
-    def _force(self, own: JointForces) -> Force:
+    def _force(self, force: JointForces) -> Force:
         """As a scene takes it. A torque limit bounds the effort of a servo."""
-        if own.kind is not PositionServo:
-            return own.force()
+        if force.kind is not PositionServo:
+            return force.force()
         limit = np.full(self.robot.dof, np.inf)
         limit[self.actuated] = self.torque_limit
-        effort = own.values.get("effort", np.full(self.robot.dof, np.inf))
-        return JointForces(own.kind, {**own.values, "effort": np.minimum(effort, limit)}).force()
+        effort = force.values.get("effort", np.full(self.robot.dof, np.inf))
+        return JointForces(force.kind, {**force.values, "effort": np.minimum(effort, limit)}).force()
 
     @property
     def actuation(self) -> Floats:
@@ -184,7 +184,7 @@ class Layout:
             damping=self.damping,
             stiffness=self.stiffness,
             rest=self.rest,
-            forces=[*(self._force(own) for own in self.forces), *self.frame_forces],
+            forces=[*(self._force(force) for force in self.forces), *self.frame_forces],
             constraints=self.constraints,
             actuation=self.actuation,
             noise=[model for model in map(self._noise, self.noise) if model is not None] or None,
@@ -211,8 +211,8 @@ class Layout:
         terms = []
         for term in self.costs:
             spec, target = term.spec, term.target
-            if term.hold is not None:
-                target = constant(holding_controls(scene, term.hold))
+            if term.holding_q is not None:
+                target = constant(holding_controls(scene, term.holding_q))
             if not term.weight.any() or (spec.term.limits and not np.isfinite(spec.term.limits(self.robot)).any()):
                 continue
             given = Given(self.robot, term.weight, target, spec.frame, spec.numbers, spec.words)
@@ -226,7 +226,7 @@ class Layout:
 
 def _part(term: CostTerm, index: NDArray[np.int64]) -> CostTerm:
     target = None if term.target is None else term.target.columns(index.tolist())
-    return CostTerm(term.spec, term.weight[index], target, None if term.hold is None else term.hold[index])
+    return CostTerm(term.spec, term.weight[index], target, None if term.holding_q is None else term.holding_q[index])
 
 
 def holding_controls(scene: Scene, q: Floats) -> Floats:
@@ -236,40 +236,40 @@ def holding_controls(scene: Scene, q: Floats) -> Floats:
 
 def joints_of_frame(robot: Robot, frame: str) -> NDArray[np.bool_]:
     """Which coordinates (n,) move a frame; all False if there is no such frame."""
-    model, moved = robot.free_model, np.zeros(robot.dof, dtype=np.bool_)
+    model, moving = robot.free_model, np.zeros(robot.dof, dtype=np.bool_)
     if model.existFrame(frame):
         for joint in model.supports[model.frames[model.getFrameId(frame)].parentJoint]:
             if joint > 0:
-                moved[robot.tree.coordinate[joint - 1]] = True
-    return moved
+                moving[robot.tree.coordinate[joint - 1]] = True
+    return moving
 
 
 def _load(spec: SceneSpec, held: Mapping[str, float]) -> Robot:
-    own, table = spec.robot, spec.root.table("robot")
-    for joint, value in own.lock.items():
+    given, table = spec.robot, spec.root.table("robot")
+    for joint, value in given.lock.items():
         if degrees_for_radians(value):
             raise table.error(f"lock.{joint}", f"{value:g} looks like degrees: positions are in rad or m")
     try:
         return load_robot(
-            own.source,
-            package_dirs=own.package_dirs,
-            lock={**own.lock, **held},
-            mimic="free" if own.mimic == "free" else "tied",
-            payload=own.payload,
-            base=own.base,
-            armature=own.armature,
-            inertia=own.inertia,
-            density=own.density,
+            given.source,
+            package_dirs=given.package_dirs,
+            lock={**given.lock, **held},
+            mimic="free" if given.mimic == "free" else "tied",
+            payload=given.payload,
+            base=given.base,
+            armature=given.armature,
+            inertia=given.inertia,
+            density=given.density,
         )
     except RobotNotFound as error:
         raise table.error("source", str(error)) from None
     except UnknownJoint as error:
-        key = "armature" if isinstance(own.armature, Mapping) and error.joint in own.armature else "lock"
+        key = "armature" if isinstance(given.armature, Mapping) and error.joint in given.armature else "lock"
         raise table.error(
             f"{key}.{error.joint}", f"there is no such joint; {suggestion(error.joint, error.joints, 'joints')}"
         ) from None
     except UnknownFrame as error:
-        index = [load.frame for load in own.payload].index(error.frame)
+        index = [load.frame for load in given.payload].index(error.frame)
         raise table.error(
             f"payload[{index}].frame",
             f"there is no frame {error.frame!r}; {suggestion(error.frame, error.frames, 'frames')}",
@@ -332,8 +332,8 @@ def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
         stiffness=springs.spread("stiffness", spec.stiffness, names),
         rest=rest,
         forces=forces,
-        frame_forces=tuple(_on_frames(own.force, own.table, robot) for own in spec.frame_forces),
-        constraints=tuple(_on_frames(own.constraint, own.table, robot) for own in spec.constraints),
+        frame_forces=tuple(_on_frames(read.force, read.table, robot) for read in spec.frame_forces),
+        constraints=tuple(_on_frames(read.constraint, read.table, robot) for read in spec.constraints),
         q0=q0,
         v0=initial.spread("v", spec.v0, names),
         actuated=actuated,
@@ -357,10 +357,10 @@ def _require_own_controls(
 ) -> None:
     """Refuse servos on joints that no control is the position of."""
     seen: set[int] = set()
-    for force, own in zip(spec.forces, forces, strict=True):
-        if own.kind is not PositionServo:
+    for force, laid in zip(spec.forces, forces, strict=True):
+        if laid.kind is not PositionServo:
             continue
-        for joint in np.flatnonzero(own.values["stiffness"]).tolist():
+        for joint in np.flatnonzero(laid.values["stiffness"]).tolist():
             name = names[joint]
             if joint in seen:
                 raise force.table.error("stiffness", f"joint {name!r} has a servo already")
@@ -448,17 +448,17 @@ def _force(spec: ForceSpec, robot: Robot) -> JointForces:
     return found
 
 
-def _on_frames(own: _OnFrames, table: Table, robot: Robot) -> _OnFrames:
+def _on_frames(part: _OnFrames, table: Table, robot: Robot) -> _OnFrames:
     """What acts on frames itself, if it fits the robot."""
     try:
-        own.bind(robot)
+        part.bind(robot)
     except UnknownFrame as error:
         raise table.error(
             "", f"there is no frame {error.frame!r}; {suggestion(error.frame, error.frames, 'frames')}"
         ) from None
     except (InputError, UnknownJoint) as error:
         raise table.error("", str(error)) from None
-    return own
+    return part
 
 
 def _has_moving_end(force: Force, robot: Robot) -> bool:
@@ -494,7 +494,7 @@ def _term(spec: CostSpec, robot: Robot, driven: Sequence[str], q0: Floats, durat
         target = spec.reference.timeline(components, duration, kind)
         if term.space == "q" and target.constant and term.reference is not None:
             _refuse_degrees(table, term.reference, target(0.0), robot)
-    hold = None
-    if spec.hold is not None:
-        hold = table.spread("hold", spec.hold, robot.joint_names) if spec.hold != () else q0
-    return CostTerm(spec, weight, target, hold)
+    holding_q = None
+    if spec.holding_q is not None:
+        holding_q = table.spread("hold", spec.holding_q, robot.joint_names) if spec.holding_q != () else q0
+    return CostTerm(spec, weight, target, holding_q)

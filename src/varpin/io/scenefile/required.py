@@ -143,8 +143,8 @@ def _costs(term: CostTerm, layout: Layout, scene: Scene, t: Floats) -> Mask:
         lower, upper = term.spec.term.limits(layout.robot)
         margin = term.spec.numbers["margin"]
         return np.asarray((term.weight != 0.0) & ((rest > upper - margin) | (rest < lower + margin)))
-    if term.hold is not None:
-        wanted = holding_controls(scene, term.hold)[None]
+    if term.holding_q is not None:
+        wanted = holding_controls(scene, term.holding_q)[None]
     else:
         wanted = rest[None] if term.target is None else term.target.at(t)
     moves = ((wanted != rest) & (term.weight != 0.0)).any(axis=0)
@@ -187,14 +187,14 @@ def _terms(layout: Layout) -> dict[str, str]:
     noise = [f"{model.kind} ({np.count_nonzero(model.intensity)} processes)" for model in layout.noise]
     limited = np.isfinite(layout.torque_limit)
     costs = [term.spec.kind + (" at the end" if term.spec.terminal else "") for term in layout.costs]
-    kinds: set[type[Force]] = {force.kind for force in layout.forces} | {type(own) for own in layout.frame_forces}
+    kinds: set[type[Force]] = {force.kind for force in layout.forces} | {type(part) for part in layout.frame_forces}
     absent = [words for words, kind in _ABSENT.items() if kind not in kinds] + ["contact"]
-    loads = [f"{load.mass:g} kg at {load.frame}" for load in spec.robot.payload]
+    payloads = [f"{payload.mass:g} kg at {payload.frame}" for payload in spec.robot.payload]
     terms = {
         "gravity": f"{', '.join(f'{g:g}' for g in gravity)} m/s^2" if any(gravity) else "none",
         "damping": of(layout.damping, joints),
         "springs": of(layout.stiffness, joints),
-        "payload": ", ".join(loads) or "none",
+        "payload": ", ".join(payloads) or "none",
         "noise": ", ".join(noise) or "none",
         "driven": ", ".join(layout.driven) or "none",
         "torque limits": of(limited.astype(float), layout.driven),
@@ -203,5 +203,5 @@ def _terms(layout: Layout) -> dict[str, str]:
         "not modelled": f"{', '.join(absent)}; shapes are read only for a replay",
     }
     if layout.constraints:
-        terms["constraints"] = ", ".join(dict.fromkeys(type(own).__name__ for own in layout.constraints))
+        terms["constraints"] = ", ".join(dict.fromkeys(type(part).__name__ for part in layout.constraints))
     return terms

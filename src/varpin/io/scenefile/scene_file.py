@@ -190,8 +190,8 @@ class SceneFile:
         for layout, part in self._parts:
             plan = solve(part, **options, check=False).policy
             rows = np.array([driven.index(name) for name in layout.driven])
-            own = np.array([names.index(name) for name in layout.robot.joint_names])
-            x = np.concatenate([own, n + own])
+            order = np.array([names.index(name) for name in layout.robot.joint_names])
+            x = np.concatenate([order, n + order])
             u[:, rows], reference[:, x] = plan.u, plan.reference
             gains[:, rows[:, None], x] = plan.gains
         return LinearPolicy(u, gains, reference, hold=plan.hold, on=plan.on, period=plan.period)

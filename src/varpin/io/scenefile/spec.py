@@ -125,7 +125,7 @@ class CostSpec:
         weight: By component.
         terminal: At the end, instead of its integral.
         reference: Its target over time, if it has one.
-        hold: A configuration whose holding torques are the reference, by joint; ``()`` for the initial one.
+        holding_q: A configuration whose holding torques are the reference, by joint; ``()`` for the initial one.
         frame: Name of a frame, for terms that have one.
         numbers: What else it takes.
         words: What else it takes.
@@ -137,7 +137,7 @@ class CostSpec:
     weight: ByName
     terminal: bool
     reference: Reference | None
-    hold: ByName | None
+    holding_q: ByName | None
     frame: str
     numbers: Mapping[str, float]
     words: Mapping[str, str]

@@ -280,9 +280,9 @@ def _reference_shape(value: Any) -> str:
 
 
 def _reference(**others: Any) -> Rule:
-    own = Annotated[float, number()]
+    scalar = Annotated[float, number()]
     what = "a number for all, a list, a table by name, sines, waypoints or a file"
-    numbers_of = {"number": own, "list": tuple[own, ...], "table": dict[str, own]}
+    numbers_of = {"number": scalar, "list": tuple[scalar, ...], "table": dict[str, scalar]}
     return either(what, _reference_shape, **numbers_of, **REFERENCE_KEYS, **others)
 
 
@@ -346,8 +346,8 @@ def _integrator_keys(kind: Any) -> type[Keys]:
 
 # [[force]] on joints: the fields of the force, by joint.
 def _force_keys(kind: Any) -> type[Keys]:
-    own: dict[str, Any] = {item.name: (Annotated[Any, values()], _default(item)) for item in fields(kind)}
-    return create_model(kind.__name__, __base__=TypedKeys, **own)
+    keys: dict[str, Any] = {item.name: (Annotated[Any, values()], _default(item)) for item in fields(kind)}
+    return create_model(kind.__name__, __base__=TypedKeys, **keys)
 
 
 def _default(item: Any) -> Any:
@@ -400,27 +400,27 @@ _OF_CONSTRAINTS = {
 
 
 def _keys_of_fields(kind: Any, rules: Mapping[str, Rule]) -> type[Keys]:
-    own: dict[str, Any] = {item.name: (Annotated[Any, rules[item.name]], _default(item)) for item in fields(kind)}
-    return create_model(kind.__name__, __base__=TypedKeys, **own)
+    keys: dict[str, Any] = {item.name: (Annotated[Any, rules[item.name]], _default(item)) for item in fields(kind)}
+    return create_model(kind.__name__, __base__=TypedKeys, **keys)
 
 
 # [[cost]]
 def _cost_keys(name: str, term: Term) -> type[Keys]:
     weight = number(least=0.0) if len(term.axes) == 1 else values(least=0.0)
-    own: dict[str, Any] = {"weight": (Annotated[Any, weight], 1.0)}
+    keys: dict[str, Any] = {"weight": (Annotated[Any, weight], 1.0)}
     if term.reference is not None:
         rule = values() if term.initial else _reference()
-        own[term.reference] = (Annotated[Any, rule], None if term.optional or term.hold else ...)
+        keys[term.reference] = (Annotated[Any, rule], None if term.optional or term.holding else ...)
     if term.frame:
-        own["frame"] = (Annotated[str, TEXT], ...)
-    if term.hold:
-        own["hold"] = (Annotated[Any, values("rad or m", flag=Literal[True])], None)
+        keys["frame"] = (Annotated[str, TEXT], ...)
+    if term.holding:
+        keys["hold"] = (Annotated[Any, values("rad or m", flag=Literal[True])], None)
     if term.can_end:
-        own["terminal"] = (Annotated[bool, FLAG], False)
+        keys["terminal"] = (Annotated[bool, FLAG], False)
     for key, default in term.numbers.items():
-        own[key] = (Annotated[float, number(least=0.0)], ... if default is None else default)
-    own |= {key: (Annotated[str, word(*options)], options[0]) for key, options in term.words.items()}
-    return create_model(name, __base__=TypedKeys, **own)
+        keys[key] = (Annotated[float, number(least=0.0)], ... if default is None else default)
+    keys |= {key: (Annotated[str, word(*options)], options[0]) for key, options in term.words.items()}
+    return create_model(name, __base__=TypedKeys, **keys)
 
 
 FORCE_KEYS = {name: _force_keys(kind) for name, kind in FORCES.items()} | {
@@ -470,7 +470,7 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
     if horizon.count * len(keys.cost) > MOST_EVALUATIONS:
         costs = f"{horizon.count} steps times {len(keys.cost)} costs"
         raise root.error("horizon", f"{costs} are too many; {MOST_EVALUATIONS} are the most")
-    forces = [_force(root.table(f"force[{index}]"), own) for index, own in enumerate(keys.force)]
+    forces = [_force(root.table(f"force[{index}]"), entry) for index, entry in enumerate(keys.force)]
     controls = keys.simulate.controls
     if controls is not None and controls != "hold":
         controls = _reference_of(root.table("simulate"), "controls", controls, horizon.dt)
@@ -486,7 +486,9 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
         rest=keys.springs.rest,
         forces=tuple(force for force in forces if isinstance(force, ForceSpec)),
         frame_forces=tuple(force for force in forces if isinstance(force, FrameForceSpec)),
-        constraints=tuple(_constraint(root.table(f"constraint[{k}]"), own) for k, own in enumerate(keys.constraint)),
+        constraints=tuple(
+            _constraint(root.table(f"constraint[{k}]"), entry) for k, entry in enumerate(keys.constraint)
+        ),
         actuated=keys.actuation.joints,
         gear=keys.actuation.gear,
         torque_limit=keys.actuation.torque_limit,
@@ -498,7 +500,7 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
         hold=horizon.hold,
         sampling=horizon.sampling,
         integrator=_integrator(root.table("integrator"), keys.integrator),
-        costs=tuple(_cost(root.table(f"cost[{k}]"), own, horizon.dt) for k, own in enumerate(keys.cost)),
+        costs=tuple(_cost(root.table(f"cost[{k}]"), entry, horizon.dt) for k, entry in enumerate(keys.cost)),
         controls=controls,
         seed=keys.simulate.seed,
         options=_given(keys.solve),
@@ -547,11 +549,11 @@ def _integrator(table: Table, keys: TypedKeys) -> Integrator:
 def _cost(table: Table, keys: TypedKeys, dt: float) -> CostSpec:
     term = TERMS[keys.type]
     given = _given(keys)
-    hold, value = given.get("hold"), given.get(term.reference or "")
-    if hold is not None and value is not None:
+    holding_q, value = given.get("hold"), given.get(term.reference or "")
+    if holding_q is not None and value is not None:
         raise table.error("", f"hold and {term.reference} exclude each other: give one of them")
     reference = None
-    if term.reference is not None and hold is None and not (term.initial and value is None):
+    if term.reference is not None and holding_q is None and not (term.initial and value is None):
         reference = _reference_of(table, term.reference, 0.0 if value is None else value, dt)
     return CostSpec(
         table=table,
@@ -560,7 +562,7 @@ def _cost(table: Table, keys: TypedKeys, dt: float) -> CostSpec:
         weight=given.get("weight", 1.0),
         terminal=given.get("terminal", False),
         reference=reference,
-        hold=() if hold is True else hold,
+        holding_q=() if holding_q is True else holding_q,
         frame=given.get("frame", ""),
         numbers={name: getattr(keys, name) for name in term.numbers},
         words={name: getattr(keys, name) for name in term.words},
@@ -568,7 +570,7 @@ def _cost(table: Table, keys: TypedKeys, dt: float) -> CostSpec:
 
 
 def _reference_of(table: Table, name: str, value: Any, dt: float) -> Reference:
-    own = table.table(name)
+    nested = table.table(name)
     if isinstance(value, WaypointKeys):
         return Reference(table, name, times=value.times, values=value.values, smooth=value.between == "smooth")
     if isinstance(value, FileKeys):
@@ -578,6 +580,6 @@ def _reference_of(table: Table, name: str, value: Any, dt: float) -> Reference:
     for index, sine in enumerate(value.sines):
         if sine.frequency > 0.5 / dt:
             most = f"<= {0.5 / dt:g} [Hz], the most that dt = {dt:g} s resolves"
-            raise own.error(f"sines[{index}].frequency", f"must be {most}, got {sine.frequency:g}")
+            raise nested.error(f"sines[{index}].frequency", f"must be {most}, got {sine.frequency:g}")
     sines = tuple(Sine(sine.of, sine.amplitude, sine.frequency, sine.phase) for sine in value.sines)
     return Reference(table, name, offset=value.offset, sines=sines)

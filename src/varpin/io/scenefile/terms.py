@@ -91,7 +91,7 @@ class Term:
         components: Names of the target's components, where they are not joints.
         axes: Names of what may be weighed apart, where that is not joints; of one, the weight is a number.
         optional: Whether the target may be left out, and is 0 then.
-        hold: Whether ``hold`` may stand for the reference.
+        holding: Whether ``hold`` may stand for the reference: the torques that keep the robot at a configuration.
         initial: Whether the target is of the beginning alone: numbers, or none if it is left out.
         can_end: Whether it can be a terminal term.
         numbers: Other keys it takes, numbers >= 0, and their defaults, None where there is none.
@@ -105,7 +105,7 @@ class Term:
     components: tuple[str, ...] = ()
     axes: tuple[str, ...] = ()
     optional: bool = False
-    hold: bool = False
+    holding: bool = False
     initial: bool = False
     can_end: bool = True
     numbers: Mapping[str, float | None] = field(default_factory=dict)
@@ -131,13 +131,13 @@ TERMS: dict[str, Term] = {
     "tracking": Term(lambda g: TrackingCost(g.reference, g.weight), "q", "reference"),
     "velocity": Term(lambda g: VelocityCost(g.weight, g.reference), "v", "reference", optional=True),
     "control": Term(
-        lambda g: ControlCost(g.weight, g.reference), "u", "reference", optional=True, hold=True, can_end=False
+        lambda g: ControlCost(g.weight, g.reference), "u", "reference", optional=True, holding=True, can_end=False
     ),
     "control_rate": Term(
         lambda g: ControlRateCost(g.weight, None if g.target is None else g.target(0.0)),
         "u",
         "before",
-        hold=True,
+        holding=True,
         initial=True,
         can_end=False,
     ),

@@ -114,9 +114,9 @@ def symplecticity_error(A: Floats) -> float:
     s = np.sqrt(np.einsum("kij,kij->kj", np.abs(A[:, :n, n:]), np.abs(A[:, n:, n:])))
     s = np.where(s > 0.0, s, 1.0)
     S = np.concatenate([1.0 / s, s], axis=1)
-    own = S[:, :, None] * A / S[:, None, :]
-    off = np.abs(own.transpose(0, 2, 1) @ J @ own - J).max(axis=(1, 2))
-    terms = (np.abs(own).transpose(0, 2, 1) @ np.abs(J) @ np.abs(own)).max(axis=(1, 2))
+    scaled = S[:, :, None] * A / S[:, None, :]
+    off = np.abs(scaled.transpose(0, 2, 1) @ J @ scaled - J).max(axis=(1, 2))
+    terms = (np.abs(scaled).transpose(0, 2, 1) @ np.abs(J) @ np.abs(scaled)).max(axis=(1, 2))
     return float(np.max(off / np.maximum(terms, 1.0)))
 
 

@@ -24,16 +24,16 @@ from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import (
     CLOSE,
     DISTURBANCE,
-    Place,
+    Window,
     between,
     changed,
     disturbance,
+    examined_nodes,
     grown,
     inertias,
     light_speed,
     masses,
     noticed,
-    places,
 )
 from varpin.study.extremes.trial import Setup
 from varpin.trajectory import Trajectory
@@ -238,13 +238,13 @@ def _in_units(setup: Setup, dt: float, nodes: NDArray[np.int64], q: Floats, v: F
 def period_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> float:
     """The largest error over a period from any of some nodes, in units of what is wrong; NaN where none is known.
 
-    From the nodes that :func:`varpin.simulation.accuracy.places` names and three more; from many more where the error
+    From the nodes of :func:`varpin.simulation.accuracy.examined_nodes` and three more; from many more where the error
     comes close to what is wrong. One of them that is wrong makes the motion wrong.
     """
     if not trajectory.steps or scene.noise.diffusion is None or not np.abs(trajectory.v).max() > 0.0:
         return math.nan
     quarters = np.linspace(0, trajectory.steps, 5)[1:-1].astype(np.int64)
-    first = places(scene, trajectory)
+    first = examined_nodes(scene, trajectory)
     inertia = inertias(scene, trajectory.q[first])
     first = np.concatenate([first, np.setdiff1d(quarters, first)])
     worst, end = math.nan, time.process_time() + _PATIENCE_PERIODS
@@ -264,7 +264,7 @@ def _error_from(scene: Scene, integrator: Integrator, trajectory: Trajectory, st
     NaN where the exact motion ends before: of a part of a start, even half a step is much; and where nothing moves
     to speak of.
     """
-    n, node = scene.robot.dof, Place.at(scene, trajectory, step)
+    n, node = scene.robot.dof, Window.at(scene, trajectory, step)
     count = int(node.judged.max())
     by = disturbance(trajectory, step, count)
     end = time.process_time() + _PATIENCE_PERIOD

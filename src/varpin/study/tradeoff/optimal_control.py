@@ -77,7 +77,7 @@ class OptimalControlTradeoff(Tradeoff):
 
     _format = "varpin.optimal-control-tradeoff/2"
     _headings = HEADINGS
-    _shown = ("integrator", "dt", "seconds", "planned_cost", "open_loop_cost", "closed_loop_cost", "failure")
+    _columns = ("integrator", "dt", "seconds", "planned_cost", "open_loop_cost", "closed_loop_cost", "failure")
 
     runs: tuple[OptimalControlRun, ...]
 

@@ -99,7 +99,7 @@ class WorkPrecision(Tradeoff):
 
     _format = "varpin.work-precision/2"
     _headings = HEADINGS
-    _shown = ("integrator", "dt", "seconds", "error", "energy_error", "tip_error", "failure")
+    _columns = ("integrator", "dt", "seconds", "error", "energy_error", "tip_error", "failure")
 
     runs: tuple[WorkPrecisionRun, ...]
     reference: str

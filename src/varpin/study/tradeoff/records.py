@@ -30,18 +30,18 @@ class Record:
     runs: tuple[Any, ...]
     _format: ClassVar[str]
     _headings: ClassVar[Mapping[str, str]]
-    _shown: ClassVar[Sequence[str]]
+    _columns: ClassVar[Sequence[str]]
 
     def pareto(self) -> tuple[Any, ...]:
         """The runs that no other beats."""
         raise NotImplementedError
 
     def _repr_html_(self) -> str:
-        rows = [[_cell(getattr(run, name)) for name in self._shown] for run in self.runs]
+        rows = [[_cell(getattr(run, name)) for name in self._columns] for run in self.runs]
         front = self.pareto()
         strong = [k for k, run in enumerate(self.runs) if run in front]
         title = f"{self!r}; nothing beats the bold runs" if strong else repr(self)
-        return markup.facts(title, [], markup.table([self._headings[name] for name in self._shown], rows, strong))
+        return markup.facts(title, [], markup.table([self._headings[name] for name in self._columns], rows, strong))
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the record as npz; returns its path.
