@@ -198,30 +198,6 @@ template <int pairs, class Factor, class Row>
     for (int c = 0; c < pairs; ++c) put_pair(sum[c], row + column + 2 * c);
 }
 
-// The same of two rows, with factors (2, end).
-template <int pairs>
-[[gnu::always_inline]] inline void subtract_product_pairs(const double* a, int inner, const double* x, int columns,
-                                                          double* out) {
-    Pair first[pairs], second[pairs];
-    double* below = out + columns;
-    for (int c = 0; c < pairs; ++c) {
-        first[c] = pair_at(out + 2 * c);
-        second[c] = pair_at(below + 2 * c);
-    }
-    for (int k = 0; k < inner; ++k, x += columns) {
-        const Pair upper{a[k], a[k]}, lower{a[inner + k], a[inner + k]};
-        for (int c = 0; c < pairs; ++c) {
-            const Pair x_pair = pair_at(x + 2 * c);
-            first[c] = first[c] - upper * x_pair;
-            second[c] = second[c] - lower * x_pair;
-        }
-    }
-    for (int c = 0; c < pairs; ++c) {
-        put_pair(first[c], out + 2 * c);
-        put_pair(second[c], below + 2 * c);
-    }
-}
-
 }  // namespace detail
 
 // row -= sum_k factor(k) other(k) over k in [begin, end).
@@ -245,25 +221,6 @@ void subtract_rows(double* row, int columns, int begin, int end, const Factor& f
     double sum = row[c];
     for (int k = begin; k < end; ++k) sum -= factor(k) * other(k)[c];
     row[c] = sum;
-}
-
-// out -= a x, for a (rows, inner), x (inner, columns) and out (rows, columns); columns are even.
-inline void subtract_product(const double* a, int rows, int inner, const double* x, int columns, double* out) {
-    int i = 0;
-    for (; i + 1 < rows; i += 2, a += 2 * inner, out += 2 * columns) {
-        int c = 0;
-        for (; c + 11 < columns; c += 12) detail::subtract_product_pairs<6>(a, inner, x + c, columns, out + c);
-        for (; c + 7 < columns; c += 8) detail::subtract_product_pairs<4>(a, inner, x + c, columns, out + c);
-        if (c + 5 < columns) {
-            detail::subtract_product_pairs<3>(a, inner, x + c, columns, out + c);
-        } else if (c + 3 < columns) {
-            detail::subtract_product_pairs<2>(a, inner, x + c, columns, out + c);
-        } else if (c + 1 < columns) {
-            detail::subtract_product_pairs<1>(a, inner, x + c, columns, out + c);
-        }
-    }
-    if (i < rows)
-        subtract_rows(out, columns, 0, inner, [&](int k) { return a[k]; }, [&](int k) { return x + k * columns; });
 }
 
 // The X with L U X = B, B and X (size of the block, columns) row by row and in one place, all columns at once.

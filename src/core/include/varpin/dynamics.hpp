@@ -21,6 +21,7 @@
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
 #include "varpin/pair.hpp"
+#include "varpin/slope_rows.hpp"
 #include "varpin/slopes.hpp"
 #include "varpin/spatial.hpp"
 #include "varpin/tree.hpp"
@@ -95,7 +96,7 @@ class ForwardDynamics {
         ldl_.resize(n * n);
         if (!derivatives) return;
         slopes_.resize(n * n);
-        weights_.resize(n * n);
+        weights_.resize(entries(SlopeRows::most_others * n, n));
         if (mechanism.couplings.any()) {
             for (auto* matrix : {&coupled_q_, &coupled_v_, &coupled_curvature_}) matrix->resize(n * n);
         }
@@ -230,42 +231,44 @@ class ForwardDynamics {
         }
     }
 
-    // How many columns of a slope are of each of q, v and force: b of a block of b coordinates, and a zero where b is
-    // odd.
-    static int slope_width(int size) { return size + size % 2; }
+    // A share in how accelerations change: x changes with other accelerations, of which these are the derivatives
+    // (b, columns), by in_q where it is q, by in_v where it is v.
+    struct Before {
+        const double* x = nullptr;
+        double in_q = 0.0, in_v = 0.0;
+    };
 
-    // How the accelerations of one block of b coordinates change (b, 3 widths) with q, v and force, once after
-    // differentiate(): M^-1 (-tau_q, -tau_v - reach tau_q, weight) with reach = 0 and weight 1. Where q and v change
-    // with reach v and with other accelerations x_k (b, 3 widths) themselves, by in_q[k] x_k and in_v[k] x_k, that is
-    // added.
-    void slope(Block block, double* a, double reach, int others, const double* const* x, const double* in_q,
-               const double* in_v, double weight) {
-        const int n = jet_.dof, size = block.end - block.begin, width = slope_width(size), columns = 3 * width;
+    // How the accelerations of one block of b coordinates change with q, v and force, columns side by side in `a`
+    // (b, columns), once after differentiate(): M^-1 (-tau_q, -tau_v - reach tau_q, ramp) with reach = 0 and ramp
+    // 1; in_q x and in_v x are changes of q and v besides. No more than two others share.
+    void slope(Block block, double* a, double reach, const Before* others, int count, double ramp) {
+        const int n = jet_.dof, size = block.end - block.begin, columns = SlopeRows::columns(size);
+        SlopeRows rows{size, ldl_.data() + block.begin * n + block.begin, n, {}, 0};
         for (int i = 0; i < size; ++i) {
             const Slopes* by = slopes_.data() + (block.begin + i) * n + block.begin;
-            const double own = weight * (1.0 + acting_[block.begin + i].by_f);
             double* row = a + i * columns;
-            // Written in pairs, as they are read next.
-            for (int j = 0; j < size; j += 2) {
-                const Slopes one = by[j], two = j + 1 < size ? by[j + 1] : Slopes();
-                put_pair(Pair{-one.q(), -two.q()}, row + j);
-                put_pair(Pair{-one.v() - reach * one.q(), -two.v() - reach * two.q()}, row + width + j);
-                put_pair(Pair{i == j ? own : 0.0, i == j + 1 ? own : 0.0}, row + 2 * width + j);
+            for (int j = 0; j < size; ++j) {
+                row[j] = -by[j].q();
+                row[size + j] = -by[j].v() - reach * by[j].q();
+                row[2 * size + j] = 0.0;
             }
+            for (int c = 3 * size; c < columns; ++c) row[c] = 0.0;
+            row[2 * size + i] = ramp * (1.0 + acting_[block.begin + i].by_f);
         }
-        for (int k = 0; k < others; ++k) {
-            if (in_q[k] == 0.0 && in_v[k] == 0.0) continue;
-            const Pair share{in_q[k], in_v[k]};
+        for (int k = 0; k < count; ++k) {
+            if (others[k].in_q == 0.0 && others[k].in_v == 0.0) continue;
+            const Pair both{others[k].in_q, others[k].in_v};
+            double* weight = weights_.data() + rows.others * size * size;
+            rows.other[rows.others++] = {weight, others[k].x};
             for (int i = 0; i < size; ++i) {
                 const Slopes* by = slopes_.data() + (block.begin + i) * n + block.begin;
                 for (int j = 0; j < size; ++j) {
-                    const Pair parts = share * by[j].both;
-                    weights_[i * size + j] = parts[0] + parts[1];
+                    const Pair parts = both * by[j].both;
+                    *weight++ = parts[0] + parts[1];
                 }
             }
-            subtract_product(weights_.data(), size, size, x[k], columns, a);
         }
-        solve_ldl_rows(ldl_.data(), n, block, a, columns, columns);
+        solve_slope_rows(rows, a);
     }
 
   private:
@@ -365,7 +368,7 @@ class ForwardDynamics {
     std::vector<double> momentum_;                  // (n) where bodies are articulated
     std::vector<double> ldl_;                       // (n, n) factors of M
     std::vector<Slopes> slopes_;                    // (n, n) of inverse dynamics
-    std::vector<double> weights_;                   // (b, b) of them, in another stage's accelerations
+    std::vector<double> weights_;                   // (others, b, b) of them, in other stages' accelerations
 };
 
 }  // namespace varpin

@@ -66,12 +66,10 @@ class ExplicitStepper {
           coefficients_(nystroem_of(method)),
           derivatives_(derivatives),
           stage_q_(mechanism.dof()),
-          stage_v_(mechanism.dof()),
-          sum_q_(derivatives ? blocks_size(mechanism.tree) : 0),
-          sum_v_(sum_q_.size()) {
+          stage_v_(mechanism.dof()) {
         for (int i = 0; i < stages(); ++i) {
             a_[i].resize(mechanism.dof());
-            if (derivatives) slope_[i].resize(sum_q_.size());
+            if (derivatives) slope_[i].resize(blocks_size(mechanism.tree));
         }
     }
 
@@ -102,22 +100,19 @@ class ExplicitStepper {
     // The derivatives of the last step in (q, v) and in the force into Jx (2n, 2n) and Jf (2n, n), of which everything
     // outside of blocks is zero already.
     void write_derivatives(double h, double* Jx, double* Jf) {
-        add_up(h * h, coefficients_.end_q, sum_q_);
-        add_up(h, coefficients_.end_v, sum_v_);
         const int n = mechanism_->dof();
-        const double *in_q = sum_q_.data(), *in_v = sum_v_.data();
+        int first = 0;
         for (const Block& block : mechanism_->tree.blocks) {
-            const int size = block.end - block.begin, width = ForwardDynamics::slope_width(size);
-            for (int row = block.begin; row < block.end; ++row, in_q += 3 * width, in_v += 3 * width) {
-                for (auto [sum, at] : {std::pair{in_q, row}, {in_v, n + row}}) {
-                    double* const x = Jx + at * 2 * n + block.begin;
-                    double* const f = Jf + at * n + block.begin;
-                    for (int c = 0; c < size; ++c) {
-                        x[c] = sum[c];
-                        x[n + c] = sum[width + c];
-                        f[c] = sum[2 * width + c];
-                    }
-                }
+            const int size = block.end - block.begin, columns = SlopeRows::columns(size);
+            for (int row = block.begin; row < block.end; ++row, first += columns) {
+                const auto part = [&](int from, double* in_q, double* in_v) {
+                    add_up(h * h, coefficients_.end_q, first + from, size, in_q + block.begin);
+                    add_up(h, coefficients_.end_v, first + from, size, in_v + block.begin);
+                };
+                double *q = Jx + row * 2 * n, *v = Jx + (n + row) * 2 * n;
+                part(0, q, v);
+                part(size, q + n, v + n);
+                part(2 * size, Jf + row * n, Jf + (n + row) * n);
                 Jx[row * 2 * n + row] += 1.0;
                 Jx[row * 2 * n + n + row] += h;
                 Jx[(n + row) * 2 * n + n + row] += 1.0;
@@ -130,7 +125,7 @@ class ExplicitStepper {
         int size = 0;
         for (const Block& block : tree.blocks) {
             const int own = block.end - block.begin;
-            size += 3 * own * ForwardDynamics::slope_width(own);
+            size += own * SlopeRows::columns(own);
         }
         return size;
     }
@@ -152,34 +147,33 @@ class ExplicitStepper {
     // The derivatives of the accelerations at stage i, which `dynamics` is at.
     void differentiate(double h, int i) {
         dynamics.differentiate(stage_v_.data(), a_[i].data());
-        double in_q[4], in_v[4];
-        for (int k = 0; k < i; ++k) {
-            in_q[k] = h * h * coefficients_.stage_q[i][k];
-            in_v[k] = h * coefficients_.stage_v[i][k];
-        }
+        ForwardDynamics::Before before[4];
+        for (int k = 0; k < i; ++k)
+            before[k] = {nullptr, h * h * coefficients_.stage_q[i][k], h * coefficients_.stage_v[i][k]};
         int first = 0;
         for (const Block& block : mechanism_->tree.blocks) {
             const int size = block.end - block.begin;
-            const double* before[4] = {};
-            for (int k = 0; k < i; ++k) before[k] = slope_[k].data() + first;
-            dynamics.slope(block, slope_[i].data() + first, h * coefficients_.reach[i], i, before, in_q, in_v,
+            for (int k = 0; k < i; ++k) before[k].x = slope_[k].data() + first;
+            dynamics.slope(block, slope_[i].data() + first, h * coefficients_.reach[i], before, i,
                            ramp ? coefficients_.reach[i] : 1.0);
-            first += 3 * size * ForwardDynamics::slope_width(size);
+            first += size * SlopeRows::columns(size);
         }
     }
 
-    // scale sum_i weight[i] slope_i.
-    void add_up(double scale, const double* weight, std::vector<double>& to) const {
-        const int size = static_cast<int>(to.size());
-        double* __restrict sum = to.data();
+    // scale sum_i weight[i] slope_i, of `size` entries from the `first` on.
+    void add_up(double scale, const double* weight, int first, int size, double* __restrict sum) const {
+        const double* slope[4] = {};
+        double factor[4] = {};
+        int count = 0;
         for (int i = 0; i < stages(); ++i) {
-            const double factor = scale * weight[i];
-            const double* __restrict x = slope_[i].data();
-            if (i == 0) {
-                for (int c = 0; c < size; ++c) sum[c] = factor * x[c];
-            } else {
-                for (int c = 0; c < size; ++c) sum[c] += factor * x[c];
-            }
+            if (weight[i] == 0.0) continue;
+            slope[count] = slope_[i].data() + first;
+            factor[count++] = scale * weight[i];
+        }
+        for (int c = 0; c < size; ++c) {
+            double total = 0.0;
+            for (int k = 0; k < count; ++k) total += factor[k] * slope[k][c];
+            sum[c] = total;
         }
     }
 
@@ -187,9 +181,8 @@ class ExplicitStepper {
     Nystroem coefficients_;
     bool derivatives_;
     std::vector<double> stage_q_, stage_v_;
-    std::vector<double> a_[4];           // (n) of each stage
-    std::vector<double> slope_[4];       // their derivatives (b, 3 widths) in q, v and force, block after block
-    std::vector<double> sum_q_, sum_v_;  // of those at the end of a step
+    std::vector<double> a_[4];      // (n) of each stage
+    std::vector<double> slope_[4];  // their derivatives (b, columns) in q, v and force, block after block
 };
 
 // P paths on their way, each from its own state.

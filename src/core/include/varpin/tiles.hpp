@@ -6,9 +6,7 @@
 #include <cstddef>
 #include <vector>
 
-#if defined(__x86_64__) && defined(__GNUC__)
-#include <cpuid.h>
-#endif
+#include "varpin/wide.hpp"
 
 namespace varpin {
 
@@ -64,17 +62,6 @@ namespace detail {
                                                    TiledMatrix& out, int rows, Part part) {
     add_tiles(a, b, depth, out, rows, part);
 }
-
-// Whether processor and system have AVX2.
-inline bool has_wide() {
-    unsigned a = 0, b = 0, c = 0, d = 0;
-    constexpr unsigned saved = 1u << 27, avx = 1u << 28, avx2 = 1u << 5;
-    if (!__get_cpuid(1, &a, &b, &c, &d) || (c & saved) == 0 || (c & avx) == 0) return false;
-    unsigned low = 0, high = 0;
-    __asm__("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
-    if ((low & 6u) != 6u) return false;
-    return __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & avx2) != 0;
-}
 #endif
 
 }  // namespace detail
@@ -83,8 +70,7 @@ inline bool has_wide() {
 inline void add_transposed_product(const TiledMatrix& a, const TiledMatrix& b, int depth, TiledMatrix& out, int rows,
                                    Part part = Part::all) {
 #if defined(__x86_64__) && defined(__GNUC__)
-    static const bool wide = detail::has_wide();
-    if (wide) return detail::add_wide_tiles(a, b, depth, out, rows, part);
+    if (has_wide()) return detail::add_wide_tiles(a, b, depth, out, rows, part);
 #endif
     detail::add_tiles(a, b, depth, out, rows, part);
 }

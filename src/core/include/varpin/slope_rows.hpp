@@ -1,0 +1,105 @@
+// M X = B - sum_k W_k X_k for many columns at once: what derivatives of accelerations ask for, where those of earlier
+// accelerations X_k enter. docs/mathematics.md, "Explicit methods".
+#pragma once
+
+#include "varpin/wide.hpp"
+
+namespace varpin {
+
+// Of rows (n, columns), which are filled up with zeros to a multiple of four.
+struct SlopeRows {
+    static constexpr int padding = 4;
+    static constexpr int most_others = 2;
+    static int columns(int n) { return (3 * n + padding - 1) / padding * padding; }
+
+    // A share in the right sides of what others there are.
+    struct Other {
+        const double* weight;  // W (n, n)
+        const double* x;       // X (n, columns)
+    };
+
+    int n = 0;
+    const double* ldl = nullptr;  // L D L' of M, rows `ldl_stride` apart
+    int ldl_stride = 0;
+    Other other[most_others] = {};
+    int others = 0;
+};
+
+namespace detail {
+
+// `fours` times four columns, whose sums stay in registers.
+template <int fours>
+[[gnu::always_inline]] inline void solve_some(const SlopeRows& rows, int columns, double* __restrict x, int first) {
+    const int n = rows.n;
+    double sum[fours][4];
+    const auto subtract = [&](double factor, const double* row) {
+        for (int f = 0; f < fours; ++f) {
+            for (int c = 0; c < 4; ++c) sum[f][c] -= factor * row[4 * f + c];
+        }
+    };
+    for (int i = 0; i < n; ++i) {
+        double* own = x + i * columns + first;
+        for (int f = 0; f < fours; ++f) {
+            for (int c = 0; c < 4; ++c) sum[f][c] = own[4 * f + c];
+        }
+        for (int o = 0; o < rows.others; ++o) {
+            const double* weight = rows.other[o].weight + i * n;
+            const double* other = rows.other[o].x + first;
+            for (int k = 0; k < n; ++k, other += columns) subtract(weight[k], other);
+        }
+        const double* factor = rows.ldl + i * rows.ldl_stride;
+        for (int k = 0; k < i; ++k) subtract(factor[k], x + k * columns + first);
+        for (int f = 0; f < fours; ++f) {
+            for (int c = 0; c < 4; ++c) own[4 * f + c] = sum[f][c];
+        }
+    }
+    for (int i = n - 1; i >= 0; --i) {
+        double* own = x + i * columns + first;
+        const double inverse = 1.0 / rows.ldl[i * rows.ldl_stride + i];
+        for (int f = 0; f < fours; ++f) {
+            for (int c = 0; c < 4; ++c) sum[f][c] = own[4 * f + c] * inverse;
+        }
+        for (int k = i + 1; k < n; ++k) subtract(rows.ldl[k * rows.ldl_stride + i], x + k * columns + first);
+        for (int f = 0; f < fours; ++f) {
+            for (int c = 0; c < 4; ++c) own[4 * f + c] = sum[f][c];
+        }
+    }
+}
+
+// Sums of 3 times four fill the registers of two numbers, of 6 times those of four.
+template <int most>
+[[gnu::always_inline]] inline void solve_all(const SlopeRows& rows, double* x) {
+    const int columns = SlopeRows::columns(rows.n);
+    int c = 0;
+    for (; c + 4 * most <= columns; c += 4 * most) solve_some<most>(rows, columns, x, c);
+    if constexpr (most > 3) {
+        for (; c + 12 <= columns; c += 12) solve_some<3>(rows, columns, x, c);
+    }
+    for (; c + 8 <= columns; c += 8) solve_some<2>(rows, columns, x, c);
+    if (c < columns) solve_some<1>(rows, columns, x, c);
+}
+
+#if defined(__x86_64__) && defined(__GNUC__)
+// GCC would make four sums at once of one row by four others instead, with twice the instructions.
+#if !defined(__clang__)
+[[gnu::optimize("no-tree-loop-vectorize")]]
+#endif
+[[gnu::target("avx2")]] inline void solve_wide(const SlopeRows& rows, double* x) {
+    solve_all<6>(rows, x);
+}
+#endif
+
+}  // namespace detail
+
+// The X in place of B (n, columns).
+#if defined(__GNUC__) && !defined(__clang__)
+[[gnu::optimize("no-tree-loop-vectorize")]]
+#endif
+inline void solve_slope_rows(const SlopeRows& rows, double* x) {
+#if defined(__x86_64__) && defined(__GNUC__)
+    if (has_wide()) return detail::solve_wide(rows, x);
+#endif
+    detail::solve_all<3>(rows, x);
+}
+
+}  // namespace varpin
