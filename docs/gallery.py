@@ -161,10 +161,10 @@ SHOTS = {
 
 # Examples: when they are shown [s], the second time where they draw no figure; and from where.
 EXAMPLES: dict[str, tuple[float, float, tuple[float, float, float] | None]] = {
-    "ur5_servos": (0.5, 0.5, (20.0, 25.0, 1.1)),
+    "ur5_servos": (0.5, 0.5, (20.0, 25.0, 0.85)),
     "panda_stop": (1.5, 1.5, (-50.0, 21.0, 1.15)),
     "kinova_door": (4.5, 4.5, (130.0, 25.0, 1.2)),
-    "tiago_reach": (0.0, 3.0, (-50.0, 21.0, 1.2)),
+    "tiago_reach": (0.0, 3.0, (-50.0, 21.0, 0.95)),
 }
 
 _VIEW = """
