@@ -201,3 +201,9 @@ def test_refusals() -> None:
     with pytest.raises(vp.InputError, match="linear between nodes"):
         vp.simulate_ensemble(problem.scene, [0, 0], [0, 0], dt=0.1, steps=N, controls=plan.policy, paths=2, rng=0,
                              integrator=problem.integrator)  # fmt: skip
+
+
+def test_monte_carlo_refuses_them_by_name() -> None:
+    plan = vp.solve(links(), max_iterations=1, check=False)
+    with pytest.raises(vp.InputError, match="linear between nodes"):
+        plan.monte_carlo(2, rng=0)
