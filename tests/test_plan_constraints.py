@@ -443,7 +443,7 @@ def test_noise_that_depends_on_the_motion_does_not_move_a_plan_within_constraint
     bounds = FAMILIES["velocities"]
     still = vp.solve(two_links(bounds, steps=steps), check=False)
     scene = vp.Scene(ROBOT, damping=0.1, noise=noise)
-    plan = vp.solve(two_links(bounds, steps=steps, scene=scene))
+    plan = vp.solve(two_links(bounds, steps=steps, scene=scene), noise="whole")
     assert plan.status is vp.Status.CONVERGED, plan.reason
     np.testing.assert_allclose(plan.controls, still.controls, rtol=0, atol=1e-6 * np.abs(still.controls).max())
     along = backward(two_links(steps=steps, scene=scene), plan.trajectory, 0.0)
