@@ -654,7 +654,7 @@ def _one_pass_on_lines(along: Along, regularization: float, limits: _Limits | No
         if final is None or squares is None or change is None:
             return None
         wide = np.concatenate([D, np.zeros((x, X - x))], axis=1)
-        found = core.RootPass(m, final.after(wide).core, end_gradient)
+        found = core.RootPass(m, final.after(wide).padded(X).core, end_gradient)
         failed = found.run(*how, steps, gains, squares.core, change.core)
     else:
         found = core.BackwardPass(m, end_gradient, end_hessian)
