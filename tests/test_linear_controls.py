@@ -234,3 +234,11 @@ def test_links_too_light_for_the_plain_pass() -> None:
     plan = vp.solve(problem, max_iterations=3, check=False)
     assert plan.cost < plan.history[0].cost or plan.status.converged
     assert np.isfinite(plan.gains).all()
+
+
+def test_advice_is_one_that_such_problems_take() -> None:
+    """Finer steps, but none that a control is held over."""
+    plan = vp.solve(links(integrator=vp.SemiImplicitEuler()))
+    (advice,) = [sentence for sentence in plan.warnings if "problem.at(" in sentence]
+    assert "problem.at(dt=0.025) " in advice
+    assert plan.problem.at(dt=0.025).linear

@@ -251,7 +251,10 @@ def _usual(problem: OptimalControlProblem) -> Integrator:
 def _sentence(problem: OptimalControlProblem, replay: Replay) -> str:
     """What a plan loses in finer steps, why, and what to change."""
     fed, alone = (percent(part) if np.isfinite(part) else "runs away" for part in (replay.feedback, replay.alone))
-    finer = f"problem.at(dt={problem.dt / PARTS:g}, hold={problem.hold * PARTS}) decides as often in finer steps"
+    dt = f"{problem.dt / PARTS:g}"
+    finer = f"problem.at(dt={dt}, hold={problem.hold * PARTS}) decides as often in finer steps"
+    if problem.linear:
+        finer = f"problem.at(dt={dt}) has finer steps"
     if -GAIN <= replay.alone <= LOSS:
         why = f"the feedback is too fast for the step; {finer}, and a greater weight on the controls slows it"
     elif problem.sampling != "gauss":

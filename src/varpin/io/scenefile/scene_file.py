@@ -122,7 +122,12 @@ class SceneFile:
         if given is None:
             return None
         if isinstance(given, Timeline):
-            return given.at((np.arange(self.spec.steps, dtype=np.float64) + 0.5) * self.spec.dt)
+            k = np.arange(self.spec.steps, dtype=np.float64)
+            found = given.at((k + 0.5) * self.spec.dt)
+            # A position of a joint moved by hand is where it is at the end of the step.
+            moved = [int(np.argmax(self.scene.actuation[c])) for c in self.scene.inputs.values()]
+            found[:, moved] = given.at((k + 1.0) * self.spec.dt)[:, moved]
+            return found
         return holding_controls(self.scene, self.q0)
 
     def simulate(self, *, progress: Callable[[int, int], None] | None = None) -> Trajectory:
