@@ -106,6 +106,7 @@ WRONG = {
     "no robot": (lambda arm: vp.combine(arm, "ur5"), "two robots or more"),
     "placements": (lambda arm: vp.combine(arm, arm, placements=[None]), "placements must be one for each of 2"),
     "planar": (lambda arm: vp.combine(arm, arm, placements=[None, "planar"]), "given to load_robot"),
+    "a place": (lambda arm: vp.combine(arm, arm, placements=[None, [2.0, 0.0, 0.0]]), "placement of 'chain2'"),
     "no rotation": (lambda arm: vp.combine(arm, arm, placements=[None, 2.0 * np.eye(4)]), "rotation"),
     "prefixes": (lambda arm: vp.combine(arm, arm, prefixes="ab"), "prefixes must be one word for each"),
     "alike": (lambda arm: vp.combine(arm, arm, prefixes=["", ""]), "'joint1' is there twice"),

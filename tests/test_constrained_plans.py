@@ -121,7 +121,7 @@ def five_bar(**options):
     drives = np.zeros((4, 2))
     drives[0, 0] = drives[3, 1] = 1.0
     closed = vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="xz")
-    scene = vp.Scene(vp.planar_chain(4), constraints=closed, actuation=drives, damping=0.1, **options)
+    scene = vp.Scene(vp.planar_chain(4), constraints=closed, actuation=drives, **{"damping": 0.1, **options})
     return scene, vp.assemble(scene, [-1.0, 1.0, 1.0, 1.0])
 
 
@@ -276,3 +276,15 @@ def test_a_controller_keeps_a_closed_loop_on_its_way():
     run = vp.Mpc(problem).run(vp.Plant(heavier, substeps=2), duration=0.8, rng=0)
     assert np.abs(run.motion.q[-1] - goal).max() < 0.05
     assert np.abs(scene.core.constraints(run.motion.q)[0]).max() < 1e-12
+
+
+@pytest.mark.parametrize("fast", [{"damping": 1e5}, {"forces": vp.CoulombFriction(1.0, width=1e-4)}])
+def test_problems_of_closed_loops_take_an_integrator_that_keeps_them(fast):
+    """However fast dampers and friction are; and nobody is told to take one that does not."""
+    scene, q0 = five_bar(**fast)
+    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0), q0, np.zeros(4), dt=0.05, steps=4)
+    assert problem.integrator == vp.Gauss(4)
+    motion = problem.simulate(np.zeros(2))
+    assert np.abs(scene.core.constraints(motion.q)[0]).max() < 1e-12
+    assert any("faster than the step" in sentence for sentence in motion.warnings)
+    assert not any("Radau" in sentence for sentence in motion.warnings)

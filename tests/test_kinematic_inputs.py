@@ -201,3 +201,24 @@ def test_what_does_not_know_inputs_refuses_them():
         vp.Scene(robot, constraints=hand, forces=[vp.PositionServo({"joint1": 10.0}, {"joint1": 1.0})])
     with pytest.raises(vp.UnknownJoint):
         vp.Scene(robot, constraints=vp.KinematicInput("joint9"))
+
+
+def test_a_motion_by_hand_comes_back_from_its_file(tmp_path):
+    scene, q, _ = crank()
+    motion = vp.simulate(scene, q, np.zeros(3), dt=0.01, steps=3)
+    back = vp.Trajectory.load(motion.save(tmp_path / "crank.npz"))
+    np.testing.assert_array_equal(back.q, motion.q)
+    np.testing.assert_array_equal(back.constraint_forces, motion.constraint_forces)
+    np.testing.assert_array_equal(vp.linearize(scene, back).B, vp.linearize(scene, motion).B)
+
+
+def test_a_file_moves_a_joint_to_where_its_sine_is_at_the_nodes(tmp_path):
+    path = tmp_path / "hand.toml"
+    path.write_text(
+        '[robot]\nsource = "finger"\n[initial]\nq = 0.5\n[horizon]\ndt = 0.01\nsteps = 10\n'
+        '[[constraint]]\ntype = "kinematic_input"\njoint = "mcp"\n'
+        '[simulate.controls]\noffset = { mcp = 0.5 }\nsines = [{ of = "mcp", amplitude = 0.1, frequency = 2.0 }]\n'
+    )
+    motion = vp.load_scene(path).simulate()
+    c = motion.joint_names.index("mcp")
+    np.testing.assert_allclose(motion.q[:, c], 0.5 + 0.1 * np.sin(4.0 * np.pi * motion.t), atol=1e-12)

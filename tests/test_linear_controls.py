@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import varpin as vp
+from varpin.control.backward import Along, _one_pass
 
 N = 8
 RNG = np.random.default_rng(3)
@@ -201,3 +202,43 @@ def test_refusals() -> None:
     with pytest.raises(vp.InputError, match="linear between nodes"):
         vp.simulate_ensemble(problem.scene, [0, 0], [0, 0], dt=0.1, steps=N, controls=plan.policy, paths=2, rng=0,
                              integrator=problem.integrator)  # fmt: skip
+
+
+def test_monte_carlo_refuses_them_by_name() -> None:
+    plan = vp.solve(links(), max_iterations=1, check=False)
+    with pytest.raises(vp.InputError, match="linear between nodes"):
+        plan.monte_carlo(2, rng=0)
+
+
+@pytest.mark.parametrize("joints", [1, 2])
+def test_the_pass_on_square_roots_is_the_plain_one(joints) -> None:
+    """One joint has a state of odd size, which the core takes with a zero beside it."""
+    end = vp.TrackingCost(np.full(joints, 0.6), 1e3) + vp.VelocityCost(1e2)
+    cost = vp.ControlCost(1e-2) + vp.ControlRateCost(1e-4) + vp.VelocityCost(0.1) + vp.Terminal(end)
+    scene = vp.Scene(vp.planar_chain(joints), damping=0.1)
+    still = np.zeros(joints)
+    problem = vp.OptimalControlProblem(scene, cost, still, still, dt=0.1, steps=N, controls="linear")
+    along = Along(problem, problem.simulate(problem.holding_policy()))
+    plain, roots = (_one_pass(along, 0.0, False, None, None, roots=way)[0] for way in (False, True))
+    for name in ("feedforward", "feedback", "previous", "gradient", "slope", "curvature"):
+        one, other = getattr(plain, name), getattr(roots, name)
+        np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-9 * np.abs(one).max(), err_msg=name)
+
+
+def test_links_too_light_for_the_plain_pass() -> None:
+    """A finger of some grams: the plain pass has lost its digits, and squares take over."""
+    scene = vp.Scene(vp.load_robot("finger"))
+    cost = vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost([1.0, 0.5, 0.4], 1.0))
+    q0, v0 = [0.5, 0.3, 0.2], np.zeros(3)
+    problem = vp.OptimalControlProblem(scene, cost, q0, v0, dt=0.01, steps=N, controls="linear")
+    plan = vp.solve(problem, max_iterations=3, check=False)
+    assert plan.cost < plan.history[0].cost or plan.status.converged
+    assert np.isfinite(plan.gains).all()
+
+
+def test_advice_is_one_that_such_problems_take() -> None:
+    """Finer steps, but none that a control is held over."""
+    plan = vp.solve(links(integrator=vp.SemiImplicitEuler()))
+    (advice,) = [sentence for sentence in plan.warnings if "problem.at(" in sentence]
+    assert "problem.at(dt=0.025) " in advice
+    assert plan.problem.at(dt=0.025).linear

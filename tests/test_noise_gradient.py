@@ -94,3 +94,14 @@ def test_where_it_stays_held() -> None:
 def test_a_wrong_choice() -> None:
     with pytest.raises(vp.InputError, match="noise must be 'held' or 'whole'"):
         vp.solve(reach(CONTROL), noise="some")
+
+
+def test_a_search_does_not_go_on_under_other_noise():
+    def problem(strength):
+        scene = vp.Scene(vp.planar_chain(2), noise=vp.ControlNoise(strength))
+        cost = vp.ControlCost(1.0) + vp.Terminal(vp.TrackingCost([0.5, 0.2], 100.0))
+        return vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=0.05, steps=6)
+
+    plan = vp.solve(problem(0.1), max_iterations=1, check=False)
+    with pytest.raises(vp.InputError, match="another problem: the noise has another strength"):
+        vp.solve(problem(0.2), resume=plan)

@@ -434,3 +434,46 @@ def test_scene_files(tmp_path):
     path.write_text(SCENE.replace("limit = 500.0", "limt = 500.0"), encoding="utf-8")
     with pytest.raises(vp.SceneFileError, match=r"plan_constraint\[1\].limt"):
         vp.load_scene(path)
+
+
+@pytest.mark.parametrize("steps", [8, 9])
+@pytest.mark.parametrize("noise", [vp.ControlNoise(0.05), vp.StateNoise(0.5)], ids=["control", "state"])
+def test_noise_that_depends_on_the_motion_does_not_move_a_plan_within_constraints(noise, steps):
+    """The motion is the one without noise; feedback and cost of the noise are those of the plain problem there."""
+    bounds = FAMILIES["velocities"]
+    still = vp.solve(two_links(bounds, steps=steps), check=False)
+    scene = vp.Scene(ROBOT, damping=0.1, noise=noise)
+    plan = vp.solve(two_links(bounds, steps=steps, scene=scene), noise="whole")
+    assert plan.status is vp.Status.CONVERGED, plan.reason
+    np.testing.assert_allclose(plan.controls, still.controls, rtol=0, atol=1e-6 * np.abs(still.controls).max())
+    along = backward(two_links(steps=steps, scene=scene), plan.trajectory, 0.0)
+    assert plan.noise_cost == pytest.approx(along.noise, rel=1e-9)
+    assert plan.noise_cost > 0.0
+    assert any("least cost without noise" in sentence for sentence in plan.warnings)
+
+
+def test_a_margin_without_noise_is_told_of():
+    plan = vp.solve(two_links([vp.WithinVelocityLimits(ROBOT, (-1.2, 1.2), margin=2.0)], steps=8))
+    assert any("margin" in sentence and "no noise" in sentence for sentence in plan.warnings)
+
+
+def test_references_of_rows_go_with_constraints():
+    """Looking at a plan between its nodes takes no reference there."""
+    reference = np.linspace(0.0, 1.0, 9)[:, None] * np.array([1.0, 0.5])
+    cost = vp.ControlCost(1e-2) + vp.TrackingCost(reference, 10.0)
+    plan = vp.solve(two_links([vp.WithinVelocityLimits(ROBOT, (-0.8, 0.8))], steps=8, cost=cost))
+    assert plan.status is vp.Status.CONVERGED, plan.reason
+    assert plan.violation <= 1e-9
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("time_limit", -1.0), ("time_limit", np.nan), ("max_iterations", -3), ("callback", 3), ("progress", 3)],
+)
+def test_options_are_checked_with_constraints_as_without(option, value):
+    told = []
+    for constraints in ([], FAMILIES["velocities"]):
+        with pytest.raises(vp.InputError, match=option) as found:
+            vp.solve(two_links(constraints, steps=8), **{option: value})
+        told.append(str(found.value))
+    assert told[0] == told[1]

@@ -470,6 +470,14 @@ MISTAKES = {
         changed('type = "midpoint"', 'type = "mid_point"'),
         "integrator.type",
     ),
+    "linear controls under noise": (
+        changed("duration = 0.1", 'duration = 0.1\ncontrols = "linear"'),
+        "horizon.controls",
+    ),
+    "limits of too many rates": (
+        GOOD + '\n[[plan_constraint]]\ntype = "control_rate"\nlimit = [1.0, 2.0, 3.0, 4.0]',
+        "plan_constraint[0]",
+    ),
     "alpha out of range": (changed("alpha = 0.5", "alpha = 1.5"), "integrator.alpha"),
     "option of another integrator": (changed("alpha = 0.5", "stages = 2"), "integrator.stages"),
     "unknown cost": (changed('"tracking"', '"traking"'), "cost[0].type"),
@@ -946,3 +954,15 @@ def test_stages_of_radau_are_taken(tmp_path):
     for line, expected in (("stages = 3\n", vp.Radau(3)), ("", vp.Radau())):
         path.write_text(head + line)
         assert vp.load_scene(path).spec.integrator == expected
+
+
+def test_without_an_integrator_a_file_takes_that_of_its_problem(tmp_path):
+    """As in Python: dampers far faster than the step are for an L-stable method."""
+    text = '[robot]\nsource = "finger"\n[horizon]\ndt = 1e-2\nsteps = 4\n[[cost]]\ntype = "control"\n'
+    path = tmp_path / "stiff.toml"
+    for damping, expected in ((0.0, vp.Gauss(4)), (10.0, vp.Radau(4))):
+        path.write_text(f"damping = {damping}\n{text}")
+        file = vp.load_scene(path, required_only=False)
+        plain = vp.OptimalControlProblem(file.scene, file.problem.cost, file.q0, file.v0, dt=1e-2, steps=4)
+        assert file.integrator == file.problem.integrator == plain.integrator == expected
+        assert file.simulate().integrator == str(expected)

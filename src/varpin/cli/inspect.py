@@ -56,7 +56,7 @@ def _inspect_scene(request: argparse.Namespace) -> int:
         add_row(table, "planned together", required.coupled)
     for name, words in required.terms.items():
         add_row(table, name, words, style="dim" if words == "none" or name == "not modelled" else "")
-    add_row(table, "horizon", f"{spec.steps} steps of {spec.dt:g} s, {spec.integrator}")
+    add_row(table, "horizon", f"{spec.steps} steps of {spec.dt:g} s, {file.integrator}")
     if required.saved:
         add_row(table, "saved", f"{100 * required.saved:.0f}% of the linear algebra of a plan, by counting")
     console = Console() if sys.stdout.isatty() else Console(width=WIDTH)

@@ -24,9 +24,11 @@ from varpin.control.multipliers import FEASIBLE, ConstraintReport, Multipliers, 
 from varpin.control.penalties import PenalizedProblem, flat, penalized
 from varpin.control.polish import deviations, onto_constraints
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.search import checked_time, require_reports
 from varpin.control.solution import Solution
 from varpin.errors import InputError, LinearizationError
 from varpin.mechanics.noise import NoiseFieldError
+from varpin.support.checks import count
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -104,8 +106,9 @@ class _Rounds:
         self.controls = self.options.pop("controls", None)
         self.resumed: Solution | None = self.options.pop("resume", None)
         self.tolerance = self.options.pop("tolerance", 1e-7)
-        self.most = self.options.pop("max_iterations", _MOST_ITERATIONS)
-        self.limit = self.options.pop("time_limit", np.inf)
+        self.most = count("max_iterations", self.options.pop("max_iterations", _MOST_ITERATIONS))
+        self.limit = checked_time(self.options.pop("time_limit", np.inf))
+        require_reports(self.callback, self.progress)
         self.label = f"{problem.scene.robot.name}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
         self.history: list[Iteration] = []
         self.noisy = bool(problem.scene.processes) and any(item.source.margin > 0.0 for item in self.bound)
@@ -338,10 +341,13 @@ class _Rounds:
             first if item.source.equality else 0.0 for item, first in zip(self.bound, known.first_weights, strict=True)
         ]
         zeros = [np.zeros(item.shape) for item in self.bound]
-        calm = penalized(self.problem, zeros, np.array(goals), zeros)
-        found = backward(calm, kept.trajectory, 0.0)
+        calm = penalized(self.problem, zeros, np.array(goals), zeros, quiet=False)
+        try:
+            found = backward(calm, kept.trajectory, 0.0)
+        except (CostError, NoiseFieldError, LinearizationError):
+            found = None
         if found is None:
-            return kept
+            return replace(kept, noise_cost=np.nan)
         return replace(kept, gains=found.feedback, previous_gains=found.previous, noise_cost=found.noise)
 
     def _backoff(self, kept: Solution) -> list[Floats]:

@@ -85,7 +85,7 @@ def noise_shares(
 
     ``processes`` (k,) says which ones count, all if left out. Empty where there is no noise.
     """
-    if problem.scene.processes == 0:
+    if problem.processes == 0:
         return np.zeros(0)
     g = impulses(problem, trajectory, plan.jumps)
     if processes is not None:
@@ -132,7 +132,7 @@ def _curvature(problem: OptimalControlProblem, trajectory: Trajectory, plan: Pla
         lin = _linearize(problem, trajectory, 0)
         J = np.concatenate([lin.A, lin.B], axis=2)
         total += np.swapaxes(J, 1, 2) @ velocity_curvature(scene, trajectory.q[1:], trajectory.v[1:], pulls[3]) @ J
-    if scene.processes and problem.integrator.variational:
+    if problem.processes and problem.integrator.variational:
         pull = plan.spread @ impulses(problem, trajectory, plan.jumps)
         weight = problem.integrator.left * np.swapaxes(plan.jumps, 1, 2) @ pull
         total[:, :n, :n] += scene.noise.curvature(weight)
@@ -479,12 +479,13 @@ class Along:
         size = hessian.shape[-1]
         rows, points = slice(begin // problem.hold, end // problem.hold), slice(begin * samples, end * samples)
         lin, velocity = self.linearized(begin, end)
+        count = problem.processes
         return core.ExpandedSteps(
             A=lin.A,
             B=lin.B,
-            G=lin.G,
-            Gx=lin.Gx,
-            Gu=lin.Gu,
+            G=np.ascontiguousarray(lin.G[:, :, :count]),
+            Gx=np.ascontiguousarray(lin.Gx[:, :, :count]),
+            Gu=np.ascontiguousarray(lin.Gu[:, :, :count]),
             rule=problem.model_rule,
             gradient=self.slopes[points],
             hessian=hessian[points] if len(hessian) > 1 else hessian,
@@ -560,7 +561,7 @@ def _one_pass(
 ) -> tuple[Plan | None, Floats]:
     problem, running = along.problem, along.running
     scene = problem.scene
-    n, m, k, N, R = scene.robot.dof, scene.controls, scene.processes, problem.steps, problem.decisions
+    n, m, k, N, R = scene.robot.dof, scene.controls, problem.processes, problem.steps, problem.decisions
     _, D, by_state, by_states = along.terminal
     if curvature is not None and problem.integrator.variational:
         pull = along.terminal.cost.gradient[:, n:]
@@ -653,7 +654,7 @@ def _one_pass_on_lines(along: Along, regularization: float, limits: _Limits | No
         if final is None or squares is None or change is None:
             return None
         wide = np.concatenate([D, np.zeros((x, X - x))], axis=1)
-        found = core.RootPass(m, final.after(wide).core, end_gradient)
+        found = core.RootPass(m, final.after(wide).padded(X).core, end_gradient)
         failed = found.run(*how, steps, gains, squares.core, change.core)
     else:
         found = core.BackwardPass(m, end_gradient, end_hessian)

@@ -75,7 +75,12 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
     told = [finding for finding in found if finding.kind not in (*_OF_STEPS, _ALTERNATION)]
     if solution.refinement is not None and not solution.refinement.met:
         told.append(Finding("true cost", solution.refinement.reason))
-    told += _unfinished(solution) + (_alternating(solution) or _restless(solution)) + _between(solution)
+    told += (
+        _unfinished(solution)
+        + _noise_left_out(solution)
+        + (_alternating(solution) or _restless(solution))
+        + _between(solution)
+    )
     try:
         replay = replayed(solution)
     except VarpinError as error:
@@ -153,24 +158,52 @@ def _unfinished(solution: Solution) -> list[Finding]:
     return [Finding("not converged", solution.reason)]
 
 
+def _noise_left_out(solution: Solution) -> list[Finding]:
+    """Says if a plan within constraints might have less noise elsewhere, for its search leaves noise out; or has none.
+
+    Noise of constant strength adds the same to all.
+    """
+    problem = solution.problem
+    if not problem.scene.processes:
+        if not any(constraint.margin > 0.0 for constraint in problem.constraints):
+            return []
+        return [
+            Finding(
+                "margin without noise",
+                "a constraint has a margin=, and the scene no noise that it could keep away from: the margin is zero",
+            )
+        ]
+    if not (problem.constraints and problem.steered.any()):
+        return []
+    return [
+        Finding(
+            "noise left out",
+            "within constraints the motion is that of least cost without noise. The strength of this noise depends on "
+            f"the motion, and what it adds to the cost, {solution.noise_cost:.4g}, may be less along another one: "
+            "without constraints=, solve lowers it, too",
+        )
+    ]
+
+
 def _between(solution: Solution) -> list[Finding]:
     """Says where constraints that hold at the nodes are violated between them, in parts of a step."""
     problem = solution.problem
     if not problem.constraints or solution.violation > FEASIBLE:
         return []
-    fine = problem.at(dt=problem.dt / PARTS, steps=problem.steps * PARTS, hold=problem.hold * PARTS)
+    dt = problem.dt / PARTS
     motion, failure = rollout(
         problem.scene,
         problem.integrator,
         problem.q0,
         problem.v0,
         open_loop(solution.controls)._replace(hold=problem.hold * PARTS),
-        fine.dt,
+        dt,
     )
     if failure is not None:
         return []
     found = []
-    for bound, whole, own in zip(fine.bound_constraints, problem.bound_constraints, solution.constraints, strict=True):
+    fine = problem.constraints_on(dt, problem.steps * PARTS, problem.hold * PARTS)
+    for bound, whole, own in zip(fine, problem.bound_constraints, solution.constraints, strict=True):
         if bound.of_controls or bound.source.equality:
             continue
         c = bound.value(motion.q, motion.v, motion.u)
@@ -218,7 +251,10 @@ def _usual(problem: OptimalControlProblem) -> Integrator:
 def _sentence(problem: OptimalControlProblem, replay: Replay) -> str:
     """What a plan loses in finer steps, why, and what to change."""
     fed, alone = (percent(part) if np.isfinite(part) else "runs away" for part in (replay.feedback, replay.alone))
-    finer = f"problem.at(dt={problem.dt / PARTS:g}, hold={problem.hold * PARTS}) decides as often in finer steps"
+    dt = f"{problem.dt / PARTS:g}"
+    finer = f"problem.at(dt={dt}, hold={problem.hold * PARTS}) decides as often in finer steps"
+    if problem.linear:
+        finer = f"problem.at(dt={dt}) has finer steps"
     if -GAIN <= replay.alone <= LOSS:
         why = f"the feedback is too fast for the step; {finer}, and a greater weight on the controls slows it"
     elif problem.sampling != "gauss":

@@ -26,7 +26,7 @@ from varpin.ensemble import (
     simulate_paths,
     without_geometry,
 )
-from varpin.errors import VarpinError
+from varpin.errors import InputError, VarpinError
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.wiener import Children, children
 from varpin.simulation.loop_stability import examined_in_loop
@@ -145,6 +145,11 @@ def monte_carlo(
 ) -> MonteCarlo:
     """As :meth:`Solution.monte_carlo` says, of any policy."""
     paths = count("paths", paths, least=2)
+    if problem.linear:
+        raise InputError(
+            "monte_carlo draws noise, and controls that are linear between nodes act in scenes without any: plan with "
+            "controls='held'"
+        )
     costs: list[Floats] = []
     found: tuple[Finding, ...] = ()
     extremes: Extremes = {}

@@ -144,10 +144,22 @@ class PenalizedProblem(OptimalControlProblem):
     Attributes:
         penalties: Of constraints on states.
         all_penalties: Of all constraints, in the problem's order.
+        quiet: Whether plans leave the scene's noise out. With it, stiff penalties would count as what noise costs.
     """
 
     penalties: tuple[Penalty, ...]
     all_penalties: tuple[Penalty, ...]
+    quiet: bool
+
+    @property
+    def processes(self) -> int:
+        """See :attr:`OptimalControlProblem.processes`."""
+        return 0 if self.quiet else self.scene.processes
+
+    @property
+    def steered(self) -> Mask:
+        """See :attr:`OptimalControlProblem.steered`."""
+        return super().steered & (not self.quiet)
 
     @property
     def model_rule(self) -> Floats:
@@ -212,7 +224,12 @@ class PenalizedProblem(OptimalControlProblem):
 
 
 def penalized(
-    problem: OptimalControlProblem, multipliers: list[Floats], weights: Floats, backoff: list[Floats]
+    problem: OptimalControlProblem,
+    multipliers: list[Floats],
+    weights: Floats,
+    backoff: list[Floats],
+    *,
+    quiet: bool = True,
 ) -> PenalizedProblem:
     """The augmented Lagrangian of a problem.
 
@@ -221,6 +238,7 @@ def penalized(
         multipliers: Of each constraint (K, rows).
         weights: Of each penalty (C,); of weight zero there is none.
         backoff: Of each constraint (K, rows).
+        quiet: Leave the scene's noise out.
     """
     made = object.__new__(PenalizedProblem)
     parts = [
@@ -233,7 +251,7 @@ def penalized(
         "penalties": tuple(part for part in parts if not part.bound.of_controls),
         "all_penalties": tuple(parts),
     }
-    own |= {"constraints": (), "bound_constraints": ()}
+    own |= {"constraints": (), "bound_constraints": (), "quiet": quiet}
     if on_rate:
         rate = problem.rate
         if rate is None:

@@ -30,7 +30,7 @@ from varpin.errors import InputError
 from varpin.integrators import Gauss, Integrator, Radau
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy, OpenLoop
-from varpin.mechanics.scene import Scene, closest_controls, refuse_inputs, require_scene, tangent_basis
+from varpin.mechanics.scene import Scene, closest_controls, differences, refuse_inputs, require_scene, tangent_basis
 from varpin.simulation.friction import rate_at_rest
 from varpin.simulation.run import on_constraints, simulate
 from varpin.simulation.soundness import announce
@@ -86,7 +86,7 @@ class OptimalControlProblem(Frozen):
         dt: Time step [s].
         steps: N.
         integrator: Any of varpin's. If left out, ``Gauss(stages=4)``; ``Radau(stages=4)`` where dry friction or dampers
-            are more than 200 times as fast as the step at ``q0`` and rest.
+            are more than 200 times as fast as the step at ``q0`` and rest, and the scene has no constraints.
         sampling: Where running costs are taken in each step. ``"gauss"``, if left out: at its two Gauss points, the
             motion between the nodes taken for a cubic, of fourth order. ``"midpoint"``: at
             ((q + q')/2, (q' - q)/dt, u), of second order; it does not see velocities that alternate from node to node,
@@ -348,12 +348,29 @@ class OptimalControlProblem(Frozen):
             return "other forces"
         if self.described_constraints != other.described_constraints:
             return "other constraints"
-        return ""
+        return next(iter(differences(self.scene, other.scene.values, noise=True)), "")
+
+    def constraints_on(self, dt: float, steps: int, hold: int) -> tuple[BoundConstraint, ...]:
+        """Its constraints on another grid."""
+        return _bind_constraints(self.constraints, self.scene, self.t0, dt, steps, hold, self.rate)
 
     @property
     def described_constraints(self) -> str:
         """Its constraints in words and numbers, all that tells them from others; empty without any."""
         return "; ".join(map(repr, self.constraints))
+
+    @property
+    def processes(self) -> int:
+        """How many Wiener processes plans reckon with."""
+        return self.scene.processes
+
+    @property
+    def steered(self) -> NDArray[np.bool_]:
+        """Which processes (k,) change plans: what those of constant strength add to the cost is the same for all."""
+        fields = self.scene.noise.diffusion
+        if fields is None or not self.integrator.variational:
+            return np.ones(self.scene.processes, dtype=np.bool_)
+        return np.array(fields.control.any(axis=(0, 2)) | fields.quadratic.any(axis=0), dtype=np.bool_)
 
     @property
     def model_rule(self) -> Floats:
@@ -546,9 +563,12 @@ def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
     """What a problem is solved with where nothing is said: the default, or its L-stable sibling.
 
     Of what is z times as fast as the step, Gauss(4) leaves 1 - 40 / z after each: next to nothing goes from 200 on.
+    Under constraints of the scene it is the default all the same, for Radau's methods do not keep them.
     """
     stages = default_integrator().stages
-    return Radau(stages=stages) if dt * rate_at_rest(scene, q0) > _STIFF else default_integrator()
+    if scene.constraints or not dt * rate_at_rest(scene, q0) > _STIFF:
+        return default_integrator()
+    return Radau(stages=stages)
 
 
 def _constraints(given: Sequence[PlanConstraint]) -> tuple[PlanConstraint, ...]:

@@ -128,7 +128,7 @@ def solve(
             what the cost would lose by its own quadratic models along the motion if each state and control were free,
             and no more than it changes by over what moves. Of squared distances that is about their value; of
             constants, whatever their size, and of what noise adds it is nothing.
-        max_iterations: At most.
+        max_iterations: At most; 100 if left out, of a problem with constraints 500 of all rounds together.
 
     Other Args:
         second_order: Full differential dynamic programming: second derivatives of the dynamics too, wherever they
@@ -159,6 +159,7 @@ def solve(
             as in the paper, with the Hessian of the value held; it leaves out what the motion's derivatives change, and
             ends next to the minimum of the expected cost. ``"whole"``: from there it goes on to that minimum, a local
             one of the model, for 10 to 50 times the time. With ``second_order`` and within control limits it is held.
+            Problems with constraints are solved for the least cost without noise; it shapes their feedback and margins.
 
     Returns:
         The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers, and
@@ -181,14 +182,11 @@ def solve(
         raise InputError(f"regularization must be >= 0, got {regularization}")
     if not is_one_of(noise, ("held", "whole")):
         raise InputError(f"noise must be 'held' or 'whole', got {noise!r}")
-    if callback is not None and not callable(callback):
-        raise InputError(f"callback must be a function of one Iteration, got {callback!r}")
-    if progress is not None and not callable(progress):
-        raise InputError(f"progress must be a function of (iterations done, max_iterations), got {progress!r}")
+    require_reports(callback, progress)
     if problem.linear and second_order:
         raise InputError("second_order is for held controls; the problem's are linear between nodes")
     positive("tolerance", tolerance, "1")
-    deadline = time.perf_counter() + (np.inf if time_limit == np.inf else positive("time_limit", time_limit, "s"))
+    deadline = time.perf_counter() + checked_time(time_limit)
     fraction("armijo", armijo)
     max_iterations = count("max_iterations", max_iterations)
 
@@ -236,6 +234,19 @@ def solve(
         status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
     solution = search.solution(status)
     return looked_at(solution)[0] if check else solution
+
+
+def require_reports(callback: object, progress: object) -> None:
+    """Refuse a callback or a progress that cannot be called."""
+    if callback is not None and not callable(callback):
+        raise InputError(f"callback must be a function of one Iteration, got {callback!r}")
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress must be a function of (iterations done, max_iterations), got {progress!r}")
+
+
+def checked_time(limit: object) -> float:
+    """A time limit [s] as a float > 0, infinite for none."""
+    return np.inf if limit == np.inf else positive("time_limit", limit, "s")
 
 
 def replan(
@@ -347,14 +358,6 @@ def _held(u: Floats, problem: OptimalControlProblem) -> Commands:
     return open_loop(u)._replace(hold=problem.hold, limits=problem.control_limits.copy())
 
 
-def _steered(problem: OptimalControlProblem) -> NDArray[np.bool_]:
-    """Which processes (k,) the plans take into account: those of constant strength change nothing in them."""
-    fields = problem.scene.noise.diffusion
-    if fields is None or not problem.integrator.variational:
-        return np.ones(problem.scene.processes, dtype=np.bool_)
-    return np.array(fields.control.any(axis=(0, 2)) | fields.quadratic.any(axis=0), dtype=np.bool_)
-
-
 def _onto_limits(u: Floats, limits: Floats) -> Floats:
     """Controls (R, m) that rounding keeps from a limit brought to it, so that they are known to be there."""
     room = 8.0 * np.finfo(float).eps * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
@@ -462,7 +465,7 @@ class _Search:
         self.reason = ""
         self.anew = anew  # whether a plan is made for the last motion, too
         self.followed = 0.0  # the length of the last step, if none was
-        self.steered = _steered(problem)
+        self.steered = problem.steered
         # Whether the whole gradient of what noise adds is to be followed in the end, and whether it is. Within limits
         # what it adds jumps where a control meets one and loses its gains: there is no gradient to follow.
         self.wants_whole = whole_noise and not (second_order or problem.limited) and bool(self.steered.any())
@@ -813,7 +816,7 @@ class _Search:
         if plan is None:
             return _Trial()
         # What is to come of the cost, and what noise adds to it, is known not to be below zero.
-        bounded = problem.cost.nonnegative and not (self.exact and problem.scene.processes)
+        bounded = problem.cost.nonnegative and not (self.exact and problem.processes)
         most = float(self.shares.sum() + added.sum()) + self.armijo * step * plan.slope if bounded else np.inf
         parts = np.inf
         if bounds.parts < np.inf and (bounds.watched or step < 1.0):
@@ -835,7 +838,7 @@ class _Search:
                 few = attempt.failure is not None and bounds.integrator != problem.integrator
                 return _Trial(cut=few or attempt.verdict is Watch.Verdict.cut)
             there = attempt.shares()
-            noise = noise_shares(problem, attempt.trajectory(), plan) if problem.scene.processes else added
+            noise = noise_shares(problem, attempt.trajectory(), plan) if problem.processes else added
             more = self._noise_beyond(attempt.trajectory(), plan) if self.whole else 0.0
         except _LOST as error:
             logger.info("%s: trial of length %g: %s", self.label, step, error)

@@ -34,6 +34,13 @@ class Squares:
         """As functions of x, where z = D x."""
         return Squares(self.root @ D, self.shift, self.linear @ D)
 
+    def padded(self, rows: int) -> Squares:
+        """With rows of zeros in the roots, ``rows`` in all."""
+        more = rows - self.shift.shape[1]
+        return Squares(
+            np.pad(self.root, ((0, 0), (0, more), (0, 0))), np.pad(self.shift, ((0, 0), (0, more))), self.linear
+        )
+
     @property
     def core(self) -> core.Squares:
         """The same for the compiled core."""

@@ -575,7 +575,8 @@ def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
             [
                 [tie.follower, tie.leader, *tie.coefficients, *[0.0] * (most - len(tie.coefficients))]
                 for tie in rows.ties
-            ]
+            ],
+            dtype=np.float64,
         )
     if rows.customs:
         found["constraints.custom"] = np.array([[float(factor.rows)] for factor in rows.customs])

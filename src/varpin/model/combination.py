@@ -59,7 +59,7 @@ def combine(
     model, ties, parts = pin.Model(), [], []
     model.gravity = robots[0].model.gravity
     for robot, place, prefix in zip(robots, placements, given, strict=True):
-        own = robot.free_model if place is None else on_base(Description(robot.name, robot.free_model), place).model
+        own = robot.free_model if place is None else _placed(robot, place)
         shift = model.njoints - 1
         rebuild(own, range(1, own.njoints), own.joints.__getitem__, onto=model, prefix=prefix)
         ties += [Tie(tie.follower + shift, tie.leader + shift, tie.ratio, tie.offset) for tie in robot.ties]
@@ -87,6 +87,13 @@ def combine(
         ),
         parts=tuple(parts),
     )
+
+
+def _placed(robot: Robot, place: ArrayLike | pin.SE3) -> pin.Model:
+    try:
+        return on_base(Description(robot.name, robot.free_model), place).model
+    except InputError as error:
+        raise InputError(f"placement of {robot.name!r}: {error}") from None
 
 
 def _homogeneous(place: ArrayLike | pin.SE3) -> ArrayLike:

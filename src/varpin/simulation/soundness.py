@@ -231,13 +231,15 @@ def _ringing(scene: Scene, fast: _Fast, dt: float, off: str = "", joint: int | N
     cure = f"dt below {2.0 / fast.rate:.3g} s resolves it"
     if fast.stop is None:
         does = f"damping is faster than the step {times}: velocities that it should stop will ring; {cure}"
-        return Finding("fast damping", f"{does}, varpin.Radau(3) stops them{off}", joint)
+        # Radau's methods do not keep constraints.
+        method = "" if scene.constraints else ", varpin.Radau(3) stops them"
+        return Finding("fast damping", f"{does}{method}{off}", joint)
     name, wide = scene.robot.joint_names[fast.stop.joint], 0.5 * dt * fast.rate * fast.stop.width
+    method = "" if scene.constraints else ", and varpin.Radau(3) stops it"
     return Finding(
         "fast friction",
         f"dry friction is faster than the step where joint {name!r} comes to rest or turns back {times}: its velocity "
-        f"may ring or creep there; {cure}, so does a width above {wide:.3g} rad/s or m/s, and varpin.Radau(3) stops "
-        f"it{off}",
+        f"may ring or creep there; {cure}, so does a width above {wide:.3g} rad/s or m/s{method}{off}",
         fast.stop.joint if joint is None else joint,
     )
 

@@ -13,7 +13,9 @@ import numpy as np
 
 from varpin.control import OptimalControlProblem, Solution, solve
 from varpin.control.costs import CostError
+from varpin.control.problem import integrator_for
 from varpin.errors import InputError, VarpinError
+from varpin.integrators import Integrator
 from varpin.io.scenefile.layout import Layout, holding_controls, lay_out
 from varpin.io.scenefile.references import Timeline
 from varpin.io.scenefile.required import Required, idle_joints, requirements
@@ -58,7 +60,7 @@ class SceneFile:
         rows = [
             ("file", spec.path.name),
             ("robot", self.robot),
-            ("horizon", f"{spec.steps} steps of {spec.dt:g} s, {spec.integrator}"),
+            ("horizon", f"{spec.steps} steps of {spec.dt:g} s, {self.integrator}"),
         ]
         return facts(spec.title, rows, self.required._repr_html_())
 
@@ -66,6 +68,11 @@ class SceneFile:
     def robot(self) -> Robot:
         """The robot that is computed."""
         return self.scene.robot
+
+    @cached_property
+    def integrator(self) -> Integrator:
+        """The integrator of the file, or, where it names none, that of :class:`varpin.OptimalControlProblem`."""
+        return self.spec.integrator or integrator_for(self.scene, self.q0, self.spec.dt)
 
     @cached_property
     def problem(self) -> OptimalControlProblem:
@@ -95,7 +102,7 @@ class SceneFile:
                 layout.v0,
                 dt=spec.dt,
                 steps=spec.steps,
-                integrator=spec.integrator,
+                integrator=self.integrator,
                 sampling=spec.sampling,  # type: ignore[arg-type]
                 hold=spec.hold,
                 control_limits=(-most, most),
@@ -103,7 +110,11 @@ class SceneFile:
                 constraints=constraints,
             )
         except (InputError, CostError) as error:
-            raise spec.root.error("cost", str(error)) from None
+            for own, made in zip(spec.plan_constraints, constraints, strict=True):
+                if str(error).startswith(made.label):
+                    raise own.table.error("", str(error)) from None
+            where = "horizon.controls" if "linear controls" in str(error) else "cost"
+            raise spec.root.error(where, str(error)) from None
 
     def controls(self) -> Floats | None:
         """Controls of a simulation, (N, m) or (m,), or None for none."""
@@ -111,7 +122,12 @@ class SceneFile:
         if given is None:
             return None
         if isinstance(given, Timeline):
-            return given.at((np.arange(self.spec.steps, dtype=np.float64) + 0.5) * self.spec.dt)
+            k = np.arange(self.spec.steps, dtype=np.float64)
+            found = given.at((k + 0.5) * self.spec.dt)
+            # A position of a joint moved by hand is where it is at the end of the step.
+            moved = [int(np.argmax(self.scene.actuation[c])) for c in self.scene.inputs.values()]
+            found[:, moved] = given.at((k + 1.0) * self.spec.dt)[:, moved]
+            return found
         return holding_controls(self.scene, self.q0)
 
     def simulate(self, *, progress: Callable[[int, int], None] | None = None) -> Trajectory:
@@ -128,7 +144,7 @@ class SceneFile:
             dt=spec.dt,
             steps=spec.steps,
             controls=self.controls(),
-            integrator=spec.integrator,
+            integrator=self.integrator,
             rng=spec.seed,
             progress=progress,
         )
@@ -221,7 +237,7 @@ class SceneFile:
             times = []
             for _ in range(repeats + 1):
                 begin = time.perf_counter()
-                simulate(scene, q0, v0, dt=self.spec.dt, steps=steps, integrator=self.spec.integrator)
+                simulate(scene, q0, v0, dt=self.spec.dt, steps=steps, integrator=self.integrator)
                 times.append(time.perf_counter() - begin)
             least[name] = min(times[1:])
         return least["whole"] / least["required"]

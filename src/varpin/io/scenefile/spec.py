@@ -185,7 +185,7 @@ class SceneSpec:
         hold: Steps that share a control.
         sampling: Of running costs.
         shape: Of a plan's controls in time: ``"held"``, or ``"linear"`` between nodes.
-        integrator: The integrator.
+        integrator: The integrator; None where the file names none.
         costs: Terms.
         controls: Of a simulation: None for none, ``"hold"`` for holding ones, or values over time.
         seed: Of the noise of a simulation; without it there is none.
@@ -217,7 +217,7 @@ class SceneSpec:
     hold: int
     sampling: str
     shape: str
-    integrator: Integrator
+    integrator: Integrator | None
     costs: tuple[CostSpec, ...]
     controls: Reference | str | None
     seed: int | None

@@ -568,7 +568,10 @@ def _point(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _integrator(table: Table, keys: TypedKeys) -> Integrator:
+def _integrator(table: Table, keys: TypedKeys) -> Integrator | None:
+    if type(keys) is TypedKeys:
+        # The file has no such table.
+        return None
     kind = keys.type or "gauss"
     given = {"stages": default_integrator().stages} if kind == "gauss" else {}
     try:
