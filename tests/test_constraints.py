@@ -569,6 +569,7 @@ WRONG = {
     "function": (lambda: vp.CustomConstraint(1, 3.0, OWN.jacobian), "value must be a function"),
     "word": (lambda: "weld", "list of varpin's constraints"),
     "in a list": (lambda: ["weld"], "'weld' in it"),
+    "of a plan": (lambda: [vp.WithinJointLimits(vp.planar_chain(3), (-1, 1))], "OptimalControlProblem"),
 }
 
 

@@ -384,6 +384,7 @@ def test_violations():
         (3.0, r"control_limits must be a pair \(lower, upper\)"),
         ((1.0, 2.0, 3.0), r"control_limits must be a pair \(lower, upper\)"),
         (("a", 1.0), "control_limits: lower must be an array of real numbers"),
+        ("robot", "-robot.effort_limit, robot.effort_limit"),
         ((np.inf, np.inf), "control_limits: nothing is within inf and inf"),
     ],
 )

@@ -359,6 +359,15 @@ def test_between_nodes_is_told():
     assert any("between them" in sentence for sentence in plan.warnings)
 
 
+def test_a_start_outside_is_told():
+    """By its row and how far, and not as a violation between nodes of the first step."""
+    plan = vp.solve(two_links([vp.WithinJointLimits(ROBOT, ([0.1, -1.0], 2.0))]))
+    (told,) = (sentence for sentence in plan.warnings if "WithinJointLimits" in sentence)
+    assert "the start is outside WithinJointLimits, lower limit of joint1 by 0.1 rad" in told
+    plan = vp.solve(two_links([vp.WithinJointLimits(ROBOT, (-1.0, 2.0))]))
+    assert not any("start" in sentence for sentence in plan.warnings)
+
+
 SCENE = """
 [robot]
 source = "ur5"

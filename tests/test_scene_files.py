@@ -441,6 +441,11 @@ MISTAKES = {
         changed("duration = 0.1", "duration = 0.101"),
         "horizon.duration",
     ),
+    "too many steps": (changed("duration = 0.1", "duration = 1e9"), "horizon.duration"),
+    "numbers in a table": (
+        GOOD + '[[cost]]\ntype = "velocity"\nreference = { constant = [1.0, 2.0] }',
+        "cost[2].reference",
+    ),
     "degrees for radians": (changed("q = [0.5, 0.3]", "q = [30.0, 20.0]"), "initial.q"),
     "locked in degrees": (changed("dip = 0.2", "dip = 20"), "robot.lock.dip"),
     "unknown driven joint": (changed('["mcp", "pip"]', '["mcp", "pop"]'), "actuation.joints[1]"),

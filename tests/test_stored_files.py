@@ -216,6 +216,11 @@ def test_another_version(name, tmp_path):
     refused(name, path, "/9'", "should have")
 
 
+def test_what_reads_a_file_of_another_kind_is_named():
+    with pytest.raises(vp.FileError, match=r"Solution\.load\(path, problem\) reads such files"):
+        vp.Trajectory.load(DATA / "solution.npz")
+
+
 @pytest.mark.parametrize("content", [b"", b"hello", b"\x93NUMPY", bytes(1000), pickle.dumps({"q": 1})])
 @pytest.mark.parametrize("name", LOADERS)
 def test_another_file(name, content, tmp_path):

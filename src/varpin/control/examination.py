@@ -6,7 +6,9 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from varpin.control.constraints import BoundConstraint
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.multipliers import FEASIBLE
 from varpin.control.problem import OptimalControlProblem, integrator_for
@@ -18,6 +20,8 @@ from varpin.integrators.base import open_line, open_loop
 from varpin.simulation.chatter import alternation, restlessness
 from varpin.simulation.run import rollout
 from varpin.simulation.soundness import Finding, announce, evident, examined
+
+Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
@@ -79,6 +83,7 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
         _unfinished(solution)
         + _noise_left_out(solution)
         + (_alternating(solution) or _restless(solution))
+        + _outside(solution)
         + _between(solution)
     )
     try:
@@ -155,7 +160,36 @@ def _unfinished(solution: Solution) -> list[Finding]:
     # What promises next to nothing is as good as the best.
     if solution.status is Status.STALLED and promised <= _LITTLE * abs(solution.cost):
         return []
-    return [Finding("not converged", solution.reason)]
+    return [Finding("not converged", f"the search ended before it converged: {solution.reason}")]
+
+
+def _at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats | None:
+    """Rows of an inequality of states at the start, which no plan can change; None for other constraints."""
+    if bound.of_controls or bound.source.equality:
+        return None
+    q, v = (np.tile(own, (problem.steps + 1, 1)) for own in (problem.q0, problem.v0))
+    c: Floats = bound.value(q, v, np.zeros((problem.steps, problem.scene.controls)))[0]
+    return c
+
+
+def _outside(solution: Solution) -> list[Finding]:
+    """Says where the start violates a constraint, which the first step is then to make good."""
+    problem = solution.problem
+    found = []
+    for bound, own in zip(problem.bound_constraints, solution.constraints, strict=True):
+        c = _at_start(problem, bound)
+        if c is None:
+            continue
+        row = int(np.argmax(c))
+        if c[row] > _BETWEEN * bound.scale:
+            found.append(
+                Finding(
+                    "start outside constraints",
+                    f"the start is outside {own.label}, {bound.rows[row]} by {c[row]:.2g} {bound.unit}, and the first "
+                    f"node, {problem.dt:g} s later, has to be inside: begin inside, or widen the bound",
+                )
+            )
+    return found
 
 
 def _noise_left_out(solution: Solution) -> list[Finding]:
@@ -211,6 +245,10 @@ def _between(solution: Solution) -> list[Finding]:
         c = c + (own.values - whole.value(solution.trajectory.q, solution.trajectory.v, solution.trajectory.u)).repeat(
             PARTS, axis=0
         )
+        outside = _at_start(problem, whole)
+        if outside is not None:
+            # What begins outside is so until the first node.
+            c[: PARTS - 1, outside > 0.0] = -np.inf
         place, row = np.unravel_index(int(np.argmax(c)), c.shape)
         if c[place, row] > _BETWEEN * bound.scale:
             found.append(

@@ -198,7 +198,7 @@ class OptimalControlProblem(Frozen):
             "sampling": sampling,
             "hold": hold,
             "t0": t0,
-            "control_limits": named_limits("control_limits", control_limits, scene.control_joints, scene.controls),
+            "control_limits": _control_limits(control_limits, scene),
             "constraints": given,
             "running": running,
             "terminal": terminal,
@@ -569,6 +569,15 @@ def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
     if scene.constraints or not dt * rate_at_rest(scene, q0) > _STIFF:
         return default_integrator()
     return Radau(stages=stages)
+
+
+def _control_limits(given: tuple[JointValues, JointValues] | None, scene: Scene) -> Floats:
+    if isinstance(given, str):
+        raise InputError(
+            "control_limits must be a pair (lower, upper), for those of a robot that is driven in every joint "
+            f"(-robot.effort_limit, robot.effort_limit); got {given!r}"
+        )
+    return named_limits("control_limits", given, scene.control_joints, scene.controls)
 
 
 def _constraints(given: Sequence[PlanConstraint]) -> tuple[PlanConstraint, ...]:

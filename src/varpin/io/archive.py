@@ -162,7 +162,16 @@ def _array(archive: zipfile.ZipFile, name: str, source: Path) -> NDArray[Any]:
 def _require_format(source: Path, found: object, form: str) -> None:
     if str(found) != form:
         what = "it has no format" if found is None else f"its format is {reprlib.repr(str(found))}"
-        raise FileError(f"{source} is not a varpin {_noun(form)}: {what}, and should have {form!r}")
+        raise FileError(
+            f"{source} is not a varpin {_noun(form)}: {what}, and should have {form!r}{_reader(str(found), form)}"
+        )
+
+
+def _reader(found: str, form: str) -> str:
+    """What reads a file of another kind than ``form``, for a message."""
+    readers = {"trajectory": "varpin.Trajectory.load(path)", "solution": "varpin.Solution.load(path, problem)"}
+    name = None if _noun(found) == _noun(form) else readers.get(_noun(found))
+    return f"; {name} reads such files" if name else ""
 
 
 def _noun(form: str) -> str:

@@ -131,7 +131,9 @@ class FrameOnFrame(Constraint):
         # d(y_a . z_b) = (w_a - w_b) . (y_a x z_b), the turn about x.
         turns = [Product(4 + (k + 1) % 3, 7 + (k + 2) % 3, 1.0, 0.0) for k in range(3)]
         rows = ConstraintRows(tuple(vectors), (*(Product(0, 1 + k, 1.0, 0.0) for k in range(3)), *turns))
-        labels = [f"{self!r} along {axis}" for axis in _AXES] + [f"{self!r} about {axis}" for axis in _AXES]
+        # Without the sixteen numbers of the placement, behind which the rest would not be seen.
+        name = f"FrameOnFrame(a={self.a!r}, b={self.b!r})"
+        labels = [f"{name} along {axis}" for axis in _AXES] + [f"{name} about {axis}" for axis in _AXES]
         return Bound(rows, tuple(labels), tuple((4 + k, 7 + k) for k in range(3)))
 
 
@@ -357,7 +359,8 @@ def constraints_of(given: Constraint | Sequence[Constraint]) -> tuple[Constraint
     Raises:
         InputError: It is none of them.
     """
-    return tuple_of("constraints", given, Constraint)
+    note = "; those of a plan, such as limits and obstacles, belong to varpin.OptimalControlProblem(constraints=)"
+    return tuple_of("constraints", given, Constraint, note)
 
 
 def joined(bound: Sequence[Bound]) -> tuple[Bound, NDArray[np.int64]]:

@@ -32,18 +32,20 @@ def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
     return require_finite(name, array)
 
 
-def tuple_of(name: str, given: Any, kind: type) -> tuple[Any, ...]:
+def tuple_of(name: str, given: Any, kind: type, note: str = "") -> tuple[Any, ...]:
     """``given``, one of a kind of varpin's objects or a sequence of them, as a tuple; the kind's plural is ``name``.
+
+    ``note`` ends the message, where other objects go by the same name.
 
     Raises:
         InputError: It is none of them, or one of them is not.
     """
     found = (given,) if isinstance(given, kind) else given
     if isinstance(found, str) or not isinstance(found, Sequence):
-        raise InputError(f"{name} must be a list of varpin's {name}, got {type(given).__name__}")
+        raise InputError(f"{name} must be a list of varpin's {name}, got {type(given).__name__}{note}")
     for own in found:
         if not isinstance(own, kind):
-            raise InputError(f"{name} must be a list of varpin's {name}, got {own!r} in it")
+            raise InputError(f"{name} must be a list of varpin's {name}, got {own!r} in it{note}")
     return tuple(found)
 
 

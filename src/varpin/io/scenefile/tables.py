@@ -221,9 +221,12 @@ class HorizonKeys(Keys):
             wrong = "one of steps, duration is missing" if duration is None else "steps and duration exclude each other"
             raise ValueError(wrong)
         if duration is not None and (steps < 1 or abs(min(steps, MOST_STEPS) * self.dt - duration) > 1e-9 * duration):
-            raise mistake(
-                "duration", f"{duration:g} s is no whole number of steps of dt = {self.dt:g} s, {MOST_STEPS} at most"
-            )
+            if steps > MOST_STEPS:
+                wrong = f"{duration:g} s is more than {MOST_STEPS} steps of dt = {self.dt:g} s, the most there may be"
+            else:
+                fits = duration / max(steps, 1)
+                wrong = f"{duration:g} s is no whole number of steps of dt = {self.dt:g} s; dt = {fits!r} would be"
+            raise mistake("duration", wrong)
         if steps % self.hold:
             raise mistake("hold", f"{steps} steps are no multiple of {self.hold}")
         return self
@@ -279,6 +282,8 @@ REFERENCE_KEYS: Mapping[str, type[Keys]] = {"file": FileKeys, "waypoints": Waypo
 
 def _reference_shape(value: Any) -> str:
     keys = set(value) if isinstance(value, dict) else set()
+    if any(isinstance(own, list | dict) for own in (value[key] for key in keys & {"constant", "value"})):
+        raise ValueError("numbers that do not change are given themselves, as in target = [0.4, 0.2, 0.3], in no table")
     return next((name for name, kind in REFERENCE_KEYS.items() if keys & set(kind.model_fields)), toml_type(value))
 
 
