@@ -90,8 +90,7 @@ class _Drawing:
             lines += [goal.places for goal in actor.goals]
             seen = np.concatenate([points, *lines, *marked])
             # What is much larger than the motion is seen in part.
-            low, high = seen.min(axis=0), seen.max(axis=0)
-            room = 0.3 * float((high - low).max())
+            low, high, room = seen.min(axis=0), seen.max(axis=0), 0.3 * size
             around = [np.clip(region.corners, low - room, high + room) for region in actor.regions]
             extents.append(np.concatenate([seen, *around]))
             axes.append(picture.body_poses(positions)[0][..., 2].reshape(-1, 3))
