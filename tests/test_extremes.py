@@ -203,7 +203,7 @@ def test_what_goes_wrong_late_is_found():
 
 def test_dampers_far_faster_than_the_step_have_an_exact_motion():
     scene = vp.Scene(rod_chain([1.0] * 2, [1.0] * 2), damping=1e6)
-    ringing = vp.simulate(scene, [0.3, 0.3], [1.0, 1.0], dt=1e-2, steps=50)
+    ringing = vp.simulate(scene, [0.3, 0.3], [1.0, 1.0], dt=1e-2, steps=50, integrator=vp.Midpoint())
     calm = vp.simulate(scene, [0.3, 0.3], [1.0, 1.0], dt=1e-2, steps=50, integrator=vp.Radau(3))
     assert period_error(scene, vp.Midpoint(), ringing) > 1.0
     assert period_error(scene, vp.Radau(3), calm) < 0.1

@@ -274,8 +274,8 @@ def work(monkeypatch, problem, **options):
     parts = []
     own = type(problem.integrator).watched
 
-    def counted(self, scene, state, commands, dt, nodes, watch):
-        found = own(self, scene, state, commands, dt, nodes, watch)
+    def counted(self, scene, state, commands, dt, nodes, *others):
+        found = own(self, scene, state, commands, dt, nodes, *others)
         parts.append(int(nodes.tally[0, : nodes.done[0], 3].sum()))
         return found
 

@@ -123,7 +123,7 @@ class Verification:
             [
                 *lines,
                 f"a step is off by {self.defect:.2e} rad or m at most; costs are good to {good} of themselves "
-                f"({self.substeps} substeps a step of {self.integrator})",
+                f"({self.substeps} substeps a step, {self.integrator})",
                 f"how to read it: {_READING}" if self.told else self._untold,
                 *([] if self.status.converged else [f"the plan is unfinished, {self.status.value}"]),
             ]

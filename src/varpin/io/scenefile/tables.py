@@ -305,7 +305,7 @@ class SolveKeys(Keys):
     forward: Annotated[str, word("closed", "open")] = "closed"
     regularization: Annotated[float, number(least=0.0)] = 0.0
     true_cost: Annotated[float, number(above=0.0)] = 0.0
-    noise: Annotated[str, word("whole", "held")] = "whole"
+    noise: Annotated[str, word("held", "whole")] = "held"
 
 
 def _output(*endings: str) -> Rule:
