@@ -165,6 +165,11 @@ EXAMPLES: dict[str, tuple[float, float, tuple[float, float, float] | None]] = {
     "panda_stop": (1.5, 1.5, (-50.0, 21.0, 1.15)),
     "kinova_door": (4.5, 4.5, (130.0, 25.0, 1.2)),
     "tiago_reach": (0.0, 3.0, (-50.0, 21.0, 0.95)),
+    "ur5_around_obstacle": (0.2, 0.8, (-25.0, 35.0, 1.0)),
+    "five_bar_circle": (0.7, 0.7, None),
+    "driven_crank": (0.0, 0.0, None),
+    "two_arms_beam": (0.0, 1.0, (-60.0, 20.0, 1.2)),
+    "panda_wipes": (0.6, 2.6, (-50.0, 21.0, 1.2)),
 }
 
 _VIEW = """

@@ -37,6 +37,4 @@ plan = vp.solve(problem)
 print(plan)
 print(f"{len(plan.history)} iterations, violations of {plan.violation:.1e} at most: {plan.status.value}")
 
-# The post in the replay: a line of targets along its axis.
-along = {f"post {k}": [0.4, 0.45, z] for k, z in enumerate(np.linspace(0.0, 0.55, 4))}
-print(vp.replay(robot, plan.trajectory, targets=along, trace="tool0", html=out / "ur5_around_obstacle.html"))
+print(vp.replay(robot, plan, trace="tool0", html=out / "ur5_around_obstacle.html"))

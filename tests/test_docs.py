@@ -22,7 +22,7 @@ PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
 # What pages write for the browser, and the package beside varpin's own that they are about.
 MADE = {
     "tutorial.md": ["panda_reach.html"],
-    "replay.md": ["marks.html", "pair.html", "controller.html"],
+    "replay.md": ["marks.html", "pair.html", "controller.html", "slider.html"],
     "control-loop.md": ["loop.html"],
     "scenes.md": ["plan.html"],
     "your-urdf.md": ["arm.html"],

@@ -215,3 +215,16 @@ def test_urdf_of_another_suffix_and_sdf(tmp_path, load):
         (tmp_path / name).write_text('<sdf version="1.6"><model name="a"/></sdf>')
         with pytest.raises(vp.RobotError, match="is an SDF file, which Pinocchio's package on PyPI cannot read"):
             vp.load_robot(tmp_path / name)
+
+
+def test_planes_are_plates_and_those_without_an_edge_are_left_out(tmp_path):
+    floor = '<geom name="floor" type="plane" size="0 0 0.1"/>'
+    floor += '<geom name="mat" type="plane" size="0.4 0.3 0.1" pos="0 0 -1"/>'
+    strip = default('<geom type="plane"/>'), '<geom name="strip" size="0.4 0 0.1"/>'
+    robot = vp.load_robot(written(tmp_path, document(floor + strip[1] + body("a", MASS + BOX), strip[0])))
+    shapes = {shape.name: shape for shape in geometry(robot).geometryObjects}
+    assert not {"floor", "strip"} & {name.removesuffix("_0") for name in shapes}
+    (plate,) = (shape for name, shape in shapes.items() if "mat" in name)
+    np.testing.assert_allclose(2.0 * plate.geometry.halfSide, [0.8, 0.6, 1e-3])
+    np.testing.assert_allclose(plate.placement.translation, [0.0, 0.0, -1.0])
+    assert vp.replay(robot, [[0.3]], dt=1.0, html=tmp_path / "page.html").exists()

@@ -38,6 +38,8 @@ _SIZES = {
     "xyaxes": (6,), "zaxis": (3,),
 }  # fmt: skip
 _ROTATIONS = ("quat", "euler", "axisangle", "xyaxes", "zaxis")
+# Half the thickness of a drawn plane [m].
+_PLATE = 5e-4
 # What acts on a robot beside its inertia, joint dampers and dry friction.
 _LEFT_OUT = {"equality": "equality constraints", "tendon": "tendons", "deformable": "deformable bodies"}
 
@@ -97,6 +99,18 @@ class _Reader:
         if any(key in attributes for key in _ROTATIONS):
             given = {key: value for key, value in given.items() if key not in _ROTATIONS}
         return ET.Element(element.tag, {**given, **attributes})
+
+    def look(self, geom: ET.Element, childclass: str) -> list[ET.Element]:
+        """A geom as :meth:`resolved`; a plane, which coal has without an edge, as a thin plate if the file ends it."""
+        plain = self.resolved(geom, childclass)
+        if plain.get("type") != "plane":
+            return [plain]
+        x, y, *_ = (*self.numbers(plain, "size", (1, 2, 3)), 0.0) if "size" in plain.attrib else (0.0, 0.0)
+        if not (x > 0.0 and y > 0.0):
+            logger.info("%s: plane %r is infinite; it is not drawn", self.path, plain.get("name", ""))
+            return []
+        plain.attrib |= {"type": "box", "size": f"{float(x)!r} {float(y)!r} {_PLATE!r}"}
+        return [plain]
 
     def turned(self, element: ET.Element) -> dict[str, str]:
         """The attributes of an element, its rotation in a form that Pinocchio reads as MuJoCo does."""
@@ -178,8 +192,10 @@ def read_mjcf(path: Path) -> Mjcf:
             for part in root.iterfind("worldbody/*"):
                 if part.tag in _BODIES:
                     stand.append(_body(part, "main", reader, moving=False, dynamics=dynamics))
-                elif part.tag == "site" or (part.tag == "geom" and not dynamics):
+                elif part.tag == "site":
                     stand.append(reader.resolved(part, "main"))
+                elif part.tag == "geom" and not dynamics:
+                    stand.extend(reader.look(part, "main"))
             keys = ET.SubElement(plain, "keyframe")
             keys.extend(part for part in root.iterfind("keyframe/key") if part.get("qpos") and part.get("name"))
             texts.append(ET.tostring(plain, encoding="unicode"))
@@ -316,7 +332,7 @@ def _body(body: ET.Element, childclass: str, reader: _Reader, *, moving: bool, d
     # Lists, as an error in a generator would come out as a TypeError.
     last.extend([reader.resolved(part, childclass) for part in body.findall("site")])
     if not dynamics:
-        last.extend([reader.resolved(part, childclass) for part in body.findall("geom")])
+        last.extend([look for part in body.findall("geom") for look in reader.look(part, childclass)])
     elif moving:
         last.extend(_masses(body, name, childclass, reader))
     parts = [part for part in body if part.tag in _BODIES]

@@ -5,12 +5,14 @@ import importlib
 import io
 import logging
 import os
+import re
 import threading
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from xml.parsers import expat
 
 from varpin.errors import InputError, MissingDependency, RobotError
 
@@ -78,9 +80,8 @@ def expand(
             said = len(notes.getvalue())
             xacro.print_location()
             where = "; ".join(line.strip() for line in notes.getvalue()[said:].splitlines())
-            kind = "" if isinstance(error, xacro.XacroException) else f"{type(error).__name__}: "
-            what = " ".join(str(error).split())
-            raise RobotError(f"{path} cannot be expanded: {kind}{what} ({where})") from None
+            where = "" if where == f"when processing file: {path}" else f" ({where})"
+            raise RobotError(f"{path} cannot be expanded: {', '.join(_told(error))}{where}") from None
     for line in filter(None, map(str.strip, notes.getvalue().splitlines())):
         logger.warning("%s: %s", path, line)
     if strict and (unknown := sorted(set(arguments) - given.asked)):
@@ -106,6 +107,20 @@ def _package(path: Path) -> tuple[ModuleType, Any]:
         return importlib.import_module("xacro"), importlib.import_module("xacro.substitution_args")
     except ModuleNotFoundError as error:
         raise MissingDependency(f"the xacro file {path}", [str(error.name)], 'pip install "varpin[xacro]"') from None
+
+
+def _told(error: BaseException) -> list[str]:
+    """What an error says, and those that it wraps, each thing once and without names of Python's classes."""
+    if isinstance(error, OSError) and error.strerror:
+        return [f"{error.strerror}: {error.filename}"]
+    if isinstance(error, expat.ExpatError):
+        return [f"it is not well-formed XML: {error}"]
+    inner = getattr(error, "exc", None)
+    said = [str(error.args[0] or "") if error.args else ""] if hasattr(error, "exc") else [str(error)]
+    said += [] if inner is None else _told(inner) if isinstance(inner, BaseException) else [str(inner)]
+    said.append(str(getattr(error, "suffix", None) or ""))
+    plain = [" ".join(re.sub(r"<class '[^']*'>:?", "", words).split()) for words in said]
+    return list(dict.fromkeys(filter(None, plain))) or [type(error).__name__]
 
 
 def _word(value: object) -> str:

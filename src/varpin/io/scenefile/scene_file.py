@@ -184,12 +184,17 @@ class SceneFile:
         """What :func:`varpin.replay` can mark of the task, as its options: ``replay(robot, motion, **scene.marks())``.
 
         Targets and paths of the frames that the cost is about, with their traces; of a reference of joints, the robot
-        that follows it as a ghost.
+        that follows it as a ghost; and constraints.
 
         Args:
             duration: Of the motion that is shown [s]; the horizon if left out.
         """
-        return marks_of(self._layout, self.spec.duration if duration is None else duration)
+        marks = marks_of(self._layout, self.spec.duration if duration is None else duration)
+        if self.spec.plan_constraints:
+            marks["constraints"] = self.problem
+        elif self.scene.constraints:
+            marks["constraints"] = self.scene
+        return marks
 
     def load_solution(self, path: str | Path) -> Solution:
         """Read a solution of this scene that :meth:`Solution.save` wrote; see :meth:`Solution.load`."""

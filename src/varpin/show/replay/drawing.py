@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 
@@ -12,8 +13,16 @@ from meshcat.animation import Animation, AnimationClip, AnimationTrack
 from numpy.typing import NDArray
 
 from varpin.errors import InputError
+from varpin.model.tree import z_to
 from varpin.show.replay import marks
-from varpin.show.replay.legend import EFFORT_COLORS, GHOST_COLOR, TARGET_COLOR, TRACE_COLORS
+from varpin.show.replay.legend import (
+    EFFORT_COLORS,
+    GHOST_COLOR,
+    REGION_COLORS,
+    TARGET_COLOR,
+    TIE_COLOR,
+    TRACE_COLORS,
+)
 from varpin.show.replay.picture import Picture, label, labels
 from varpin.show.replay.script import Actor, Outlook, Script, Target, Trace
 from varpin.show.replay.shapes import ShapeLoader
@@ -25,7 +34,9 @@ Floats = NDArray[np.float64]
 _FARTHEST = 1e18
 
 # Of marks, in sizes of a robot's motion.
-_TUBE, _BEAD, _BALL, _TRIAD, _LABEL = 0.003, 0.006, 0.02, 0.1, 0.045
+_TUBE, _BEAD, _BALL, _TRIAD, _LABEL, _TIE, _ROD, _EDGE = 0.003, 0.006, 0.02, 0.1, 0.045, 0.02, 0.006, 0.1
+
+logger = logging.getLogger(__name__)
 
 
 def draw(viewer: meshcat.Visualizer, script: Script) -> None:
@@ -51,10 +62,13 @@ class _Drawing:
             self._actor(actor, number, place, size)
             # Robots in one place share what is marked there.
             if not any((place == other).all() for other in places[:k]):
-                self._notes([*self.script.traces, *actor.traces], self.script.targets, f"notes{number}", place, size)
+                targets = [*self.script.targets, *actor.goals]
+                self._notes([*self.script.traces, *actor.traces], targets, f"notes{number}", place, size)
             else:
-                self._notes(actor.traces, [], f"notes{number}", place, size)
+                self._notes(actor.traces, actor.goals, f"notes{number}", place, size)
             self._outlooks(actor.outlooks, f"notes{number}", size)
+            self._ties(actor, number, size)
+            self._regions(actor, f"notes{number}", size)
         if len(self.script.times) > 1:
             repetitions = math.inf if self.script.loop else 1
             self.viewer.set_animation(Animation(self.clips), play=True, repetitions=repetitions)
@@ -71,7 +85,14 @@ class _Drawing:
             size = max(size, float(np.ptp(points, axis=0).max()))
             lines = [trace.points for trace in actor.traces]
             lines += [outlook.places.reshape(-1, 3) for outlook in actor.outlooks]
-            extents.append(np.concatenate([points, *lines, *marked]))
+            lines += [tie.b[1][None] for tie in actor.ties if tie.b[0] < 0]
+            lines += [tie.a[1][None] for tie in actor.ties if tie.a[0] < 0]
+            lines += [goal.places for goal in actor.goals]
+            seen = np.concatenate([points, *lines, *marked])
+            # What is much larger than the motion is seen in part.
+            low, high, room = seen.min(axis=0), seen.max(axis=0), 0.3 * size
+            around = [np.clip(region.corners, low - room, high + room) for region in actor.regions]
+            extents.append(np.concatenate([seen, *around]))
             axes.append(picture.body_poses(positions)[0][..., 2].reshape(-1, 3))
         if not np.abs(np.concatenate(extents)).max() < _FARTHEST:
             raise InputError(f"what is to be shown has sizes or places beyond {_FARTHEST:g} m, which no viewer draws")
@@ -156,6 +177,106 @@ class _Drawing:
                 self.viewer[node].set_object(marks.bead(_BEAD * size, GHOST_COLOR))
                 self.viewer[node].set_transform(_translation(places[0]))
                 self._animate(node, "position", "vector3", places)
+
+    def _ties(self, actor: Actor, number: str, size: float) -> None:
+        """Points, rods, lines and planes of the mechanism's constraints."""
+        if not actor.ties:
+            return
+        picture, rows = self.pictures[id(actor.robot)], actor.positions["robot"]
+        R, p = picture.body_poses(rows)
+        nodes = picture.moving_nodes(f"robot{number}")
+
+        def on(body: int, k: int) -> str:
+            return f"{nodes[body] if body >= 0 else f'robot{number}/base'}/ties/{k}"
+
+        def world(end: tuple[int, Floats]) -> Floats:
+            body, place = end
+            return np.broadcast_to(place, (len(rows), 3)) if body < 0 else R[:, body] @ place + p[:, body]
+
+        planes: dict[tuple[float, ...], list[Floats]] = {}
+        for k, tie in enumerate(actor.ties):
+            for end in (tie.a, tie.b) if tie.axis is None else (tie.a,):
+                node = f"{on(end[0], k)} {'a' if end is tie.a else 'b'}"
+                self.viewer[node].set_object(marks.pin(_TIE * size, TIE_COLOR))
+                self.viewer[node].set_transform(_translation(end[1]))
+            a, b = world(tie.a), world(tie.b)
+            body, place = tie.b
+            if tie.axis is None:
+                self._rod(f"notes{number}/ties/{k}", a, b, size)
+                continue
+            way = a - (p[:, body] if body >= 0 else 0.0)
+            seen = np.einsum("kji,kj->ki", R[:, body], way) if body >= 0 else way
+            if tie.plane:
+                # Points in one plane share its square.
+                key = (float(body), *tie.axis.round(9).tolist(), round(float(tie.axis @ place), 9))
+                planes.setdefault(key, []).append(seen)
+            else:
+                along = (seen - place) @ tie.axis
+                ends = [along.min() - _EDGE * size, along.max() + _EDGE * size]
+                line = place + np.outer(ends, tie.axis)
+                self.viewer[f"{on(body, k)} line"].set_object(marks.tube(line, _TUBE * size, TIE_COLOR))
+        for k, (key, groups) in enumerate(planes.items()):
+            body, normal, height = int(key[0]), np.array(key[1:4]), key[4]
+            axes, points = z_to(normal), np.concatenate(groups)
+            flat = points @ axes[:, :2]
+            middle, half = 0.5 * (flat.min(axis=0) + flat.max(axis=0)), 0.5 * float(np.ptp(flat, axis=0).max())
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = axes, axes @ [*middle, height]
+            node = f"{on(body, k)} plane"
+            self.viewer[node].set_object(marks.sheet(half + _EDGE * size, TIE_COLOR))
+            self.viewer[node].set_transform(pose)
+
+    def _rod(self, node: str, a: Floats, b: Floats, size: float) -> None:
+        """A rod between two places (K, 3) in the world, as long as they are apart; none if they coincide."""
+        ways = b - a
+        lengths = np.linalg.norm(ways, axis=1)
+        if lengths.max() < _TUBE * size:
+            return
+        # Turned from keyframe to keyframe on the shortest way; in between the page does the same.
+        before, turn = np.array([0.0, 0.0, 1.0]), pin.Quaternion.Identity()
+        turns = []
+        for way, length in zip(ways, lengths, strict=True):
+            if length > 1e-9 * size:
+                turn = pin.Quaternion.FromTwoVectors(before, way / length) * turn
+                turn.normalize()
+                before = way / length
+            turns.append(turn.coeffs().copy())
+        pose = _translation(0.5 * (a[0] + b[0]))
+        pose[:3, :3] = pin.Quaternion(turns[0]).toRotationMatrix() @ np.diag([1.0, 1.0, lengths[0]])
+        self.viewer[node].set_object(marks.rod(_ROD * size, TIE_COLOR))
+        self.viewer[node].set_transform(pose)
+        self._animate(node, "position", "vector3", 0.5 * (a + b))
+        self._animate(node, "quaternion", "quaternion", np.array(turns))
+        scales = np.column_stack([np.ones((len(lengths), 2)), lengths])
+        self._animate(node, "scale", "vector3", scales)
+
+    def _regions(self, actor: Actor, root: str, size: float) -> None:
+        """Obstacles, and where frames have to be."""
+        if not actor.regions:
+            return
+        picture = self.pictures[id(actor.robot)]
+        points = picture.swept(np.concatenate([_samples(rows) for rows in actor.positions.values()]))
+        for k, region in enumerate(actor.regions):
+            if not np.abs(region.corners).max() < _FARTHEST:
+                logger.warning("%s %r is larger than what viewers draw; it is left out", region.kind, region.name)
+                continue
+            color, node = REGION_COLORS[region.kind], f"{root}/regions/{k} {label(region.name)}"
+            pose = np.eye(4)
+            if region.box is None:
+                way = region.end - region.begin
+                length = float(np.linalg.norm(way))
+                pose[:3, :3] = z_to(way / length) if length > 0.0 else np.eye(3)
+                pose[:3, 3] = 0.5 * (region.begin + region.end)
+                self.viewer[node].set_object(marks.capsule(region.radius, length, color))
+            else:
+                low, high = region.box_within(points, _EDGE * size)
+                pose[:3, :3] = region.rotation
+                pose[:3, 3] = region.begin + region.rotation @ (0.5 * (low + high))
+                if (high > low).all():
+                    self.viewer[node].set_object(marks.box(high - low, color))
+                else:
+                    self.viewer[node].set_object(marks.sheet(0.5 * float((high - low).max()), color))
+            self.viewer[node].set_transform(pose)
 
     def _animate(self, node: str, name: str, kind: str, values: Floats) -> None:
         """Give a property of a node its values (K, ...) at the keyframes."""

@@ -11,6 +11,8 @@ from varpin.show.replay.script import Script
 
 # Colours that neither robots nor the background have.
 GHOST_COLOR, TARGET_COLOR = 0x1450D2, 0xC0187A
+TIE_COLOR = 0x007C8A
+REGION_COLORS = {"obstacle": 0x9A5B13, "out": 0x9A5B13, "in": 0x6B3FA8}
 TRACE_COLORS = {"motion": 0xD1480F, "ghost": GHOST_COLOR, "reference": 0x157A3C}
 
 # From no torque to all there is; linear in between.
@@ -45,7 +47,15 @@ def legend(script: Script) -> list[Entry]:
         if names:
             words = "reference" if [*names] == ["reference"] else text.format(", ".join(names))
             entries.append(Entry(words, (f"#{TRACE_COLORS[kind]:06x}",)))
-    if script.targets:
+    kinds = dict.fromkeys(tie.name for actor in script.actors for tie in actor.ties)
+    if kinds:
+        entries.append(Entry(f"constraint: {', '.join(kinds)}", (f"#{TIE_COLOR:06x}",)))
+    found = [region for actor in script.actors for region in actor.regions]
+    for kind, text in (("obstacle", "obstacle: {}"), ("out", "{} keeps out"), ("in", "{} keeps in")):
+        names = dict.fromkeys(region.name for region in found if region.kind == kind)
+        if names:
+            entries.append(Entry(text.format(", ".join(names)), (f"#{REGION_COLORS[kind]:06x}",)))
+    if script.targets or any(actor.goals for actor in script.actors):
         entries.append(Entry("target", (f"#{TARGET_COLOR:06x}",)))
     return entries
 

@@ -40,6 +40,47 @@ def ball(radius: float, color: int) -> Object:
     return meshcat.geometry.Mesh(meshcat.geometry.Sphere(radius), material)
 
 
+def pin(radius: float, color: int) -> Object:
+    """A small sphere that is seen through the links around it."""
+    material = MeshBasicMaterial(color=color, opacity=0.85, transparent=True, depthTest=False, depthWrite=False)
+    return meshcat.geometry.Mesh(meshcat.geometry.Sphere(radius), material)
+
+
+def rod(radius: float, color: int) -> Object:
+    """A rod of length 1 around the z axis, from -1/2 to 1/2."""
+    return tube(np.array([[0.0, 0.0, -0.5], [0.0, 0.0, 0.5]]), radius, color)
+
+
+def sheet(half: float, color: int) -> Object:
+    """A translucent square across the z axis, half as wide as ``half`` [m] to each side, seen from both."""
+    corners = half * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    form = TriangularMeshGeometry(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    return meshcat.geometry.Mesh(form, _glass(MeshBasicMaterial, color, 0.25))
+
+
+def capsule(radius: float, length: float, color: int) -> Object:
+    """A translucent capsule around the z axis; of length 0, a sphere."""
+    parts, rings = 48, 12
+    angles = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 2 * rings)
+    z = radius * np.sin(angles) + np.repeat([-0.5 * length, 0.5 * length], rings)
+    turn = 2.0 * np.pi * np.arange(parts) / parts
+    around = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    flat = (radius * np.cos(angles))[:, None, None] * around
+    vertices = np.concatenate([flat, np.broadcast_to(z[:, None, None], (2 * rings, parts, 1))], axis=2).reshape(-1, 3)
+    form = TriangularMeshGeometry(vertices, _bands(2 * rings, parts))
+    return meshcat.geometry.Mesh(form, _glass(MeshPhongMaterial, color, 0.45, flatShading=True))
+
+
+def box(sides: Floats, color: int) -> Object:
+    """A translucent box of some sides (3,) [m] around the origin."""
+    return meshcat.geometry.Mesh(meshcat.geometry.Box(sides.tolist()), _glass(MeshPhongMaterial, color, 0.3))
+
+
+def _glass(kind: Any, color: int, opacity: float, **options: Any) -> Any:
+    """A translucent material that hides nothing behind it."""
+    return kind(color=color, opacity=opacity, transparent=True, depthWrite=False, **options)
+
+
 def triad(length: float) -> Object:
     """The axes of a frame: x red, y green, z blue."""
     parts = [_swept(np.array([np.zeros(3), axis]), 0.04 * length) for axis in length * np.eye(3)]
@@ -132,8 +173,12 @@ def _swept(points: Floats, radius: float) -> tuple[Floats, NDArray[np.int64]]:
     angles = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
     ring = np.cos(angles)[:, None] * normals[:, None] + np.sin(angles)[:, None] * np.cross(tangents, normals)[:, None]
     vertices = (points[:, None] + radius * ring).reshape(-1, 3)
-    side = np.arange(_SIDES)
-    low, high = side, (side + 1) % _SIDES
-    quads = np.stack([low, high, low + _SIDES, high, high + _SIDES, low + _SIDES], axis=1).reshape(-1, 3)
-    faces = (quads[None] + _SIDES * np.arange(len(points) - 1)[:, None, None]).reshape(-1, 3)
-    return vertices, faces
+    return vertices, _bands(len(points), _SIDES)
+
+
+def _bands(rings: int, parts: int) -> NDArray[np.int64]:
+    """Triangles (2 * (rings - 1) * parts, 3) between rings of so many corners."""
+    side = np.arange(parts)
+    low, high = side, (side + 1) % parts
+    quads = np.stack([low, high, low + parts, high, high + parts, low + parts], axis=1).reshape(-1, 3)
+    return np.asarray((quads[None] + parts * np.arange(rings - 1)[:, None, None]).reshape(-1, 3))

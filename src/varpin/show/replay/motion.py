@@ -25,6 +25,7 @@ from varpin.show.replay.annotations import (
     traces,
 )
 from varpin.show.replay.script import Actor, Script
+from varpin.show.replay.surroundings import goals, parts_of, regions, ties
 from varpin.show.replay.video import Film, frame_size
 from varpin.support.checks import JointValues, as_floats, count, finite_array, positive, require_finite, writable
 from varpin.trajectory import Trajectory
@@ -32,8 +33,9 @@ from varpin.trajectory import Trajectory
 if TYPE_CHECKING:
     import meshcat
 
-    from varpin.control import Solution
+    from varpin.control import OptimalControlProblem, Solution
     from varpin.control.mpc import MpcRun
+    from varpin.mechanics.scene import Scene
     from varpin.show.replay.page import Inline
 
 Floats = NDArray[np.float64]
@@ -58,6 +60,7 @@ def replay(
     frames: bool | str | Sequence[str] = False,
     torques: bool | ArrayLike | Sequence[bool | ArrayLike] = False,
     torque_limit: JointValues | None = None,
+    constraints: bool | Scene | OptimalControlProblem | Sequence[bool | Scene | OptimalControlProblem] = True,
     offset: ArrayLike | None = None,
     speed: float = 1.0,
     loop: bool = True,
@@ -97,6 +100,10 @@ def replay(
             spread evenly over the motion's time. Of several robots, that for all of them, or a list with one for each.
         torque_limit: One number, (n,) or by joint name [N m or N]; the robot's effort limits if left out. A joint
             without one is red at its own largest torque.
+        constraints: Draw what the motion is held to: where constraints of the mechanism act, and of a plan its
+            obstacles, regions and goals. ``True`` takes them from a plan or a controller's run, and ``False`` draws
+            none; a trajectory or an array has none of its own, so give its scene or its problem. Of several robots,
+            True or False for all of them, or a list with one for each.
         offset: From each of several robots to the next (3,) [m]; far enough to see them all if left out.
         speed: Playback speed; 1 is true speed, 0.1 ten times slower.
         loop: Start again at the end; otherwise stop there.
@@ -122,8 +129,8 @@ def replay(
 
     Raises:
         InputError: Neither a file nor ``open``, or both; a motion or a ghost of another shape or another robot, or not
-            finite; ``dt`` missing or out of place; a frame that is not there; a target, a reference, torques or an
-            ``offset`` that are none.
+            finite; ``dt`` missing or out of place; a frame that is not there; a target, a reference, torques,
+            ``constraints`` or an ``offset`` that are none, or of another robot.
         FileError: The file cannot be written.
         MissingDependency: A film needs imageio, selenium, Chromium or its driver, which are not there.
     """
@@ -164,12 +171,17 @@ def replay(
     traced, triads = frame_names("trace", arms, trace), frame_names("frames", arms, frames)
     paths, tracks = references(reference), target_tracks(targets, end)
     shares = _shares(pairs, _each("torques", torques, len(pairs)), torque_limit)
+    held = [
+        parts_of(given, run, arm)
+        for given, (arm, run) in zip(_each("constraints", constraints, len(shown)), shown, strict=True)
+    ]
     step = None if offset is None else finite_array("offset", offset, (3,))
 
     moving = [t for t, _, _ in tracks.values() if len(t) > 1]
     followed = [second[0] for second in ghosts if second is not None]
     times = _times([t for t, _ in motions], followed + moving, end, fps / speed, max_frames)
     clock = times if growing else None
+    marked = tuple(target(name, track, times) for name, track in tracks.items())
     actors = []
     for k, (arm, (t, q)) in enumerate(zip(arms, motions, strict=True)):
         positions, lines = {"robot": _positions(arm, t, q, times)}, traces("motion", arm, traced[k], t, q, end, clock)
@@ -183,8 +195,9 @@ def replay(
         if second is not None and beside[k] is not None:
             lines += traces("ghost", arm, traced[k], *second, end, clock)
         efforts = _efforts(arm, shares[k], t[-1], times)
-        actors.append(Actor(arm, positions, tuple(lines), tuple(plans), triads[k], efforts))
-    marked = tuple(target(name, track, times) for name, track in tracks.items())
+        scene, wanted = held[k]
+        beyond = (ties(scene), regions(wanted), goals(wanted, marked))
+        actors.append(Actor(arm, positions, tuple(lines), tuple(plans), triads[k], efforts, *beyond))
     script = Script(times / speed, tuple(actors), paths, marked, step, loop, speed)
 
     from varpin.show.replay import viewer  # noqa: PLC0415 - meshcat is slow to import, and few runs show anything

@@ -61,6 +61,70 @@ class Target:
 
 
 @dataclass(frozen=True, eq=False)
+class Tie:
+    """Where a constraint of the mechanism acts.
+
+    Attributes:
+        name: The kind of constraint.
+        a: The body that carries the one point, -1 for the world, and the place on it (3,) [m].
+        b: The same of the other.
+        axis: Of a line or a plane through b, a unit vector (3,) in the axes of b's body; None of two points.
+        plane: Whether the axis is the normal of a plane.
+    """
+
+    name: str
+    a: tuple[int, Floats]
+    b: tuple[int, Floats]
+    axis: Floats | None = None
+    plane: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A body to keep clear of, or a part of the world that a frame has to be in or out of.
+
+    Attributes:
+        kind: Which of these.
+        name: Of the body, or of the frame.
+        begin: One end of its axis in the world (3,) [m]; of a sphere its centre, of a box its origin.
+        end: The other end (3,) [m].
+        radius: Of a sphere or a capsule [m].
+        box: Lower and upper sides of a box from its origin (2, 3) [m], infinite where it has none; None of round ones.
+        rotation: Axes of the box in the world (3, 3).
+    """
+
+    kind: Literal["obstacle", "out", "in"]
+    name: str
+    begin: Floats
+    end: Floats
+    radius: float
+    box: Floats | None = None
+    rotation: Floats = field(default_factory=lambda: np.eye(3))
+
+    @property
+    def corners(self) -> Floats:
+        """Points (k, 3) around what is finite of it [m]."""
+        if self.box is None:
+            reach = self.radius * np.vstack([np.eye(3), -np.eye(3)])
+            return np.concatenate([self.begin + reach, self.end + reach])
+        sides = np.where(np.isfinite(self.box), self.box, 0.0)
+        return np.asarray(self.begin + _corners(sides) @ self.rotation.T)
+
+    def box_within(self, points: Floats, margin: float) -> Floats:
+        """Its sides (2, 3) [m], those that are infinite put around points (P, 3), with a margin [m]."""
+        assert self.box is not None
+        (lower, upper), seen = self.box, (points - self.begin) @ self.rotation
+        low = np.minimum(seen.min(axis=0), np.where(np.isfinite(upper), upper, np.inf)) - margin
+        high = np.maximum(seen.max(axis=0), np.where(np.isfinite(lower), lower, -np.inf)) + margin
+        return np.array([np.where(np.isfinite(lower), lower, low), np.where(np.isfinite(upper), upper, high)])
+
+
+def _corners(box: Floats) -> Floats:
+    """The corners (8, 3) of a box (2, 3)."""
+    return np.stack(np.meshgrid(*box.T), axis=-1).reshape(8, 3)
+
+
+@dataclass(frozen=True, eq=False)
 class Actor:
     """A robot that moves.
 
@@ -73,6 +137,9 @@ class Actor:
         frames: Names of those drawn as triads.
         effort: Share of the limit that the torque of each joint of the tree takes at the keyframes (K, b), in [0, 1];
             None for the robot in its own colours.
+        ties: Of the mechanism.
+        regions: That it keeps to.
+        goals: Of its plan.
     """
 
     robot: Robot
@@ -81,6 +148,9 @@ class Actor:
     outlooks: tuple[Outlook, ...] = ()
     frames: tuple[str, ...] = ()
     effort: Floats | None = None
+    ties: tuple[Tie, ...] = ()
+    regions: tuple[Region, ...] = ()
+    goals: tuple[Target, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,110 @@
+"""What a scene and a plan have beside the robot, to be drawn: ties of the mechanism, obstacles, regions, goals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.errors import InputError
+from varpin.mechanics.constraints import Constraint, Distance, FrameOnFrame, PointOnLine, PointOnPlane, PointOnPoint
+from varpin.mechanics.forces import point_of
+from varpin.mechanics.scene import Scene
+from varpin.model import Robot
+from varpin.model.tree import z_to
+from varpin.show.replay.script import Region, Target, Tie
+
+if TYPE_CHECKING:
+    from varpin.control.constraints import PlanConstraint
+
+Floats = NDArray[np.float64]
+
+
+def parts_of(given: object, motion: object, robot: Robot) -> tuple[Scene | None, tuple[PlanConstraint, ...]]:
+    """The scene whose constraints are drawn, and the constraints of the plan.
+
+    Args:
+        given: Whether to draw those of the motion; or a scene; or a problem, with those of its plans.
+        motion: What is shown, which knows its problem if it is a plan or a controller's run.
+        robot: The arm that is shown.
+
+    Raises:
+        InputError: It is none of these, or of another robot.
+    """
+    source = given
+    if isinstance(given, bool | np.bool_):
+        plans = getattr(motion, "plans", None)
+        source = getattr(plans[0] if plans else motion, "problem", None) if given else None
+    if source is None:
+        return None, ()
+    scene = source if isinstance(source, Scene) else getattr(source, "scene", None)
+    if not isinstance(scene, Scene):
+        raise InputError(
+            f"constraints must be True or False, a Scene or an OptimalControlProblem, got {type(given).__name__}"
+        )
+    own = scene.robot
+    if own.joint_names != robot.joint_names or not own.built_like(robot):
+        raise InputError(f"constraints are of robot {own.name!r}, another one than {robot.name!r}, which is shown")
+    return scene, tuple(() if source is scene else source.constraints)  # type: ignore[attr-defined]
+
+
+def ties(scene: Scene | None) -> tuple[Tie, ...]:
+    """Where the constraints of a mechanism act; ties of joints and constraints of one's own have no place."""
+    found = [] if scene is None else [_tie(constraint, scene.robot) for constraint in scene.constraints]
+    return tuple(tie for tie in found if tie is not None)
+
+
+def _tie(constraint: Constraint, robot: Robot) -> Tie | None:
+    name = type(constraint).__name__
+    if not isinstance(constraint, Distance | FrameOnFrame | PointOnLine | PointOnPlane | PointOnPoint):
+        return None
+    (body, _, here), (other, turned, there) = (point_of(end, getattr(constraint, end), robot) for end in "ab")
+    axis = getattr(constraint, "normal", getattr(constraint, "direction", None))
+    if axis is not None:
+        axis = turned @ np.asarray(axis, dtype=np.float64)
+        axis /= np.linalg.norm(axis)
+    return Tie(name, (body, here), (other, there), axis, plane=isinstance(constraint, PointOnPlane))
+
+
+def regions(constraints: Sequence[PlanConstraint]) -> tuple[Region, ...]:
+    """Bodies to keep clear of, and where frames have to be or must not be."""
+    if not constraints:
+        return ()
+    from varpin.control import constraints as kinds  # noqa: PLC0415 - few replays need controllers imported
+
+    found: dict[Any, Region] = {}
+    for own in constraints:
+        if isinstance(own, kinds.KeepClear):
+            for body in own.obstacles:
+                half = None if body.sides is None else 0.5 * body.sides
+                box = None if half is None else np.array([-half, half])
+                region = Region("obstacle", body.name, body.begin, body.end, body.radius, box, body.rotation)
+                # One obstacle may be that of several constraints.
+                found[repr(body)] = region
+        elif isinstance(own, kinds.KeepInSphere | kinds.KeepOutOfSphere):
+            kind = "out" if own.outside else "in"
+            found[own] = Region(kind, own.frame, own.center, own.center, own.radius)  # type: ignore[arg-type]
+        elif isinstance(own, kinds.KeepInBox):
+            found[own] = Region("in", own.frame, np.zeros(3), np.zeros(3), 0.0, own.limits)
+        elif isinstance(own, kinds.KeepInHalfSpace):
+            plane = np.array([[-np.inf, -np.inf, 0.0], [np.inf, np.inf, 0.0]])
+            place = own.offset * own.normal
+            found[own] = Region("in", own.frame, place, place, 0.0, plane, z_to(own.normal))
+    return tuple(found.values())
+
+
+def goals(constraints: Sequence[PlanConstraint], taken: Sequence[Target]) -> tuple[Target, ...]:
+    """Where frames have to end, but for places that are targets already."""
+    if not constraints:
+        return ()
+    from varpin.control.constraints import ReachFrame  # noqa: PLC0415 - as above
+
+    found = []
+    for own in constraints:
+        if isinstance(own, ReachFrame) and own.position is not None:
+            place = own.position
+            if not any(np.allclose(target.places[-1], place, atol=1e-9) for target in taken):
+                found.append(Target(f"goal of {own.frame}", place[None]))
+    return tuple(found)
