@@ -80,7 +80,7 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
     if solution.refinement is not None and not solution.refinement.met:
         told.append(Finding("true cost", solution.refinement.reason))
     told += _unfinished(solution) + (_alternating(solution) or _restless(solution))
-    told += _outside(solution) + _between(solution)
+    told += starts_outside(problem) + _between(solution)
     try:
         replay = replayed(solution)
     except VarpinError as error:
@@ -167,11 +167,10 @@ def _at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats 
     return c
 
 
-def _outside(solution: Solution) -> list[Finding]:
+def starts_outside(problem: OptimalControlProblem) -> list[Finding]:
     """Says where the start violates a constraint, which the first step is then to make good."""
-    problem = solution.problem
     found = []
-    for bound, own in zip(problem.bound_constraints, solution.constraints, strict=True):
+    for bound in problem.bound_constraints:
         c = _at_start(problem, bound)
         if c is None:
             continue
@@ -180,7 +179,7 @@ def _outside(solution: Solution) -> list[Finding]:
             found.append(
                 Finding(
                     "start outside constraints",
-                    f"the start is outside {own.label}, {bound.rows[row]} by {c[row]:.2g} {bound.unit}, and the first "
+                    f"the start is outside {bound.source.label}, {bound.rows[row]} by {c[row]:.2g} {bound.unit}, and the first "
                     f"node, {problem.dt:g} s later, has to be inside: begin inside, or widen the bound",
                 )
             )
