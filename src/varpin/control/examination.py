@@ -179,8 +179,8 @@ def starts_outside(problem: OptimalControlProblem) -> list[Finding]:
             found.append(
                 Finding(
                     "start outside constraints",
-                    f"the start is outside {bound.source.label}, {bound.rows[row]} by {c[row]:.2g} {bound.unit}, and the first "
-                    f"node, {problem.dt:g} s later, has to be inside: begin inside, or widen the bound",
+                    f"the start is outside {bound.source.label}, {bound.rows[row]} by {c[row]:.2g} {bound.unit}, and the "
+                    f"first node, {problem.dt:g} s later, has to be inside: begin inside, or widen the bound",
                 )
             )
     return found
