@@ -179,8 +179,8 @@ def starts_outside(problem: OptimalControlProblem) -> list[Finding]:
             found.append(
                 Finding(
                     "start outside constraints",
-                    f"the start is outside {bound.source.label}, {bound.rows[row]} by {c[row]:.2g} {bound.unit}, and the "
-                    f"first node, {problem.dt:g} s later, has to be inside: begin inside, or widen the bound",
+                    f"the start is outside {bound.source.label}, {bound.rows[row]} by {c[row]:.2g} {bound.unit}, "
+                    f"and the first node, {problem.dt:g} s later, has to be inside: begin inside, or widen the bound",
                 )
             )
     return found
@@ -241,8 +241,8 @@ def _restless(solution: Solution) -> list[Finding]:
         Finding(
             _RESTLESS,
             f"the velocity of {name} goes up and down {found.changes} times in {len(decided) - 1} decisions: where "
-            "the task does not ask for it, the cost hardly weighs it; a running VelocityCost, even a small one, calms "
-            "it",
+            "the task does not ask for it, the cost hardly weighs it; a running VelocityCost, even a small one, or a "
+            "larger one calms it",
             found.joint,
         )
     ]
