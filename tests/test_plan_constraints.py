@@ -359,9 +359,12 @@ def test_between_nodes_is_told():
     assert any("between them" in sentence for sentence in plan.warnings)
 
 
-def test_a_start_outside_is_told():
-    """By its row and how far, and not as a violation between nodes of the first step."""
-    plan = vp.solve(two_links([vp.WithinJointLimits(ROBOT, ([0.1, -1.0], 2.0))]))
+def test_a_start_outside_is_told(caplog):
+    """By its row and how far, before the search, and not as a violation between nodes of the first step."""
+    problem = two_links([vp.WithinJointLimits(ROBOT, ([0.1, -1.0], 2.0))])
+    vp.solve(problem, max_iterations=0)
+    assert caplog.messages[0].startswith("the start is outside")
+    plan = vp.solve(problem)
     (told,) = (sentence for sentence in plan.warnings if "WithinJointLimits" in sentence)
     assert "the start is outside WithinJointLimits, lower limit of joint1 by 0.1 rad" in told
     plan = vp.solve(two_links([vp.WithinJointLimits(ROBOT, (-1.0, 2.0))]))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from varpin.control.backward import backward
 from varpin.control.costs import CostError
-from varpin.control.examination import looked_at
+from varpin.control.examination import looked_at, starts_outside
 from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.multipliers import FEASIBLE, ConstraintReport, Multipliers, reports, split
 from varpin.control.penalties import PenalizedProblem, flat, penalized
@@ -28,6 +28,7 @@ from varpin.control.search import checked_time, require_reports
 from varpin.control.solution import Solution
 from varpin.errors import InputError, LinearizationError
 from varpin.mechanics.noise import NoiseFieldError
+from varpin.simulation.soundness import announce
 from varpin.support.checks import count
 from varpin.trajectory import Trajectory
 
@@ -118,6 +119,9 @@ class _Rounds:
         began = time.perf_counter()
         # Options are looked at, and the first motion made, by a search that does nothing more.
         first = self._first()
+        if self.check:
+            # Now, as the search of a plan that there may not be takes long.
+            announce(logger, self.problem.scene, self.problem.dt, starts_outside(self.problem))
         last = len(self.history) + self.most
         found, resume = first, self._resumed_search()
         while True:

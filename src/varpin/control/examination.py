@@ -83,7 +83,7 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
         _unfinished(solution)
         + _noise_left_out(solution)
         + (_alternating(solution) or _restless(solution))
-        + _outside(solution)
+        + starts_outside(problem)
         + _between(solution)
     )
     try:
@@ -172,11 +172,10 @@ def _at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats 
     return c
 
 
-def _outside(solution: Solution) -> list[Finding]:
+def starts_outside(problem: OptimalControlProblem) -> list[Finding]:
     """Says where the start violates a constraint, which the first step is then to make good."""
-    problem = solution.problem
     found = []
-    for bound, own in zip(problem.bound_constraints, solution.constraints, strict=True):
+    for bound in problem.bound_constraints:
         c = _at_start(problem, bound)
         if c is None:
             continue
@@ -185,8 +184,8 @@ def _outside(solution: Solution) -> list[Finding]:
             found.append(
                 Finding(
                     "start outside constraints",
-                    f"the start is outside {own.label}, {bound.rows[row]} by {c[row]:.2g} {bound.unit}, and the first "
-                    f"node, {problem.dt:g} s later, has to be inside: begin inside, or widen the bound",
+                    f"the start is outside {bound.source.label}, {bound.rows[row]} by {c[row]:.2g} {bound.unit}, "
+                    f"and the first node, {problem.dt:g} s later, has to be inside: begin inside, or widen the bound",
                 )
             )
     return found
@@ -275,8 +274,8 @@ def _restless(solution: Solution) -> list[Finding]:
         Finding(
             _RESTLESS,
             f"the velocity of {name} goes up and down {found.changes} times in {len(decided) - 1} decisions: where "
-            "the task does not ask for it, the cost hardly weighs it; a running VelocityCost, even a small one, calms "
-            "it",
+            "the task does not ask for it, the cost hardly weighs it; a running VelocityCost, even a small one, or a "
+            "larger one calms it",
             found.joint,
         )
     ]

@@ -32,8 +32,8 @@ class Status(Enum):
         "says where. A smaller dt, or a cost that is finite around the motion, may help"
     )
     INFEASIBLE = (
-        "infeasible: a constraint cannot be met from the first controls, and the reason names it. Other first controls "
-        "may lead around an obstacle; a longer horizon, wider limits or another goal may help"
+        "infeasible: a constraint cannot be met from the first controls, and plan.reason names it. Other first "
+        "controls may lead around an obstacle; a longer horizon, wider limits or another goal may help"
     )
     OUT_OF_TIME = "stopped at the time limit: this is the best motion so far"
     INTERRUPTED = "interrupted: this is the best motion so far"
