@@ -153,3 +153,19 @@ def test_one_stage_moves_from_rest_under_the_default_guard(damping):
     assert motion.statistics.substeps.max() == 1
     free = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=100, integrator=vp.Radau(1, guard=None))
     np.testing.assert_allclose(motion.q, free.q, rtol=0, atol=1e-12)
+
+
+def test_a_spring_beside_a_damper_keeps_its_energy():
+    """The default takes Radau for the one; the other swings by itself, undamped, at a radian a step."""
+    model, inertia = pin.Model(), 0.33
+    for name in ("spring", "damper"):
+        joint = model.addJoint(0, pin.JointModelRY(), pin.SE3.Identity(), name)
+        model.appendBodyToJoint(joint, pin.Inertia(1.0, np.zeros(3), inertia * np.eye(3)), pin.SE3.Identity())
+    stiffness = inertia * 50.0**2
+    scene = vp.Scene(vp.load_robot(model), gravity=False, stiffness=[stiffness, 0.0], damping=[0.0, 100.0])
+    motion = vp.simulate(scene, [0.5, 0.0], [0.0, 1.0], dt=0.02, steps=500)
+    assert motion.integrator == str(vp.Radau(3))
+    energy = 0.5 * (stiffness * motion.q[:, 0] ** 2 + inertia * motion.v[:, 0] ** 2)
+    np.testing.assert_allclose(energy / energy[0], 1.0, rtol=0, atol=0.01)
+    exact = 0.5 * np.cos(50.0 * motion.t)
+    assert np.abs(motion.q[:, 0] - exact).max() < 0.005

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from varpin.core import Tableau
 from varpin.integrators.collocation import Collocation
+from varpin.integrators.gauss import BUDGET_SHARE
 from varpin.integrators.tableau import radau, radau_coefficients
 
 Floats = NDArray[np.float64]
@@ -28,7 +29,8 @@ class Radau(Collocation):
         stages: s, from 1 to 6. One is the implicit Euler method, whose error is in percents of the motion.
 
     Other Args:
-        guard: As of :class:`Midpoint`, and so are the others.
+        guard: As of :class:`Midpoint`, and so are the others; with two stages or more 1/100 of its ``energy_budget``
+            is allowed, so that oscillations that nothing damps keep their energy beside dampers.
         tolerance: On the residual, in units of the rounding error of the terms that cancel in it.
         kick: When noise kicks the momentum, ``"left"`` or ``"split"``.
     """
@@ -39,6 +41,10 @@ class Radau(Collocation):
     def order(self) -> int:
         """See :meth:`Integrator.order`; 2 s - 1."""
         return 2 * int(self.stages) - 1
+
+    def _shares(self) -> tuple[float, float]:
+        # The budget alone: a step's own balance is off where it damps what it does not resolve, and is to.
+        return (1.0, BUDGET_SHARE) if self.stages > 1 else (1.0, 1.0)
 
     def _tableau(self) -> Tableau:
         return radau(int(self.stages))
