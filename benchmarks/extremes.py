@@ -7,6 +7,10 @@ markers, and exits with status 1 if anything is silent wrong.
     python benchmarks/extremes.py FOLDER             # some five hours of one core
     python benchmarks/extremes.py FOLDER --turns 6   # an hour: trees and larger robots take turns at the trials
     python benchmarks/extremes.py FOLDER ur5 tree17  # these alone, and no table
+    python benchmarks/extremes.py FOLDER --scenes    # the scenes made up for it, to FOLDER/scenes.json: 20 minutes
+    python benchmarks/extremes.py FOLDER --deep      # and the long ones: hours
+
+``docs/limits.py`` makes its tables of the record of scenes.
 """
 
 import argparse
@@ -22,11 +26,11 @@ from pages import fill
 import varpin as vp
 from varpin.model import bundled_robots
 from varpin.model.example_robot_data import installed
-from varpin.study import extremes
-from varpin.study.extremes import Kind, Record
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
+import battery  # noqa: E402
+from battery import Kind, Record  # noqa: E402
 from mechanisms import random_tree  # noqa: E402
 
 DOCUMENT = ROOT / "docs" / "limits.md"
@@ -54,9 +58,9 @@ def robot_of(name: str) -> vp.Robot:
     return vp.load_robot(model)
 
 
-def trials_of(name: str, robot: vp.Robot, turns: int = 1) -> list[extremes.Trial | extremes.Plan]:
+def trials_of(name: str, robot: vp.Robot, turns: int = 1) -> list[battery.Trial | battery.Plan]:
     """The battery, of which trees and robots of more than four joints may get each so many-th trial, by turns."""
-    trials = extremes.trials_on(robot)
+    trials = battery.trials_on(robot)
     if robot.dof > LARGE:
         turns = max(turns, TURNS)
     elif robot.dof <= 4 and not name.startswith("tree"):
@@ -69,10 +73,10 @@ def judge(
     robot: vp.Robot,
     folder: Path | None = None,
     turns: int = 1,
-    progress: extremes.battery.Progress | None = None,
+    progress: battery.Progress | None = None,
 ) -> Record:
     """The record of a robot, in a file of its name if a folder is given."""
-    return extremes.run(
+    return battery.run(
         robot,
         trials=trials_of(name, robot, turns),
         save=None if folder is None else folder / f"{name}.json",
@@ -130,14 +134,31 @@ def _row(name: str, joints: int | str, records: Sequence[Record]) -> str:
     return f"| {name} | {joints} | {sum(counts)} | {' | '.join(map(str, counts))} |"
 
 
+def scenes(path: Path, *, deep: bool) -> int:
+    """The record of the scenes, in a file; returns the exit status."""
+
+    def tell(done: int, cells: int, what: str) -> None:
+        sys.stderr.write(f"\r{f'{done}/{cells} {what}'[:118]:118}")
+
+    record = battery.run(deep=deep, save=path, progress=tell)
+    print(f"\n{record}, {len(record.needless())} warnings without need")
+    for cell in record.wrong():
+        print(f"  silent wrong: {cell.trial}, {cell.integrator}: {'; '.join(cell.found)}")
+    return 130 if record.missing else 1 if record.wrong() else 0
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("folder", type=Path, help="where the records are kept")
     parser.add_argument("robots", nargs="*", help="these alone, and no table in the page")
     parser.add_argument("--turns", type=int, default=1, metavar="K", help="trees and larger robots get each K-th trial")
+    parser.add_argument("--scenes", action="store_true", help="the scenes made up for the battery, and no robots")
+    parser.add_argument("--deep", action="store_true", help="the long scenes, too")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     logging.getLogger("varpin").setLevel(logging.CRITICAL)
+    if options.scenes or options.deep:
+        return scenes(options.folder / "scenes.json", deep=options.deep)
     results = []
     for name, robot, record in judged(options.robots or names(), options.folder, options.turns):
         results.append((name, robot, record))

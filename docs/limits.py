@@ -1,10 +1,10 @@
-"""The tables of docs/limits.md, from a record that ``varpin extremes`` wrote.
+"""The tables of docs/limits.md, from a record of the battery of scenes.
 
-    varpin extremes --out extremes
-    python docs/limits.py extremes/extremes.json
-    python docs/limits.py --chains                  # the table of undamped chains: five minutes
+    python benchmarks/extremes.py FOLDER --scenes
+    python docs/limits.py FOLDER/scenes.json
+    python docs/limits.py --chains    # the table of undamped chains: five minutes
 
-A record of ``varpin extremes --deep`` gives the table of the long scenes as well. Other simulators take part in theirs
+A record with ``--deep`` gives the table of the long scenes as well. Other simulators take part in theirs
 where they are installed (``pip install "varpin[peers]"``; trep has no release for Python 3).
 """
 
@@ -21,14 +21,15 @@ import numpy as np
 
 import varpin as vp
 from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.study.extremes import PLANS, TRIALS, Cell, Kind, Record, Trial
-from varpin.study.extremes.battery import INTEGRATORS
-from varpin.study.extremes.exact import Exact, exact_motion
-from varpin.study.extremes.trial import LEVELS
+from varpin.study.extremes import INTEGRATORS
+from varpin.study.extremes.exact import Exact
+from varpin.study.extremes.record import LEVELS
 
 DOCUMENT = Path(__file__).resolve().parent / "limits.md"
-sys.path.insert(0, str(DOCUMENT.parents[1] / "benchmarks"))
+sys.path[:0] = [str(DOCUMENT.parents[1] / name) for name in ("benchmarks", "tests")]
 import peers  # noqa: E402
+from battery import PLANS, TRIALS, Cell, Kind, Record, Trial  # noqa: E402
+from battery.exact import exact_motion  # noqa: E402
 from pages import fill  # noqa: E402
 
 OWN = {"Midpoint": "Midpoint(alpha=0.5)", "Gauss(4)": "Gauss(stages=4)", "RungeKutta4": "RungeKutta4"}

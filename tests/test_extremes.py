@@ -6,9 +6,13 @@ import dataclasses
 import json
 import math
 
+import battery
 import numpy as np
 import pinocchio as pin
 import pytest
+from battery import Setup, Trial
+from battery.exact import exact_motion, period_error
+from battery.plans import Task, changes, cost_error, judge_plan, part_left
 from mechanisms import slider
 
 import varpin as vp
@@ -16,14 +20,11 @@ from varpin.cli import main
 from varpin.mechanics.wiener import wiener_increments
 from varpin.model.chain import rod_chain
 from varpin.simulation.soundness import Finding
-from varpin.study import extremes
-from varpin.study.extremes import Kind, Setup, Trial, checks
-from varpin.study.extremes.battery import INTEGRATORS
-from varpin.study.extremes.exact import exact_motion, period_error
-from varpin.study.extremes.plans import Task, changes, cost_error, judge_plan, part_left
-from varpin.study.extremes.trial import LEVELS
+from varpin.study.extremes import INTEGRATORS, Kind, checks
+from varpin.study.extremes import robot as robot_checks
+from varpin.study.extremes.record import LEVELS
 
-BY_NAME = {trial.name: trial for trial in (*extremes.TRIALS, *extremes.PLANS)}
+BY_NAME = {trial.name: trial for trial in (*battery.TRIALS, *battery.PLANS)}
 MEASURES = ("error", "joint", "velocity", "period", "energy", "momentum", "reversal", "symplecticity", "record")
 
 
@@ -45,14 +46,14 @@ def error_of(name, exact, motion):
 
 def run_one(setup, dt=1e-2, steps=100, integrator=None, **options):
     trial = Trial("made up", "made up", lambda: setup, dt, steps, **options)
-    return extremes.run(trials=[trial], integrators=[integrator or vp.Midpoint()]).cells[0]
+    return battery.run(trials=[trial], integrators=[integrator or vp.Midpoint()]).cells[0]
 
 
 @pytest.fixture
 def hasty(monkeypatch):
     """Little time for the exact motions over periods, which decide nothing here."""
-    monkeypatch.setattr("varpin.study.extremes.exact._PATIENCE_PERIODS", 0.1)
-    monkeypatch.setattr("varpin.study.extremes.exact._PATIENCE_PERIOD", 0.1)
+    monkeypatch.setattr("battery.exact._PATIENCE_PERIODS", 0.1)
+    monkeypatch.setattr("battery.exact._PATIENCE_PERIOD", 0.1)
 
 
 def same(one, other):
@@ -66,7 +67,7 @@ def same(one, other):
 
 def test_a_sound_motion_passes_every_check():
     setup, motion = falling(gravity=False)
-    found = checks.measures(setup, vp.Midpoint(), motion, exact_motion(setup, 1e-2, 100, 0.3))
+    found = battery.measures(setup, vp.Midpoint(), motion, exact_motion(setup, 1e-2, 100, 0.3))
     assert not any(math.isnan(found[name]) for name in MEASURES)
     assert checks.findings(found, vp.Midpoint()) == ()
     assert found["error"] < 1e-2
@@ -158,7 +159,7 @@ def test_nan_is_found():
 
 def test_the_exact_motion_is_exact():
     # A linear oscillator, overdamped and not, in closed form against DOP853.
-    for trial in extremes.TRIALS:
+    for trial in battery.TRIALS:
         if trial.name in (
             "spring, h omega = 0.1",
             "spring and damper, h d / I = 0.1",
@@ -187,11 +188,11 @@ def test_the_error_of_a_period_is_that_of_its_closed_form():
 def test_what_goes_wrong_late_is_found():
     """A fifth of its way is added to what is left of a motion from a node on, of which every record is consistent."""
     setup, motion = falling(dt=1e-2, steps=400)
-    before = checks.measures(setup, vp.Midpoint(), motion, exact_motion(setup, 1e-2, 400, 0.3))
+    before = battery.measures(setup, vp.Midpoint(), motion, exact_motion(setup, 1e-2, 400, 0.3))
     later = vp.simulate(setup.scene, motion.q[250] + 0.3, motion.v[250], dt=1e-2, steps=150)
     arrays = {name: np.append(getattr(motion, name)[:250], getattr(later, name), axis=0) for name in "qvp"}
     energy = np.append(motion.energy[:250], later.energy)
-    found = checks.measures(
+    found = battery.measures(
         setup,
         vp.Midpoint(),
         tampered(motion, **arrays, energy=energy),
@@ -281,13 +282,13 @@ def test_errors_without_a_name_are_silent_wrong():
         raise ZeroDivisionError("of the test")
 
     trial = Trial("made up", "made up", build, 1e-2, 10)
-    (cell,) = extremes.run(trials=[trial], integrators=[vp.Midpoint()]).cells
+    (cell,) = battery.run(trials=[trial], integrators=[vp.Midpoint()]).cells
     assert cell.kind is Kind.WRONG
     assert cell.found == ("unnamed error: ZeroDivisionError: of the test",)
 
 
 def test_refused_before_anything_ran():
-    (cell,) = extremes.run(trials=[BY_NAME["tip of 0 kg"]], integrators=[vp.Midpoint()]).cells
+    (cell,) = battery.run(trials=[BY_NAME["tip of 0 kg"]], integrators=[vp.Midpoint()]).cells
     assert (cell.kind, cell.done) == (Kind.REFUSED, 0)
     assert cell.said[0].startswith("SingularMassMatrix: ")
 
@@ -303,7 +304,7 @@ def test_stopped_with_the_motion_so_far(hasty):
 def test_a_motion_that_takes_too_long_is_judged_by_what_there_is(hasty):
     setup, _ = falling()
     trial = Trial("long", "made up", lambda: setup, 1e-3, 100_000, window=0.1)
-    (cell,) = extremes.run(trials=[trial], integrators=[vp.Midpoint()], patience=0.01).cells
+    (cell,) = battery.run(trials=[trial], integrators=[vp.Midpoint()], patience=0.01).cells
     assert 0 < cell.done < cell.steps
     assert cell.kind is Kind.ACCURATE
 
@@ -336,9 +337,7 @@ def test_a_plan_that_is_no_optimum_is_found(small_plan):
 
 def test_a_plan_of_nan_is_silent_wrong(monkeypatch, small_plan):
     _, solution = small_plan
-    monkeypatch.setattr(
-        "varpin.study.extremes.plans.solve", lambda *_, **__: dataclasses.replace(solution, cost=math.nan)
-    )
+    monkeypatch.setattr("battery.plans.solve", lambda *_, **__: dataclasses.replace(solution, cost=math.nan))
     outcome = judge_plan(BY_NAME["10 nodes"], vp.Midpoint())
     assert outcome.kind is Kind.WRONG
     assert "cost off by" in outcome.found[0]
@@ -352,9 +351,9 @@ def test_a_plan_that_whirls_with_nothing_said_is_silent_wrong(monkeypatch, small
     assert changes(solution.trajectory) <= 2
     assert changes(motion) >= 7
     whirling = dataclasses.replace(solution, trajectory=motion, cost=task.cost(motion))
-    monkeypatch.setattr("varpin.study.extremes.plans.solve", lambda *_, **__: whirling)
+    monkeypatch.setattr("battery.plans.solve", lambda *_, **__: whirling)
     # Ten steps have no more than nine changes.
-    monkeypatch.setattr("varpin.study.extremes.plans._FEW", 4)
+    monkeypatch.setattr("battery.plans._FEW", 4)
     outcome = judge_plan(BY_NAME["10 nodes"], vp.Midpoint())
     assert outcome.kind is Kind.WRONG
     assert any("goes up and down" in text for text in outcome.found)
@@ -378,7 +377,7 @@ def test_the_cost_by_hand_has_the_weights():
 
 
 def small_battery(load):
-    trials = extremes.trials_on(load("finger"))
+    trials = battery.trials_on(load("finger"))
     return [trial for trial in trials if trial.name in ("falls, dt = 0.5 s", "1 node")]
 
 
@@ -386,7 +385,7 @@ def test_resumes_to_the_same_record(load, tmp_path):
     trials, robot = small_battery(load), load("finger")
     members = [vp.Midpoint(), vp.Gauss(4), vp.ExplicitEuler()]
     options = {"trials": trials, "integrators": members}
-    whole = extremes.run(robot, **options, save=tmp_path / "whole.json")
+    whole = battery.run(robot, **options, save=tmp_path / "whole.json")
     assert (len(whole.cells), whole.missing) == (6, 0)
 
     def interrupt_at(count):
@@ -397,28 +396,28 @@ def test_resumes_to_the_same_record(load, tmp_path):
         return interrupt
 
     path = tmp_path / "cut.json"
-    cut = extremes.run(robot, **options, save=path, progress=interrupt_at(2))
+    cut = battery.run(robot, **options, save=path, progress=interrupt_at(2))
     assert (len(cut.cells), cut.missing) == (2, 4)
-    kept = extremes.Record.load(path)
+    kept = battery.Record.load(path)
     assert [cell.seconds for cell in kept.cells] == [cell.seconds for cell in cut.cells]
-    again = extremes.run(robot, **options, save=path)
+    again = battery.run(robot, **options, save=path)
     assert all(same(*pair) for pair in zip(again.cells, whole.cells, strict=True))
     # What was there was not run again: even its time stands.
     assert [cell.seconds for cell in again.cells[:2]] == [cell.seconds for cell in cut.cells]
     # Nor is it lost where something else comes first, and is interrupted.
     more = [Trial("made up", "made up", trials[0].build, 1e-3, 10), *trials]
-    kept = extremes.run(robot, **options | {"trials": more}, save=path, progress=interrupt_at(6))
+    kept = battery.run(robot, **options | {"trials": more}, save=path, progress=interrupt_at(6))
     assert (len(kept.cells), kept.missing) == (len(whole.cells), len(members))
-    assert len(extremes.Record.load(path).cells) == len(whole.cells)
+    assert len(battery.Record.load(path).cells) == len(whole.cells)
 
 
 def test_a_record_survives_the_disk(tmp_path):
     numbers = dict.fromkeys(MEASURES, 0.2) | {"error": math.nan, "energy": math.inf, "momentum": 1e-300}
-    cell = extremes.Cell(
+    cell = battery.Cell(
         "f", "t", "i", Kind.STOPPED, **numbers, said=("a",), found=(), done=1, steps=2, seconds=0.5, fingerprint="abc"
     )
-    record = extremes.Record((cell,), "robot", deep=True, missing=3)
-    loaded = extremes.Record.load(record.save(tmp_path / "record.json"))
+    record = battery.Record((cell,), "robot", deep=True, missing=3)
+    loaded = battery.Record.load(record.save(tmp_path / "record.json"))
     assert str(loaded.cells) == str(record.cells)
     assert (loaded.robot, loaded.deep, loaded.missing, loaded.version) == ("robot", True, 3, vp.__version__)
     assert json.loads((tmp_path / "record.json").read_text())["cells"][0]["error"] is None
@@ -429,23 +428,29 @@ def test_damaged_records_are_refused(tmp_path, text):
     path = tmp_path / "record.json"
     path.write_text(text)
     with pytest.raises(vp.FileError, match=r"record\.json"):
-        extremes.run(trials=[], save=path)
+        battery.run(trials=[], save=path)
 
 
 def test_every_trial_has_a_name_of_its_own(load):
-    for trials in ((*extremes.TRIALS, *extremes.PLANS), extremes.trials_on(load("finger"))):
+    for trials in ((*battery.TRIALS, *battery.PLANS), battery.trials_on(load("finger"))):
         names = [trial.name for trial in trials]
         assert len(set(names)) == len(names)
     assert len({repr(member) for member in INTEGRATORS}) == len(INTEGRATORS) == 10
 
 
-def test_the_command_writes_its_files(tmp_path, capsys, monkeypatch, load):
-    monkeypatch.setattr("varpin.study.extremes.battery.trials_on", lambda _: small_battery(load))
-    monkeypatch.setattr("varpin.study.extremes.battery.INTEGRATORS", (vp.Midpoint(), vp.RungeKutta4()))
+def few(names, *lies):
+    """``motions_of``, of which these are taken, and lies added."""
+    own = robot_checks.motions_of
+    return lambda robot: [*(motion for motion in own(robot) if motion.name in names), *lies]
+
+
+def test_the_command_writes_its_files(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(robot_checks, "motions_of", few({"falls, dt = 0.5 s", "no gravity"}))
+    monkeypatch.setattr(robot_checks, "INTEGRATORS", (vp.Midpoint(), vp.RungeKutta4()))
     assert main(["extremes", "finger", "--out", str(tmp_path)]) == 0
     assert "finger at the extremes" in capsys.readouterr().out
-    record = extremes.Record.load(tmp_path / "extremes.json")
-    assert len(record.cells) == 3
+    record = battery.Record.load(tmp_path / "extremes.json")
+    assert len(record.cells) == 4
     page = (tmp_path / "extremes.html").read_text()
     assert page.count("<td class=") == len(record.cells) + 2
     assert "<script" not in page
@@ -453,19 +458,81 @@ def test_the_command_writes_its_files(tmp_path, capsys, monkeypatch, load):
 
 
 def test_the_command_fails_where_anything_is_silent_wrong(capsys, monkeypatch):
-    rod = vp.Scene(rod_chain([1.0], [1.0]))
-    lie = Setup(rod, np.zeros(1), np.zeros(1), exact=lambda t: (np.array([-7.0 * t * t]), np.array([-14.0 * t])))
-    trial = Trial("a lie", "made up", lambda: lie, 1e-3, 500)
-    monkeypatch.setattr("varpin.study.extremes.battery.TRIALS", (trial,))
-    monkeypatch.setattr("varpin.study.extremes.battery.PLANS", ())
-    monkeypatch.setattr("varpin.study.extremes.battery.INTEGRATORS", (vp.Midpoint(), vp.RungeKutta4()))
-    assert main(["extremes", "--quiet"]) == 1
-    assert capsys.readouterr().out.count("silent wrong: a lie, ") == 2
+    monkeypatch.setattr(robot_checks, "motions_of", few({"no gravity"}))
+    monkeypatch.setattr(robot_checks, "INTEGRATORS", (vp.Midpoint(), vp.RungeKutta4()))
+    honest = robot_checks.attempt
+
+    def lying(*given, **options):
+        """The recorded momenta leak."""
+        motion, error = honest(*given, **options)
+        return tampered(motion, **drifting(motion)), error
+
+    monkeypatch.setattr(robot_checks, "attempt", lying)
+    assert main(["extremes", "finger", "--quiet"]) == 1
+    assert capsys.readouterr().out.count("silent wrong: no gravity, ") == 2
+
+
+def test_the_command_needs_a_robot(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["extremes"])
+    assert end.value.code == 2
+    assert "required: ROBOT" in capsys.readouterr().err
+
+
+def test_check_robot_agrees_with_the_battery(load, hasty):
+    """Errors from the start, with noise and without, are those that the battery computes on its own way."""
+    robot = load("double_pendulum")
+    members = [vp.Midpoint(), vp.Gauss(2), vp.ExplicitEuler()]
+    names = {"falls, dt = 0.1 s", "after 1e6 turns", "+-10 times its weight", "noise of 1 times its weight"}
+    trials = [trial for trial in battery.trials_on(robot) if trial.name in names]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(robot_checks, "motions_of", few(names))
+        own = vp.check_robot("double_pendulum", integrators=members)
+    whole = battery.run(robot, trials=trials, integrators=members)
+    assert own.missing == 0
+    for mine, other in zip(own.cells, whole.cells, strict=True):
+        assert (mine.trial, mine.integrator, mine.kind) == (other.trial, other.integrator, other.kind)
+        for name in ("error", "joint", "velocity", "energy", "reversal", "symplecticity", "record"):
+            expected = getattr(other, name)
+            assert getattr(mine, name) == pytest.approx(expected, rel=1e-3, abs=1e-8, nan_ok=True), (mine, name)
+        assert mine.kind is Kind.STOPPED or not math.isnan(mine.error)
+
+
+def test_check_robot_keeps_what_was_done(load):
+    def interrupt(done, cells, name):
+        if done == 2:
+            raise KeyboardInterrupt
+
+    record = vp.check_robot(load("finger"), progress=interrupt)
+    assert (len(record.cells), record.missing) == (2, 208)
+
+
+def test_check_robot_refuses(load):
+    with pytest.raises(vp.InputError, match="patience"):
+        vp.check_robot(load("finger"), patience=0.0)
+    with pytest.raises(vp.RobotError, match="nosuch"):
+        vp.check_robot("nosuch")
+
+
+@pytest.mark.parametrize(
+    "name", ["3 links, dt = 0.5 s", "tip of 1e-09 kg", "spring, h omega = 10", "1e6 N m on 3 links"]
+)
+def test_nothing_in_some_scenes_is_silent_wrong(name, hasty):
+    record = battery.run(trials=[BY_NAME[name]], integrators=[vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4()])
+    assert [(cell.integrator, cell.found) for cell in record.wrong()] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name, trial in BY_NAME.items() if not trial.deep])
+def test_nothing_in_the_battery_is_silent_wrong(name):
+    record = battery.run(trials=[BY_NAME[name]])
+    assert record.missing == 0
+    assert [(cell.integrator, cell.found) for cell in record.wrong()] == []
 
 
 @pytest.mark.slow
 def test_nothing_on_the_finger_is_silent_wrong(load):
-    record = extremes.run(load("finger"))
+    record = battery.run(load("finger"))
     assert record.missing == 0
     assert [(cell.trial, cell.integrator, cell.found) for cell in record.wrong()] == []
     counts = record.counts()
@@ -483,7 +550,7 @@ def test_random_trees_are_many_kinds(benchmark):
     assert {tree.dof for tree in trees} == set(range(2, 9))
     assert 0.1 < np.mean([bool((np.diff(tree.tree.parent) == 1).all()) for tree in trees]) < 0.9
     assert len({benchmark.robot_of("tree3").tree.mass.tobytes(), trees[3].tree.mass.tobytes()}) == 1
-    every = {trial.name for trial in extremes.trials_on(trees[0])}
+    every = {trial.name for trial in battery.trials_on(trees[0])}
     own = [
         {trial.name for trial in benchmark.trials_of(f"tree{k}", trees[k], benchmark.TURNS)}
         for k in range(benchmark.TURNS)
@@ -494,7 +561,7 @@ def test_random_trees_are_many_kinds(benchmark):
 
 def test_the_table_of_robots_counts_every_cell(benchmark, load, tmp_path):
     robot, members = load("finger"), [vp.Midpoint(), vp.RungeKutta4()]
-    record = extremes.run(robot, trials=small_battery(load)[:1], integrators=members)
+    record = battery.run(robot, trials=small_battery(load)[:1], integrators=members)
     rows = list(benchmark.table([("finger", robot, record), ("tree1", robot, record), ("twin", robot, "finger")]))
     assert rows[2].startswith("| finger | 3 | 2 | ")
     assert rows[3].startswith("| twin | 3 | the same mechanism as finger |")
@@ -509,9 +576,9 @@ def test_nothing_on_robots_and_trees_is_silent_wrong(benchmark, name):
     trials = (
         benchmark.trials_of(name, robot, benchmark.TURNS)
         if name.startswith("tree")
-        else extremes.trials_on(robot)[:: benchmark.TURNS]
+        else battery.trials_on(robot)[:: benchmark.TURNS]
     )
-    record = extremes.run(robot, trials=trials)
+    record = battery.run(robot, trials=trials)
     assert record.missing == 0
     assert [(cell.trial, cell.integrator, cell.found) for cell in record.wrong()] == []
     assert record.counts()[Kind.ACCURATE] > 0
@@ -524,7 +591,7 @@ def test_needless_warnings_are_counted(monkeypatch):
     cell = run_one(setup, 1e-3)
     assert cell.warned
     assert cell.needless
-    record = extremes.Record((cell,), "robot", deep=False)
+    record = battery.Record((cell,), "robot", deep=False)
     assert record.needless() == (cell,)
 
 

@@ -158,6 +158,7 @@ if TYPE_CHECKING:
     from varpin.show.inspection import LinkReport as LinkReport
     from varpin.show.inspection import RobotReport as RobotReport
     from varpin.show.inspection import inspect_robot as inspect_robot
+    from varpin.study.extremes import check_robot as check_robot
     from varpin.study.linearization_check import LinearizationCheck as LinearizationCheck
     from varpin.study.linearization_check import check_linearization as check_linearization
     from varpin.study.tradeoff import Advice as Advice
@@ -208,6 +209,7 @@ _LATE: dict[str, tuple[str, ...]] = {
     "varpin.ensemble": ("Ensemble", "EnsembleInterrupted", "EnsembleStatistics", "PathFailure", "simulate_ensemble"),
     "varpin.show.inspection": ("FrameReport", "JointReport", "LinkReport", "RobotReport", "inspect_robot"),
     "varpin.linearization": ("Curvature", "Linearization", "Moments", "linearize", "propagate_moments", "second_order"),
+    "varpin.study.extremes": ("check_robot",),
     "varpin.study.linearization_check": ("LinearizationCheck", "check_linearization"),
     "varpin.control.mpc": ("Mpc", "MpcRun", "Plant"),
     "varpin.io.scenefile": ("Required", "SceneFile", "SceneFileError", "load_scene"),

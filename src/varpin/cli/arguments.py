@@ -22,14 +22,12 @@ from varpin.model import Robot, load_robot
 from varpin.support.checks import JointValues, joint_array
 
 
-def add_robot(parser: argparse.ArgumentParser, *, optional: bool = False, scenes: bool = False) -> None:
+def add_robot(parser: argparse.ArgumentParser, *, scenes: bool = False) -> None:
     """The robot by name or file, and the joints to lock."""
     parser.add_argument(
         "robot",
         metavar="ROBOT",
-        nargs="?" if optional else None,
         help="path of a URDF file, or name of a robot of varpin or of example-robot-data"
-        + ("; scenes made up for it if left out" if optional else "")
         + ("; or a scene file (TOML), or name of a scene of varpin" if scenes else ""),
     )
     add_robot_options(parser)

@@ -6,21 +6,16 @@ import argparse
 import logging
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.text import Text
-
-from varpin.model import load_robot
-from varpin.study.tradeoff import advise, work_precision
-
-if TYPE_CHECKING:
-    from varpin.study.extremes import Cell
 
 from varpin.cli.arguments import add_motion, add_robot, motion_of, robot_options, simulate_words
 from varpin.cli.console import progress_bar, say
 from varpin.cli.exits import FAULTY, INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import folder_at
+from varpin.model import load_robot
+from varpin.study.tradeoff import advise, work_precision
 from varpin.support.tables import WIDTH, add_row, table_of
 
 
@@ -164,49 +159,44 @@ def _paper(request: argparse.Namespace, errors: Console) -> int:
 def add_extremes(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin extremes``."""
     parser.description = (
-        "Run scenes at the extremes with every integrator, and judge each result by independent checks: accurate; "
-        "degraded, and varpin says so; refused; stopped; or silent wrong, which is a fault of varpin's. What is in the "
-        "folder already is not run again, so an interrupted battery goes on where it stopped. Exit status 1 if "
-        "anything is silent wrong."
+        "Run a robot's motions where it is hard with every integrator, and judge each by independent checks: accurate; "
+        "degraded, and varpin says so; refused; stopped; or silent wrong, which is a fault of varpin's. Exit status 1 "
+        "if anything is silent wrong."
     )
     parser.set_defaults(run=_extremes, log_level=logging.CRITICAL)
-    add_robot(parser, optional=True)
-    parser.add_argument("--deep", action="store_true", help="the long scenes too: hours")
+    add_robot(parser)
+    parser.add_argument("--deep", action="store_true", help="give each motion 15 minutes of work instead of 20 s")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="write the record (JSON) and a heat map (HTML)")
     parser.add_argument("--quiet", action="store_true", help="print nothing but what is silent wrong")
 
 
 def _extremes(request: argparse.Namespace, errors: Console) -> int:
     from varpin.show import extremes_report as report  # noqa: PLC0415 - most commands have no use for it
-    from varpin.study.extremes import Kind, run  # noqa: PLC0415
+    from varpin.study.extremes import Kind, check_robot  # noqa: PLC0415
 
-    robot = None
-    if request.robot is not None:
-        robot = load_robot(request.robot, **robot_options(request))
+    robot = load_robot(request.robot, **robot_options(request))
     folder = None if request.out is None else folder_at(request.out)
     with request.interrupts.keeping(), progress_bar(errors, 1, quiet=request.quiet, unit="cells") as progress:
-        record = run(
+        record = check_robot(
             robot,
-            deep=request.deep,
-            save=None if folder is None else folder / "extremes.json",
+            patience=900.0 if request.deep else 20.0,
             progress=lambda done, cells, _: progress(done, cells),
         )
+    if folder is not None:
+        record.save(folder / "extremes.json")
     files = [] if folder is None else [folder / "extremes.json", report.write_page(folder / "extremes.html", record)]
     console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
-    columns, rows = report.grid(record)
     if not request.quiet:
-        table = table_of(f"{record.robot} at the extremes", ("scene", *columns))
-        last = ""
-        for family, trial, cells in rows:
-            if family != last:
-                add_row(table, family, style="bold")
-                last = family
-            entries = (cells.get(name) for name in columns)
-            table.add_row(Text(f"  {trial}"), *(_extreme(cell) for cell in entries))
+        columns, rows = report.grid(record)
+        table = table_of(f"{record.robot} at the extremes", ("motion", *columns))
+        for name, cells in rows.items():
+            entries = (cells.get(column) for column in columns)
+            table.add_row(
+                Text(name), *(Text(report.entry(c), style=report.STYLES[c.kind]) if c else Text("") for c in entries)
+            )
         console.print(table)
         for kind, count in record.counts().items():
             say(console, f"{count} {kind.value}", prefix=report.LETTERS[kind])
-        say(console, report.false_alarms(record), prefix="needless")
         for path in files:
             say(console, str(path), prefix="written")
     for cell in record.wrong():
@@ -214,9 +204,3 @@ def _extremes(request: argparse.Namespace, errors: Console) -> int:
     if record.missing:
         return INTERRUPTED
     return FAULTY if record.wrong() else 0
-
-
-def _extreme(cell: Cell | None) -> Text:
-    from varpin.show.extremes_report import STYLES, entry  # noqa: PLC0415
-
-    return Text("") if cell is None else Text(entry(cell), style=STYLES[cell.kind])

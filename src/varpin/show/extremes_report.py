@@ -1,16 +1,15 @@
-"""A record of extreme scenes as a page (HTML): a heat map of every scene with every integrator, without scripts."""
+"""What came of a robot at the extremes as a page (HTML): a heat map of motions and integrators, without scripts."""
 
 from __future__ import annotations
 
 import html
 import math
 import os
-from collections.abc import Iterable
 from pathlib import Path
 
 from varpin.io.archive import atomic_file
 from varpin.study.extremes import Cell, Kind, Record
-from varpin.study.extremes.trial import LEVELS
+from varpin.study.extremes.record import LEVELS
 from varpin.support.checks import writable
 from varpin.support.markup import page
 
@@ -36,7 +35,7 @@ table { font-size: 0.78rem; }
 th { border: 0; font-weight: 600; padding: 0.15rem 0.5rem; }
 thead th { position: sticky; top: 0; background: #fff; font-size: 0.72rem; vertical-align: bottom; }
 td { border: 1px solid #fff; padding: 0.15rem 0.4rem; min-width: 4.2rem; text-align: right; white-space: nowrap; }
-td.name { text-align: left; } tr.family th { padding-top: 0.8rem; font-size: 0.9rem; border-bottom: 1px solid #bbb; }
+td.name { text-align: left; }
 .accurate0 { background: #6fc3a4; } .accurate1 { background: #9ad5bf; } .accurate2 { background: #c4e7da; }
 .degraded { background: #f6dc8b; } .refused { background: #b9d9ee; } .stopped { background: #e3c4d8; }
 .wrong { background: #c8102e; color: #fff; font-weight: 700; }
@@ -45,36 +44,29 @@ dt { padding: 0 0.5rem; } dd { margin: 0; }
 """
 
 
-def false_alarms(record: Record) -> str:
-    """How many warnings were needless, in words."""
-    warned, needless = record.counts()[Kind.DEGRADED], len(record.needless())
-    return f"Of {warned} cells that varpin warns of, {needless} fail no check: false alarms."
-
-
 def entry(cell: Cell) -> str:
     """A cell in a few signs: its letter and its error, or how far it came."""
     if cell.kind is Kind.STOPPED:
         return f"S {cell.done}/{cell.steps}"
     if cell.kind is Kind.REFUSED:
         return "R"
-    short = "" if cell.done == cell.steps else f" {cell.done}/{cell.steps}"
-    return f"{LETTERS[cell.kind]} {headline(cell)}{short}"
+    # The energy's error stands where no exact motion is known.
+    known = (
+        f" {cell.error:.0e}"
+        if not math.isnan(cell.error)
+        else ""
+        if math.isnan(cell.energy)
+        else f" E {cell.energy:.0e}"
+    )
+    return LETTERS[cell.kind] + known + ("" if cell.done == cell.steps else f" {cell.done}/{cell.steps}")
 
 
-def headline(cell: Cell) -> str:
-    """Its error, or what stands for it: the energy's error where no exact motion is known."""
-    if not math.isnan(cell.error):
-        return f"{cell.error:.0e}"
-    return "" if math.isnan(cell.energy) else f"E {cell.energy:.0e}"
-
-
-def grid(record: Record) -> tuple[list[str], list[tuple[str, str, dict[str, Cell]]]]:
-    """The integrators, and rows of a family, a trial and its cells by integrator."""
-    rows: dict[tuple[str, str], dict[str, Cell]] = {}
+def grid(record: Record) -> tuple[list[str], dict[str, dict[str, Cell]]]:
+    """The integrators, and the cells of each motion by integrator."""
+    rows: dict[str, dict[str, Cell]] = {}
     for cell in record.cells:
-        rows.setdefault((cell.family, cell.trial), {})[cell.integrator] = cell
-    columns = list(dict.fromkeys(cell.integrator for cell in record.cells))
-    return columns, [(family, trial, cells) for (family, trial), cells in rows.items()]
+        rows.setdefault(cell.trial, {})[cell.integrator] = cell
+    return list(dict.fromkeys(cell.integrator for cell in record.cells)), rows
 
 
 def write_page(path: str | os.PathLike[str], record: Record) -> Path:
@@ -90,45 +82,33 @@ def write_page(path: str | os.PathLike[str], record: Record) -> Path:
 
 
 def _page(record: Record) -> str:
-    columns, rows = grid(record)
-    counts = record.counts()
+    (columns, rows), counts = grid(record), record.counts()
     legend = "".join(
         f'<dt class="{_class(kind, math.nan)}">{LETTERS[kind]} {kind.value}: {counts[kind]}</dt><dd>{text}</dd>'
         for kind, text in _MEANING.items()
     )
     head = "".join(f"<th>{html.escape(name).replace('(', '<br>(')}</th>" for name in columns)
+    lines = (
+        f'<tr><td class="name">{html.escape(name)}</td>{"".join(_box(cells.get(column)) for column in columns)}</tr>\n'
+        for name, cells in rows.items()
+    )
     missing = f" An interruption left out {record.missing} cells." if record.missing else ""
     body = f"""<p>varpin {html.escape(record.version)}.
-Errors are the largest distance in q from the exact motion over some periods,
-in units of how far that motion goes; E stands before the error of the energy balance over the whole run, in units of
-the energy there is to turn over, where no exact motion is known. Point at a cell for all of its measures.{missing}</p>
+Errors are the largest distance in q from the exact motion, in units of how far that motion goes; E stands before the
+error of the energy balance over the whole run, in units of the energy there is to turn over, where no exact motion is
+known. Point at a cell for all of its measures.{missing}</p>
 <dl>{legend}</dl>
-<p>{false_alarms(record)}</p>
-<table><thead><tr><th>scene</th>{head}</tr></thead><tbody>{"".join(_rows(columns, rows))}</tbody></table>"""
+<table><thead><tr><th>motion</th>{head}</tr></thead><tbody>{"".join(lines)}</tbody></table>"""
     return page(f"Varpin at the extremes: {record.robot}", body, _STYLE)
 
 
-def _rows(columns: list[str], rows: list[tuple[str, str, dict[str, Cell]]]) -> Iterable[str]:
-    last = ""
-    for family, trial, cells in rows:
-        if family != last:
-            yield f'<tr class="family"><th colspan="{len(columns) + 1}">{html.escape(family)}</th></tr>\n'
-            last = family
-        inner = "".join(_box(cells[name]) if name in cells else "<td></td>" for name in columns)
-        yield f'<tr><td class="name">{html.escape(trial)}</td>{inner}</tr>\n'
-
-
-def _box(cell: Cell) -> str:
-    tip = html.escape(details(cell), quote=True)
-    return f'<td class="{_class(cell.kind, cell.error)}" title="{tip}">{html.escape(entry(cell))}</td>'
-
-
-def details(cell: Cell) -> str:
-    """All there is to say of a cell."""
+def _box(cell: Cell | None) -> str:
+    if cell is None:
+        return "<td></td>"
     values = [f"{name} {getattr(cell, name):.2g}" for name in LEVELS if not math.isnan(getattr(cell, name))]
-    kind = f"{cell.kind.value}, needlessly" if cell.needless else cell.kind.value
-    lines = [f"{kind}; {cell.done} of {cell.steps} steps, {cell.seconds:.2g} s", ", ".join(values)]
-    return "\n".join(line for line in (*lines, *cell.found, *cell.said) if line)
+    lines = [f"{cell.kind.value}; {cell.done} of {cell.steps} steps, {cell.seconds:.2g} s", ", ".join(values)]
+    tip = html.escape("\n".join(line for line in (*lines, *cell.found, *cell.said) if line), quote=True)
+    return f'<td class="{_class(cell.kind, cell.error)}" title="{tip}">{html.escape(entry(cell))}</td>'
 
 
 def _class(kind: Kind, error: float) -> str:

@@ -19,8 +19,8 @@ from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import changed
 from varpin.simulation.run import simulate
-from varpin.study.extremes.exact import SHORTEST, Exact, period_error
-from varpin.study.extremes.trial import CONSERVED_MOMENTUM, LEVELS, Setup
+from varpin.study.extremes.exact import SHORTEST, Exact
+from varpin.study.extremes.record import CONSERVED_MOMENTUM, LEVELS
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -186,16 +186,20 @@ def finite(trajectory: Trajectory) -> bool:
     return all(bool(np.isfinite(array).all()) for array in arrays)
 
 
-def measures(setup: Setup, integrator: Integrator, trajectory: Trajectory, exact: Exact | None) -> dict[str, float]:
+def measures(scene: Scene, integrator: Integrator, trajectory: Trajectory, exact: Exact | None) -> dict[str, float]:
     """Every check of a motion by its name in :class:`Cell`."""
-    scene = setup.scene
-    if exact is not None and exact.cut and integrator.order == 1 and exact.nodes[-1] < _STARTING and not setup.v0.any():
+    if (
+        exact is not None
+        and exact.cut
+        and integrator.order == 1
+        and exact.nodes[-1] < _STARTING
+        and not trajectory.v[0].any()
+    ):
         # What starts from rest is behind by half a step: much of what can be told of it, little of its motion.
         exact = None
     with np.errstate(over="ignore", invalid="ignore"):
         A = linearized(scene, integrator, trajectory)
         return ({} if exact is None else exact.errors(trajectory)) | {
-            "period": period_error(scene, integrator, trajectory),
             "energy": energy_error(scene, trajectory),
             "momentum": momentum_error(scene, trajectory),
             "reversal": reversal_error(scene, integrator, trajectory),
@@ -204,9 +208,9 @@ def measures(setup: Setup, integrator: Integrator, trajectory: Trajectory, exact
         }
 
 
-def condition(setup: Setup) -> float:
+def condition(scene: Scene, q0: Floats) -> float:
     """Condition number of the mass matrix at the start: rounding in its solutions is as much larger."""
-    mass = lagrangian_jet(setup.scene, setup.q0, np.zeros_like(setup.q0), backend="pinocchio").Lvv
+    mass = lagrangian_jet(scene, q0, np.zeros_like(q0), backend="pinocchio").Lvv
     return float(np.linalg.cond(mass)) if mass.size else 1.0
 
 

@@ -1,15 +1,13 @@
-"""Exact motions, and the distance of an integrator's motion from them.
+"""The exact motion of a scene, and the distance of an integrator's motion from it.
 
-The exact motion is LSODA's at 1e-11: it takes stiff dampers, and shares nothing with the integrator. Where it is
-compared and from which error on a motion is wrong are :mod:`varpin.simulation.accuracy`'s, as for the warnings.
+The exact motion is LSODA's at 1e-11: it takes stiff dampers, and shares nothing with the integrator. From which error
+on a motion is wrong is :mod:`varpin.simulation.accuracy`'s, as for the warnings.
 """
 
 from __future__ import annotations
 
-import math
 import time
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,25 +15,10 @@ import scipy
 from numpy.typing import NDArray
 
 from varpin.core import ForwardDynamics
-from varpin.errors import VarpinError
 from varpin.integrators import ExplicitEuler, Integrator
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.simulation.accuracy import (
-    CLOSE,
-    DISTURBANCE,
-    Window,
-    between,
-    changed,
-    disturbance,
-    examined_nodes,
-    grown,
-    inertias,
-    light_speed,
-    masses,
-    noticed,
-)
-from varpin.study.extremes.trial import Setup
+from varpin.simulation.accuracy import DISTURBANCE, changed, grown, light_speed, masses, noticed
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -43,66 +26,25 @@ Floats = NDArray[np.float64]
 _TOLERANCE = 1e-11
 # Speeds below this count as it [rad/s or m/s].
 _SLOWEST = 1e-3
-# Ways shorter than this count as it in a window; over a period they are the tolerance's own [rad or m].
-SHORTEST, _SHORTEST_PERIOD = 1e-6, 1e-8
-# Steps integrated between two tests of whether the motion is still predictable.
-_CHUNK = 32
-# Processor time, which other programs do not change [s]: for the motion of a window, for all periods, for one of them.
-_PATIENCE, _PATIENCE_PERIODS, _PATIENCE_PERIOD = 3.0, 4.0, 1.0
+# Ways shorter than this count as it [rad or m].
+SHORTEST = 1e-6
+# Processor time for the motion of a window, which other programs do not change [s].
+PATIENCE = 3.0
 # Nodes of a window, and those at its start, where what is stiff dies out.
-_NODES, _START = 32, 4
+NODES, START = 32, 4
 
 
-class _EndsHereError(ArithmeticError):
+class EndsHereError(ArithmeticError):
     """The exact motion goes no further, or takes too long."""
 
 
-def motion_of(
-    scene: Scene, x: Floats, u: Floats, dt: float, *, dw: Floats | None, left: float, origin: Floats, end: float
-) -> Iterator[Floats]:
-    """States (K, 2n) of the exact motion, the first itself, then step by step or many at once.
-
-    It ends where it cannot be integrated, or at a processor time.
-
-    Args:
-        scene: The scene.
-        x: q and v at first (2n,).
-        u: Controls of each step (N, m).
-        dt: Time step [s].
-        dw: Increments of the Wiener processes (N, k), or None.
-        left: Part of each kick that comes before its step; the rest comes after it.
-        origin: Configuration that diffusion fields are relative to (n,).
-        end: Processor time at which it ends [s].
-    """
-    dynamics, done, length = ForwardDynamics(scene.core), 0, 1
-
-    def kicked(x: Floats, part: float) -> Floats:
-        if dw is None or not part:
-            return x
-        q, v = np.split(x, 2)
-        field = scene.noise.fields(q[None], v[None], u[done : done + 1], origin).F[0]
-        return np.append(q, v + part * np.linalg.solve(masses(scene, q[None])[0], field @ dw[done]))
-
-    yield x[None]
-    while done < len(u):
-        same = (u[done : done + length] == u[done]).all(axis=1)
-        ahead = 1 if dw is not None else len(same) if same.all() else int(same.argmin())
-        try:
-            states = _integrated(dynamics, scene.actuation @ u[done], kicked(x, left), dt, ahead, end)
-        except _EndsHereError:
-            return
-        states[-1] = kicked(states[-1], 1.0 - left)
-        yield states
-        x, done, length = states[-1], done + ahead, min(2 * length, _CHUNK)
-
-
-def _integrated(dynamics: ForwardDynamics, force: Floats, x: Floats, dt: float, steps: int, end: float) -> Floats:
+def integrated(dynamics: ForwardDynamics, force: Floats, x: Floats, dt: float, steps: int, end: float) -> Floats:
     """(q, v) after each of some steps (K, 2n) under one force."""
 
     def rate(_: float, x: Floats) -> Floats:
         slope, regular = dynamics.rate(x, force)
         if not (regular and np.isfinite(slope).all()) or time.process_time() > end:
-            raise _EndsHereError
+            raise EndsHereError
         return slope
 
     n = len(force)
@@ -114,26 +56,8 @@ def _integrated(dynamics: ForwardDynamics, force: Floats, x: Floats, dt: float, 
             rate, x, dt * np.arange(steps + 1), rtol=_TOLERANCE, atol=atol, tfirst=True, mxstep=10**6, full_output=True
         )
     if report["message"] != "Integration successful.":
-        raise _EndsHereError
+        raise EndsHereError
     return np.asarray(states[1:])
-
-
-def _predictable(plain: Iterator[Floats], disturbed: Iterator[Floats], by: float) -> tuple[Floats, int]:
-    """States (K + 1, 2n) of a motion, and after how many steps a disturbance of q has grown out of hand, K if never."""
-    rows: list[list[Floats]] = [[], []]
-    states, known = np.zeros((0, 0)), 0
-    for parts in zip(plain, disturbed, strict=False):
-        for row, part in zip(rows, parts, strict=True):
-            row.append(part)
-        states, other = (np.concatenate(row) for row in rows)
-        n = states.shape[1] // 2
-        known = grown(states[:, :n], other[:, :n], by) if len(states) > 1 else 0
-        if known < len(states) - 1:
-            break
-    return states, known
-
-
-# --- from the start ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,115 +99,71 @@ class Exact:
         }
 
 
-def exact_motion(setup: Setup, dt: float, steps: int, window: float, *, late: bool = False) -> Exact:
-    """The exact motion over a window, as far as a small disturbance does not grow out of hand.
+def kicked(scene: Scene, x: Floats, u: Floats, dw: Floats, origin: Floats) -> Floats:
+    """A state (2n,) after the kick of a step's increments (k,); diffusion fields are relative to ``origin`` (n,)."""
+    q, v = np.split(x, 2)
+    field = scene.noise.fields(q[None], v[None], u[None], origin).F[0]
+    return np.append(q, v + np.linalg.solve(masses(scene, q[None])[0], field @ dw))
 
-    In closed form where there is one. A kick comes before its step, or after it if ``late``: to strong order one,
-    which is what is promised of additive noise, that is the same motion.
 
-    Raises:
-        VarpinError: It cannot be integrated over a single step.
+def exact_motion(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, window: float, ahead: Floats | float = 0.0
+) -> Exact | None:
+    """The exact motion from a trajectory's start over a window [s], as far as a small disturbance does not grow.
+
+    Where q is ``ahead`` by whole turns it is computed without them. A kick comes before its step, or after the step of
+    the explicit Euler method, which does not know of it. None where it cannot be integrated over a single step.
     """
-    steps = min(steps, max(1, round(window / dt)))
-    varying = (setup.controls is not None and setup.controls.ndim == 2) or setup.increments is not None
-    stride = 1 if varying else max(1, steps // _NODES)
-    if varying:
-        steps = min(steps, 2 * _NODES)
-    nodes = np.union1d(np.arange(1, min(steps, _START) + 1), np.arange(stride, steps + 1, stride))
-    if setup.exact is not None:
-        q, v = (np.array(part) for part in zip(*(setup.exact(k * dt) for k in nodes), strict=True))
-        known = steps
-    else:
-        states, known = _reference(setup, dt, int(nodes[-1]), late)
-        if not known:
-            raise VarpinError("there is no exact motion of a single step")
-        q, v = np.split(states[nodes[nodes < len(states)]], 2, axis=1)
-        q = q + setup.shift
+    dt, steps = trajectory.dt, min(trajectory.steps, max(1, round(window / trajectory.dt)))
+    if not trajectory.steps:
+        return None
+    u, dw, q0, v0 = trajectory.u[:steps], trajectory.dw[:steps], trajectory.q[0] - ahead, trajectory.v[0]
+    # The first of the steps that each control is held for.
+    noisy, late = bool(dw.any()), isinstance(integrator, ExplicitEuler)
+    first = np.flatnonzero(np.append(True, (u[1:] != u[:-1]).any(axis=1) | noisy))
+    if len(first) > 1:
+        steps = min(steps, 2 * NODES)
+    first, end = first[first < steps], time.process_time() + PATIENCE
+    dynamics, paths = ForwardDynamics(scene.core), []
+    for by in (0.0, DISTURBANCE):
+        states = np.append(q0 + by, v0)[None]
+        for begin, after in zip(first, np.append(first[1:], steps), strict=True):
+            x, given = states[-1], (u[begin], dw[begin], trajectory.q[0])
+            if noisy and not late:
+                x = kicked(scene, x, *given)
+            try:
+                more = integrated(dynamics, scene.actuation @ u[begin], x, dt, int(after - begin), end)
+            except EndsHereError:
+                break
+            if noisy and late:
+                more[-1] = kicked(scene, more[-1], *given)
+            states = np.concatenate([states, more])
+        paths.append(states)
+    known = min(map(len, paths))
+    if known < 2:
+        return None
+    plain, disturbed = (states[:known] for states in paths)
+    known = grown(plain[:, : len(q0)], disturbed[:, : len(q0)], DISTURBANCE)
+    stride = 1 if len(first) > 1 else max(1, steps // NODES)
+    nodes = np.union1d(np.arange(1, min(steps, START) + 1), np.arange(stride, steps + 1, stride))
     # At the last of the known steps the disturbance has grown already, if they are not all.
     count = int((nodes <= (known if known >= nodes[-1] else max(1, known - 1))).sum())
-    return _in_units(setup, dt, nodes[:count], q[:count], v[:count], cut=count < len(nodes))
+    q, v = np.split(plain[nodes[:count]], 2, axis=1)
+    return in_units(scene, trajectory.q[0], v0, dt, nodes[:count], q + ahead, v, cut=count < len(nodes))
 
 
-def _reference(setup: Setup, dt: float, steps: int, late: bool) -> tuple[Floats, int]:
-    scene = setup.scene if setup.twin is None else setup.twin
-    origin, end = setup.q0 - setup.shift, time.process_time() + _PATIENCE
-    controls = np.zeros(scene.controls) if setup.controls is None else setup.controls
-    u = np.broadcast_to(controls, (steps, scene.controls)) if controls.ndim == 1 else controls[:steps]
-
-    def path(by: float) -> Iterator[Floats]:
-        x, left = np.append(origin + by, setup.v0), 0.0 if late else 1.0
-        return motion_of(scene, x, u, dt, dw=setup.increments, left=left, origin=setup.q0, end=end)
-
-    return _predictable(path(0.0), path(DISTURBANCE), DISTURBANCE)
-
-
-def _in_units(setup: Setup, dt: float, nodes: NDArray[np.int64], q: Floats, v: Floats, *, cut: bool) -> Exact:
+def in_units(
+    scene: Scene, q0: Floats, v0: Floats, dt: float, nodes: NDArray[np.int64], q: Floats, v: Floats, *, cut: bool
+) -> Exact:
     """An exact motion with its ways and speeds: of each joint its own, or a small part of the others'."""
-    velocities = np.vstack([setup.v0, v])
-    M = lagrangian_jet(setup.scene, setup.q0, np.zeros_like(setup.q0), backend="pinocchio").Lvv
+    velocities = np.vstack([v0, v])
+    M = lagrangian_jet(scene, q0, np.zeros_like(q0), backend="pinocchio").Lvv
     ways, speeds = noticed(
-        setup.scene,
-        np.abs(q - setup.q0).max(axis=0),
+        scene,
+        np.abs(q - q0).max(axis=0),
         np.abs(velocities).max(axis=0),
         light_speed(np.diag(M), changed(velocities)),
         np.asarray(float(nodes[-1]) * dt),
     )
-    way = max(float(np.abs(q - setup.q0).max()), SHORTEST)
+    way = max(float(np.abs(q - q0).max()), SHORTEST)
     return Exact(nodes, q, v, way, np.maximum(ways, SHORTEST), np.maximum(speeds, SHORTEST), cut)
-
-
-# --- from nodes all over the motion --------------------------------------------------------------------------------
-
-
-def period_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> float:
-    """The largest error over a period from any of some nodes, in units of what is wrong; NaN where none is known.
-
-    From the nodes of :func:`varpin.simulation.accuracy.examined_nodes` and three more; from many more where the error
-    comes close to what is wrong. One of them that is wrong makes the motion wrong.
-    """
-    if not trajectory.steps or scene.noise.diffusion is None or not np.abs(trajectory.v).max() > 0.0:
-        return math.nan
-    quarters = np.linspace(0, trajectory.steps, 5)[1:-1].astype(np.int64)
-    first = examined_nodes(scene, trajectory)
-    inertia = inertias(scene, trajectory.q[first])
-    first = np.concatenate([first, np.setdiff1d(quarters, first)])
-    worst, end = math.nan, time.process_time() + _PATIENCE_PERIODS
-    for steps in (first, between(trajectory.steps, first)):
-        for step in steps.tolist():
-            worst = np.fmax(worst, _error_from(scene, integrator, trajectory, step, inertia))
-            if worst >= 1.0 or time.process_time() > end:
-                return float(worst)
-        if not worst >= CLOSE:
-            break
-    return float(worst)
-
-
-def _error_from(scene: Scene, integrator: Integrator, trajectory: Trajectory, step: int, inertia: Floats) -> float:
-    """The error over a period from one node, as far as a small disturbance does not grow out of hand.
-
-    NaN where the exact motion ends before: of a part of a start, even half a step is much; and where nothing moves
-    to speak of.
-    """
-    n, node = scene.robot.dof, Window.at(scene, trajectory, step)
-    count = int(node.judged.max())
-    by = disturbance(trajectory, step, count)
-    end = time.process_time() + _PATIENCE_PERIOD
-    ahead = slice(step, step + count)
-
-    def path(in_q: float, in_v: float) -> Iterator[Floats]:
-        x = np.concatenate([trajectory.q[step] + in_q, trajectory.v[step] + in_v])
-        dw = trajectory.dw[ahead] if trajectory.dw.any() else None
-        # Explicit Euler's kicks come after the step.
-        left = 0.0 if isinstance(integrator, ExplicitEuler) else integrator.left
-        u, dt = trajectory.u[ahead], trajectory.dt
-        return motion_of(scene, x, u, dt, dw=dw, left=left, origin=trajectory.q[0], end=end)
-
-    plain, known = _predictable(path(0.0, 0.0), path(*by), by[0])
-    if known == len(plain) - 1 < count:
-        return math.nan
-    nodes, plain = slice(step, step + known + 1), plain[: known + 1]
-    if max(np.ptp(q, axis=0).max() for q in (plain[:, :n], trajectory.q[nodes])) < _SHORTEST_PERIOD:
-        return math.nan
-    with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(plain[:, :n] - trajectory.q[nodes]), np.abs(plain[:, n:] - trajectory.v[nodes])
-    return node.error(scene, trajectory, inertia, off, cut=known < count).worst

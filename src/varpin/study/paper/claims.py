@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,14 @@ class Claim:
 NOT_MEASURED = "not measured"
 # A growth, or a change with the step, is "far" greater than another from this factor on.
 FAR = 3.0
+# Sentences of several claims.
+_APART = "The optimized solution obtained by the Euler method is far more dependent on the step size."
+_FAR_GROWTH = "The growth in the cost is far greater when the Euler method is used."
+_EXCESS = (
+    "Over the sampled-data optimum the true cost of {} stays below 2% up to 6 ms, and Euler's exceeds ten times "
+    "that or fails."
+)
+_HINGE = "The claims do not hinge on what the paper leaves open: {}."
 # Which of both true costs one number stands for.
 _BETTER = "the better of open loop and feedback"
 
@@ -119,146 +128,39 @@ def free_motions() -> dict[tuple[str, float], Trajectory]:
 
 # The numbers in words, and the verdict.
 Judgement = tuple[str, str]
+Judge = Callable[[Any], Judgement]
+
+# Sources, sentences and judgements, of motions and of cells: in the order of the report.
+_OF_MOTIONS: list[tuple[str, str, Judge]] = []
+_OF_CELLS: list[tuple[str, str, Judge]] = []
+
+
+def _claim(source: str, sentence: str, among: list[tuple[str, str, Judge]] = _OF_CELLS) -> Callable[[Judge], Judge]:
+    """Make a claim of what judges it; its :class:`NotRunError` says that its cells were not run."""
+
+    def keep(judge: Judge) -> Judge:
+        among.append((source, sentence, judge))
+        return judge
+
+    return keep
 
 
 def assess(cells: Cells, motions: Motions) -> list[Claim]:
     """Every claim of the paper and of varpin."""
-    claims = []
-    for source, sentence, judge in _claims(cells, motions):
-        try:
-            claims.append(Claim(source, sentence, *judge()))
-        except NotRunError:
-            claims.append(Claim(source, sentence, "The cells that could tell were not run.", NOT_MEASURED))
-    return claims
-
-
-def _claims(cells: Cells, motions: Motions) -> list[tuple[str, str, Callable[[], Judgement]]]:
-    """Sources, sentences and judgements; :class:`NotRunError` of a judgement says that its cells were not run."""
-    apart = "The optimized solution obtained by the Euler method is far more dependent on the step size."
-    far = "The growth in the cost is far greater when the Euler method is used."
-    excess = (
-        "Over the sampled-data optimum the true cost of {} stays below 2% up to 6 ms, and Euler's exceeds ten times "
-        "that or fails."
-    )
     variations = [setting for setting in VARIATIONS if series(cells, setting, "0", "Euler")]
-    return [
-        (
-            "paper, section 1.1",
-            "alpha = 1/2 results in second order accuracy.",
-            lambda: _order(motions),
-        ),
-        (
-            "paper, section 1.1",
-            "Variational integrators are able to ensure (or strongly enforce) the conservation of fundamental "
-            "quantities such as momentum and energy.",
-            lambda: _conserved(motions),
-        ),
-        (
-            "paper, figure 1",
-            "The accuracy of the Euler method is degraded when the discretization step size is increased while the "
-            "variational integrator is negligibly affected.",
-            lambda: _free(motions),
-        ),
-        (
-            "paper, section 3, case 1",
-            "If the additive noise is neither state nor control dependent the S-DDP algorithm is equivalent to the "
-            "classic DDP solution.",
-            lambda: _additive(cells),
-        ),
-        ("paper, figures 2a and 2b, case 1", apart, lambda: _solution(cells, "1")),
-        (
-            "paper, table 1 and figure 5, case 1",
-            "The optimized cost increases more rapidly as the discretization time step is increased when the Euler "
-            "method is used.",
-            lambda: _growth(cells, "1"),
-        ),
-        (
-            "paper, table 1",
-            "The number of algorithm iterations is more predictable when the variational integrator is used.",
-            lambda: _iterations(cells),
-        ),
-        (
-            "paper, figure 2c",
-            "When the variational integrator is used the required computational time can be drastically reduced "
-            "without significantly changing the optimized cost.",
-            lambda: _time(cells),
-        ),
-        (
-            "paper, section 3 (left to future work there)",
-            "The growth of the optimized cost when the variational integrator is used is caused, in part, by the "
-            "reduction of the controller's bandwidth.",
-            lambda: _bandwidth(cells),
-        ),
-        ("paper, figures 3a and 3b, case 2", apart, lambda: _solution(cells, "2")),
-        (
-            "paper, figure 3c, case 2",
-            "The optimal control input is dependent on the time step, since it is advantageous to reduce the amount of "
-            "induced noise.",
-            lambda: _controls(cells),
-        ),
-        ("paper, figure 5b, case 2", far, lambda: _far_growth(cells, "2")),
-        (
-            "paper, case 3",
-            "Both methods are strongly dependent on the discretization step size.",
-            lambda: _state_dependent(cells),
-        ),
-        (
-            "paper, figure 4, case 3",
-            "The optimized state trajectory is dependent on the step size: it is advantageous to keep the system near "
-            "its start.",
-            lambda: _trajectory(cells),
-        ),
-        ("paper, table 1, case 3", far, lambda: _far_growth(cells, "3")),
-        (
-            "paper, abstract",
-            "The proposed variational integrator can be used to enable real-time implementation of nonlinear optimal "
-            "control algorithms.",
-            lambda: (
-                "No control loop was run here against the clock; times of single searches are under figure 2c.",
-                NOT_MEASURED,
-            ),
-        ),
-        (
-            "paper, conclusion",
-            "These benefits are not limited to S-DDP: similar improvements can be expected of any process that "
-            "utilizes propagated system trajectories or linearized system dynamics.",
-            lambda: ("No other process was run here.", NOT_MEASURED),
-        ),
-        (
-            "varpin",
-            excess.format("the plan with the midpoint integrator"),
-            lambda: _excess(cells, "variational"),
-        ),
-        (
-            "varpin",
-            excess.format("the plan with Gauss collocation of fourth order"),
-            lambda: _excess(cells, cases.FOURTH_ORDER),
-        ),
-        (
-            "varpin",
-            "The variational plan's true cost is never above Euler's at the same step.",
-            lambda: _true_cost(cells),
-        ),
-        (
-            "varpin",
-            "The feedback gains, referred to the middle of the step, converge as dt^2.",
-            lambda: _gains(cells),
-        ),
-        (
-            "varpin",
-            "Where noise matters, S-DDP's policy has a lower expected cost than that of DDP, which knows of no noise, "
-            "and its predicted cost is right to 5%.",
-            lambda: _under_noise(cells),
-        ),
-        *(
-            (
-                "varpin",
-                f"The claims do not hinge on what the paper leaves open: {setting.title}.",
-                lambda setting=setting: _hinge(cells, setting),
-            )
-            for setting in variations
-        ),
+    hinges: list[tuple[str, str, Judge]] = [
+        ("varpin", _HINGE.format(setting.title), partial(_hinge, setting=setting)) for setting in variations
     ]
+    claims = []
+    given: tuple[tuple[Any, list[tuple[str, str, Judge]]], ...]
+    given = (motions, _OF_MOTIONS), (cells, [*_OF_CELLS, *hinges])
+    for results, members in given:
+        for source, sentence, judge in members:
+            try:
+                claims.append(Claim(source, sentence, *judge(results)))
+            except NotRunError:
+                claims.append(Claim(source, sentence, "The cells that could tell were not run.", NOT_MEASURED))
+    return claims
 
 
 # --- without controls ----------------------------------------------------------------------------------------------
@@ -272,6 +174,7 @@ def _error(motions: Motions, method: str, dt: float) -> float:
     return float(np.abs(motion.q[:, 0] - np.interp(motion.t, exact.t, exact.q[:, 0])).max())
 
 
+@_claim("paper, section 1.1", "alpha = 1/2 results in second order accuracy.", _OF_MOTIONS)
 def _order(motions: Motions) -> Judgement:
     steps, orders = FREE_STEPS[1:], {}
     for method in METHODS:
@@ -284,6 +187,12 @@ def _order(motions: Motions) -> Judgement:
     )
 
 
+@_claim(
+    "paper, section 1.1",
+    "Variational integrators are able to ensure (or strongly enforce) the conservation of fundamental "
+    "quantities such as momentum and energy.",
+    _OF_MOTIONS,
+)
 def _conserved(motions: Motions) -> Judgement:
     drifts = {}
     for method in METHODS:
@@ -299,6 +208,12 @@ def _conserved(motions: Motions) -> Judgement:
     )
 
 
+@_claim(
+    "paper, figure 1",
+    "The accuracy of the Euler method is degraded when the discretization step size is increased while the "
+    "variational integrator is negligibly affected.",
+    _OF_MOTIONS,
+)
 def _free(motions: Motions) -> Judgement:
     travel, rows = float(np.ptp(motions[REFERENCE, cases.FINE].q[:, 0])), []
     for method in METHODS:
@@ -328,6 +243,11 @@ def _steps_of(fine: Cell) -> str:
     return f"dt = {fine.dt:g} s to {COARSE:g} s"
 
 
+@_claim(
+    "paper, section 3, case 1",
+    "If the additive noise is neither state nor control dependent the S-DDP algorithm is equivalent to the "
+    "classic DDP solution.",
+)
 def _additive(cells: Cells) -> Judgement:
     differences = []
     for noisy in series(cells, MAIN, "1", "variational"):
@@ -370,6 +290,9 @@ def _solution(cells: Cells, case: str) -> Judgement:
     )
 
 
+_claim("paper, figures 2a and 2b, case 1", _APART)(partial(_solution, case="1"))
+
+
 def _growths(cells: Cells, case: str) -> tuple[tuple[float, float], tuple[float, float], str]:
     """Growth of both methods' optimized costs: expected, of the mean motion alone, and in words."""
     pairs = [_pair(cells, case, method) for method in METHODS]
@@ -382,8 +305,13 @@ def _growths(cells: Cells, case: str) -> tuple[tuple[float, float], tuple[float,
     return (vi, euler), (vi_mean, euler_mean), text
 
 
-def _growth(cells: Cells, case: str) -> Judgement:
-    (vi, euler), (vi_mean, euler_mean), text = _growths(cells, case)
+@_claim(
+    "paper, table 1 and figure 5, case 1",
+    "The optimized cost increases more rapidly as the discretization time step is increased when the Euler "
+    "method is used.",
+)
+def _growth(cells: Cells) -> Judgement:
+    (vi, euler), (vi_mean, euler_mean), text = _growths(cells, "1")
     return f"{text}.", verdict(euler > vi, euler_mean > vi_mean)
 
 
@@ -394,6 +322,9 @@ def _far_growth(cells: Cells, case: str) -> Judgement:
     return f"{text}.{note}", verdict(far[0])
 
 
+@_claim(
+    "paper, table 1", "The number of algorithm iterations is more predictable when the variational integrator is used."
+)
 def _iterations(cells: Cells) -> Judgement:
     counts = {
         method: [c.iterations for case in CASES for c in series(cells, MAIN, case.key, method) if c.dt <= COARSE]
@@ -410,6 +341,11 @@ def _iterations(cells: Cells) -> Judgement:
     )
 
 
+@_claim(
+    "paper, figure 2c",
+    "When the variational integrator is used the required computational time can be drastically reduced "
+    "without significantly changing the optimized cost.",
+)
 def _time(cells: Cells) -> Judgement:
     a, b = _pair(cells, "1", "variational")
     expected = (b.cost + b.noise_cost) / (a.cost + a.noise_cost) - 1.0
@@ -422,6 +358,11 @@ def _time(cells: Cells) -> Judgement:
     )
 
 
+@_claim(
+    "paper, section 3 (left to future work there)",
+    "The growth of the optimized cost when the variational integrator is used is caused, in part, by the "
+    "reduction of the controller's bandwidth.",
+)
 def _bandwidth(cells: Cells) -> Judgement:
     optima = series(cells, MAIN, "0", OPTIMUM)
     if len(optima) < 2:
@@ -434,6 +375,14 @@ def _bandwidth(cells: Cells) -> Judgement:
     )
 
 
+_claim("paper, figures 3a and 3b, case 2", _APART)(partial(_solution, case="2"))
+
+
+@_claim(
+    "paper, figure 3c, case 2",
+    "The optimal control input is dependent on the time step, since it is advantageous to reduce the amount "
+    "of induced noise.",
+)
 def _controls(cells: Cells) -> Judgement:
     noisy, plain = (_pair(cells, case, "variational", COARSEST) for case in ("2", "0"))
     change, quiet = (_controls_apart(*pair, until=0.1) for pair in (noisy, plain))
@@ -446,6 +395,10 @@ def _controls(cells: Cells) -> Judgement:
     )
 
 
+_claim("paper, figure 5b, case 2", _FAR_GROWTH)(partial(_far_growth, case="2"))
+
+
+@_claim("paper, case 3", "Both methods are strongly dependent on the discretization step size.")
 def _state_dependent(cells: Cells) -> Judgement:
     (vi, euler), _, _ = _growths(cells, "3")
     pairs = [_pair(cells, "3", method) for method in METHODS]
@@ -457,6 +410,11 @@ def _state_dependent(cells: Cells) -> Judgement:
     )
 
 
+@_claim(
+    "paper, figure 4, case 3",
+    "The optimized state trajectory is dependent on the step size: it is advantageous to keep the system near"
+    " its start.",
+)
 def _trajectory(cells: Cells) -> Judgement:
     noisy, plain = (_pair(cells, case, "variational") for case in ("3", "0"))
     change, quiet = (_apart(*pair, slice(1)) for pair in (noisy, plain))
@@ -468,6 +426,24 @@ def _trajectory(cells: Cells) -> Judgement:
         f"{by_noise:.2g} rad. Largest tracking error {error:.2g} rad.",
         verdict(change > 0.1 * error, by_noise > 0.5 * change),
     )
+
+
+_claim("paper, table 1, case 3", _FAR_GROWTH)(partial(_far_growth, case="3"))
+_claim(
+    "paper, abstract",
+    "The proposed variational integrator can be used to enable real-time implementation of nonlinear optimal "
+    "control algorithms.",
+)(
+    lambda _: (
+        "No control loop was run here against the clock; times of single searches are under figure 2c.",
+        NOT_MEASURED,
+    )
+)
+_claim(
+    "paper, conclusion",
+    "These benefits are not limited to S-DDP: similar improvements can be expected of any process that "
+    "utilizes propagated system trajectories or linearized system dynamics.",
+)(lambda _: ("No other process was run here.", NOT_MEASURED))
 
 
 # --- varpin's own --------------------------------------------------------------------------------------------------
@@ -489,6 +465,13 @@ def _excess(cells: Cells, method: str) -> Judgement:
     return f"Excess (own / Euler), each {_BETTER}: {'; '.join(rows)}.", verdict(all(small), all(large))
 
 
+_claim("varpin", _EXCESS.format("the plan with the midpoint integrator"))(partial(_excess, method="variational"))
+_claim("varpin", _EXCESS.format("the plan with Gauss collocation of fourth order"))(
+    partial(_excess, method=cases.FOURTH_ORDER)
+)
+
+
+@_claim("varpin", "The variational plan's true cost is never above Euler's at the same step.")
 def _true_cost(cells: Cells) -> Judgement:
     eulers = {c.dt: c.true_cost for c in series(cells, MAIN, "0", "Euler")}
     plans = series(cells, MAIN, "0", "variational")
@@ -496,6 +479,7 @@ def _true_cost(cells: Cells) -> Judgement:
     return f"At {sum(wins)} of {len(wins)} steps, of each {_BETTER}.", verdict(*wins)
 
 
+@_claim("varpin", "The feedback gains, referred to the middle of the step, converge as dt^2.")
 def _gains(cells: Cells) -> Judgement:
     rows, good = [], []
     for setting in (MAIN, *VARIATIONS):
@@ -515,6 +499,11 @@ def _gains(cells: Cells) -> Judgement:
     return f"Slopes between neighbouring steps, the finest as reference: {'; '.join(rows)}.", verdict(*good)
 
 
+@_claim(
+    "varpin",
+    "Where noise matters, S-DDP's policy has a lower expected cost than that of DDP, which knows of no noise,"
+    " and its predicted cost is right to 5%.",
+)
 def _under_noise(cells: Cells) -> Judgement:
     rows, good, near = [], [], []
     for known, blind in zip(series_of_noise(cells, STOCHASTIC), series_of_noise(cells, PLAIN), strict=True):

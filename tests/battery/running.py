@@ -6,101 +6,32 @@ import hashlib
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import cache, cached_property
 from pathlib import Path
 
-from varpin._version import __version__
+import varpin
+from battery.exact import exact_motion, period_error
+from battery.plans import PLANS, Plan, judge_plan
+from battery.scenes import TRIALS, trials_on
+from battery.trial import Outcome, Setup, Trial
 from varpin.errors import VarpinError
-from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
-from varpin.io.archive import load_json, save_json
+from varpin.integrators import ExplicitEuler, Integrator
 from varpin.model import Robot
-from varpin.simulation import limits
-from varpin.simulation.run import Interrupted, simulate
-from varpin.study.extremes.checks import condition, findings, finite, measures
-from varpin.study.extremes.exact import Exact, exact_motion
-from varpin.study.extremes.plans import PLANS, Plan, judge_plan
-from varpin.study.extremes.scenes import TRIALS, trials_on
-from varpin.study.extremes.trial import LEVELS, Cell, Kind, Outcome, Setup, Trial, line_of
+from varpin.study.extremes import checks
+from varpin.study.extremes.checks import condition, findings
+from varpin.study.extremes.exact import Exact
+from varpin.study.extremes.record import LEVELS, Cell, Kind, Record
+from varpin.study.extremes.robot import INTEGRATORS, Progress, attempt, judge
 from varpin.support.checks import positive, writable
 from varpin.trajectory import Trajectory
-
-FORMAT = "varpin.extremes/3"
-
-INTEGRATORS: tuple[Integrator, ...] = (
-    *(Midpoint(alpha=alpha) for alpha in (0.0, 0.5, 1.0)),
-    *(Gauss(stages=stages) for stages in (1, 2, 3, 4)),
-    ExplicitEuler(),
-    SemiImplicitEuler(),
-    RungeKutta4(),
-)
 
 # A motion gets this long, and the plain battery half a minute at most for one [s].
 _PATIENCE, _DEEP_PATIENCE = 20.0, 900.0
 # Between two looks at the disk [s].
 _SAVED_EVERY = 2.0
 
-Progress = Callable[[int, int, str], None]
-# What no coarse step excuses: a record that contradicts itself, and derivatives without their structure.
-_STRUCTURE = ("record", "symplecticity")
 _MEASURES = tuple(LEVELS)
-
-
-class _OutOfTime(KeyboardInterrupt):
-    """Ends a motion that takes too long, as Ctrl-C does."""
-
-
-@dataclass(frozen=True, eq=False)
-class Record:
-    """What came of a battery.
-
-    Attributes:
-        cells: In the order of the trials, and of the integrators within.
-        robot: The robot's name, or that of the battery of scenes.
-        deep: Whether the long trials were among them.
-        missing: Cells that an interruption left out.
-        version: The varpin that made it.
-    """
-
-    cells: tuple[Cell, ...]
-    robot: str
-    deep: bool
-    missing: int = 0
-    version: str = __version__
-
-    def __repr__(self) -> str:
-        counts = ", ".join(f"{count} {kind.value}" for kind, count in self.counts().items() if count)
-        return f"Record({self.robot}: {counts or 'no cells'}{f', {self.missing} missing' if self.missing else ''})"
-
-    def counts(self) -> dict[Kind, int]:
-        """How many cells there are of each kind."""
-        return {kind: sum(cell.kind is kind for cell in self.cells) for kind in Kind}
-
-    def wrong(self) -> tuple[Cell, ...]:
-        """The cells that are wrong with nothing said."""
-        return tuple(cell for cell in self.cells if cell.kind is Kind.WRONG)
-
-    def needless(self) -> tuple[Cell, ...]:
-        """The cells that varpin warns of although every check passes: false alarms."""
-        return tuple(cell for cell in self.cells if cell.needless)
-
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the record as JSON; returns its path. What is not a finite number stands there as null.
-
-        Raises:
-            FileError: The path cannot be written.
-        """
-        return save_json(path, FORMAT, self)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Record:
-        """Read a record that :meth:`save` wrote.
-
-        Raises:
-            FileError: The file is missing, damaged or something else.
-        """
-        return load_json(path, FORMAT, cls)
 
 
 def run(
@@ -176,14 +107,20 @@ def run(
     return current()
 
 
+def measures(setup: Setup, integrator: Integrator, trajectory: Trajectory, exact: Exact | None) -> dict[str, float]:
+    """Every check of a motion by its name in :class:`Cell`: those of ``check_robot``, and from nodes all over it."""
+    own = checks.measures(setup.scene, integrator, trajectory, exact)
+    return own | {"period": period_error(setup.scene, integrator, trajectory)}
+
+
 @cache
 def _sources() -> str:
-    """SHA-256 over varpin's own sources: no record outlives the code that made it."""
+    """SHA-256 over varpin's own sources and these: no record outlives the code that made it."""
     digest = hashlib.sha256()
-    folder = Path(__file__).parents[2]
-    for source in sorted(folder.rglob("*.py")):
-        digest.update(str(source.relative_to(folder)).encode())
-        digest.update(source.read_bytes())
+    for folder in (Path(varpin.__file__).parent, Path(__file__).parent):
+        for source in sorted(folder.rglob("*.py")):
+            digest.update(str(source.relative_to(folder)).encode())
+            digest.update(source.read_bytes())
     return digest.hexdigest()
 
 
@@ -230,21 +167,13 @@ class Bench:
         return self.trial.build()
 
     def _judge_motion(self, trial: Trial, integrator: Integrator, patience: float) -> Outcome:
-        trajectory, error = _simulated(self._setup, trial, integrator, patience)
-        found = measures(self._setup, integrator, trajectory, self._exact_motion(trial, integrator))
-        wrong = findings(found, integrator, condition(self._setup))
-        warnings = (warning for warning in trajectory.warnings if not warning.startswith(limits.KINDS))
-        said = (*(() if error is None else (line_of(error),)), *warnings)
-        if not finite(trajectory):
-            kind, wrong = Kind.WRONG, ("the record is not finite", *wrong)
-        elif any(text.startswith(_STRUCTURE) for text in wrong):
-            kind = Kind.WRONG
-        elif error is not None:
-            kind = Kind.STOPPED
-        elif said:
-            kind = Kind.DEGRADED
-        else:
-            kind = Kind.WRONG if wrong else Kind.ACCURATE
+        setup = self._setup
+        trajectory, error = attempt(
+            patience, setup.scene, setup.q0, setup.v0, dt=trial.dt, steps=trial.steps,
+            controls=setup.controls, increments=setup.increments, integrator=integrator,
+        )  # fmt: skip
+        found = measures(setup, integrator, trajectory, self._exact_motion(trial, integrator))
+        kind, said, wrong = judge(trajectory, error, findings(found, integrator, condition(setup.scene, setup.q0)))
         return Outcome(kind, found, said, wrong, trajectory.steps)
 
     def _exact_motion(self, trial: Trial, integrator: Integrator) -> Exact | None:
@@ -257,39 +186,3 @@ class Bench:
             except VarpinError:
                 self._exact[late] = None
         return self._exact[late]
-
-
-def _simulated(
-    setup: Setup, trial: Trial, integrator: Integrator, patience: float
-) -> tuple[Trajectory, VarpinError | None]:
-    """The motion, as far as it goes, and the error that stopped it.
-
-    Raises:
-        VarpinError: It is refused before anything ran.
-    """
-    begin = time.process_time()
-
-    def stop_late(done: int, steps: int) -> None:
-        if done < steps and time.process_time() - begin > patience:
-            raise _OutOfTime
-
-    try:
-        return simulate(
-            setup.scene,
-            setup.q0,
-            setup.v0,
-            dt=trial.dt,
-            steps=trial.steps,
-            controls=setup.controls,
-            increments=setup.increments,
-            integrator=integrator,
-            progress=stop_late,
-        ), None
-    except Interrupted as error:
-        if time.process_time() - begin <= patience:
-            raise
-        return error.trajectory, None
-    except VarpinError as error:
-        if getattr(error, "trajectory", None) is None:
-            raise
-        return error.trajectory, error  # type: ignore[attr-defined]

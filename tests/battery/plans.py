@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from battery.trial import Outcome
 from varpin.control import OptimalControlProblem, Solution, Status, solve
 from varpin.control.costs import ControlCost, Cost, Terminal, TrackingCost
 from varpin.errors import VarpinError
@@ -23,7 +24,7 @@ from varpin.model import Robot
 from varpin.model.chain import rod_chain
 from varpin.simulation.run import simulate
 from varpin.study.extremes.checks import energy_error
-from varpin.study.extremes.trial import LEVELS, Kind, Outcome
+from varpin.study.extremes.record import LEVELS, Kind
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -92,7 +93,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Plan:
-    """A task at an extreme; attributes as of :class:`varpin.study.extremes.Trial`."""
+    """A task at an extreme; attributes as of :class:`battery.Trial`."""
 
     name: str
     family: str

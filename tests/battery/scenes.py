@@ -9,20 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from battery.plans import UP, Plan, plans_on
+from battery.trial import ClosedForm, Setup, Trial
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.noise import AdditiveNoise
-from varpin.mechanics.scene import EARTH, Scene
+from varpin.mechanics.scene import Scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.model import Robot, load_robot
 from varpin.model.chain import rod_chain
-from varpin.study.extremes.plans import UP, Plan, plans_on
-from varpin.study.extremes.trial import ClosedForm, Setup, Trial
+from varpin.study.extremes.robot import Motion, flipping, motions_of
 
 Floats = NDArray[np.float64]
 
 _TURN = 2.0 * math.pi
-# Steps from rest that make a motion of which half a step is little.
-_FIRST = 40
 # Squared rate of a hanging rod of 1 m [1/s^2].
 _HANGING = 1.5 * 9.81
 
@@ -98,11 +97,6 @@ def _stiff_finger(h_omega: float, dt: float) -> Callable[[], Setup]:
         return _setup(robot, [0.3, 0.5, 0.4], gravity=False, stiffness=stiffness)
 
     return build
-
-
-def _flipping(torque: Floats) -> Floats:
-    """Torques (n,) that change their sign at each of 200 steps (200, n)."""
-    return np.where(np.arange(200) % 2 == 0, 1.0, -1.0)[:, None] * torque
 
 
 def _times() -> Iterator[Trial]:
@@ -189,7 +183,7 @@ def _loads() -> Iterator[Trial]:
     yield Trial("64 links, 1000 steps", "links", _chain(64), 1e-2, 1000, window=0.5, deep=True)
     yield Trial("256 links, 200 steps", "links", _chain(256), 1e-2, 200, window=0.1, deep=True)
     for torque, dt in ((10.0, 1e-2), (1e3, 1e-2), (1e6, 1e-3)):
-        flips = _chain(3, 0.1, controls=_flipping(np.full(3, torque)))
+        flips = _chain(3, 0.1, controls=flipping(np.full(3, torque)))
         yield Trial(f"+-{torque:g} N m, every {dt:g} s", "torque", flips, dt, 200)
     # Of a rod of 1/3 kg m^2.
     alpha = np.array([3e6])
@@ -221,43 +215,11 @@ TRIALS: tuple[Trial, ...] = (
 
 
 def trials_on(robot: Robot) -> list[Trial | Plan]:
-    """Those trials that make sense for any robot, scaled by its weight and by how fast it falls from q = 0.3."""
-    n = robot.dof
-    jet = lagrangian_jet(Scene(robot, damping=0.0), np.full(n, 0.3), np.zeros(n))
-    # The inertia that each joint has to move, and the heaviest of the forces that gravity takes it to.
-    inertia = np.diag(jet.Lvv)
-    weight = np.maximum(np.abs(jet.Lq), 1e-3 * inertia)
+    """The motions of ``check_robot``, to be judged all over and with their noise, and plans."""
 
-    def at(v: ArrayLike = 0.0, **rest: Any) -> Callable[[], Setup]:
-        return lambda: _setup(robot, 0.3, v, **{"damping": 0.0} | rest)
+    def trial(m: Motion) -> Trial:
+        twin = m.scene if m.ahead.any() else None
+        setup = Setup(m.scene, m.q0, m.v0, m.controls, m.increments, twin=twin, shift=m.ahead)
+        return Trial(m.name, m.family, lambda: setup, m.dt, m.steps, window=m.window)
 
-    # What starts to slide down is behind by half a step with any method of first order: much of its first steps, little
-    # of its motion.
-    trials = [
-        Trial(f"falls, dt = {dt:g} s", "time step", at(), dt, steps, window=max(0.3, _FIRST * dt))
-        for dt, steps in ((1e-6, 500), (1e-4, 1000), (1e-3, 1000), (0.01, 500), (0.1, 100), (0.5, 40))
-    ]
-    for rate in (10.0, 1e3):
-        window = max(1.0 / rate, _FIRST * 1e-3)
-        trials.append(Trial(f"{rate:g} rad/s", "joint rate", at(rate, gravity=False), 1e-3, 500, window=window))
-    # A mimic joint that follows turns by a part of it, and no motion is the same then.
-    turns = np.where(robot.slides | bool(robot.ties), 0.0, _TURN * 1e6)
-    heavy = at(gravity=1e3 * np.array(EARTH))
-    trials += [
-        Trial("after 1e6 turns", "turns", at(ahead=turns), 1e-3, 500, window=0.3),
-        Trial("no gravity", "gravity", at(1.0, gravity=False), 1e-2, 500, window=0.5),
-        Trial("gravity 1e4 m/s^2", "gravity", heavy, 1e-3, 500, window=_FIRST * 1e-3),
-    ]
-    for turned in (0.1, 2.4, 50.0):
-        stiff = at(stiffness=(turned / 1e-3) ** 2 * inertia)
-        trials.append(Trial(f"springs, h omega = {turned:g}", "stiffness", stiff, 1e-3, 500, window=0.01))
-    for lost in (0.1, 10.0, 1e4):
-        brakes = at(1.0, damping=lost / 1e-3 * inertia)
-        trials.append(Trial(f"dampers, h d / I = {lost:g}", "damping", brakes, 1e-3, 500, window=0.05))
-    for share in (10.0, 1e6):
-        flips = at(controls=_flipping(share * weight))
-        trials.append(Trial(f"+-{share:g} times its weight", "torque", flips, 1e-3, 200))
-    for strength in (1e-12, 1.0):
-        noisy = at(noise=AdditiveNoise(strength * weight), increments=wiener_increments(n, 1e-3, 100, 0))
-        trials.append(Trial(f"noise of {strength:g} times its weight", "noise", noisy, 1e-3, 100))
-    return [*trials, *plans_on(robot)]
+    return [*map(trial, motions_of(robot)), *plans_on(robot)]

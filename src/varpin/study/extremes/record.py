@@ -1,23 +1,17 @@
-"""A scene at an extreme, and the judgement of what came of it with one integrator."""
+"""What came of a robot's motions at the extremes: a judgement of each scene with each integrator."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import os
+from dataclasses import dataclass
 from enum import Enum
+from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from varpin.errors import VarpinError
-from varpin.integrators import Integrator
-from varpin.mechanics.scene import Scene
+from varpin._version import __version__
+from varpin.io.archive import load_json, save_json
 from varpin.simulation.accuracy import WRONG_ENERGY, WRONG_MOTION, WRONG_POSITION, WRONG_VELOCITY
 
-Floats = NDArray[np.float64]
-
-# A motion in closed form: q and v, each (n,), at a time [s].
-ClosedForm = Callable[[float], tuple[Floats, Floats]]
+FORMAT = "varpin.extremes/3"
 
 # The measures of a motion in the order of a cell's fields, and the value from which on each of them is wrong: accuracy
 # in units of the motion itself, structure in units of rounding, with a margin for ill-conditioned mass matrices.
@@ -44,58 +38,6 @@ class Kind(Enum):
     REFUSED = "refused"
     STOPPED = "stopped"
     WRONG = "silent wrong"
-
-
-@dataclass(frozen=True, eq=False)
-class Setup:
-    """Initial state and inputs of a motion.
-
-    Attributes:
-        scene: The scene.
-        q0: (n,) [rad or m].
-        v0: (n,) [rad/s or m/s].
-        controls: None, one row (m,), or a row for each step (N, m).
-        increments: Of the Wiener processes (N, k) [s^0.5], or None.
-        exact: The motion in closed form, or None.
-        twin: A scene with the same motion that is easier to compute, or None: at the origin, with angles reduced.
-        shift: Distance of q from the twin's (n,) [rad or m].
-    """
-
-    scene: Scene
-    q0: Floats
-    v0: Floats
-    controls: Floats | None = None
-    increments: Floats | None = None
-    exact: ClosedForm | None = None
-    twin: Scene | None = None
-    shift: Floats | float = 0.0
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A scene at an extreme.
-
-    Attributes:
-        name: Unique in a battery.
-        family: The extreme.
-        build: Makes the setup; may raise varpin's refusal of it.
-        dt: Time step [s].
-        steps: N.
-        window: Duration of the comparison with the exact motion [s]: some periods of what moves.
-        deep: Whether it takes long, and is left out of the usual battery.
-    """
-
-    name: str
-    family: str
-    build: Callable[[], Setup]
-    dt: float
-    steps: int
-    window: float = 1.0
-    deep: bool = False
-
-    def takes(self, integrator: Integrator) -> bool:  # noqa: ARG002
-        """Whether it is run with an integrator: with all of them."""
-        return True
 
 
 @dataclass(frozen=True)
@@ -156,22 +98,56 @@ class Cell:
         return self.warned and not self.found
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """The judgement of a motion or a plan: a part of a :class:`Cell`, and its measures by name as far as they apply."""
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What came of a battery.
 
-    kind: Kind
-    measures: dict[str, float] = field(default_factory=dict)
-    said: tuple[str, ...] = ()
-    found: tuple[str, ...] = ()
-    done: int = 0
+    Attributes:
+        cells: In the order of the trials, and of the integrators within.
+        robot: The robot's name, or that of the battery of scenes.
+        deep: Whether the long trials were among them.
+        missing: Cells that an interruption left out.
+        version: The varpin that made it.
+    """
+
+    cells: tuple[Cell, ...]
+    robot: str
+    deep: bool
+    missing: int = 0
+    version: str = __version__
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{count} {kind.value}" for kind, count in self.counts().items() if count)
+        return f"Record({self.robot}: {counts or 'no cells'}{f', {self.missing} missing' if self.missing else ''})"
+
+    def counts(self) -> dict[Kind, int]:
+        """How many cells there are of each kind."""
+        return {kind: sum(cell.kind is kind for cell in self.cells) for kind in Kind}
+
+    def wrong(self) -> tuple[Cell, ...]:
+        """The cells that are wrong with nothing said."""
+        return tuple(cell for cell in self.cells if cell.kind is Kind.WRONG)
+
+    def needless(self) -> tuple[Cell, ...]:
+        """The cells that varpin warns of although every check passes: false alarms."""
+        return tuple(cell for cell in self.cells if cell.needless)
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the record as JSON; returns its path. What is not a finite number stands there as null.
+
+        Raises:
+            FileError: The path cannot be written.
+        """
+        return save_json(path, FORMAT, self)
 
     @classmethod
-    def of_error(cls, error: Exception, kind: Kind, done: int = 0) -> Outcome:
-        """A refusal or a stop where the error is varpin's own; any other error is a fault of varpin's."""
-        if isinstance(error, VarpinError):
-            return cls(kind, said=(line_of(error),), done=done)
-        return cls(Kind.WRONG, found=(f"unnamed error: {type(error).__name__}: {error}",))
+    def load(cls, path: str | os.PathLike[str]) -> Record:
+        """Read a record that :meth:`save` wrote.
+
+        Raises:
+            FileError: The file is missing, damaged or something else.
+        """
+        return load_json(path, FORMAT, cls)
 
 
 def line_of(error: Exception) -> str:

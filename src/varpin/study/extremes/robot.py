@@ -1,0 +1,240 @@
+"""A robot's own motions where it is hard, each with every integrator and judged by independent checks."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.errors import VarpinError
+from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
+from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.noise import AdditiveNoise
+from varpin.mechanics.scene import EARTH, Scene
+from varpin.mechanics.wiener import wiener_increments
+from varpin.model import Robot, load_robot
+from varpin.simulation import limits
+from varpin.simulation.run import Interrupted, simulate
+from varpin.study.extremes.checks import condition, findings, finite, measures
+from varpin.study.extremes.exact import exact_motion
+from varpin.study.extremes.record import LEVELS, Cell, Kind, Record, line_of
+from varpin.support.checks import positive
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+Progress = Callable[[int, int, str], None]
+
+INTEGRATORS: tuple[Integrator, ...] = (
+    *(Midpoint(alpha=alpha) for alpha in (0.0, 0.5, 1.0)),
+    *(Gauss(stages=stages) for stages in (1, 2, 3, 4)),
+    ExplicitEuler(),
+    SemiImplicitEuler(),
+    RungeKutta4(),
+)
+
+# Steps from rest that make a motion of which half a step is little.
+_FIRST = 40
+# What no coarse step excuses: a record that contradicts itself, and derivatives without their structure.
+_STRUCTURE = ("record", "symplecticity")
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion that is hard to integrate.
+
+    Attributes:
+        name: Unique among a robot's.
+        family: What is extreme about it.
+        dt: Time step [s].
+        steps: N.
+        scene: The scene.
+        q0: (n,) [rad or m].
+        v0: (n,) [rad/s or m/s].
+        controls: None, or a row for each step (N, m).
+        increments: Of the Wiener processes (N, k) [s^0.5], or None.
+        ahead: Whole turns in q0 that the motion does not depend on (n,) [rad].
+        window: Duration of the comparison with the exact motion [s].
+    """
+
+    name: str
+    family: str
+    dt: float
+    steps: int
+    scene: Scene
+    q0: Floats
+    v0: Floats
+    controls: Floats | None
+    increments: Floats | None
+    ahead: Floats
+    window: float
+
+
+def motions_of(robot: Robot) -> list[Motion]:
+    """Motions that make sense for any robot, scaled by its weight and by how fast it falls from q = 0.3."""
+    n = robot.dof
+    jet = lagrangian_jet(Scene(robot, damping=0.0), np.full(n, 0.3), np.zeros(n))
+    # The inertia that each joint has to move, and the heaviest of the forces that gravity takes it to.
+    inertia = np.diag(jet.Lvv)
+    weight = np.maximum(np.abs(jet.Lq), 1e-3 * inertia)
+    found: list[Motion] = []
+
+    def add(
+        family: str,
+        name: str,
+        dt: float,
+        steps: int,
+        window: float = 1.0,
+        *,
+        v: ArrayLike = 0.0,
+        ahead: ArrayLike = 0.0,
+        controls: Floats | None = None,
+        increments: Floats | None = None,
+        **scene: Any,
+    ) -> None:
+        v0, shift = (np.broadcast_to(np.asarray(x, dtype=np.float64), (n,)).copy() for x in (v, ahead))
+        whole = Scene(robot, **{"damping": 0.0} | scene)
+        found.append(Motion(name, family, dt, steps, whole, 0.3 + shift, v0, controls, increments, shift, window))
+
+    # What starts to slide down is behind by half a step with any method of first order: much of its first steps, little
+    # of its motion.
+    for dt, steps in ((1e-6, 500), (1e-4, 1000), (1e-3, 1000), (0.01, 500), (0.1, 100), (0.5, 40)):
+        add("time step", f"falls, dt = {dt:g} s", dt, steps, max(0.3, _FIRST * dt))
+    for rate in (10.0, 1e3):
+        add("joint rate", f"{rate:g} rad/s", 1e-3, 500, max(1.0 / rate, _FIRST * 1e-3), v=rate, gravity=False)
+    # A mimic joint that follows turns by a part of it, and no motion is the same then.
+    turns = np.where(robot.slides | bool(robot.ties), 0.0, 2.0 * math.pi * 1e6)
+    add("turns", "after 1e6 turns", 1e-3, 500, 0.3, ahead=turns)
+    add("gravity", "no gravity", 1e-2, 500, 0.5, v=1.0, gravity=False)
+    add("gravity", "gravity 1e4 m/s^2", 1e-3, 500, _FIRST * 1e-3, gravity=1e3 * np.array(EARTH))
+    for turned in (0.1, 2.4, 50.0):
+        add("stiffness", f"springs, h omega = {turned:g}", 1e-3, 500, 0.01, stiffness=(turned / 1e-3) ** 2 * inertia)
+    for lost in (0.1, 10.0, 1e4):
+        add("damping", f"dampers, h d / I = {lost:g}", 1e-3, 500, 0.05, v=1.0, damping=lost / 1e-3 * inertia)
+    for share in (10.0, 1e6):
+        add("torque", f"+-{share:g} times its weight", 1e-3, 200, controls=flipping(share * weight))
+    for strength in (1e-12, 1.0):
+        noise, dw = AdditiveNoise(strength * weight), wiener_increments(n, 1e-3, 100, 0)
+        add("noise", f"noise of {strength:g} times its weight", 1e-3, 100, noise=noise, increments=dw)
+    return found
+
+
+def flipping(torque: Floats) -> Floats:
+    """Torques (n,) that change their sign at each of 200 steps (200, n)."""
+    return np.where(np.arange(200) % 2 == 0, 1.0, -1.0)[:, None] * torque
+
+
+def check_robot(
+    robot: Robot | str | os.PathLike[str],
+    *,
+    integrators: Sequence[Integrator] | None = None,
+    patience: float = 20.0,
+    progress: Progress | None = None,
+) -> Record:
+    """Run a robot's motions where it is hard with every integrator, and judge each by independent checks.
+
+    It falls at steps from 1e-6 s to 0.5 s, turns fast and far, floats, hangs on stiff springs and dampers, is pushed to
+    and fro, and trembles. Momenta and energies are held against Pinocchio's, q and v against LSODA's motion at 1e-11,
+    energy and momentum against their balance, symmetric methods against the way back, and the derivatives of
+    variational ones against A' J A = J.
+
+    Main args:
+        robot: The robot, its name, or the path of its file.
+        integrators: These alone.
+
+    Other Args:
+        patience: Processor time that a motion may take before it is judged by what there is [s].
+        progress: Called with (cells done, cells in all, the next one's name).
+
+    Returns:
+        The record; after Ctrl-C, of what was done. ``record.wrong()`` are results that are wrong without a warning.
+
+    Raises:
+        RobotError: There is no such robot, or its file cannot be read.
+        InputError: ``patience`` is not positive.
+    """
+    own = robot if isinstance(robot, Robot) else load_robot(robot)
+    limit = positive("patience", patience, "s")
+    jobs = [(m, i) for m in motions_of(own) for i in (INTEGRATORS if integrators is None else integrators)]
+    cells: list[Cell] = []
+    try:
+        for motion, integrator in jobs:
+            if progress is not None:
+                progress(len(cells), len(jobs), f"{motion.name}, {integrator}")
+            cells.append(_cell(motion, integrator, limit))
+    except KeyboardInterrupt:
+        pass
+    return Record(tuple(cells), own.name, deep=False, missing=len(jobs) - len(cells))
+
+
+def _cell(motion: Motion, integrator: Integrator, patience: float) -> Cell:
+    scene, begin = motion.scene, time.perf_counter()
+    done, said, wrong, found = 0, (), (), {}  # type: int, tuple[str, ...], tuple[str, ...], dict[str, float]
+    try:
+        trajectory, error = attempt(
+            patience, scene, motion.q0, motion.v0, dt=motion.dt, steps=motion.steps,
+            controls=motion.controls, increments=motion.increments, integrator=integrator,
+        )  # fmt: skip
+    except VarpinError as refusal:
+        kind, said = Kind.REFUSED, (line_of(refusal),)
+    except Exception as fault:
+        kind, wrong = Kind.WRONG, (f"unnamed error: {line_of(fault)}",)
+    else:
+        exact = exact_motion(scene, integrator, trajectory, motion.window, motion.ahead)
+        found, done = measures(scene, integrator, trajectory, exact), trajectory.steps
+        kind, said, wrong = judge(trajectory, error, findings(found, integrator, condition(scene, motion.q0)))
+    return Cell(
+        family=motion.family, trial=motion.name, integrator=str(integrator), kind=kind, said=said, found=wrong,
+        done=done, steps=motion.steps, seconds=round(time.perf_counter() - begin, 3), fingerprint="",
+        **dict.fromkeys(LEVELS, math.nan) | found,
+    )  # fmt: skip
+
+
+def judge(
+    trajectory: Trajectory, error: VarpinError | None, wrong: tuple[str, ...]
+) -> tuple[Kind, tuple[str, ...], tuple[str, ...]]:
+    """The kind of a motion that an error may have ended, what varpin said of it, and what the checks found wrong."""
+    warnings = (warning for warning in trajectory.warnings if not warning.startswith(limits.KINDS))
+    said = (*(() if error is None else (line_of(error),)), *warnings)
+    if not finite(trajectory):
+        return Kind.WRONG, said, ("the record is not finite", *wrong)
+    if any(text.startswith(_STRUCTURE) for text in wrong):
+        return Kind.WRONG, said, wrong
+    if error is not None:
+        return Kind.STOPPED, said, wrong
+    return Kind.DEGRADED if said else Kind.WRONG if wrong else Kind.ACCURATE, said, wrong
+
+
+class _OutOfTime(KeyboardInterrupt):
+    """Ends a motion that takes too long, as Ctrl-C does."""
+
+
+def attempt(
+    patience: float, scene: Scene, q0: Floats, v0: Floats, **options: Any
+) -> tuple[Trajectory, VarpinError | None]:
+    """A motion as far as it goes within a processor time [s], and the error that stopped it.
+
+    Raises:
+        VarpinError: It is refused before anything ran.
+    """
+    begin = time.process_time()
+
+    def stop_late(done: int, steps: int) -> None:
+        if done < steps and time.process_time() - begin > patience:
+            raise _OutOfTime
+
+    try:
+        return simulate(scene, q0, v0, progress=stop_late, **options), None
+    except Interrupted as error:
+        if time.process_time() - begin <= patience:
+            raise
+        return error.trajectory, None
+    except VarpinError as error:
+        if getattr(error, "trajectory", None) is None:
+            raise
+        return error.trajectory, error  # type: ignore[attr-defined]
