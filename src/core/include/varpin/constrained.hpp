@@ -45,13 +45,16 @@ struct ConstrainedState {
         : path(mechanism, stages),
           rate(mechanism.constraints.rows()),
           impulse(mechanism.constraints.rows()),
-          past_impulse(stages * mechanism.constraints.rows()) {}
+          past_impulse(stages * mechanism.constraints.rows()),
+          miss(PathState::most_misses * past_impulse.size()) {}
     PathState path;
     int rank = -1;                     // of the constraints, for the whole rollout
     int weakest = 0;                   // the constraint row that a failed step would name
     std::vector<double> rate;          // (m) of rows whose joint is moved by hand, at the node; zero of others
     std::vector<double> impulse;       // (m) of the last step, negative Lam added up [N s or N m s]
     std::vector<double> past_impulse;  // (s, m) Lam of the last whole step
+    std::vector<double> miss;          // (misses, s, m) of its guess, as PathState's
+    int trend = 0;                     // rows of `miss` that would have made the best guess
     std::vector<double> impulses;      // (steps, m) of the last roll
 };
 
@@ -85,6 +88,7 @@ class ConstrainedStepper {
           pushed(stages * n),
           push_size(stages * n),
           unit(n),
+          foreseen(stages * n),
           white(n),
           along(n),
           wanted(n),
@@ -129,7 +133,7 @@ class ConstrainedStepper {
             path.momentum[i] = p[i];
         }
         diffusion_centers(mechanism, q, path.center.data());
-        path.known = path.level = 0;
+        path.known = path.level = path.trend = state.trend = 0;
         state.rank = -1;
         if (!look_at(state)) return false;
         state.rank = here.rank();
@@ -196,12 +200,18 @@ class ConstrainedStepper {
             divide(level, level == 0 && path.known > 0, guards.most_halvings, halvings, take);
         if (outcome != Outcome::solved) return outcome;
         path.level = deepest;
+        const int known = path.known;
         path.known = 0;
         if (deepest == 0) {
+            if (known > 0) {
+                path.trend = follow_misses(equation.V.data(), foreseen.data(), stages * n, known, path.miss.data());
+                state.trend =
+                    follow_misses(impulse.data(), state.past_impulse.data(), stages * m, known, state.miss.data());
+            }
             std::copy(equation.V.begin(), equation.V.end(), path.past.begin());
             std::copy(path.v.begin(), path.v.end(), path.past_end.begin());
             state.past_impulse = impulse;
-            path.known = 1;
+            path.known = std::min(known + 1, PathState::most_misses + 1);
         }
         return Outcome::solved;
     }
@@ -371,6 +381,7 @@ class ConstrainedStepper {
     std::vector<double> block, saddle, right, solution;
     std::vector<int> rows;
     std::vector<double> null, reduced_mass, reduced;
+    std::vector<double> foreseen;                 // (s, n) stage velocities without what guesses miss
     std::vector<double> white, along, wanted;     // (n)
     std::vector<double> rest, parts;              // (m, n)
     std::vector<double> product;                  // (r, r)
@@ -434,13 +445,13 @@ class ConstrainedStepper {
     }
 
     // M's factors and C at q, the `rank` rows that are farthest from depending on each other, or, for -1, all that do
-    // not. False where M is not positive definite.
-    bool find_basis(const double* q, int rank, ConstraintBasis& basis) {
+    // not. False where M is not positive definite. C is there already where it has `visited` q.
+    bool find_basis(const double* q, int rank, ConstraintBasis& basis, bool visited = false) {
         if (!energy_guard.factor(q)) return false;
         basis.ldl = energy_guard.factors();
         basis.root.resize(n);
         for (int i = 0; i < n; ++i) basis.root[i] = 1.0 / std::sqrt(basis.ldl[i * n + i]);
-        mechanism.constraints.at(q, basis.jet);
+        if (!visited) mechanism.constraints.at(q, basis.jet);
         basis.rows.resize(m * n);
         basis.size.assign(m, 0.0);
         // Of the terms that cancel in a row: their squares times the diagonal of M^-1.
@@ -586,18 +597,28 @@ class ConstrainedStepper {
         std::fill(impulse.begin(), impulse.end(), 0.0);
     }
 
-    // The polynomial through the last step's stage velocities and the velocity at its end, moved by kicks since.
+    // The polynomial through the last step's stage velocities and the velocity at its end, moved by kicks since, and
+    // the last impulses; by how much these miss goes on too, as in VariationalStepper.
     void extrapolate(const ConstrainedState& state) {
         const PathState& path = state.path;
+        const bool steady = mechanism.diffusion.processes == 0;
+        const int trend = steady ? path.trend : 0, impulse_trend = steady ? state.trend : 0;
         for (int i = 0; i < stages; ++i) {
             const double* ahead = &tableau.ahead[i * (stages + 1)];
             for (int c = 0; c < n; ++c) {
+                const int k = i * n + c;
                 double sum = path.v[c] - path.past_end[c];
                 for (int j = 0; j < stages; ++j) sum += ahead[j] * path.past[j * n + c];
-                equation.V[i * n + c] = sum + ahead[stages] * path.past_end[c];
+                foreseen[k] = sum + ahead[stages] * path.past_end[c];
+                double missing = 0.0;
+                for (int r = 0; r < trend; ++r) missing += path.miss[r * stages * n + k];
+                equation.V[k] = foreseen[k] + missing;
             }
         }
-        impulse = state.past_impulse;
+        for (int k = 0; k < stages * m; ++k) {
+            impulse[k] = state.past_impulse[k];
+            for (int r = 0; r < impulse_trend; ++r) impulse[k] += state.miss[r * stages * m + k];
+        }
     }
 
     // One substep from where the path stands; moves the path only if it is accepted.
@@ -622,7 +643,9 @@ class ConstrainedStepper {
             rate[own.row] = share * (goal[d] - path.place[own.coordinate].place.high) / h;
         }
         for (int i = 0; i < n; ++i) unit[i] = trial.place[i].place.high;
-        if (!find_basis(unit.data(), state.rank, there)) return Outcome::singular;
+        // The last Lobatto point is the end.
+        if (!jets_wanted) std::swap(there.jet, point.back());
+        if (!find_basis(unit.data(), state.rank, there, !jets_wanted)) return Outcome::singular;
         if (!(there.least > near_toggle) && there.rank() > 0) {
             state.weakest = there.weakest;
             return Outcome::toggle;
@@ -712,17 +735,23 @@ class ConstrainedStepper {
                 }
             }
             ++effort.newton_iterations;
+            // With one stage no impulse acts where rows bend, and the bodies alone bend the momenta.
+            double left = fresh && stages == 1 ? equation.left_by_bending(h, worst) : infinity;
             fresh = false;
             if (before < infinity) {
                 const double contraction = std::sqrt(moved / before);
-                if (!jets_wanted && sure * contraction * worst <= tolerance) {
+                left = std::min(left, contraction * worst);
+                fresh = !(worst * contraction * contraction * contraction <= tolerance);
+            }
+            if (!jets_wanted && sure * left <= tolerance) {
+                visit_points(h, start);
+                const double open = rows_error(h);
+                if (open <= tolerance) {
                     equation.correct_slopes(h);
-                    if (stages > 1) visit_points(h, start);
                     push();
-                    worst *= contraction;
+                    worst = std::max(left, open);
                     break;
                 }
-                fresh = !(worst * contraction * contraction * contraction <= tolerance);
             }
             before = moved;
         }
@@ -822,17 +851,27 @@ class ConstrainedStepper {
                 if (!(error <= worst)) worst = error;
             }
         }
-        double swiftest = 0.0;
-        for (const double velocity : equation.V) swiftest = std::max(swiftest, std::abs(velocity));
-        for (int k = 1; k <= stages; ++k) {
+        for (int k = 0; k < stages; ++k) {
             for (int a = 0; a < r; ++a) {
                 const int row = here.order[a];
-                const double g = point[k - 1].g[row];
-                right[stages * n + (k - 1) * r + a] = -row_scale[row] * g / h;
+                right[stages * n + k * r + a] = -row_scale[row] * point[k].g[row] / h;
+            }
+        }
+        const double open = rows_error(h);
+        return open > worst || std::isnan(open) ? open : worst;
+    }
+
+    // The largest g at the Lobatto points in rounding units of its terms.
+    double rows_error(double h) const {
+        double worst = 0.0, swiftest = 0.0;
+        for (const double velocity : equation.V) swiftest = std::max(swiftest, std::abs(velocity));
+        for (const ConstraintJet& jet : point) {
+            for (const int row : here.order) {
                 // Terms may vanish where the row holds; what it may be off by then is the rounding of the stages' way.
-                double scale = point[k - 1].scale[row];
-                for (int c = 0; c < n; ++c) scale += std::abs(point[k - 1].C[row * n + c]) * h * swiftest;
-                const double error = scale > nothing ? std::abs(g) / (rounding_unit * scale) : std::abs(g);
+                double scale = jet.scale[row];
+                for (int c = 0; c < n; ++c) scale += std::abs(jet.C[row * n + c]) * h * swiftest;
+                const double open = std::abs(jet.g[row]),
+                             error = scale > nothing ? open / (rounding_unit * scale) : open;
                 if (!(error <= worst)) worst = error;
             }
         }
@@ -957,7 +996,7 @@ class ConstrainedStepper {
             taken[best] = 1;
             double* z = &null[f * n];
             for (int c = 0; c < n; ++c) z[c] = candidate[best * n + c] / longest;
-            for (int i = 0; i < n; ++i) {
+            for (int i = 0; i < n && f + 1 < free; ++i) {
                 if (!taken[i]) orthogonalize(&candidate[i * n], null, f + 1);
             }
         }
