@@ -1,5 +1,6 @@
 // Steppers, passes and costs have all their memory once they are made, and linearizations after their first step: a
 // controller may run them at its rate.
+#include <cmath>
 #include <cstdio>
 #include <cstdlib>
 #include <limits>
@@ -8,6 +9,7 @@
 #include <vector>
 
 #include "varpin/backward.hpp"
+#include "varpin/constrained.hpp"
 #include "varpin/costs.hpp"
 #include "varpin/explicit.hpp"
 #include "varpin/linearization.hpp"
@@ -182,7 +184,38 @@ bool allocates_nothing(const varpin::Mechanism& mechanism) {
     return right;
 }
 
+// A chain whose tip slides along a line, from rest.
+bool constrained_steps_allocate_nothing() {
+    varpin::Mechanism mechanism = chain();
+    const varpin::CarriedVector tip{n - 1, {1.0, 0.0, 0.0}}, across{-1, {0.0, 1.0, 0.0}, true};
+    const double q0[n] = {0.4, 0.3, -0.5}, v0[n] = {}, h = 0.001;
+    const double height = std::sin(0.4) + std::sin(0.7) + std::sin(0.2);
+    mechanism.constraints = {
+        {{{tip}}, {{across}}}, {{.x = 0, .y = 1, .constant = height}}, {}, {}, mechanism.tree.bodies, n};
+    const varpin::Tableau midpoint{.stages = 1,
+                                   .a = {0.5},
+                                   .gradient = {0.5},
+                                   .force = {0.5},
+                                   .b = {1.0},
+                                   .c = {0.5},
+                                   .ahead = {-1.0, 2.0},
+                                   .reach = 0.25};
+    varpin::ConstrainedStepper stepper(mechanism, midpoint, {0.0, 1.0}, 0.5, {});
+    varpin::ConstrainedState state(mechanism, 1);
+    const std::vector<double> force(n);
+    const auto steps = [&] {
+        for (int s = 0; s < N; ++s) {
+            if (stepper.step(h, state) != varpin::Outcome::solved) return false;
+        }
+        return true;
+    };
+    if (!stepper.begin(q0, v0, state)) return false;
+    stepper.take_force(force.data(), false);
+    // The first steps make room at the start, the end and the start before.
+    return steps() && without_allocation("steps under constraints", steps);
+}
+
 int main() {
     const bool alone = allocates_nothing(chain()), coupled = allocates_nothing(coupled_chain());
-    return alone && coupled ? 0 : 1;
+    return alone && coupled && constrained_steps_allocate_nothing() ? 0 : 1;
 }

@@ -28,6 +28,7 @@ namespace varpin {
 struct ConstraintBasis {
     ConstraintJet jet;
     std::vector<double> ldl;   // (n, n) factors of M
+    std::vector<double> root;  // (n) D^-1/2
     std::vector<double> rows;  // (m, n) D^-1/2 L^-1 C', a row each
     std::vector<double> Q;     // (r, n) an orthonormal basis of theirs
     std::vector<double> R;     // (r, r) upper triangular: row order[k] = sum_{i<=k} R_ik Q_i
@@ -44,13 +45,16 @@ struct ConstrainedState {
         : path(mechanism, stages),
           rate(mechanism.constraints.rows()),
           impulse(mechanism.constraints.rows()),
-          past_impulse(stages * mechanism.constraints.rows()) {}
+          past_impulse(stages * mechanism.constraints.rows()),
+          miss(PathState::most_misses * past_impulse.size()) {}
     PathState path;
     int rank = -1;                     // of the constraints, for the whole rollout
     int weakest = 0;                   // the constraint row that a failed step would name
     std::vector<double> rate;          // (m) of rows whose joint is moved by hand, at the node; zero of others
     std::vector<double> impulse;       // (m) of the last step, negative Lam added up [N s or N m s]
     std::vector<double> past_impulse;  // (s, m) Lam of the last whole step
+    std::vector<double> miss;          // (misses, s, m) of its guess, as PathState's
+    int trend = 0;                     // rows of `miss` that would have made the best guess
     std::vector<double> impulses;      // (steps, m) of the last roll
 };
 
@@ -73,7 +77,6 @@ class ConstrainedStepper {
           at(places),
           weight(stages * stages),
           trial(n),
-          mass_jet(mechanism.tree, false),
           point(stages),
           impulse(stages * m),
           total(m),
@@ -84,8 +87,18 @@ class ConstrainedStepper {
           bent(n * n),
           pushed(stages * n),
           push_size(stages * n),
-          unit(n) {
-        mass_jet.M.resize(entries(n, n));
+          unit(n),
+          foreseen(stages * n),
+          white(n),
+          along(n),
+          wanted(n),
+          rest(m * n),
+          parts(m * n),
+          product(n * n),
+          mass(n * n),
+          curved(n * n),
+          candidate(n * n),
+          taken(std::max(m, n)) {
         equation.every_kind = !mechanism.constraints.driven().empty();
         for (int i = 0; i < stages; ++i) {
             for (int k = 0; k < stages; ++k) weight[i * stages + k] = 1.0 - at[k * stages + i] / tableau.b[i];
@@ -120,14 +133,14 @@ class ConstrainedStepper {
             path.momentum[i] = p[i];
         }
         diffusion_centers(mechanism, q, path.center.data());
-        path.known = path.level = 0;
+        path.known = path.level = path.trend = state.trend = 0;
         state.rank = -1;
         if (!look_at(state)) return false;
         state.rank = here.rank();
         for (const DrivenRow& own : mechanism.constraints.driven()) state.rate[own.row] = path.v[own.coordinate];
         if (project) absorb(state);
         for (int i = 0; i < n; ++i) unit[i] = path.place[i].place.high;
-        if (!energy_guard.node(unit.data(), path.momentum.data(), path.v.data())) return false;
+        energy_guard.velocity(path.momentum.data(), path.v.data());
         energy_guard.begin(unit.data(), path.momentum.data(), path.v.data(), path.energies);
         return true;
     }
@@ -144,7 +157,8 @@ class ConstrainedStepper {
     bool look_at(ConstrainedState& state) {
         for (int i = 0; i < n; ++i) unit[i] = state.path.place[i].place.high;
         if (!find_basis(unit.data(), state.rank, here)) return false;
-        return energy_guard.node(unit.data(), state.path.momentum.data(), state.path.v.data());
+        energy_guard.velocity(state.path.momentum.data(), state.path.v.data());
+        return true;
     }
 
     // Add an impulse (n) to the momentum; constraints absorb what is normal to them.
@@ -180,18 +194,24 @@ class ConstrainedStepper {
                 guess(path);
             }
             bring_force(begin, level);
-            return attempt(length_of(h, level), state);
+            return attempt(length_of(h, level), state, false);
         };
         const auto [outcome, deepest] =
             divide(level, level == 0 && path.known > 0, guards.most_halvings, halvings, take);
         if (outcome != Outcome::solved) return outcome;
         path.level = deepest;
+        const int known = path.known;
         path.known = 0;
         if (deepest == 0) {
+            if (known > 0) {
+                path.trend = follow_misses(equation.V.data(), foreseen.data(), stages * n, known, path.miss.data());
+                state.trend =
+                    follow_misses(impulse.data(), state.past_impulse.data(), stages * m, known, state.miss.data());
+            }
             std::copy(equation.V.begin(), equation.V.end(), path.past.begin());
             std::copy(path.v.begin(), path.v.end(), path.past_end.begin());
             state.past_impulse = impulse;
-            path.known = 1;
+            path.known = std::min(known + 1, PathState::most_misses + 1);
         }
         return Outcome::solved;
     }
@@ -201,7 +221,7 @@ class ConstrainedStepper {
     Outcome part(double h, int level, double begin, ConstrainedState& state) {
         bring_force(begin, level);
         guess(state.path);
-        return attempt(length_of(h, level), state);
+        return attempt(length_of(h, level), state, true);
     }
 
     // A whole step from a guess (s, n) next to its root.
@@ -209,7 +229,7 @@ class ConstrainedStepper {
         std::copy(V, V + stages * n, equation.V.begin());
         std::fill(impulse.begin(), impulse.end(), 0.0);
         share = 1.0;
-        return attempt(h, state);
+        return attempt(h, state, true);
     }
 
     void roll(double h, const Commands& commands, const double* increments, const double* drift,
@@ -223,6 +243,7 @@ class ConstrainedStepper {
             double* u = nodes.u + p * steps * controls;
             path.halvings.clear();
             state.impulses.clear();
+            state.impulses.reserve(steps * m);
             nodes.done[p] = 0;
             nodes.ended[p] = static_cast<std::int64_t>(Outcome::solved);
             if (!look_at(state)) {
@@ -235,8 +256,7 @@ class ConstrainedStepper {
                 apply_policy(commands, p, s, n, path.q.data(), path.momentum.data(), u);
                 if (noisy) {
                     noise_impulse(mechanism, 1.0, path.q.data(), path.center.data(), u + s * controls, dw, y.data());
-                    const std::vector<double> push = y;
-                    kick(push.data(), state);
+                    kick(y.data(), state);
                 }
                 const double* extra = drift ? drift + row * n : nullptr;
                 const double* within = stage_controls(commands, p, s, stages, u, line);
@@ -329,10 +349,12 @@ class ConstrainedStepper {
         project_derivatives(h, path, end);
     }
 
-    ConstraintBasis here, there;  // at the start of the substep that was solved last, and at its end
-    ConstraintBasis origin;       // of it, once the path has moved on
+    ConstraintBasis here;    // where the path stands
+    ConstraintBasis origin;  // where the substep that was solved last began, once the path has moved on
 
   private:
+    ConstraintBasis there;  // where a substep that is tried ends
+
     // In units of the terms that make up a row: below, it depends on the others. Rounding leaves 1e-15.
     static constexpr double dependent = 1e-9;
     // Below, constraints that are independent are too near to a point where they are not.
@@ -340,6 +362,7 @@ class ConstrainedStepper {
     // How far C may turn within a substep, in units of itself, where guards are active.
     static constexpr double most_turn = 0.7;
     static constexpr double stagnation = 100.0;
+    static constexpr double sure = 10.0;  // as Collocation's
     static constexpr int most_corrections = 12;
 
     double share = 1.0;          // of what is left of a step, that the next part of it is
@@ -349,7 +372,6 @@ class ConstrainedStepper {
     std::vector<double> at;      // (s + 1, s) t_kj
     std::vector<double> weight;  // (s, s) w_ik
     Trial trial;
-    Jet<double> mass_jet;
     std::vector<ConstraintJet> point;  // of Lobatto points 1 .. s
     std::vector<double> impulse;       // (s, m) Lam_k, zero for rows that are left out
     std::vector<double> total;         // (m)
@@ -359,6 +381,12 @@ class ConstrainedStepper {
     std::vector<double> block, saddle, right, solution;
     std::vector<int> rows;
     std::vector<double> null, reduced_mass, reduced;
+    std::vector<double> foreseen;                 // (s, n) stage velocities without what guesses miss
+    std::vector<double> white, along, wanted;     // (n)
+    std::vector<double> rest, parts;              // (m, n)
+    std::vector<double> product;                  // (r, r)
+    std::vector<double> mass, curved, candidate;  // (n, n)
+    std::vector<char> taken;                      // of rows, or of coordinates
 
     std::vector<double> dV, columns, bends;
 
@@ -374,36 +402,36 @@ class ConstrainedStepper {
     // L_vq dq1.
     template <class End>
     void project_derivatives(double h, const PathState& path, const End& end) {
-        const int r = there.rank();
+        const int r = here.rank();
         for (int i = 0; i < n; ++i) unit[i] = path.place[i].place.high;
         Jet<double>& jet = equation.stage[0];
         lagrangian_jet(mechanism, unit.data(), path.v.data(), jet);
         std::vector<double> bend(m * n), curvature(n * n), z(n), along(r), dq(n), turned(n);
-        mechanism.constraints.bend(path.v.data(), there.jet, bend.data());
-        mechanism.constraints.add_curvature(last.data(), 1.0, there.jet, curvature.data());
+        mechanism.constraints.bend(path.v.data(), here.jet, bend.data());
+        mechanism.constraints.add_curvature(last.data(), 1.0, here.jet, curvature.data());
         for (int c = 0; c < 3 * n; ++c) {
             for (int i = 0; i < n; ++i) dq[i] = end(i, c);
             for (int i = 0; i < n; ++i) {
                 turned[i] = inner(&jet.A[i * n], dq.data());
                 z[i] = end(n + i, c) - turned[i] - inner(&curvature[i * n], dq.data());
             }
-            whiten(there, z.data(), z.data());
+            whiten(here, z.data(), z.data());
             for (int k = 0; k < r; ++k) {
-                double own = -inner(&bend[there.order[k] * n], dq.data());
-                const int moved = mechanism.constraints.driven_by(there.order[k]);
+                double own = -inner(&bend[here.order[k] * n], dq.data());
+                const int moved = mechanism.constraints.driven_by(here.order[k]);
                 if (moved >= 0) own += share / h * ((c == 2 * n + moved) - (c == moved));
-                for (int j = 0; j < k; ++j) own -= there.R[j * r + k] * along[j];
-                along[k] = own / there.R[k * r + k];
+                for (int j = 0; j < k; ++j) own -= here.R[j * r + k] * along[j];
+                along[k] = own / here.R[k * r + k];
             }
             const std::vector<double> before = z;
             for (int k = 0; k < r; ++k) {
-                const double change = along[k] - inner(&there.Q[k * n], before.data());
-                for (int i = 0; i < n; ++i) z[i] += change * there.Q[k * n + i];
+                const double change = along[k] - inner(&here.Q[k * n], before.data());
+                for (int i = 0; i < n; ++i) z[i] += change * here.Q[k * n + i];
             }
-            for (int i = 0; i < n; ++i) z[i] *= std::sqrt(there.ldl[i * n + i]);
+            for (int i = 0; i < n; ++i) z[i] *= std::sqrt(here.ldl[i * n + i]);
             for (int i = n - 1; i >= 0; --i) {
                 double sum = z[i];
-                for (int j = 0; j < i; ++j) sum += there.ldl[i * n + j] * z[j];
+                for (int j = 0; j < i; ++j) sum += here.ldl[i * n + j] * z[j];
                 end(n + i, c) = sum + turned[i];
             }
         }
@@ -417,38 +445,40 @@ class ConstrainedStepper {
     }
 
     // M's factors and C at q, the `rank` rows that are farthest from depending on each other, or, for -1, all that do
-    // not. False where M is not positive definite.
-    bool find_basis(const double* q, int rank, ConstraintBasis& basis) {
-        mass_matrix(mechanism, q, mass_jet);
-        basis.ldl = mass_jet.M;
-        if (!factor_ldl(basis.ldl.data(), n, {0, n})) return false;
-        mechanism.constraints.at(q, basis.jet);
+    // not. False where M is not positive definite. C is there already where it has `visited` q.
+    bool find_basis(const double* q, int rank, ConstraintBasis& basis, bool visited = false) {
+        if (!energy_guard.factor(q)) return false;
+        basis.ldl = energy_guard.factors();
+        basis.root.resize(n);
+        for (int i = 0; i < n; ++i) basis.root[i] = 1.0 / std::sqrt(basis.ldl[i * n + i]);
+        if (!visited) mechanism.constraints.at(q, basis.jet);
         basis.rows.resize(m * n);
-        basis.size.resize(m);
+        basis.size.assign(m, 0.0);
         // Of the terms that cancel in a row: their squares times the diagonal of M^-1.
-        std::vector<double> inverse(n), column(n);
         for (int c = 0; c < n; ++c) {
-            std::fill(column.begin(), column.end(), 0.0);
-            column[c] = 1.0;
-            whiten(basis, column.data(), column.data());
-            for (double entry : column) inverse[c] += entry * entry;
+            double inverse = 0.0;
+            for (int i = c; i < n; ++i) {
+                double entry = i == c ? 1.0 : 0.0;
+                for (int j = c; j < i; ++j) entry -= basis.ldl[i * n + j] * white[j];
+                white[i] = entry;
+                inverse += entry * entry * basis.root[i] * basis.root[i];
+            }
+            for (int r = 0; r < m; ++r)
+                basis.size[r] += basis.jet.size[r * n + c] * basis.jet.size[r * n + c] * inverse;
         }
         for (int r = 0; r < m; ++r) {
             whiten(basis, &basis.jet.C[r * n], &basis.rows[r * n]);
-            double size = 0.0;
-            for (int c = 0; c < n; ++c) size += basis.jet.size[r * n + c] * basis.jet.size[r * n + c] * inverse[c];
-            basis.size[r] = std::sqrt(size);
+            basis.size[r] = std::sqrt(basis.size[r]);
         }
         // Gram and Schmidt, twice, the row first that has most left in units of its size.
-        std::vector<double> rest = basis.rows;
-        std::vector<char> taken(m, 0);
+        std::copy(basis.rows.begin(), basis.rows.end(), rest.begin());
+        std::fill(taken.begin(), taken.end(), 0);
         basis.order.clear();
         basis.Q.clear();
         basis.least = 1.0;
         basis.weakest = 0;
         const int most = rank < 0 ? std::min(m, n) : rank;
         double next = 0.0;
-        std::vector<std::vector<double>> share(m);
         for (int k = 0; k <= most && k < m; ++k) {
             int best = -1;
             double farthest = 0.0;
@@ -473,12 +503,12 @@ class ConstrainedStepper {
             for (int r = 0; r < m; ++r) {
                 if (taken[r] && r != best) continue;
                 const double along = inner(q_k, &rest[r * n]);
-                share[r].push_back(along);
-                for (int c = 0; c < n; ++c) rest[r * n + c] -= along * q_k[c];
+                parts[r * n + k] = along;
                 if (r == best) continue;
+                for (int c = 0; c < n; ++c) rest[r * n + c] -= along * q_k[c];
                 for (int i = 0; i <= k; ++i) {
                     const double again = inner(&basis.Q[i * n], &rest[r * n]);
-                    share[r][i] += again;
+                    parts[r * n + i] += again;
                     for (int c = 0; c < n; ++c) rest[r * n + c] -= again * basis.Q[i * n + c];
                 }
             }
@@ -486,7 +516,7 @@ class ConstrainedStepper {
         const int found = basis.rank();
         basis.R.assign(found * found, 0.0);
         for (int k = 0; k < found; ++k) {
-            for (int i = 0; i <= k; ++i) basis.R[i * found + k] = share[basis.order[k]][i];
+            for (int i = 0; i <= k; ++i) basis.R[i * found + k] = parts[basis.order[k] * n + i];
         }
         // Rows that were dependent are no more: the rollout began where they were by chance.
         if (rank >= 0 && (next > 1e3 * dependent || found < rank)) basis.least = 0.0;
@@ -496,7 +526,7 @@ class ConstrainedStepper {
     // D^-1/2 L^-1 b.
     void whiten(const ConstraintBasis& basis, const double* b, double* x) const {
         solve_lower(basis.ldl.data(), n, {0, n}, b, x);
-        for (int i = 0; i < n; ++i) x[i] /= std::sqrt(basis.ldl[i * n + i]);
+        for (int i = 0; i < n; ++i) x[i] *= basis.root[i];
     }
 
     double inner(const double* a, const double* b) const {
@@ -526,9 +556,7 @@ class ConstrainedStepper {
     // Lam (m) with C M^-1 (p - C' Lam) = rate, of the basis' rows; zero of others.
     void find_impulse(const ConstraintBasis& basis, const double* p, const double* rate, double* Lam) {
         const int r = basis.rank();
-        std::vector<double> white(n), along(r);
         whiten(basis, p, white.data());
-        std::vector<double> wanted(r);
         for (int k = 0; k < r; ++k) {
             double own = rate[basis.order[k]];
             for (int j = 0; j < k; ++j) own -= basis.R[j * r + k] * wanted[j];
@@ -569,26 +597,36 @@ class ConstrainedStepper {
         std::fill(impulse.begin(), impulse.end(), 0.0);
     }
 
-    // The polynomial through the last step's stage velocities and the velocity at its end, moved by kicks since.
+    // The polynomial through the last step's stage velocities and the velocity at its end, moved by kicks since, and
+    // the last impulses; by how much these miss goes on too, as in VariationalStepper.
     void extrapolate(const ConstrainedState& state) {
         const PathState& path = state.path;
+        const bool steady = mechanism.diffusion.processes == 0;
+        const int trend = steady ? path.trend : 0, impulse_trend = steady ? state.trend : 0;
         for (int i = 0; i < stages; ++i) {
             const double* ahead = &tableau.ahead[i * (stages + 1)];
             for (int c = 0; c < n; ++c) {
+                const int k = i * n + c;
                 double sum = path.v[c] - path.past_end[c];
                 for (int j = 0; j < stages; ++j) sum += ahead[j] * path.past[j * n + c];
-                equation.V[i * n + c] = sum + ahead[stages] * path.past_end[c];
+                foreseen[k] = sum + ahead[stages] * path.past_end[c];
+                double missing = 0.0;
+                for (int r = 0; r < trend; ++r) missing += path.miss[r * stages * n + k];
+                equation.V[k] = foreseen[k] + missing;
             }
         }
-        impulse = state.past_impulse;
+        for (int k = 0; k < stages * m; ++k) {
+            impulse[k] = state.past_impulse[k];
+            for (int r = 0; r < impulse_trend; ++r) impulse[k] += state.miss[r * stages * m + k];
+        }
     }
 
     // One substep from where the path stands; moves the path only if it is accepted.
-    Outcome attempt(double h, ConstrainedState& state) {
+    Outcome attempt(double h, ConstrainedState& state, bool jets_wanted) {
         PathState& path = state.path;
         state.weakest = here.weakest;
         if (!(here.least > near_toggle) && m > 0 && here.rank() > 0) return Outcome::toggle;
-        const Outcome solved = solve(h, path);
+        const Outcome solved = solve(h, path, jets_wanted);
         if (solved != Outcome::solved) return solved;
         double margin = infinity;
         if (guards.active) {
@@ -605,7 +643,9 @@ class ConstrainedStepper {
             rate[own.row] = share * (goal[d] - path.place[own.coordinate].place.high) / h;
         }
         for (int i = 0; i < n; ++i) unit[i] = trial.place[i].place.high;
-        if (!find_basis(unit.data(), state.rank, there)) return Outcome::singular;
+        // The last Lobatto point is the end.
+        if (!jets_wanted) std::swap(there.jet, point.back());
+        if (!find_basis(unit.data(), state.rank, there, !jets_wanted)) return Outcome::singular;
         if (!(there.least > near_toggle) && there.rank() > 0) {
             state.weakest = there.weakest;
             return Outcome::toggle;
@@ -618,7 +658,7 @@ class ConstrainedStepper {
             for (int r = 0; r < m; ++r) last[r] += total[r];
         }
         for (const DrivenRow& own : mechanism.constraints.driven()) add_work(own, path);
-        const Outcome outcome = energy_guard.settle(guards, tableau, path.energies, path.place, path.v, trial);
+        const Outcome outcome = energy_guard.settle(guards, tableau, path.energies, path.place, path.v, trial, true);
         if (outcome != Outcome::solved) return outcome;
         effort.branch_margin = std::min(effort.branch_margin, margin);
         ++effort.substeps;
@@ -631,7 +671,7 @@ class ConstrainedStepper {
         std::swap(path.p, trial.p);
         state.rate = rate;
         std::swap(origin, here);
-        here = there;
+        std::swap(here, there);
         bool turned = false;
         for (int i = 0; i < n; ++i) {
             const double turns = path.place[i].turns;
@@ -645,8 +685,10 @@ class ConstrainedStepper {
         return Outcome::solved;
     }
 
-    // Newton's method on the stages and the constraints. Ends with jets of the root, and with C at all points.
-    Outcome solve(double h, const PathState& path) {
+    // Newton's method on the stages and the constraints, as Collocation::solve: factors are kept while they contract,
+    // and a correction that is sure to be the last one is not looked at again unless `jets_wanted`. It then ends with
+    // jets of the root, and with C at all points; else with those of the last iterate.
+    Outcome solve(double h, const PathState& path, bool jets_wanted) {
         const Start start{path.place.data(), path.p.data(), force.data(), stride};
         // In units of these the matrix has entries about 1.
         for (int c = 0; c < n; ++c) scaled[c] = 1.0 / std::sqrt(mass_diagonal(c));
@@ -655,23 +697,35 @@ class ConstrainedStepper {
             if (std::find(here.order.begin(), here.order.end(), r) != here.order.end()) continue;
             for (int k = 0; k < stages; ++k) impulse[k * m + r] = 0.0;
         }
+        const int size = stages * (n + here.rank());
         double before = infinity, worst = infinity;
+        bool fresh = true;
         for (int iteration = 0; iteration < most_corrections + 1; ++iteration) {
-            equation.sweep(h, start, true, effort);
+            equation.sweep(h, start, fresh, effort);
             visit_points(h, start);
             worst = residuals(h, start);
-            if (worst <= tolerance) break;
+            if (worst <= tolerance) {
+                if (fresh || !jets_wanted) break;
+                fresh = true;
+                continue;
+            }
             if (!(worst < infinity)) return Outcome::not_finite;
             if (iteration == most_corrections) break;
-            assemble(h);
-            const int size = stages * (n + here.rank());
-            if (factor_lu_pivoting(saddle.data(), size, rows.data()) == 0) return Outcome::fold;
+            if (fresh) {
+                assemble(h);
+                if (factor_lu_pivoting(saddle.data(), size, rows.data()) == 0) return Outcome::fold;
+            }
             solve_lu_pivoting(saddle.data(), size, rows.data(), right.data(), solution.data());
             for (int i = 0; i < stages; ++i) {
                 for (int c = 0; c < n; ++c) equation.delta[i * n + c] = scaled[c] * solution[i * n + c];
             }
             const double moved = equation.kinetic_size(equation.delta.data());
-            if (!(moved <= 0.25 * before)) break;
+            if (!(moved <= 0.25 * before)) {
+                // The factors may be to blame, if they are of another iterate.
+                if (fresh) break;
+                fresh = true;
+                continue;
+            }
             for (int k = 0; k < stages * n; ++k) equation.V[k] += equation.delta[k];
             const int r = here.rank();
             for (int k = 0; k < stages; ++k) {
@@ -681,6 +735,24 @@ class ConstrainedStepper {
                 }
             }
             ++effort.newton_iterations;
+            // With one stage no impulse acts where rows bend, and the bodies alone bend the momenta.
+            double left = fresh && stages == 1 ? equation.left_by_bending(h, worst) : infinity;
+            fresh = false;
+            if (before < infinity) {
+                const double contraction = std::sqrt(moved / before);
+                left = std::min(left, contraction * worst);
+                fresh = !(worst * contraction * contraction * contraction <= tolerance);
+            }
+            if (!jets_wanted && sure * left <= tolerance) {
+                visit_points(h, start);
+                const double open = rows_error(h);
+                if (open <= tolerance) {
+                    equation.correct_slopes(h);
+                    push();
+                    worst = std::max(left, open);
+                    break;
+                }
+            }
             before = moved;
         }
         if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
@@ -730,14 +802,11 @@ class ConstrainedStepper {
         }
     }
 
-    // r of the stages into `right`, -g / h behind it; the largest in rounding units of its terms.
-    double residuals(double h, const Start& start) {
-        double worst = 0.0;
-        const int r = here.rank();
-        right.assign(stages * (n + r), 0.0);
-        solution.resize(right.size());
+    // C_k' Lam_k into `pushed`, and the size of its terms.
+    void push() {
         std::fill(pushed.begin(), pushed.end(), 0.0);
         std::fill(push_size.begin(), push_size.end(), 0.0);
+        const int r = here.rank();
         for (int k = 0; k < stages; ++k) {
             const ConstraintJet& jet = jet_at(k);
             for (int a = 0; a < r; ++a) {
@@ -749,6 +818,15 @@ class ConstrainedStepper {
                 }
             }
         }
+    }
+
+    // r of the stages into `right`, -g / h behind it; the largest in rounding units of its terms.
+    double residuals(double h, const Start& start) {
+        double worst = 0.0;
+        const int r = here.rank();
+        right.assign(stages * (n + r), 0.0);
+        solution.resize(right.size());
+        push();
         for (int i = 0; i < stages; ++i) {
             for (int c = 0; c < n; ++c) {
                 const int k = i * n + c;
@@ -773,17 +851,27 @@ class ConstrainedStepper {
                 if (!(error <= worst)) worst = error;
             }
         }
-        double swiftest = 0.0;
-        for (const double velocity : equation.V) swiftest = std::max(swiftest, std::abs(velocity));
-        for (int k = 1; k <= stages; ++k) {
+        for (int k = 0; k < stages; ++k) {
             for (int a = 0; a < r; ++a) {
                 const int row = here.order[a];
-                const double g = point[k - 1].g[row];
-                right[stages * n + (k - 1) * r + a] = -row_scale[row] * g / h;
+                right[stages * n + k * r + a] = -row_scale[row] * point[k].g[row] / h;
+            }
+        }
+        const double open = rows_error(h);
+        return open > worst || std::isnan(open) ? open : worst;
+    }
+
+    // The largest g at the Lobatto points in rounding units of its terms.
+    double rows_error(double h) const {
+        double worst = 0.0, swiftest = 0.0;
+        for (const double velocity : equation.V) swiftest = std::max(swiftest, std::abs(velocity));
+        for (const ConstraintJet& jet : point) {
+            for (const int row : here.order) {
                 // Terms may vanish where the row holds; what it may be off by then is the rounding of the stages' way.
-                double scale = point[k - 1].scale[row];
-                for (int c = 0; c < n; ++c) scale += std::abs(point[k - 1].C[row * n + c]) * h * swiftest;
-                const double error = scale > nothing ? std::abs(g) / (rounding_unit * scale) : std::abs(g);
+                double scale = jet.scale[row];
+                for (int c = 0; c < n; ++c) scale += std::abs(jet.C[row * n + c]) * h * swiftest;
+                const double open = std::abs(jet.g[row]),
+                             error = scale > nothing ? open / (rounding_unit * scale) : open;
                 if (!(error <= worst)) worst = error;
             }
         }
@@ -839,7 +927,6 @@ class ConstrainedStepper {
     double turn_to(const ConstraintJet& jet) {
         const int r = here.rank();
         double sum = 0.0;
-        std::vector<double> white(n), product(r * r);
         for (int a = 0; a < r; ++a) {
             whiten(here, &jet.C[here.order[a] * n], white.data());
             for (int k = 0; k < r; ++k) product[k * r + a] = inner(&here.Q[k * n], white.data());
@@ -868,7 +955,8 @@ class ConstrainedStepper {
         if (free == 0) return infinity;
         find_null();
         const double exaggerated = h * h * tableau.reach / (1.0 - guards.branch_margin);
-        std::vector<double> mass(n * n), curved(n * n);
+        std::fill(mass.begin(), mass.end(), 0.0);
+        std::fill(curved.begin(), curved.end(), 0.0);
         for (int i = 0; i < n; ++i) {
             for (int j = 0; j < n; ++j) {
                 for (int s = 0; s < stages; ++s) {
@@ -891,8 +979,8 @@ class ConstrainedStepper {
     void find_null() {
         const int r = here.rank(), free = n - r;
         null.assign(free * n, 0.0);
-        std::vector<double> candidate(n * n);
-        std::vector<char> taken(n, 0);
+        std::fill(candidate.begin(), candidate.end(), 0.0);
+        std::fill(taken.begin(), taken.end(), 0);
         for (int i = 0; i < n; ++i) {
             candidate[i * n + i] = 1.0;
             orthogonalize(&candidate[i * n], here.Q, r);
@@ -908,13 +996,13 @@ class ConstrainedStepper {
             taken[best] = 1;
             double* z = &null[f * n];
             for (int c = 0; c < n; ++c) z[c] = candidate[best * n + c] / longest;
-            for (int i = 0; i < n; ++i) {
+            for (int i = 0; i < n && f + 1 < free; ++i) {
                 if (!taken[i]) orthogonalize(&candidate[i * n], null, f + 1);
             }
         }
         for (int f = 0; f < free; ++f) {
             double* z = &null[f * n];
-            for (int c = 0; c < n; ++c) z[c] /= std::sqrt(here.ldl[c * n + c]);
+            for (int c = 0; c < n; ++c) z[c] *= here.root[c];
             solve_upper(here.ldl.data(), n, {0, n}, z);
         }
     }

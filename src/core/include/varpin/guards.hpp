@@ -137,15 +137,22 @@ class EnergyGuard {
                 return true;
             }
         }
+        if (!factor(q)) return false;
+        velocity(p, v);
+        return true;
+    }
+
+    // Energies and the factors L D L' of M at q, where bodies are not articulated; the blocks' lower triangles.
+    bool factor(const double* q) {
         mass_matrix(mechanism, q, jet);
         for (const Block& block : blocks_of(mechanism.tree, n)) {
             for (int i = block.begin; i < block.end; ++i)
                 std::copy(&jet.M[i * n + block.begin], &jet.M[i * n + i] + 1, &ldl[i * n + block.begin]);
             if (!factor_ldl(ldl.data(), n, block)) return false;
         }
-        velocity(p, v);
         return true;
     }
+    const std::vector<double>& factors() const { return ldl; }
 
     // v = M^-1 p from the factors L D L' that `node` left. The terms of the kinetic energy 1/2 y' D^-1 y with L y = p,
     // none of which is negative, are the coordinates' shares.
@@ -244,14 +251,18 @@ class EnergyGuard {
     }
 
     // Velocity and energy of the node that a substep has reached, and whether its energy balance closes; enters it if
-    // so.
+    // so. Where M has been factored there, it is not again.
     Outcome settle(const Guards& guards, const Tableau& tableau, Energies& energies, const std::vector<Place>& from,
-                   const std::vector<double>& from_v, Trial& trial) {
+                   const std::vector<double>& from_v, Trial& trial, bool factored = false) {
         for (int i = 0; i < n; ++i) {
             trial.at[i] = trial.place[i].place.high;
             trial.momentum[i] = trial.p[i].high;
         }
-        if (!node(trial.at.data(), trial.momentum.data(), trial.v.data())) return Outcome::singular;
+        if (factored) {
+            velocity(trial.momentum.data(), trial.v.data());
+        } else if (!node(trial.at.data(), trial.momentum.data(), trial.v.data())) {
+            return Outcome::singular;
+        }
         find_turnover(energies);
         const Tree& tree = mechanism.tree;
         std::fill(work.begin(), work.end(), 0.0);

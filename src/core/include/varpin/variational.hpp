@@ -53,6 +53,25 @@ struct PathState {
     std::vector<std::uint8_t> halvings;  // of each part of every step of the last `roll` that was not taken whole
 };
 
+// By how much a guess of `size` numbers has missed the root, and the backward differences of that over `known` guesses,
+// into `miss` (misses, size). The difference of order r is what r rows would have left: returns the r of the least.
+inline int follow_misses(const double* root, const double* guess, int size, int known, double* miss) {
+    constexpr int most = PathState::most_misses;
+    const int orders = std::min(known, most + 1);
+    double left[most + 1] = {};
+    for (int k = 0; k < size; ++k) {
+        double now = root[k] - guess[k];
+        for (int r = 0; r < orders; ++r) {
+            left[r] += std::abs(now);
+            if (r == most) break;
+            const double then = miss[r * size + k];
+            miss[r * size + k] = now;
+            now -= then;
+        }
+    }
+    return orders == 1 ? 1 : static_cast<int>(std::min_element(left, left + orders) - left);
+}
+
 // What a step took.
 inline void record_effort(const Effort& effort, const Nodes& nodes, std::int64_t row) {
     std::int64_t* tally = nodes.tally + 4 * row;
@@ -344,28 +363,13 @@ class VariationalStepper {
 
     void remember(PathState& state) {
         std::copy(step_equation.V.begin(), step_equation.V.end(), state.past.begin());
-        if (state.known > 0) follow_misses(state);
+        if (state.known > 0) {
+            state.trend = follow_misses(step_equation.V.data(), guess.data(), step_equation.stages * n, state.known,
+                                        state.miss.data());
+        }
         std::copy(state.v.begin(), state.v.end(), state.past_end.begin());
         std::copy(force.begin(), force.begin() + n, state.past_force.begin());
         state.known = std::min(state.known + 1, PathState::most_misses + 1);
-    }
-
-    // The difference of order r is what r rows would have left of the miss of the last step.
-    void follow_misses(PathState& state) const {
-        constexpr int most = PathState::most_misses;
-        const int size = step_equation.stages * n, orders = std::min(state.known, most + 1);
-        double left[most + 1] = {};
-        for (int k = 0; k < size; ++k) {
-            double now = step_equation.V[k] - guess[k];
-            for (int r = 0; r < orders; ++r) {
-                left[r] += std::abs(now);
-                if (r == most) break;
-                const double then = state.miss[r * size + k];
-                state.miss[r * size + k] = now;
-                now -= then;
-            }
-        }
-        state.trend = orders == 1 ? 1 : static_cast<int>(std::min_element(left, left + orders) - left);
     }
 
     void noise_kick(double part, const double* u, const double* dw, PathState& state) {
