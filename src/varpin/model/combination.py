@@ -27,7 +27,7 @@ def combine(
     """Several robots as one, whose coordinates are those of the first, then those of the second, and so on.
 
     Nothing joins them but what a scene adds: a :class:`varpin.FrameOnFrame` between a frame of each closes the loop of
-    two arms that hold one object. Limits, damping, friction, armature, mimic joints, shapes and postures go along.
+    two arms that hold one object. Limits, damping, friction, armature, mimic joints, shapes and postures go along::
 
         left, right = vp.load_robot("ur5"), vp.load_robot("ur5")
         pair = vp.combine(left, right, placements=[None, facing], prefixes=["left_", "right_"])
