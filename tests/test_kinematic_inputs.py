@@ -222,3 +222,19 @@ def test_a_file_moves_a_joint_to_where_its_sine_is_at_the_nodes(tmp_path):
     motion = vp.load_scene(path).simulate()
     c = motion.joint_names.index("mcp")
     np.testing.assert_allclose(motion.q[:, c], 0.5 + 0.1 * np.sin(4.0 * np.pi * motion.t), atol=1e-12)
+
+
+def test_derivatives_of_a_crank_that_starts_from_rest():
+    """Velocities are at their root from the start there, impulses are not."""
+    slot = vp.PointOnPoint("tip", (0.0, 0.0, 0.0), axes="z")
+    scene = vp.Scene(
+        vp.planar_chain(2, length=0.3, mass=0.5),
+        actuation=["joint1"],
+        constraints=[slot, vp.KinematicInput("joint1")],
+        damping=0.01,
+    )
+    begin = vp.assemble(scene, [-0.6, 1.2])
+    turn = begin[0] + 0.5 * (1.0 - np.cos(np.pi * 2e-3 * np.arange(1, 4)))
+    motion = vp.simulate(scene, begin, np.zeros(2), dt=2e-3, steps=3, controls=turn[:, None], integrator=vp.Gauss(2))
+    # Both links are as long, so the second turns twice as far the other way.
+    np.testing.assert_allclose(vp.linearize(scene, motion).B[:, :2, 0], [[1.0, -2.0]] * 3, atol=1e-8)

@@ -698,7 +698,7 @@ class ConstrainedStepper {
             for (int k = 0; k < stages; ++k) impulse[k * m + r] = 0.0;
         }
         const int size = stages * (n + here.rank());
-        double before = infinity, worst = infinity;
+        double before = infinity, worst = infinity, worst_before = infinity;
         bool fresh = true;
         for (int iteration = 0; iteration < most_corrections + 1; ++iteration) {
             equation.sweep(h, start, fresh, effort);
@@ -720,7 +720,8 @@ class ConstrainedStepper {
                 for (int c = 0; c < n; ++c) equation.delta[i * n + c] = scaled[c] * solution[i * n + c];
             }
             const double moved = equation.kinetic_size(equation.delta.data());
-            if (!(moved <= 0.25 * before)) {
+            // Impulses may have a way to go where velocities have none.
+            if (!(moved <= 0.25 * before) && !(worst <= 0.25 * worst_before)) {
                 // The factors may be to blame, if they are of another iterate.
                 if (fresh) break;
                 fresh = true;
@@ -754,6 +755,7 @@ class ConstrainedStepper {
                 }
             }
             before = moved;
+            worst_before = worst;
         }
         if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
         effort.residual = std::max(effort.residual, worst);
