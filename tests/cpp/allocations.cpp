@@ -74,15 +74,16 @@ void* operator new(std::size_t size) {
 void operator delete(void* memory) noexcept { std::free(memory); }
 void operator delete(void* memory, std::size_t) noexcept { std::free(memory); }
 
+const varpin::Tableau midpoint{.stages = 1,
+                               .a = {0.5},
+                               .gradient = {0.5},
+                               .force = {0.5},
+                               .b = {1.0},
+                               .c = {0.5},
+                               .ahead = {-1.0, 2.0},
+                               .reach = 0.25};
+
 bool allocates_nothing(const varpin::Mechanism& mechanism) {
-    const varpin::Tableau midpoint{.stages = 1,
-                                   .a = {0.5},
-                                   .gradient = {0.5},
-                                   .force = {0.5},
-                                   .b = {1.0},
-                                   .c = {0.5},
-                                   .ahead = {-1.0, 2.0},
-                                   .reach = 0.25};
     const double q0[n] = {0.3, -0.2, 0.1}, v0[n] = {}, h = 0.01;
     std::vector<double> u(N * n, 0.5), q(N * n), p(N * n), v(N * n), energy(N), applied(N * n), quality(3 * N);
     std::vector<double> least(n, -infinity), greatest(n, infinity);
@@ -192,14 +193,6 @@ bool constrained_steps_allocate_nothing() {
     const double height = std::sin(0.4) + std::sin(0.7) + std::sin(0.2);
     mechanism.constraints = {
         {{{tip}}, {{across}}}, {{.x = 0, .y = 1, .constant = height}}, {}, {}, mechanism.tree.bodies, n};
-    const varpin::Tableau midpoint{.stages = 1,
-                                   .a = {0.5},
-                                   .gradient = {0.5},
-                                   .force = {0.5},
-                                   .b = {1.0},
-                                   .c = {0.5},
-                                   .ahead = {-1.0, 2.0},
-                                   .reach = 0.25};
     varpin::ConstrainedStepper stepper(mechanism, midpoint, {0.0, 1.0}, 0.5, {});
     varpin::ConstrainedState state(mechanism, 1);
     const std::vector<double> force(n);

@@ -17,7 +17,7 @@ from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.model.robot import Robot, geometry
 from varpin.model.tree import place_of_frame, z_to
 from varpin.model.urdf import decoded, parsed
-from varpin.support.checks import finite_array, positive
+from varpin.support.checks import finite_array, positive, rotation_matrix
 from varpin.support.frozen import Frozen
 
 Floats = NDArray[np.float64]
@@ -63,9 +63,7 @@ class Obstacle(Frozen):
         at, size = finite_array("box center", center, (3,)), finite_array("box sides", sides, (3,))
         if not (size > 0.0).all():
             raise InputError(f"box sides must be > 0 [m], got {size}")
-        R = np.eye(3) if rotation is None else finite_array("box rotation", rotation, (3, 3))
-        if np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
-            raise InputError("box rotation must be a rotation matrix: R'R = 1 and det R = 1")
+        R = np.eye(3) if rotation is None else rotation_matrix("box rotation", rotation)
         return cls(str(name), at, at, 0.0, size, R)
 
     def __repr__(self) -> str:

@@ -32,6 +32,18 @@ def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
     return require_finite(name, array)
 
 
+def rotation_matrix(name: str, value: ArrayLike) -> Floats:
+    """``value`` as a new rotation matrix (3, 3).
+
+    Raises:
+        InputError: As :func:`finite_array`, or R'R is not 1 to 1e-6, or R mirrors.
+    """
+    R = finite_array(name, value, (3, 3))
+    if np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
+        raise InputError(f"{name} must be a rotation matrix: R'R = 1 and det R = 1")
+    return R
+
+
 def tuple_of(name: str, given: Any, kind: type, note: str = "") -> tuple[Any, ...]:
     """``given``, one of a kind of varpin's objects or a sequence of them, as a tuple; the kind's plural is ``name``.
 

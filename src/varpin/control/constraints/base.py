@@ -48,6 +48,7 @@ class Horizon(Frozen):
         return len(self.t) - 1
 
 
+@dataclass(frozen=True, eq=False)
 class BoundConstraint(Frozen, ABC):
     """A constraint on a grid: c <= 0 or c = 0 for ``rows`` at each of K places, nodes or decisions.
 

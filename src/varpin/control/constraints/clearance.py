@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.control.constraints.base import (
     BoundConstraint,
     Horizon,
-    Integers,
     PlanConstraint,
     checked_margin,
     nodes_after,
@@ -32,12 +31,6 @@ _LENGTH = 0.1
 
 @dataclass(frozen=True, eq=False)
 class _BoundClearance(BoundConstraint):
-    source: PlanConstraint
-    places: Integers
-    times: Floats
-    rows: tuple[str, ...]
-    unit: str
-    scale: float
     of: Clearance
     distance: float
 

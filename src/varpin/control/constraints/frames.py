@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.control.constraints.base import (
     BoundConstraint,
     Horizon,
-    Integers,
     PlanConstraint,
     checked_margin,
     nodes_after,
@@ -22,7 +21,7 @@ from varpin.control.constraints.base import (
 from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
-from varpin.support.checks import as_floats, checked_limits, finite, finite_array, positive
+from varpin.support.checks import as_floats, checked_limits, finite, finite_array, positive, rotation_matrix
 
 Floats = NDArray[np.float64]
 
@@ -76,12 +75,7 @@ class ReachFrame(_OfFrame):
         if position is None and rotation is None:
             raise InputError("ReachFrame takes a position, a rotation or both")
         self.position = None if position is None else finite_array("ReachFrame position", position, (3,))
-        self.rotation = None
-        if rotation is not None:
-            R = finite_array("ReachFrame rotation", rotation, (3, 3))
-            if np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
-                raise InputError("ReachFrame rotation must be a rotation matrix: R'R = 1 and det R = 1")
-            self.rotation = R
+        self.rotation = None if rotation is None else rotation_matrix("ReachFrame rotation", rotation)
 
     def bind(self, horizon: Horizon) -> BoundConstraint:
         """See :meth:`PlanConstraint.bind`."""
@@ -95,12 +89,6 @@ class ReachFrame(_OfFrame):
 
 @dataclass(frozen=True, eq=False)
 class _BoundGoal(BoundConstraint):
-    source: PlanConstraint
-    places: Integers
-    times: Floats
-    rows: tuple[str, ...]
-    unit: str
-    scale: float
     goal: ReachFrame
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
@@ -138,12 +126,6 @@ def _log_slope(e: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _BoundRegion(BoundConstraint):
-    source: PlanConstraint
-    places: Integers
-    times: Floats
-    rows: tuple[str, ...]
-    unit: str
-    scale: float
     region: _Region
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002

@@ -31,12 +31,6 @@ _POSITION, _SPEED = 0.1, 0.5
 
 @dataclass(frozen=True, eq=False)
 class _BoundBox(BoundConstraint):
-    source: PlanConstraint
-    places: Integers
-    times: Floats
-    rows: tuple[str, ...]
-    unit: str
-    scale: float
     in_velocity: bool
     columns: Integers  # which coordinate each row is of
     signs: Floats  # 1 for upper limits, -1 for lower ones
@@ -150,12 +144,6 @@ class BoundRate(BoundConstraint):
         before: The control before the horizon (m,), or None where the first one is free.
     """
 
-    source: PlanConstraint
-    places: Integers
-    times: Floats
-    rows: tuple[str, ...]
-    unit: str
-    scale: float
     period: float
     hold: int
     limit: Floats
