@@ -794,6 +794,13 @@ def _refuse_trembling_angles(noise: Noise | Sequence[Noise] | None, elements: Se
         )
 
 
+def _sole_control(actuation: Floats, c: int) -> int | None:
+    """The control that drives coordinate ``c`` with share 1, and nothing else; None where there is no such control."""
+    drives = np.flatnonzero(actuation[c])
+    alone = len(drives) == 1 and actuation[c, drives[0]] == 1.0 and np.count_nonzero(actuation[:, drives[0]]) == 1
+    return int(drives[0]) if alone else None
+
+
 def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Element], bound: Bound) -> None:
     """Refuse a KinematicInput whose joint has no control of its own, or a servo besides."""
     served = {own.coordinate for own in of_kind(elements, "PositionServo")}
@@ -803,9 +810,7 @@ def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Eleme
         c, name = tie.follower, robot.joint_names[tie.follower]
         if c in served:
             raise InputError(f"joint {name!r} has both a PositionServo and a KinematicInput")
-        drives = np.flatnonzero(actuation[c])
-        alone = len(drives) == 1 and actuation[c, drives[0]] == 1.0 and np.count_nonzero(actuation[:, drives[0]]) == 1
-        if not alone:
+        if _sole_control(actuation, c) is None:
             raise InputError(
                 f"the KinematicInput of joint {name!r} needs a control of its own, its position: under this actuation "
                 "none is; name the joint in the actuation, or give it a column with a 1"
@@ -824,14 +829,13 @@ def _served(robot: Robot, actuation: Floats, elements: Sequence[Element]) -> Flo
         c, name = servo.coordinate, robot.joint_names[servo.coordinate]
         if sum(other.coordinate == c for other in servos) > 1:
             raise InputError(f"joint {name!r} has two position servos")
-        drives = np.flatnonzero(actuation[c])
-        alone = len(drives) == 1 and actuation[c, drives[0]] == 1.0 and np.count_nonzero(actuation[:, drives[0]]) == 1
-        if not alone:
+        alone = _sole_control(actuation, c)
+        if alone is None:
             raise InputError(
                 f"the position servo of joint {name!r} needs a control of its own: under this actuation none is the "
                 "joint's alone, with share 1"
             )
-        scaled[c, drives[0]] = servo.values[0]
+        scaled[c, alone] = servo.values[0]
     return scaled
 
 
