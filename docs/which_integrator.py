@@ -1,12 +1,13 @@
 """The measurements behind docs/which-integrator.md: its tables and figures.
 
-Short horizon, long horizon, optimal control, noise, stiffness and real arms, for varpin's integrators and, where they are
-installed (``pip install "varpin[peers]"``), for MuJoCo, Drake and a DOP853 in C++; SciPy's DOP853 on Pinocchio's
+Short horizon, long horizon, optimal control, noise, stiffness and real arms, for varpin's integrators and, where they
+are installed (``pip install "varpin[peers]"``), for MuJoCo, Drake and a DOP853 in C++; SciPy's DOP853 on Pinocchio's
 forward dynamics always takes part. A time of varpin's is that of a plain ``simulate`` call, its look at the motion
 included. Times are the best of several rounds in which the methods take turns, after a round that does not count.
 
     python docs/which_integrator.py                   # rewrites the page and its figures
     python docs/which_integrator.py --quick FOLDER    # shorter, into a folder: the page, its figures, and which.csv
+    python docs/which_integrator.py --only real       # one section
     python docs/which_integrator.py --redraw          # the figure of plans, from the numbers on the page
 """
 
