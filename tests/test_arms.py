@@ -72,11 +72,11 @@ def test_who_integrates_where_nobody_is_named(load):
         return vp.simulate(scene, np.zeros(7), np.zeros(7), dt=dt, steps=steps, rng=0 if options else None).integrator
 
     assert taken() == "Radau(stages=3)"
-    assert taken(5e-5) == "Midpoint(alpha=0.5)"
+    assert taken(5e-5) == "Gauss(stages=2)"
     assert taken(noise=vp.AdditiveNoise(0.1)) == "Midpoint(alpha=0.5)"
-    assert vp.simulate(vp.Scene(load("ur5")), np.zeros(6), np.zeros(6), dt=1e-2, steps=1).integrator == (
-        "Midpoint(alpha=0.5)"
-    )
+    assert vp.simulate(vp.Scene(load("ur5")), np.zeros(6), np.zeros(6), dt=1e-2, steps=1).integrator == "Gauss(stages=2)"
+    held = vp.Scene(load("ur5"), damping=1e3, constraints=[vp.PointOnPlane("tool0", np.zeros(3), normal=[1.0, 0.0, 0.0])])
+    assert vp.simulate(held, np.zeros(6), np.zeros(6), dt=1e-2, steps=1).integrator == "Gauss(stages=2)"
     rubbing = vp.Scene(load("ur5"), forces=[vp.CoulombFriction(1.0)])
     assert vp.simulate(rubbing, np.zeros(6), np.ones(6), dt=1e-2, steps=1).integrator == "Radau(stages=3)"
 
