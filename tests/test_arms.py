@@ -74,8 +74,12 @@ def test_who_integrates_where_nobody_is_named(load):
     assert taken() == "Radau(stages=3)"
     assert taken(5e-5) == "Gauss(stages=2)"
     assert taken(noise=vp.AdditiveNoise(0.1)) == "Midpoint(alpha=0.5)"
-    assert vp.simulate(vp.Scene(load("ur5")), np.zeros(6), np.zeros(6), dt=1e-2, steps=1).integrator == "Gauss(stages=2)"
-    held = vp.Scene(load("ur5"), damping=1e3, constraints=[vp.PointOnPlane("tool0", np.zeros(3), normal=[1.0, 0.0, 0.0])])
+    assert (
+        vp.simulate(vp.Scene(load("ur5")), np.zeros(6), np.zeros(6), dt=1e-2, steps=1).integrator == "Gauss(stages=2)"
+    )
+    held = vp.Scene(
+        load("ur5"), damping=1e3, constraints=[vp.PointOnPlane("tool0", np.zeros(3), normal=[1.0, 0.0, 0.0])]
+    )
     assert vp.simulate(held, np.zeros(6), np.zeros(6), dt=1e-2, steps=1).integrator == "Gauss(stages=2)"
     rubbing = vp.Scene(load("ur5"), forces=[vp.CoulombFriction(1.0)])
     assert vp.simulate(rubbing, np.zeros(6), np.ones(6), dt=1e-2, steps=1).integrator == "Radau(stages=3)"
