@@ -460,7 +460,8 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
     damped = bool(_fast_damping(scene, trajectory).rate)
     if steps == 1:
         return not damped and _halves_agree(scene, integrator, trajectory)
-    other, times = _STOPPING if damped else integrator, 1 if damped and not integrator.l_stable else 2
+    foreign = damped and not integrator.l_stable
+    other, times = _STOPPING if foreign else integrator, 1 if foreign else 2
     apart = max(pieces, 1 + steps % 2) - 1
     begins = np.array([i * (steps - length) // apart for i in range(apart + 1)]) if apart else _FROM_START
     if pieces == _WINDOWS:
