@@ -77,9 +77,7 @@ def test_who_integrates_where_nobody_is_named(load):
     assert (
         vp.simulate(vp.Scene(load("ur5")), np.zeros(6), np.zeros(6), dt=1e-2, steps=1).integrator == "Gauss(stages=2)"
     )
-    held = vp.Scene(
-        load("ur5"), damping=1e3, constraints=[vp.JointTie("wrist_1_joint", "elbow_joint")]
-    )
+    held = vp.Scene(load("ur5"), damping=1e3, constraints=[vp.JointTie("wrist_1_joint", "elbow_joint")])
     assert vp.simulate(held, np.zeros(6), np.zeros(6), dt=1e-2, steps=1).integrator == "Gauss(stages=2)"
     rubbing = vp.Scene(load("ur5"), forces=[vp.CoulombFriction(1.0)])
     assert vp.simulate(rubbing, np.zeros(6), np.ones(6), dt=1e-2, steps=1).integrator == "Radau(stages=4)"

@@ -100,7 +100,9 @@ def add_integrator(parser: argparse.ArgumentParser) -> None:
         help=f"{', '.join(BY_NAME)}; with options as Python writes them, 'Gauss(stages=3)'; default: Gauss(stages=2), "
         "with 4 where springs are fast for the step, or Radau(stages=4) where dampers are faster than it",
     )
-    group.add_argument("--stages", type=int, metavar="N", help="of Gauss, which it asks for: 1 to 6, of order twice as many")
+    group.add_argument(
+        "--stages", type=int, metavar="N", help="of Gauss, which it asks for: 1 to 6, of order twice as many"
+    )
     group.add_argument(
         "--alpha", type=float, metavar="A", help="of Midpoint, which it asks for, in [0, 1]: of second order at 0.5"
     )

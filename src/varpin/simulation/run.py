@@ -52,9 +52,9 @@ logger = logging.getLogger(__name__)
 _CHUNK = 30_000
 # What steps where no integrator is given; and under noise, for more stages do not raise the strong order.
 _USUAL, _NOISY = Gauss(2), Midpoint()
-# What steps where something turns by more than this in a step [rad]: two stages lose a thousandth of a radian in fifteen
-# periods there. And where something damps this many times faster than the step: velocities of the others lag and ring,
-# and three stages miss by a tenth what torques that jump do to them.
+# What steps where something turns by more than this in a step [rad], of which two stages lose 2e-4 rad a period. And
+# where something damps this many times faster than the step: velocities of the others lag and ring, and three stages
+# miss by a tenth what torques that jump do to them.
 _SWINGING, _TURNS = Gauss(4), 0.4
 _STOPPING, _RINGS = Radau(4), 2.0
 # Of more joints than so many nobody asks, for that takes as long as a motion.
