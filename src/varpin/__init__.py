@@ -88,6 +88,7 @@ from varpin.simulation.run import StepFailure as StepFailure
 from varpin.simulation.run import ToleranceError as ToleranceError
 from varpin.simulation.run import simulate as simulate
 from varpin.trajectory import Accuracy as Accuracy
+from varpin.trajectory import Nodes as Nodes
 from varpin.trajectory import StepStatistics as StepStatistics
 from varpin.trajectory import Trajectory as Trajectory
 
@@ -158,6 +159,7 @@ if TYPE_CHECKING:
     from varpin.show.inspection_report import JointReport as JointReport
     from varpin.show.inspection_report import LinkReport as LinkReport
     from varpin.show.inspection_report import RobotReport as RobotReport
+    from varpin.show.replay.live import LiveView as LiveView
     from varpin.study.extremes import check_robot as check_robot
     from varpin.study.linearization_check import LinearizationCheck as LinearizationCheck
     from varpin.study.linearization_check import check_linearization as check_linearization
@@ -209,6 +211,7 @@ _LATE: dict[str, tuple[str, ...]] = {
     "varpin.ensemble": ("Ensemble", "EnsembleInterrupted", "EnsembleStatistics", "PathFailure", "simulate_ensemble"),
     "varpin.show.inspection": ("inspect_robot",),
     "varpin.show.inspection_report": ("FrameReport", "JointReport", "LinkReport", "RobotReport"),
+    "varpin.show.replay.live": ("LiveView",),
     "varpin.linearization": ("Curvature", "Linearization", "Moments", "linearize", "propagate_moments", "second_order"),
     "varpin.study.extremes": ("check_robot",),
     "varpin.study.linearization_check": ("LinearizationCheck", "check_linearization"),
