@@ -34,8 +34,8 @@ Mask = NDArray[np.bool_]
 # Nodes that are linearized at a time: their derivatives are not kept.
 _BLOCK = 2048
 
-# Passes that look for the constraints that their motion meets.
-_FORESEEN, _BISECTIONS = 60, 40
+# Of the way from one pass to the next.
+_BISECTIONS = 40
 
 # A pass whose Quu rounding may have changed by more than this part is made anew on square roots.
 TRUSTED = 1e-9
@@ -178,7 +178,7 @@ def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -
         return _within_limits(along, regularization, curvature)
     rows = _Rows(along, problem)
     held, best, least = rows.begun, None, 0.0
-    for _ in range(_FORESEEN):
+    for _ in range(problem.passes):
         passing = rows.along(held)
         plan = _within_limits(passing, regularization, curvature)
         if plan is None:
