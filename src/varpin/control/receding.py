@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 # part of its first weight: stiffer ones take more iterations than a tick has.
 _GROWTH, _ENOUGH, _HEAVIEST = 10.0, 0.5, 1e4
 # Backward passes that an iteration may take to find the rows that its motion meets: the tick before knows most of them.
-_PASSES = 4
+_PASSES = 8
 # Multipliers beyond this part of the cost over a tenth of a constraint's range only wind up, at what cannot be met.
 _LARGEST = 1e3
 # Of a violation, what ticks in a row are to take away, or there is no plan to be found; and how many.
