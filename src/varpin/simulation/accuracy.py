@@ -242,8 +242,8 @@ def noticed(scene: Scene, way: Floats, speed: Floats, light: Floats, duration: F
     ``light`` are the velocities that would have little of the others' energy (..., n), ``duration`` how long they are
     looked at [s].
     """
-    least = np.minimum(LITTLE * _of_its_kind(scene, speed), light)
-    least_way = np.minimum(LITTLE * _of_its_kind(scene, way), light * duration)
+    least = np.minimum(LITTLE * largest_of_its_kind(scene, speed), light)
+    least_way = np.minimum(LITTLE * largest_of_its_kind(scene, way), light * duration)
     return np.maximum(way, least_way), np.maximum(speed, least)
 
 
@@ -254,7 +254,7 @@ def light_speed(inertia: Floats, change: Floats) -> Floats:
     return light
 
 
-def _of_its_kind(scene: Scene, values: Floats) -> Floats:
+def largest_of_its_kind(scene: Scene, values: Floats) -> Floats:
     """For each coordinate (..., n), the largest value of all that turn, or of all that slide: units do not compare."""
     sliding = scene.robot.slides
     largest = [values[..., kind].max(axis=-1, initial=0.0, keepdims=True) for kind in (sliding, ~sliding)]
