@@ -296,7 +296,8 @@ class _Rounds:
             first_weights=begun.first_weights,
             backoff=backoff,
             worst=violation,
-            tolerance=begun.tolerance if exact else max(_FINAL * self.tolerance, _TIGHTER * begun.tolerance),
+            # While a violation stays, whether it falls at all is to be found out, and not the optimum to many digits.
+            tolerance=begun.tolerance if exact or stays else max(_FINAL * self.tolerance, _TIGHTER * begun.tolerance),
             round=begun.round + 1,
             stuck=stuck,
         )

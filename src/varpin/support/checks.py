@@ -178,6 +178,22 @@ def named_limits(
     return checked_limits(name, sides, size)
 
 
+def over_time(name: str, function: Callable[[float], ArrayLike], times: Floats, size: int) -> Floats:
+    """A function of time at some times (N,), (N, size).
+
+    Raises:
+        InputError: It raises, or returns another shape or values that are not finite.
+    """
+    rows = []
+    for time in times.tolist():
+        try:
+            value = function(time)
+        except Exception as error:
+            raise InputError(f"{name} raised {error!r} at t = {time:.6g} s") from error
+        rows.append(finite_array(f"{name} at t = {time:.6g} s", value, (size,)))
+    return np.array(rows).reshape(len(times), size)
+
+
 def as_floats(name: str, value: object) -> Floats:
     """``value`` as a new float array, or an InputError that names it."""
     try:
