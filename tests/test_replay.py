@@ -577,3 +577,12 @@ def test_all_of_the_motion_is_in_view_above_the_bar(browser, tmp_path, size):
         browser.set_window_size(800, 600)
     told = [entry["message"] for entry in browser.get_log("browser")]
     assert not [words for words in told if "deprecated" in words]
+
+
+@pytest.mark.parametrize(("frequency", "told"), [(1.0, False), (40.0, True)])
+def test_a_long_motion_with_too_few_keyframes_is_said_to_be_one(finger, tmp_path, caplog, frequency, told):
+    t = np.linspace(0.0, 20.0, 20_001)
+    q = 0.5 + 0.3 * np.sin(frequency * t)[:, None] * np.ones(3)
+    with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
+        replay(finger, q, dt=1e-3, html=tmp_path / "long.html", max_frames=200)
+    assert ("20 s of motion are shown with 200 keyframes" in caplog.text) == told
