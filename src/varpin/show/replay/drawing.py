@@ -27,7 +27,7 @@ from varpin.show.replay.legend import (
 from varpin.show.replay.picture import Picture, label, labels
 from varpin.show.replay.script import Actor, Outlook, Script, Target, Trace
 from varpin.show.replay.shapes import ShapeLoader
-from varpin.show.replay.view import set_view, side_by_side, view_direction
+from varpin.show.replay.view import across, set_view, side_by_side, view_direction
 
 Floats = NDArray[np.float64]
 
@@ -100,7 +100,7 @@ class _Drawing:
     def _stage(self) -> Stage:
         """Set the view."""
         marked = [trace.points for trace in self.script.traces] + [target.places for target in self.script.targets]
-        extents, axes = [], []
+        extents, poses = [], []
         size = 0.0
         for actor in self.script.actors:
             picture = self.pictures[id(actor.robot)]
@@ -118,12 +118,14 @@ class _Drawing:
             low, high, room = seen.min(axis=0), seen.max(axis=0), 0.3 * size
             around = [np.clip(region.corners, low - room, high + room) for region in actor.regions]
             extents.append(np.concatenate([seen, *around]))
-            axes.append(picture.body_poses(positions)[0][..., 2].reshape(-1, 3))
+            poses.append(picture.body_poses(positions))
         if not np.abs(np.concatenate(extents)).max() < _FARTHEST:
             raise InputError(f"what is to be shown has sizes or places beyond {_FARTHEST:g} m, which no viewer draws")
         # A point, or what is too small to tell from one, is seen from a metre away.
         size = size if size > 1.0 / _FARTHEST else 1.0
-        toward = view_direction(np.concatenate(axes))
+        toward = view_direction(np.concatenate([R[..., 2].reshape(-1, 3) for R, _ in poses]))
+        for k, actor in enumerate(self.script.actors):
+            extents[k] = np.concatenate([extents[k], *self._around_marks(actor, *poses[k], toward, size)])
         offset = self.script.offset
         places = side_by_side(extents, toward) if offset is None else [k * offset for k in range(len(extents))]
         base = self.pictures[id(self.script.actors[0].robot)].corners(-1)
@@ -132,6 +134,21 @@ class _Drawing:
         set_view(self.viewer, points, toward, float(floor), size)
         pictures = [self.pictures[id(actor.robot)] for actor in self.script.actors]
         return Stage(size, places, points, toward, float(floor), pictures)
+
+    def _around_marks(self, actor: Actor, R: Floats, p: Floats, toward: Floats, size: float) -> list[Floats]:
+        """Points (P, 3) around labels and triads, of bodies whose poses are (S, b, 3, 3) and (S, b, 3)."""
+        found = []
+        right = across(toward)
+        up = np.cross(toward, right)
+        for target in (*self.script.targets, *actor.goals):
+            half = 0.5 * marks.label_width(target.name) * _LABEL * size * right
+            top = (1.2 * _BALL + _LABEL) * size * up
+            found += [target.places + top - half, target.places + top + half, target.places - _BALL * size * up]
+        for name in actor.frames:
+            body, placement = self.pictures[id(actor.robot)].frame(name)
+            tips = placement.translation + _TRIAD * size * placement.rotation.T
+            found.append(tips if body < 0 else (tips @ R[:, body].transpose(0, 2, 1) + p[:, body, None]).reshape(-1, 3))
+        return found
 
     def _actor(self, actor: Actor, number: str, place: Floats, size: float) -> None:
         picture, tree = self.pictures[id(actor.robot)], actor.robot.tree

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import meshcat
 import numpy as np
@@ -29,6 +29,7 @@ from varpin.show.replay import marks
 from varpin.show.replay.annotations import frame_names, references, rows_at, target, target_tracks
 from varpin.show.replay.drawing import draw, joint_motion, joint_track
 from varpin.show.replay.legend import TRACE_COLORS
+from varpin.show.replay.page import lowered
 from varpin.show.replay.script import Actor, Script
 from varpin.show.replay.surroundings import goals, parts_of, regions, ties
 from varpin.show.replay.view import set_view
@@ -486,6 +487,12 @@ class _Window(ViewerWindow):
         self.zmq_socket.setsockopt(zmq.RCVTIMEO, int(1000 * _ANSWER))
         self.zmq_socket.setsockopt(zmq.LINGER, 0)
         self.zmq_socket.connect(self.zmq_url)
+
+    def send(self, command: Any) -> None:
+        """Send a command, and wait until the server has taken it."""
+        words = lowered(command)
+        self.zmq_socket.send_multipart([words["type"].encode(), words["path"].encode(), umsgpack.packb(words)])
+        self.zmq_socket.recv()
 
     def _listen(self) -> None:
         for line in self.server_proc.stderr:
