@@ -21,6 +21,11 @@ SLOW = (
     "alex_sake_hands",
     "allegro_left_hand",
     "tiago_no_hand",
+    "alex_nub_hands",
+    "alex_psyonic_hands",
+    "allegro_right_hand",
+    "double_pendulum_simple",
+    "tiago_pro",
 )
 
 
@@ -52,12 +57,13 @@ def middle(robot):
     return 0.5 * (lower + upper)
 
 
+@pytest.mark.parametrize("share", [0.05, 0.2])
 @pytest.mark.parametrize("name", [*FAST, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
-def test_torques_that_jump_on_arms_with_their_own_damping(load, name):
+def test_torques_that_jump_on_arms_with_their_own_damping(load, name, share):
     """Of the largest way, and of the largest velocity, of each joint, with nothing said of the integrator."""
     robot = load(name)
     scene, q0, rng = vp.Scene(robot, damping="robot"), middle(robot), np.random.default_rng(1)
-    rows = scene.holding_torque(q0) + 0.05 * rng.normal(size=(20, robot.dof)) * np.minimum(robot.effort_limit, 50.0)
+    rows = scene.holding_torque(q0) + share * rng.normal(size=(20, robot.dof)) * np.minimum(robot.effort_limit, 50.0)
     q, v = exact(scene, q0, rows, 1e-2)
     motion = vp.simulate(scene, q0, np.zeros(robot.dof), dt=1e-2, steps=20, controls=rows)
     assert (np.abs(motion.q - q).max(axis=0) <= 0.01 * np.abs(q - q0).max(axis=0)).all()
