@@ -128,7 +128,7 @@ def test_steps_of_servos_of_any_stiffness(load, frequency):
 
 @pytest.mark.parametrize("frequency", [20, 500, 5000])
 def test_servos_at_their_limits(load, frequency):
-    """Commands beyond the motors for a while: within 5 % of their way, or told that steps are coarse."""
+    """Commands beyond the motors for a while: within 1e-3 rad in the end, or told that steps are coarse."""
     robot = load("ur5")
     scene = served(robot, frequency, 0.3 * robot.effort_limit)
     goal = START + np.array([0.3, 0.1, -0.1, 0.0, 0.0, 0.0])
@@ -138,8 +138,7 @@ def test_servos_at_their_limits(load, frequency):
     assert np.abs(drive_forces(scene.elements, fine.q[:-1], fine.v[:-1], fine.u @ scene.actuation)).max() > 0.29 * 150.0
     for integrator in (None, vp.Midpoint(), vp.Gauss(2), vp.Gauss(4)):
         motion = vp.simulate(scene, START, np.zeros(6), dt=5e-3, steps=100, controls=rows, integrator=integrator)
-        way = np.ptp(fine.q, axis=0).max()
-        near = np.abs(motion.q - fine.q[::64]).max() <= 0.05 * way
+        near = np.abs(motion.q[-1] - fine.q[-1]).max() <= 1e-3
         assert near or any("is coarse for" in told or "faster than the step" in told for told in motion.warnings)
 
 
