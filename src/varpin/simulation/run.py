@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -20,7 +21,7 @@ from varpin.integrators.within import Times, changing
 from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
-from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop, takes
+from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.mechanics.scene import CORRECTED, Scene, refuse_constraints, refuse_inputs, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.simulation import limits
@@ -37,14 +38,16 @@ from varpin.support.checks import (
     joint_array,
     positive,
     require_finite,
+    takes,
+    told_motion,
 )
-from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
+from varpin.trajectory import STEP_NUMBERS, Accuracy, Nodes, Trajectory
 
 Floats = NDArray[np.float64]
 ControlLaw = Callable[[float, Floats, Floats], JointValues]
 # Controls that are known before the motion, or fed back by the core.
 Controls = JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None
-Progress = Callable[[int, int], None]
+Progress = Callable[[int, int], None] | Callable[[int, int, Nodes], None]
 
 logger = logging.getLogger(__name__)
 
@@ -59,6 +62,8 @@ _SWINGING, _TURNS = Gauss(4), 0.4
 _STOPPING, _RINGS = Radau(4), 2.0
 # Of more joints than so many nobody asks, for that takes as long as a motion.
 _ASKED = 200
+# Who is told the motion is called at least so often [s], where nothing but whole chunks of steps takes longer.
+_LOOK = 1.0 / 60.0
 # Who may be chosen for a tolerance as well, where something damps faster than the coarsest steps by this factor.
 _STIFF, _FAR = (Radau(3), Radau(4)), 4.0
 # What a start may be moved by onto constraints without a word [rad or m].
@@ -251,6 +256,43 @@ class _Record:
         return _trajectory(self.scene, self.integrator, self.dt, self._first, parts, dw, within, self._line)
 
 
+class _Reporter:
+    """Who is told how far a motion is, and perhaps what it was since the last time."""
+
+    def __init__(self, progress: Progress | None, steps: int, dt: float) -> None:
+        self._progress: Any = progress
+        self._steps, self._dt = steps, dt
+        self._moving = told_motion("progress", progress, "steps done, steps in all", "nodes")
+        self._parts: list[Segment] = []
+        self._last = time.perf_counter()
+
+    def begin(self, node: Segment) -> None:
+        """Take the first node, and tell of it who is told the motion."""
+        if self._moving:
+            self._parts = [node]
+            self._tell(0)
+
+    def add(self, segment: Segment, done: int, *, due: bool) -> None:
+        """Take steps, after which so many are ``done``; and tell, if that is due."""
+        if self._progress is None:
+            return
+        if self._moving:
+            self._parts.append(segment)
+            due = due or time.perf_counter() - self._last > _LOOK
+        if due or done == self._steps:
+            self._tell(done)
+
+    def _tell(self, done: int) -> None:
+        if not self._moving:
+            self._progress(done, self._steps)
+            return
+        q, v = (np.concatenate([getattr(part, name) for part in self._parts]) for name in ("q", "v"))
+        nodes = Nodes(np.arange(done - len(q) + 1, done + 1, dtype=np.float64) * self._dt, q, v)
+        self._parts = [replace(self._parts[-1], q=q[-1:], v=v[-1:])]
+        self._progress(done, self._steps, nodes)
+        self._last = time.perf_counter()
+
+
 def _trajectory(
     scene: Scene,
     integrator: Integrator,
@@ -432,7 +474,9 @@ def simulate(
         check: Look at the finished motion, whether the balance of its energy closes, its steps resolve it and its
             control loop is stable, for ``Trajectory.warnings`` and the log. It takes about half as long as the
             motion, and 0.1 ms; some times as long as the motion where its steps are coarse.
-        progress: Called now and then with (steps done, steps in all).
+        progress: Called now and then with (steps done, steps in all). A function that needs three arguments gets the
+            motion, too: a :class:`varpin.Nodes` with the nodes from the last call on, the one it ended with first; as
+            :class:`varpin.LiveView` does.
 
     Returns:
         The trajectory, frozen.
@@ -475,6 +519,7 @@ def simulate(
     _require_memory(scene, steps)
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
     integrator = usual_integrator(scene, q0, v0, dt, noisy=len(dw) > 0) if integrator is None else integrator
+    reporter = _Reporter(progress, steps, dt)
     law = controls if callable(controls) else None
     if callable(controls) or isinstance(controls, OpenLoop):
         refuse_inputs(scene, "simulate with a function of time or a law")
@@ -502,6 +547,7 @@ def simulate(
     stepwise = scene.noise.diffusion is None or scene.custom is not None or bool(scene.bound_constraints.rows.customs)
     interrupted = False
     try:
+        reporter.begin(start)
         while record.steps < steps:
             done = record.steps
             block = _next_block(controls, commands, record, 1 if stepwise else chunk, steps - done)
@@ -511,8 +557,7 @@ def simulate(
                 # What a law has just decided is in no step yet.
                 decided = None if law is None else (done, block.u)
                 raise _step_failure(record, segment.failure, hold if check else None, decided)
-            if progress is not None and (done // chunk < record.steps // chunk or record.steps == steps):
-                progress(record.steps, steps)
+            reporter.add(segment, record.steps, due=done // chunk < record.steps // chunk)
     except KeyboardInterrupt:
         interrupted = True
     try:
