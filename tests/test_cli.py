@@ -130,7 +130,7 @@ def test_quiet_run_prints_nothing(arm, capsys):
 
 
 def test_split_steps_are_flagged_in_the_table_and_warned_of(arm, capsys):
-    assert main(["simulate", arm, "--dt", "0.3", "--steps", "20", "--v0", "5", "0"]) == 0
+    assert main(["simulate", arm, "--integrator", "midpoint", "--dt", "0.3", "--steps", "20", "--v0", "5", "0"]) == 0
     out, err = capsys.readouterr()
     assert re.search(r"split steps +│ \d+ of 20, into up to \d+ parts: a smaller dt keeps the structure", out)
     said = r"^varpin: warning: dt = 0.3 s is coarse for .* \(\d+ of 20 steps were taken in up to \d+ parts\)$"

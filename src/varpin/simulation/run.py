@@ -464,7 +464,7 @@ def simulate(
         integrator: If left out, ``Gauss(stages=2)``; where, at the start, springs turn a mode by more than 0.4 rad in a
             step, ``Gauss(stages=4)``; where dampers, dry friction or servos are more than twice as fast as the step
             there, ``Radau(stages=4)``, unless the scene has constraints. A CustomForce is not asked for either.
-            ``Midpoint()`` in scenes with noise; with a tolerance, the cheapest that there is.
+            ``Midpoint()`` where noise is drawn; with a tolerance, the cheapest that there is.
 
     Other Args:
         rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero, and a
@@ -516,7 +516,9 @@ def simulate(
     else:
         dt, steps = _times(dt, steps, duration)
     period = count("period", period, least=1)
-    integrator = usual_integrator(scene, q0, v0, dt) if integrator is None else integrator
+    _require_memory(scene, steps)
+    dw = wiener_increments(scene.processes, dt, steps, rng, increments)
+    integrator = usual_integrator(scene, q0, v0, dt, noisy=len(dw) > 0) if integrator is None else integrator
     reporter = _Reporter(progress, steps, dt)
     law = controls if callable(controls) else None
     if callable(controls) or isinstance(controls, OpenLoop):
@@ -528,13 +530,11 @@ def simulate(
             f"period = {period} is of a control law, a function of (t, q, v); rows are given one a step, "
             "and a LinearPolicy has a hold of its own"
         )
-    _require_memory(scene, steps)
     if callable(controls) or isinstance(controls, OpenLoop):
         commands = open_loop(np.zeros((0, scene.controls)))._replace(hold=period)
     else:
         commands = commands_of(scene, integrator, controls, steps, dt)
     hold = period if law is not None else commands.hold if isinstance(controls, LinearPolicy) else None
-    dw = wiener_increments(scene.processes, dt, steps, rng, increments)
     state, (start,) = integrator.start(scene, q0[None], v0[None])
     linear = bool(len(commands.places))
     if linear:
@@ -692,13 +692,13 @@ def _time_of_wish(dt: float | None, steps: int | None, duration: float | None) -
     return positive("duration", duration, "s")
 
 
-def usual_integrator(scene: Scene, q0: Floats, v0: Floats, dt: float) -> Integrator:
+def usual_integrator(scene: Scene, q0: Floats, v0: Floats, dt: float, *, noisy: bool) -> Integrator:
     """Who integrates where nobody is named.
 
     Under noise it is the midpoint rule: its positions have the right law where damping is faster than the step, and a
     warning tells of its velocities. Radau's velocities lose nearly all of the noise.
     """
-    if scene.processes:
+    if noisy:
         return _NOISY
     # Radau's methods do not keep constraints.
     if not scene.constraints and _damps_faster(scene, q0, v0, _RINGS / dt):

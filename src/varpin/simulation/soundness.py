@@ -45,6 +45,7 @@ from varpin.simulation.friction import Stop, rate_at_stops, stops
 from varpin.simulation.limits import left as limits_left
 from varpin.simulation.phase import phase_lost
 from varpin.simulation.retaking import Again, Finer, finer, taken_again
+from varpin.simulation.saturation import bent
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -252,7 +253,7 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     found = [*_energy(scene, integrator, trajectory)]
     unsettled = _unsettled(scene, integrator, trajectory)
     if resolved(scene, integrator, trajectory):
-        return (*found, *(() if found else _out_of_phase(scene, integrator, trajectory)), *unsettled)
+        return (*found, *(() if found else _adding_up(scene, integrator, trajectory)), *unsettled)
     error = motion_error(scene, integrator, trajectory)
     if error is not None and spoken_of(error):
         dt, start = trajectory.dt, trajectory.t[error.step]
@@ -273,8 +274,26 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
         if ((before * after < 0.0) & (np.abs(before) > _STILL) & (np.abs(after) > 0.5 * np.abs(before))).any():
             found.append(_ringing(scene, fast, trajectory.dt))
     if not found:
-        found.extend(_out_of_phase(scene, integrator, trajectory))
+        found.extend(_adding_up(scene, integrator, trajectory))
     return (*found, *(own for own in unsettled if own.kind not in {other.kind for other in found}))
+
+
+def _adding_up(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Says what adds up over a motion that steps resolve from period to period."""
+    return (*_out_of_phase(scene, integrator, trajectory), *_at_limits_of_drives(scene, integrator, trajectory))
+
+
+def _at_limits_of_drives(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Says if servos come to the limits of their drives, or leave them, in steps that are too long for that."""
+    found = bent(scene, integrator, trajectory)
+    if found is None:
+        return ()
+    sentence = (
+        f"servos come to the limits of their drives, or leave them, in {found.steps} steps: dt = {trajectory.dt:g} s "
+        f"is coarse for {integrator} there, and joint {trajectory.joint_names[found.joint]!r} may be off by "
+        f"{found.off:.2g} rad or m, {100 * found.share:.2g}% of the longest way of a joint; smaller steps mend it"
+    )
+    return (Finding("servos at their limits", sentence, found.joint),)
 
 
 def _out_of_phase(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:

@@ -105,7 +105,7 @@ def check_linearization(
     q, v = joint_array("q", q, scene.robot.joint_names), joint_array("v", v, scene.robot.joint_names)
     u = np.zeros(m) if u is None else finite_array("u", u, (m,))
     dt, step = positive("dt", dt, "s"), positive("step", step, "1")
-    method = usual_integrator(scene, q, v, dt) if integrator is None else integrator
+    method = usual_integrator(scene, q, v, dt, noisy=k > 0) if integrator is None else integrator
     options: dict[str, Any] = {"dt": dt, "steps": 1, "integrator": method, "check": False}
     motion = simulate(scene, q, v, controls=u, increments=0.0, **options)
     lin = linearize(scene, motion, integrator=method)

@@ -80,7 +80,7 @@ class SceneFile:
             return self.spec.integrator
         if self.spec.costs:
             return integrator_for(self.scene, self.q0, self.spec.dt)
-        return usual_integrator(self.scene, self.q0, self.v0, self.spec.dt)
+        return usual_integrator(self.scene, self.q0, self.v0, self.spec.dt, noisy=self.spec.seed is not None)
 
     @cached_property
     def problem(self) -> OptimalControlProblem:
