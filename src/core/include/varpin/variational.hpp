@@ -19,9 +19,8 @@ namespace varpin {
 
 // Where a path stands.
 struct PathState {
-    // Enough for one iteration without a second look on chains of up to 100 links; of motions that turn by a third of a
-    // radian a step no more of them foresee the root.
-    static constexpr int most_misses = 5;
+    // More would add up to more of their rounding.
+    static constexpr int most_misses = 3;
 
     PathState(const Mechanism& mechanism, int stages)
         : place(mechanism.dof()),
