@@ -122,12 +122,20 @@ class _Explicit(Integrator):
         return failure_of(nodes, 0, int(nodes.done[0]), REASONS), np.zeros(0, dtype=np.uint8)
 
     def motions(
-        self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, drift: Floats, dt: float
+        self,
+        scene: Scene,
+        q0: Floats,
+        v0: Floats,
+        commands: Commands,
+        drift: Floats,
+        dt: float,
+        impulses: Floats | None = None,
     ) -> tuple[Floats, Floats] | None:
         """See :meth:`Integrator.motions`."""
         paths, n = q0.shape
         nodes = new_nodes(paths, steps_of(commands), n, scene.controls)
-        core.ExplicitRollout.start(scene.core, self.method, q0, v0).roll(dt, commands, scene.silence, drift, nodes)
+        rollout = core.ExplicitRollout.start(scene.core, self.method, q0, v0)
+        rollout.roll(dt, commands, scene.silence, drift, nodes, impulses=impulses)
         return None if nodes.ended.any() else (nodes.q, nodes.v)
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.core import doubled_steps_agree, energy_turnover, fastest_damping, glance
-from varpin.integrators import Integrator, Radau, Reference
+from varpin.integrators import ExplicitEuler, Integrator, Radau, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.integrators.within import changing, in_pairs, in_parts, shares
 from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.noise import impulses
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import (
     EVEN,
@@ -489,12 +490,14 @@ def _kicks(scene: Scene, trajectory: Trajectory) -> tuple[Floats | float, Floats
 def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
     """Whether even steps of twice the length make the same motion, so that there is nothing more to look for.
 
-    Windows all over the motion, or some of them, are taken again from their first nodes, all at once. That takes half
-    as long as the motion, or less; a motion of whole steps without noise can pass.
+    Windows all over the motion, or some of them, are taken again from their first nodes, all at once, under the kicks
+    that noise gave it. That takes half as long as the motion, or less; a motion of whole steps can pass whose noise
+    the core knows.
     """
     steps, q, v, u = trajectory.steps, trajectory.q, trajectory.v, trajectory.u
-    if isinstance(integrator, Reference) or not steps or trajectory.dw.any() or scene.noise.diffusion is None:
+    if isinstance(integrator, Reference) or not steps or scene.noise.diffusion is None:
         return False
+    noisy = bool(trajectory.dw.any())
     # Windows of like lengths, which are even.
     pieces = min(-(-steps // WINDOW), _WINDOWS)
     length = min(WINDOW, 2 * -(-steps // (2 * pieces)), steps - steps % 2)
@@ -508,7 +511,7 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
     # against that in steps as long as theirs.
     damped = bool(_fast_damping(scene, trajectory).rate)
     if steps == 1:
-        return not damped and _halves_agree(scene, integrator, trajectory)
+        return not (damped or noisy) and _halves_agree(scene, integrator, trajectory)
     foreign = damped and not integrator.l_stable
     other, times = _STOPPING if foreign else integrator, 1 if foreign else 2
     apart = max(pieces, 1 + steps % 2) - 1
@@ -520,15 +523,44 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
         # Commands are the same for all paths; their forces need not be.
         held = u[begins[:, None] + np.arange(length)].reshape(len(begins), length // times, times, -1)
         commands, drift = open_loop(np.zeros_like(u[:length:times])), held.mean(axis=2) @ scene.actuation.T
+    kicks = _kicks_of(scene, integrator, trajectory, begins, length, times) if noisy else None
     if trajectory.u_stages.shape[1]:
-        again = _windows_under(scene, integrator, trajectory, begins, length, other, times)
+        again = _windows_under(scene, integrator, trajectory, begins, length, other, times, kicks)
     else:
-        again = other.motions(scene, q[begins], v[begins], commands, drift, times * trajectory.dt)
+        again = other.motions(scene, q[begins], v[begins], commands, drift, times * trajectory.dt, kicks)
     if times == 1 and again is not None:
         again = np.ascontiguousarray(again[0][:, 1::2]), np.ascontiguousarray(again[1][:, 1::2])
     # How much less the error is in steps of half the length; of another method nothing is known.
     gain = (1.0 if damped else 2.0**integrator.order - 1.0) / _MARGIN
     return again is not None and _agree(scene, (q, v), begins, length, trajectory.dt, again, gain)
+
+
+def _kicks_of(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, begins: Integers, length: int, times: int
+) -> Floats:
+    """Impulses of the noise in windows of a motion, before and after each step of ``times`` of its own (P, K, 2, n).
+
+    In a step of twice the length half of what kicked in its middle comes before it and half after it: its end is then
+    at the same place, with the same momentum, to first order in the step.
+    """
+    diffusion, first = scene.noise.diffusion, trajectory.q[0]
+    assert diffusion is not None
+    step = begins[:, None] + np.arange(length)
+    # Explicit Euler's kicks come after the step.
+    left = 0.0 if isinstance(integrator, ExplicitEuler) else integrator.left
+    n = trajectory.q.shape[1]
+
+    def part(share: float, node: Integers) -> Floats:
+        if share == 0.0:
+            return np.zeros((*step.shape, n))
+        rows = trajectory.q[node.ravel()], trajectory.u[step.ravel()], trajectory.dw[step.ravel()]
+        return share * impulses(diffusion, *rows, first).reshape(*step.shape, n)
+
+    before, after = part(left, step), part(1.0 - left, step + 1)
+    if times == 2:
+        half = 0.5 * (after[:, ::2] + before[:, 1::2])
+        before, after = before[:, ::2] + half, half + after[:, 1::2]
+    return np.stack([before, after], axis=2)
 
 
 def _agree(
@@ -579,15 +611,17 @@ def _windows_under(
     length: int,
     other: Integrator,
     times: int,
+    kicks: Floats | None,
 ) -> tuple[Floats, Floats] | None:
     """Windows of a motion whose controls change within steps, by another method, or in steps of twice the length."""
     at, mine, found = other.stage_times, integrator.stage_times, []
-    for begin in begins:
+    for window, begin in enumerate(begins):
         values = trajectory.u_stages[begin : begin + length]
         commands = changing(in_parts(values, mine, 1, at) if times == 1 else in_pairs(values, mine, at), at)
         node = slice(begin, begin + 1)
-        drift = np.zeros((0, 0, scene.robot.dof))
-        again = other.motions(scene, trajectory.q[node], trajectory.v[node], commands, drift, times * trajectory.dt)
+        given = commands, np.zeros((0, 0, scene.robot.dof)), times * trajectory.dt
+        own = None if kicks is None else kicks[window : window + 1]
+        again = other.motions(scene, trajectory.q[node], trajectory.v[node], *given, own)
         if again is None:
             return None
         found.append(again)
