@@ -72,8 +72,8 @@ _LOSSY = 1e-8
 _PATIENCE = 15
 # Where the optimum costs nothing, there is nothing to be relative to but this part of what was at stake at first.
 _NOTHING = 1e-9
-# The shortest step of a line search, about.
-_SHORTEST = 1e-6
+# The shortest step of a line search, about, and its trials at most.
+_SHORTEST, _TRIALS = 1e-6, 40
 # A trial is given up where a step wants more halvings than this, or than the motion so far, and where it has taken more
 # parts in all than so many times those of the motion so far. What was given up is tried again with more of both where
 # nothing else has led far, and without a bound where nothing has helped; a search that stalls goes on without bounds.
@@ -385,7 +385,8 @@ def _onto_limits(u: Floats, limits: Floats) -> Floats:
 
 def _lengths(backtracking: float) -> list[float]:
     """Of the steps that a line search tries, the longest first."""
-    return [backtracking**i for i in range(1 + round(np.log(_SHORTEST) / np.log(backtracking)))]
+    shorter = max(1, round(np.log(_SHORTEST) / np.log(backtracking)))
+    return [backtracking**i for i in range(min(1 + shorter, _TRIALS))]
 
 
 @functools.lru_cache(maxsize=256)
