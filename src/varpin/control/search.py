@@ -55,7 +55,9 @@ Progress = Callable[[int, int], None]
 logger = logging.getLogger(__name__)
 
 # What a step must keep of the promised slope, and the factor between trials.
-ARMIJO, BACKTRACKING = 1e-5, 0.25
+ARMIJO, BACKTRACKING = 1e-5, 0.5
+# A step that keeps less of the slope than this is poor: shorter ones are tried as long as they are better.
+_POOR = 0.3
 # The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it shrinks after
 # long steps and grows after short ones.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
@@ -70,8 +72,8 @@ _LOSSY = 1e-8
 _PATIENCE = 15
 # Where the optimum costs nothing, there is nothing to be relative to but this part of what was at stake at first.
 _NOTHING = 1e-9
-# Trials of a line search: 0.25^10 is 1e-6.
-_TRIALS = 10
+# The shortest step of a line search, about, and its trials at most.
+_SHORTEST, _TRIALS = 1e-6, 40
 # A trial is given up where a step wants more halvings than this, or than the motion so far, and where it has taken more
 # parts in all than so many times those of the motion so far. What was given up is tried again with more of both where
 # nothing else has led far, and without a bound where nothing has helped; a search that stalls goes on without bounds.
@@ -379,6 +381,12 @@ def _onto_limits(u: Floats, limits: Floats) -> Floats:
     for limit in limits:
         u = np.where(np.abs(u - limit) <= room, limit, u)
     return u
+
+
+def _lengths(backtracking: float) -> list[float]:
+    """Of the steps that a line search tries, the longest first."""
+    shorter = max(1, round(np.log(_SHORTEST) / np.log(backtracking)))
+    return [backtracking**i for i in range(min(1 + shorter, _TRIALS))]
 
 
 @functools.lru_cache(maxsize=256)
@@ -786,14 +794,18 @@ class _Search:
         added = noise_shares(self.problem, self.trajectory, self.plan)
         taken, length, tried, trials = _Trial(), 0.0, None, 0
         feedback = self._feedback(self.plan)
-        left = list(self.backtracking ** np.arange(_TRIALS))
+        left = _lengths(self.backtracking)
         for bounds in self._bounds():
             cut = []
             for step in left:
                 trials += 1
-                trial = self._try(float(step), feedback, added, bounds)
-                if trial.expected <= self.armijo * step * self.plan.slope:
-                    taken, length = trial, float(step)
+                trial = self._try(step, feedback, added, bounds)
+                if trial.expected <= self.armijo * step * self.plan.slope and trial.expected < taken.expected:
+                    taken, length = trial, step
+                    if trial.expected <= _POOR * step * self.plan.slope:
+                        break
+                    continue
+                if length > 0.0:
                     break
                 if trial.cut:
                     cut.append(step)
