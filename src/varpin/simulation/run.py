@@ -874,8 +874,10 @@ def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps:
         InputError: The array is neither (steps, m) nor (m,), or not finite; the policy is for something else; a law.
         ControlError: The function of an OpenLoop failed; it holds no trajectory.
     """
-    if isinstance(controls, LinearPolicy | OpenLoop | FirstOrderHold):
+    if isinstance(controls, OpenLoop | FirstOrderHold):
         refuse_inputs(scene, f"a {type(controls).__name__}")
+    if isinstance(controls, LinearPolicy) and controls.hold != 1:
+        refuse_inputs(scene, "a LinearPolicy that holds its controls over several steps")
     if isinstance(controls, LinearPolicy):
         if controls.joints is not None and controls.joints != scene.control_joints:
             raise InputError(
