@@ -342,16 +342,42 @@ def test_a_motion_by_hand_comes_back_from_its_file(tmp_path):
     np.testing.assert_array_equal(vp.linearize(scene, back).B, vp.linearize(scene, motion).B)
 
 
-def test_a_file_moves_a_joint_to_where_its_sine_is_at_the_nodes(tmp_path):
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_a_file_moves_a_joint_to_where_its_sine_is_at_the_nodes(tmp_path, interpolation):
     path = tmp_path / "hand.toml"
     path.write_text(
         '[robot]\nsource = "finger"\n[initial]\nq = 0.5\n[horizon]\ndt = 0.01\nsteps = 10\n'
-        '[[constraint]]\ntype = "kinematic_input"\njoint = "mcp"\n'
+        f'[[constraint]]\ntype = "kinematic_input"\njoint = "mcp"\ninterpolation = "{interpolation}"\n'
         '[simulate.controls]\noffset = { mcp = 0.5 }\nsines = [{ of = "mcp", amplitude = 0.1, frequency = 2.0 }]\n'
     )
     motion = vp.load_scene(path).simulate()
     c = motion.joint_names.index("mcp")
     np.testing.assert_allclose(motion.q[:, c], 0.5 + 0.1 * np.sin(4.0 * np.pi * motion.t), atol=1e-12)
+    if interpolation == "cubic":
+        rate = 0.4 * np.pi * np.cos(4.0 * np.pi * motion.t[1:])
+        np.testing.assert_allclose(motion.v[1:, c], rate, atol=1e-9)
+
+
+def test_a_file_with_costs_is_simulated_and_solved(tmp_path):
+    """A torque limit bounds no position; degrees are told of."""
+    text = (
+        'damping = 0\n[robot]\nsource = "double_pendulum"\n[initial]\nq = { joint1 = 3.1416 }\n'
+        '[actuation]\njoints = ["joint1"]\ntorque_limit = 0.5\n[horizon]\ndt = 0.02\nsteps = 50\n'
+        '[[constraint]]\ntype = "kinematic_input"\njoint = "joint1"\n'
+        '[[cost]]\ntype = "control_rate"\nweight = 0.05\nbefore = 3.1416\n'
+        '[[cost]]\ntype = "tracking"\nterminal = true\nweight = 100.0\n'
+        "reference = { joint1 = 3.5, joint2 = -0.3584 }\n[simulate]\ncontrols = "
+    )
+    path = tmp_path / "hand.toml"
+    path.write_text(text + '"hold"\n')
+    scene = vp.load_scene(path)
+    np.testing.assert_allclose(scene.simulate().q[:, 0], 3.1416, atol=1e-12)
+    plan = scene.solve()
+    assert plan.status.converged
+    np.testing.assert_allclose(plan.trajectory.q[-1], [3.5, -0.3584], atol=0.01)
+    path.write_text(text + "{ joint1 = 180.0 }\n")
+    with pytest.raises(vp.SceneFileError, match="180 of 'joint1' looks like degrees"):
+        vp.load_scene(path)
 
 
 def test_derivatives_of_a_crank_that_starts_from_rest():
