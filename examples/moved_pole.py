@@ -1,4 +1,4 @@
-"""A joint is moved by hand so that the pole on it swings over and comes to rest: the plan chooses where it goes."""
+"""A joint is moved by hand so that the pole on it hangs still at the end: the plan chooses where the joint goes."""
 
 from pathlib import Path
 

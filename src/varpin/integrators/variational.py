@@ -322,7 +322,9 @@ class Variational(Integrator):
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
         """See :meth:`Integrator.contract`; steps that were taken in parts are chained as in :meth:`linearize`."""
-        refuse_constraints(scene, "second_order")
+        refuse_constraints(
+            scene, "second_order", "varpin.linearize does, and varpin.solve does without second_order=True"
+        )
         if scene.custom is not None:
             raise InputError("second derivatives are not there for a scene with a CustomForce")
         steps = self._steps(scene, trajectory)

@@ -600,18 +600,18 @@ def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
     return found
 
 
-def refuse_constraints(scene: Scene, what: str) -> None:
-    """Refuse a scene with constraints where they would not be kept.
+_KEEPS = "motions and plans do, with varpin.Midpoint() or varpin.Gauss(stages)"
+
+
+def refuse_constraints(scene: Scene, what: str, instead: str = _KEEPS) -> None:
+    """Refuse a scene with constraints where they would not be kept; ``instead`` says what takes them.
 
     Raises:
         InputError: The scene has constraints.
     """
     if scene.constraints:
         names = ", ".join(dict.fromkeys(type(constraint).__name__ for constraint in scene.constraints))
-        raise InputError(
-            f"{what} does not take scenes with constraints, and this one has {names}: motions and plans do, with "
-            "varpin.Midpoint() or varpin.Gauss(stages)"
-        )
+        raise InputError(f"{what} does not take scenes with constraints, and this one has {names}: {instead}")
 
 
 def refuse_inputs(scene: Scene, what: str) -> None:

@@ -741,7 +741,9 @@ def _require_choice(scene: Scene, controls: Controls | ControlLaw, integrator: I
         raise InputError(
             "tolerance is of single motions without noise: leave the noise out of the scene, or give dt and steps"
         )
-    refuse_constraints(scene, "simulate with a tolerance")
+    refuse_constraints(
+        scene, "simulate with a tolerance", "give dt and varpin.Gauss(2) or more stages, and compare with half that dt"
+    )
     if isinstance(integrator, Reference):
         raise InputError("Reference chooses its own steps: its tolerance is rtol; give it dt and steps")
     if callable(controls):
