@@ -135,6 +135,19 @@ def swing(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
     _label(below, "torque [N m]", legend=False)
 
 
+def closing(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
+    """The distance of the pads, and the torque of the drive below it."""
+    motion = plan.trajectory
+    above, below = figure.subplots(2, 1, sharex=True)
+    for axes in (above, below):
+        plots.apply_style(axes)
+    right, left = (scene.robot.frame_positions(motion.q, f"{side}_pad") for side in ("right", "left"))
+    above.plot(motion.t, 1e3 * (right - left)[:, 0], color="0.2")
+    above.set_ylabel("distance of the pads [mm]")
+    below.stairs(motion.u[:, 0], motion.t, baseline=None, color="0.2")
+    _label(below, "torque of the drive [N m]", legend=False)
+
+
 def _axes(figure: SubFigure) -> Axes:
     axes = figure.subplots()
     plots.apply_style(axes)
@@ -157,6 +170,7 @@ SHOTS = {
     "allegro_finger": Shot(0.55, joints, (-50.0, 21.0, 1.1)),
     "double_pendulum_swing_up": Shot(0.95, swing),
     "talos_wave": Shot(1.2, joints, (-50.0, 21.0, 0.9)),
+    "gripper_closes": Shot(0.2, closing, (-80.0, 12.0, 1.0)),
 }
 
 # Examples: when they are shown [s], the second time where they draw no figure; and from where.

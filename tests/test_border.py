@@ -169,7 +169,8 @@ def calls():
     yield "curvature of constraints", closed.core.constraint_curvature, at
     yield "begin under constraints", constrained(closed).begin, {"q": draw(P, n), "v": draw(P, n)}
     yield "kick under constraints", constrained(closed, begun=True).kick, {"impulse": draw(P, n)}
-    again = {**steps(closed), "guess": guess, "places": lobatto_places(2)}
+    moved = vp.Scene(own.robot, constraints=vp.KinematicInput(own.robot.joint_names[0], "cubic"))
+    again = {**steps(moved), "rates": draw(N, 1), "guess": guess, "places": lobatto_places(2)}
     yield "derivatives under constraints", core.constrained_derivatives, again
     yield "rate", dynamics.rate, {"x": draw(2 * n), "force": draw(n)}
     yield "node", dynamics.node, {"x": draw(2 * n)}

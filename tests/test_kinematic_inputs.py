@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import minimize
 
 import varpin as vp
 from varpin.mechanics.assembly import along_constraints
@@ -82,7 +83,8 @@ def crank(**options):
     links = options.pop("links", 3)
     loop = vp.PointOnPoint("tip", (1.3, 0.0, 0.2), axes="xz")
     robot = vp.planar_chain(links)
-    scene = vp.Scene(robot, actuation=["joint1"], constraints=[loop, vp.KinematicInput("joint1")], **options)
+    hand = vp.KinematicInput("joint1", options.pop("interpolation", "linear"))
+    scene = vp.Scene(robot, actuation=["joint1"], constraints=[loop, hand], **options)
     free = vp.Scene(robot, constraints=loop)
     q = vp.assemble(free, [-1.5, 1.5, 1.5, 0.3][:links])
     return scene, q, along_constraints(free, q, np.array([1.0, 0.0, 0.0, 0.5][:links]))
@@ -105,11 +107,12 @@ def test_a_crank_drives_its_loop():
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(guard=None), vp.Gauss(2, guard=None), vp.Gauss(3, guard=None)])
 @pytest.mark.parametrize("links", [3, 4])
-def test_linearizations_are_the_slopes_of_steps(integrator, links):
-    """In states along the constraints and in the position at the step's end."""
-    scene, q, v = crank(links=links, damping=0.3)
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_linearizations_are_the_slopes_of_steps(integrator, links, interpolation):
+    """In states along the constraints, in the position at the step's end, and in the velocity there of a cubic."""
+    scene, q, v = crank(links=links, damping=0.3, interpolation=interpolation)
     fixed = vp.Scene(scene.robot, constraints=scene.constraints[:1])
-    u = np.array([[q[0] + 0.004], [q[0] + 0.01]])
+    u = np.array([[q[0] + 0.004, 1.1], [q[0] + 0.01, 0.9]])[:, : scene.controls]
     motion = vp.simulate(scene, q, v, dt=4e-3, steps=2, controls=u, integrator=integrator)
     lin = vp.linearize(scene, motion)
 
@@ -127,29 +130,148 @@ def test_linearizations_are_the_slopes_of_steps(integrator, links):
 
     rng = np.random.default_rng(0)
     for _ in range(4):
-        dq, dv, du = rng.normal(size=links), rng.normal(size=links), 0.2 * rng.normal()
+        dq, dv, du = rng.normal(size=links), rng.normal(size=links), 0.2 * rng.normal(size=scene.controls)
         size, into, out = 3e-4, 0.0, 0.0
         for k, w in WEIGHTS.items():
             ahead, behind = (step(s * k * size * dq, s * k * size * dv, s * k * size * du) for s in (1, -1))
             into = into + w / size * (ahead[0] - behind[0])
             out = out + w / size * (ahead[1] - behind[1])
-        np.testing.assert_allclose(lin.A[0] @ into + lin.B[0, :, 0] * du, out, atol=1e-8 * np.abs(out).max())
+        np.testing.assert_allclose(lin.A[0] @ into + lin.B[0] @ du, out, atol=1e-8 * np.abs(out).max())
 
 
-def test_split_steps_are_linearized_in_their_parts():
-    scene, q, v = crank(links=4)
-    u = np.array([[q[0] + 0.3]])
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_split_steps_are_linearized_in_their_parts(interpolation):
+    scene, q, v = crank(links=4, interpolation=interpolation)
+    u = np.array([[q[0] + 0.3, 1.5]])[:, : scene.controls]
     motion = vp.simulate(scene, q, v, dt=0.15, steps=1, controls=u, check=False)
     assert motion.statistics.substeps[0] > 1
     np.testing.assert_allclose(motion.q[1, 0], u[0, 0], atol=1e-13)
-    B = vp.linearize(scene, motion).B[0, :, 0]
-    slope = 0.0
-    for k, w in WEIGHTS.items():
-        ends = [vp.simulate(scene, q, v, dt=0.15, steps=1, controls=u + s * k * 1e-3, check=False) for s in (1, -1)]
-        assert all((end.statistics.substeps == motion.statistics.substeps).all() for end in ends)
-        ahead, behind = (np.append(end.q[1], end.p[1]) for end in ends)
-        slope = slope + w / 1e-3 * (ahead - behind)
-    np.testing.assert_allclose(B, slope, atol=1e-8 * np.abs(slope).max())
+    if interpolation == "cubic":
+        np.testing.assert_allclose(motion.v[1, 0], u[0, 1], atol=1e-12)
+    B = vp.linearize(scene, motion).B[0]
+    for c in range(scene.controls):
+        slope = 0.0
+        for k, w in WEIGHTS.items():
+            more = k * 1e-3 * np.eye(scene.controls)[c]
+            ends = [vp.simulate(scene, q, v, dt=0.15, steps=1, controls=u + s * more, check=False) for s in (1, -1)]
+            assert all((end.statistics.substeps == motion.statistics.substeps).all() for end in ends)
+            ahead, behind = (np.append(end.q[1], end.p[1]) for end in ends)
+            slope = slope + w / 1e-3 * (ahead - behind)
+        np.testing.assert_allclose(B[:, c], slope, atol=1e-8 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize(("integrator", "order"), [(vp.Midpoint(), 2), (vp.Gauss(2), 4), (vp.Gauss(3), 4)])
+def test_a_cubic_input_keeps_the_order(integrator, order):
+    """Positions and mean torques against DOP853 with the acceleration given; four is the order of the cubic."""
+    scene = vp.Scene(vp.planar_chain(3), actuation=["joint1"], constraints=vp.KinematicInput("joint1", "cubic"))
+    q0, v0 = np.array([swing(0.0), 0.5, -0.4]), np.array([1.2, 0.0, 0.0])
+
+    def rate(t):
+        return 1.2 * np.cos(3.0 * t)
+
+    fine = np.linspace(0.0, 1.0, 1601)
+    truth, torque = prescribed(vp.Scene(scene.robot), q0, v0, fine, swing, rate, lambda t: -3.6 * np.sin(3.0 * t))
+    errors = []
+    for steps in (50, 100):
+        t, every = np.linspace(0.0, 1.0, steps + 1), 1600 // steps
+        u = np.stack([swing(t[1:]), rate(t[1:])], axis=1)
+        motion = vp.simulate(scene, q0, v0, dt=1.0 / steps, steps=steps, controls=u, integrator=integrator)
+        np.testing.assert_allclose(motion.v[1:, 0], u[:, 1], atol=1e-13)
+        weights = np.tile([2.0, 4.0], every // 2)
+        weights[0] = 1.0
+        mean = [
+            (weights @ part[:-1] + part[-1]) / (3.0 * every)
+            for part in (torque[k * every : (k + 1) * every + 1] for k in range(steps))
+        ]
+        errors.append([np.abs(motion.q - truth[::every]).max(), np.abs(motion.constraint_forces[:, 0] - mean).max()])
+    ratio = np.array(errors[0]) / np.array(errors[1])
+    assert errors[1][0] < {2: 2e-3, 4: 1e-6}[order]
+    assert 0.8 * 2.0**order < ratio[0] < 1.25 * 2.0**order
+    assert errors[1][1] < {2: 2e-2, 4: 1e-3}[order] * np.abs(torque).max()
+    assert ratio[1] > 3.3
+
+
+def test_a_kick_leaves_the_velocity_of_a_cubic_input():
+    """K is the slope of a step in impulses, of which those on the joint are absorbed."""
+    scene, q, v = crank(links=4, interpolation="cubic", noise=vp.AdditiveNoise(np.eye(4)))
+    options = {"dt": 4e-3, "steps": 1, "controls": np.array([[q[0] + 0.004, 1.1]]), "integrator": vp.Gauss(2)}
+    still = vp.simulate(scene, q, v, increments=0.0, **options)
+    slope = np.zeros((8, 4))
+    for c in range(4):
+        for k, w in WEIGHTS.items():
+            ends = [vp.simulate(scene, q, v, increments=s * k * 1e-2 * np.eye(4)[None, c], **options) for s in (1, -1)]
+            ahead, behind = (np.append(end.q[1], end.p[1]) for end in ends)
+            slope[:, c] += w / 1e-2 * (ahead - behind)
+    np.testing.assert_allclose(vp.linearize(scene, still).K[0], slope, atol=1e-8 * np.abs(slope).max())
+
+
+def hanging():
+    """A pole that hangs from a joint moved by hand, and what it is to do."""
+    scene = vp.Scene(vp.planar_chain(2), actuation=["joint1"], constraints=vp.KinematicInput("joint1"))
+    q0 = np.array([0.5 * np.pi, 0.0])
+    goal = q0 + np.array([0.8, -0.8])
+    cost = vp.ControlRateCost(0.05, before=[q0[0]]) + vp.VelocityCost([0.0, 0.05])
+    cost += vp.Terminal(vp.TrackingCost(goal, 100.0) + vp.VelocityCost([0.0, 10.0]))
+    return scene, cost, q0, goal
+
+
+def test_a_plan_chooses_where_a_joint_is_moved():
+    """Against a quasi-Newton method on the same costs, by rollouts alone, within the same limits."""
+    scene, cost, q0, goal = hanging()
+    most = q0[0] + 0.78
+    problem = vp.OptimalControlProblem(
+        scene, cost, q0, np.zeros(2), dt=0.06, steps=20, integrator=vp.Gauss(2), control_limits=(-10.0, most)
+    )
+    plan = vp.solve(problem)
+    assert plan.status.converged
+    assert plan.trajectory.u.max() == most
+    np.testing.assert_allclose(plan.trajectory.q[1:, 0], plan.trajectory.u[:, 0], atol=1e-13)
+
+    def value(u):
+        motion = vp.simulate(
+            scene, q0, np.zeros(2), dt=0.06, steps=20, controls=u[:, None], integrator=vp.Gauss(2), check=False
+        )
+        return float(problem.costs(motion.q, motion.v, motion.u))
+
+    assert value(plan.trajectory.u[:, 0]) == pytest.approx(plan.cost, rel=1e-12)
+    start = np.linspace(q0[0], goal[0], 21)[1:]
+    found = minimize(value, np.minimum(start, most), method="L-BFGS-B", bounds=[(-10.0, most)] * 20)
+    assert plan.cost <= found.fun * (1.0 + 1e-9)
+    assert plan.cost == pytest.approx(found.fun, rel=1e-4)
+
+
+def test_a_plan_by_hand_holds_on_the_continuous_system():
+    """Between nodes the joint moves on lines, in substeps as well; feedback is that of the policy."""
+    scene, cost, q0, goal = hanging()
+    problem = vp.OptimalControlProblem(scene, cost, q0, np.zeros(2), dt=0.02, steps=60)
+    plan = vp.solve(problem)
+    told = plan.verify(tolerance=1e-5)
+    assert abs(told.closed_loop_loss) < 2e-3
+    assert told.open_loop_gap < 1e-6
+    assert told.defect < 1e-6
+    assert np.abs(plan.trajectory.q[-1] - goal).max() < 0.01
+    again = vp.simulate(scene, q0, np.zeros(2), dt=0.02, steps=60, controls=plan.policy, integrator=problem.integrator)
+    np.testing.assert_array_equal(again.q, plan.trajectory.q)
+    pushed = vp.simulate(
+        scene,
+        q0 + np.array([0.0, 0.05]),
+        np.zeros(2),
+        dt=0.02,
+        steps=60,
+        controls=plan.policy,
+        integrator=problem.integrator,
+    )
+    blind = vp.simulate(
+        scene,
+        q0 + np.array([0.0, 0.05]),
+        np.zeros(2),
+        dt=0.02,
+        steps=60,
+        controls=plan.trajectory.u,
+        integrator=problem.integrator,
+    )
+    ends = [float(problem.costs(x.q, x.v, x.u)) for x in (pushed, blind)]
+    assert ends[0] < ends[1]
 
 
 def test_a_mechanism_without_freedom_may_turn_round():
@@ -175,17 +297,25 @@ def test_what_does_not_know_inputs_refuses_them():
     scene, q, v = crank()
     robot, loop = scene.robot, scene.constraints[0]
     hand = vp.KinematicInput("joint1")
-    policy = vp.LinearPolicy(np.zeros((3, 1)), np.zeros((3, 1, 6)), np.zeros((3, 6)), on="momentum")
+    held = vp.LinearPolicy(np.zeros((3, 1)), np.zeros((3, 1, 6)), np.zeros((3, 6)), hold=2, on="momentum")
     tries = [
-        lambda: vp.OptimalControlProblem(scene, vp.ControlCost(1.0), q, v, dt=0.01, steps=3),
         lambda: vp.Plant(scene),
         lambda: vp.simulate(scene, q, v, dt=0.01, steps=3, controls=lambda t, q, v: [0.0]),
         lambda: vp.simulate(scene, q, v, dt=0.01, steps=3, controls=vp.OpenLoop(lambda t: [0.0])),
-        lambda: vp.simulate(scene, q, v, dt=0.01, steps=3, controls=policy),
+        lambda: vp.simulate(scene, q, v, dt=0.01, steps=3, controls=held),
     ]
     for attempt in tries:
         with pytest.raises(vp.InputError, match="does not take scenes with a KinematicInput"):
             attempt()
+    cost = vp.ControlCost(1.0)
+    for options in ({"hold": 3}, {"controls": "linear"}):
+        with pytest.raises(vp.InputError, match="leave hold and controls='linear' out"):
+            vp.OptimalControlProblem(scene, cost, q, v, dt=0.01, steps=3, **options)
+    smooth = vp.Scene(robot, constraints=[loop, vp.KinematicInput("joint1", "cubic")])
+    with pytest.raises(vp.InputError, match="plans take no cubic KinematicInput"):
+        vp.OptimalControlProblem(smooth, cost, q, v, dt=0.01, steps=3)
+    with pytest.raises(vp.InputError, match="interpolation must be 'linear' or 'cubic', got 'spline'"):
+        vp.Scene(robot, constraints=vp.KinematicInput("joint1", "spline"))
     two = [loop, hand, vp.KinematicInput("joint2")]
     with pytest.raises(vp.InputError, match=r"KinematicInput\(joint='joint2'\) moves a joint that .* move already"):
         vp.simulate(vp.Scene(robot, constraints=two), q, v, dt=0.01, steps=3)
@@ -212,16 +342,42 @@ def test_a_motion_by_hand_comes_back_from_its_file(tmp_path):
     np.testing.assert_array_equal(vp.linearize(scene, back).B, vp.linearize(scene, motion).B)
 
 
-def test_a_file_moves_a_joint_to_where_its_sine_is_at_the_nodes(tmp_path):
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_a_file_moves_a_joint_to_where_its_sine_is_at_the_nodes(tmp_path, interpolation):
     path = tmp_path / "hand.toml"
     path.write_text(
         '[robot]\nsource = "finger"\n[initial]\nq = 0.5\n[horizon]\ndt = 0.01\nsteps = 10\n'
-        '[[constraint]]\ntype = "kinematic_input"\njoint = "mcp"\n'
+        f'[[constraint]]\ntype = "kinematic_input"\njoint = "mcp"\ninterpolation = "{interpolation}"\n'
         '[simulate.controls]\noffset = { mcp = 0.5 }\nsines = [{ of = "mcp", amplitude = 0.1, frequency = 2.0 }]\n'
     )
     motion = vp.load_scene(path).simulate()
     c = motion.joint_names.index("mcp")
     np.testing.assert_allclose(motion.q[:, c], 0.5 + 0.1 * np.sin(4.0 * np.pi * motion.t), atol=1e-12)
+    if interpolation == "cubic":
+        rate = 0.4 * np.pi * np.cos(4.0 * np.pi * motion.t[1:])
+        np.testing.assert_allclose(motion.v[1:, c], rate, atol=1e-9)
+
+
+def test_a_file_with_costs_is_simulated_and_solved(tmp_path):
+    """A torque limit bounds no position; degrees are told of."""
+    text = (
+        'damping = 0\n[robot]\nsource = "double_pendulum"\n[initial]\nq = { joint1 = 3.1416 }\n'
+        '[actuation]\njoints = ["joint1"]\ntorque_limit = 0.5\n[horizon]\ndt = 0.02\nsteps = 50\n'
+        '[[constraint]]\ntype = "kinematic_input"\njoint = "joint1"\n'
+        '[[cost]]\ntype = "control_rate"\nweight = 0.05\nbefore = 3.1416\n'
+        '[[cost]]\ntype = "tracking"\nterminal = true\nweight = 100.0\n'
+        "reference = { joint1 = 3.5, joint2 = -0.3584 }\n[simulate]\ncontrols = "
+    )
+    path = tmp_path / "hand.toml"
+    path.write_text(text + '"hold"\n')
+    scene = vp.load_scene(path)
+    np.testing.assert_allclose(scene.simulate().q[:, 0], 3.1416, atol=1e-12)
+    plan = scene.solve()
+    assert plan.status.converged
+    np.testing.assert_allclose(plan.trajectory.q[-1], [3.5, -0.3584], atol=0.01)
+    path.write_text(text + "{ joint1 = 180.0 }\n")
+    with pytest.raises(vp.SceneFileError, match="180 of 'joint1' looks like degrees"):
+        vp.load_scene(path)
 
 
 def test_derivatives_of_a_crank_that_starts_from_rest():

@@ -132,7 +132,9 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
     if scene.processes == 0:
         return Linearization(
             A=Jx,
-            B=(Jf.reshape(-1, n) @ scene.actuation).reshape(steps, 2 * n, m),  # one product instead of many small ones
+            B=(Jf.reshape(-1, Jf.shape[2]) @ scene.transmission).reshape(
+                steps, 2 * n, m
+            ),  # one product instead of many small ones
             K=_kick_columns(scene, trajectory, integrator, Jk),
             J=Jk,
             F=np.zeros((steps, n, 0)),
@@ -143,7 +145,7 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
             variational=integrator.variational,
         )
     start = scene.noise.fields(q[:-1], v[:-1], trajectory.u, first)
-    A, B = Jx, Jf @ scene.actuation
+    A, B = Jx, Jf @ scene.transmission
     if start.Fv is not None:
         drift_x, drift_u = _drift_derivatives(scene, trajectory, first, variational=integrator.variational)
         A, B = A + integrator.drift_share * Jf @ drift_x, B + integrator.drift_share * Jf @ drift_u

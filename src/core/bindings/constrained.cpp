@@ -61,16 +61,23 @@ class ConstrainedRollout : public Rollout<ConstrainedStepping, ConstrainedState>
     int weakest(std::size_t path) const { return state(path).weakest; }
 };
 
-std::tuple<Out, Out, std::int64_t, std::size_t> constrained_derivatives(
+std::tuple<Out, Out, Out, std::int64_t, std::size_t> constrained_derivatives(
     const Mechanism& mechanism, const Tableau& tableau, In<2> places, double tolerance, const Guards& guards, double h,
-    In<2> q, In<2> p, In<3> force, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp) {
+    In<2> q, In<2> p, In<3> force, In<2> rates, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp) {
     const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
     ConstrainedLinearization work(mechanism, tableau, places_of(tableau, places), tolerance, guards);
     work.varies = at.varies;
     work.ramp = ramp;
-    return derivatives_of(at, tableau, guess, [&](std::size_t s, const double* next, double* Jx, double* Jf) {
-        return work.first(h, at.q(s), at.p(s), next, at.force(s), at.halvings(s), Jx, Jf);
-    });
+    const std::size_t moved = mechanism.constraints.driven().size();
+    require(rates, "rates", {at.N, moved});
+    double* by_rate = nullptr;
+    const Out R = array_for(by_rate, {at.N, 2 * at.n, moved});
+    const auto [X, F, outcome, done] =
+        derivatives_of(at, tableau, guess, [&](std::size_t s, const double* next, double* Jx, double* Jf) {
+            return work.first(h, at.q(s), at.p(s), next, at.force(s), rates.data() + s * moved, at.halvings(s), Jx, Jf,
+                              by_rate + s * 2 * at.n * moved);
+        });
+    return {X, F, R, outcome, done};
 }
 
 }  // namespace
@@ -88,7 +95,7 @@ void register_constrained(nb::module_& m) {
         .def("impulses", &ConstrainedRollout::impulses, "path"_a)
         .def("weakest", &ConstrainedRollout::weakest, "path"_a);
     m.def("constrained_derivatives", &constrained_derivatives, "mechanism"_a, "tableau"_a, "places"_a, "tolerance"_a,
-          "guards"_a, "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a,
+          "guards"_a, "dt"_a, "q"_a, "p"_a, "force"_a, "rates"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a,
           "ramp"_a = false);
 }
 

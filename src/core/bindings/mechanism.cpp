@@ -85,10 +85,11 @@ CoupledElement coupling_of(const std::string& kind, int a, int b, const std::vec
 }
 
 // Vectors that bodies carry (body, whether it is a direction, place), rows that are products (x, y, factor, constant)
-// and ties (follower, leader, coefficients), and functions (rows, of q: (g, C), of q and weights: curvature).
+// and ties (follower, leader, coefficients, the control that is a rate or -1), and functions (rows, of q: (g, C), of q
+// and weights: curvature).
 using NamedVector = std::vector<std::tuple<int, bool, std::array<double, 3>>>;
 using NamedConstraints = std::tuple<std::vector<NamedVector>, std::vector<std::tuple<int, int, double, double>>,
-                                    std::vector<std::tuple<int, int, std::vector<double>>>,
+                                    std::vector<std::tuple<int, int, std::vector<double>, int>>,
                                     std::vector<std::tuple<int, nb::object, nb::object>>>;
 
 // A Python function that is called without the interpreter's lock held.
@@ -143,10 +144,10 @@ Constraints constraints_of(const NamedConstraints& named, const std::vector<Body
         rows.push_back({x, y, factor, constant});
     }
     std::vector<TieRow> tied;
-    for (const auto& [follower, leader, coefficients] : ties) {
+    for (const auto& [follower, leader, coefficients, rate] : ties) {
         require_below(follower, n);
         require_below(leader, n);
-        tied.push_back({follower, leader, coefficients});
+        tied.push_back({follower, leader, coefficients, rate});
     }
     std::vector<CustomRows> functions;
     for (const auto& [count, value, bending] : customs) functions.push_back(custom_rows(count, value, bending, n));

@@ -192,6 +192,7 @@ class Mpc:
     def __post_init__(self) -> None:
         if not isinstance(self.problem, OptimalControlProblem):
             raise InputError(f"problem must be an OptimalControlProblem, got {type(self.problem).__name__}")
+        refuse_inputs(self.problem.scene, "Mpc")
         if self.problem.linear:
             raise InputError("Mpc decides on controls that are held: the problem's are linear between nodes")
         count("iterations", self.iterations, least=1)

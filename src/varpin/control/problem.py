@@ -30,7 +30,7 @@ from varpin.errors import InputError
 from varpin.integrators import Gauss, Integrator, Radau
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy, OpenLoop
-from varpin.mechanics.scene import Scene, closest_controls, differences, refuse_inputs, require_scene, tangent_basis
+from varpin.mechanics.scene import Scene, closest_controls, differences, require_scene, tangent_basis
 from varpin.simulation.friction import rate_at_rest
 from varpin.simulation.run import on_constraints, simulate
 from varpin.simulation.soundness import announce
@@ -103,7 +103,8 @@ class OptimalControlProblem(Frozen):
             first order.
         hold: Steps that share one control: a digital controller's period over the integrator's step.
         t0: When the horizon begins [s]; references that are functions of time see it.
-        control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none.
+        control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none;
+            of a :class:`varpin.KinematicInput` its positions at nodes.
         controls: ``"held"``, each constant over ``hold`` steps, or ``"linear"`` in time between nodes.
         constraints: What the motion has to keep to, whatever it costs (:class:`PlanConstraint`): limits of joints, a
             frame's goal, regions, clearance. Those of a :class:`Scene` are others: they belong to the mechanism, and
@@ -157,13 +158,12 @@ class OptimalControlProblem(Frozen):
             UnknownJoint: A name that is no joint's, or of controls no driven joint's.
             InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
                 reference that does not fit the problem's grid, or limits that leave a control nothing; linear controls
-                with ``hold``, in a scene with noise or with constraints; constraints that are no plan constraints or
-                of another robot.
+                with ``hold``, in a scene with noise or with constraints; either with joints that are moved by hand, or
+                a cubic one of these; constraints that are no plan constraints or of another robot.
             CostError: A reference that is a function fails.
             AssemblyError: The scene's constraints cannot be kept next to q0.
         """
         n, m = require_scene(scene).robot.dof, scene.controls
-        refuse_inputs(scene, "OptimalControlProblem")
         if not isinstance(cost, Cost):
             raise InputError(f"cost must be a cost, for example varpin.TrackingCost(...), got {type(cost).__name__}")
         dt, steps, hold = positive("dt", dt, "s"), count("steps", steps, least=1), count("hold", hold, least=1)
@@ -173,6 +173,16 @@ class OptimalControlProblem(Frozen):
             raise InputError(f"sampling must be 'midpoint', 'gauss' or 'start', got {sampling!r}")
         if not is_one_of(controls, ("held", "linear")):
             raise InputError(f"controls must be 'held' or 'linear', got {controls!r}")
+        if scene.inputs and (hold != 1 or controls == "linear"):
+            raise InputError(
+                "the control of a KinematicInput is where its joint is at the next node: leave hold and "
+                "controls='linear' out; it moves linearly between nodes"
+            )
+        if max(scene.rates, default=-1) >= 0:
+            raise InputError(
+                "plans take no cubic KinematicInput: costs that are sampled in a step do not see what its velocities "
+                "at nodes do between them; plan with interpolation='linear', and keep it smooth by a ControlRateCost"
+            )
         if controls == "linear" and hold != 1:
             raise InputError(f"linear controls change at every node: leave hold = {hold} out, or take controls='held'")
         if controls == "linear" and scene.processes:

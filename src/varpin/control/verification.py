@@ -293,10 +293,13 @@ def _defect(problem: OptimalControlProblem, trajectory: Trajectory, substeps: in
     """Largest distance in q between the plan's steps and accurate ones from the same nodes."""
     scene, h, n = problem.scene, problem.dt / substeps, problem.scene.robot.dof
     state, _ = integrator.start(scene, trajectory.q[:-1].copy(), trajectory.v[:-1].copy())
-    if problem.linear:
+    if problem.linear or scene.inputs:
         off = []
         for k in range(trajectory.steps):
-            line = open_line(trajectory.u_nodes[k : k + 2], integrator.stage_times)._replace(hold=substeps)
+            if problem.linear:
+                line = open_line(trajectory.u_nodes[k : k + 2], integrator.stage_times)._replace(hold=substeps)
+            else:
+                line = open_loop(trajectory.u[k : k + 1])._replace(hold=substeps)
             motion, failure = rollout(scene, integrator, trajectory.q[k], trajectory.v[k], line, h)
             off.append(np.nan if failure else float(np.abs(motion.q[-1] - trajectory.q[k + 1]).max()))
         return float(np.max(off))

@@ -236,13 +236,14 @@ def constrained_derivatives(
     q: Floats,
     p: Floats,
     force: Floats,
+    rates: Floats,
     substeps: Integers,
     halvings: Bytes,
     *,
     guess: Floats,
     ramp: bool = False,
-) -> tuple[Floats, Floats, int, int]:
-    """As variational_derivatives."""
+) -> tuple[Floats, Floats, Floats, int, int]:
+    """As variational_derivatives; and in the rates (N, i) of joints moved by hand, (N, 2n, i)."""
 
 def variational_derivatives(
     mechanism: Mechanism,

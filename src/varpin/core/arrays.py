@@ -84,6 +84,7 @@ class Tied(NamedTuple):
     follower: int
     leader: int
     coefficients: tuple[float, ...]
+    rate: int = -1  # of a joint moved by hand on a cubic: the control that is its rate at the end; else -1
 
 
 class CustomRows(NamedTuple):

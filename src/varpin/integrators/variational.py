@@ -69,10 +69,12 @@ class VariationalRun:
     Attributes:
         paths: In the core.
         start: Configurations at which the rollout started (P, n) [rad or m].
+        moved: Whether joints are moved by hand.
     """
 
     paths: VariationalRollout | ConstrainedRollout
     start: Floats
+    moved: bool = False
 
 
 @dataclass(frozen=True)
@@ -172,9 +174,9 @@ class Variational(Integrator):
     def _guards(self) -> Guards:
         return _of_core(self.guard, *self._shares())
 
-    def _guards_of(self, scene: Scene) -> Guards:
-        """Those of a scene with constraints: what moves a joint by hand gives and takes energy as it likes."""
-        if self.guard is None or not scene.inputs:
+    def _guards_of(self, *, moved: bool) -> Guards:
+        """Those of a scene: what moves a joint by hand gives and takes energy as it likes."""
+        if self.guard is None or not moved:
             return self._guards()
         return _of_core(replace(self.guard, energy_balance=_ANY_ENERGY, energy_budget=_ANY_ENERGY))
 
@@ -196,21 +198,20 @@ class Variational(Integrator):
 
     def _begun(self, scene: Scene, q0: Floats, v0: Floats) -> VariationalRun:
         rollout: VariationalRollout | ConstrainedRollout
+        guards = self._guards_of(moved=bool(scene.inputs))
         if scene.constraints:
             rollout = ConstrainedRollout(
-                scene.core, self._tableau(), self._places(scene), float(self.tolerance), self._guards_of(scene), len(q0)
+                scene.core, self._tableau(), self._places(scene), float(self.tolerance), guards, len(q0)
             )
         else:
-            rollout = VariationalRollout(
-                scene.core, self._tableau(), float(self.tolerance), self._guards(), self.left, len(q0)
-            )
+            rollout = VariationalRollout(scene.core, self._tableau(), float(self.tolerance), guards, self.left, len(q0))
         if not rollout.begin(q0, v0):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
-        return VariationalRun(rollout, q0.copy())
+        return VariationalRun(rollout, q0.copy(), bool(scene.inputs))
 
     def fork(self, state: VariationalRun) -> VariationalRun:
         """See :meth:`Integrator.fork`."""
-        return replace(state, paths=state.paths.fork(self._guards()))
+        return replace(state, paths=state.paths.fork(self._guards_of(moved=state.moved)))
 
     def rollout_compiled(
         self,
@@ -296,15 +297,29 @@ class Variational(Integrator):
         A step that was taken in parts is taken again in the same parts, and their derivatives are chained.
         """
         Jx, Jf = self._derivatives(scene, trajectory)
-        return Jx, Jf, Jx[:, :, scene.robot.dof :]
+        kicks = Jx[:, :, scene.robot.dof :]
+        if max(scene.rates, default=-1) >= 0:
+            # The momentum of such a joint tells its velocity, which a kick leaves as it is.
+            kicks = kicks @ _along(scene, trajectory.q[:-1])
+        return Jx, Jf, kicks
 
     def _derivatives(self, scene: Scene, trajectory: Trajectory, *, ramp: bool = False) -> tuple[Floats, Floats]:
-        """Of each step in (q, p) and in a force that is constant over it, or grows from 0 to it if it is a ramp."""
+        """Of each step in (q, p) and in a force that is constant over it, or grows from 0 to it if it is a ramp.
+
+        Behind the forces stand the velocities of cubic inputs, as in :attr:`Scene.transmission`.
+        """
         steps = self._steps(scene, trajectory)
         guess = np.ascontiguousarray(self._guess(trajectory))
         if scene.constraints:
             places = self._places(scene)
-            Jx, Jf, outcome, done = constrained_derivatives(**steps, places=places, guess=guess, ramp=ramp)
+            cubic = [k for k, rate in enumerate(scene.rates) if rate >= 0]
+            rates = np.zeros((trajectory.steps, len(scene.rates)))
+            rates[:, cubic] = trajectory.u[:, [scene.rates[k] for k in cubic]]
+            Jx, Jf, Jr, outcome, done = constrained_derivatives(
+                **steps, rates=rates, places=places, guess=guess, ramp=ramp
+            )
+            if cubic:
+                Jf = np.concatenate([Jf, Jr[:, :, cubic]], axis=2)
         else:
             Jx, Jf, outcome, done = variational_derivatives(**steps, guess=guess, ramp=ramp)
         _require_solved(trajectory, outcome, done)
@@ -318,7 +333,9 @@ class Variational(Integrator):
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
         """See :meth:`Integrator.contract`; steps that were taken in parts are chained as in :meth:`linearize`."""
-        refuse_constraints(scene, "second_order")
+        refuse_constraints(
+            scene, "second_order", "varpin.linearize does, and varpin.solve does without second_order=True"
+        )
         if scene.custom is not None:
             raise InputError("second derivatives are not there for a scene with a CustomForce")
         steps = self._steps(scene, trajectory)
@@ -388,6 +405,17 @@ def _constrained(scene: Scene, paths: ConstrainedRollout, i: int, segment: Segme
         label = scene.bound_constraints.labels[paths.weakest(i)]
         failure = replace(failure, reason=f"{failure.reason}: {label}")
     return replace(segment, impulses=paths.impulses(i)[:, scene.constraint_order], failure=failure)
+
+
+def _along(scene: Scene, q: Floats) -> Floats:
+    """What constraints leave of impulses at configurations (N, n): 1 - C' (C M^-1 C')^-1 C M^-1, (N, n, n)."""
+    M = scene.core.jets(np.ascontiguousarray(q), np.zeros_like(q))[0]
+    C = scene.core.constraints(np.ascontiguousarray(q))[2]
+    eased = np.linalg.solve(M, C.transpose(0, 2, 1))
+    found: Floats = np.eye(q.shape[1]) - C.transpose(0, 2, 1) @ np.linalg.pinv(C @ eased, rcond=1e-9) @ eased.transpose(
+        0, 2, 1
+    )
+    return found
 
 
 @functools.lru_cache(maxsize=256)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +21,7 @@ from varpin.core.arrays import Carried, ConstraintRows, CustomRows, Product, Tie
 from varpin.errors import InputError, UnknownJoint
 from varpin.mechanics.forces import Point, kept, point_of, require_movable, shown
 from varpin.model import Robot
-from varpin.support.checks import as_floats, count, finite, finite_array, positive, tuple_of
+from varpin.support.checks import as_floats, count, finite, finite_array, is_one_of, positive, tuple_of
 from varpin.support.frozen import Frozen
 
 Floats = NDArray[np.float64]
@@ -243,22 +243,35 @@ class JointTie(Constraint):
 class KinematicInput(Constraint):
     """A joint that is moved by hand: its control is where it is at the end of a step, and its force follows.
 
-    Within a step it moves at a constant rate from where it is. Row k of the controls has its position [rad or m] at
-    node k + 1, in place of a force; the actuation gives it a control of its own with a 1, as it does where it is left
-    out. ``Trajectory.constraint_forces`` has the force on the joint, its mean over each step [N m or N].
+    Row k of the controls has its position [rad or m] at node k + 1, in place of a force; the actuation gives it a
+    control of its own with a 1, as it does where it is left out. ``Trajectory.constraint_forces`` has the force on the
+    joint, its mean over each step [N m or N].
 
     Attributes:
         joint: The joint's name.
+        interpolation: How it moves within a step: ``"linear"``, at a constant rate from where it is, or ``"cubic"``, on
+            the cubic through position and velocity at both nodes. A cubic has a second control, its velocity at node
+            k + 1 [rad/s or m/s]: a column that the scene adds behind those of ``actuation``, in the order of the
+            scene's constraints. Velocities are continuous then, and no impulse acts at nodes.
     """
 
     joint: str
+    interpolation: Literal["linear", "cubic"] = "linear"
+
+    def __repr__(self) -> str:
+        shape = "" if self.interpolation == "linear" else f", interpolation={self.interpolation!r}"
+        return f"KinematicInput(joint={self.joint!r}{shape})"
 
     def bind(self, robot: Robot) -> Bound:
         """See :meth:`Constraint.bind`."""
         if self.joint not in robot.joint_names:
             raise UnknownJoint(str(self.joint), robot.joint_names, "KinematicInput")
+        if not is_one_of(self.interpolation, ("linear", "cubic")):
+            raise InputError(f"interpolation must be 'linear' or 'cubic', got {self.interpolation!r}")
         c = robot.coordinate(self.joint)
-        return Bound(ConstraintRows(ties=(Tied(c, c, ()),)), (f"{self!r}",))
+        # Which control its rate is, the scene knows.
+        rate = 0 if self.interpolation == "cubic" else -1
+        return Bound(ConstraintRows(ties=(Tied(c, c, (), rate),)), (f"{self!r}",))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

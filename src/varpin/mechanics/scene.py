@@ -127,7 +127,7 @@ class Scene(Frozen):
         rest: Configuration (n,) at which the springs are slack, those of a joint taken together [rad or m].
         armature: Inertia of rotors (n,), the robot's own and that of ``forces`` [kg m^2 or kg].
         actuation: Matrix (n, m) from controls to generalized forces [N m or N per unit of control]; of a position
-            servo's control, its stiffness.
+            servo's control, its stiffness; zero for velocities of cubic inputs, its last columns.
         noise: The diffusion fields of the noise models, if any.
         constraints: What the motion keeps, g(q) = 0; see :mod:`varpin.mechanics.constraints`.
     """
@@ -204,11 +204,12 @@ class Scene(Frozen):
         values |= _forces(robot, forces, damping, stiffness, rest)
         values["actuation"] = _served(robot, _actuation(robot, actuation), values["elements"])
         _refuse_trembling_angles(noise, values["elements"], robot)
-        values["noise"] = bind(noise, values["actuation"], robot.joint_names)
         values["constraints"] = constraints_of(constraints)
         bound, order = joined([constraint.bind(robot) for constraint in values["constraints"]])
-        values |= {"bound_constraints": bound, "constraint_order": order, "announced": set()}
         _require_positions(robot, values["actuation"], values["elements"], bound)
+        values["actuation"], bound = _with_rates(values["actuation"], bound)
+        values["noise"] = bind(noise, values["actuation"], robot.joint_names)
+        values |= {"bound_constraints": bound, "constraint_order": order, "announced": set()}
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
@@ -336,6 +337,19 @@ class Scene(Frozen):
             for k, tie in enumerate(rows.ties)
             if tie.follower == tie.leader and not tie.coefficients
         }
+
+    @cached_property
+    def rates(self) -> tuple[int, ...]:
+        """For each of :attr:`inputs`, the control that is its velocity at the end of a step; -1 for one on a line."""
+        return tuple(tie.rate for tie in self.bound_constraints.rows.ties if tie.follower == tie.leader)
+
+    @cached_property
+    def transmission(self) -> Floats:
+        """From controls (m,) to what steps are differentiated in: forces (n,), and of cubic inputs velocities."""
+        rates = [rate for rate in self.rates if rate >= 0]
+        if not rates:
+            return self.actuation
+        return np.vstack([self.actuation, np.eye(self.controls)[rates]])
 
     @property
     def _gear(self) -> Floats:
@@ -578,23 +592,26 @@ def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
             ],
             dtype=np.float64,
         )
+        if any(tie.rate >= 0 for tie in rows.ties):
+            rates = np.array([[float(tie.rate)] for tie in rows.ties])
+            found["constraints.ties"] = np.hstack([found["constraints.ties"], rates])
     if rows.customs:
         found["constraints.custom"] = np.array([[float(factor.rows)] for factor in rows.customs])
     return found
 
 
-def refuse_constraints(scene: Scene, what: str) -> None:
-    """Refuse a scene with constraints where they would not be kept.
+_KEEPS = "motions and plans do, with varpin.Midpoint() or varpin.Gauss(stages)"
+
+
+def refuse_constraints(scene: Scene, what: str, instead: str = _KEEPS) -> None:
+    """Refuse a scene with constraints where they would not be kept; ``instead`` says what takes them.
 
     Raises:
         InputError: The scene has constraints.
     """
     if scene.constraints:
         names = ", ".join(dict.fromkeys(type(constraint).__name__ for constraint in scene.constraints))
-        raise InputError(
-            f"{what} does not take scenes with constraints, and this one has {names}: motions and plans do, with "
-            "varpin.Midpoint() or varpin.Gauss(stages)"
-        )
+        raise InputError(f"{what} does not take scenes with constraints, and this one has {names}: {instead}")
 
 
 def refuse_inputs(scene: Scene, what: str) -> None:
@@ -606,8 +623,8 @@ def refuse_inputs(scene: Scene, what: str) -> None:
     if scene.inputs:
         names = ", ".join(scene.robot.joint_names[c] for c in scene.inputs.values())
         raise InputError(
-            f"{what} does not take scenes with a KinematicInput, and this one has some of {names}: simulate, "
-            "simulate_ensemble and linearize do, with controls that are rows (N, m)"
+            f"{what} does not take scenes with a KinematicInput, and this one has some of {names}: simulate and "
+            "simulate_ensemble do with controls that are rows (N, m) or a plan's policy, and OptimalControlProblem does"
         )
 
 
@@ -815,6 +832,20 @@ def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Eleme
                 f"the KinematicInput of joint {name!r} needs a control of its own, its position: under this actuation "
                 "none is; name the joint in the actuation, or give it a column with a 1"
             )
+
+
+def _with_rates(actuation: Floats, bound: Bound) -> tuple[Floats, Bound]:
+    """The actuation with a column of zeros for the velocity of each cubic input, and the rows that know these."""
+    m, ties = actuation.shape[1], list(bound.rows.ties)
+    cubic = [k for k, tie in enumerate(ties) if tie.rate >= 0]
+    if not cubic:
+        return actuation, bound
+    for k, place in enumerate(cubic):
+        ties[place] = ties[place]._replace(rate=m + k)
+    return (
+        np.hstack([actuation, np.zeros((len(actuation), len(cubic)))]),
+        bound._replace(rows=bound.rows._replace(ties=tuple(ties))),
+    )
 
 
 def _served(robot: Robot, actuation: Floats, elements: Sequence[Element]) -> Floats:

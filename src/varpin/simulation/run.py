@@ -741,7 +741,9 @@ def _require_choice(scene: Scene, controls: Controls | ControlLaw, integrator: I
         raise InputError(
             "tolerance is of single motions without noise: leave the noise out of the scene, or give dt and steps"
         )
-    refuse_constraints(scene, "simulate with a tolerance")
+    refuse_constraints(
+        scene, "simulate with a tolerance", "give dt and varpin.Gauss(2) or more stages, and compare with half that dt"
+    )
     if isinstance(integrator, Reference):
         raise InputError("Reference chooses its own steps: its tolerance is rtol; give it dt and steps")
     if callable(controls):
@@ -936,8 +938,10 @@ def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps:
         InputError: The array is neither (steps, m) nor (m,), or not finite; the policy is for something else; a law.
         ControlError: The function of an OpenLoop failed; it holds no trajectory.
     """
-    if isinstance(controls, LinearPolicy | OpenLoop | FirstOrderHold):
+    if isinstance(controls, OpenLoop | FirstOrderHold):
         refuse_inputs(scene, f"a {type(controls).__name__}")
+    if isinstance(controls, LinearPolicy) and controls.hold != 1:
+        refuse_inputs(scene, "a LinearPolicy that holds its controls over several steps")
     if isinstance(controls, LinearPolicy):
         if controls.joints is not None and controls.joints != scene.control_joints:
             raise InputError(

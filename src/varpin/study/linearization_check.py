@@ -100,7 +100,12 @@ def check_linearization(
         InputError: Wrong shapes, or values that are not finite.
         StepFailure: A step of the differences cannot be taken; a smaller ``step`` or ``dt`` may help.
     """
-    refuse_constraints(require_scene(scene), "check_linearization")
+    refuse_constraints(
+        require_scene(scene),
+        "check_linearization",
+        "varpin.linearize does; its A and B are slopes along the constraints, so hold them against steps between "
+        "states that varpin.assemble has brought onto these",
+    )
     n, m, k = require_scene(scene).robot.dof, scene.controls, scene.processes
     q, v = joint_array("q", q, scene.robot.joint_names), joint_array("v", v, scene.robot.joint_names)
     u = np.zeros(m) if u is None else finite_array("u", u, (m,))

@@ -11,6 +11,7 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
 #include <span>
@@ -103,6 +104,11 @@ class ConstrainedStepper {
         for (int i = 0; i < stages; ++i) {
             for (int k = 0; k < stages; ++k) weight[i * stages + k] = 1.0 - at[k * stages + i] / tableau.b[i];
         }
+        const std::vector<DrivenRow>& driven = mechanism.constraints.driven();
+        goal_rate.assign(driven.size(), 0.0);
+        begun.assign(driven.size(), 0.0);
+        curved_paths = std::any_of(driven.begin(), driven.end(), [](const DrivenRow& own) { return own.rate >= 0; });
+        if (curved_paths) from_q.resize(n), from_v.resize(n);
     }
     ConstrainedStepper(const ConstrainedStepper&) = delete;
     ConstrainedStepper& operator=(const ConstrainedStepper&) = delete;
@@ -119,8 +125,10 @@ class ConstrainedStepper {
     Effort effort;                       // of the last step
     std::vector<std::uint8_t> halvings;  // of each part of the last step; none if it was taken whole
 
-    // A joint that is moved by hand goes at a constant rate to where its entry of the step's force says that it is at
-    // the end. Its row of the constraints is g = q - (that motion), and no force acts on it but the row's.
+    // A joint that is moved by hand goes to where its entry of the step's force says that it is at the end: at a
+    // constant rate, or on the cubic from its rate to the one that a control gives. Its row of the constraints is
+    // g = q - (that motion), and no force acts on it but the row's. Where a control is held over several steps, the end
+    // is that of the last of them, `left` from here.
 
     // Put a path at (q, p), p brought onto the tangent space; false where M(q) is not positive definite.
     bool begin_at(const double* q, const double* p, ConstrainedState& state, bool project = true) {
@@ -172,6 +180,10 @@ class ConstrainedStepper {
         absorb(state);
         energy_guard.kicked(unit.data(), path.momentum.data(), path.v.data(), path.energies);
     }
+
+    // The rates at their goals of joints that are moved by hand on cubics, in the order of their rows; of others
+    // unread.
+    void take_rates(const double* own) { std::copy(own, own + goal_rate.size(), goal_rate.begin()); }
 
     // Take the force (n) of a step, constant over it, or (s, n) at its stages if it `varies`.
     void take_force(const double* own, bool varies) {
@@ -229,6 +241,7 @@ class ConstrainedStepper {
         std::copy(V, V + stages * n, equation.V.begin());
         std::fill(impulse.begin(), impulse.end(), 0.0);
         share = 1.0;
+        left = 1;
         return attempt(h, state, true);
     }
 
@@ -267,6 +280,11 @@ class ConstrainedStepper {
                     constant_force(mechanism, extra, u + s * controls, force.data());
                 }
                 take_goals();
+                for (std::size_t d = 0; d < goal_rate.size(); ++d) {
+                    const int control = mechanism.constraints.driven()[d].rate;
+                    if (control >= 0) goal_rate[d] = u[s * controls + control];
+                }
+                left = commands.hold - static_cast<int>(s % commands.hold);
                 const Outcome outcome = step(h, state);
                 record_effort(effort, nodes, row);
                 nodes.ended[p] = static_cast<std::int64_t>(outcome);
@@ -281,8 +299,8 @@ class ConstrainedStepper {
 
     // Derivatives of the substep that was solved last, from (q0, p0) under the force f, as a map on all of R^2n: of
     // (q1, p1) in (q0, p0), Jx (2n, 2n), and in f, Jf (2n, n). At q0 it asks for no g(q0) = 0, and p0's part across the
-    // tangent space is absorbed.
-    void derivatives(double h, const PathState& path, double* Jx, double* Jf) {
+    // tangent space is absorbed. In rates at goals, Jr (2n, driven rows), zero of joints on lines.
+    void derivatives(double h, const PathState& path, double* Jx, double* Jf, double* Jr) {
         std::swap(here, origin);
         const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = 3 * n;
         assemble(h);
@@ -310,43 +328,63 @@ class ConstrainedStepper {
                 const int row = here.order[a];
                 double* own = &columns[(wide + k * r + a) * w];
                 for (int c = 0; c < n; ++c) own[c] = -row_scale[row] * point[k].C[row * n + c] / h;
-                const int c = mechanism.constraints.driven_by(row);
-                if (c < 0) continue;
-                own[2 * n + c] = row_scale[row] * way_to(k + 1) / h;
-                own[c] += row_scale[row] * (1.0 - way_to(k + 1)) / h;
+                const int d = driven_of(row);
+                if (d < 0) continue;
+                const int c = mechanism.constraints.driven()[d].coordinate;
+                const Way way = way_at(d, way_to(k + 1));
+                own[2 * n + c] = row_scale[row] * way.ahead / h;
+                own[c] += row_scale[row] * (1.0 - way.ahead) / h;
             }
         }
-        std::vector<double> sorted(columns.size());
-        for (int i = 0; i < size; ++i) std::copy_n(&columns[rows[i] * w], w, &sorted[i * w]);
-        solve_lu_rows(saddle.data(), size, {0, size}, sorted.data(), w, w);
-        for (int i = 0; i < wide; ++i) {
-            for (int c = 0; c < w; ++c) dV[i * w + c] = scaled[i % n] * sorted[i * w + c];
-        }
-        equation.end_derivatives(h, {0, n}, dV, Jx, Jf);
-        // Of the impulses up to the last one: C_k' dLam_k + Lam_k . g_qq dQ~_k.
-        const auto end = [&](int row, int c) -> double& {
-            return c < 2 * n ? Jx[row * 2 * n + c] : Jf[row * n + c - 2 * n];
-        };
-        std::vector<double> dQ(n);
-        for (int c = 0; c < w; ++c) {
-            for (int k = 0; k < stages; ++k) {
-                for (int i = 0; i < n; ++i) {
-                    double sum = 0.0;
-                    for (int j = 0; j < stages; ++j) sum += at[k * stages + j] * dV[(j * n + i) * w + c];
-                    dQ[i] = h * sum + (c == i ? 1.0 : 0.0);
-                }
-                for (int i = 0; i < n; ++i) {
-                    double sum = inner(&bends[(k * n + i) * n], dQ.data());
+        end_columns(h, Jx, Jf);
+        // In the rates at both ends of a cubic, in the place of its goal.
+        if (curved_paths) {
+            for (int end = 0; end < 2; ++end) {
+                columns.assign(entries(size, w), 0.0);
+                for (int k = 0; k < stages; ++k) {
                     for (int a = 0; a < r; ++a) {
-                        const int row = here.order[a];
-                        sum += jet_at(k).C[row * n + i] * row_scale[row] * sorted[(wide + k * r + a) * w + c];
+                        const int d = driven_of(here.order[a]);
+                        if (d < 0) continue;
+                        const DrivenRow& own = mechanism.constraints.driven()[d];
+                        const Way way = way_at(d, way_to(k + 1));
+                        columns[(wide + k * r + a) * w + 2 * n + own.coordinate] =
+                            row_scale[own.row] * (end == 0 ? way.begin : way.end) / share;
                     }
-                    end(n + i, c) -= sum;
                 }
+                by_rates[end].resize(6 * n * n);
+                end_columns(h, by_rates[end].data(), by_rates[end].data() + 4 * n * n);
             }
         }
         std::swap(here, origin);
-        project_derivatives(h, path, end);
+        project_derivatives(h, path, Goal::place, Jx, Jf);
+        if (!curved_paths) return;
+        for (int end = 0; end < 2; ++end) {
+            project_derivatives(h, path, end == 0 ? Goal::begin : Goal::end, by_rates[end].data(),
+                                by_rates[end].data() + 4 * n * n);
+        }
+        const std::vector<DrivenRow>& driven = mechanism.constraints.driven();
+        lagrangian_jet(mechanism, from_q.data(), from_v.data(), equation.stage[0]);
+        for (std::size_t d = 0; d < driven.size(); ++d) {
+            const double *at_begin = by_rates[0].data() + 4 * n * n, *at_end = by_rates[1].data() + 4 * n * n;
+            for (int i = 0; i < 2 * n; ++i)
+                Jr[i * driven.size() + d] = driven[d].rate < 0 ? 0.0 : at_end[i * n + driven[d].coordinate];
+            if (driven[d].rate < 0) continue;
+            // The rate at the beginning is the momentum's, v = M^-1 p: M dv = dp - L_vq dq.
+            std::fill(y.begin(), y.end(), 0.0);
+            y[driven[d].coordinate] = 1.0;
+            whiten(origin, y.data(), y.data());
+            for (int i = 0; i < n; ++i) y[i] *= origin.root[i];
+            solve_upper(origin.ldl.data(), n, {0, n}, y.data());
+            for (int c = 0; c < n; ++c) {
+                double by_q = 0.0;
+                for (int j = 0; j < n; ++j) by_q -= y[j] * equation.stage[0].A[j * n + c];
+                for (int i = 0; i < 2 * n; ++i) {
+                    const double own = at_begin[i * n + driven[d].coordinate];
+                    Jx[i * 2 * n + c] += own * by_q;
+                    Jx[i * 2 * n + n + c] += own * y[c];
+                }
+            }
+        }
     }
 
     ConstraintBasis here;    // where the path stands
@@ -365,12 +403,17 @@ class ConstrainedStepper {
     static constexpr double sure = 10.0;  // as Collocation's
     static constexpr int most_corrections = 12;
 
-    double share = 1.0;          // of what is left of a step, that the next part of it is
-    std::vector<double> goal;    // of each joint that is moved by hand, at the end of the step
-    std::vector<double> given;   // (s, n) force at the stages of the whole step, where it varies
-    std::vector<double> line;    // (s, m) controls there, where they are linear
-    std::vector<double> at;      // (s + 1, s) t_kj
-    std::vector<double> weight;  // (s, s) w_ik
+    int left = 1;                                 // steps to the goal of joints that are moved by hand
+    double share = 1.0;                           // of what is left to it, that the next part is
+    std::vector<double> goal;                     // of each joint that is moved by hand, where it is to be
+    std::vector<double> goal_rate, begun;         // the rates there and where the part begins
+    bool curved_paths = false;                    // whether any goes on a cubic
+    std::vector<double> from_q, from_v;           // (n) where the part began, if so
+    std::array<std::vector<double>, 2> by_rates;  // (2n, 2n) and (2n, n), derivatives in rates at both ends
+    std::vector<double> given;                    // (s, n) force at the stages of the whole step, where it varies
+    std::vector<double> line;                     // (s, m) controls there, where they are linear
+    std::vector<double> at;                       // (s + 1, s) t_kj
+    std::vector<double> weight;                   // (s, s) w_ik
     Trial trial;
     std::vector<ConstraintJet> point;  // of Lobatto points 1 .. s
     std::vector<double> impulse;       // (s, m) Lam_k, zero for rows that are left out
@@ -398,10 +441,77 @@ class ConstrainedStepper {
                                                 &bends[k * n * n]);
     }
 
+    // Of what a joint's course depends on: the goal, or the rates at both ends of a cubic.
+    enum class Goal { place, begin, end };
+
+    // Shares of a joint's position, from where it begins, in the way to its goal; in its rates there and at the goal,
+    // times the time that is left.
+    struct Way {
+        double ahead, begin, end;
+    };
+    // At a share of the time that is left.
+    Way way_at(int d, double at) const {
+        if (mechanism.constraints.driven()[d].rate < 0) return {at, 0.0, 0.0};
+        return {at * at * (3.0 - 2.0 * at), at * (1.0 - at) * (1.0 - at), at * at * (at - 1.0)};
+    }
+    // The same of its rate: in the mean rate that is left, and in both rates.
+    Way pace_at(int d, double at) const {
+        if (mechanism.constraints.driven()[d].rate < 0) return {1.0, 0.0, 0.0};
+        return {6.0 * at * (1.0 - at), (1.0 - at) * (1.0 - 3.0 * at), at * (3.0 * at - 2.0)};
+    }
+    double rate_at(int d, double at, double h, double from) const {
+        const Way pace = pace_at(d, at);
+        return pace.ahead * share * (goal[d] - from) / h + pace.begin * begun[d] + pace.end * goal_rate[d];
+    }
+    // Which of the joints that are moved by hand a row moves, or -1.
+    int driven_of(int row) const {
+        const std::vector<DrivenRow>& driven = mechanism.constraints.driven();
+        for (std::size_t d = 0; d < driven.size(); ++d) {
+            if (driven[d].row == row) return static_cast<int>(d);
+        }
+        return -1;
+    }
+
+    // Derivatives of the end of a substep but for its last impulse, from the right sides in `columns` and the factors
+    // of the bordered matrix.
+    void end_columns(double h, double* Jx, double* Jf) {
+        const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = 3 * n;
+        std::vector<double> sorted(columns.size());
+        for (int i = 0; i < size; ++i) std::copy_n(&columns[rows[i] * w], w, &sorted[i * w]);
+        solve_lu_rows(saddle.data(), size, {0, size}, sorted.data(), w, w);
+        for (int i = 0; i < wide; ++i) {
+            for (int c = 0; c < w; ++c) dV[i * w + c] = scaled[i % n] * sorted[i * w + c];
+        }
+        equation.end_derivatives(h, {0, n}, dV, Jx, Jf);
+        // Of the impulses up to the last one: C_k' dLam_k + Lam_k . g_qq dQ~_k.
+        std::vector<double> dQ(n);
+        for (int c = 0; c < w; ++c) {
+            for (int k = 0; k < stages; ++k) {
+                for (int i = 0; i < n; ++i) {
+                    double sum = 0.0;
+                    for (int j = 0; j < stages; ++j) sum += at[k * stages + j] * dV[(j * n + i) * w + c];
+                    dQ[i] = h * sum + (c == i ? 1.0 : 0.0);
+                }
+                for (int i = 0; i < n; ++i) {
+                    double sum = inner(&bends[(k * n + i) * n], dQ.data());
+                    for (int a = 0; a < r; ++a) {
+                        const int row = here.order[a];
+                        sum += jet_at(k).C[row * n + i] * row_scale[row] * sorted[(wide + k * r + a) * w + c];
+                    }
+                    entry(Jx, Jf, n + i, c) -= sum;
+                }
+            }
+        }
+    }
+
+    double& entry(double* Jx, double* Jf, int row, int c) const {
+        return c < 2 * n ? Jx[row * 2 * n + c] : Jf[row * n + c - 2 * n];
+    }
+
     // The last impulse: M dv1 + C1' dLam = dp - (L_vq + Lam . g_qq) dq1, C1 dv1 = -(g_qq v1) dq1, and dp1 = M dv1 +
     // L_vq dq1.
-    template <class End>
-    void project_derivatives(double h, const PathState& path, const End& end) {
+    void project_derivatives(double h, const PathState& path, Goal what, double* Jx, double* Jf) {
+        const auto end = [&](int row, int c) -> double& { return entry(Jx, Jf, row, c); };
         const int r = here.rank();
         for (int i = 0; i < n; ++i) unit[i] = path.place[i].place.high;
         Jet<double>& jet = equation.stage[0];
@@ -418,8 +528,15 @@ class ConstrainedStepper {
             whiten(here, z.data(), z.data());
             for (int k = 0; k < r; ++k) {
                 double own = -inner(&bend[here.order[k] * n], dq.data());
-                const int moved = mechanism.constraints.driven_by(here.order[k]);
-                if (moved >= 0) own += share / h * ((c == 2 * n + moved) - (c == moved));
+                if (const int d = driven_of(here.order[k]); d >= 0) {
+                    const int moved = mechanism.constraints.driven()[d].coordinate;
+                    const Way pace = pace_at(d, share);
+                    if (what == Goal::place) {
+                        own += pace.ahead * share / h * ((c == 2 * n + moved) - (c == moved));
+                    } else if (c == 2 * n + moved) {
+                        own += what == Goal::begin ? pace.begin : pace.end;
+                    }
+                }
                 for (int j = 0; j < k; ++j) own -= here.R[j * r + k] * along[j];
                 along[k] = own / here.R[k * r + k];
             }
@@ -546,7 +663,7 @@ class ConstrainedStepper {
         }
     }
 
-    // How much of the way from here to its goal such a joint has gone at Lobatto point k of the part.
+    // How much of the time that is left to its goal has gone at Lobatto point k of the part.
     double way_to(int k) const {
         double place = 0.0;
         for (int j = 0; j < stages; ++j) place += at[k * stages + j];
@@ -626,6 +743,11 @@ class ConstrainedStepper {
         PathState& path = state.path;
         state.weakest = here.weakest;
         if (!(here.least > near_toggle) && m > 0 && here.rank() > 0) return Outcome::toggle;
+        for (std::size_t d = 0; d < goal.size(); ++d) begun[d] = state.rate[mechanism.constraints.driven()[d].row];
+        if (curved_paths) {
+            for (int i = 0; i < n; ++i) from_q[i] = path.place[i].place.high;
+            std::copy(path.v.begin(), path.v.end(), from_v.begin());
+        }
         const Outcome solved = solve(h, path, jets_wanted);
         if (solved != Outcome::solved) return solved;
         double margin = infinity;
@@ -640,7 +762,7 @@ class ConstrainedStepper {
         rate.assign(m, 0.0);
         for (std::size_t d = 0; d < goal.size(); ++d) {
             const DrivenRow& own = mechanism.constraints.driven()[d];
-            rate[own.row] = share * (goal[d] - path.place[own.coordinate].place.high) / h;
+            rate[own.row] = rate_at(static_cast<int>(d), share, h, path.place[own.coordinate].place.high);
         }
         for (int i = 0; i < n; ++i) unit[i] = trial.place[i].place.high;
         // The last Lobatto point is the end.
@@ -657,7 +779,7 @@ class ConstrainedStepper {
             for (int c = 0; c < n; ++c) trial.p[c] = trial.p[c].plus(-across(there.jet, total.data(), c));
             for (int r = 0; r < m; ++r) last[r] += total[r];
         }
-        for (const DrivenRow& own : mechanism.constraints.driven()) add_work(own, path);
+        for (std::size_t d = 0; d < goal.size(); ++d) add_work(static_cast<int>(d), h, path);
         const Outcome outcome = energy_guard.settle(guards, tableau, path.energies, path.place, path.v, trial, true);
         if (outcome != Outcome::solved) return outcome;
         effort.branch_margin = std::min(effort.branch_margin, margin);
@@ -764,7 +886,7 @@ class ConstrainedStepper {
 
     // Where the force varies: bring it to the stages of a part of the step.
     void bring_force(double begin, int level) {
-        share = length_of(1.0, level) / (1.0 - begin);
+        share = length_of(1.0, level) / (left - begin);
         if (stride == 0) return;
         bring_to_part(tableau, n, given.data(), begin, length_of(1.0, level), force.data());
     }
@@ -776,11 +898,14 @@ class ConstrainedStepper {
     }
 
     // What moves a joint by hand does this work: its impulses, the first of which meets the velocity before it, too.
-    void add_work(const DrivenRow& own, const PathState& path) {
-        const double after = rate[own.row], first = 0.5 * (path.v[own.coordinate] + after);
+    void add_work(int d, double h, const PathState& path) {
+        const DrivenRow& own = mechanism.constraints.driven()[d];
+        const double from = path.place[own.coordinate].place.high;
         for (int k = 0; k <= stages; ++k) {
             const double Lam = k < stages ? impulse[k * m + own.row] : last[own.row];
-            const double work = -Lam * (k == 0 ? first : after);
+            double velocity = rate_at(d, way_to(k), h, from);
+            if (k == 0) velocity = 0.5 * (path.v[own.coordinate] + velocity);
+            const double work = -Lam * velocity;
             trial.work[own.coordinate] += work;
             trial.magnitude[own.coordinate] += std::abs(work);
         }
@@ -797,9 +922,12 @@ class ConstrainedStepper {
             for (std::size_t d = 0; d < goal.size(); ++d) {
                 const DrivenRow& own = mechanism.constraints.driven()[d];
                 const Place& from = start.place[own.coordinate];
-                const double left = goal[d] - from.place.high;
-                point[k - 1].g[own.row] = Qk[own.coordinate] - (from.place.high + (from.place.low + way_to(k) * left));
-                point[k - 1].scale[own.row] = std::abs(Qk[own.coordinate]) + std::abs(left);
+                const Way way = way_at(static_cast<int>(d), way_to(k));
+                const double ahead = goal[d] - from.place.high, swing = begun[d] * way.begin + goal_rate[d] * way.end;
+                const double moved = way.ahead * ahead + h / share * swing;
+                point[k - 1].g[own.row] = Qk[own.coordinate] - (from.place.high + (from.place.low + moved));
+                point[k - 1].scale[own.row] =
+                    std::abs(Qk[own.coordinate]) + std::abs(ahead) + h / share * std::abs(swing);
             }
         }
     }
@@ -1064,29 +1192,33 @@ class ConstrainedLinearization {
         : stepper(mechanism, tableau, places, tolerance, guards),
           n(mechanism.dof()),
           state(mechanism, tableau.stages),
-          chained(n) {}
+          chained(n, static_cast<int>(mechanism.constraints.driven().size())) {}
 
     Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf) {
+                  const double* rates, std::span<const std::uint8_t> halvings, double* Jx, double* Jf, double* Jr) {
         stepper.take_force(force, varies);
+        stepper.take_rates(rates);
         if (!stepper.begin_at(q, p, state, false)) return Outcome::singular;
         if (halvings.empty()) {
             Outcome outcome = stepper.from_guess(h, guess, state);
             if (outcome != Outcome::solved) outcome = stepper.part(h, 0, 0.0, state);
             if (outcome == Outcome::solved) {
                 if (ramp) stepper.equation.weigh_ramp(0.0, 1.0);
-                stepper.derivatives(h, state.path, Jx, Jf);
+                stepper.derivatives(h, state.path, Jx, Jf, Jr);
                 return outcome;
             }
             if (!stepper.guards.active) return outcome;
         }
         chained.begin(Jx, Jf);
+        std::fill(Jr, Jr + chained.part_rate.size(), 0.0);
         return parts_again(halvings, stepper.guards.halvings_again(), [&](int level, double begin) {
             const Outcome outcome = stepper.part(h, level, begin, state);
             if (outcome != Outcome::solved) return outcome;
             if (ramp) stepper.equation.weigh_ramp(begin, length_of(1.0, level));
-            stepper.derivatives(length_of(h, level), state.path, chained.part.data(), chained.part_f.data());
+            stepper.derivatives(length_of(h, level), state.path, chained.part.data(), chained.part_f.data(),
+                                chained.part_rate.data());
             chained.follow(Jx, Jf);
+            chained.follow_rates(Jr);
             return outcome;
         });
     }

@@ -48,12 +48,14 @@ struct TieRow {
     int follower = 0;
     int leader = 0;
     std::vector<double> coefficients;
+    int rate = -1;  // of a joint that is moved by hand: the control that is its rate at the goal, or -1 for a line
 };
 
 // The row of a joint that is moved by hand: q - (where it is to be), of which the core knows the second.
 struct DrivenRow {
     int row = 0;
     int coordinate = 0;
+    int rate = -1;  // as TieRow's
 };
 
 // A function of q with several rows.
@@ -104,20 +106,17 @@ class Constraints {
         }
         rows_ = static_cast<int>(products_.size() + ties_.size());
         for (const CustomRows& own_rows : customs_) rows_ += own_rows.rows;
-        driven_by_.assign(rows_, -1);
         for (std::size_t k = 0; k < ties_.size(); ++k) {
             if (ties_[k].follower != ties_[k].leader || !ties_[k].coefficients.empty()) continue;
-            driven_.push_back({static_cast<int>(products_.size() + k), ties_[k].follower});
-            driven_by_[driven_.back().row] = driven_.back().coordinate;
+            driven_.push_back({static_cast<int>(products_.size() + k), ties_[k].follower, ties_[k].rate});
         }
     }
 
     // m: products first, then ties, then functions.
     int rows() const { return rows_; }
 
-    // Rows of joints that are moved by hand; and the coordinate that a row moves, -1 if it does not.
+    // Rows of joints that are moved by hand.
     const std::vector<DrivenRow>& driven() const { return driven_; }
-    int driven_by(int row) const { return driven_by_[row]; }
 
     // g and C at q.
     void at(const double* q, ConstraintJet& w) const {
@@ -267,7 +266,6 @@ class Constraints {
     std::vector<ProductRow> products_;
     std::vector<TieRow> ties_;
     std::vector<DrivenRow> driven_;
-    std::vector<int> driven_by_;
     std::vector<CustomRows> customs_;
     int n_ = 0;
     int rows_ = 0;

@@ -76,10 +76,15 @@ Outcome parts_again(std::span<const std::uint8_t> halvings, int most_halvings, c
 // Derivatives (2n, 2n) and (2n, n) of a step from those of its parts, `part` and `part_f`.
 class ChainedDerivatives {
   public:
-    explicit ChainedDerivatives(int n)
-        : part(entries(2 * n, 2 * n)), part_f(entries(2 * n, n)), n_(n), product_(part.size()) {}
+    explicit ChainedDerivatives(int n, int rates = 0)
+        : part(entries(2 * n, 2 * n)),
+          part_f(entries(2 * n, n)),
+          part_rate(entries(2 * n, rates)),
+          n_(n),
+          rates_(rates),
+          product_(part.size()) {}
 
-    std::vector<double> part, part_f;  // of the last part
+    std::vector<double> part, part_f, part_rate;  // of the last part
 
     // Of a step of no length.
     void begin(double* Jx, double* Jf) const {
@@ -88,7 +93,11 @@ class ChainedDerivatives {
         for (int i = 0; i < 2 * n_; ++i) Jx[i * 2 * n_ + i] = 1.0;
     }
 
-    // Let the last part follow those before.
+    // Let the last part follow those before; the same of derivatives in rates (2n, rates).
+    void follow_rates(double* Jr) {
+        times(rates_, Jr);
+        for (int i = 0; i < 2 * n_ * rates_; ++i) Jr[i] += part_rate[i];
+    }
     void follow(double* Jx, double* Jf) {
         times(2 * n_, Jx);
         times(n_, Jf);
@@ -96,7 +105,7 @@ class ChainedDerivatives {
     }
 
   private:
-    int n_;
+    int n_, rates_;
     std::vector<double> product_;
 
     void times(int columns, double* right) {

@@ -15,7 +15,7 @@ from varpin.io.scenefile.references import Timeline, constant
 from varpin.io.scenefile.spec import CostSpec, ForceSpec, SceneSpec, degrees_for_radians
 from varpin.io.scenefile.table import Floats, SceneFileError, Table, suggestion
 from varpin.io.scenefile.terms import Given
-from varpin.mechanics.constraints import Constraint
+from varpin.mechanics.constraints import Constraint, KinematicInput
 from varpin.mechanics.forces import Force, PositionServo
 from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
 from varpin.mechanics.scene import Scene, closest_controls, damping_of
@@ -151,9 +151,16 @@ class Layout:
         return np.asarray(np.any([np.zeros(self.robot.dof, dtype=np.bool_), *servos], axis=0))
 
     @property
+    def moved(self) -> NDArray[np.bool_]:
+        """Joints (n,) whose control is a position that they are moved to by hand."""
+        names = [each.joint for each in self.constraints if isinstance(each, KinematicInput)]
+        return np.isin(self.robot.joint_names, names)
+
+    @property
     def control_limit(self) -> Floats:
-        """Of controls (m,), infinite where there is none: of positions none, the torque limit is their servo's."""
-        return np.where(self.served[self.actuated], np.inf, self.torque_limit / np.abs(self.gear))
+        """Of controls (m,), infinite where there is none: of positions none, a torque limit is their servo's."""
+        positions = (self.served | self.moved)[self.actuated]
+        return np.where(positions, np.inf, self.torque_limit / np.abs(self.gear))
 
     def _force(self, force: JointForces) -> Force:
         """As a scene takes it. A torque limit bounds the effort of a servo."""
@@ -375,7 +382,7 @@ def _require_own_controls(
 
 def _require_controls(layout: Layout) -> None:
     """Refuse controls of a simulation beyond their limits, degrees for positions, and noise in proportion to those."""
-    spec, served = layout.spec, layout.served[layout.actuated]
+    spec, served, moved = layout.spec, layout.served[layout.actuated], layout.moved[layout.actuated]
     for index, model in enumerate(layout.noise):
         if model.kind == "control" and (served & (model.intensity != 0.0)).any():
             joint = layout.driven[int(np.argmax(served & (model.intensity != 0.0)))]
@@ -387,12 +394,12 @@ def _require_controls(layout: Layout) -> None:
         return
     table = spec.root.table("simulate")
     given = layout.controls.at(times_of(spec))
-    for joint, column in zip(layout.actuated[served].tolist(), given.T[served], strict=True):
+    for joint, column in zip(layout.actuated[served | moved].tolist(), given.T[served | moved], strict=True):
         worst = float(column[np.argmax(np.abs(column))])
         if not layout.robot.slides[joint] and degrees_for_radians(worst):
             name = layout.robot.joint_names[joint]
-            raise table.error("controls", f"{worst:g} of {name!r} looks like degrees: positions of servos are in rad")
-    force, limit = np.abs(given * layout.gear), np.where(served, np.inf, layout.torque_limit)
+            raise table.error("controls", f"{worst:g} of {name!r} looks like degrees: positions are in rad")
+    force, limit = np.abs(given * layout.gear), np.where(served | moved, np.inf, layout.torque_limit)
     if (force > limit * (1.0 + 1e-9)).any():
         worst_joint = int(np.argmax((force - limit).max(axis=0)))
         raise table.error(

@@ -135,8 +135,16 @@ class SceneFile:
             # A position of a joint moved by hand is where it is at the end of the step.
             moved = [int(np.argmax(self.scene.actuation[c])) for c in self.scene.inputs.values()]
             found[:, moved] = given.at((k + 1.0) * self.spec.dt)[:, moved]
-            return found
+            cubic = [place for place, rate in zip(moved, self.scene.rates, strict=True) if rate >= 0]
+            return np.hstack([found, self._rates(given)[:, cubic]]) if cubic else found
         return holding_controls(self.scene, self.q0)
+
+    def _rates(self, given: Timeline) -> Floats:
+        """Derivatives of values over time at the ends of steps, by differences backward, within the horizon."""
+        t, h = np.arange(1.0, self.spec.steps + 1.0) * self.spec.dt, 0.01 * self.spec.dt
+        before = [weight * given.at(t - k * h) for k, weight in enumerate((25.0, -48.0, 36.0, -16.0, 3.0))]
+        rates: Floats = sum(before[1:], before[0]) / (12.0 * h)
+        return rates
 
     def simulate(self, *, progress: Callable[[int, int], None] | None = None) -> Trajectory:
         """The motion under the controls of ``[simulate]``, with noise if it gives a seed.

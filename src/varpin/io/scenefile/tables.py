@@ -402,6 +402,7 @@ _OF_CONSTRAINTS = {
     "a": _POINT,
     "b": _POINT,
     "direction": numbers(3),
+    "interpolation": word("linear", "cubic"),
     "length": number("m", above=0.0),
     "normal": numbers(3),
     "placement": numbers(16),

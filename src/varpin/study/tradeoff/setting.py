@@ -90,7 +90,11 @@ class Setting(Frozen):
             InputError: Wrong shapes or values, a scene with noise, controls that are a function.
         """
         joints = require_scene(scene).robot.joint_names
-        refuse_constraints(scene, "A study of integrators")
+        refuse_constraints(
+            scene,
+            "A study of integrators",
+            "only varpin.Midpoint() and varpin.Gauss(stages) keep them; compare motions with dt and with half of it",
+        )
         if scene.processes:
             raise InputError("errors of single motions are compared here: leave the noise out of the scene")
         if callable(controls):
