@@ -93,8 +93,8 @@ from varpin.trajectory import Trajectory as Trajectory
 
 if TYPE_CHECKING:
     from varpin.control import ConstraintReport as ConstraintReport
-    from varpin.control import Kept as Kept
     from varpin.control import Iteration as Iteration
+    from varpin.control import Kept as Kept
     from varpin.control import MonteCarlo as MonteCarlo
     from varpin.control import MonteCarloInterrupted as MonteCarloInterrupted
     from varpin.control import Multipliers as Multipliers
