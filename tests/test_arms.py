@@ -65,20 +65,25 @@ def test_torques_that_jump_on_arms_with_their_own_damping(load, name):
 
 
 def test_who_integrates_where_nobody_is_named(load):
-    """Dampers faster than the step change it; noise and constraints do not go with the other."""
+    """Dampers and springs faster than the step change it; Radau goes neither with noise nor with constraints."""
 
     def taken(dt=1e-2, steps=1, **options):
         scene = vp.Scene(load("xarm7"), damping="robot", **options)
         return vp.simulate(scene, np.zeros(7), np.zeros(7), dt=dt, steps=steps, rng=0 if options else None).integrator
 
-    assert taken() == "Radau(stages=3)"
-    assert taken(5e-5) == "Midpoint(alpha=0.5)"
+    assert taken() == "Radau(stages=4)"
+    assert taken(5e-5) == "Gauss(stages=2)"
     assert taken(noise=vp.AdditiveNoise(0.1)) == "Midpoint(alpha=0.5)"
-    assert vp.simulate(vp.Scene(load("ur5")), np.zeros(6), np.zeros(6), dt=1e-2, steps=1).integrator == (
-        "Midpoint(alpha=0.5)"
+    assert (
+        vp.simulate(vp.Scene(load("ur5")), np.zeros(6), np.zeros(6), dt=1e-2, steps=1).integrator == "Gauss(stages=2)"
     )
+    held = vp.Scene(load("ur5"), damping=1e3, constraints=[vp.JointTie("wrist_1_joint", "elbow_joint")])
+    assert vp.simulate(held, np.zeros(6), np.zeros(6), dt=1e-2, steps=1).integrator == "Gauss(stages=2)"
     rubbing = vp.Scene(load("ur5"), forces=[vp.CoulombFriction(1.0)])
-    assert vp.simulate(rubbing, np.zeros(6), np.ones(6), dt=1e-2, steps=1).integrator == "Radau(stages=3)"
+    assert vp.simulate(rubbing, np.zeros(6), np.ones(6), dt=1e-2, steps=1).integrator == "Radau(stages=4)"
+    stiff = vp.Scene(load("ur5"), stiffness=1e4)
+    assert vp.simulate(stiff, np.zeros(6), np.ones(6), dt=1e-2, steps=1).integrator == "Gauss(stages=4)"
+    assert vp.simulate(stiff, np.zeros(6), np.ones(6), dt=1e-4, steps=1).integrator == "Gauss(stages=2)"
 
 
 START = np.array([0.0, -1.2, 1.4, -1.0, -1.57, 0.0])

@@ -1,7 +1,10 @@
 """What closed loops must hold to: energy over long times, time reversal, and no silent wrong motion in odd loops."""
 
+import functools
+
 import numpy as np
 import pytest
+from battery.loops import LOOPS, STIFF
 
 import varpin as vp
 from varpin.mechanics.assembly import along_constraints
@@ -83,3 +86,77 @@ def test_odd_loops_move_rightly_or_say_that_they_do_not(count):
     assert not wrong
     assert right > count / 5
     assert told > count / 10
+
+
+LOOP_METHODS = [vp.Midpoint(), vp.Gauss(2), vp.Gauss(3)]
+
+
+@functools.cache
+def exact_motion(number):
+    """A loop, a state in it, and its motion by DOP853 on Pinocchio's own calls."""
+    loop = LOOPS[number]()
+    q = vp.assemble(loop.scene, loop.start)
+    v = along_constraints(loop.scene, q, loop.push)
+    return loop, q, v, loop.dynamics().motion(q, v, np.linspace(0.0, loop.duration, 31), stiff=loop.stiff)
+
+
+def moved(number, integrator, steps):
+    """The motion, and how far q and v are off, in units of the way and of the largest velocity."""
+    loop, q, v, (exact_q, exact_v) = exact_motion(number)
+    controls = None if loop.controls is None else vp.OpenLoop(loop.controls)
+    dt = loop.duration / steps
+    motion = vp.simulate(loop.scene, q, v, dt=dt, steps=steps, controls=controls, integrator=integrator)
+    mine, its = max(1, steps // 30), max(1, 30 // steps)
+    off = np.abs(motion.q[::mine] - exact_q[::its]).max() / np.ptp(exact_q, axis=0).max()
+    rate_off = np.abs(motion.v[::mine] - exact_v[::its]).max() / np.abs(exact_v).max()
+    return motion, off, rate_off
+
+
+def told(motion):
+    """Whether warnings speak of more than limits of the robot."""
+    return any("limits" not in sentence for sentence in motion.warnings)
+
+
+def judged(number, integrator, steps):
+    """Asserts that a loop moves rightly, or that the user is told; whether it moved."""
+    try:
+        motion, off, rate_off = moved(number, integrator, steps)
+    except vp.StepFailure:
+        return False
+    g, _, C = exact_motion(number)[0].scene.core.constraints(motion.q)
+    assert np.abs(g).max() < 1e-11
+    assert np.abs(np.einsum("kmn,kn->km", C, motion.v)).max() < 1e-12 * max(1.0, 10.0 * np.abs(motion.v).max())
+    assert (off < 0.05 and rate_off < 0.1) or told(motion)
+    return True
+
+
+# The stiff references take seconds each.
+@pytest.mark.parametrize(
+    "number", [pytest.param(k, marks=[pytest.mark.slow] if k in STIFF else []) for k in range(len(LOOPS))]
+)
+def test_loops_at_their_extremes_move_as_index_reduced_equations_do(number):
+    for integrator in LOOP_METHODS:
+        assert judged(number, integrator, 30)
+    if number in STIFF:
+        return
+    _, off, rate_off = moved(number, vp.Gauss(3), 300)
+    assert off < 1e-8
+    assert rate_off < 1e-8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(len(LOOPS)))
+def test_loops_at_their_extremes_over_decades_of_steps(number):
+    for integrator in (vp.Midpoint(), *(vp.Gauss(stages) for stages in (1, 2, 3, 4))):
+        went = [judged(number, integrator, steps) for steps in (3, 30, 300, 3000)]
+        assert all(went[1:])
+
+
+@pytest.mark.parametrize(("integrator", "steps"), [(vp.Midpoint(), 60), (vp.Gauss(2), 30), (vp.Gauss(3), 15)])
+def test_two_driven_arms_converge_with_the_order_of_the_integrator(integrator, steps):
+    errors = []
+    for N in (steps, 2 * steps):
+        motion, off, rate_off = moved(len(LOOPS) - 1, integrator, N)
+        assert motion.statistics.split_steps == 0
+        errors.append(max(off, rate_off))
+    assert np.log2(errors[0] / errors[1]) > integrator.order - 0.4

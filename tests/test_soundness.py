@@ -556,3 +556,18 @@ def test_many_motions_of_an_explicit_method_at_once(integrator):
         motion = vp.simulate(scene, q0[i], v0[i], dt=0.02, steps=4, controls=drift[i], integrator=integrator)
         np.testing.assert_array_equal(q[i], motion.q[1:])
         np.testing.assert_array_equal(v[i], motion.v[1:])
+
+
+@pytest.mark.parametrize(("dt", "steps"), [(1e-3, 100), (1e-2, 100)])
+def test_rounding_of_joints_that_a_falling_lift_carries_is_no_motion(dt, steps):
+    """They have no weight in its fall, and stay where they are."""
+    model, joint = pin.Model(), 0
+    for kind in (pin.JointModelPZ(), pin.JointModelRX(), pin.JointModelRY(), pin.JointModelRZ()):
+        joint = model.addJoint(joint, kind, pin.SE3(np.eye(3), np.array([0.1, 0.2, 0.3])), f"joint{joint}")
+        inertia = pin.Inertia(20.0 / 3.0**joint, np.array([0.05, 0.1, 0.07]), np.diag([0.01, 0.02, 0.015]))
+        model.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
+    scene, q = vp.Scene(vp.load_robot(model)), np.array([0.0, 0.3, -0.8, 0.5])
+    motion = vp.simulate(scene, q, np.zeros(4), dt=dt, steps=steps)
+    assert motion.q[-1, 0] == pytest.approx(-0.5 * 9.81 * (dt * steps) ** 2, rel=1e-9)
+    assert 0.0 < np.abs(motion.v[:, 1:]).max() < 1e-12
+    assert motion.warnings == ()

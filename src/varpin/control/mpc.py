@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,12 +20,12 @@ from varpin.integrators.base import Failure
 from varpin.mechanics.scene import Scene, refuse_inputs, require_scene
 from varpin.simulation.chatter import alternation
 from varpin.simulation.loop_stability import examined_in_loop
-from varpin.simulation.run import Interrupted, StepFailure, noise_forgotten, simulate
+from varpin.simulation.run import Interrupted, Progress, StepFailure, noise_forgotten, simulate
 from varpin.simulation.soundness import Finding, announce, evident, with_warnings
-from varpin.support.checks import JointValues, control_values, count, positive, real
+from varpin.support.checks import JointValues, control_values, count, positive, real, told_motion
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, warning_count
-from varpin.trajectory import Trajectory, chained
+from varpin.trajectory import Nodes, Trajectory, chained
 
 Floats = NDArray[np.float64]
 
@@ -273,7 +273,7 @@ class Mpc:
         *,
         duration: float,
         rng: np.random.Generator | int | None = None,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Progress | None = None,
     ) -> MpcRun:
         """Control a simulated plant from the problem's initial state.
 
@@ -286,7 +286,8 @@ class Mpc:
             rng: Generator or seed of the plant's noise; without it there is none, of which a noisy plant has a warning.
 
         Other Args:
-            progress: Called with (ticks done, ticks in all).
+            progress: Called with (ticks done, ticks in all). A function that needs three arguments gets the plant's
+                motion in the last tick, too, a :class:`varpin.Nodes`; as :class:`varpin.LiveView` does.
 
         Raises:
             InputError: A plant with other controls or joints.
@@ -296,6 +297,8 @@ class Mpc:
             Interrupted: Ctrl-C; holds the plant's motion so far.
         """
         problem = self.problem
+        tell: Any = progress
+        moving = told_motion("progress", progress, "ticks done, ticks in all", "nodes")
         plant = Plant(problem.scene) if plant is None else plant
         if not isinstance(plant, Plant):
             raise InputError(f"plant must be a varpin.Plant, for example varpin.Plant(scene), got {plant!r}")
@@ -337,8 +340,10 @@ class Mpc:
                 parts.append(_simulated(plant, dt, q, v, u, generator, parts))
                 q, v = parts[-1].q[-1], parts[-1].v[-1]
                 before = u if problem.remembers else None
-                if progress is not None:
-                    progress(tick + 1, ticks)
+                if moving:
+                    tell(tick + 1, ticks, Nodes(tick * self.period + parts[-1].t, parts[-1].q, parts[-1].v))
+                elif tell is not None:
+                    tell(tick + 1, ticks)
         except KeyboardInterrupt:
             if not parts:
                 raise

@@ -115,6 +115,13 @@ class Integrator(ABC):
         """
         return ()
 
+    def amplification(self, z: NDArray[np.complex128]) -> NDArray[np.complex128] | None:  # noqa: ARG002 - as others'
+        """By what a step of h multiplies modes exp(lambda t) of a linear system, (k,) of z = h lambda.
+
+        The motion itself multiplies them by exp(z). None where nobody has worked it out.
+        """
+        return None
+
     @property
     def left(self) -> float:
         """The part of a step's kick that comes before the step; the rest comes after it."""

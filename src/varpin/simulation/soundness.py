@@ -43,6 +43,7 @@ from varpin.simulation.accuracy import (
 from varpin.simulation.chatter import RUN, Alternation, alternation
 from varpin.simulation.friction import Stop, rate_at_stops, stops
 from varpin.simulation.limits import left as limits_left
+from varpin.simulation.phase import phase_lost
 from varpin.simulation.retaking import Again, Finer, finer, taken_again
 from varpin.trajectory import Trajectory
 
@@ -251,7 +252,7 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     found = [*_energy(scene, integrator, trajectory)]
     unsettled = _unsettled(scene, integrator, trajectory)
     if resolved(scene, integrator, trajectory):
-        return (*found, *unsettled)
+        return (*found, *(() if found else _out_of_phase(scene, integrator, trajectory)), *unsettled)
     error = motion_error(scene, integrator, trajectory)
     if error is not None and spoken_of(error):
         dt, start = trajectory.dt, trajectory.t[error.step]
@@ -271,7 +272,23 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
         before, after = trajectory.v[:-1], trajectory.v[1:]
         if ((before * after < 0.0) & (np.abs(before) > _STILL) & (np.abs(after) > 0.5 * np.abs(before))).any():
             found.append(_ringing(scene, fast, trajectory.dt))
+    if not found:
+        found.extend(_out_of_phase(scene, integrator, trajectory))
     return (*found, *(own for own in unsettled if own.kind not in {other.kind for other in found}))
+
+
+def _out_of_phase(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Says if oscillations on springs lose more over the whole motion than can be told from a period."""
+    lost = phase_lost(scene, integrator, trajectory)
+    if lost is None:
+        return ()
+    sentence = (
+        f"oscillations of {lost.rate / (2.0 * np.pi):.3g} Hz lose phase or height: over the motion, steps of "
+        f"dt = {trajectory.dt:g} s by {integrator} put them off by about {100 * lost.turned:.2g}% of their height, "
+        f"and joint {trajectory.joint_names[lost.joint]!r} by {lost.off:.2g} rad or m, {100 * lost.share:.2g}% of the "
+        "longest way of a joint; smaller steps or more stages keep them"
+    )
+    return (Finding("phase", sentence, lost.joint),)
 
 
 def _unsettled(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -460,7 +477,8 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
     damped = bool(_fast_damping(scene, trajectory).rate)
     if steps == 1:
         return not damped and _halves_agree(scene, integrator, trajectory)
-    other, times = _STOPPING if damped else integrator, 1 if damped and not integrator.l_stable else 2
+    foreign = damped and not integrator.l_stable
+    other, times = _STOPPING if foreign else integrator, 1 if foreign else 2
     apart = max(pieces, 1 + steps % 2) - 1
     begins = np.array([i * (steps - length) // apart for i in range(apart + 1)]) if apart else _FROM_START
     if pieces == _WINDOWS:
