@@ -104,6 +104,11 @@ class Region:
     way: Floats | None = None
 
     @property
+    def moves(self) -> bool:
+        """Whether it does not stand."""
+        return self.way is not None
+
+    @property
     def corners(self) -> Floats:
         """Points (k, 3) around what is finite of it [m], wherever it goes."""
         if self.box is None:
