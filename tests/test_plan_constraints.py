@@ -569,3 +569,23 @@ def test_verification_tells_what_the_continuous_robot_violates():
     assert seen.violation == max(speed.closed_loop, goal.closed_loop)
     assert "WithinVelocityLimits is violated by [rad/s or m/s]: planned" in str(seen)
     assert "limit of joint" in speed.where
+
+
+def test_bounds_on_the_way_to_a_goal_that_they_forbid_settle():
+    """Many rows at once: the first round is over in a few whole steps, and the goal is told of soon."""
+    robot = vp.planar_chain(3)
+    goal = vp.ReachFrame(robot, "tip", position=[1.2, 0.0, -2.0])
+    cost = vp.ControlCost(1e-3) + vp.VelocityCost(0.1)
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, damping=0.1),
+        cost,
+        np.zeros(3),
+        np.zeros(3),
+        dt=0.04,
+        steps=30,
+        constraints=[vp.WithinVelocityLimits(robot, (-0.1, 0.1)), goal],
+    )
+    plan = vp.solve(problem, check=False)
+    assert plan.status is vp.Status.INFEASIBLE
+    assert "ReachFrame('tip')" in plan.reason
+    assert len(plan.history) <= 40
