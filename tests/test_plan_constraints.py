@@ -3,10 +3,13 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
 import varpin as vp
 from varpin.control.backward import backward
+from varpin.control.hints import hints
+from varpin.control.hints import reach as hints_reach
 from varpin.control.penalties import penalized
 from varpin.model.clearance import capsule_around, clearance
 from varpin.model.kinematics import frame_kinematics
@@ -254,8 +257,6 @@ def test_what_is_refused():
         vp.WithinControlRate(0.0)
     with pytest.raises(vp.InputError, match="margin must be >= 0"):
         vp.WithinJointLimits(ROBOT, (-1, 1), margin=-1.0)
-    with pytest.raises(vp.InputError, match="would leave them out"):
-        vp.Mpc(two_links(FAMILIES["velocities"]))
 
 
 def test_clearance_derivatives():
@@ -469,6 +470,56 @@ def test_a_margin_without_noise_is_told_of():
     assert any("margin" in sentence and "no noise" in sentence for sentence in plan.warnings)
 
 
+def told_of(problem):
+    return [finding.sentence for finding in hints(problem)]
+
+
+def test_hints_before_a_search():
+    """What no motion meets, or looks like other units, is named; what can be met is not."""
+    reach = {
+        "gets 2 m from there at most: no motion": [vp.ReachFrame(ROBOT, "tip", position=[2.1, 0.0, 0.0])],
+        "millimetres": [vp.ReachFrame(ROBOT, "tip", position=[1200.0, 0.0, -900.0])],
+        "two goals that are 0.1 m apart": [
+            vp.ReachFrame(ROBOT, "tip", position=[1.2, 0.0, -0.9]),
+            vp.ReachFrame(ROBOT, "tip", position=[1.2, 0.0, -1.0]),
+        ],
+        "the sphere by 0.2 m at t = 1.2 s": [
+            vp.ReachFrame(ROBOT, "tip", position=[1.2, 0.0, -0.9]),
+            vp.KeepOutOfSphere(ROBOT, "tip", lambda t: [1.2, 0.0, -2.2 + t], 0.3),
+        ],
+        "turn to 90 rad": [vp.WithinJointLimits(ROBOT, (-90.0, 90.0))],
+        "joint1 0.2 rad or m outside WithinJointLimits": [vp.WithinJointLimits(ROBOT, (-1.0, 0.8))],
+        "joint1 and table are too close by 0.01": [
+            vp.KeepClear(
+                ROBOT,
+                [vp.Obstacle.sphere([0.0, 0.0, -0.1], 0.06, name="table")],
+                capsules={"joint1": ([0, 0, 0], [1, 0, 0], 0.05)},
+            )
+        ],
+    }
+    for words, constraints in reach.items():
+        (told,) = told_of(two_links(constraints))
+        assert words in told
+    for constraints in FAMILIES.values():
+        assert all("outside WithinJointLimits" in told for told in told_of(two_links(constraints)))
+    degrees = vp.ControlCost(1e-2) + vp.Terminal(2.0 * vp.TrackingCost([60.0, 30.0], 1.0))
+    assert "joint1 at 60 rad" in told_of(two_links(FAMILIES["velocities"], cost=degrees))[0]
+    plan = vp.solve(two_links(reach["two goals that are 0.1 m apart"], steps=8), max_iterations=0)
+    assert any("two goals" in sentence for sentence in plan.warnings)
+
+
+def test_reach_bounds_where_a_frame_gets():
+    """Of many postures, rails included."""
+    for name, frame in (("ur5", "tool0"), ("tiago_no_hand", "wrist_ft_tool_link")):
+        robot = vp.load_robot(name)
+        kinematics = frame_kinematics(robot, frame)
+        lower, upper = robot.position_limits
+        rng = np.random.default_rng(0)
+        q = rng.uniform(np.maximum(lower, -7.0), np.minimum(upper, 7.0), (2000, robot.dof))
+        away = np.linalg.norm(kinematics.placements(q)[1] - kinematics.links.translation[0], axis=1)
+        assert away.max() <= hints_reach(robot, kinematics) < 2.5 * away.max()
+
+
 def test_references_of_rows_go_with_constraints():
     """Looking at a plan between its nodes takes no reference there."""
     reference = np.linspace(0.0, 1.0, 9)[:, None] * np.array([1.0, 0.5])
@@ -489,3 +540,52 @@ def test_options_are_checked_with_constraints_as_without(option, value):
             vp.solve(two_links(constraints, steps=8), **{option: value})
         told.append(str(found.value))
     assert told[0] == told[1]
+
+
+def test_verification_tells_what_the_continuous_robot_violates():
+    """Between nodes, and where coarse steps mislead; against an integration by SciPy."""
+    problem = two_links(
+        [*FAMILIES["velocities"], *FAMILIES["goal"]], steps=14, dt=0.1, integrator=vp.Midpoint(), sampling="midpoint"
+    )
+    plan = vp.solve(problem, check=False)
+    seen = plan.verify(tolerance=1e-8)
+    speed, goal = seen.constraints
+    assert max(speed.planned, goal.planned) <= 1e-9
+    x, fastest = np.zeros(4), 0.0
+
+    def rate(_, x, torque):
+        return np.append(x[2:], pin.aba(model, data, x[:2], x[2:], torque - 0.1 * x[2:]))
+
+    model, data = ROBOT.model, ROBOT.model.createData()
+    for torque in plan.controls:
+        times = np.linspace(0.0, 0.1, seen.substeps + 1)
+        found = solve_ivp(rate, (0.0, 0.1), x, "DOP853", rtol=1e-11, atol=1e-12, args=(torque,), t_eval=times).y
+        x, fastest = found[:, -1], max(fastest, np.abs(found[2:]).max())
+    assert speed.open_loop == pytest.approx(fastest - 1.2, rel=1e-3)
+    tip = ROBOT.frame_positions(x[:2], "tip")
+    assert goal.open_loop == pytest.approx(np.abs(tip - [1.2, 0.0, -0.9]).max(), rel=1e-4)
+    assert speed.open_loop > 1e-3 < speed.closed_loop
+    assert goal.closed_loop < goal.open_loop
+    assert seen.violation == max(speed.closed_loop, goal.closed_loop)
+    assert "WithinVelocityLimits is violated by [rad/s or m/s]: planned" in str(seen)
+    assert "limit of joint" in speed.where
+
+
+def test_bounds_on_the_way_to_a_goal_that_they_forbid_settle():
+    """Many rows at once: the first round is over in a few whole steps, and the goal is told of soon."""
+    robot = vp.planar_chain(3)
+    goal = vp.ReachFrame(robot, "tip", position=[1.2, 0.0, -2.0])
+    cost = vp.ControlCost(1e-3) + vp.VelocityCost(0.1)
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, damping=0.1),
+        cost,
+        np.zeros(3),
+        np.zeros(3),
+        dt=0.04,
+        steps=30,
+        constraints=[vp.WithinVelocityLimits(robot, (-0.1, 0.1)), goal],
+    )
+    plan = vp.solve(problem, check=False)
+    assert plan.status is vp.Status.INFEASIBLE
+    assert "ReachFrame('tip')" in plan.reason
+    assert len(plan.history) <= 40

@@ -7,6 +7,7 @@ from test_replay_marks import assert_no_errors, names, placements, pose, vertice
 
 import varpin as vp
 from varpin.show.replay import replay
+from varpin.show.replay.surroundings import regions
 
 CAPSULES = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
 
@@ -151,3 +152,24 @@ def test_what_no_viewer_draws_is_left_out_with_a_word(plan, tmp_path, caplog):
     )  # fmt: skip
     replay(robot, [[0.3, 0.2]], dt=1.0, constraints=huge, html=tmp_path / "huge.html")
     assert "'tip' is larger than what viewers draw" in caplog.text
+
+
+def test_what_moves_is_drawn_where_it_is():
+    """Obstacles and spheres at the keyframes, from the time that the plan begins at."""
+    robot = vp.planar_chain(2)
+
+    def way(t):
+        return np.array([0.1 * t, 0.0, 0.2 * t])
+
+    arm = {"joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
+    ball = vp.Obstacle.sphere([1.0, 0.0, -2.0], 0.1).moving(way)
+    constraints = [
+        vp.KeepClear(robot, [ball], capsules=arm),
+        vp.KeepOutOfSphere(robot, "tip", lambda t: way(t) - [0, 0, 3], 0.2),
+    ]
+    times = np.array([0.5, 0.7, 1.1])
+    for region, begin in zip(regions(constraints, times), ([1.0, 0.0, -2.0], [0.0, 0.0, -3.0]), strict=True):
+        np.testing.assert_allclose(region.begin, begin + way(0.5), atol=1e-15)
+        np.testing.assert_allclose(region.begin + region.way, [begin + way(t) for t in times], atol=1e-15)
+        reach = region.corners.max(axis=0) - region.radius
+        np.testing.assert_allclose(reach, begin + way(1.1), atol=1e-12)

@@ -95,6 +95,7 @@ from varpin.trajectory import Trajectory as Trajectory
 if TYPE_CHECKING:
     from varpin.control import ConstraintReport as ConstraintReport
     from varpin.control import Iteration as Iteration
+    from varpin.control import Kept as Kept
     from varpin.control import MonteCarlo as MonteCarlo
     from varpin.control import MonteCarloInterrupted as MonteCarloInterrupted
     from varpin.control import Multipliers as Multipliers
@@ -105,6 +106,7 @@ if TYPE_CHECKING:
     from varpin.control import Solution as Solution
     from varpin.control import Status as Status
     from varpin.control import Verification as Verification
+    from varpin.control import ViolationOnRobot as ViolationOnRobot
     from varpin.control import Violations as Violations
     from varpin.control import solve as solve
     from varpin.control.constraints import KeepClear as KeepClear
@@ -219,6 +221,7 @@ _LATE: dict[str, tuple[str, ...]] = {
     "varpin.io.scenefile": ("Required", "SceneFile", "SceneFileError", "load_scene"),
     "varpin.control": (
         "ConstraintReport",
+        "Kept",
         "Iteration",
         "MonteCarlo",
         "MonteCarloInterrupted",
@@ -230,6 +233,7 @@ _LATE: dict[str, tuple[str, ...]] = {
         "Solution",
         "Status",
         "Verification",
+        "ViolationOnRobot",
         "Violations",
         "solve",
     ),

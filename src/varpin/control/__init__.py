@@ -19,3 +19,4 @@ from varpin.control.solution import Violations as Violations
 from varpin.control.solution_file import solution_trajectory as solution_trajectory
 from varpin.control.solving import solve as solve
 from varpin.control.verification import Verification as Verification
+from varpin.control.verification import ViolationOnRobot as ViolationOnRobot

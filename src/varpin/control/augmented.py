@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from varpin.control.backward import backward
 from varpin.control.costs import CostError
-from varpin.control.examination import looked_at, starts_outside
+from varpin.control.examination import foreseen, looked_at
 from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.multipliers import FEASIBLE, ConstraintReport, Multipliers, reports, split
 from varpin.control.penalties import PenalizedProblem, flat, penalized
@@ -120,7 +120,7 @@ class _Rounds:
         first = self._first()
         if self.check:
             # Now, as the search of a plan that there may not be takes long.
-            announce(logger, self.problem.scene, self.problem.dt, starts_outside(self.problem))
+            announce(logger, self.problem.scene, self.problem.dt, foreseen(self.problem))
         last = len(self.history) + self.most
         found, resume = first, self._resumed_search()
         while True:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.control.constraints import BoundConstraint
+from varpin.control.hints import hints
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.multipliers import FEASIBLE, TOLD
 from varpin.control.problem import OptimalControlProblem, integrator_for
@@ -81,7 +82,7 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
         _unfinished(solution)
         + _noise_left_out(solution)
         + (_alternating(solution) or _restless(solution))
-        + starts_outside(problem)
+        + foreseen(problem)
         + _between(solution)
     )
     try:
@@ -168,6 +169,11 @@ def _at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats 
     q, v = (np.tile(own, (problem.steps + 1, 1)) for own in (problem.q0, problem.v0))
     c: Floats = bound.value(q, v, np.zeros((problem.steps, problem.scene.controls)))[0]
     return c
+
+
+def foreseen(problem: OptimalControlProblem) -> list[Finding]:
+    """What is wrong with a problem's constraints before any search."""
+    return [*starts_outside(problem), *hints(problem)]
 
 
 def starts_outside(problem: OptimalControlProblem) -> list[Finding]:

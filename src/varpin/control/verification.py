@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import BoundSum
 from varpin.control.history import Status
 from varpin.control.problem import OptimalControlProblem, bind_cost
@@ -42,6 +43,33 @@ _STABLE = 2.78
 
 
 @dataclass(frozen=True)
+class ViolationOnRobot:
+    """By how much a constraint is violated at most, in its own unit.
+
+    Attributes:
+        label: The constraint.
+        unit: Of the values.
+        planned: At its places in the plan.
+        open_loop: Of the continuous system under the plan's controls alone, between nodes, too; of a goal at the end.
+            NaN where that motion runs away.
+        closed_loop: The same with feedback.
+        where: The worst row and time with feedback, in words; empty where nothing is violated.
+    """
+
+    label: str
+    unit: str
+    planned: float
+    open_loop: float
+    closed_loop: float
+    where: str
+
+    def __str__(self) -> str:
+        ways = [("planned", self.planned), ("controls alone", self.open_loop), ("with feedback", self.closed_loop)]
+        told = ", ".join(f"{name} {x:.1e}" if np.isfinite(x) else f"{name} runs away" for name, x in ways)
+        return f"{self.label} is violated by [{self.unit}]: {told}{f' ({self.where})' if self.where else ''}"
+
+
+@dataclass(frozen=True)
 class Verification:
     """A plan held against an accurate integration of the continuous system.
 
@@ -59,6 +87,8 @@ class Verification:
         status: How the search for the plan ended.
         integrator: Of the accurate integration: ``Radau(stages=3)`` where dampers, friction or servos are much faster
             than the plan's step.
+        constraints: How the continuous system keeps to each of the problem's constraints, without margins, at the nodes
+            of the accurate integration after the plan's first one. Limits of the controls' rate are those of decisions.
     """
 
     planned_cost: float
@@ -71,6 +101,12 @@ class Verification:
     accuracy: float
     status: Status = Status.CONVERGED
     integrator: str = str(_USUAL)
+    constraints: tuple[ViolationOnRobot, ...] = ()
+
+    @property
+    def violation(self) -> float:
+        """The most that a constraint is violated with feedback on the continuous system, in its own unit."""
+        return max((item.closed_loop for item in self.constraints), default=0.0)
 
     @property
     def told(self) -> bool:
@@ -109,6 +145,7 @@ class Verification:
         facts_ = [
             ("how to read it", _READING if self.told else self._untold),
             ("a step is off by", f"{self.defect:.2e} rad or m"),
+            *(("constraint", told) for told in self.constraints),
             *([] if self.status.converged else [("the plan is unfinished", self.status.value)]),
         ]
         return facts("Verification on the continuous system", facts_, table(head, rows))
@@ -125,6 +162,7 @@ class Verification:
                 f"a step is off by {self.defect:.2e} rad or m at most; costs are good to {good} of themselves "
                 f"({self.substeps} substeps a step, {self.integrator})",
                 f"how to read it: {_READING}" if self.told else self._untold,
+                *map(str, self.constraints),
                 *([] if self.status.converged else [f"the plan is unfinished, {self.status.value}"]),
             ]
         )
@@ -222,6 +260,7 @@ def _against(
             break
         substeps *= 2
     end = plan.q[-1]
+    blind = blind._replace(hold=problem.hold * substeps)
     return Verification(
         planned_cost=planned_cost,
         open_loop_cost=opened[0],
@@ -233,7 +272,48 @@ def _against(
         accuracy=accuracy,
         status=status,
         integrator=str(integrator),
+        constraints=_violations(problem, plan, (blind, feedback), substeps, integrator),
     )
+
+
+def _violations(
+    problem: OptimalControlProblem,
+    plan: Trajectory,
+    ways: tuple[Commands, Commands],
+    substeps: int,
+    integrator: Integrator,
+) -> tuple[ViolationOnRobot, ...]:
+    """What the continuous system makes of each constraint under the controls alone, and with feedback."""
+    if not problem.constraints:
+        return ()
+    h = problem.dt / substeps
+    fine = problem.constraints_on(h, problem.steps * substeps, problem.hold * substeps)
+    motions = [rollout(problem.scene, integrator, problem.q0, problem.v0, way, h) for way in ways]
+    found = []
+    for bound, whole in zip(fine, problem.bound_constraints, strict=True):
+        planned = _excess(whole, whole.value(plan.q, plan.v, plan.u))
+        worst, where = [], ""
+        for motion, failure in motions:
+            if failure is not None:
+                worst.append(np.nan)
+                continue
+            excess = _excess(bound, bound.value(motion.q, motion.v, motion.u))
+            if not bound.of_controls and not bound.source.equality:
+                # The first node of the plan is the first that it can change.
+                excess[: substeps - 1] = 0.0
+            place, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
+            worst.append(float(excess[place, row]))
+            where = f"{bound.rows[row]} at t = {bound.times[place]:.4g} s" if worst[-1] > 0.0 else ""
+        label, unit = bound.source.label, bound.unit
+        opened, closed = worst
+        found.append(ViolationOnRobot(label, unit, float(planned.max(initial=0.0)), opened, closed, where))
+    return tuple(found)
+
+
+def _excess(bound: BoundConstraint, c: Floats) -> Floats:
+    """What of values (K, rows) is violated."""
+    found: Floats = np.abs(c) if bound.source.equality else np.maximum(c, 0.0)
+    return found
 
 
 def _fast(problem: OptimalControlProblem, plan: Trajectory) -> bool:

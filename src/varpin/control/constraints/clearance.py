@@ -100,6 +100,11 @@ class KeepClear(PlanConstraint):
             name: (begin.tolist(), end.tolist(), radius) for name, (begin, end, radius) in self._of.capsules.items()
         }
 
+    def missing(self, q: Floats, t: float) -> Floats:
+        """What each pair is too close by (N, pairs) [m] at configurations (N, n) and one time, below zero if clear."""
+        found: Floats = self.distance - self._of.over(np.array([t])).distances(q)
+        return found
+
     def bind(self, horizon: Horizon) -> BoundConstraint:
         """See :meth:`PlanConstraint.bind`."""
         require_same(self, self.robot, horizon)

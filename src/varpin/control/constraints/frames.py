@@ -136,6 +136,11 @@ class _BoundRegion(BoundConstraint):
         p = (p.reshape(*at.shape[:-1], 3) - self.shifts).reshape(-1, 3)
         return self.region.distances(p).reshape(*at.shape[:-1], len(self.rows))
 
+    def outside(self, place: Floats) -> Floats:
+        """C (rows,) of a place (3,) [m] at the last node."""
+        found: Floats = self.region.distances((place - self.shifts[-1])[None])[0]
+        return found
+
     def jacobian(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
         _, p, J = self.region.kinematics.jacobians(np.ascontiguousarray(q[self.places]))
         slopes = self.region.slopes(p - self.shifts) @ J[:, :3]

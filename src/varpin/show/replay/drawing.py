@@ -318,6 +318,8 @@ class _Drawing:
                 else:
                     self.viewer[node].set_object(marks.sheet(0.5 * float((high - low).max()), color))
             self.viewer[node].set_transform(pose)
+            if region.way is not None and len(region.way) > 1:
+                self._animate(node, "position", "vector3", pose[:3, 3] + region.way)
 
     def _animate(self, node: str, name: str, kind: str, values: Floats) -> None:
         """Give a property of a node its values (K, ...) at the keyframes."""

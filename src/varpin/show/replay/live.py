@@ -130,18 +130,21 @@ class LiveView:
         self._hold = max(positive("hold", hold, "s"), self._interval)
         self._traced = frame_names("trace", [robot], trace)[0]
         held = False if source is robot or not constraints else source
-        scene, wanted = parts_of(held, None, robot)
+        scene, wanted, begin = parts_of(held, None, robot)
         marked = tuple(target(name, track, np.zeros(1)) for name, track in target_tracks(targets, 0.0).items())
         lower, upper = robot.position_limits
         start = np.clip(np.zeros(robot.dof), lower, upper)
         start = np.asarray(getattr(source, "q0", start), dtype=np.float64)
         self._ties = ties(scene)
+        standing = regions(wanted, np.array([begin]))
+        if moving := [region.name for region in standing if region.moves]:
+            logger.warning("a LiveView shows %s where it is at t = %g s; replays move it", " and ".join(moving), begin)
         actor = Actor(
             robot,
             {"robot": _positions(robot, start[None])},
             frames=frame_names("frames", [robot], frames)[0],
             ties=self._ties,
-            regions=regions(wanted),
+            regions=standing,
             goals=goals(wanted, marked),
             reach=None if self._ties else _positions(robot, _postures(robot, start)),
         )

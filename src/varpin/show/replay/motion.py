@@ -202,8 +202,8 @@ def replay(
         if second is not None and beside[k] is not None:
             lines += traces("ghost", arm, traced[k], *second, end, clock)
         efforts = _efforts(arm, shares[k], t[-1], times)
-        scene, wanted = held[k]
-        beyond = (ties(scene), regions(wanted), goals(wanted, marked))
+        scene, wanted, begin = held[k]
+        beyond = (ties(scene), regions(wanted, begin + np.minimum(times, t[-1])), goals(wanted, marked))
         actors.append(Actor(arm, positions, tuple(lines), tuple(plans), triads[k], efforts, *beyond))
     script = Script(times / speed, tuple(actors), paths, marked, step, loop, speed)
 

@@ -91,6 +91,7 @@ class Region:
         radius: Of a sphere or a capsule [m].
         box: Lower and upper sides of a box from its origin (2, 3) [m], infinite where it has none; None of round ones.
         rotation: Axes of the box in the world (3, 3).
+        way: How far it is from there at the keyframes (K, 3) [m]; None where it stands.
     """
 
     kind: Literal["obstacle", "out", "in"]
@@ -100,15 +101,25 @@ class Region:
     radius: float
     box: Floats | None = None
     rotation: Floats = field(default_factory=lambda: np.eye(3))
+    way: Floats | None = None
+
+    @property
+    def moves(self) -> bool:
+        """Whether it does not stand."""
+        return self.way is not None
 
     @property
     def corners(self) -> Floats:
-        """Points (k, 3) around what is finite of it [m]."""
+        """Points (k, 3) around what is finite of it [m], wherever it goes."""
         if self.box is None:
             reach = self.radius * np.vstack([np.eye(3), -np.eye(3)])
-            return np.concatenate([self.begin + reach, self.end + reach])
-        sides = np.where(np.isfinite(self.box), self.box, 0.0)
-        return np.asarray(self.begin + _corners(sides) @ self.rotation.T)
+            found = np.concatenate([self.begin + reach, self.end + reach])
+        else:
+            sides = np.where(np.isfinite(self.box), self.box, 0.0)
+            found = np.asarray(self.begin + _corners(sides) @ self.rotation.T)
+        if self.way is None:
+            return found
+        return np.concatenate([found + self.way.min(axis=0), found + self.way.max(axis=0)])
 
     def box_within(self, points: Floats, margin: float) -> Floats:
         """Its sides (2, 3) [m], those that are infinite put around points (P, 3), with a margin [m]."""

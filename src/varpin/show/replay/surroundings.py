@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 
-def parts_of(given: object, motion: object, robot: Robot) -> tuple[Scene | None, tuple[PlanConstraint, ...]]:
-    """The scene whose constraints are drawn, and the constraints of the plan.
+def parts_of(given: object, motion: object, robot: Robot) -> tuple[Scene | None, tuple[PlanConstraint, ...], float]:
+    """The scene whose constraints are drawn, the constraints of the plan, and the time that it begins at [s].
 
     Args:
         given: Whether to draw those of the motion; or a scene; or a problem, with those of its plans.
@@ -38,7 +38,7 @@ def parts_of(given: object, motion: object, robot: Robot) -> tuple[Scene | None,
         plans = getattr(motion, "plans", None)
         source = getattr(plans[0] if plans else motion, "problem", None) if given else None
     if source is None:
-        return None, ()
+        return None, (), 0.0
     scene = source if isinstance(source, Scene) else getattr(source, "scene", None)
     if not isinstance(scene, Scene):
         raise InputError(
@@ -47,7 +47,9 @@ def parts_of(given: object, motion: object, robot: Robot) -> tuple[Scene | None,
     own = scene.robot
     if own.joint_names != robot.joint_names or not own.built_like(robot):
         raise InputError(f"constraints are of robot {own.name!r}, another one than {robot.name!r}, which is shown")
-    return scene, tuple(() if source is scene else source.constraints)  # type: ignore[attr-defined]
+    if source is scene:
+        return scene, (), 0.0
+    return scene, tuple(source.constraints), float(source.t0)  # type: ignore[attr-defined]
 
 
 def ties(scene: Scene | None) -> tuple[Tie, ...]:
@@ -68,8 +70,8 @@ def _tie(constraint: Constraint, robot: Robot) -> Tie | None:
     return Tie(name, (body, here), (other, there), axis, plane=isinstance(constraint, PointOnPlane))
 
 
-def regions(constraints: Sequence[PlanConstraint]) -> tuple[Region, ...]:
-    """Bodies to keep clear of, and where frames have to be or must not be."""
+def regions(constraints: Sequence[PlanConstraint], times: Floats) -> tuple[Region, ...]:
+    """Bodies to keep clear of, and where frames have to be or must not be; those that move at ``times`` (K,) [s]."""
     if not constraints:
         return ()
     from varpin.control import constraints as kinds  # noqa: PLC0415 - few replays need controllers imported
@@ -80,12 +82,18 @@ def regions(constraints: Sequence[PlanConstraint]) -> tuple[Region, ...]:
             for body in own.obstacles:
                 half = None if body.sides is None else 0.5 * body.sides
                 box = None if half is None else np.array([-half, half])
-                region = Region("obstacle", body.name, body.begin, body.end, body.radius, box, body.rotation)
+                ends, way = (body.begin, body.end), None
+                if body.shift is not None:
+                    shifts = body.shifts(times)
+                    ends, way = (body.begin + shifts[0], body.end + shifts[0]), shifts - shifts[0]
+                region = Region("obstacle", body.name, *ends, body.radius, box, body.rotation, way)
                 # One obstacle may be that of several constraints.
                 found[repr(body)] = region
         elif isinstance(own, kinds.KeepInSphere | kinds.KeepOutOfSphere):
             kind = "out" if own.outside else "in"
-            found[own] = Region(kind, own.frame, own.center, own.center, own.radius)  # type: ignore[arg-type]
+            centers = own.shifts(times)
+            way = centers - centers[0] if callable(own.center) else None
+            found[own] = Region(kind, own.frame, centers[0], centers[0], own.radius, way=way)  # type: ignore[arg-type]
         elif isinstance(own, kinds.KeepInBox):
             found[own] = Region("in", own.frame, np.zeros(3), np.zeros(3), 0.0, own.limits)
         elif isinstance(own, kinds.KeepInHalfSpace):

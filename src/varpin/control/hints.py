@@ -1,0 +1,185 @@
+"""What can be said of a problem's constraints without a search: that no motion meets them, or units are mixed up."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.constraints import BoundConstraint, KeepClear, ReachFrame, WithinJointLimits
+from varpin.control.costs import Cost, FramePositionCost, Terminal, TrackingCost
+from varpin.control.costs.base import Scaled
+from varpin.control.problem import OptimalControlProblem
+from varpin.model import Robot
+from varpin.model.kinematics import FrameKinematics
+from varpin.simulation.soundness import Finding
+
+Floats = NDArray[np.float64]
+
+# Angles beyond two turns [rad], and goals beyond so many times the reach, are taken for other units.
+_TURNS, _AFAR = 4.0 * np.pi, 50.0
+# Postures in which a pair of bodies has to be too close for it to be so in all.
+_POSTURES = 64
+# Parts of a millimetre that two places of one frame may be apart.
+_SAME = 1e-6
+
+
+def hints(problem: OptimalControlProblem) -> list[Finding]:
+    """Says which constraints of a problem no motion meets, and which look like degrees or millimetres."""
+    if not problem.constraints:
+        return []
+    found = [*_goals(problem), *_limits(problem), *_ends(problem)]
+    for bound in problem.bound_constraints:
+        found += _overlaps(problem, bound)
+    return found
+
+
+def reach(robot: Robot, frame: FrameKinematics) -> float:
+    """How far a frame gets from its first joint at most [m]: all lengths one after another; infinite on free rails."""
+    links = frame.links
+    total = float(np.linalg.norm(links.translation[1:], axis=1).sum() + np.linalg.norm(frame.translation))
+    lower, upper = robot.position_limits
+    for joint in np.flatnonzero(links.prismatic):
+        c, ratio, offset = links.coordinate[joint], links.ratio[joint], links.offset[joint]
+        total += float(np.abs(ratio * np.array([lower[c], upper[c]]) + offset).max())
+    return total
+
+
+def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
+    """Goals out of reach, two of one frame, and those in a region that the frame is kept out of."""
+    goals = [bound for bound in problem.bound_constraints if isinstance(bound.source, ReachFrame)]
+    for bound in goals:
+        goal = bound.source
+        assert isinstance(goal, ReachFrame)
+        if goal.position is None:
+            continue
+        most = reach(goal.robot, goal.kinematics)
+        away = float(np.linalg.norm(goal.position - goal.kinematics.links.translation[0]))
+        if away > most:
+            units = ": it may be in millimetres, and positions are in metres" if away > _AFAR * most else ""
+            yield Finding(
+                "goal out of reach",
+                f"{goal.label} has its goal {away:.4g} m from the first joint, and the frame gets {most:.4g} m from "
+                f"there at most{units}: no motion ends there",
+            )
+    for one, other in combinations(goals, 2):
+        a, b = one.source, other.source
+        assert isinstance(a, ReachFrame)
+        assert isinstance(b, ReachFrame)
+        if a.frame == b.frame and a.position is not None and b.position is not None:
+            apart = float(np.linalg.norm(a.position - b.position))
+            if apart > _SAME:
+                yield Finding(
+                    "two goals", f"{a.label} has two goals that are {apart:.4g} m apart: no motion ends at both"
+                )
+    places = [(goal.source.frame, goal.source.position, f"the goal of {goal.source.label}") for goal in goals]  # type: ignore[attr-defined]
+    places += [
+        (term.frame, term.target, f"the target of FramePositionCost({term.frame!r})")
+        for term in _last(problem.cost)
+        if isinstance(term, FramePositionCost) and not callable(term.target) and np.ndim(term.target) == 1
+    ]
+    for bound in problem.bound_constraints:
+        outside = getattr(bound, "outside", None)
+        if outside is None:
+            continue
+        for frame, place, name in places:
+            if place is None or frame != bound.source.frame:  # type: ignore[attr-defined]
+                continue
+            c = outside(place)
+            row = int(np.argmax(c))
+            if c[row] > _SAME:
+                yield Finding(
+                    "goal outside constraints",
+                    f"{name} is outside {bound.source.label}, {bound.rows[row]} by {c[row]:.4g} m at t = "
+                    f"{bound.times[-1]:.4g} s: move the one or the other",
+                )
+
+
+def _limits(problem: OptimalControlProblem) -> Iterator[Finding]:
+    """Limits of joints that look like degrees."""
+    turning = _turning(problem.scene.robot)
+    for own in problem.constraints:
+        if not isinstance(own, WithinJointLimits):
+            continue
+        wide = np.where(np.isfinite(own.limits), np.abs(own.limits), 0.0).max(axis=0) * turning
+        joint = int(np.argmax(wide))
+        if wide[joint] > _TURNS:
+            yield Finding(
+                "limits in degrees",
+                f"{own.label} lets {own.robot.joint_names[joint]} turn to {wide[joint]:.4g} rad, "
+                f"{wide[joint] / (2.0 * np.pi):.0f} turns: limits are in radians, np.deg2rad makes them of degrees",
+            )
+
+
+def _ends(problem: OptimalControlProblem) -> Iterator[Finding]:
+    """Configurations that the plan is to end at, and that joint limits forbid or that look like degrees."""
+    robot = problem.scene.robot
+    turning = _turning(robot)
+    for term in _last(problem.cost):
+        if not isinstance(term, TrackingCost) or not isinstance(term.reference, np.ndarray):
+            continue
+        end = term.reference
+        if end.shape != (robot.dof,):
+            continue
+        joint = int(np.argmax(np.abs(end) * turning))
+        if abs(end[joint]) * turning[joint] > _TURNS:
+            yield Finding(
+                "goal in degrees",
+                f"the terminal TrackingCost wants {robot.joint_names[joint]} at {end[joint]:.4g} rad, "
+                f"{abs(end[joint]) / (2.0 * np.pi):.0f} turns: angles are in radians, np.deg2rad makes them of degrees",
+            )
+            continue
+        for own in problem.constraints:
+            if not isinstance(own, WithinJointLimits):
+                continue
+            beyond = np.maximum(end - own.limits[1], own.limits[0] - end)
+            joint = int(np.argmax(beyond))
+            if beyond[joint] > _SAME:
+                yield Finding(
+                    "goal outside constraints",
+                    f"the terminal TrackingCost wants {robot.joint_names[joint]} {beyond[joint]:.4g} rad or m outside "
+                    f"{own.label}, where the plan will not end",
+                )
+
+
+def _overlaps(problem: OptimalControlProblem, bound: BoundConstraint) -> Iterator[Finding]:
+    """Pairs of bodies that are too close in every posture."""
+    own = bound.source
+    if not isinstance(own, KeepClear):
+        return
+    robot = problem.scene.robot
+    lower, upper = robot.position_limits
+    turns = 2.0 * np.pi * np.ones(robot.dof)
+    lower, upper = np.maximum(lower, -turns), np.minimum(upper, turns)
+    rng = np.random.default_rng(0)
+    q = rng.uniform(lower, upper, (_POSTURES, robot.dof))
+    q[0] = problem.q0
+    missing = own.missing(q, problem.t0)
+    least = missing.min(axis=0)
+    for pair in np.flatnonzero(least > 0.0):
+        yield Finding(
+            "pair always too close",
+            f"KeepClear: {own.pairs[pair]} are too close by {least[pair]:.2g} m or more in each of {_POSTURES} "
+            "postures, so no plan keeps them apart. A link is taken for a capsule, which holds more than the link: "
+            "leave it out with links=, give it a smaller one with capsules=, or move the obstacle",
+        )
+
+
+def _turning(robot: Robot) -> Floats:
+    """1 for coordinates that turn joints (n,), 0 for those that slide them."""
+    turning = np.ones(robot.dof)
+    turning[robot.tree.coordinate[np.flatnonzero(robot.tree.prismatic)]] = 0.0
+    return turning
+
+
+def _last(cost: Cost) -> Iterator[Cost]:
+    """What a cost has at its end, without factors."""
+    for term in cost.terms:
+        inner, at_end = term, False
+        while isinstance(inner, Terminal | Scaled):
+            at_end = at_end or isinstance(inner, Terminal)
+            inner = inner.cost
+        if at_end:
+            yield from (part.cost if isinstance(part, Scaled) else part for part in inner.terms)
