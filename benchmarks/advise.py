@@ -5,8 +5,9 @@ against the cheapest of all integrators over steps a factor 2^(1/4) apart that m
 
     python benchmarks/advise.py --cases 200 --seed 0
 
-With ``--simulate`` the same for ``simulate(duration=, tolerance=)``: on random cases, some under controls, errors at
-all nodes against SciPy's DOP853 on Pinocchio's aba, and costs in evaluations, which are the same on every machine.
+With ``--simulate`` the same for ``simulate(duration=, tolerance=)``: on random cases, free and under controls, with
+dampers, springs, servos, friction and rotors; errors at all nodes against SciPy's DOP853 on Pinocchio's aba, and costs
+in evaluations, which are the same on every machine.
 
     python benchmarks/advise.py --simulate --cases 200 --seed 0
 """
@@ -21,6 +22,7 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicHermiteSpline
 
 import varpin as vp
 from varpin.study.tradeoff import INTEGRATORS
@@ -29,6 +31,8 @@ from varpin.study.tradeoff.setting import Setting
 ROBOTS = ("finger", "ur5", "xarm7", "talos_arm", "z1", "chain2", "chain3", "chain5", "chain7")
 RATIO = 2.0**0.25
 REPEATS = 5
+# Evaluations in Python after which a motion is beyond the reference.
+PATIENCE = 60_000
 
 
 @dataclass(frozen=True)
@@ -128,58 +132,142 @@ class Simulated:
         return self.accuracy.search_evaluations / self.cost
 
 
-def judge_simulation(rng: np.random.Generator) -> Simulated | None:
-    """One case, or None where the reference itself does not know the motion well enough to judge."""
-    name, scene, q0, v0, duration, tolerance = random_case(rng)
-    effort = 0.3 * np.abs(scene.holding_torque(np.zeros_like(q0))).max() + 0.1 * np.diag(
-        vp.lagrangian_jet(scene, q0, v0).Lvv
+@dataclass(frozen=True)
+class Motion:
+    """A motion of many kinds: what ``simulate`` is given, and its acceleration without varpin.
+
+    Attributes:
+        name: What it is, as text.
+        scene: With damping, springs, servos, friction and rotors, as drawn.
+        q0: (n,) [rad or m].
+        v0: (n,) [rad/s or m/s].
+        duration: [s].
+        controls: As ``simulate`` takes them.
+        command: The control at a time.
+        pieces: Equal parts of the motion, between which the controls may jump.
+        acceleration: Of (q, v, u), by Pinocchio's aba and the forces' formulas.
+    """
+
+    name: str
+    scene: vp.Scene
+    q0: np.ndarray
+    v0: np.ndarray
+    duration: float
+    controls: np.ndarray | vp.OpenLoop | None
+    command: Callable[[float], np.ndarray]
+    pieces: int
+    acceleration: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+def random_motion(rng: np.random.Generator) -> tuple[Motion, float]:
+    """A motion and a tolerance: half of them with servos, friction or rotors, under all kinds of controls."""
+    name, plain, q0, v0, duration, tolerance = random_case(rng)
+    robot, n = plain.robot, q0.size
+    inertia = vp.lagrangian_jet(plain, q0, v0).Lvv.diagonal()
+    effort = 0.3 * np.abs(plain.holding_torque(np.zeros(n))) + 10.0 * inertia
+    servos, friction, rotors = rng.random(3) < (0.25, 0.25, 0.15)
+    rate, ratio = 2.0 * np.pi * rng.uniform(1.0, 20.0), rng.uniform(0.2, 2.0)
+    stiffness, damping = inertia * rate**2 * servos, 2.0 * ratio * inertia * rate * servos
+    level, width = effort * rng.uniform(0.05, 0.5) * friction, float(10.0 ** rng.uniform(-2.0, -0.5))
+    armature = inertia * rng.uniform(0.1, 1.0) * rotors
+    forces: list[vp.Force] = []
+    for present, force in (
+        (servos, vp.PositionServo(stiffness, damping)),
+        (friction, vp.CoulombFriction(level, width)),
+        (rotors, vp.Armature(armature)),
+    ):
+        forces += [force] if present else []
+    scene = vp.Scene(
+        robot, gravity=plain.gravity, damping=plain.damping, stiffness=plain.stiffness, rest=plain.rest, forces=forces
     )
+    controls, command, pieces, kind = random_controls(rng, q0 if servos else None, effort, duration)
+    model = robot.model.copy()
+    model.armature = model.armature + armature
+    model.gravity.linear = np.asarray(plain.gravity)
+    data = model.createData()
+
+    def acceleration(q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+        drive = stiffness * (u - q) - damping * v if servos else u
+        passive = plain.damping * v + plain.stiffness * (q - plain.rest) + level * np.tanh(v / width)
+        return pin.aba(model, data, robot.configuration(q), v, drive - passive)
+
+    parts = (
+        (f"servos of {rate / 2 / np.pi:.2g} Hz", servos),
+        (f"friction of width {width:.2g}", friction),
+        ("rotors", rotors),
+        ("damped", bool(plain.damping.any())),
+    )
+    what = ", ".join([name, f"{duration:g} s", kind, *(part for part, present in parts if present)])
+    return Motion(what, scene, q0, v0, duration, controls, command, pieces, acceleration), tolerance
+
+
+def random_controls(
+    rng: np.random.Generator, q0: np.ndarray | None, effort: np.ndarray, duration: float
+) -> tuple[np.ndarray | vp.OpenLoop | None, Callable[[float], np.ndarray], int, str]:
+    """Controls, the same as a function of time, how many equal parts they have, and what they are.
+
+    Those of servos, whose ``q0`` is given, are positions within 0.4 rad of it; without any the servos hold q0.
+    """
+    n = effort.size
+    about, size = (np.zeros(n), effort) if q0 is None else (q0, np.full(n, 0.2))
     kind = str(rng.choice(["free", "rows", "time"]))
-    controls: np.ndarray | vp.OpenLoop | None = None
-    pieces, torque = 1, lambda _: np.zeros_like(q0)
     if kind == "rows":
         pieces = int(rng.integers(1, 6))
-        controls = rows = effort * rng.normal(size=(pieces, q0.size))
-        torque = lambda t: rows[min(int(t / duration * pieces), pieces - 1)]  # noqa: E731
-    elif kind == "time":
-        # Such motions are right to second order only, so tight tolerances take long.
-        tolerance = max(tolerance, 10.0 ** rng.uniform(-6.5, -2.0))
-        rate, phase = rng.uniform(1.0, 8.0, q0.size), rng.uniform(0.0, 6.3, q0.size)
-        torque = lambda t: effort * np.sin(rate * t + phase)  # noqa: E731
-        controls = vp.OpenLoop(torque)
-    tight, loose = (true_motion(scene, q0, v0, duration, torque, pieces, rtol) for rtol in (5e-14, 1e-12))
-    looks = duration * (np.arange(200) + 0.5) / 200
+        rows = about + size * np.clip(rng.normal(size=(pieces, n)), -2.0, 2.0)
+        return rows, lambda t: rows[min(int(t / duration * pieces), pieces - 1)], pieces, kind
+    if kind == "time":
+        rate, phase = rng.uniform(1.0, 8.0, n), rng.uniform(0.0, 6.3, n)
+
+        def command(t: float) -> np.ndarray:
+            return about + size * np.sin(rate * t + phase)
+
+        return vp.OpenLoop(command), command, 1, kind
+    return None if q0 is None else about, lambda _: about, 1, kind
+
+
+def judge_simulation(rng: np.random.Generator) -> Simulated | None:
+    """One case, or None where the reference itself does not know the motion well enough to judge."""
+    given, tolerance = random_motion(rng)
+    try:
+        tight, loose = (true_motion(given, rtol) for rtol in (5e-14, 1e-12))
+    except TimeoutError:
+        return None
+    looks = given.duration * (np.arange(200) + 0.5) / 200
     if not np.abs(tight(looks) - loose(looks)).max() <= 0.1 * tolerance:
         return None
-    motion = vp.simulate(scene, q0, v0, duration=duration, tolerance=tolerance, controls=controls, check=False)
-    best, best_cost = cheapest(scene, q0, v0, duration, controls, tight, tolerance, pieces, cost_of(motion))
+    motion = vp.simulate(
+        given.scene,
+        given.q0,
+        given.v0,
+        duration=given.duration,
+        tolerance=tolerance,
+        controls=given.controls,
+        check=False,
+    )
+    best, best_cost = cheapest(given, tight, tolerance, cost_of(motion))
     error = float(np.abs(motion.q - tight(motion.t)).max())
-    what = f"{name}, {duration:g} s, {kind}{', damped' if scene.damping.any() else ''}"
-    return Simulated(what, tolerance, motion.accuracy, error, cost_of(motion), best, best_cost)
+    return Simulated(given.name, tolerance, motion.accuracy, error, cost_of(motion), best, best_cost)
 
 
-def true_motion(
-    scene: vp.Scene,
-    q0: np.ndarray,
-    v0: np.ndarray,
-    duration: float,
-    torque: Callable[[float], np.ndarray],
-    pieces: int,
-    rtol: float,
-) -> Callable[[np.ndarray], np.ndarray]:
-    """Configurations (K, n) at times (K,) by DOP853 on Pinocchio's aba; torques may jump between equal pieces."""
-    model, n = scene.robot.model, q0.size
-    data = model.createData()
-    ends = duration * np.arange(pieces + 1) / pieces
-    parts, state = [], np.concatenate([q0, v0])
+def true_motion(given: Motion, rtol: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Configurations (K, n) at times (K,) by DOP853 on Pinocchio's aba; controls may jump between equal pieces.
+
+    Raises:
+        TimeoutError: It takes too many evaluations.
+    """
+    n, asked = given.q0.size, 0
+    ends = given.duration * np.arange(given.pieces + 1) / given.pieces
+    parts, state = [], np.concatenate([given.q0, given.v0])
     for begin, end in pairwise(ends):
         middle = 0.5 * (begin + end)
 
         def slope(t: float, x: np.ndarray, middle: float = middle) -> np.ndarray:
-            q, v = x[:n], x[n:]
-            given = torque(t if pieces == 1 else middle)
-            force = given - scene.damping * v - scene.stiffness * (q - scene.rest)
-            return np.concatenate([v, pin.aba(model, data, scene.robot.configuration(q), v, force)])
+            nonlocal asked
+            asked += 1
+            if asked > PATIENCE:
+                raise TimeoutError
+            u = given.command(t if given.pieces == 1 else middle)
+            return np.concatenate([x[n:], given.acceleration(x[:n], x[n:], u)])
 
         options = {"rtol": rtol, "atol": rtol, "max_step": 0.02, "dense_output": True}
         solution = solve_ivp(slope, (begin, end), state, "DOP853", **options)
@@ -187,7 +275,7 @@ def true_motion(
         state = solution.y[:, -1]
 
     def at(times: np.ndarray) -> np.ndarray:
-        piece = np.clip(np.searchsorted(ends, times) - 1, 0, pieces - 1)
+        piece = np.clip(np.searchsorted(ends, times) - 1, 0, given.pieces - 1)
         q = np.empty((len(times), n))
         for k in np.unique(piece):
             q[piece == k] = parts[k](times[piece == k])[:n].T
@@ -202,37 +290,42 @@ def cost_of(motion: vp.Trajectory) -> int:
 
 
 def cheapest(
-    scene: vp.Scene,
-    q0: np.ndarray,
-    v0: np.ndarray,
-    duration: float,
-    controls: np.ndarray | vp.OpenLoop | None,
-    exact: Callable[[np.ndarray], np.ndarray],
-    tolerance: float,
-    pieces: int,
-    most: int,
+    given: Motion, exact: Callable[[np.ndarray], np.ndarray], tolerance: float, most: int
 ) -> tuple[str, float]:
     """The integrator and step that meet the tolerance at all nodes with the fewest evaluations, and how many."""
     best, cost = "", math.inf
-    for integrator in sorted(INTEGRATORS, key=lambda own: -own.order):
+    start, pieces = (given.scene, given.q0, given.v0), given.pieces
+    for integrator in sorted((*INTEGRATORS, vp.Radau(3), vp.Radau(4)), key=lambda own: -own.order):
         parts = 1.0
         while True:
             steps = pieces * round(parts)
-            held = np.repeat(controls, steps // pieces, axis=0) if isinstance(controls, np.ndarray) else controls
+            held = given.controls
+            if isinstance(held, np.ndarray) and held.ndim == 2:
+                held = np.repeat(held, steps // pieces, axis=0)
             parts = max(parts * RATIO, round(parts) + 1)
+            options = {"dt": given.duration / steps, "steps": steps, "controls": held, "integrator": integrator}
             try:
-                motion = vp.simulate(
-                    scene, q0, v0, dt=duration / steps, steps=steps, controls=held, integrator=integrator, check=False
-                )
+                motion = vp.simulate(*start, **options, check=False)
             except vp.StepFailure:
                 continue
             if cost_of(motion) >= min(cost, 1.01 * most):
                 break
-            if np.abs(motion.q - exact(motion.t)).max() <= tolerance:
+            if np.abs(motion.q - exact(motion.t)).max() <= tolerance and follows(motion, exact):
                 # More steps of the same method meet it too, and cost more.
                 best, cost = f"{integrator} at {motion.dt:.3g} s", cost_of(motion)
                 break
     return best, cost
+
+
+def follows(motion: vp.Trajectory, exact: Callable[[np.ndarray], np.ndarray]) -> bool:
+    """Whether the cubics through the nodes stay within a tenth of each joint's way.
+
+    A single step to where servos come to rest tells nothing of how they get there.
+    """
+    looks = motion.t[-1] * (np.arange(400) + 0.5) / 400
+    true = exact(looks)
+    off = np.abs(CubicHermiteSpline(motion.t, motion.q, motion.v)(looks) - true).max(axis=0)
+    return bool((off <= 0.1 * np.ptp(true, axis=0) + 1e-9).all())
 
 
 def report_simulations(cases: int, seed: int) -> None:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -38,15 +38,19 @@ class PeerBlewUp(RuntimeError):
 
 @dataclass(frozen=True)
 class Case:
-    """A motion: from (q0, v0) under constant torques u.
+    """A motion: from (q0, v0) under torques u + swing sin(omega t), or under rows of torques.
 
     Attributes:
         name: For people.
-        scene: Every joint actuated.
+        scene: Every joint actuated; of its forces peers know dampers and springs.
         q0: (n,) [rad].
         v0: (n,) [rad/s].
-        u: (n,) [N m].
+        u: (n,) [N m]; or (N, n), each row for duration / N.
         duration: [s].
+        swing: (n,) [N m]; None for constant torques.
+        omega: Of the swing [rad/s].
+        friction: Level of smooth friction, of SciPy's and the compiled DOP853 alone (n,) [N m]; None for none.
+        width: Its width [rad/s].
     """
 
     name: str
@@ -55,6 +59,15 @@ class Case:
     v0: np.ndarray
     u: np.ndarray
     duration: float = 1.0
+    swing: np.ndarray | None = None
+    omega: float = 1.0
+    friction: np.ndarray | None = None
+    width: float = 1.0
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Torques by row (N, n) [N m]; a single row unless they jump."""
+        return np.atleast_2d(self.u)
 
 
 @dataclass(frozen=True)
@@ -108,32 +121,43 @@ def forces(scene: vp.Scene, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.n
     return scene.actuation @ u - scene.damping * v - scene.stiffness * (q - scene.rest)
 
 
-def acceleration(case: Case) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Forward dynamics by ``pin.aba``, a function of (q, v)."""
+def acceleration(case: Case) -> Callable[..., np.ndarray]:
+    """Forward dynamics by ``pin.aba``, a function of (q, v), the time and a row of torques; of the first at t = 0."""
     scene = case.scene
     model = scene.robot.model.copy()
     model.gravity.linear = scene.gravity
-    data = model.createData()
-    push, damping, stiffness, rest = scene.actuation @ case.u, scene.damping, scene.stiffness, scene.rest
-    return lambda q, v: pin.aba(model, data, q, v, push - damping * v - stiffness * (q - rest))
+    data, still = model.createData(), np.zeros(scene.robot.dof)
+    pushes, damping, stiffness, rest = case.rows @ scene.actuation.T, scene.damping, scene.stiffness, scene.rest
+    swing = still if case.swing is None else case.swing
+    friction = still if case.friction is None else case.friction
+
+    def rate(q: np.ndarray, v: np.ndarray, t: float = 0.0, row: int = 0) -> np.ndarray:
+        driven = pushes[row] + swing * np.sin(case.omega * t) - friction * np.tanh(v / case.width)
+        return pin.aba(model, data, q, v, driven - damping * v - stiffness * (q - rest))
+
+    return rate
 
 
 # SciPy --------------------------------------------------------------------------------------------------------------
 
 
 def scipy_run(case: Case, rtol: float, method: str = "DOP853") -> Callable[[], np.ndarray]:
-    """A run of SciPy's integrator on ``pin.aba`` that gives the last q."""
-    n, aba = case.scene.robot.dof, acceleration(case)
-    start = np.concatenate([case.q0, case.v0])
+    """A run of SciPy's integrator on ``pin.aba`` that gives the last q; it begins anew where torques jump."""
+    n, aba, rows = case.scene.robot.dof, acceleration(case), len(case.rows)
+    start, each = np.concatenate([case.q0, case.v0]), case.duration / len(case.rows)
 
-    def rate(_: float, x: np.ndarray) -> np.ndarray:
-        return np.concatenate([x[n:], aba(x[:n], x[n:])])
+    def rate(t: float, x: np.ndarray, row: int) -> np.ndarray:
+        return np.concatenate([x[n:], aba(x[:n], x[n:], t, row)])
 
     def run() -> np.ndarray:
-        solution = solve_ivp(rate, (0.0, case.duration), start, method=method, rtol=rtol, atol=rtol)
-        if not solution.success:
-            raise PeerBlewUp(solution.message)
-        return solution.y[:n, -1]
+        x = start
+        for row in range(rows):
+            span = row * each, (row + 1) * each
+            solution = solve_ivp(rate, span, x, method=method, rtol=rtol, atol=rtol, args=(row,))
+            if not solution.success:
+                raise PeerBlewUp(solution.message)
+            x = solution.y[:, -1]
+        return x[:n]
 
     return run
 
@@ -178,18 +202,25 @@ def compiled_run(case: Case, tolerance: float) -> Callable[[], np.ndarray] | Non
     placements = np.array([np.append(body.placement.rotation.ravel(), body.placement.translation) for body in own])
     axes = np.array([body.axis for body in own], dtype=float)
     inertias = np.array([body.inertia.toDynamicParameters() for body in own])
-    forces = np.array([scene.actuation @ case.u, scene.damping, scene.stiffness, scene.rest])
+    still = np.zeros(len(own))
+    swing, friction = (still if x is None else x for x in (case.swing, case.friction))
+    forces = np.array([still, scene.damping, scene.stiffness, scene.rest, swing, friction])
     arrays = [np.ascontiguousarray(a) for a in (parents, placements, axes, inertias, scene.gravity, forces)]
+    shape = ctypes.c_double(case.omega), ctypes.c_double(case.width)
     # Never freed: it lives as long as the process.
-    problem = ctypes.c_void_p(library.varpin_problem(len(own), *map(_pointer, arrays)))
+    problem = ctypes.c_void_p(library.varpin_problem(len(own), *map(_pointer, arrays), *shape))
+    pushes = np.ascontiguousarray(case.rows @ scene.actuation.T)
+    each = case.duration / len(pushes)
     coefficients = [np.ascontiguousarray(a) for a in (dop853.A[:12, :12], dop853.B, dop853.E3, dop853.E5)]
     start = np.concatenate([case.q0, case.v0])
 
     def run() -> np.ndarray:
-        x = start.copy()
-        duration, asked = ctypes.c_double(case.duration), ctypes.c_double(tolerance)
-        if library.varpin_integrate(problem, _pointer(x), duration, asked, *map(_pointer, coefficients)) < 0:
-            raise PeerBlewUp("the step of DOP853 vanishes")
+        x, asked = start.copy(), ctypes.c_double(tolerance)
+        tables = [_pointer(table) for table in coefficients]
+        for row, push in enumerate(pushes):
+            begin, end = ctypes.c_double(row * each), ctypes.c_double((row + 1) * each)
+            if library.varpin_integrate(problem, _pointer(x), _pointer(push), begin, end, asked, *tables) < 0:
+                raise PeerBlewUp("the step of DOP853 vanishes")
         return x[: len(own)]
 
     return run
@@ -198,20 +229,42 @@ def compiled_run(case: Case, tolerance: float) -> Callable[[], np.ndarray] | Non
 # MuJoCo -------------------------------------------------------------------------------------------------------------
 
 
-def mujoco_model(scene: vp.Scene, dt: float, integrator: str = "Euler", *, energy: bool = False) -> Any:
-    """A scene as a mujoco.MjModel, or None without MuJoCo."""
+Servos = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def mujoco_model(
+    scene: vp.Scene,
+    dt: float,
+    integrator: str = "Euler",
+    *,
+    energy: bool = False,
+    actuators: Literal["motors"] | Servos | None = None,
+) -> Any:
+    """A scene as a mujoco.MjModel, or None without MuJoCo.
+
+    ``actuators`` are a motor for every joint, or position actuators instead of its springs and dampers: stiffness and
+    damping (n,); what they swing from is not the model's.
+    """
     mujoco = available("mujoco")
     if mujoco is None:
         return None
     own = bodies(scene.robot)
+    servos = actuators if isinstance(actuators, tuple) else None
+    damping, stiffness = (scene.damping, scene.stiffness) if servos is None else np.zeros((2, len(own)))
+    motors = [
+        f'<motor joint="j{k}"/>'
+        if servos is None
+        else f'<position joint="j{k}" kp="{float(servos[0][k])!r}" kv="{float(servos[1][k])!r}"/>'
+        for k in range(len(own) if actuators else 0)
+    ]
     texts: list[str] = []
     for k, body in enumerate(own):
         moments, axes = np.linalg.eigh(body.inertia.inertia)
         axes[:, 2] *= np.sign(np.linalg.det(axes))
         texts.append(
             f'<body name="b{k}" pos="{_row(body.placement.translation)}" quat="{_quaternion(body.placement.rotation)}">'
-            f'<joint type="hinge" axis="{_row(body.axis)}" damping="{float(scene.damping[k])!r}"'
-            f' stiffness="{float(scene.stiffness[k])!r}" springref="{float(scene.rest[k])!r}"/>'
+            f'<joint name="j{k}" type="hinge" axis="{_row(body.axis)}" damping="{float(damping[k])!r}"'
+            f' stiffness="{float(stiffness[k])!r}" springref="{float(scene.rest[k])!r}"/>'
             f'<inertial pos="{_row(body.inertia.lever)}" quat="{_quaternion(axes)}" mass="{float(body.inertia.mass)!r}"'
             f' diaginertia="{_row(moments_of(moments))}"/>'
         )
@@ -223,7 +276,7 @@ def mujoco_model(scene: vp.Scene, dt: float, integrator: str = "Euler", *, energ
         '<mujoco><compiler angle="radian" boundinertia="0" balanceinertia="true"/>'
         f'<option timestep="{dt!r}" integrator="{integrator}" gravity="{_row(scene.gravity)}">'
         '<flag contact="disable" constraint="disable"/></option>'
-        f"<worldbody>{tree(0)}</worldbody></mujoco>"
+        f"<worldbody>{tree(0)}</worldbody><actuator>{''.join(motors)}</actuator></mujoco>"
     )
     if energy:
         model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
@@ -251,6 +304,42 @@ def mujoco_run(case: Case, dt: float, integrator: str) -> Callable[[], np.ndarra
     return run
 
 
+def mujoco_driven_run(
+    case: Case, dt: float, integrator: str, servos: Servos | None = None
+) -> Callable[[], np.ndarray] | None:
+    """A run under torques that change in time, or under position servos, that gives the last q; None without MuJoCo.
+
+    A control is held over a step: a row's as it is, a swing's from the step's middle. ``servos`` are stiffness, damping
+    and where the goals swing from, each (n,); the swing is then the goals' [rad] and the case's own springs and dampers
+    stand for the servos, which are MuJoCo's position actuators instead.
+    """
+    mujoco = available("mujoco")
+    if mujoco is None or case.friction is not None:
+        return None
+    scene, n, steps = case.scene, case.scene.robot.dof, round(case.duration / dt)
+    model = mujoco_model(scene, dt, integrator, actuators=servos or "motors")
+    t = (np.arange(steps) + 0.5) * dt
+    swing = np.zeros(n) if case.swing is None else case.swing
+    pushes = case.rows @ scene.actuation.T if servos is None else servos[2][None]
+    swing = swing if servos is None else swing / servos[0]
+    rows = np.minimum((t / (case.duration / len(pushes))).astype(int), len(pushes) - 1)
+    controls = (pushes[rows] + np.sin(case.omega * t)[:, None] * swing)[None]
+    data, whole = mujoco.MjData(model), int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    data.qpos[:], data.qvel[:] = case.q0, case.v0
+    start = np.empty((1, mujoco.mj_stateSize(model, whole)))
+    mujoco.mj_getState(model, data, start[0], whole)
+    rollout = importlib.import_module("mujoco.rollout").rollout
+    mujoco.set_mju_user_warning(lambda _: None)
+
+    def run() -> np.ndarray:
+        states, _ = rollout([model], [data], start, controls)
+        if not np.isfinite(states).all() or np.abs(states[0, -1]).max() > 1e10:
+            raise PeerBlewUp("MuJoCo's motion is not finite")
+        return states[0, -1, 1 : 1 + n].copy()
+
+    return run
+
+
 def mujoco_energies(case: Case, dt: float, integrator: str) -> np.ndarray | None:
     """Total energy [J] at every node (N + 1,); None without MuJoCo."""
     mujoco = available("mujoco")
@@ -271,7 +360,7 @@ def mujoco_energies(case: Case, dt: float, integrator: str) -> np.ndarray | None
 def _mujoco_start(mujoco: ModuleType, model: Any, data: Any, case: Case) -> None:
     mujoco.mj_resetData(model, data)
     data.qpos[:], data.qvel[:] = case.q0, case.v0
-    data.qfrc_applied[:] = case.scene.actuation @ case.u
+    data.qfrc_applied[:] = case.scene.actuation @ case.rows[0]
 
 
 # Drake --------------------------------------------------------------------------------------------------------------

@@ -1,10 +1,12 @@
 """How the search of a plan goes on a set of tasks: iterations, rollouts, and its cost above the best one known.
 
-    PYTHONPATH=src python benchmarks/plans.py [--best FILE] [words that a task's name has]
+    PYTHONPATH=src python benchmarks/plans.py [--best FILE] [--fddp] [words that a task's name has]
 
 Five arms reach, without limits on their torques and within them; one carries a load, one follows a wave, and two links
 swing up. Cold starts, all options as they are. ``--best FILE`` keeps the least cost that any run has found, and
-compares with it. What is counted does not depend on the machine's load.
+compares with it. ``--fddp`` solves each task with crocoddyl's FDDP too, within limits with its BoxFDDP, on the same
+steps from the same first motion; it needs the environment of docs/crocoddyl.md. What is counted does not depend on the
+machine's load.
 """
 
 from __future__ import annotations
@@ -101,16 +103,33 @@ def problem(
     return vp.OptimalControlProblem(scene, cost, begin, rest, dt=0.02, steps=steps, control_limits=limits)
 
 
+def by_fddp(task: vp.OptimalControlProblem, most: int) -> tuple[int, float]:
+    """Iterations and cost of crocoddyl's solver."""
+    import crocoddyl  # noqa: PLC0415 - an environment of its own
+
+    from varpin.crocoddyl import first_guess, shooting_problem  # noqa: PLC0415
+
+    shooting = shooting_problem(task)
+    if task.limited:
+        for node in shooting.runningModels:
+            node.u_lb, node.u_ub = task.control_limits
+    solver = (crocoddyl.SolverBoxFDDP if task.limited else crocoddyl.SolverFDDP)(shooting)
+    solver.th_stop = 1e-7
+    solver.solve(*first_guess(task), most, False)
+    return min(solver.iter + 1, most), solver.cost
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--best", type=Path, help="a file (JSON) of the least costs known")
     parser.add_argument("--most", type=int, default=100, help="iterations")
+    parser.add_argument("--fddp", action="store_true", help="crocoddyl's iterations and costs, too")
     parser.add_argument("words", nargs="*", help="of the tasks' names")
     asked = parser.parse_args()
     logging.getLogger("varpin").setLevel(logging.ERROR)
     best = json.loads(asked.best.read_text()) if asked.best and asked.best.exists() else {}
     print(f"{'task':36} {'status':15} {'iterations':>10} {'rollouts':>8} {'passes':>6} {'cost':>11} {'above best':>10}")
-    total = np.zeros(4, dtype=int)
+    total, theirs = np.zeros(4, dtype=int), 0
     for name, task in (*of_arms(), *others()):
         if not all(word in name for word in asked.words):
             continue
@@ -123,7 +142,13 @@ def main() -> None:
             f"{plan.cost / best[name] - 1.0:10.1e}",
             flush=True,
         )
+        if asked.fddp:
+            iterations, cost = by_fddp(task, asked.most)
+            theirs += iterations
+            print(f"{'':36} {'FDDP':15} {iterations:10d} {'':15} {cost:11.5g}", flush=True)
     print(f"{'all':36} {total[0]:3d} converged   {total[1]:10d} {total[2]:8d} {total[3]:6d}")
+    if asked.fddp:
+        print(f"{'all':36} {'FDDP':15} {theirs:10d}")
     if asked.best:
         asked.best.write_text(json.dumps(best, indent=1))
 

@@ -28,9 +28,9 @@ LOCK = {f"panda_joint{k}": 0.3 for k in (1, 3, 5, 6, 7)} | {"panda_finger_joint1
 def simulation(
     scene: vp.Scene, q0: np.ndarray, controls: np.ndarray | None = None, speed: float = 0.0, rng: int | None = None
 ) -> Callable[[], object]:
-    """A run of STEPS steps."""
-    v0 = np.full(len(q0), speed)
-    return lambda: vp.simulate(scene, q0, v0, dt=DT, steps=STEPS, controls=controls, rng=rng)
+    """A run of STEPS steps, by the same method with noise and without."""
+    v0, options = np.full(len(q0), speed), {"controls": controls, "integrator": vp.Midpoint(), "rng": rng}
+    return lambda: vp.simulate(scene, q0, v0, dt=DT, steps=STEPS, **options)
 
 
 def fingers(copies: int) -> vp.Robot:

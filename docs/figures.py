@@ -13,8 +13,8 @@ from pathlib import Path
 
 import matplotlib.image
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from pictures import save, save_image
 from PIL import Image
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
@@ -48,7 +48,7 @@ def screenshot(page: Path, seconds: float, size: tuple[int, int] = (800, 640), a
             browser.quit()
 
 
-def reach(folder: Path) -> bytes:
+def reach(folder: Path) -> Image.Image:
     """A UR5 on its way to a posture, with its trace, its target, its reference and its torques."""
     robot = vp.load_robot("ur5")
     scene = vp.Scene(robot, damping=0.1)
@@ -72,7 +72,7 @@ def reach(folder: Path) -> bytes:
         frames=True,
         torques=True,
     )
-    return screenshot(page, 5.0, at=0.25)
+    return Image.open(io.BytesIO(screenshot(page, 5.0, at=0.25)))
 
 
 _NOTEBOOK = """<!DOCTYPE html><meta charset="utf-8"><style>
@@ -118,15 +118,15 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         page = vp.replay(finger, motion.q[:1], dt=1.0, html=Path(folder) / "finger.html")
         picture = matplotlib.image.imread(io.BytesIO(screenshot(page, 3.0)))
-        (IMAGES / "replay.png").write_bytes(reach(Path(folder)))
-        notebook(Path(folder)).convert("RGB").save(IMAGES / "notebook.png", optimize=True)
-        controller(Path(folder)).save(IMAGES / "controller.png", optimize=True)
+        save_image(reach(Path(folder)), IMAGES / "replay.png")
+        save_image(notebook(Path(folder)), IMAGES / "notebook.png")
+        save_image(controller(Path(folder)), IMAGES / "controller.png")
     figure = Figure(figsize=(11, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.imshow(picture)
     left.axis("off")
     plots.plot_joints(motion, axes=right, robot=finger)
-    FigureCanvasAgg(figure).print_png(IMAGES / "finger.png")
+    save(figure, IMAGES / "finger.png")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ from pathlib import Path
 import imageio.v3
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
@@ -31,6 +30,7 @@ from varpin.show.replay.video import film_frames
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / "benchmarks"))
 from pages import fill  # noqa: E402
+from pictures import save  # noqa: E402
 
 SIZE = (600, 450)
 
@@ -156,20 +156,20 @@ SHOTS = {
     "kinova_circle": Shot(2.8, circle, (245.0, 40.0, 1.0)),
     "allegro_finger": Shot(0.55, joints, (-50.0, 21.0, 1.1)),
     "double_pendulum_swing_up": Shot(0.95, swing),
-    "talos_wave": Shot(1.2, joints, (-50.0, 21.0, 1.1)),
+    "talos_wave": Shot(1.2, joints, (-50.0, 21.0, 0.9)),
 }
 
 # Examples: when they are shown [s], the second time where they draw no figure; and from where.
 EXAMPLES: dict[str, tuple[float, float, tuple[float, float, float] | None]] = {
     "ur5_servos": (0.5, 0.5, (20.0, 25.0, 0.85)),
-    "panda_stop": (1.5, 1.5, (-50.0, 21.0, 1.15)),
-    "kinova_door": (4.5, 4.5, (130.0, 25.0, 1.2)),
+    "panda_stop": (1.5, 1.5, (-50.0, 21.0, 1.0)),
+    "kinova_door": (4.5, 4.5, (130.0, 25.0, 0.95)),
     "tiago_reach": (0.0, 3.0, (-50.0, 21.0, 0.95)),
     "ur5_around_obstacle": (0.2, 0.8, (-25.0, 35.0, 1.0)),
     "five_bar_circle": (0.7, 0.7, None),
     "driven_crank": (0.0, 0.0, None),
-    "two_arms_beam": (0.0, 1.0, (-60.0, 20.0, 1.2)),
-    "panda_wipes": (0.6, 2.6, (-50.0, 21.0, 1.2)),
+    "two_arms_beam": (0.0, 1.0, (-60.0, 20.0, 0.95)),
+    "panda_wipes": (0.6, 2.6, (-50.0, 21.0, 1.05)),
 }
 
 _VIEW = """
@@ -200,7 +200,7 @@ def draw(name: str, scene: vp.SceneFile, plan: vp.Solution) -> None:
     axes.imshow(photograph(name, scene, plan))
     axes.axis("off")
     SHOTS[name].draw(right, scene, plan)
-    FigureCanvasAgg(figure).print_png(HERE / "images" / f"gallery_{name}.png")
+    save(figure, HERE / "images" / f"gallery_{name}.png")
 
 
 def row(scene: vp.SceneFile, plan: vp.Solution) -> str:
@@ -227,7 +227,7 @@ def draw_example(name: str) -> None:
         axes = part.add_axes((0.0, 0.0, 1.0, 1.0))
         axes.imshow(picture)
         axes.axis("off")
-    FigureCanvasAgg(figure).print_png(HERE / "images" / f"gallery_{name}.png")
+    save(figure, HERE / "images" / f"gallery_{name}.png")
 
 
 def main() -> None:

@@ -1,12 +1,13 @@
 """The measurements behind docs/which-integrator.md: its tables and figures.
 
-Short horizon, long horizon, optimal control, noise and stiffness, for varpin's integrators and, where they are
-installed (``pip install "varpin[peers]"``), for MuJoCo, Drake and a DOP853 in C++; SciPy's DOP853 on Pinocchio's
+Short horizon, long horizon, optimal control, noise, stiffness and real arms, for varpin's integrators and, where they
+are installed (``pip install "varpin[peers]"``), for MuJoCo, Drake and a DOP853 in C++; SciPy's DOP853 on Pinocchio's
 forward dynamics always takes part. A time of varpin's is that of a plain ``simulate`` call, its look at the motion
 included. Times are the best of several rounds in which the methods take turns, after a round that does not count.
 
     python docs/which_integrator.py                   # rewrites the page and its figures
     python docs/which_integrator.py --quick FOLDER    # shorter, into a folder: the page, its figures, and which.csv
+    python docs/which_integrator.py --only real       # one section
     python docs/which_integrator.py --redraw          # the figure of plans, from the numbers on the page
 """
 
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -57,6 +59,8 @@ STYLES = {
     "Gauss(3)": ("#004d80", "h", "-"),
     "Gauss(4)": ("#000000", "P", "-"),
     "Gauss(5)": ("#666666", "*", "-"),
+    "Radau(2)": ("#d4a6c8", "X", "-"),
+    "Radau(3)": ("#8c2d6b", "X", "-"),
     "ExplicitEuler": ("#f0c040", "<", "-"),
     "SemiImplicitEuler": ("#b8860b", ">", "-"),
     "RungeKutta4": ("#e69f00", "x", "-"),
@@ -66,6 +70,7 @@ STYLES = {
     "Drake RK3": ("#7b3294", "p", "--"),
     "DOP853 in C++": ("#00573d", "8", "--"),
     "SciPy DOP853": ("#009e73", "s", "--"),
+    "SciPy Radau": ("#9bd3bf", "s", ":"),
     "trep midpoint": ("#999933", "d", "--"),
     "Midpoint, split kick": ("#009e73", "s", "--"),
     "Euler-Maruyama": ("#d55e00", "^", "-"),
@@ -220,6 +225,35 @@ def short_entries(case: peers.Case, scale: Scale) -> list[Entry]:
     return entries
 
 
+def best_of(points: Sequence[Point], motion: str, levels: Iterable[float], names: Sequence[str]) -> list[str]:
+    """Rows of a table: the least time to each error of varpin and of each peer, the least of all in bold."""
+    lines = []
+    for level in levels:
+        good = [p for p in points if p.error <= level]
+        sides = [[p for p in good if p.ours]] + [[p for p in good if p.method.startswith(name)] for name in names]
+        best = [min(side, key=lambda p: p.microseconds, default=None) for side in sides]
+        fastest = min((p.microseconds for p in best if p is not None), default=0.0)
+        cells = []
+        for p in best:
+            text = "-" if p is None else f"{p.microseconds:.0f} ({p.method.removeprefix('MuJoCo ')}, {p.setting})"
+            cells.append(f"**{text}**" if p is not None and p.microseconds == fastest else text)
+        lines.append(f"| {motion} | {level:.0e} | {' | '.join(cells)} |")
+    return lines
+
+
+def draw_race(axes: Axes, points: Sequence[Point], handles: dict[str, object]) -> None:
+    """Error over time of every method."""
+    for method, (colour, marker, stroke) in STYLES.items():
+        own = [p for p in points if p.method == method and p.error < LOST]
+        if own:
+            (handles[method],) = axes.loglog(
+                [p.microseconds for p in own],
+                [p.error for p in own],
+                color=colour, marker=marker, linestyle=stroke, markersize=5, linewidth=1.1,
+            )  # fmt: skip
+    plots.apply_style(axes)
+
+
 def short(scale: Scale) -> tuple[str, Figure, list[tuple[str, Point]]]:
     """The race over one second."""
     figure = Figure(figsize=(15, 4.9), layout="constrained")
@@ -242,27 +276,9 @@ def short(scale: Scale) -> tuple[str, Figure, list[tuple[str, Point]]]:
         ).q[-1]
         points = race(short_entries(case, scale), exact, scale)
         rows += [(case.name, point) for point in points]
-        for level in LEVELS:
-            good = [p for p in points if p.error <= level]
-            sides = [[p for p in good if p.ours]]
-            sides += [[p for p in good if p.method.startswith(peer)] for peer in ("MuJoCo", "DOP853", "Drake", "SciPy")]
-            best = [min(side, key=lambda p: p.microseconds, default=None) for side in sides]
-            fastest = min((p.microseconds for p in best if p is not None), default=0.0)
-            cells = []
-            for p in best:
-                text = "-" if p is None else f"{p.microseconds:.0f} ({p.method.removeprefix('MuJoCo ')}, {p.setting})"
-                cells.append(f"**{text}**" if p is not None and p.microseconds == fastest else text)
-            lines.append(f"| {case.name} | {level:.0e} | {' | '.join(cells)} |")
-        for method, (colour, marker, stroke) in STYLES.items():
-            own = [p for p in points if p.method == method and p.error < LOST]
-            if own:
-                (handles[method],) = axes.loglog(
-                    [p.microseconds for p in own],
-                    [p.error for p in own],
-                    color=colour, marker=marker, linestyle=stroke, markersize=5, linewidth=1.1,
-                )  # fmt: skip
+        lines += best_of(points, case.name, LEVELS, ("MuJoCo", "DOP853", "Drake", "SciPy"))
+        draw_race(axes, points, handles)
         axes.set(title=case.name, xlabel="time for one second [us]", ylim=(1e-13, LOST))
-        plots.apply_style(axes)
     panels[0].set_ylabel("error in q after 1 s [rad]")
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=7, fontsize=8, frameon=False)
     return "\n".join(lines + against_trep(rows)), figure, rows
@@ -658,6 +674,118 @@ def stiff(scale: Scale) -> tuple[str, Figure]:
     return "\n\n".join(tables), figure
 
 
+# Real arms ----------------------------------------------------------------------------------------------------------
+
+REAL_LEVELS = (1e-2, 1e-3, 1e-4, 1e-6, 1e-8, 1e-10)
+REAL: tuple[vp.Integrator, ...] = (
+    vp.RungeKutta4(), vp.Midpoint(), *(vp.Gauss(s) for s in (2, 3, 4)), *(vp.Radau(s) for s in (2, 3)),
+)  # fmt: skip
+REAL_STEPS = (100, 200, 400, 1000, 2000, 4000)
+
+
+@dataclass(frozen=True)
+class RealArm:
+    """A race of an arm as it is: what peers are given, and how varpin has it.
+
+    Attributes:
+        case: With servos as springs and dampers about goals that swing by torques.
+        scene: With servos or friction as they are.
+        controls: Of a number of steps.
+        servos: Stiffness, damping and rest, for MuJoCo's actuators; None without.
+    """
+
+    case: peers.Case
+    scene: vp.Scene
+    controls: Callable[[int], vp.OpenLoop | np.ndarray]
+    servos: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+
+def real_arms() -> list[RealArm]:
+    """An arm with its file's damping under torques that jump, one on servos, one with friction under smooth torques."""
+    damped = vp.load_robot("xarm7")
+    scene = vp.Scene(damped, damping="robot")
+    q0, rest = np.array([0.3, -0.4, 0.2, 1.0, -0.1, 1.2, 0.4]), np.zeros(7)
+    hold = vp.lagrangian_jet(scene, q0, rest)
+    rows = -hold.Lq + 0.1 * damped.effort_limit * np.random.default_rng(0).uniform(-1.0, 1.0, (100, 7))
+    jumping = peers.Case("xarm7, torques that jump", scene, q0, rest, rows)
+
+    servoed = vp.load_robot("ur5")
+    start, swing, omega = np.array([0.0, -1.2, 1.4, -1.8, -1.57, 0.0]), np.full(6, 0.3), 2.0 * np.pi
+    inertia = np.diag(vp.lagrangian_jet(vp.Scene(servoed), start, np.zeros(6)).Lvv)
+    # 10 Hz, damped to 0.7 of critical.
+    stiffness, damping = inertia * (20.0 * np.pi) ** 2, 1.4 * inertia * 20.0 * np.pi
+    springs = vp.Scene(servoed, stiffness=stiffness, damping=damping, rest=start)
+    tracking = peers.Case("ur5, servos", springs, start, np.zeros(6), np.zeros(6), swing=stiffness * swing, omega=omega)
+    servos = vp.Scene(servoed, forces=[vp.PositionServo(stiffness, damping)])
+
+    dry = vp.load_robot("panda", lock={"panda_finger_joint1": 0.0})
+    level, width = np.array([0.6, 0.9, 0.6, 0.9, 0.4, 0.4, 0.3]), 0.1
+    q0, swing = np.array([0.0, -0.6, 0.0, -2.2, 0.0, 1.8, 0.7]), np.array([2.5, 4.0, 2.0, 2.5, 0.8, 0.8, 0.5])
+    held = -vp.lagrangian_jet(vp.Scene(dry), q0, rest).Lq
+    rubbing = peers.Case(
+        "panda, friction", vp.Scene(dry), q0, rest, held, swing=swing, omega=omega, friction=level, width=width
+    )
+    rough = vp.Scene(dry, forces=[vp.CoulombFriction(level, width)])
+    return [
+        RealArm(jumping, scene, lambda steps: np.repeat(rows, steps // len(rows), axis=0)),
+        RealArm(
+            tracking,
+            servos,
+            lambda _: vp.OpenLoop(lambda t: start + np.sin(omega * t) * 0.3),
+            (stiffness, damping, start),
+        ),
+        RealArm(rubbing, rough, lambda _: vp.OpenLoop(lambda t: held + np.sin(omega * t) * swing)),
+    ]
+
+
+def real_entries(arm: RealArm, scale: Scale) -> list[Entry]:
+    """All methods at all settings."""
+    case, entries = arm.case, []
+
+    def own(integrator: vp.Integrator, steps: int) -> Run:
+        dt, controls = case.duration / steps, arm.controls(steps)
+        return lambda: vp.simulate(
+            arm.scene, case.q0, case.v0, dt=dt, steps=steps, controls=controls, integrator=integrator
+        ).q[-1]
+
+    for integrator in REAL:
+        for steps in REAL_STEPS[:: scale.thin]:
+            entries.append(Entry(name_of(integrator), f"{case.duration / steps:.3g} s", own(integrator, steps)))
+    for scheme in ("Euler", "implicitfast", "RK4"):
+        for steps in (*REAL_STEPS, 10_000)[:: scale.thin]:
+            dt = case.duration / steps
+            run = peers.mujoco_driven_run(case, dt, scheme, arm.servos)
+            entries += [] if run is None else [Entry(f"MuJoCo {scheme}", f"{dt:g} s", run)]
+    for rtol in (10.0 ** -np.arange(3.0, 13.0))[:: scale.thin]:
+        compiled = peers.compiled_run(case, rtol)
+        entries += [] if compiled is None else [Entry("DOP853 in C++", f"rtol {rtol:.0e}", compiled)]
+        entries.append(Entry("SciPy Radau", f"rtol {rtol:.0e}", peers.scipy_run(case, rtol, "Radau")))
+    return entries
+
+
+def real(scale: Scale) -> tuple[str, Figure, list[tuple[str, Point]]]:
+    """The race of arms as they are."""
+    figure = Figure(figsize=(13, 4.9), layout="constrained")
+    panels = figure.subplots(1, 3, sharey=True)
+    names = "MuJoCo", "DOP853", "SciPy"
+    lines = [
+        "| motion | error [rad] | varpin [us] | MuJoCo [us] | DOP853 in C++ [us] | SciPy Radau [us] |",
+        "|---|---|---|---|---|---|",
+    ]
+    rows = []
+    handles: dict[str, object] = {}
+    for arm, axes in zip(real_arms(), panels, strict=True):
+        exact = peers.scipy_run(arm.case, 1e-13)()
+        points = race(real_entries(arm, scale), exact, scale)
+        rows += [(arm.case.name, point) for point in points]
+        lines += best_of(points, arm.case.name, REAL_LEVELS, names)
+        draw_race(axes, points, handles)
+        axes.set(title=arm.case.name, xlabel="time for one second [us]", ylim=(1e-12, LOST))
+    panels[0].set_ylabel("error in q after 1 s [rad]")
+    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=7, fontsize=8, frameon=False)
+    return "\n".join(lines), figure, rows
+
+
 # The page -----------------------------------------------------------------------------------------------------------
 
 
@@ -679,6 +807,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("folder", nargs="?", type=Path, default=DOCS, help="where page and images go; docs if left out")
     parser.add_argument("--quick", action="store_true", help="shorter runs, fewer settings")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="these sections alone: short, long, control, ...")
     parser.add_argument("--redraw", action="store_true", help="draw the plans from the page's table, measure nothing")
     options = parser.parse_args(None if arguments is None else list(arguments))
     scale = QUICK if options.quick else FULL
@@ -693,15 +822,19 @@ def main(arguments: Iterable[str] | None = None) -> None:
     logging.getLogger("varpin").setLevel(logging.ERROR)
     for case in short_cases():
         peers.require_same(case)
-    parts, figures = {"machine": machine(scale)}, {}
-    begin = time.perf_counter()
-    parts["short"], figures["short"], rows = short(scale)
-    sections: dict[str, Callable[[Scale], tuple[str, Figure]]] = {
-        "long": long, "control": control, "noise": noise, "stiff": stiff,
+    sections: dict[str, Callable[[Scale], tuple[Any, ...]]] = {
+        "short": short, "long": long, "control": control, "noise": noise, "stiff": stiff, "real": real,
     }  # fmt: skip
-    _tell("short", begin)
+    if options.only is not None and set(options.only) - set(sections):
+        parser.error(f"--only takes names of {', '.join(sections)}, got {' '.join(options.only)}")
+    parts, figures = {"machine": machine(scale)}, {}
+    rows: list[tuple[str, Point]] = []
+    begin = time.perf_counter()
     for name, section in sections.items():
-        parts[name], figures[name] = section(scale)
+        if options.only is not None and name not in options.only:
+            continue
+        parts[name], figures[name], *raced = section(scale)
+        rows += raced[0] if raced else []
         _tell(name, begin)
     for name, figure in figures.items():
         _print(figure, images / f"which_{name}.png")

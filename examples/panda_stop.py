@@ -12,10 +12,11 @@ out = Path("out")
 out.mkdir(exist_ok=True)
 
 robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.02})
-# The file has dampers and no dry friction. Friction [N m] and its width [rad/s] are those that Gaz et al. identified
-# ("Dynamic identification of the Franka Emika Panda robot", IEEE RA-L 4, 2019).
-level = np.array([0.27, 0.44, 0.32, 0.64, 0.42, 0.15, 0.28])
-width = np.array([0.39, 0.22, 0.20, 0.36, 0.24, 0.12, 0.19])
+# The file has dampers and no dry friction. Gaz et al. identified phi1 / (1 + exp(-phi2 (v + phi3))) less its value at
+# rest ("Dynamic identification of the Franka Emika Panda robot", IEEE RA-L 4, 2019; the numbers are in their
+# franka_model.h). Without its small shift phi3 that is phi1 / 2 tanh(phi2 v / 2): level [N m] and width [rad/s].
+level = 0.5 * np.array([0.54615, 0.87224, 0.64068, 1.2794, 0.83904, 0.30301, 0.56489])
+width = 2.0 / np.array([5.1181, 9.0657, 10.136, 5.5903, 8.3469, 17.133, 10.336])
 stop = vp.JointStop(stiffness=2000.0, damping=20.0, width=2e-3)  # at the position limits of the file
 scene = vp.Scene(robot, damping="robot", forces=[vp.CoulombFriction(level, width), stop])
 

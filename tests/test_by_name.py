@@ -29,7 +29,7 @@ def test_a_scene_takes_values_by_joint_name():
 
 def test_motions_start_where_names_say():
     scene = vp.Scene(UR5, damping=0.1)
-    options = {"dt": 2e-3, "steps": 20}
+    options = {"dt": 2e-3, "steps": 20, "integrator": vp.Midpoint()}
     rows = vp.simulate(scene, ROW, 0.1 * ROW, **options)
     spin = {name: 0.1 * value for name, value in POSE.items()}
     assert same(vp.simulate(scene, POSE, spin, **options), rows)

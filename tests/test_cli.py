@@ -55,7 +55,7 @@ def test_plain_run_prints_a_summary_and_writes_nothing(arm, tmp_path, capsys):
     out, err = capsys.readouterr()
     assert err == ""
     for words in (
-        "arm: Midpoint(alpha=0.5)",
+        "arm: Gauss(stages=2)",
         "50, 0.01 s each, 0.5 s in all",
         "Newton iterations",
         "split steps                 │ none",
@@ -130,7 +130,7 @@ def test_quiet_run_prints_nothing(arm, capsys):
 
 
 def test_split_steps_are_flagged_in_the_table_and_warned_of(arm, capsys):
-    assert main(["simulate", arm, "--dt", "0.3", "--steps", "20", "--v0", "5", "0"]) == 0
+    assert main(["simulate", arm, "--integrator", "midpoint", "--dt", "0.3", "--steps", "20", "--v0", "5", "0"]) == 0
     out, err = capsys.readouterr()
     assert re.search(r"split steps +│ \d+ of 20, into up to \d+ parts: a smaller dt keeps the structure", out)
     said = r"^varpin: warning: dt = 0.3 s is coarse for .* \(\d+ of 20 steps were taken in up to \d+ parts\)$"
@@ -173,7 +173,7 @@ def test_energy_of_a_damped_motion_is_what_it_lost(arm, tmp_path, capsys):
         (["--integrator", "gauss", "--stages", "9"], "stages must be at most 6, got 9"),
         (["--integrator", "Gauss(steps=2)"], "Gauss has no option 'steps'; its options are stages, "),
         (["--integrator", "RungeKutta4", "--stages", "2"], "--stages is an option of Gauss, not of RungeKutta4"),
-        (["--stages", "2"], "--stages is an option of Gauss, not of Midpoint"),
+        (["--stages", "2", "--alpha", "0.5"], "--stages is an option of Gauss, not of Midpoint"),
         (["--q0", "elbo=1"], "q0: the robot has no joint 'elbo'; did you mean 'elbow'?"),
         (["--q0", "elbow=nan"], "q0['elbow'] is nan; it must be finite"),
         (["--q0", "elbow=1", "2"], "--q0 takes either numbers or JOINT=VALUE, not both at once"),
@@ -251,7 +251,8 @@ def test_joints_are_set_by_name(arm, tmp_path):
         (["--integrator", "SemiImplicitEuler"], vp.SemiImplicitEuler()),
         (["--integrator", "midpoint", "--alpha", "0.3"], vp.Midpoint(alpha=0.3)),
         (["--alpha", "0.3"], vp.Midpoint(alpha=0.3)),
-        ([], vp.Midpoint()),
+        (["--stages", "3"], vp.Gauss(3)),
+        ([], vp.Gauss(2)),
     ],
 )
 def test_integrators_are_chosen_by_name(arm, tmp_path, words, integrator):

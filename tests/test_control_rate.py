@@ -291,7 +291,7 @@ def test_policies_feed_the_control_before_back(monkeypatch, integrator, limits, 
 @pytest.mark.parametrize("before", [None, BEFORE], ids=["free", "given"])
 def test_ensembles_feed_the_control_before_of_each_path_back(monkeypatch, before):
     """The same bytes as paths by themselves, over many blocks and groups."""
-    monkeypatch.setattr("varpin.ensemble._BLOCK", 5 * 45 * 8)
+    monkeypatch.setattr("varpin.ensemble.paths._BLOCK", 5 * 45 * 8)
     scene = vp.Scene(sliders(2), gravity=False, damping=0.3, noise=vp.AdditiveNoise(0.4))
     policy = random_policy(scene, 20, before=before)
     options = {"dt": 0.05, "steps": 20, "controls": policy}

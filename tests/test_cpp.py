@@ -106,7 +106,9 @@ def planned():
     u0 = scene.holding_torque(start)
 
     def rollout(q0, controls):
-        return vp.simulate(scene, q0, np.zeros(n), dt=h, steps=N, controls=controls, check=False)
+        return vp.simulate(
+            scene, q0, np.zeros(n), dt=h, steps=N, controls=controls, integrator=vp.Midpoint(), check=False
+        )
 
     def cost(motion):
         total = 0.0

@@ -30,7 +30,7 @@ def same_statistics(one, other, tolerance=0.0):
 
 
 def blocks_of(monkeypatch, numbers):
-    monkeypatch.setattr(varpin.ensemble, "_BLOCK", numbers)
+    monkeypatch.setattr(varpin.ensemble.paths, "_BLOCK", numbers)
 
 
 def numbers_a_step(scene, paths):
@@ -88,7 +88,8 @@ def test_each_path_may_have_its_own_start():
 
 def test_without_noise_all_paths_are_one():
     end = run(vp.Scene(vp.planar_chain(2)), paths=3)
-    alone = vp.simulate(vp.Scene(vp.planar_chain(2)), *START.values(), dt=0.01, steps=50, controls=[0.3, -0.1])
+    options = {"dt": 0.01, "steps": 50, "controls": [0.3, -0.1], "integrator": vp.Midpoint()}
+    alone = vp.simulate(vp.Scene(vp.planar_chain(2)), *START.values(), **options)
     for path in range(3):
         assert end.q[path].tobytes() == alone.q.tobytes()
     assert np.abs(end.statistics.covariance).max() < 1e-28
@@ -315,7 +316,7 @@ def test_interruption_before_anything_is_done(monkeypatch):
     def stop(*given):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(varpin.ensemble, "simulate_paths", stop)
+    monkeypatch.setattr(varpin.ensemble.run, "simulate_paths", stop)
     with pytest.raises(vp.EnsembleInterrupted, match=r"interrupted after 0 paths$") as caught:
         run()
     assert caught.value.ensemble is None
@@ -323,7 +324,7 @@ def test_interruption_before_anything_is_done(monkeypatch):
 
 def test_quantiles_of_very_many_paths_are_off_by_no_more_than_they_say(monkeypatch):
     exact = run(paths=3000, steps=20, quantiles=[0.0, 0.01, 0.5, 0.9, 1.0]).statistics
-    monkeypatch.setattr(varpin.ensemble, "_EXACT", 1000)
+    monkeypatch.setattr(varpin.ensemble.statistics, "_EXACT", 1000)
     rough = run(paths=3000, steps=20, quantiles=[0.0, 0.01, 0.5, 0.9, 1.0], store=False, workers=3).statistics
     assert not exact.quantile_errors.any()
     off = np.abs(rough.quantiles - exact.quantiles)
@@ -339,9 +340,9 @@ def test_quantiles_of_very_many_paths_are_off_by_no_more_than_they_say(monkeypat
     np.testing.assert_array_equal(again.quantiles, rough.quantiles)
     q0 = np.zeros((3000, 2))
     q0[2000:] = np.linspace(1.0, 3.0, 1000)[:, None]
-    monkeypatch.setattr(varpin.ensemble, "_EXACT", 2**25)
+    monkeypatch.setattr(varpin.ensemble.statistics, "_EXACT", 2**25)
     exact = run(paths=3000, steps=5, q0=q0, store=False).statistics
-    monkeypatch.setattr(varpin.ensemble, "_EXACT", 1000)
+    monkeypatch.setattr(varpin.ensemble.statistics, "_EXACT", 1000)
     rough = run(paths=3000, steps=5, q0=q0, store=False).statistics
     assert (np.abs(rough.quantiles - exact.quantiles) <= rough.quantile_errors + 1e-15).all()
 
@@ -393,7 +394,7 @@ def test_an_interrupted_ensemble_carries_warnings(monkeypatch):
         run(scene, **COARSE | {"paths": 300}, progress=interrupt)
     part = caught.value.ensemble
     assert part.warnings == run(scene, **COARSE | {"paths": int(part.statistics.count[0])}).warnings != ()
-    monkeypatch.setattr(varpin.ensemble, "_look", stop)
+    monkeypatch.setattr(varpin.ensemble.looks, "_look", stop)
     with pytest.raises(vp.EnsembleInterrupted) as caught:
         run(scene, **COARSE | {"paths": 300}, progress=interrupt)
     assert caught.value.ensemble.warnings == ()

@@ -70,7 +70,7 @@ def test_processes_give_the_bytes_of_threads(pool, store):
 
 
 def test_estimated_quantiles_are_those_of_threads(spawned, monkeypatch):
-    monkeypatch.setattr(varpin.ensemble, "_EXACT", 1000)
+    monkeypatch.setattr(varpin.ensemble.statistics, "_EXACT", 1000)
     threads = run(paths=300, store=False, workers=3)
     assert threads.statistics.quantile_errors.any()
     same_ensembles(run(paths=300, store=False, executor=spawned), threads)
@@ -259,14 +259,14 @@ def test_tasks_ahead_are_bounded_by_workers_and_by_bytes(executor, result_bytes,
 @pytest.mark.parametrize("options", [{"store": True}, {"quantiles": ()}, {}, {"exact": 1000}])
 def test_what_a_chunk_takes_is_known_beforehand(options, monkeypatch):
     """The bytes that come back, against those that bound how many chunks are ahead."""
-    told, real = [], varpin.ensemble.in_order
+    told, real = [], varpin.ensemble.run.in_order
 
     def listening(*args, result_bytes=0):
         told.append(result_bytes)
         return real(*args, result_bytes=result_bytes)
 
-    monkeypatch.setattr(varpin.ensemble, "in_order", listening)
-    monkeypatch.setattr(varpin.ensemble, "_EXACT", options.pop("exact", 2**25))
+    monkeypatch.setattr(varpin.ensemble.run, "in_order", listening)
+    monkeypatch.setattr(varpin.ensemble.statistics, "_EXACT", options.pop("exact", 2**25))
     shipping = Shipping()
     run(paths=1024, executor=shipping, **{"store": False} | options)
     # Of a chunk that is not the first, from which bins are made where they are.

@@ -31,7 +31,9 @@ MEASURES = ("error", "joint", "velocity", "period", "energy", "momentum", "rever
 def falling(integrator=None, *, dt=1e-2, steps=100, **scene):
     """Three links that fall: their setup and their motion."""
     setup = Setup(vp.Scene(rod_chain([1.0] * 3, [1.0] * 3), **scene), np.zeros(3), np.array([0.0, 1.0, 0.0]))
-    return setup, vp.simulate(setup.scene, setup.q0, setup.v0, dt=dt, steps=steps, integrator=integrator)
+    return setup, vp.simulate(
+        setup.scene, setup.q0, setup.v0, dt=dt, steps=steps, integrator=integrator or vp.Midpoint()
+    )
 
 
 def tampered(trajectory, **changes):
@@ -189,7 +191,7 @@ def test_what_goes_wrong_late_is_found():
     """A fifth of its way is added to what is left of a motion from a node on, of which every record is consistent."""
     setup, motion = falling(dt=1e-2, steps=400)
     before = battery.measures(setup, vp.Midpoint(), motion, exact_motion(setup, 1e-2, 400, 0.3))
-    later = vp.simulate(setup.scene, motion.q[250] + 0.3, motion.v[250], dt=1e-2, steps=150)
+    later = vp.simulate(setup.scene, motion.q[250] + 0.3, motion.v[250], dt=1e-2, steps=150, integrator=vp.Midpoint())
     arrays = {name: np.append(getattr(motion, name)[:250], getattr(later, name), axis=0) for name in "qvp"}
     energy = np.append(motion.energy[:250], later.energy)
     found = battery.measures(

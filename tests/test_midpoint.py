@@ -81,7 +81,7 @@ def test_order_two(name, forced):
     errors = []
     for steps in (128, 256, 512, 1024):
         controls = None if swing is None else vp.OpenLoop(swing)
-        end = vp.simulate(scene, q0, v0, dt=duration / steps, steps=steps, controls=controls)
+        end = vp.simulate(scene, q0, v0, dt=duration / steps, steps=steps, controls=controls, integrator=vp.Midpoint())
         assert end.statistics.split_steps == 0
         errors.append(np.abs(end.q[-1] - exact).max())
     assert ((slopes(errors) > 1.95) & (slopes(errors) < 2.05)).all(), errors
@@ -108,7 +108,9 @@ def test_a_digital_controller_is_off_the_continuous_law_in_first_order():
     q0, v0 = np.zeros(6), np.zeros(6)
     exact = reference(scene, q0, v0, 0.5, law)
     errors = [
-        np.abs(vp.simulate(scene, q0, v0, dt=0.5 / k, steps=k, controls=law).q[-1] - exact).max()
+        np.abs(
+            vp.simulate(scene, q0, v0, dt=0.5 / k, steps=k, controls=law, integrator=vp.Midpoint()).q[-1] - exact
+        ).max()
         for k in (400, 800, 1600)
     ]
     assert ((slopes(errors) > 0.9) & (slopes(errors) < 1.1)).all(), errors
@@ -121,7 +123,9 @@ def test_pendulum_against_the_elliptic_solution():
     w, k = np.sqrt(1.5 * GRAVITY), np.sin(0.5 * amplitude)
     errors = []
     for steps in (1000, 2000, 4000):
-        motion = vp.simulate(scene, [0.5 * np.pi - amplitude], [0.0], dt=5.0 / steps, steps=steps)
+        motion = vp.simulate(
+            scene, [0.5 * np.pi - amplitude], [0.0], dt=5.0 / steps, steps=steps, integrator=vp.Midpoint()
+        )
         sn, _, _, _ = ellipj(ellipk(k**2) - w * motion.t, k**2)
         errors.append(np.abs((0.5 * np.pi - motion.q[:, 0]) - 2.0 * np.arcsin(k * sn)).max())
     assert ((slopes(errors) > 1.95) & (slopes(errors) < 2.05)).all(), errors
@@ -162,7 +166,9 @@ def test_symplectic(name, alpha):
 def test_momentum_about_a_vertical_axis_is_conserved_to_rounding():
     """Gravity does not see the first joint of an arm that stands upright."""
     scene = vp.Scene(vp.load_robot("ur5"))
-    motion = vp.simulate(scene, [0.3, -1.0, 0.8, 0.2, 0.4, 0.1], [2.0, 0.5, 0, 1, 0, 3], dt=2e-3, steps=20_000)
+    motion = vp.simulate(
+        scene, [0.3, -1.0, 0.8, 0.2, 0.4, 0.1], [2.0, 0.5, 0, 1, 0, 3], dt=2e-3, steps=20_000, integrator=vp.Midpoint()
+    )
     about_axis = motion.p[:, 0]
     assert np.ptp(motion.p[:, 1]) > 1.0
     assert np.abs(about_axis - about_axis[0]).max() <= 4.0 * np.spacing(abs(about_axis[0]))
@@ -172,8 +178,8 @@ def test_reversible():
     """Turned round, a conservative motion runs back to where it came from."""
     scene = vp.Scene(vp.load_robot("ur5"))
     q0, v0 = np.linspace(0.1, 0.6, 6), np.linspace(1.0, -1.0, 6)
-    there = vp.simulate(scene, q0, v0, dt=5e-3, steps=200)
-    back = vp.simulate(scene, there.q[-1], -there.v[-1], dt=5e-3, steps=200)
+    there = vp.simulate(scene, q0, v0, dt=5e-3, steps=200, integrator=vp.Midpoint())
+    back = vp.simulate(scene, there.q[-1], -there.v[-1], dt=5e-3, steps=200, integrator=vp.Midpoint())
     assert there.statistics.split_steps == back.statistics.split_steps == 0
     np.testing.assert_allclose(back.q[-1], q0, rtol=0, atol=1e-10)
     np.testing.assert_allclose(-back.v[-1], v0, rtol=0, atol=1e-10)
@@ -182,7 +188,10 @@ def test_reversible():
 def energy_errors(dt, steps, starts):
     """Energy errors (len(starts), steps + 1) of three 1 m, 1 kg links from horizontal rest, in m g n^2 / 2."""
     scene = vp.Scene(vp.planar_chain(3))
-    runs = [vp.simulate(scene, np.full(3, tilt), np.zeros(3), dt=dt, steps=steps) for tilt in starts]
+    runs = [
+        vp.simulate(scene, np.full(3, tilt), np.zeros(3), dt=dt, steps=steps, integrator=vp.Midpoint())
+        for tilt in starts
+    ]
     assert sum(run.statistics.split_steps for run in runs) <= 1e-2 * steps * len(runs)
     return np.array([run.energy - run.energy[0] for run in runs]) / (GRAVITY * 9 / 2)
 
@@ -203,7 +212,7 @@ def test_energy_round_off_walks_at_random():
     joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slide")
     model.appendBodyToJoint(joint, pin.Inertia.FromSphere(1.0, 0.1), pin.SE3.Identity())
     scene = vp.Scene(vp.load_robot(model), stiffness=3.0, gravity=False)
-    motion = vp.simulate(scene, [1.0], [0.3], dt=1e-2, steps=1_000_000)
+    motion = vp.simulate(scene, [1.0], [0.3], dt=1e-2, steps=1_000_000, integrator=vp.Midpoint())
     error = np.abs(motion.energy / motion.energy[0] - 1.0)
     assert error.max() < 50 * np.finfo(float).eps
 
@@ -220,7 +229,14 @@ def test_energy_of_a_million_small_steps_does_not_drift():
 
 @pytest.mark.parametrize("links", [16, 32, pytest.param(100, marks=pytest.mark.slow)])
 def test_long_chains_fall_for_ten_seconds(links):
-    motion = vp.simulate(vp.Scene(vp.planar_chain(links)), np.zeros(links), np.zeros(links), dt=1e-2, steps=1000)
+    motion = vp.simulate(
+        vp.Scene(vp.planar_chain(links)),
+        np.zeros(links),
+        np.zeros(links),
+        dt=1e-2,
+        steps=1000,
+        integrator=vp.Midpoint(),
+    )
     evaluations = motion.statistics.jets.sum() + motion.statistics.sweeps.sum()
     assert evaluations / motion.statistics.substeps.sum() <= 6.0
     assert np.abs(motion.energy - motion.energy[0]).max() < 0.05 * GRAVITY * links**2 / 2
@@ -230,7 +246,9 @@ def test_long_chains_fall_for_ten_seconds(links):
 @pytest.mark.parametrize("dt", [0.05, 0.1, 0.2, 0.5])
 def test_no_silent_energy_jump_at_coarse_steps(links, dt):
     steps = int(200 / dt)
-    motion = vp.simulate(vp.Scene(vp.planar_chain(links)), np.zeros(links), np.zeros(links), dt=dt, steps=steps)
+    motion = vp.simulate(
+        vp.Scene(vp.planar_chain(links)), np.zeros(links), np.zeros(links), dt=dt, steps=steps, integrator=vp.Midpoint()
+    )
     assert motion.statistics.split_steps > 0
     assert motion.statistics.jets.sum() / motion.statistics.substeps.sum() <= 6.0
     assert np.abs(motion.energy - motion.energy[0]).max() < 0.05 * GRAVITY * links**2 / 2
@@ -252,7 +270,9 @@ def test_few_iterations_from_rest_under_gravity(name):
     robot = vp.load_robot(name)
     tilted = vp.Scene(robot, gravity=[3.0, -5.0, -8.0])
     for scene, q0 in ((vp.Scene(robot), 0.0), (tilted, 0.5)):
-        motion = vp.simulate(scene, np.full(robot.dof, q0), np.zeros(robot.dof), dt=1e-3, steps=300)
+        motion = vp.simulate(
+            scene, np.full(robot.dof, q0), np.zeros(robot.dof), dt=1e-3, steps=300, integrator=vp.Midpoint()
+        )
         assert motion.statistics.newton_iterations.mean() <= 3.0
         assert motion.statistics.residual.max() < 20.0
 
@@ -262,7 +282,7 @@ def test_few_iterations_from_rest_under_gravity(name):
 def test_stiff_springs_and_dampers(stiffness, damping):
     """Springs and dampers far faster than the step: finite, bounded, and dissipating what they should."""
     scene = vp.Scene(vp.load_robot("finger"), gravity=False, stiffness=stiffness, damping=damping)
-    motion = vp.simulate(scene, [0.1, 0.1, 0.1], np.zeros(3), dt=1e-2, steps=500)
+    motion = vp.simulate(scene, [0.1, 0.1, 0.1], np.zeros(3), dt=1e-2, steps=500, integrator=vp.Midpoint())
     assert np.isfinite(motion.q).all()
     if damping == 0.0:
         assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 0.1
@@ -274,7 +294,9 @@ def test_stiff_springs_and_dampers(stiffness, damping):
 def test_failure_keeps_what_was_done():
     scene = vp.Scene(vp.planar_chain(3))
     with pytest.raises(vp.StepFailure, match="smaller dt may go further") as caught:
-        vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-2, steps=1000, controls=np.full(3, 1e6))
+        vp.simulate(
+            scene, np.zeros(3), np.zeros(3), dt=1e-2, steps=1000, controls=np.full(3, 1e6), integrator=vp.Midpoint()
+        )
     error = caught.value
     assert error.trajectory.steps == error.step > 0
     assert error.time == pytest.approx(error.step * 1e-2)
@@ -287,7 +309,9 @@ def test_failure_keeps_what_was_done():
 
 def test_split_steps_are_reported(caplog):
     with caplog.at_level(logging.WARNING, logger="varpin"):
-        motion = vp.simulate(vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=0.1, steps=100)
+        motion = vp.simulate(
+            vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=0.1, steps=100, integrator=vp.Midpoint()
+        )
     assert motion.statistics.split_steps > 0
     assert f"{motion.statistics.split_steps} of 100 steps were taken in up to" in caplog.text
     assert "split by the guards" in repr(motion)
@@ -316,8 +340,10 @@ def test_a_function_and_an_array_of_controls_do_the_same():
     scene = vp.Scene(vp.load_robot("finger"), gravity=False, damping=1e-3)
     u = np.random.default_rng(0).normal(size=(50, 3)) * 1e-3
     start = np.zeros(3), np.zeros(3)
-    by_array = vp.simulate(scene, *start, dt=1e-3, steps=50, controls=u)
-    by_law = vp.simulate(scene, *start, dt=1e-3, steps=50, controls=lambda t, q, v: u[round(t / 1e-3)])
+    by_array = vp.simulate(scene, *start, dt=1e-3, steps=50, controls=u, integrator=vp.Midpoint())
+    by_law = vp.simulate(
+        scene, *start, dt=1e-3, steps=50, controls=lambda t, q, v: u[round(t / 1e-3)], integrator=vp.Midpoint()
+    )
     np.testing.assert_array_equal(by_array.q, by_law.q)
     np.testing.assert_array_equal(by_law.u, u)
 
@@ -330,16 +356,16 @@ def test_interruption_keeps_what_was_done():
             raise KeyboardInterrupt
 
     with pytest.raises(vp.Interrupted) as caught:
-        vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=100_000, progress=stop)
+        vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=100_000, progress=stop, integrator=vp.Midpoint())
     done = caught.value.trajectory
     assert 20_000 < done.steps < 100_000
-    whole = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=done.steps)
+    whole = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=done.steps, integrator=vp.Midpoint())
     np.testing.assert_array_equal(done.q, whole.q)
 
 
 def test_velocity_and_energy_at_nodes_are_those_of_the_momentum():
     scene = vp.Scene(vp.load_robot("ur5"), damping=1.0, stiffness=2.0)
-    motion = vp.simulate(scene, np.full(6, 0.3), np.zeros(6), dt=1e-2, steps=20)
+    motion = vp.simulate(scene, np.full(6, 0.3), np.zeros(6), dt=1e-2, steps=20, integrator=vp.Midpoint())
     for k in (0, 7, 20):
         jet = vp.lagrangian_jet(scene, motion.q[k], motion.v[k], backend="pinocchio")
         np.testing.assert_allclose(jet.Lv, motion.p[k], rtol=1e-11, atol=1e-13)
@@ -364,7 +390,7 @@ def test_a_heavy_part_does_not_hide_a_light_one():
     model.appendBodyToJoint(joint, pin.Inertia.FromSphere(1000.0, 0.1), pin.SE3.Identity())
     both = vp.Scene(vp.load_robot(model))
     assert both.robot.joint_names[-1] == "slide"
-    motion = vp.simulate(both, np.zeros(4), np.zeros(4), dt=0.1, steps=200)
+    motion = vp.simulate(both, np.zeros(4), np.zeros(4), dt=0.1, steps=200, integrator=vp.Midpoint())
     alone = vp.Scene(chain)
     jets = [vp.lagrangian_jet(alone, q[:3], v[:3]) for q, v in zip(motion.q, motion.v, strict=True)]
     energy = np.array([jet.Lv @ v[:3] - jet.L for jet, v in zip(jets, motion.v, strict=True)])
@@ -376,8 +402,12 @@ def test_a_constant_torque_is_guarded_like_a_potential(dt):
     """The same physics twice: springs slack at 1.5 rad, and springs slack at 0 and a torque."""
     chain, start = vp.planar_chain(3), (np.zeros(3), np.zeros(3))
     steps = int(200 / dt)
-    spring = vp.simulate(vp.Scene(chain, stiffness=20.0, rest=1.5), *start, dt=dt, steps=steps)
-    torque = vp.simulate(vp.Scene(chain, stiffness=20.0), *start, dt=dt, steps=steps, controls=np.full(3, 30.0))
+    spring = vp.simulate(
+        vp.Scene(chain, stiffness=20.0, rest=1.5), *start, dt=dt, steps=steps, integrator=vp.Midpoint()
+    )
+    torque = vp.simulate(
+        vp.Scene(chain, stiffness=20.0), *start, dt=dt, steps=steps, controls=np.full(3, 30.0), integrator=vp.Midpoint()
+    )
     for energy in (spring.energy, torque.energy - 30.0 * torque.q.sum(axis=1)):
         assert np.abs(energy - energy[0]).max() < 0.1 * GRAVITY * 9 / 2
     errors = np.abs(torque.energy - 30.0 * torque.q.sum(axis=1) - torque.energy[0])
@@ -392,7 +422,7 @@ def test_dampers_faster_than_the_step_are_reported(caplog):
     assert "damping is faster than the step" in caplog.text
     assert (np.diff(np.sign(motion.v[:, 0])) != 0).all()
     caplog.clear()
-    vp.simulate(vp.Scene(vp.planar_chain(1), damping=1.0), [0.0], [1.0], dt=0.1, steps=5)
+    vp.simulate(vp.Scene(vp.planar_chain(1), damping=1.0), [0.0], [1.0], dt=0.1, steps=5, integrator=vp.Midpoint())
     assert "damping" not in caplog.text
 
 

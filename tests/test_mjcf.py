@@ -84,6 +84,15 @@ FILES = {
     "two compilers": one(place='euler="10 20 30"').replace("<worldbody>", '<compiler angle="degree"/><worldbody>'),
     "full inertia": one('<inertial pos="0 0 1" mass="1" fullinertia="0.02 0.03 0.025 0.001 0.002 0.003"/>' + TIP),
     "shapes": one(f'{BOX}<geom type="capsule" size="0.05" fromto="0 0 0 0.1 0.2 0.3"/>{BALL} density="9"/>{TIP}'),
+    "shapes that nothing touches": one(f'{BALL} contype="0" conaffinity="0"/>{BOX}{TIP}'),
+    "shapes that nothing touches by default": one(
+        f'{BALL}/>{BOX}<geom type="cylinder" size="0.1" fromto="0 0 0 0.1 0.2 0.3"/>{TIP}',
+        default('<geom contype="0" conaffinity="0" density="300"/>'),
+    ),
+    "long shapes": one(
+        '<geom type="ellipsoid" size="0.1 0.2 0.05" quat="0.9 0.1 0.3 0"/><geom type="cylinder" size="0.1 0.2"/>'
+        '<geom type="box" size="0.05" fromto="0 0 0 0.1 0.2 0.3" mass="2"/><geom type="capsule" size="0.1 0.2"/>' + TIP
+    ),
     "shapes without mass": one(f'{BALL} mass="0"/><geom type="mesh" mesh="tet" density="0"/>{BOX}{TIP}', MESH),
     "shapes beside an inertia": one(MASS + BOX + '<geom type="mesh" mesh="tet"/>' + TIP, MESH),
     "shapes instead of an inertia": one(MASS + BOX + TIP, compiler='angle="radian" inertiafromgeom="true"'),
@@ -156,6 +165,8 @@ def test_shapes_and_locked_joints(tmp_path):
     [
         (one(joint=HINGE.format('stiffness="2"')), r"joint springs \(1\)"),
         (one(joint=HINGE.format('damping="2 0.5"')), r"nonlinear joint dampers \(1\)"),
+        (one(joint=HINGE.format('springdamper="0.1 1"')), r"springs and dampers by their time constant \(1\)"),
+        (one(MASS + TIP, '<option density="1.2" viscosity="0.01"/>'), r"forces of a fluid \(1\)"),
         (one(compiler='boundmass="0.1"'), r"least masses and inertias \(1\)"),
         (one(place='gravcomp="1"'), r"gravity compensation \(1\)"),
         (one(MASS + TIP, '<equality><joint joint1="ja" joint2="jtip"/></equality>'), r"equality constraints \(1\)"),
@@ -178,6 +189,8 @@ def test_what_is_left_out_is_told(tmp_path, caplog, text, words):
         ),
         (one(MASS + f'<replicate count="2">{TIP}</replicate>'), "has <replicate>, which Pinocchio does not read"),
         (one(FRAME.format(BOX) + TIP), "a <geom> in a <frame>"),
+        (one(f'{BALL} shellinertia="true"/>{TIP}'), "body 'a': its mass is on the surface of a shape"),
+        (one(compiler='coordinate="global"'), "its places are in world axes"),
         (one(compiler='settotalmass="10"'), "scaled by settotalmass"),
         (one(compiler='eulerseq="xy"', place=LEANING), "eulerseq is 'xy', where three of x, y and z belong"),
         (one(joint='<freejoint name="f"/>'), "joint 'f' is a JointModelFreeFlyer"),

@@ -125,3 +125,41 @@ def test_whole_motions_of_peers_are_the_exact_one(peers):
             assert motion.said == ""
             assert np.abs(motion.q - exact.q).max() < level, name
             assert np.abs(motion.v - exact.v).max() < 10.0 * level, name
+
+
+@pytest.mark.parametrize("kind", ["swing", "rows", "friction"])
+def test_peers_are_driven_alike(peers, case, kind):
+    """Torques that swing, that jump, and friction, against varpin's own forces and controls."""
+    rng, mild = np.random.default_rng(0), vp.Scene(case.scene.robot, damping=0.7)
+    case = dataclasses.replace(case, scene=mild)
+    scene, controls = case.scene, case.u
+    if kind == "rows":
+        controls = case.u + rng.uniform(-1.0, 1.0, (20, 6))
+        case = dataclasses.replace(case, u=controls)
+    else:
+        swing = rng.uniform(-1.0, 1.0, 6)
+        controls = vp.OpenLoop(lambda t: case.u + np.sin(20.0 * t) * swing)
+        case = dataclasses.replace(case, swing=swing, omega=20.0)
+    if kind == "friction":
+        case = dataclasses.replace(case, friction=np.full(6, 0.5), width=0.2)
+        scene = vp.Scene(scene.robot, damping=0.7, forces=[vp.CoulombFriction(0.5, 0.2)])
+    options = {"dt": 0.01, "steps": 20, "controls": controls, "integrator": vp.Gauss(5)}
+    exact = vp.simulate(scene, case.q0, case.v0, **options).q[-1]
+    np.testing.assert_allclose(peers.scipy_run(case, 1e-11)(), exact, rtol=0, atol=1e-8)
+    run = peers.mujoco_driven_run(case, 1e-4, "RK4")
+    if run is not None:
+        # Torques that change in time are held over a step there.
+        np.testing.assert_allclose(run(), exact, rtol=0, atol=1e-6)
+
+
+def test_servos_of_mujoco_are_the_springs_and_dampers_of_others(peers, case):
+    stiffness, damping, swing = np.full(6, 300.0), np.full(6, 10.0), np.full(6, 0.1)
+    springs = vp.Scene(case.scene.robot, stiffness=stiffness, damping=damping, rest=case.q0)
+    tracking = dataclasses.replace(case, scene=springs, u=np.zeros(6), swing=stiffness * swing, omega=20.0)
+    servos = vp.Scene(case.scene.robot, forces=[vp.PositionServo(stiffness, damping)])
+    goals = vp.OpenLoop(lambda t: case.q0 + np.sin(20.0 * t) * swing)
+    exact = vp.simulate(servos, case.q0, case.v0, dt=0.01, steps=20, controls=goals, integrator=vp.Gauss(5)).q[-1]
+    np.testing.assert_allclose(peers.scipy_run(tracking, 1e-11)(), exact, rtol=0, atol=1e-8)
+    run = peers.mujoco_driven_run(tracking, 1e-4, "RK4", (stiffness, damping, case.q0))
+    if run is not None:
+        np.testing.assert_allclose(run(), exact, rtol=0, atol=1e-6)

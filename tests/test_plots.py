@@ -272,3 +272,16 @@ def test_plotting_a_motion_imports_no_optimizer():
     found = "any(name.startswith(('varpin.control', 'varpin.study')) for name in sys.modules)"
     program = f"import sys, varpin.show.plots; sys.exit({found})"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_lines_of_many_joints_differ():
+    styles = [str(sorted(style.items())) for style in plots._styles(84)]
+    assert len(set(styles)) == 84
+
+
+def test_a_single_node_is_a_point():
+    chain = vp.planar_chain(2)
+    start = {"q0": [0.3, 0.1], "v0": [0.0, 0.0], "dt": 1e-2}
+    for steps, marker in ((0, "o"), (1, "None")):
+        _, axes = plots.plot_joints(vp.simulate(vp.Scene(chain), **start, steps=steps))
+        assert [line.get_marker() for line in axes.lines] == [marker] * 2

@@ -526,3 +526,63 @@ def test_titles_are_escaped(tmp_path):
     model.name = "<b>arm</b>"
     page = replay(vp.load_robot(model), [[0.0]], dt=1.0, html=tmp_path / "page.html").read_text()
     assert "<title>&lt;b&gt;arm&lt;/b&gt; - varpin</title>" in page
+
+
+@pytest.mark.parametrize("size", [(800, 640), (400, 700)])
+def test_all_of_the_motion_is_in_view_above_the_bar(browser, tmp_path, size):
+    robot = vp.load_robot("talos_arm")
+    q = np.linspace(-0.5, 0.5, 5)[:, None] * np.ones(robot.dof)
+    marks = {"targets": {"a place with a long name": [0.3, 0.5, 0.6]}, "frames": True}
+    browser.set_window_size(*size)
+    try:
+        visit(browser, replay(robot, q, dt=0.2, html=tmp_path / "view.html", **marks))
+        for seconds in (0.0, 0.4, 0.8):
+            seek(browser, seconds)
+            canvas, pane, low, high = browser.execute_script(
+                """
+                const camera = viewer.camera, Point = camera.position.constructor, pane = viewer.dom_element;
+                camera.updateMatrixWorld(true);
+                const low = [9, 9], high = [-9, -9];
+                viewer.scene_tree.find(["meshcat"]).object.traverse(node => {
+                    if (!node.isMesh && !node.isSprite) return;
+                    // A label is turned to the camera; its corners are half of its width and height from its place.
+                    const sides = [[-0.5, 0.5], [-0.5, 0.5], [0, 0]];
+                    const place = new Point().setFromMatrixPosition(node.matrixWorld);
+                    if (node.isMesh) {
+                        node.geometry.computeBoundingBox();
+                        const {min, max} = node.geometry.boundingBox;
+                        ["x", "y", "z"].forEach((axis, k) => { sides[k] = [min[axis], max[axis]]; });
+                    }
+                    for (const x of sides[0]) for (const y of sides[1]) for (const z of sides[2]) {
+                        const corner = node.isMesh
+                            ? new Point(x, y, z).applyMatrix4(node.matrixWorld)
+                            : new Point(x * node.scale.x, y * node.scale.y, 0)
+                                .applyQuaternion(camera.getWorldQuaternion(camera.quaternion.clone())).add(place);
+                        corner.project(camera);
+                        [corner.x, corner.y].forEach((value, k) => {
+                            low[k] = Math.min(low[k], value); high[k] = Math.max(high[k], value);
+                        });
+                    }
+                });
+                const canvas = viewer.renderer.domElement;
+                return [[canvas.clientWidth, canvas.clientHeight], [pane.clientWidth, pane.clientHeight], low, high];"""
+            )
+            assert canvas == pane
+            assert canvas[1] <= browser.execute_script(
+                "return innerHeight - document.getElementById('bar').offsetHeight"
+            )
+            assert min(low) > -1.0
+            assert max(high) < 1.0
+    finally:
+        browser.set_window_size(800, 600)
+    told = [entry["message"] for entry in browser.get_log("browser")]
+    assert not [words for words in told if "deprecated" in words]
+
+
+@pytest.mark.parametrize(("frequency", "told"), [(1.0, False), (40.0, True)])
+def test_a_long_motion_with_too_few_keyframes_is_said_to_be_one(finger, tmp_path, caplog, frequency, told):
+    t = np.linspace(0.0, 20.0, 20_001)
+    q = 0.5 + 0.3 * np.sin(frequency * t)[:, None] * np.ones(3)
+    with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
+        replay(finger, q, dt=1e-3, html=tmp_path / "long.html", max_frames=200)
+    assert ("20 s of motion are shown with 200 keyframes" in caplog.text) == told

@@ -584,12 +584,14 @@ def test_quadratic_convergence(sampling, hold):
     newton, gauss = swing(True, sampling=sampling, hold=hold), swing(False, sampling=sampling, hold=hold)
     assert newton.status is gauss.status is vp.Status.CONVERGED
     assert newton.cost == pytest.approx(gauss.cost, rel=1e-12)
-    assert newton.iterations <= 0.6 * gauss.iterations
     promised = np.log([item.expected_decrease / newton.cost for item in newton.history])
     assert promised[-1] < np.log(1e-15)
     assert promised[-1] / promised[-2] > 1.6
     linear = np.log([item.expected_decrease / gauss.cost for item in gauss.history])
     assert linear[-1] / linear[-2] < 1.1
+    # Far from the optimum both go alike; it is near it that Newton's method takes fewer iterations.
+    near = np.log(1e-3)
+    assert (promised < near).sum() <= 0.6 * (linear < near).sum()
     np.testing.assert_allclose(newton.controls, gauss.controls, rtol=0, atol=1e-5 * np.abs(gauss.controls).max())
 
 

@@ -411,7 +411,7 @@ def test_a_short_blow_in_a_long_quiet_motion_is_found():
 def test_friction_takes_of_the_errors_of_the_energy_too():
     """What the balance of a damped pendulum is off by on its way fades with what is left of its motion."""
     scene = vp.Scene(ROD, damping=0.3)
-    motion = vp.simulate(scene, [0.0], [0.0], dt=0.05, steps=300)
+    motion = vp.simulate(scene, [0.0], [0.0], dt=0.05, steps=300, integrator=vp.Midpoint())
     assert motion.statistics.split_steps == 0
     off = np.abs(motion.statistics.energy_defect)
     assert off.max() > 1e-3
@@ -556,3 +556,95 @@ def test_many_motions_of_an_explicit_method_at_once(integrator):
         motion = vp.simulate(scene, q0[i], v0[i], dt=0.02, steps=4, controls=drift[i], integrator=integrator)
         np.testing.assert_array_equal(q[i], motion.q[1:])
         np.testing.assert_array_equal(v[i], motion.v[1:])
+
+
+def fields(n, by_controls, rng):
+    """Noise of n processes across the joints, and more that grows with the controls."""
+    return vp.AdditiveNoise(0.1 * rng.normal(size=(n, n))) + (
+        vp.ControlNoise(0.1) if by_controls else vp.StateNoise(0.2)
+    )
+
+
+@pytest.mark.parametrize("by_controls", [False, True], ids=["state", "control"])
+@pytest.mark.parametrize("kick", ["left", "split"])
+def test_impulses_by_hand_are_those_of_the_noise(kick, by_controls):
+    """Jumps of the momenta before and after each step make the motion that the noise made, step by step."""
+    rng, n, steps = np.random.default_rng(8), 3, 12
+    scene = vp.Scene(vp.planar_chain(n), damping=0.1, noise=fields(n, by_controls, rng))
+    u = rng.normal(size=(steps, n))
+    start = rng.normal(size=(1, n)), rng.normal(size=(1, n))
+    for integrator in (vp.Midpoint(kick=kick), vp.Gauss(2, kick=kick), vp.RungeKutta4(), vp.SemiImplicitEuler()):
+        left = integrator.left
+        motion = vp.simulate(
+            scene, start[0][0], start[1][0], dt=0.01, steps=steps, controls=u, integrator=integrator, rng=2, check=False
+        )
+        jumps = np.empty((1, steps, 2, n))
+        for k, (share, node) in enumerate(((left, motion.q[:-1]), (1.0 - left, motion.q[1:]))):
+            F = scene.noise.fields(node, np.zeros_like(node), u, motion.q[0]).F
+            jumps[0, :, k] = share * np.einsum("Nik,Nk->Ni", F, motion.dw)
+        q, v = integrator.motions(scene, *start, open_loop(u), np.zeros((0, 0, n)), 0.01, jumps)
+        np.testing.assert_allclose(q[0], motion.q[1:], rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(v[0], motion.v[1:], rtol=0.0, atol=1e-11)
+
+
+@pytest.mark.parametrize("controls", ["held", "changing", "none"])
+@pytest.mark.parametrize(
+    "integrator",
+    [vp.Midpoint(), vp.Midpoint(kick="split"), vp.Gauss(2), vp.Radau(2), vp.RungeKutta4(), vp.ExplicitEuler()],
+    ids=str,
+)
+def test_noisy_motions_pass_where_smaller_steps_under_the_same_kicks_agree(integrator, controls):
+    """And not where they do not; the kicks of a step come at its ends, whatever parts it is taken in."""
+    rng = np.random.default_rng(4)
+    scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=fields(2, controls != "none", rng))
+    start, left = ([0.3, 0.2], [0.5, 0.0]), 0.0 if integrator == vp.ExplicitEuler() else integrator.left
+    passed = []
+    for dt in (0.2, 0.02, 0.002):
+        steps = max(40, round(0.5 / dt))
+        u = {"none": np.zeros((steps, 2)), "held": np.full((steps, 2), 0.3), "changing": rng.normal(size=(steps, 2))}
+        given = {"controls": u[controls], "check": False}
+        try:
+            motion = vp.simulate(scene, *start, dt=dt, steps=steps, integrator=integrator, rng=3, **given)
+        except vp.StepFailure:
+            continue
+        if not resolved(scene, integrator, motion):
+            continue
+        passed.append(dt)
+        q, v = (np.array([x]) for x in start)
+        off = 0.0
+        for k in range(steps):
+            ends = np.zeros((1, 16, 2, 2))
+            at = motion.q[k : k + 1], motion.v[k : k + 1], motion.u[k : k + 1], motion.q[0]
+            ends[0, 0, 0] = left * scene.noise.fields(*at).F[0] @ motion.dw[k]
+            at = motion.q[k + 1 : k + 2], *at[1:]
+            ends[0, -1, 1] = (1.0 - left) * scene.noise.fields(*at).F[0] @ motion.dw[k]
+            parts = open_loop(np.repeat(motion.u[k : k + 1], 16, axis=0))
+            fine = vp.Gauss(3).motions(scene, q, v, parts, np.zeros((0, 0, 2)), dt / 16, ends)
+            q, v = fine[0][:, -1], fine[1][:, -1]
+            off = max(off, np.abs((q[0] - motion.q[k + 1]) / np.ptp(motion.q, axis=0)).max())
+        assert off < WRONG_POSITION
+    assert 0.2 not in passed
+    assert 0.002 in passed or integrator.order == 1
+
+
+def test_the_look_at_a_noisy_motion_takes_less_than_the_motion(evaluations):
+    scene = vp.Scene(vp.planar_chain(3), noise=vp.AdditiveNoise(1e-2))
+    motion = vp.simulate(scene, np.full(3, 0.4), np.zeros(3), dt=1e-3, steps=2000, rng=0, check=False)
+    evaluations()
+    assert examined(scene, vp.Midpoint(), motion)[1] == ()
+    assert evaluations() <= 0.75 * int((motion.statistics.jets + motion.statistics.sweeps).sum())
+
+
+@pytest.mark.parametrize(("dt", "steps"), [(1e-3, 100), (1e-2, 100)])
+def test_rounding_of_joints_that_a_falling_lift_carries_is_no_motion(dt, steps):
+    """They have no weight in its fall, and stay where they are."""
+    model, joint = pin.Model(), 0
+    for kind in (pin.JointModelPZ(), pin.JointModelRX(), pin.JointModelRY(), pin.JointModelRZ()):
+        joint = model.addJoint(joint, kind, pin.SE3(np.eye(3), np.array([0.1, 0.2, 0.3])), f"joint{joint}")
+        inertia = pin.Inertia(20.0 / 3.0**joint, np.array([0.05, 0.1, 0.07]), np.diag([0.01, 0.02, 0.015]))
+        model.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
+    scene, q = vp.Scene(vp.load_robot(model)), np.array([0.0, 0.3, -0.8, 0.5])
+    motion = vp.simulate(scene, q, np.zeros(4), dt=dt, steps=steps)
+    assert motion.q[-1, 0] == pytest.approx(-0.5 * 9.81 * (dt * steps) ** 2, rel=1e-9)
+    assert 0.0 < np.abs(motion.v[:, 1:]).max() < 1e-12
+    assert motion.warnings == ()

@@ -190,7 +190,8 @@ def test_parts_are_kept_however_a_motion_is_made():
     scene, motion = moving("finger", integrator, 1)
     expected = motion.statistics
     start, options = (motion.q[0], motion.v[0]), {"dt": motion.dt, "steps": motion.steps, "check": False}
-    by_law = vp.simulate(scene, *start, controls=lambda t, q, v: motion.u[round(t / motion.dt)], **options)
+    law = {"controls": lambda t, q, v: motion.u[round(t / motion.dt)], "integrator": integrator}
+    by_law = vp.simulate(scene, *start, **law, **options)
     np.testing.assert_array_equal(by_law.statistics.halvings, expected.halvings)
     state, _ = integrator.start(scene, np.array([motion.q[0], np.zeros(3)]), np.array([motion.v[0], np.zeros(3)]))
     for now in (slice(0, 5), slice(5, 8)):

@@ -88,6 +88,7 @@ from varpin.simulation.run import StepFailure as StepFailure
 from varpin.simulation.run import ToleranceError as ToleranceError
 from varpin.simulation.run import simulate as simulate
 from varpin.trajectory import Accuracy as Accuracy
+from varpin.trajectory import Nodes as Nodes
 from varpin.trajectory import StepStatistics as StepStatistics
 from varpin.trajectory import Trajectory as Trajectory
 
@@ -153,11 +154,12 @@ if TYPE_CHECKING:
     from varpin.linearization import propagate_moments as propagate_moments
     from varpin.linearization import second_order as second_order
     from varpin.model.clearance import Obstacle as Obstacle
-    from varpin.show.inspection import FrameReport as FrameReport
-    from varpin.show.inspection import JointReport as JointReport
-    from varpin.show.inspection import LinkReport as LinkReport
-    from varpin.show.inspection import RobotReport as RobotReport
     from varpin.show.inspection import inspect_robot as inspect_robot
+    from varpin.show.inspection_report import FrameReport as FrameReport
+    from varpin.show.inspection_report import JointReport as JointReport
+    from varpin.show.inspection_report import LinkReport as LinkReport
+    from varpin.show.inspection_report import RobotReport as RobotReport
+    from varpin.show.replay.live import LiveView as LiveView
     from varpin.study.extremes import check_robot as check_robot
     from varpin.study.linearization_check import LinearizationCheck as LinearizationCheck
     from varpin.study.linearization_check import check_linearization as check_linearization
@@ -207,7 +209,9 @@ _LATE: dict[str, tuple[str, ...]] = {
     ),
     "varpin.model.clearance": ("Obstacle",),
     "varpin.ensemble": ("Ensemble", "EnsembleInterrupted", "EnsembleStatistics", "PathFailure", "simulate_ensemble"),
-    "varpin.show.inspection": ("FrameReport", "JointReport", "LinkReport", "RobotReport", "inspect_robot"),
+    "varpin.show.inspection": ("inspect_robot",),
+    "varpin.show.inspection_report": ("FrameReport", "JointReport", "LinkReport", "RobotReport"),
+    "varpin.show.replay.live": ("LiveView",),
     "varpin.linearization": ("Curvature", "Linearization", "Moments", "linearize", "propagate_moments", "second_order"),
     "varpin.study.extremes": ("check_robot",),
     "varpin.study.linearization_check": ("LinearizationCheck", "check_linearization"),

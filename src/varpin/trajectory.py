@@ -165,6 +165,21 @@ class Accuracy:
 
 
 @dataclass(frozen=True, eq=False)
+class Nodes:
+    """A stretch of a motion while it is computed, as :func:`varpin.simulate` hands it to a ``progress`` function.
+
+    Attributes:
+        t: Times (k,) [s].
+        q: Configurations (k, n) [rad or m].
+        v: Velocities (k, n) [rad/s or m/s].
+    """
+
+    t: Floats
+    q: Floats
+    v: Floats
+
+
+@dataclass(frozen=True, eq=False)
 class Trajectory(Frozen):
     """A motion over N steps and N + 1 nodes.
 

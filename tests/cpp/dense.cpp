@@ -96,5 +96,10 @@ int main() {
         std::copy(singular, singular + 4, lu);
         expect(varpin::factor_lu_pivoting(lu, 2, order) == 0, "a singular matrix has no sign");
     }
+    {
+        const double nan = std::numeric_limits<double>::quiet_NaN();
+        expect(varpin::larger(2.0, 1.0) == 2.0 && varpin::larger(1.0, 2.0) == 2.0, "larger");
+        expect(std::isnan(varpin::larger(nan, 1.0)) && std::isnan(varpin::larger(1.0, nan)), "larger of NaN");
+    }
     return failures;
 }

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cstdint>
+#include <optional>
 #include <span>
 #include <stdexcept>
 #include <string>
@@ -153,6 +154,14 @@ inline const double* increments_of(const Mechanism& mechanism, const In<3>& incr
 inline const double* drift_of(const Mechanism& mechanism, const In<3>& drift, const NodeArrays& nodes) {
     const auto n = static_cast<std::size_t>(mechanism.dof());
     return given(drift, "drift", {nodes.paths(), nodes.steps(), n}) ? drift.data() : nullptr;
+}
+
+// Impulses before and after each step of each path (P, N, 2, n), or null for none.
+inline const double* impulses_of(const Mechanism& mechanism, const std::optional<In<4>>& impulses, nb::handle nodes) {
+    if (!impulses) return nullptr;
+    const NodeArrays to(mechanism, nodes);
+    require(*impulses, "impulses", {to.paths(), to.steps(), 2, static_cast<std::size_t>(mechanism.dof())});
+    return impulses->data();
 }
 
 // Roll `paths` paths by the commands into the nodes: move(commands, increments, drift, nodes) without the interpreter's

@@ -1,7 +1,9 @@
 // Rollouts of the variational integrators, and the derivatives of their steps.
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
 #include <memory>
+#include <optional>
 #include <tuple>
 #include <vector>
 
@@ -56,11 +58,13 @@ class VariationalRollout : public Rollout<Stepping, PathState> {
 
     VariationalRollout fork(const Guards& guards) const { return forked(*this, guards); }
 
-    void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes, HeldWatch* watch) {
+    void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes, HeldWatch* watch,
+              const std::optional<In<4>>& impulses) {
+        const double* kicks = impulses_of(*mechanism_, impulses, nodes);
         roll_paths(*mechanism_, states_.size(), stages_, commands, increments, drift, nodes,
                    [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
                        Watch* watching = watch ? watch->of(to) : nullptr;
-                       stepping_->roll(guards_, h, by, dw, more, states_, to, watching);
+                       stepping_->roll(guards_, h, by, dw, more, kicks, states_, to, watching);
                    });
     }
 };
@@ -129,7 +133,7 @@ void register_rollouts(nb::module_& m) {
         .def("fork", &VariationalRollout::fork, "guards"_a, nb::keep_alive<0, 1>())
         .def("begin", &VariationalRollout::begin, "q"_a, "v"_a)
         .def("roll", &VariationalRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a,
-             "watch"_a.none() = nb::none())
+             "watch"_a.none() = nb::none(), "impulses"_a = nb::none())
         .def("kick", &VariationalRollout::kick, "impulse"_a)
         .def("nodes", &VariationalRollout::nodes)
         .def("halvings", &VariationalRollout::halvings, "path"_a);

@@ -16,7 +16,8 @@ struct Stepping {
     virtual bool begin(const double* q, const double* v, PathState& state) = 0;
     virtual void kick(const double* impulse, PathState& state) = 0;
     virtual void roll(const Guards& guards, double h, const Commands& commands, const double* increments,
-                      const double* drift, std::vector<PathState>& states, const Nodes& nodes, Watch* watch) = 0;
+                      const double* drift, const double* impulses, std::vector<PathState>& states, const Nodes& nodes,
+                      Watch* watch) = 0;
 };
 
 struct Differentiation {
@@ -40,9 +41,9 @@ struct SteppingOf final : Stepping {
         core.kick(impulse, state);
     }
     void roll(const Guards& guards, double h, const Commands& commands, const double* increments, const double* drift,
-              std::vector<PathState>& states, const Nodes& nodes, Watch* watch) override {
+              const double* impulses, std::vector<PathState>& states, const Nodes& nodes, Watch* watch) override {
         core.guards = guards;
-        core.roll(h, commands, increments, drift, states, nodes, watch);
+        core.roll(h, commands, increments, drift, impulses, states, nodes, watch);
     }
 };
 

@@ -97,12 +97,14 @@ def add_integrator(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--integrator",
         metavar="NAME",
-        help=f"{', '.join(BY_NAME)}; with options as Python writes them, 'Gauss(stages=3)'; default: Midpoint, "
-        "or Radau(stages=3) where dampers are faster than the step",
+        help=f"{', '.join(BY_NAME)}; with options as Python writes them, 'Gauss(stages=3)'; default: Gauss(stages=2), "
+        "with 4 where springs are fast for the step, or Radau(stages=4) where dampers are faster than it",
     )
-    group.add_argument("--stages", type=int, metavar="N", help="of Gauss: 1 to 6, of order twice as many; default: 2")
     group.add_argument(
-        "--alpha", type=float, metavar="A", help="of Midpoint, in [0, 1]: of second order at 0.5, the default"
+        "--stages", type=int, metavar="N", help="of Gauss, which it asks for: 1 to 6, of order twice as many"
+    )
+    group.add_argument(
+        "--alpha", type=float, metavar="A", help="of Midpoint, which it asks for, in [0, 1]: of second order at 0.5"
     )
 
 
@@ -112,7 +114,9 @@ def integrator_asked_for(request: argparse.Namespace) -> Integrator:
     Raises:
         InputError: An unknown name, or an option that it does not have.
     """
-    text = (request.integrator or "Midpoint").strip()
+    # An option by itself asks for who has it.
+    usual = "Gauss" if request.alpha is None else "Midpoint"
+    text = (request.integrator or usual).strip()
     name, bracket, rest = text.partition("(")
     # runge_kutta_4, RUNGEKUTTA4 and semi-implicit-euler are as good as the names of the classes.
     plain = {_letters(member): member for member in BY_NAME}

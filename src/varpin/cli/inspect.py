@@ -22,7 +22,7 @@ from varpin.cli.arguments import (
 from varpin.cli.console import say
 from varpin.model import build_robot, robot_names
 from varpin.show.inspection import inspect_robot
-from varpin.show.inspection_tables import parts_of
+from varpin.show.inspection_report import parts_of
 from varpin.support.tables import WIDTH, add_row, facts, table_of
 
 

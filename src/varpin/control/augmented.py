@@ -102,14 +102,13 @@ class _Rounds:
         self.problem, self.search, self.bound = problem, search, problem.bound_constraints
         self.options = dict(options)
         self.check = bool(self.options.pop("check", True))
-        self.callback = self.options.pop("callback", None)
         self.progress = self.options.pop("progress", None)
         self.controls = self.options.pop("controls", None)
         self.resumed: Solution | None = self.options.pop("resume", None)
         self.tolerance = self.options.pop("tolerance", 1e-7)
         self.most = count("max_iterations", self.options.pop("max_iterations", _MOST_ITERATIONS))
         self.limit = checked_time(self.options.pop("time_limit", np.inf))
-        require_reports(self.callback, self.progress)
+        self.tell = require_reports(self.options.pop("callback", None), self.progress)
         self.label = f"{problem.scene.robot.name}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
         self.history: list[Iteration] = []
         self.noisy = bool(problem.scene.processes) and any(item.source.margin > 0.0 for item in self.bound)
@@ -211,10 +210,9 @@ class _Rounds:
         own = [replace(item, index=item.index - begun) for item in resumed.search.history[begun:]]
         return replace(resumed, search=replace(resumed.search, history=tuple(own)))
 
-    def _report(self, known: int, last: int, item: Iteration) -> None:
+    def _report(self, known: int, last: int, item: Iteration, motion: Trajectory) -> None:
         item = replace(item, index=item.index + known)
-        if self.callback is not None:
-            self.callback(item)
+        self.tell(item, motion)
         if self.progress is not None:
             self.progress(min(item.index + 1, last), last)
 
@@ -298,7 +296,8 @@ class _Rounds:
             first_weights=begun.first_weights,
             backoff=backoff,
             worst=violation,
-            tolerance=begun.tolerance if exact else max(_FINAL * self.tolerance, _TIGHTER * begun.tolerance),
+            # While a violation stays, whether it falls at all is to be found out, and not the optimum to many digits.
+            tolerance=begun.tolerance if exact or stays else max(_FINAL * self.tolerance, _TIGHTER * begun.tolerance),
             round=begun.round + 1,
             stuck=stuck,
         )

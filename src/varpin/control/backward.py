@@ -34,8 +34,8 @@ Mask = NDArray[np.bool_]
 # Nodes that are linearized at a time: their derivatives are not kept.
 _BLOCK = 2048
 
-# Passes that look for the constraints that their motion meets.
-_FORESEEN, _BISECTIONS = 60, 40
+# Of the way from one pass to the next.
+_BISECTIONS = 40
 
 # A pass whose Quu rounding may have changed by more than this part is made anew on square roots.
 TRUSTED = 1e-9
@@ -171,14 +171,14 @@ def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -
     A penalty is zero up to its bound and a parabola beyond. Around the nominal motion alone it pulls back what is
     beyond, and knows nothing of what the step brings there. So passes are made until the rows that count are those that
     their linearized motion meets: Newton steps to the minimum of the piecewise quadratic model, each as long as lowers
-    it most. Where they do not settle, the best pass of them is taken.
+    it most. Where they do not settle, the best pass of them is taken, or the place that the steps have come to.
     """
     problem = along.problem
     if not isinstance(problem, PenalizedProblem) or len(along.blocks) > 1:
         return _within_limits(along, regularization, curvature)
     rows = _Rows(along, problem)
-    held, best, least = rows.begun, None, 0.0
-    for _ in range(_FORESEEN):
+    held, best, least, last = rows.begun, None, 0.0, None
+    for _ in range(problem.passes):
         passing = rows.along(held)
         plan = _within_limits(passing, regularization, curvature)
         if plan is None:
@@ -190,8 +190,11 @@ def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -
         met = [penalty.held(s) for penalty, s in zip(rows.penalties, ahead, strict=True)]
         if all(np.array_equal(a, b) for a, b in zip(met, held, strict=True)):
             break
-        rows.move(plan, held, ahead)
-        held = [penalty.held(s) for penalty, s in zip(rows.penalties, rows.at, strict=True)]
+        rows.move(plan, held, ahead, slope)
+        held, last = [penalty.held(s) for penalty, s in zip(rows.penalties, rows.at, strict=True)], plan
+    else:
+        if last is not None and rows.slope < 0.0 and rows.lowered < least:
+            best = rows.there(last)
     if best is None:
         return _within_limits(along, regularization, curvature)
     return replace(best, model=along.model)
@@ -214,6 +217,9 @@ class _Rows:
         self.jacobians = [item.bound.jacobian(q, v) for item in self.of_nodes]
         # Where the steps to the model's minimum have come to: the rows there, and the cost without penalties.
         self.at, self.cost = self.signed, 0.0
+        # The controls and states there, and the model's slope from its start in that direction.
+        self.moves = np.zeros((problem.decisions, u.shape[1]))
+        self.states, self.slope = np.zeros((len(q), 2 * q.shape[1])), 0.0
         # d(q, v)/dx at the nodes.
         n = problem.scene.robot.dof
         slopes = np.tile(np.eye(2 * n), (len(q), 1, 1))
@@ -247,6 +253,7 @@ class _Rows:
                     move = move + plan.previous[k] @ moves[k - 1]
                 moves[k] = np.clip(move, slack[k, 0], slack[k, 1]) if slack.size else move
             states[j + 1] = lin.A[j] @ states[j] + lin.B[j] @ moves[k]
+        self.ahead_of = states, moves
         found = [
             s + np.einsum("krx,kx->kr", J, states[item.bound.places])
             for item, s, J in zip(self.of_nodes, self.signed[: len(self.of_nodes)], self.by_state, strict=True)
@@ -258,8 +265,11 @@ class _Rows:
             found.append(s + np.concatenate([rate, -rate], axis=1))
         return found
 
-    def move(self, plan: Plan, held: list[Mask], ahead: list[Floats]) -> None:
-        """Go on towards the minimum ``ahead`` of the model in which ``held`` rows count, as far as lowers it most."""
+    def move(self, plan: Plan, held: list[Mask], ahead: list[Floats], along: float) -> None:
+        """Go on towards the minimum ``ahead`` of the model in which ``held`` rows count, as far as lowers it most.
+
+        ``along`` is the slope of the model at its start towards there.
+        """
         at, to = flat(self.at), flat(ahead)
         counts = np.concatenate([rows.ravel() for rows in held])
         weights = np.concatenate(
@@ -285,6 +295,26 @@ class _Rows:
             low, high = (middle, high) if slope(middle) <= 0.0 else (low, middle)
         self.at = [a + low * (b - a) for a, b in zip(self.at, ahead, strict=True)]
         self.cost = least + (1.0 - low) ** 2 * gap - 0.5 * float(of_held @ (at + low * way) ** 2)
+        states, moves = self.ahead_of
+        self.states, self.moves = self.states + low * (states - self.states), self.moves + low * (moves - self.moves)
+        self.slope += low * (along - self.slope)
+
+    @property
+    def lowered(self) -> float:
+        """By what the model has changed where the steps have come to, below zero where it is lower."""
+        total = self.cost
+        for item, s, now, t in zip(self.penalties, self.signed, self.begun, self.at, strict=True):
+            total += 0.5 * item.weight * float((t[item.held(t)] ** 2).sum() - (s[now] ** 2).sum())
+        return total
+
+    def there(self, plan: Plan) -> Plan:
+        """A plan to where the steps have come to, with the feedback of another."""
+        at = self.states[: -1 : self.problem.hold]
+        ahead = self.moves - np.einsum("kmx,kx->km", plan.feedback, at)
+        if plan.previous is not None:
+            ahead[1:] -= np.einsum("kmi,ki->km", plan.previous[1:], self.moves[:-1])
+        curvature = 2.0 * (self.lowered - self.slope)
+        return replace(plan, feedforward=ahead, slope=self.slope, curvature=curvature, limited=True)
 
     def change(self, plan: Plan, held: list[Mask], ahead: list[Floats]) -> tuple[float, float]:
         """By what the piecewise model changes over a plan's whole step, and its slope at the start."""

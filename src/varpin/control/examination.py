@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import ITERATIONS, Status
-from varpin.control.multipliers import FEASIBLE
+from varpin.control.multipliers import FEASIBLE, TOLD
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
 from varpin.control.verification import accurate_cost, percent
@@ -33,8 +33,6 @@ LOSS, GAIN = 1e-3, 1e-2
 _OF_STEPS = ("coarse steps", "fast damping", "fast friction", "split steps")
 # Of its cost, what a search that stalls may still promise without a word.
 _LITTLE = 1e-3
-# Of a tenth of a constraint's range, what it may be violated by between nodes without a word.
-_BETWEEN = 1e-2
 _ALTERNATION, _RESTLESS = "alternating velocities", "restless velocities"
 
 
@@ -180,7 +178,7 @@ def starts_outside(problem: OptimalControlProblem) -> list[Finding]:
         if c is None:
             continue
         row = int(np.argmax(c))
-        if c[row] > _BETWEEN * bound.scale:
+        if c[row] > TOLD * bound.scale:
             found.append(
                 Finding(
                     "start outside constraints",
@@ -249,7 +247,7 @@ def _between(solution: Solution) -> list[Finding]:
             # What begins outside is so until the first node.
             c[: PARTS - 1, outside > 0.0] = -np.inf
         place, row = np.unravel_index(int(np.argmax(c)), c.shape)
-        if c[place, row] > _BETWEEN * bound.scale:
+        if c[place, row] > TOLD * bound.scale:
             found.append(
                 Finding(
                     "constraints between nodes",

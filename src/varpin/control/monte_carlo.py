@@ -15,17 +15,8 @@ from numpy.typing import NDArray
 from varpin.control.costs import CostSum
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.verification import excess, percent
-from varpin.ensemble import (
-    Extremes,
-    Shared,
-    Task,
-    chunks,
-    greater,
-    looked_at,
-    looked_at_here,
-    simulate_paths,
-    without_geometry,
-)
+from varpin.ensemble.looks import greater, looked_at, looked_at_here
+from varpin.ensemble.paths import Extremes, Shared, Task, chunks, simulate_paths, without_geometry
 from varpin.errors import InputError, VarpinError
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.wiener import Children, children

@@ -4,27 +4,28 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.control import OptimalControlProblem, Solution, looked_at, replan, solve
+from varpin.control import Kept, OptimalControlProblem, Solution, kept, looked_at, replan, solve
 from varpin.control.costs import CostError
+from varpin.control.history import Status
 from varpin.errors import InputError
 from varpin.integrators import Gauss, Integrator
 from varpin.integrators.base import Failure
 from varpin.mechanics.scene import Scene, refuse_inputs, require_scene
 from varpin.simulation.chatter import alternation
 from varpin.simulation.loop_stability import examined_in_loop
-from varpin.simulation.run import Interrupted, StepFailure, noise_forgotten, simulate
+from varpin.simulation.run import Interrupted, Progress, StepFailure, noise_forgotten, simulate
 from varpin.simulation.soundness import Finding, announce, evident, with_warnings
-from varpin.support.checks import JointValues, control_values, count, positive, real
+from varpin.support.checks import JointValues, control_values, count, positive, real, told_motion
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, warning_count
-from varpin.trajectory import Trajectory, chained
+from varpin.trajectory import Nodes, Trajectory, chained
 
 Floats = NDArray[np.float64]
 
@@ -68,9 +69,11 @@ class MpcRun(Frozen):
         late: Ticks whose plan came after its budget (K,); the plan of the tick before acted on.
         period: Of the ticks [s].
         budget: For planning in a tick [s]; infinite for any.
+        constraints: How plans and motion kept to each of the problem's constraints.
         warnings: What looks wrong with the first plan, unless it does with the plant's motion, too; with that motion,
             as in :attr:`Trajectory.warnings`, and its velocities from tick to tick; and whether planning took longer
-            than the period, or than the budget, in more than one tick of twenty, which depends on the machine.
+            than the period, or than the budget, in more than one tick of twenty, which depends on the machine. Of
+            constraints, where the plant's motion violated them, and how many ticks found no plan within them.
     """
 
     motion: Trajectory
@@ -80,7 +83,13 @@ class MpcRun(Frozen):
     late: NDArray[np.bool_]
     period: float
     budget: float
+    constraints: tuple[Kept, ...] = ()
     warnings: tuple[str, ...] = ()
+
+    @property
+    def infeasible(self) -> int:
+        """In how many ticks no plan was found that keeps to the constraints."""
+        return sum(plan.status is Status.INFEASIBLE for plan in self.plans)
 
     def planned(self, ahead: float | None = None) -> Floats:
         """Where the plans mean to be some time later: configurations (K + 1, n) [rad or m].
@@ -134,6 +143,7 @@ class MpcRun(Frozen):
             ("planning took", self._planning),
             ("late", self._within),
             ("plant", self.motion),
+            *(("constraint", told) for told in self.constraints),
             *(("warning", sentence) for sentence in self.warnings),
         ]
         return facts(f"Run of a controller of {self.motion.robot}", rows)
@@ -141,7 +151,8 @@ class MpcRun(Frozen):
     def __str__(self) -> str:
         ticks = f"{len(self.plans)} ticks of {1e3 * self.period:.3g} ms"
         told = f"{ticks}: planning took {self._planning}; {self._within}"
-        return "\n".join([told, *(f"warning: {sentence}" for sentence in self.warnings)])
+        warned = (f"warning: {sentence}" for sentence in self.warnings)
+        return "\n".join([told, *map(str, self.constraints), *warned])
 
 
 @dataclass(frozen=True)
@@ -152,9 +163,15 @@ class Mpc:
     those of the plant: the horizon recedes. Where changes of controls cost something, each plan goes on from the
     control that acted last.
 
+    Constraints of the problem hold along every horizon, with obstacles that move where they will be. Multipliers go on
+    from tick to tick, moved on with the plan, and each iteration of a tick is one of the augmented Lagrangian: a plan
+    keeps to its constraints to the accuracy that so few iterations give, which ``MpcRun.constraints`` has for every
+    tick. A goal (:class:`ReachFrame`) is that of the end of every horizon. Limits of the controls' rate go on from the
+    control that acted last. What a margin comes to is that of the first plan.
+
     Main args:
-        problem: The problem; its horizon, discretization, noise and limits are those of every tick, its initial state
-            and ``t0`` those of the first.
+        problem: The problem; its horizon, discretization, noise, limits and constraints are those of every tick, its
+            initial state and ``t0`` those of the first.
         iterations: Of S-DDP in a tick, at most.
 
     Other Args:
@@ -177,11 +194,6 @@ class Mpc:
             raise InputError(f"problem must be an OptimalControlProblem, got {type(self.problem).__name__}")
         if self.problem.linear:
             raise InputError("Mpc decides on controls that are held: the problem's are linear between nodes")
-        if self.problem.constraints:
-            raise InputError(
-                "Mpc has no time for the rounds of hard constraints, and would leave them out: make them costs "
-                "(JointLimitBarrier, VelocityLimitBarrier, CustomCost), or plan with varpin.solve and follow the plan"
-            )
         count("iterations", self.iterations, least=1)
         count("first_iterations", self.first_iterations, least=1)
         positive("tolerance", self.tolerance, "1")
@@ -221,7 +233,8 @@ class Mpc:
             v: (n,) or by joint name [rad/s or m/s].
             previous: The plan to start from; None in the first tick.
             decisions: How many decisions ago it was made.
-            before: The control applied last, (m,) or by joint name, where changes of controls cost something. Left out,
+            before: The control applied last, (m,) or by joint name, where changes of controls cost something or have a
+                limit. Left out,
                 what ``previous`` meant to apply, and in the first tick what the problem says.
 
         Raises:
@@ -232,8 +245,8 @@ class Mpc:
         scene = self.problem.scene
         if before is not None:
             before = control_values("before", before, scene.control_joints, scene.controls)
-        elif self.problem.rate and previous is not None and previous.problem.rate:
-            before = previous.problem.rate.before
+        elif self.problem.remembers and previous is not None:
+            before = previous.problem.before
             if decisions > 0:
                 before = previous.controls[min(decisions, len(previous.controls)) - 1]
         problem = self.problem.at(q0=q, v0=v, t0=t, before=before)
@@ -260,7 +273,7 @@ class Mpc:
         *,
         duration: float,
         rng: np.random.Generator | int | None = None,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Progress | None = None,
     ) -> MpcRun:
         """Control a simulated plant from the problem's initial state.
 
@@ -273,7 +286,8 @@ class Mpc:
             rng: Generator or seed of the plant's noise; without it there is none, of which a noisy plant has a warning.
 
         Other Args:
-            progress: Called with (ticks done, ticks in all).
+            progress: Called with (ticks done, ticks in all). A function that needs three arguments gets the plant's
+                motion in the last tick, too, a :class:`varpin.Nodes`; as :class:`varpin.LiveView` does.
 
         Raises:
             InputError: A plant with other controls or joints.
@@ -283,6 +297,8 @@ class Mpc:
             Interrupted: Ctrl-C; holds the plant's motion so far.
         """
         problem = self.problem
+        tell: Any = progress
+        moving = told_motion("progress", progress, "ticks done, ticks in all", "nodes")
         plant = Plant(problem.scene) if plant is None else plant
         if not isinstance(plant, Plant):
             raise InputError(f"plant must be a varpin.Plant, for example varpin.Plant(scene), got {plant!r}")
@@ -301,7 +317,7 @@ class Mpc:
         dt = self.period / plant.substeps
         generator = None if rng is None else np.random.default_rng(rng)
         q, v = problem.q0, problem.v0
-        before = None if problem.rate is None else problem.rate.before
+        before = problem.before
         (active, of_plan), age = self._first_plan(problem), 0
         parts: list[Trajectory] = []
         plans, seconds, iterations, late = [], np.zeros(ticks), np.zeros(ticks, dtype=np.int64), np.zeros(ticks, bool)
@@ -323,9 +339,11 @@ class Mpc:
                 u = _decision(active, age, q, v, before)
                 parts.append(_simulated(plant, dt, q, v, u, generator, parts))
                 q, v = parts[-1].q[-1], parts[-1].v[-1]
-                before = None if problem.rate is None else u
-                if progress is not None:
-                    progress(tick + 1, ticks)
+                before = u if problem.remembers else None
+                if moving:
+                    tell(tick + 1, ticks, Nodes(tick * self.period + parts[-1].t, parts[-1].q, parts[-1].v))
+                elif tell is not None:
+                    tell(tick + 1, ticks)
         except KeyboardInterrupt:
             if not parts:
                 raise
@@ -334,6 +352,8 @@ class Mpc:
         found = (*noise_forgotten(plant.scene, rng), *found, *_alternating(motion, plant.substeps))
         found = (*found, *_behind(seconds, self.period), *_late(late, self.budget))
         found = (*found, *_whole_ticks(duration, ticks, self.period))
+        held = kept(problem, tuple(plans), motion, plant.substeps)
+        found = (*found, *_outside(held))
         announce(logger, plant.scene, dt, found)
         again = {(finding.kind, finding.joint) for finding in found}
         first = [finding.sentence for finding in of_plan if (finding.kind, finding.joint) not in again]
@@ -345,11 +365,39 @@ class Mpc:
             late,
             self.period,
             self.budget,
+            constraints=held,
             warnings=(
                 *(f"the first plan: {sentence}" for sentence in first),
                 *(finding.sentence for finding in found),
             ),
         )
+
+
+def _outside(held: Sequence[Kept]) -> tuple[Finding, ...]:
+    """Says where the plant's motion violated a constraint, and in how many ticks there was no plan within them."""
+    found = []
+    for own in held:
+        if own.infeasible.any():
+            tick = int(np.argmax(np.where(own.infeasible, own.planned, 0.0)))
+            found.append(
+                Finding(
+                    "infeasible ticks",
+                    f"in {int(own.infeasible.sum())} of {len(own.planned)} ticks no plan was found that keeps to "
+                    f"{own.label}; in tick {tick} it is violated by {own.planned[tick]:.2g} {own.unit}, and the plan "
+                    "acts all the same: a longer horizon, wider limits or more iterations may help",
+                )
+            )
+        if own.worst > own.tolerance:
+            when = own.t[int(np.argmax(own.moved))]
+            found.append(
+                Finding(
+                    "motion outside constraints",
+                    f"the plant's motion violates {own.label} by {own.worst:.2g} {own.unit} at t = {when:.4g} s: a "
+                    "bound that is as much narrower (of noise, a margin=), a smaller dt, more iterations or a longer "
+                    "horizon keep it inside",
+                )
+            )
+    return tuple(found)
 
 
 def _whole_ticks(duration: float, ticks: int, period: float) -> tuple[Finding, ...]:

@@ -18,6 +18,8 @@ Floats = NDArray[np.float64]
 
 # What a constraint may be violated by at its places in a plan that is feasible, in its own unit.
 FEASIBLE = 1e-6
+# Of a tenth of a constraint's range, what is violated beside its places, or by a controller, without a word.
+TOLD = 1e-2
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,9 @@ from varpin.trajectory import Trajectory
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+# Passes that look for the constraints that their motion meets.
+_PASSES = 60
+
 
 @dataclass(frozen=True, eq=False)
 class Penalty(Frozen):
@@ -145,11 +148,13 @@ class PenalizedProblem(OptimalControlProblem):
         penalties: Of constraints on states.
         all_penalties: Of all constraints, in the problem's order.
         quiet: Whether plans leave the scene's noise out. With it, stiff penalties would count as what noise costs.
+        passes: That a backward pass may take to find the rows that its motion meets.
     """
 
     penalties: tuple[Penalty, ...]
     all_penalties: tuple[Penalty, ...]
     quiet: bool
+    passes: int
 
     @property
     def processes(self) -> int:
@@ -230,6 +235,7 @@ def penalized(
     backoff: list[Floats],
     *,
     quiet: bool = True,
+    passes: int = _PASSES,
 ) -> PenalizedProblem:
     """The augmented Lagrangian of a problem.
 
@@ -239,6 +245,7 @@ def penalized(
         weights: Of each penalty (C,); of weight zero there is none.
         backoff: Of each constraint (K, rows).
         quiet: Leave the scene's noise out.
+        passes: That a backward pass may take at most to find the rows that its motion meets.
     """
     made = object.__new__(PenalizedProblem)
     parts = [
@@ -251,7 +258,7 @@ def penalized(
         "penalties": tuple(part for part in parts if not part.bound.of_controls),
         "all_penalties": tuple(parts),
     }
-    own |= {"constraints": (), "bound_constraints": (), "quiet": quiet}
+    own |= {"constraints": (), "bound_constraints": (), "quiet": quiet, "passes": passes}
     if on_rate:
         rate = problem.rate
         if rate is None:

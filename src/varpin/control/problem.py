@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.control.constraints import BoundConstraint, Horizon, PlanConstraint
+from varpin.control.constraints import BoundConstraint, BoundRate, Horizon, PlanConstraint
 from varpin.control.costs import (
     BoundSum,
     ControlRate,
@@ -34,7 +34,16 @@ from varpin.mechanics.scene import Scene, closest_controls, differences, refuse_
 from varpin.simulation.friction import rate_at_rest
 from varpin.simulation.run import on_constraints, simulate
 from varpin.simulation.soundness import announce
-from varpin.support.checks import JointValues, count, is_one_of, joint_array, named_limits, positive, real
+from varpin.support.checks import (
+    JointValues,
+    control_values,
+    count,
+    is_one_of,
+    joint_array,
+    named_limits,
+    positive,
+    real,
+)
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
 from varpin.trajectory import Trajectory, require_motion
@@ -235,6 +244,18 @@ class OptimalControlProblem(Frozen):
         return self.dt * self.steps
 
     @property
+    def remembers(self) -> bool:
+        """Whether the control before the horizon counts: changes of controls cost something or have a limit."""
+        return self.rate is not None or any(item.of_controls for item in self.bound_constraints)
+
+    @property
+    def before(self) -> Floats | None:
+        """The control before the horizon (m,); None where it does not count, or nothing is known of it."""
+        known = None if self.rate is None else self.rate.before
+        limits = (item.before for item in self.bound_constraints if isinstance(item, BoundRate))
+        return next((before for before in (known, *limits) if before is not None), None)
+
+    @property
     def decisions(self) -> int:
         """R, the number of controls to choose: steps / hold, or steps + 1 where they are linear between nodes."""
         return self.steps + 1 if self.linear else self.steps // self.hold
@@ -266,14 +287,17 @@ class OptimalControlProblem(Frozen):
         """The same problem, discretized otherwise or from another state.
 
         With ``dt`` alone the horizon stays, and the number of steps follows. ``before`` is the control applied before
-        the horizon, one number, (m,) or by joint name, for its :class:`ControlRateCost`.
+        the horizon, one number, (m,) or by joint name, for its :class:`ControlRateCost` and
+        :class:`WithinControlRate`.
 
         Raises:
             InputError: The horizon is no multiple of ``dt``, or ``before`` is given and changes of controls cost
-                nothing; or as for the problem itself.
+                nothing and have no limit; or as for the problem itself.
         """
-        if before is not None and self.rate is None:
-            raise InputError("before is the control that a ControlRateCost begins with, and the cost has none")
+        if before is not None and not self.remembers:
+            raise InputError(
+                "before is the control that a ControlRateCost or a WithinControlRate begins with, and there is none"
+            )
         if dt is not None and steps is None:
             steps = round(self.duration / positive("dt", dt, "s"))
             if abs(steps * dt - self.duration) > 1e-9 * self.duration:
@@ -293,8 +317,15 @@ class OptimalControlProblem(Frozen):
             t0=self.t0 if t0 is None else t0,
             control_limits=(self.control_limits[0], self.control_limits[1]),
             controls=self.controls if controls is None else controls,
-            constraints=self.constraints,
+            constraints=self._after(before),
         )
+
+    def _after(self, before: JointValues | None) -> tuple[PlanConstraint, ...]:
+        """The constraints on a horizon after another control."""
+        if before is None:
+            return self.constraints
+        control = control_values("before", before, self.scene.control_joints, self.scene.controls)
+        return tuple(item.after(control) for item in self.constraints)
 
     def _restarted(
         self, q0: JointValues | None, v0: JointValues | None, t0: float | None, before: JointValues | None
@@ -311,6 +342,7 @@ class OptimalControlProblem(Frozen):
         for array in changed.values():
             array.setflags(write=False)
         if before is not None:
+            changed["constraints"] = self._after(before)
             changed["cost"] = with_control_before(self.cost, before)
             changed["rate"] = control_rate(changed["cost"], scene.controls, scene.control_joints)
         if t0 is not None and real("t0", t0) != self.t0:
@@ -318,10 +350,11 @@ class OptimalControlProblem(Frozen):
             times = t0 + _times(_rule(self.sampling, self.dt)[0], self.steps, self.dt)
             points = replace(self.running.points, t=times, t0=t0)
             changed["running"], changed["terminal"] = bind_cost(self.cost, times, points, (self.running, self.terminal))
-        if self.constraints and ("rate" in changed or "t0" in changed):
+        if self.constraints and ("constraints" in changed or "t0" in changed):
             rate, t0 = changed.get("rate", self.rate), changed.get("t0", self.t0)
             grid = (t0, self.dt, self.steps, self.hold)
-            changed["bound_constraints"] = _bind_constraints(self.constraints, scene, *grid, rate)
+            own = changed.get("constraints", self.constraints)
+            changed["bound_constraints"] = _bind_constraints(own, scene, *grid, rate)
         problem = object.__new__(type(self))
         # Past the dataclass, which refuses assignments.
         vars(problem).update(vars(self) | changed)

@@ -8,7 +8,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, is_dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,17 +42,22 @@ from varpin.support.checks import (
     is_one_of,
     positive,
     real,
+    takes,
+    told_motion,
 )
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
-Callback = Callable[[Iteration], None]
+Callback = Callable[[Iteration], None] | Callable[[Iteration, Trajectory], None]
+Report = Callable[[Iteration, Trajectory], None]
 Progress = Callable[[int, int], None]
 
 logger = logging.getLogger(__name__)
 
 # What a step must keep of the promised slope, and the factor between trials.
-ARMIJO, BACKTRACKING = 1e-5, 0.25
+ARMIJO, BACKTRACKING = 1e-5, 0.5
+# A step that keeps less of the slope than this is poor: shorter ones are tried as long as they are better.
+_POOR = 0.3
 # The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it shrinks after
 # long steps and grows after short ones.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
@@ -67,8 +72,8 @@ _LOSSY = 1e-8
 _PATIENCE = 15
 # Where the optimum costs nothing, there is nothing to be relative to but this part of what was at stake at first.
 _NOTHING = 1e-9
-# Trials of a line search: 0.25^10 is 1e-6.
-_TRIALS = 10
+# The shortest step of a line search, about, and its trials at most.
+_SHORTEST, _TRIALS = 1e-6, 40
 # A trial is given up where a step wants more halvings than this, or than the motion so far, and where it has taken more
 # parts in all than so many times those of the motion so far. What was given up is tried again with more of both where
 # nothing else has led far, and without a bound where nothing has helped; a search that stalls goes on without bounds.
@@ -141,7 +146,9 @@ def solve(
         time_limit: No iteration begins when this time has passed since the call [s]. What is found then depends on the
             machine.
         callback: Called with each :class:`Iteration`; ``callback=print`` prints the rows of :meth:`Solution.table` as
-            they come. The log has them too, at level INFO, each after the robot and the horizon that it is of.
+            they come. The log has them too, at level INFO, each after the robot and the horizon that it is of. A
+            function that needs two arguments gets the motion that the iteration ended with, too, a
+            :class:`varpin.Trajectory`; as :class:`varpin.LiveView` does.
         progress: Called after each iteration with (iterations done, max_iterations); few searches need them all.
         resume: A solution of this very problem, as solve returned it or as read from a file: the search goes on where
             it stopped, for at most ``max_iterations`` more, as if it had not been interrupted. Give the other options
@@ -182,7 +189,7 @@ def solve(
         raise InputError(f"regularization must be >= 0, got {regularization}")
     if not is_one_of(noise, ("held", "whole")):
         raise InputError(f"noise must be 'held' or 'whole', got {noise!r}")
-    require_reports(callback, progress)
+    tell = require_reports(callback, progress)
     if problem.linear and second_order:
         raise InputError("second_order is for held controls; the problem's are linear between nodes")
     positive("tolerance", tolerance, "1")
@@ -190,9 +197,8 @@ def solve(
     fraction("armijo", armijo)
     max_iterations = count("max_iterations", max_iterations)
 
-    def report(item: Iteration) -> None:
-        if callback is not None:
-            callback(item)
+    def report(item: Iteration, motion: Trajectory) -> None:
+        tell(item, motion)
         if progress is not None:
             # Convergence may take a last look after the last iteration.
             progress(min(item.index + 1 - known, max_iterations), max_iterations)
@@ -236,12 +242,23 @@ def solve(
     return looked_at(solution)[0] if check else solution
 
 
-def require_reports(callback: object, progress: object) -> None:
-    """Refuse a callback or a progress that cannot be called."""
-    if callback is not None and not callable(callback):
-        raise InputError(f"callback must be a function of one Iteration, got {callback!r}")
-    if progress is not None and not callable(progress):
+def require_reports(callback: Any, progress: object) -> Report:
+    """The callback as a function of an iteration and its motion, whichever of them it takes.
+
+    Raises:
+        InputError: It, or a progress, cannot be called with what it is told.
+    """
+    both = told_motion("callback", callback, "iteration", "motion")
+    if progress is not None and not (callable(progress) and takes(progress, 2)):
         raise InputError(f"progress must be a function of (iterations done, max_iterations), got {progress!r}")
+
+    def tell(item: Iteration, motion: Trajectory) -> None:
+        if both:
+            callback(item, motion)
+        elif callback is not None:
+            callback(item)
+
+    return tell
 
 
 def checked_time(limit: object) -> float:
@@ -267,7 +284,7 @@ def replan(
     search = _Search(problem, second_order=False, anew=False)
     search.begin(_shifted_commands(problem, previous, decisions))
     try:
-        status = search.run(tolerance, max_iterations, deadline, lambda _: None)
+        status = search.run(tolerance, max_iterations, deadline, lambda *_: None)
     except KeyboardInterrupt:
         status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
     return search.solution(status)
@@ -364,6 +381,12 @@ def _onto_limits(u: Floats, limits: Floats) -> Floats:
     for limit in limits:
         u = np.where(np.abs(u - limit) <= room, limit, u)
     return u
+
+
+def _lengths(backtracking: float) -> list[float]:
+    """Of the steps that a line search tries, the longest first."""
+    shorter = max(1, round(np.log(_SHORTEST) / np.log(backtracking)))
+    return [backtracking**i for i in range(min(1 + shorter, _TRIALS))]
 
 
 @functools.lru_cache(maxsize=256)
@@ -519,7 +542,7 @@ class _Search:
             whole=self.whole,
         )
 
-    def run(self, tolerance: float, max_iterations: int, deadline: float, report: Callback) -> Status:
+    def run(self, tolerance: float, max_iterations: int, deadline: float, report: Report) -> Status:
         last, longest = len(self.history) + max_iterations, 0.0
         while True:
             self.state = self._state()
@@ -693,7 +716,7 @@ class _Search:
         share = np.nan if self.plan is None else self._share(tolerance)
         return f"{self._promised()}{needed}; the tolerance of {tolerance:g} times the cost at stake is {share:.1e}"
 
-    def _note(self, report: Callback, started: float, passes: int, step: _Step | None = None) -> None:
+    def _note(self, report: Report, started: float, passes: int, step: _Step | None = None) -> None:
         if self.plan is None:
             return
         item = Iteration(
@@ -711,7 +734,7 @@ class _Search:
         )
         self.history.append(item)
         logger.info("%s: %s", self.label, item)
-        report(item)
+        report(item, self.trajectory)
 
     def _relax(self) -> None:
         self.growth = min(1.0 / _GROWTH, self.growth / _GROWTH)
@@ -771,14 +794,18 @@ class _Search:
         added = noise_shares(self.problem, self.trajectory, self.plan)
         taken, length, tried, trials = _Trial(), 0.0, None, 0
         feedback = self._feedback(self.plan)
-        left = list(self.backtracking ** np.arange(_TRIALS))
+        left = _lengths(self.backtracking)
         for bounds in self._bounds():
             cut = []
             for step in left:
                 trials += 1
-                trial = self._try(float(step), feedback, added, bounds)
-                if trial.expected <= self.armijo * step * self.plan.slope:
-                    taken, length = trial, float(step)
+                trial = self._try(step, feedback, added, bounds)
+                if trial.expected <= self.armijo * step * self.plan.slope and trial.expected < taken.expected:
+                    taken, length = trial, step
+                    if trial.expected <= _POOR * step * self.plan.slope:
+                        break
+                    continue
+                if length > 0.0:
                     break
                 if trial.cut:
                     cut.append(step)

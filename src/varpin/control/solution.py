@@ -298,7 +298,7 @@ class Solution(Frozen):
                 gains = np.concatenate([gains[:, :, :n] + second @ by_q, second @ by_p], axis=2)
         nodes = trajectory.p if x == "momentum" else trajectory.v
         reference = np.hstack([trajectory.q[rows], nodes[rows]])
-        limits, rate = self.problem.control_limits, self.problem.rate
+        limits = self.problem.control_limits
         return LinearPolicy(
             self.controls[1:] if linear else self.controls,
             gains,
@@ -307,7 +307,7 @@ class Solution(Frozen):
             x,
             (limits[0], limits[1]),
             previous_gains=previous_gains,
-            before=first if linear or rate is None else rate.before,
+            before=first if linear else self.problem.before,
             linear=linear,
             period=self.problem.period,
             joints=self.problem.scene.control_joints,

@@ -200,10 +200,12 @@ class VariationalRollout(_Rollout):
         drift: Floats,
         nodes: Nodes,
         watch: Watch | None = None,
+        impulses: Floats | None = None,
     ) -> None:
         """Take the steps that the commands are for, and write them into the nodes; named tuples of arrays.
 
-        One path alone may be under a watch, which may end it.
+        One path alone may be under a watch, which may end it. ``impulses`` on top of the noise's jump the momenta
+        before and after each step (P, N, 2, n).
         """
 
 class ConstrainedRollout(_Rollout):
@@ -495,6 +497,7 @@ class ExplicitRollout:
         drift: Floats,
         nodes: Nodes,
         watch: Watch | None = None,
+        impulses: Floats | None = None,
     ) -> None:
         """All N steps of length dt [s] of all paths.
 

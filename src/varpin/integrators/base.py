@@ -115,6 +115,13 @@ class Integrator(ABC):
         """
         return ()
 
+    def amplification(self, z: NDArray[np.complex128]) -> NDArray[np.complex128] | None:  # noqa: ARG002 - as others'
+        """By what a step of h multiplies modes exp(lambda t) of a linear system, (k,) of z = h lambda.
+
+        The motion itself multiplies them by exp(z). None where nobody has worked it out.
+        """
+        return None
+
     @property
     def left(self) -> float:
         """The part of a step's kick that comes before the step; the rest comes after it."""
@@ -209,12 +216,22 @@ class Integrator(ABC):
         """:meth:`rollout` with fields that the core evaluates; ``drift`` is a force (P, N, n), or (0, 0, n)."""
 
     def motions(
-        self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, drift: Floats, dt: float
+        self,
+        scene: Scene,
+        q0: Floats,
+        v0: Floats,
+        commands: Commands,
+        drift: Floats,
+        dt: float,
+        impulses: Floats | None = None,
     ) -> tuple[Floats, Floats] | None:
         """Configurations and velocities (P, N, n) after each step of P motions from (q0, v0) (P, n), without noise.
 
-        ``commands`` and ``drift`` are as for :meth:`rollout_compiled`. None where one of the motions stops.
+        ``commands`` and ``drift`` are as for :meth:`rollout_compiled`; ``impulses`` jump the momenta before and after
+        each step (P, N, 2, n). None where one of the motions stops, and for an integrator that takes no impulses.
         """
+        if impulses is not None:
+            return None
         try:
             state, _ = self.start(scene, q0, v0)
         except SingularMassMatrix:

@@ -122,12 +122,20 @@ class _Explicit(Integrator):
         return failure_of(nodes, 0, int(nodes.done[0]), REASONS), np.zeros(0, dtype=np.uint8)
 
     def motions(
-        self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, drift: Floats, dt: float
+        self,
+        scene: Scene,
+        q0: Floats,
+        v0: Floats,
+        commands: Commands,
+        drift: Floats,
+        dt: float,
+        impulses: Floats | None = None,
     ) -> tuple[Floats, Floats] | None:
         """See :meth:`Integrator.motions`."""
         paths, n = q0.shape
         nodes = new_nodes(paths, steps_of(commands), n, scene.controls)
-        core.ExplicitRollout.start(scene.core, self.method, q0, v0).roll(dt, commands, scene.silence, drift, nodes)
+        rollout = core.ExplicitRollout.start(scene.core, self.method, q0, v0)
+        rollout.roll(dt, commands, scene.silence, drift, nodes, impulses=impulses)
         return None if nodes.ended.any() else (nodes.q, nodes.v)
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
@@ -188,6 +196,15 @@ class SemiImplicitEuler(_Explicit):
     method: ClassVar[ExplicitMethod] = ExplicitMethod.semi_implicit
     order = 1
 
+    def amplification(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """See :meth:`Integrator.amplification`; of the modes z of v' = (z + z~) v - z z~ q, the one next to exp(z)."""
+        damped, pulled = 2.0 * z.real, np.abs(z) ** 2
+        half = 0.5 * (2.0 + damped - pulled)
+        root = np.sqrt((half**2 - 1.0 - damped).astype(np.complex128))
+        both = np.array([half + root, half - root])
+        nearest = np.abs(both - np.exp(z)).argmin(axis=0)
+        return np.asarray(both[nearest, np.arange(len(z))])
+
 
 @dataclass(frozen=True)
 class RungeKutta4(_Explicit):
@@ -196,6 +213,10 @@ class RungeKutta4(_Explicit):
     method: ClassVar[ExplicitMethod] = ExplicitMethod.runge_kutta
     order = 4
     stage_times = (0.0, 0.5, 1.0)
+
+    def amplification(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """See :meth:`Integrator.amplification`."""
+        return 1.0 + z * (1.0 + z / 2.0 * (1.0 + z / 3.0 * (1.0 + z / 4.0)))
 
     def ramps(self, scene: Scene, trajectory: Trajectory) -> Floats:
         """See :meth:`Integrator.ramps`."""

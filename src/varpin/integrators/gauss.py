@@ -54,13 +54,8 @@ class Gauss(Collocation):
     def _constraint_places(self) -> Floats | None:
         return lobatto_places(int(self.stages))
 
-    @property
-    def stage_times(self) -> tuple[float, ...]:
-        """See :attr:`Integrator.stage_times`."""
-        return tuple(self._times().tolist()) if self.stages > 1 else ()
-
-    def _times(self) -> Floats:
-        return gauss_coefficients(int(self.stages))[2]
+    def _coefficients(self) -> tuple[Floats, Floats, Floats]:
+        return gauss_coefficients(int(self.stages))
 
     def _shares(self) -> tuple[float, float]:
         return (BALANCE_SHARE, BUDGET_SHARE) if self.stages > 1 else (1.0, 1.0)

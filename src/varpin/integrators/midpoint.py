@@ -80,3 +80,7 @@ class Midpoint(Variational):
 
     def _times(self) -> Floats:
         return np.array([float(self.alpha)])
+
+    def amplification(self, z: NDArray[np.complex128]) -> NDArray[np.complex128] | None:
+        """See :meth:`Integrator.amplification`; for alpha = 1/2 alone."""
+        return (1.0 + 0.5 * z) / (1.0 - 0.5 * z) if self.alpha == 0.5 else None

@@ -49,10 +49,5 @@ class Radau(Collocation):
     def _tableau(self) -> Tableau:
         return radau(int(self.stages))
 
-    @property
-    def stage_times(self) -> tuple[float, ...]:
-        """See :attr:`Integrator.stage_times`."""
-        return tuple(self._times().tolist()) if self.stages > 1 else ()
-
-    def _times(self) -> Floats:
-        return radau_coefficients(int(self.stages))[2]
+    def _coefficients(self) -> tuple[Floats, Floats, Floats]:
+        return radau_coefficients(int(self.stages))

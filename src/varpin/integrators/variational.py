@@ -245,14 +245,25 @@ class Variational(Integrator):
         return failure_of(nodes, 0, done, REASONS), parts_of(nodes, 0, done, state.paths.halvings)
 
     def motions(
-        self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, drift: Floats, dt: float
+        self,
+        scene: Scene,
+        q0: Floats,
+        v0: Floats,
+        commands: Commands,
+        drift: Floats,
+        dt: float,
+        impulses: Floats | None = None,
     ) -> tuple[Floats, Floats] | None:
         """See :meth:`Integrator.motions`."""
         try:
             run = self._begun(scene, q0, v0)
         except SingularMassMatrix:
             return None
-        nodes = _rolled(scene, run, commands, scene.silence, drift, dt)
+        nodes = new_nodes(len(q0), steps_of(commands), scene.robot.dof, scene.controls)
+        if isinstance(run.paths, ConstrainedRollout):
+            run.paths.roll(dt, commands, scene.silence, drift, nodes)
+        else:
+            run.paths.roll(dt, commands, scene.silence, drift, nodes, impulses=impulses)
         return None if nodes.ended.any() else (nodes.q, nodes.v)
 
     def step_in_python(

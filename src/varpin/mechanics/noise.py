@@ -134,11 +134,23 @@ class CompiledFields(BoundNoise):
         """See :meth:`BoundNoise.fields`."""
         arrays = self.arrays
         n, k = arrays.constant.shape
-        offset = q[:, :, None] - np.where(np.isnan(arrays.center), start[:, None], arrays.center)
-        F = arrays.constant + np.einsum("ikm,Nm->Nik", arrays.control, u) + arrays.quadratic * offset**2
+        F, offset = _values(arrays, q, u, start)
         Fq = np.zeros((len(q), n, k, n))
         Fq[:, np.arange(n), :, np.arange(n)] = np.moveaxis(2.0 * arrays.quadratic * offset, 1, 0)
         return Fields(F, Fq, None, np.broadcast_to(arrays.control, (len(q), *arrays.control.shape)))
+
+
+def _values(arrays: Diffusion, q: Floats, u: Floats, start: Floats) -> tuple[Floats, Floats]:
+    """The fields that the core evaluates (N, n, k), and how far q is from their centres."""
+    offset = q[:, :, None] - np.where(np.isnan(arrays.center), start[:, None], arrays.center)
+    F: Floats = arrays.constant + np.einsum("ikm,Nm->Nik", arrays.control, u) + arrays.quadratic * offset**2
+    return F, offset
+
+
+def impulses(arrays: Diffusion, q: Floats, u: Floats, dw: Floats, start: Floats) -> Floats:
+    """sum_i F_i(q, u) dw_i (N, n) of fields that the core evaluates, for dw (N, k); the rest as of ``fields``."""
+    found: Floats = np.einsum("Nik,Nk->Ni", _values(arrays, q, u, start)[0], dw)
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from varpin.support.checks import (
     named_limits,
     positive,
     require_finite,
+    takes,
 )
 from varpin.support.frozen import Frozen
 
@@ -87,19 +87,6 @@ class FirstOrderHold(Frozen):
         share = np.arange(parts)[:, None] / parts
         between = (1.0 - share) * self.u[:-1, None] + share * self.u[1:, None]
         return FirstOrderHold(np.vstack([between.reshape(-1, self.u.shape[1]), self.u[-1:]]))
-
-
-def takes(function: Callable[..., object], arguments: int) -> bool:
-    """Whether a function can be called with so many arguments; true where it does not tell."""
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):
-        return True
-    try:
-        signature.bind(*range(arguments))
-    except TypeError:
-        return False
-    return True
 
 
 @dataclass(frozen=True, eq=False, init=False)

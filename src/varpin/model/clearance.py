@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -17,7 +17,7 @@ from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.model.robot import Robot, geometry
 from varpin.model.tree import place_of_frame, z_to
 from varpin.model.urdf import decoded, parsed
-from varpin.support.checks import finite_array, positive, rotation_matrix
+from varpin.support.checks import finite_array, over_time, positive, rotation_matrix
 from varpin.support.frozen import Frozen
 
 Floats = NDArray[np.float64]
@@ -27,7 +27,9 @@ coal = pin.coal
 
 @dataclass(frozen=True, eq=False)
 class Obstacle(Frozen):
-    """A body that stands in the world. Made by :meth:`sphere`, :meth:`capsule` and :meth:`box`.
+    """A body that stands in the world, or moves there. Made by :meth:`sphere`, :meth:`capsule` and :meth:`box`.
+
+        ball = vp.Obstacle.sphere([0.5, 0.0, 0.4], 0.1).moving(lambda t: [0.0, 0.2 * np.sin(t), 0.0])
 
     Attributes:
         name: For messages.
@@ -36,6 +38,7 @@ class Obstacle(Frozen):
         radius: [m]; 0 of a box.
         sides: Of a box (3,) [m], else None.
         rotation: Of a box, its axes in the world (3, 3).
+        shift: Where it is at a time, from where the others say (3,) [m]; None where it stands.
     """
 
     name: str
@@ -44,6 +47,7 @@ class Obstacle(Frozen):
     radius: float
     sides: Floats | None
     rotation: Floats
+    shift: Callable[[float], ArrayLike] | None = None
 
     @classmethod
     def sphere(cls, center: ArrayLike, radius: float, name: str = "sphere") -> Obstacle:
@@ -66,14 +70,38 @@ class Obstacle(Frozen):
         R = np.eye(3) if rotation is None else rotation_matrix("box rotation", rotation)
         return cls(str(name), at, at, 0.0, size, R)
 
+    def moving(self, shift: Callable[[float], ArrayLike]) -> Obstacle:
+        """The body on its way: at a time t [s] it is off the place it was described at by ``shift(t)`` (3,) [m].
+
+        It does not turn. A plan within constraints knows its way for the whole horizon.
+
+        Raises:
+            InputError: ``shift`` is no function, or the obstacle moves already.
+        """
+        if not callable(shift):
+            raise InputError(f"Obstacle.moving takes a function of time, got {shift!r}")
+        if self.shift is not None:
+            raise InputError(f"obstacle {self.name!r} moves already: add both ways up in one function")
+        return replace(self, shift=shift)
+
+    def shifts(self, times: Floats) -> Floats:
+        """Of its way at some times (N,) [s]: (N, 3) [m], zero where it stands.
+
+        Raises:
+            InputError: Its function fails, or returns no place.
+        """
+        if self.shift is None:
+            return np.zeros((len(times), 3))
+        return over_time(f"the way of obstacle {self.name!r}", self.shift, times, 3)
+
     def __repr__(self) -> str:
+        moving = "" if self.shift is None else f".moving({self.shift!r})"
         if self.sides is not None:
-            return (
-                f"Obstacle.box({self.begin.tolist()}, {self.sides.tolist()}, {self.rotation.tolist()}, {self.name!r})"
-            )
+            sides, turn = self.sides.tolist(), self.rotation.tolist()
+            return f"Obstacle.box({self.begin.tolist()}, {sides}, {turn}, {self.name!r}){moving}"
         if self.begin is self.end:
-            return f"Obstacle.sphere({self.begin.tolist()}, {self.radius!r}, {self.name!r})"
-        return f"Obstacle.capsule({self.begin.tolist()}, {self.end.tolist()}, {self.radius!r}, {self.name!r})"
+            return f"Obstacle.sphere({self.begin.tolist()}, {self.radius!r}, {self.name!r}){moving}"
+        return f"Obstacle.capsule({self.begin.tolist()}, {self.end.tolist()}, {self.radius!r}, {self.name!r}){moving}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +112,8 @@ class _Body:
         name: Of the link or obstacle.
         kinematics: Of the link's frame; None in the world.
         rotation: Of a box, its axes (3, 3).
+        obstacle: What it is in the world; None of a link.
+        shifts: Of an obstacle that moves, at the times that are asked for (K, 3) [m].
     """
 
     name: str
@@ -93,6 +123,8 @@ class _Body:
     radius: float
     sides: Floats | None
     rotation: Floats
+    obstacle: Obstacle | None = None
+    shifts: Floats = field(default_factory=lambda: np.zeros((1, 3)))
 
 
 class Clearance(Frozen):
@@ -102,6 +134,27 @@ class Clearance(Frozen):
         self._bodies, self._pairs = tuple(bodies), tuple(pairs)
         self.names = tuple(f"{bodies[i].name} and {bodies[k].name}" for i, k in pairs)
         self.capsules = {body.name: (body.begin, body.end, body.radius) for body in bodies if body.kinematics}
+
+    @property
+    def moves(self) -> bool:
+        """Whether an obstacle does."""
+        return any(body.obstacle is not None and body.obstacle.shift is not None for body in self._bodies)
+
+    def over(self, times: Floats) -> Clearance:
+        """The same with obstacles where they are at some times (K,) [s], to which configurations then belong.
+
+        Of q (N, n), N is a multiple of K: row i is at the time i mod K.
+
+        Raises:
+            InputError: The way of an obstacle fails.
+        """
+        if not self.moves:
+            return self
+        bodies = [
+            body if body.obstacle is None else replace(body, shifts=body.obstacle.shifts(times))
+            for body in self._bodies
+        ]
+        return Clearance(bodies, self._pairs)
 
     def distances(self, q: Floats) -> Floats:
         """The distance of each pair (N, pairs) [m] at q (N, n); negative where they overlap."""
@@ -139,7 +192,8 @@ class Clearance(Frozen):
     def _placed(body: _Body, q: Floats) -> tuple[Floats, Floats, Floats]:
         """Ends of the axis (N, 3) and (N, 3), and the axes of a box (N, 3, 3), in the world."""
         if body.kinematics is None:
-            ends = (np.broadcast_to(x, (len(q), 3)) for x in (body.begin, body.end))
+            way = np.tile(body.shifts, (len(q) // len(body.shifts), 1))
+            ends = (x + way for x in (body.begin, body.end))
             return *ends, np.broadcast_to(body.rotation, (len(q), 3, 3))  # type: ignore[return-value]
         R, p = body.kinematics.placements(q)
         return R @ body.begin + p, R @ body.end + p, R @ body.rotation
@@ -262,7 +316,7 @@ def clearance(
     for obstacle in obstacles:
         pairs += [(i, len(parts)) for i in moving]
         own = (obstacle.begin, obstacle.end, obstacle.radius, obstacle.sides, obstacle.rotation)
-        parts.append(_Body(obstacle.name, None, *own))
+        parts.append(_Body(obstacle.name, None, *own, obstacle=obstacle))
     if not pairs:
         raise InputError(
             f"robot {robot.name!r} has nothing to keep clear of: give obstacles, or itself=True, and links with shapes "

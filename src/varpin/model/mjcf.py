@@ -35,7 +35,7 @@ _IN_FRAMES = {"body", "camera", "frame", "light", "site"}
 _SIZES = {
     "armature": (1,), "axis": (3,), "density": (1,), "diaginertia": (3,), "frictionloss": (1,), "fromto": (6,),
     "fullinertia": (6,), "mass": (1,), "pos": (3,), "quat": (4,), "range": (2,), "ref": (1,), "size": (1, 2, 3),
-    "xyaxes": (6,), "zaxis": (3,),
+    "springdamper": (2,), "xyaxes": (6,), "zaxis": (3,),
 }  # fmt: skip
 _ROTATIONS = ("quat", "euler", "axisangle", "xyaxes", "zaxis")
 # Half the thickness of a drawn plane [m].
@@ -169,6 +169,11 @@ def read_mjcf(path: Path) -> Mjcf:
     reader = _Reader(path, compiler, _classes(root, reader), reader.left_out)
     if "settotalmass" in compiler:
         raise reader.fault("its masses are scaled by settotalmass, which Pinocchio does not read")
+    if compiler.get("coordinate", "local") == "global":
+        raise reader.fault(
+            "its places are in world axes (coordinate='global'), which MuJoCo has not read since 2.3.4, nor does "
+            "Pinocchio: MuJoCo 2.3.3 writes it with places in each body's own axes"
+        )
     reader.left_out["least masses and inertias"] += int(bool({"boundmass", "boundinertia"} & set(compiler)))
     reader.left_out["balancing of inertias"] += int(compiler.get("balanceinertia") == "true")
     for part in root.iter():
@@ -177,6 +182,9 @@ def read_mjcf(path: Path) -> Mjcf:
         other = [child.tag for child in part if part.tag == "frame" and child.tag not in _IN_FRAMES]
         if other:
             raise reader.fault(f"it has a <{other[0]}> in a <frame>: varpin reads those around bodies and sites")
+    for option in root.findall("option"):
+        fluid = [reader.numbers(option, key, (1,)) for key in ("density", "viscosity") if key in option.attrib]
+        reader.left_out["forces of a fluid"] += int(np.any(fluid))
     for tag, what in _LEFT_OUT.items():
         reader.left_out[what] += sum(len(part) for part in root.findall(tag))
     texts = []
@@ -360,6 +368,8 @@ def _joint(joint: ET.Element, childclass: str, reader: _Reader, dynamics: bool) 
     )
     plain.set("damping", repr(float(damping[0])))
     if dynamics:
+        given = "springdamper" in plain.attrib and (reader.numbers(plain, "springdamper", (2,)) > 0.0).all()
+        reader.left_out["springs and dampers by their time constant"] += int(given)
         reader.left_out["joint springs"] += int(stiffness.any())
         reader.left_out["nonlinear joint dampers"] += int(damping[1:].any())
     return plain
@@ -388,6 +398,11 @@ def _masses(body: ET.Element, name: str, childclass: str, reader: _Reader) -> li
                 f"body {name!r} has no <inertial>, and its mass follows from a mesh, which Pinocchio takes otherwise "
                 "than MuJoCo: give it an <inertial>, from body_mass, body_ipos, body_iquat and body_inertia of MuJoCo"
             )
+        if plain.get("shellinertia") == "true":
+            raise reader.fault(f"body {name!r}: its mass is on the surface of a shape, which Pinocchio does not read")
+        # To Pinocchio a shape that nothing touches has no mass.
+        for key in ("contype", "conaffinity"):
+            plain.attrib.pop(key, None)
         shapes.append(plain)
     return shapes
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -21,18 +20,11 @@ from varpin.model.inertia import fault, principal_moments
 from varpin.model.mimic import joint_index
 from varpin.model.tree import is_unbounded, joint_axis
 from varpin.model.urdf import Urdf, read_urdf
-from varpin.show.inspection_tables import parts_of
+from varpin.show.inspection_report import FrameKind, FrameReport, JointReport, Kind, LinkReport, RobotReport
 from varpin.support.checks import JointValues, joint_array
-from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, folded, table, warning_count
-from varpin.support.tables import plain
 
 Floats = NDArray[np.float64]
-Kind = Literal["revolute", "prismatic", "continuous", "mimic"]
-FrameKind = Literal["link", "joint", "fixed joint", "frame"]
 
-# The largest step is no limit beyond this [s].
-_ANY_STEP = 100.0
 # Beyond what any of example-robot-data's arms shows: masses there differ by up to 320 between neighbours, principal
 # moments by 2e5, and M scaled to a unit diagonal has a condition number of up to 830.
 MASS_RATIO = 1e3
@@ -43,150 +35,6 @@ LENGTH_RATIO = 2.0
 LENGTH = 10.0
 # [kg/m^3] of osmium, the densest element.
 DENSITY = 22_600.0
-
-
-@dataclass(frozen=True, eq=False)
-class JointReport(Frozen):
-    """A joint that moves.
-
-    Attributes:
-        name: Its name.
-        kind: Revolute, prismatic, continuous (revolute without end stops) or mimic.
-        axis: Unit axis (3,) in the joint's own frame.
-        unit: Of its position, rad or m.
-        lower: Lower position limit [rad or m], -inf if none.
-        upper: Upper position limit [rad or m], inf if none.
-        velocity: Velocity limit [rad/s or m/s], inf if none.
-        effort: Effort limit [N m or N], inf if none.
-        follows: For a mimic joint, what it does: its leader, ratio and offset in words; else empty.
-    """
-
-    name: str
-    kind: Kind
-    axis: Floats
-    unit: Literal["rad", "m"]
-    lower: float
-    upper: float
-    velocity: float
-    effort: float
-    follows: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class LinkReport(Frozen):
-    """A link with mass or inertia; for a model in memory, a joint's links taken together.
-
-    Attributes:
-        name: Its name.
-        joint: The joint that moves it, or empty for a link of the base.
-        mass: [kg].
-        center: Centre of mass (3,) in the link's frame [m].
-        inertia: (3, 3) about the centre of mass [kg m^2].
-        moments: Principal moments of inertia (3,), ascending [kg m^2].
-    """
-
-    name: str
-    joint: str
-    mass: float
-    center: Floats
-    inertia: Floats
-    moments: Floats
-
-
-@dataclass(frozen=True)
-class FrameReport:
-    """A frame, whose name costs, traces and payloads take.
-
-    Attributes:
-        name: Its name.
-        kind: A link's, a joint's, a fixed joint's, or one by itself.
-        parent: The link or frame that it is attached to, or empty for the world.
-        joint: The joint that moves it, or empty if it is fixed to the base.
-    """
-
-    name: str
-    kind: FrameKind
-    parent: str
-    joint: str
-
-
-@dataclass(frozen=True, eq=False)
-class RobotReport(Frozen):
-    """A robot as its description has it, and what looks wrong; ``print`` shows all of it in tables.
-
-    Attributes:
-        robot: The robot, possibly one that :func:`varpin.load_robot` refuses.
-        joints: Every joint that moves, mimic joints included, in Pinocchio's order.
-        links: Every link with mass or inertia.
-        frames: Every frame by whose name varpin finds it, in Pinocchio's order.
-        locked: Joints held still, and where [rad or m].
-        total_mass: Of everything that moves [kg].
-        q: The configuration looked at (n,) [rad or m].
-        v: The velocity there (n,) [rad/s or m/s].
-        condition: Condition number of M(q); it mixes units if there are prismatic joints. Infinite if singular.
-        scaled_condition: Condition number of M(q) with rows and columns scaled to a unit diagonal, which depends
-            on no unit. Infinite if singular.
-        largest_step: Largest dt [s] whose step the midpoint integrator's branch guard accepts around (q, v); infinite
-            where no direction is unstable, None where M is singular. It says nothing about accuracy.
-        branch_margin: The guard's margin, for which ``largest_step`` holds.
-        warnings: What looks wrong, in words that name the joint or link.
-    """
-
-    robot: Robot = field(repr=False)
-    joints: tuple[JointReport, ...]
-    links: tuple[LinkReport, ...]
-    frames: tuple[FrameReport, ...]
-    locked: Mapping[str, float | tuple[float, ...]]
-    total_mass: float
-    q: Floats
-    v: Floats
-    condition: float
-    scaled_condition: float
-    largest_step: float | None
-    branch_margin: float
-    warnings: tuple[str, ...]
-
-    def __repr__(self) -> str:
-        warned = warning_count(self.warnings)
-        return f"RobotReport({self.robot.name}: {len(self.joints)} joints, {len(self.links)} links{warned})"
-
-    def __str__(self) -> str:
-        return plain(parts_of(self))
-
-    @property
-    def step_in_words(self) -> str:
-        """The largest step the guard accepts around (q, v)."""
-        if self.largest_step is None:
-            return "undefined: the mass matrix is singular"
-        # A description's own rounding, a frame turned by 1.5708, makes directions unstable that are not.
-        step = "any: nothing is unstable" if self.largest_step > _ANY_STEP else f"{self.largest_step:.3g} s"
-        return f"{step} at this q, {'at rest' if not self.v.any() else 'and this v'}"
-
-    def _repr_html_(self) -> str:
-        rows: list[tuple[str, object]] = [
-            ("mass that moves [kg]", self.total_mass),
-            ("condition of M(q)", f"{self.condition:.3g}; {self.scaled_condition:.3g} with a unit diagonal"),
-            ("largest step the guard accepts", self.step_in_words),
-            *(("warning", warning) for warning in self.warnings),
-        ]
-        joints = [
-            (j.name, f"mimic: {j.follows}" if j.follows else j.kind, j.lower, j.upper, j.velocity, j.effort)
-            for j in self.joints
-        ]
-        links = [(x.name, x.joint or "the base", x.mass, "  ".join(f"{m:.3g}" for m in x.moments)) for x in self.links]
-        return facts(
-            f"Robot {self.robot.name}, looked into",
-            rows,
-            table(("joint", "kind", "lower [rad or m]", "upper", "velocity [1/s]", "effort [N m or N]"), joints),
-            folded("links", table(("link", "moved by", "mass [kg]", "principal moments [kg m^2]"), links)),
-            folded(
-                "frames",
-                table(
-                    ("frame", "what it is", "on", "moved by"),
-                    [(x.name, x.kind, x.parent or "the world", x.joint or "the base") for x in self.frames],
-                ),
-            ),
-        )
 
 
 def inspect_robot(

@@ -28,7 +28,9 @@ Floats = NDArray[np.float64]
 
 # Okabe and Ito's palette for colour-blind readers, without its yellow, which is faint on white.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
-DASHES = ("-", "--", ":", "-.")
+DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (9, 3)))
+# Of lines that have run out of dashes, too.
+_WIDTHS = (1.4, 0.7)
 # More rows than this make the legend two columns wide.
 _LEGEND_ROWS = 20
 # Points a line is drawn with at most; between them its extremes are kept.
@@ -311,16 +313,11 @@ def _plot_trade(
     for name, style in zip(names, _styles(len(names)), strict=True):
         curve = [(seconds, value) for label, seconds, value in points if label == name]
         axes.plot(*zip(*curve, strict=True), label=name, marker="o", markersize=4, **style)
-    axes.plot(
-        *zip(*front, strict=True),
-        label=front_name,
-        color="0.3",
-        linewidth=0.8,
-        marker="o",
-        markersize=9,
-        markerfacecolor="none",
-        zorder=1,
-    )
+    ring: dict[str, Any] = {"marker": "o", "markersize": 9, "markerfacecolor": "none", "color": "0.3", "zorder": 1}
+    axes.plot(*zip(*front, strict=True), linestyle="none", **ring)
+    # Of those that are as fast but for the spread of their times, the line joins the best.
+    best = [(seconds, value) for k, (seconds, value) in enumerate(front) if all(value < v for _, v in front[:k])]
+    axes.plot(*zip(*best, strict=True), label=front_name, linewidth=0.8, **ring)
     axes.set_xscale("log")
     apply_style(axes)
     axes.legend(frameon=False, fontsize="small")
@@ -428,9 +425,14 @@ def _position_unit(joint: int, slides: NDArray[np.bool_] | None) -> str:
 
 
 def _styles(lines: int) -> list[dict[str, Any]]:
-    """Line styles that stay apart: all colours, then all colours dashed, and so on."""
-    pairs = ({"color": color, "linestyle": dash, "linewidth": 1.4} for dash in cycle(DASHES) for color in COLORS)
-    return list(islice(pairs, lines))
+    """Line styles that stay apart: all colours, then all colours dashed, and so on, and all of that thinner."""
+    kinds = (
+        {"color": color, "linestyle": dash, "linewidth": width}
+        for width in cycle(_WIDTHS)
+        for dash in DASHES
+        for color in COLORS
+    )
+    return list(islice(kinds, lines))
 
 
 def _finish(axes: Axes, trajectory: Trajectory, label: str, lines: int) -> None:
@@ -439,6 +441,11 @@ def _finish(axes: Axes, trajectory: Trajectory, label: str, lines: int) -> None:
     apply_style(axes)
     if trajectory.duration > 0.0:
         axes.set_xlim(trajectory.t[0], trajectory.t[-1])
+    else:
+        # A line through one node would not be seen.
+        for line in axes.lines:
+            if np.size(line.get_xdata()) == 1:
+                line.set_marker("o")
     if lines > 1:
         axes.legend(
             loc="upper left",

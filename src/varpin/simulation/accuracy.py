@@ -42,6 +42,8 @@ PREDICTABLE, DISTURBANCE = 10.0, 1e-7
 LITTLE, LIGHT = 1e-2, 1e-2
 # Part of a joint's motion so far below which what it does at one place is rest.
 _REST = 1e-3
+# Parts of positions and velocities that are no more than what rounding adds up to.
+_ROUNDING = 1e3 * float(np.finfo(np.float64).eps)
 # Part of a speed that counts as changed if nothing changes it: a wheel that turns evenly turns over next to nothing.
 EVEN = 1e-3
 
@@ -137,9 +139,13 @@ class Window:
             so_far = self.varied[here - 1, joints]
             growth = np.where(so_far > 0.0, self.varied[self.judged - 1, joints] / so_far, np.inf)
             growth = np.maximum(np.minimum(growth, self.judged / here), 1.0)
-            rounding = 1e3 * np.finfo(np.float64).eps * (1.0 + np.abs(trajectory.q[self.step]).max())
+            rounding = _ROUNDING * (1.0 + np.abs(trajectory.q[self.step]).max())
             position = np.where(far <= rounding, 0.0, far * (1.0 if cut else growth) / way)
-            velocity = np.where(fast <= 1e-9 * speed, 0.0, fast / speed)
+            # What momenta of joints that move round to goes into the velocities of those at rest.
+            root = np.sqrt(inertia)
+            fastest = np.abs(trajectory.v[self.step : self.step + until + 1]).max(axis=0)
+            rounding = np.maximum(rounding / (trajectory.dt * here), _ROUNDING * (root * fastest).max() / root)
+            velocity = np.where(fast <= np.maximum(rounding, 1e-9 * speed), 0.0, fast / speed)
             motion = position * way / way.max()
             shares = np.array([position / WRONG_POSITION, velocity / WRONG_VELOCITY, motion / WRONG_MOTION])
         joint = int(np.argmax(np.where(np.isnan(shares), np.inf, shares).max(axis=0)))
@@ -236,8 +242,8 @@ def noticed(scene: Scene, way: Floats, speed: Floats, light: Floats, duration: F
     ``light`` are the velocities that would have little of the others' energy (..., n), ``duration`` how long they are
     looked at [s].
     """
-    least = np.minimum(LITTLE * _of_its_kind(scene, speed), light)
-    least_way = np.minimum(LITTLE * _of_its_kind(scene, way), light * duration)
+    least = np.minimum(LITTLE * largest_of_its_kind(scene, speed), light)
+    least_way = np.minimum(LITTLE * largest_of_its_kind(scene, way), light * duration)
     return np.maximum(way, least_way), np.maximum(speed, least)
 
 
@@ -248,7 +254,7 @@ def light_speed(inertia: Floats, change: Floats) -> Floats:
     return light
 
 
-def _of_its_kind(scene: Scene, values: Floats) -> Floats:
+def largest_of_its_kind(scene: Scene, values: Floats) -> Floats:
     """For each coordinate (..., n), the largest value of all that turn, or of all that slide: units do not compare."""
     sliding = scene.robot.slides
     largest = [values[..., kind].max(axis=-1, initial=0.0, keepdims=True) for kind in (sliding, ~sliding)]

@@ -11,6 +11,7 @@ from varpin.errors import SingularMassMatrix
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Radau, RungeKutta4
 from varpin.integrators.base import open_loop
 from varpin.integrators.collocation import MOST_STAGES
+from varpin.integrators.variational import Variational
 from varpin.integrators.within import Times, changing, in_parts
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
@@ -44,16 +45,17 @@ def finer(integrator: Integrator, trajectory: Trajectory, *, damped: bool, pulle
     explicit ones of first order where springs are no faster either (``pulled``).
     """
     stages = int(getattr(integrator, "stages", 1))
+    kick = integrator.kick if isinstance(integrator, Variational) else "left"
     if trajectory.dw.any() and isinstance(integrator, ExplicitEuler):
         # Its kicks come after the step.
         return Finer(integrator, 2, 0.5)
     more = stages + 1 if stages < MOST_STAGES else MOST_STAGES - 1
     parts = 2 if stages == MOST_STAGES else 1
     if damped or integrator.l_stable:
-        return Finer(Radau(max(3, more)), parts, 0.0)
+        return Finer(Radau(max(3, more), kick=kick), parts, 0.0)
     if integrator.order == 1 and not (integrator.variational or pulled):
         return Finer(RungeKutta4(), parts, 0.0)
-    return Finer(Gauss(max(2 if integrator.order <= 2 else 3, more)), parts, 0.0)
+    return Finer(Gauss(max(2 if integrator.order <= 2 else 3, more), kick=kick), parts, 0.0)
 
 
 class Again:

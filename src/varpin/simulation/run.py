@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -11,16 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.core import fastest_damping
+from varpin.core import fastest_damping, pulls_fast
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, UnknownJoint, VarpinError
-from varpin.integrators import Integrator, Midpoint, Radau, Reference, Segment, integrator_of
+from varpin.integrators import Gauss, Integrator, Midpoint, Radau, Reference, Segment, integrator_of
 from varpin.integrators.base import Failure, join, lines, open_loop, rows, steps_of
 from varpin.integrators.within import Times, changing
 from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
-from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop, takes
+from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.mechanics.scene import CORRECTED, Scene, refuse_constraints, refuse_inputs, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.simulation import limits
@@ -37,23 +38,32 @@ from varpin.support.checks import (
     joint_array,
     positive,
     require_finite,
+    takes,
+    told_motion,
 )
-from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
+from varpin.trajectory import STEP_NUMBERS, Accuracy, Nodes, Trajectory
 
 Floats = NDArray[np.float64]
 ControlLaw = Callable[[float, Floats, Floats], JointValues]
 # Controls that are known before the motion, or fed back by the core.
 Controls = JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None
-Progress = Callable[[int, int], None]
+Progress = Callable[[int, int], None] | Callable[[int, int, Nodes], None]
 
 logger = logging.getLogger(__name__)
 
 # Work between two looks at the progress callback and at Ctrl-C, in steps of one joint: some tens of milliseconds.
 _CHUNK = 30_000
-# What steps where no integrator is given; and where something damps faster than the step, by this factor: the midpoint
-# rule's velocities lag and ring. Of more joints than so many nobody asks, for that takes as long as a motion.
-_MIDPOINT, _STOPPING = Midpoint(), Radau(3)
-_RINGS, _ASKED = 1.0, 200
+# What steps where no integrator is given; and under noise, for more stages do not raise the strong order.
+_USUAL, _NOISY = Gauss(2), Midpoint()
+# What steps where something turns by more than this in a step [rad], of which two stages lose 2e-4 rad a period. And
+# where something damps this many times faster than the step: velocities of the others lag and ring, and three stages
+# miss by a tenth what torques that jump do to them.
+_SWINGING, _TURNS = Gauss(4), 0.4
+_STOPPING, _RINGS = Radau(4), 2.0
+# Of more joints than so many nobody asks, for that takes as long as a motion.
+_ASKED = 200
+# Who is told the motion is called at least so often [s], where nothing but whole chunks of steps takes longer.
+_LOOK = 1.0 / 60.0
 # Who may be chosen for a tolerance as well, where something damps faster than the coarsest steps by this factor.
 _STIFF, _FAR = (Radau(3), Radau(4)), 4.0
 # What a start may be moved by onto constraints without a word [rad or m].
@@ -246,6 +256,43 @@ class _Record:
         return _trajectory(self.scene, self.integrator, self.dt, self._first, parts, dw, within, self._line)
 
 
+class _Reporter:
+    """Who is told how far a motion is, and perhaps what it was since the last time."""
+
+    def __init__(self, progress: Progress | None, steps: int, dt: float) -> None:
+        self._progress: Any = progress
+        self._steps, self._dt = steps, dt
+        self._moving = told_motion("progress", progress, "steps done, steps in all", "nodes")
+        self._parts: list[Segment] = []
+        self._last = time.perf_counter()
+
+    def begin(self, node: Segment) -> None:
+        """Take the first node, and tell of it who is told the motion."""
+        if self._moving:
+            self._parts = [node]
+            self._tell(0)
+
+    def add(self, segment: Segment, done: int, *, due: bool) -> None:
+        """Take steps, after which so many are ``done``; and tell, if that is due."""
+        if self._progress is None:
+            return
+        if self._moving:
+            self._parts.append(segment)
+            due = due or time.perf_counter() - self._last > _LOOK
+        if due or done == self._steps:
+            self._tell(done)
+
+    def _tell(self, done: int) -> None:
+        if not self._moving:
+            self._progress(done, self._steps)
+            return
+        q, v = (np.concatenate([getattr(part, name) for part in self._parts]) for name in ("q", "v"))
+        nodes = Nodes(np.arange(done - len(q) + 1, done + 1, dtype=np.float64) * self._dt, q, v)
+        self._parts = [replace(self._parts[-1], q=q[-1:], v=v[-1:])]
+        self._progress(done, self._steps, nodes)
+        self._last = time.perf_counter()
+
+
 def _trajectory(
     scene: Scene,
     integrator: Integrator,
@@ -414,9 +461,10 @@ def simulate(
             step. A law is a digital controller: it is called once where each of its periods begins, with the time and
             the state of that node, and what it returns is held over the period.
         period: Of a control law, in steps.
-        integrator: If left out, :class:`Midpoint` with alpha = 1/2; or ``Radau(3)`` where, at the start, dampers, dry
-            friction or servos are faster than the step, and there is neither noise nor a constraint nor a CustomForce;
-            with a tolerance, the cheapest that there is.
+        integrator: If left out, ``Gauss(stages=2)``; where, at the start, springs turn a mode by more than 0.4 rad in a
+            step, ``Gauss(stages=4)``; where dampers, dry friction or servos are more than twice as fast as the step
+            there, ``Radau(stages=4)``, unless the scene has constraints. A CustomForce is not asked for either.
+            ``Midpoint()`` where noise is drawn; with a tolerance, the cheapest that there is.
 
     Other Args:
         rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero, and a
@@ -426,7 +474,9 @@ def simulate(
         check: Look at the finished motion, whether the balance of its energy closes, its steps resolve it and its
             control loop is stable, for ``Trajectory.warnings`` and the log. It takes about half as long as the
             motion, and 0.1 ms; some times as long as the motion where its steps are coarse.
-        progress: Called now and then with (steps done, steps in all).
+        progress: Called now and then with (steps done, steps in all). A function that needs three arguments gets the
+            motion, too: a :class:`varpin.Nodes` with the nodes from the last call on, the one it ended with first; as
+            :class:`varpin.LiveView` does.
 
     Returns:
         The trajectory, frozen.
@@ -466,7 +516,10 @@ def simulate(
     else:
         dt, steps = _times(dt, steps, duration)
     period = count("period", period, least=1)
-    integrator = _usual(scene, q0, v0, dt) if integrator is None else integrator
+    _require_memory(scene, steps)
+    dw = wiener_increments(scene.processes, dt, steps, rng, increments)
+    integrator = usual_integrator(scene, q0, v0, dt, noisy=len(dw) > 0) if integrator is None else integrator
+    reporter = _Reporter(progress, steps, dt)
     law = controls if callable(controls) else None
     if callable(controls) or isinstance(controls, OpenLoop):
         refuse_inputs(scene, "simulate with a function of time or a law")
@@ -477,13 +530,11 @@ def simulate(
             f"period = {period} is of a control law, a function of (t, q, v); rows are given one a step, "
             "and a LinearPolicy has a hold of its own"
         )
-    _require_memory(scene, steps)
     if callable(controls) or isinstance(controls, OpenLoop):
         commands = open_loop(np.zeros((0, scene.controls)))._replace(hold=period)
     else:
         commands = commands_of(scene, integrator, controls, steps, dt)
     hold = period if law is not None else commands.hold if isinstance(controls, LinearPolicy) else None
-    dw = wiener_increments(scene.processes, dt, steps, rng, increments)
     state, (start,) = integrator.start(scene, q0[None], v0[None])
     linear = bool(len(commands.places))
     if linear:
@@ -496,6 +547,7 @@ def simulate(
     stepwise = scene.noise.diffusion is None or scene.custom is not None or bool(scene.bound_constraints.rows.customs)
     interrupted = False
     try:
+        reporter.begin(start)
         while record.steps < steps:
             done = record.steps
             block = _next_block(controls, commands, record, 1 if stepwise else chunk, steps - done)
@@ -505,8 +557,7 @@ def simulate(
                 # What a law has just decided is in no step yet.
                 decided = None if law is None else (done, block.u)
                 raise _step_failure(record, segment.failure, hold if check else None, decided)
-            if progress is not None and (done // chunk < record.steps // chunk or record.steps == steps):
-                progress(record.steps, steps)
+            reporter.add(segment, record.steps, due=done // chunk < record.steps // chunk)
     except KeyboardInterrupt:
         interrupted = True
     try:
@@ -641,15 +692,18 @@ def _time_of_wish(dt: float | None, steps: int | None, duration: float | None) -
     return positive("duration", duration, "s")
 
 
-def _usual(scene: Scene, q0: Floats, v0: Floats, dt: float) -> Integrator:
+def usual_integrator(scene: Scene, q0: Floats, v0: Floats, dt: float, *, noisy: bool) -> Integrator:
     """Who integrates where nobody is named.
 
     Under noise it is the midpoint rule: its positions have the right law where damping is faster than the step, and a
     warning tells of its velocities. Radau's velocities lose nearly all of the noise.
     """
-    if scene.constraints or scene.processes:
-        return _MIDPOINT
-    return _STOPPING if _damps_faster(scene, q0, v0, _RINGS / dt) else _MIDPOINT
+    if noisy:
+        return _NOISY
+    # Radau's methods do not keep constraints.
+    if not scene.constraints and _damps_faster(scene, q0, v0, _RINGS / dt):
+        return _STOPPING
+    return _SWINGING if _swings_faster(scene, q0, _TURNS / dt) else _USUAL
 
 
 def _candidates(scene: Scene, q0: Floats, v0: Floats, duration: float) -> tuple[Integrator, ...]:
@@ -667,6 +721,14 @@ def _damps_faster(scene: Scene, q0: Floats, v0: Floats, rate: float) -> bool:
     velocities = np.array([v0, np.zeros_like(v0)])
     forces = np.tile(scene.actuation @ scene.command_at(q0), (2, 1))
     return fastest_damping(scene.core, np.tile(q0, (2, 1)), velocities, forces, rate) > 0.0
+
+
+def _swings_faster(scene: Scene, q0: Floats, rate: float) -> bool:
+    """Whether springs, servos or gravity make a mode faster than a rate [rad/s] at rest at the start."""
+    if scene.custom is not None or len(q0) > _ASKED:
+        return False
+    forces = (scene.actuation @ scene.command_at(q0))[None]
+    return bool(pulls_fast(scene.core, q0[None], np.zeros((1, len(q0))), forces, 1.0 / rate))
 
 
 def _require_choice(scene: Scene, controls: Controls | ControlLaw, integrator: Integrator | None) -> Controls:

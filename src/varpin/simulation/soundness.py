@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.core import doubled_steps_agree, energy_turnover, fastest_damping, glance
-from varpin.integrators import Integrator, Radau, Reference
+from varpin.integrators import ExplicitEuler, Integrator, Radau, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.integrators.within import changing, in_pairs, in_parts, shares
 from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.noise import impulses
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import (
     EVEN,
@@ -43,7 +44,9 @@ from varpin.simulation.accuracy import (
 from varpin.simulation.chatter import RUN, Alternation, alternation
 from varpin.simulation.friction import Stop, rate_at_stops, stops
 from varpin.simulation.limits import left as limits_left
+from varpin.simulation.phase import phase_lost
 from varpin.simulation.retaking import Again, Finer, finer, taken_again
+from varpin.simulation.saturation import bent
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -67,8 +70,8 @@ WORK, LEAST_WORK = 50, 256
 _WINDOWS, _MARGIN = 16, 8.0
 # What they are taken again with where dampers are faster than the step.
 _STOPPING = Radau(3)
-# Steps from where a joint comes to rest that are taken again with it, and in how many parts each.
-_SETTLING, _SETTLED = 6, 2
+# Steps from where a joint comes to rest that are taken again with it, and in how many parts each; in more if it fails.
+_SETTLING, _SETTLED = 6, (2, 16)
 # What the velocity may be off by there: over several steps in widths of the friction; in one, of the largest velocity.
 _RUBS, _FELT = 0.1, 1e-3
 # Nodes at which mass matrices, and energies of single groups, are looked at; and rates of dampers.
@@ -251,7 +254,7 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     found = [*_energy(scene, integrator, trajectory)]
     unsettled = _unsettled(scene, integrator, trajectory)
     if resolved(scene, integrator, trajectory):
-        return (*found, *unsettled)
+        return (*found, *(() if found else _adding_up(scene, integrator, trajectory)), *unsettled)
     error = motion_error(scene, integrator, trajectory)
     if error is not None and spoken_of(error):
         dt, start = trajectory.dt, trajectory.t[error.step]
@@ -271,7 +274,41 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
         before, after = trajectory.v[:-1], trajectory.v[1:]
         if ((before * after < 0.0) & (np.abs(before) > _STILL) & (np.abs(after) > 0.5 * np.abs(before))).any():
             found.append(_ringing(scene, fast, trajectory.dt))
+    if not found:
+        found.extend(_adding_up(scene, integrator, trajectory))
     return (*found, *(own for own in unsettled if own.kind not in {other.kind for other in found}))
+
+
+def _adding_up(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Says what adds up over a motion that steps resolve from period to period."""
+    return (*_out_of_phase(scene, integrator, trajectory), *_at_limits_of_drives(scene, integrator, trajectory))
+
+
+def _at_limits_of_drives(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Says if servos come to the limits of their drives, or leave them, in steps that are too long for that."""
+    found = bent(scene, integrator, trajectory)
+    if found is None:
+        return ()
+    sentence = (
+        f"servos come to the limits of their drives, or leave them, in {found.steps} steps: dt = {trajectory.dt:g} s "
+        f"is coarse for {integrator} there, and joint {trajectory.joint_names[found.joint]!r} may be off by "
+        f"{found.off:.2g} rad or m, {100 * found.share:.2g}% of the longest way of a joint; smaller steps mend it"
+    )
+    return (Finding("servos at their limits", sentence, found.joint),)
+
+
+def _out_of_phase(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Says if oscillations on springs lose more over the whole motion than can be told from a period."""
+    lost = phase_lost(scene, integrator, trajectory)
+    if lost is None:
+        return ()
+    sentence = (
+        f"oscillations of {lost.rate / (2.0 * np.pi):.3g} Hz lose phase or height: over the motion, steps of "
+        f"dt = {trajectory.dt:g} s by {integrator} put them off by about {100 * lost.turned:.2g}% of their height, "
+        f"and joint {trajectory.joint_names[lost.joint]!r} by {lost.off:.2g} rad or m, {100 * lost.share:.2g}% of the "
+        "longest way of a joint; smaller steps or more stages keep them"
+    )
+    return (Finding("phase", sentence, lost.joint),)
 
 
 def _unsettled(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -288,16 +325,29 @@ def _unsettled(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
         count = min(_SETTLING, trajectory.steps - stop.step)
         if not rate or count < _SETTLING // 2:
             continue
-        again = taken_again(scene, _STOPPING, trajectory, integrator.stage_times, stop.step, count, _SETTLED)
-        if again is None:
-            continue
-        off = np.abs(again[1] - trajectory.v[stop.step : stop.step + count + 1])[1:, stop.joint]
+        off = _off_rest(scene, integrator, trajectory, stop, count)
+        if len(off) < _SETTLING // 2:
+            # What nothing gets through cannot be seen to be right.
+            return (_ringing(scene, _Fast(rate, stop), trajectory.dt),)
         lasting, most = float(np.median(off)), float(off.max())
         speed = float(np.abs(trajectory.v[:, stop.joint]).max())
         if lasting > _RUBS * stop.width or (most > stop.width and most > _FELT * speed):
             since = f"; after t = {trajectory.t[stop.step]:.4g} s it is off by up to {most:.3g} rad/s or m/s"
             return (_ringing(scene, _Fast(rate, stop), trajectory.dt, since),)
     return ()
+
+
+def _off_rest(scene: Scene, integrator: Integrator, trajectory: Trajectory, stop: Stop, count: int) -> Floats:
+    """How far a joint's velocity is from the right one in the steps after it stops, as many as are known."""
+    off = np.zeros(0)
+    for parts in _SETTLED:
+        again = taken_again(scene, _STOPPING, trajectory, integrator.stage_times, stop.step, count, parts)
+        if again is not None:
+            off = np.abs(again[1] - trajectory.v[stop.step : stop.step + count + 1])[1:, stop.joint]
+            off = off[np.isfinite(off)]
+        if len(off) >= _SETTLING // 2:
+            break
+    return off
 
 
 def _energy(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -440,12 +490,14 @@ def _kicks(scene: Scene, trajectory: Trajectory) -> tuple[Floats | float, Floats
 def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
     """Whether even steps of twice the length make the same motion, so that there is nothing more to look for.
 
-    Windows all over the motion, or some of them, are taken again from their first nodes, all at once. That takes half
-    as long as the motion, or less; a motion of whole steps without noise can pass.
+    Windows all over the motion, or some of them, are taken again from their first nodes, all at once, under the kicks
+    that noise gave it. That takes half as long as the motion, or less; a motion of whole steps can pass whose noise
+    the core knows.
     """
     steps, q, v, u = trajectory.steps, trajectory.q, trajectory.v, trajectory.u
-    if isinstance(integrator, Reference) or not steps or trajectory.dw.any() or scene.noise.diffusion is None:
+    if isinstance(integrator, Reference) or not steps or scene.noise.diffusion is None:
         return False
+    noisy = bool(trajectory.dw.any())
     # Windows of like lengths, which are even.
     pieces = min(-(-steps // WINDOW), _WINDOWS)
     length = min(WINDOW, 2 * -(-steps // (2 * pieces)), steps - steps % 2)
@@ -459,8 +511,9 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
     # against that in steps as long as theirs.
     damped = bool(_fast_damping(scene, trajectory).rate)
     if steps == 1:
-        return not damped and _halves_agree(scene, integrator, trajectory)
-    other, times = _STOPPING if damped else integrator, 1 if damped and not integrator.l_stable else 2
+        return not (damped or noisy) and _halves_agree(scene, integrator, trajectory)
+    foreign = damped and not integrator.l_stable
+    other, times = _STOPPING if foreign else integrator, 1 if foreign else 2
     apart = max(pieces, 1 + steps % 2) - 1
     begins = np.array([i * (steps - length) // apart for i in range(apart + 1)]) if apart else _FROM_START
     if pieces == _WINDOWS:
@@ -470,15 +523,44 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
         # Commands are the same for all paths; their forces need not be.
         held = u[begins[:, None] + np.arange(length)].reshape(len(begins), length // times, times, -1)
         commands, drift = open_loop(np.zeros_like(u[:length:times])), held.mean(axis=2) @ scene.actuation.T
+    kicks = _kicks_of(scene, integrator, trajectory, begins, length, times) if noisy else None
     if trajectory.u_stages.shape[1]:
-        again = _windows_under(scene, integrator, trajectory, begins, length, other, times)
+        again = _windows_under(scene, integrator, trajectory, begins, length, other, times, kicks)
     else:
-        again = other.motions(scene, q[begins], v[begins], commands, drift, times * trajectory.dt)
+        again = other.motions(scene, q[begins], v[begins], commands, drift, times * trajectory.dt, kicks)
     if times == 1 and again is not None:
         again = np.ascontiguousarray(again[0][:, 1::2]), np.ascontiguousarray(again[1][:, 1::2])
     # How much less the error is in steps of half the length; of another method nothing is known.
     gain = (1.0 if damped else 2.0**integrator.order - 1.0) / _MARGIN
     return again is not None and _agree(scene, (q, v), begins, length, trajectory.dt, again, gain)
+
+
+def _kicks_of(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, begins: Integers, length: int, times: int
+) -> Floats:
+    """Impulses of the noise in windows of a motion, before and after each step of ``times`` of its own (P, K, 2, n).
+
+    In a step of twice the length half of what kicked in its middle comes before it and half after it: its end is then
+    at the same place, with the same momentum, to first order in the step.
+    """
+    diffusion, first = scene.noise.diffusion, trajectory.q[0]
+    assert diffusion is not None
+    step = begins[:, None] + np.arange(length)
+    # Explicit Euler's kicks come after the step.
+    left = 0.0 if isinstance(integrator, ExplicitEuler) else integrator.left
+    n = trajectory.q.shape[1]
+
+    def part(share: float, node: Integers) -> Floats:
+        if share == 0.0:
+            return np.zeros((*step.shape, n))
+        rows = trajectory.q[node.ravel()], trajectory.u[step.ravel()], trajectory.dw[step.ravel()]
+        return share * impulses(diffusion, *rows, first).reshape(*step.shape, n)
+
+    before, after = part(left, step), part(1.0 - left, step + 1)
+    if times == 2:
+        half = 0.5 * (after[:, ::2] + before[:, 1::2])
+        before, after = before[:, ::2] + half, half + after[:, 1::2]
+    return np.stack([before, after], axis=2)
 
 
 def _agree(
@@ -529,15 +611,17 @@ def _windows_under(
     length: int,
     other: Integrator,
     times: int,
+    kicks: Floats | None,
 ) -> tuple[Floats, Floats] | None:
     """Windows of a motion whose controls change within steps, by another method, or in steps of twice the length."""
     at, mine, found = other.stage_times, integrator.stage_times, []
-    for begin in begins:
+    for window, begin in enumerate(begins):
         values = trajectory.u_stages[begin : begin + length]
         commands = changing(in_parts(values, mine, 1, at) if times == 1 else in_pairs(values, mine, at), at)
         node = slice(begin, begin + 1)
-        drift = np.zeros((0, 0, scene.robot.dof))
-        again = other.motions(scene, trajectory.q[node], trajectory.v[node], commands, drift, times * trajectory.dt)
+        given = commands, np.zeros((0, 0, scene.robot.dof)), times * trajectory.dt
+        own = None if kicks is None else kicks[window : window + 1]
+        again = other.motions(scene, trajectory.q[node], trajectory.v[node], *given, own)
         if again is None:
             return None
         found.append(again)

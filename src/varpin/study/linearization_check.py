@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.integrators import Integrator, Midpoint
+from varpin.integrators import Integrator
 from varpin.linearization import linearize
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
-from varpin.simulation.run import simulate
+from varpin.simulation.run import simulate, usual_integrator
 from varpin.support.checks import JointValues, finite_array, joint_array, positive
 
 Floats = NDArray[np.float64]
@@ -93,7 +93,7 @@ def check_linearization(
         dt: Time step [s].
 
     Other Args:
-        integrator: ``Midpoint()`` if left out.
+        integrator: That of :func:`varpin.simulate` if left out.
         step: Of the differences, in the units of :class:`LinearizationCheck`.
 
     Raises:
@@ -105,7 +105,7 @@ def check_linearization(
     q, v = joint_array("q", q, scene.robot.joint_names), joint_array("v", v, scene.robot.joint_names)
     u = np.zeros(m) if u is None else finite_array("u", u, (m,))
     dt, step = positive("dt", dt, "s"), positive("step", step, "1")
-    method = Midpoint() if integrator is None else integrator
+    method = usual_integrator(scene, q, v, dt, noisy=k > 0) if integrator is None else integrator
     options: dict[str, Any] = {"dt": dt, "steps": 1, "integrator": method, "check": False}
     motion = simulate(scene, q, v, controls=u, increments=0.0, **options)
     lin = linearize(scene, motion, integrator=method)

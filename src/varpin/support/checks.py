@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import os
 import reprlib
@@ -177,6 +178,22 @@ def named_limits(
     return checked_limits(name, sides, size)
 
 
+def over_time(name: str, function: Callable[[float], ArrayLike], times: Floats, size: int) -> Floats:
+    """A function of time at some times (N,), (N, size).
+
+    Raises:
+        InputError: It raises, or returns another shape or values that are not finite.
+    """
+    rows = []
+    for time in times.tolist():
+        try:
+            value = function(time)
+        except Exception as error:
+            raise InputError(f"{name} raised {error!r} at t = {time:.6g} s") from error
+        rows.append(finite_array(f"{name} at t = {time:.6g} s", value, (size,)))
+    return np.array(rows).reshape(len(times), size)
+
+
 def as_floats(name: str, value: object) -> Floats:
     """``value`` as a new float array, or an InputError that names it."""
     try:
@@ -296,3 +313,40 @@ def is_file(path: Path) -> bool:
         return path.is_file()
     except OSError:
         return False
+
+
+def takes(function: Callable[..., object], arguments: int) -> bool:
+    """Whether a function can be called with so many arguments; true where it does not tell."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return True
+    try:
+        signature.bind(*range(arguments))
+    except TypeError:
+        return False
+    return True
+
+
+def told_motion(name: str, function: object, arguments: str, motion: str) -> bool:
+    """Whether a function that is told how far something is wants the motion, too, as one argument more.
+
+    Args:
+        name: Of the function.
+        function: What was given; None for nobody to be told.
+        arguments: What it is told at least, in words, separated by commas.
+        motion: The last argument, in words.
+
+    Raises:
+        InputError: It can be called with neither.
+    """
+    if function is None:
+        return False
+    least = arguments.count(",") + 1
+    if callable(function):
+        # What takes any number of arguments, as print does, is told the least.
+        if takes(function, least):
+            return False
+        if takes(function, least + 1):
+            return True
+    raise InputError(f"{name} must be a function of ({arguments}), or of ({arguments}, {motion}); got {function!r}")

@@ -471,7 +471,7 @@ class Collocation {
                 residual[i * n + c] = error;
                 scale = h * scale + std::abs(start.p[c].high) + stage[i].Lv_scale[c];
                 if (scale > nothing) error = std::abs(error) / (rounding_unit * scale);
-                if (!(error <= worst)) worst = error;  // NaN ends up in worst
+                worst = larger(error, worst);
             }
         }
         return worst;

@@ -865,7 +865,7 @@ class ConstrainedStepper {
                 right[i * n + c] = scaled[c] * error;
                 scale = h * scale + std::abs(start.p[c].high) + equation.stage[i].Lv_scale[c] + across_size;
                 if (scale > nothing) error = std::abs(error) / (rounding_unit * scale);
-                if (!(error <= worst)) worst = error;
+                worst = larger(error, worst);
             }
         }
         for (int k = 0; k < stages; ++k) {
@@ -889,7 +889,7 @@ class ConstrainedStepper {
                 for (int c = 0; c < n; ++c) scale += std::abs(jet.C[row * n + c]) * h * swiftest;
                 const double open = std::abs(jet.g[row]),
                              error = scale > nothing ? open / (rounding_unit * scale) : open;
-                if (!(error <= worst)) worst = error;
+                worst = larger(error, worst);
             }
         }
         return worst;

@@ -13,6 +13,9 @@
 
 namespace varpin {
 
+// The larger of two numbers, and NaN if one of them is.
+inline double larger(double a, double b) { return a > b || a != a ? a : b; }
+
 namespace detail {
 
 // y -= s x over columns [first, last) of two rows, two at a time: on rows as short as an arm's, what compilers make of

@@ -218,10 +218,11 @@ class ExplicitRollout {
         return true;
     }
 
-    // All steps, each of length h. Increments (P, N, k) and a drift (P, N, n) on top of the controls' force are null
-    // for none. A path alone may be under a watch, which may end it.
-    void roll(double h, const Commands& commands, const double* increments, const double* drift, const Nodes& nodes,
-              Watch* watch = nullptr) {
+    // All steps, each of length h. Increments (P, N, k), a drift (P, N, n) on top of the controls' force and impulses
+    // on top of the noise's, before and after each step (P, N, 2, n), are null for none. A path alone may be under a
+    // watch, which may end it.
+    void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
+              const Nodes& nodes, Watch* watch = nullptr) {
         for (std::int64_t i = 0; i < paths_; ++i) {
             load(i);
             nodes.done[i] = 0;
@@ -230,7 +231,8 @@ class ExplicitRollout {
             for (std::int64_t s = 0; s < nodes.steps; ++s) {
                 const std::int64_t row = i * nodes.steps + s;
                 const double* dw = increments ? increments + row * mechanism_->diffusion.processes : nullptr;
-                outcome = step(h, commands, dw, drift ? drift + row * dof() : nullptr, regular, nodes, i, s);
+                const double* kicks = impulses ? impulses + 2 * row * dof() : nullptr;
+                outcome = step(h, commands, dw, drift ? drift + row * dof() : nullptr, kicks, regular, nodes, i, s);
                 if (outcome != Outcome::solved) break;
                 nodes.done[i] = s + 1;
                 if (watch && !watch->after(s, 0)) break;
@@ -255,8 +257,8 @@ class ExplicitRollout {
     bool at_state() { return stepper_.dynamics.at(stepper_.q.data(), stepper_.v.data()); }
 
     // One step of a path, with its node; the dynamics are at its state before and after.
-    Outcome step(double h, const Commands& commands, const double* dw, const double* drift, bool regular,
-                 const Nodes& nodes, std::int64_t path, std::int64_t s) {
+    Outcome step(double h, const Commands& commands, const double* dw, const double* drift, const double* kicks,
+                 bool regular, const Nodes& nodes, std::int64_t path, std::int64_t s) {
         const int n = dof(), m = mechanism_->controls;
         std::vector<double>& at_q = stepper_.q;
         std::vector<double>& at_v = stepper_.v;
@@ -267,6 +269,7 @@ class ExplicitRollout {
         stage_forces(*mechanism_, drift, within ? within : u, within ? stepper_.places() : 1, force_.data());
         if (!regular) return Outcome::singular;
         const bool beside = method_ == ExplicitMethod::euler;
+        if (kicks) kick(kicks);
         if (dw) {
             noise_impulse(*mechanism_, 1.0, at_q.data(), center(path), u, dw, jump_.data());
             stepper_.dynamics.solve_mass(jump_.data(), jump_.data());
@@ -277,8 +280,16 @@ class ExplicitRollout {
         }
         regular = stepper_.step(h, force_.data(), within ? n : 0);
         if (dw && beside) add_jump();
+        if (kicks && regular && at_state()) kick(kicks + n);
         nodes.tally[(path * nodes.steps + s) * 4 + 2] = stepper_.stages();
         return regular ? enter_node(nodes, path, s) : Outcome::singular;
+    }
+
+    // An impulse (n) at the state, which the dynamics are at.
+    void kick(const double* impulse) {
+        stepper_.dynamics.solve_mass(impulse, jump_.data());
+        add_jump();
+        at_state();
     }
 
     void add_jump() {

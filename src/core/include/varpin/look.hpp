@@ -15,9 +15,6 @@
 
 namespace varpin {
 
-// The larger of two numbers, and NaN if one of them is.
-inline double larger(double a, double b) { return a > b || a != a ? a : b; }
-
 // The largest, the least and the largest magnitude of some numbers.
 struct Extent {
     double least = std::numeric_limits<double>::infinity();

@@ -217,9 +217,10 @@ class VariationalStepper {
 
     // Steps of every path from where it stands. Writes into `nodes` the node after each step, what was applied in it
     // and what it took. A path that fails stops there; nodes.ended and nodes.done say how and where. `increments` of
-    // the Wiener processes (P, N, k) and `drift`, a force besides the controls' (P, N, n), may be null. A path alone
-    // may be under a watch, which may end it.
-    void roll(double h, const Commands& commands, const double* increments, const double* drift,
+    // the Wiener processes (P, N, k), `drift`, a force besides the controls' (P, N, n), and `impulses` besides the
+    // noise's, before and after each step (P, N, 2, n), may be null. A path alone may be under a watch, which may end
+    // it.
+    void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
               std::vector<PathState>& states, const Nodes& nodes, Watch* watch = nullptr) {
         const std::int64_t steps = nodes.steps;
         const int m = mechanism.controls, k = mechanism.diffusion.processes, stages = step_equation.stages;
@@ -236,6 +237,7 @@ class VariationalStepper {
                 const double* dw = noisy ? increments + row * k : nullptr;
                 apply_policy(commands, path, s, n, state.q.data(), state.momentum.data(), u);
                 if (noisy) noise_kick(left, u + s * m, dw, state);
+                if (impulses) kick(impulses + 2 * row * n, state);
                 const double* within = stage_controls(commands, path, s, stages, u, line);
                 stride = within ? static_cast<int>(n) : 0;
                 if (within) {
@@ -249,6 +251,7 @@ class VariationalStepper {
                 if (outcome != Outcome::solved) break;
                 state.halvings.insert(state.halvings.end(), halvings.begin(), halvings.end());
                 if (noisy && left < 1.0) noise_kick(1.0 - left, u + s * m, dw, state);
+                if (impulses) kick(impulses + (2 * row + 1) * n, state);
                 record_node(state, n, nodes, row);
                 nodes.done[path] = s + 1;
                 if (watch && !watch->after(s, effort.substeps)) break;
@@ -330,11 +333,10 @@ class VariationalStepper {
 
     // Extrapolate the last whole step into the stage velocities. The polynomial through them and the velocity at its
     // end goes on, moved by what a kick has since done to the velocity, and bent by what has changed in a held force.
-    // Where nothing kicks, by how much it misses goes on too: by the backward differences of as high an order as would
-    // have served the last step best.
+    // By how much it misses goes on too: by the backward differences of as high an order as would have served the last
+    // step best.
     void extrapolate(double h, const PathState& state) {
         const Stages stages = step_equation.stages;
-        const int trend = mechanism.diffusion.processes == 0 ? state.trend : 0;
         double *change = bend.data(), *acceleration = change + n;
         bool changed = false;
         for (int c = 0; c < n; ++c) {
@@ -355,7 +357,7 @@ class VariationalStepper {
                 const int k = i * n + c;
                 guess[k] = total + h * tableau.c[i] * acceleration[c];
                 double missing = 0.0;
-                for (int r = 0; r < trend; ++r) missing += state.miss[r * stages * n + k];
+                for (int r = 0; r < state.trend; ++r) missing += state.miss[r * stages * n + k];
                 step_equation.V[k] = guess[k] + missing;
             }
         }

@@ -110,6 +110,10 @@ class PlanConstraint(Frozen, ABC):
             InputError: It is of another robot, or does not fit the controls.
         """
 
+    def after(self, before: Floats) -> PlanConstraint:  # noqa: ARG002
+        """The constraint on a horizon that begins after another control (m,)."""
+        return self
+
     @property
     def label(self) -> str:
         """What it is called in reports."""

@@ -71,7 +71,8 @@ class KeepClear(PlanConstraint):
 
         Args:
             robot: The robot.
-            obstacles: From :meth:`Obstacle.sphere`, :meth:`Obstacle.capsule` and :meth:`Obstacle.box`.
+            obstacles: From :meth:`Obstacle.sphere`, :meth:`Obstacle.capsule` and :meth:`Obstacle.box`; they may move
+                (:meth:`Obstacle.moving`).
             distance: What is to be between the bodies of a pair at least [m].
             links: Which links; all that joints move and that have shapes or a capsule given if left out.
             itself: Keep links clear of each other, too, but for neighbours: those on one joint or on two that follow
@@ -102,4 +103,6 @@ class KeepClear(PlanConstraint):
     def bind(self, horizon: Horizon) -> BoundConstraint:
         """See :meth:`PlanConstraint.bind`."""
         require_same(self, self.robot, horizon)
-        return _BoundClearance(self, *nodes_after(horizon), self.pairs, "m", _LENGTH, self._of, self.distance)
+        places, times = nodes_after(horizon)
+        of = self._of.over(times)
+        return _BoundClearance(self, places, times, self.pairs, "m", _LENGTH, of, self.distance)

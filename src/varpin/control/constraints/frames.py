@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,7 @@ from varpin.control.constraints.base import (
 from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
-from varpin.support.checks import as_floats, checked_limits, finite, finite_array, positive, rotation_matrix
+from varpin.support.checks import as_floats, checked_limits, finite, finite_array, over_time, positive, rotation_matrix
 
 Floats = NDArray[np.float64]
 
@@ -127,15 +128,17 @@ def _log_slope(e: Floats) -> Floats:
 @dataclass(frozen=True, eq=False)
 class _BoundRegion(BoundConstraint):
     region: _Region
+    shifts: Floats  # of the region at each place (K, 3), or (1, 3) where it stands
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
         at = q[..., self.places, :]
         _, p = self.region.kinematics.placements(np.ascontiguousarray(at.reshape(-1, at.shape[-1])))
+        p = (p.reshape(*at.shape[:-1], 3) - self.shifts).reshape(-1, 3)
         return self.region.distances(p).reshape(*at.shape[:-1], len(self.rows))
 
     def jacobian(self, q: Floats, v: Floats) -> Floats:  # noqa: ARG002
         _, p, J = self.region.kinematics.jacobians(np.ascontiguousarray(q[self.places]))
-        slopes = self.region.slopes(p) @ J[:, :3]
+        slopes = self.region.slopes(p - self.shifts) @ J[:, :3]
         return np.concatenate([slopes, np.zeros_like(slopes)], axis=2)
 
 
@@ -158,7 +161,16 @@ class _Region(_OfFrame):
     def bind(self, horizon: Horizon) -> BoundConstraint:
         """See :meth:`PlanConstraint.bind`."""
         require_same(self, self.robot, horizon)
-        return _BoundRegion(self, *nodes_after(horizon), self._rows, "m", _LENGTH, self)
+        places, times = nodes_after(horizon)
+        return _BoundRegion(self, places, times, self._rows, "m", _LENGTH, self, self.shifts(times))
+
+    def shifts(self, times: Floats) -> Floats:  # noqa: ARG002
+        """Where the region is at some times (K,) [s], from its own origin (K, 3) or (1, 3) [m].
+
+        Raises:
+            InputError: A function of the user's fails.
+        """
+        return np.zeros((1, 3))
 
 
 class KeepInHalfSpace(_Region):
@@ -244,14 +256,23 @@ class KeepInBox(_Region):
 
 class _OfSphere(_Region):
     outside: bool
+    center: Floats | Callable[[float], ArrayLike]
 
-    def __init__(self, robot: Robot, frame: str, center: ArrayLike, radius: float, *, margin: float = 0.0) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        center: ArrayLike | Callable[[float], ArrayLike],
+        radius: float,
+        *,
+        margin: float = 0.0,
+    ) -> None:
         """Describe the constraint.
 
         Args:
             robot: The robot.
             frame: Name of the frame.
-            center: Of the sphere in the world (3,) [m].
+            center: Of the sphere in the world (3,) [m], or a function of time [s] that returns it.
             radius: Of the sphere [m].
             margin: In standard deviations of what noise does to the distance.
 
@@ -261,7 +282,9 @@ class _OfSphere(_Region):
         """
         self._take(robot, frame)
         name = type(self).__name__
-        self.center = finite_array(f"{name} center", as_floats(f"{name} center", center), (3,))
+        self.center = (
+            center if callable(center) else finite_array(f"{name} center", as_floats(f"{name} center", center), (3,))
+        )
         self.radius = positive(f"{name} radius", radius, "m")
         self.margin = checked_margin(self, margin)
 
@@ -269,18 +292,23 @@ class _OfSphere(_Region):
     def _rows(self) -> tuple[str, ...]:
         return ("the sphere",)
 
+    def shifts(self, times: Floats) -> Floats:
+        """See the base: places are then those from the centre."""
+        if callable(self.center):
+            return over_time(f"{type(self).__name__} center", self.center, times, 3)
+        return self.center[None]
+
     def distances(self, p: Floats) -> Floats:
         """See the base."""
-        beyond: Floats = np.linalg.norm(p - self.center, axis=1, keepdims=True) - self.radius
+        beyond: Floats = np.linalg.norm(p, axis=1, keepdims=True) - self.radius
         return -beyond if self.outside else beyond
 
     def slopes(self, p: Floats) -> Floats:
         """See the base."""
-        away = p - self.center
-        length = np.linalg.norm(away, axis=1, keepdims=True)
+        length = np.linalg.norm(p, axis=1, keepdims=True)
         # At the centre every way leads out; inside, none is needed.
         fixed = np.array([0.0, 0.0, 1.0 if self.outside else 0.0])
-        unit = np.where(length > 0.0, away / np.where(length > 0.0, length, 1.0), fixed)
+        unit = np.where(length > 0.0, p / np.where(length > 0.0, length, 1.0), fixed)
         found: Floats = (-unit if self.outside else unit)[:, None]
         return found
 

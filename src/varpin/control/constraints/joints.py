@@ -197,6 +197,10 @@ class WithinControlRate(PlanConstraint):
             raise InputError(f"WithinControlRate limit must be > 0 [control/s], got {limit!r}")
         self.before = before
 
+    def after(self, before: Floats) -> PlanConstraint:
+        """See :meth:`PlanConstraint.after`."""
+        return WithinControlRate(self.limit, before)
+
     def bind(self, horizon: Horizon) -> BoundConstraint:
         """See :meth:`PlanConstraint.bind`."""
         name, m, joints = "WithinControlRate", horizon.controls, horizon.control_joints

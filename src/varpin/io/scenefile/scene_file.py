@@ -25,7 +25,7 @@ from varpin.io.scenefile.table import Floats
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot
-from varpin.simulation.run import simulate
+from varpin.simulation.run import simulate, usual_integrator
 from varpin.support.markup import facts
 from varpin.trajectory import Trajectory
 
@@ -71,8 +71,16 @@ class SceneFile:
 
     @cached_property
     def integrator(self) -> Integrator:
-        """The integrator of the file, or, where it names none, that of :class:`varpin.OptimalControlProblem`."""
-        return self.spec.integrator or integrator_for(self.scene, self.q0, self.spec.dt)
+        """The integrator of the file.
+
+        Where it names none, that of :class:`varpin.OptimalControlProblem`, or of :func:`varpin.simulate` where nothing
+        is to be planned.
+        """
+        if self.spec.integrator is not None:
+            return self.spec.integrator
+        if self.spec.costs:
+            return integrator_for(self.scene, self.q0, self.spec.dt)
+        return usual_integrator(self.scene, self.q0, self.v0, self.spec.dt, noisy=self.spec.seed is not None)
 
     @cached_property
     def problem(self) -> OptimalControlProblem:

@@ -83,7 +83,7 @@ def traces(
         parts = math.ceil(_FEWEST / (len(times) - 1))
         fine = np.arange((len(times) - 1) * parts + 1) / parts
         times = np.interp(fine, np.arange(len(times)), times)
-    rows = _at(times, t, q)
+    rows = rows_at(times, t, q)
     found = []
     for name in names:
         points = robot.frame_positions(rows, name)
@@ -108,14 +108,14 @@ def outlooks(robot: Robot, names: Sequence[str], run: MpcRun, ahead: float, time
     found = []
     for name in names:
         beads = [
-            robot.frame_positions(_at(times, ticks, run.planned(ahead * part)), name)
+            robot.frame_positions(rows_at(times, ticks, run.planned(ahead * part)), name)
             for part in np.arange(1, _BEADS + 1) / _BEADS
         ]
         found.append(Outlook(name, np.stack(beads, axis=1)))
     return found
 
 
-def _at(times: Floats, t: Floats, rows: Floats) -> Floats:
+def rows_at(times: Floats, t: Floats, rows: Floats) -> Floats:
     """Rows (N, n) at times (N,), read off at others."""
     return np.column_stack([np.interp(times, t, column) for column in rows.T])
 
@@ -206,7 +206,7 @@ def target(name: str, track: tuple[Floats, Floats, Floats | None], times: Floats
     t, places, turns = track
     if len(t) == 1:
         return Target(name, places, turns)
-    at = _at(times, t, places)
+    at = rows_at(times, t, places)
     if turns is None:
         return Target(name, at)
     between = scipy.spatial.transform.Slerp(t, scipy.spatial.transform.Rotation.from_quat(turns))

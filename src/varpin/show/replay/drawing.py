@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import meshcat
 import numpy as np
@@ -26,7 +27,7 @@ from varpin.show.replay.legend import (
 from varpin.show.replay.picture import Picture, label, labels
 from varpin.show.replay.script import Actor, Outlook, Script, Target, Trace
 from varpin.show.replay.shapes import ShapeLoader
-from varpin.show.replay.view import set_view, side_by_side, view_direction
+from varpin.show.replay.view import across, set_view, side_by_side, view_direction
 
 Floats = NDArray[np.float64]
 
@@ -39,9 +40,30 @@ _TUBE, _BEAD, _BALL, _TRIAD, _LABEL, _TIE, _ROD, _EDGE = 0.003, 0.006, 0.02, 0.1
 logger = logging.getLogger(__name__)
 
 
-def draw(viewer: meshcat.Visualizer, script: Script) -> None:
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """What the view was set for.
+
+    Attributes:
+        size: Of the largest robot's motion [m].
+        places: Where each robot is (3,) [m].
+        points: All that is to be seen (P, 3) [m].
+        toward: Unit vector (3,) to the camera.
+        floor: Height of the grid [m].
+        pictures: What each robot looks like.
+    """
+
+    size: float
+    places: list[Floats]
+    points: Floats
+    toward: Floats
+    floor: float
+    pictures: list[Picture]
+
+
+def draw(viewer: meshcat.Visualizer, script: Script) -> Stage:
     """Send everything a script shows."""
-    _Drawing(viewer, script).draw()
+    return _Drawing(viewer, script).draw()
 
 
 class _Drawing:
@@ -55,8 +77,9 @@ class _Drawing:
         robots = {id(actor.robot): actor.robot for actor in script.actors}
         self.pictures = {key: Picture.of(robot) for key, robot in robots.items()}
 
-    def draw(self) -> None:
-        size, places = self._stage()
+    def draw(self) -> Stage:
+        stage = self._stage()
+        size, places = stage.size, stage.places
         for k, (actor, place) in enumerate(zip(self.script.actors, places, strict=True)):
             number = f" {k + 1}" if k else ""
             self._actor(actor, number, place, size)
@@ -72,15 +95,17 @@ class _Drawing:
         if len(self.script.times) > 1:
             repetitions = math.inf if self.script.loop else 1
             self.viewer.set_animation(Animation(self.clips), play=True, repetitions=repetitions)
+        return stage
 
-    def _stage(self) -> tuple[float, list[Floats]]:
-        """Set the view; returns the size of the largest robot's motion [m] and where each robot goes."""
+    def _stage(self) -> Stage:
+        """Set the view."""
         marked = [trace.points for trace in self.script.traces] + [target.places for target in self.script.targets]
-        extents, axes = [], []
+        extents, poses = [], []
         size = 0.0
         for actor in self.script.actors:
             picture = self.pictures[id(actor.robot)]
-            positions = np.concatenate([_samples(rows) for rows in actor.positions.values()])
+            reach = [] if actor.reach is None else [actor.reach]
+            positions = np.concatenate([*(_samples(rows) for rows in actor.positions.values()), *reach])
             points = picture.swept(positions)
             size = max(size, float(np.ptp(points, axis=0).max()))
             lines = [trace.points for trace in actor.traces]
@@ -93,19 +118,37 @@ class _Drawing:
             low, high, room = seen.min(axis=0), seen.max(axis=0), 0.3 * size
             around = [np.clip(region.corners, low - room, high + room) for region in actor.regions]
             extents.append(np.concatenate([seen, *around]))
-            axes.append(picture.body_poses(positions)[0][..., 2].reshape(-1, 3))
+            poses.append(picture.body_poses(positions))
         if not np.abs(np.concatenate(extents)).max() < _FARTHEST:
             raise InputError(f"what is to be shown has sizes or places beyond {_FARTHEST:g} m, which no viewer draws")
         # A point, or what is too small to tell from one, is seen from a metre away.
         size = size if size > 1.0 / _FARTHEST else 1.0
-        toward = view_direction(np.concatenate(axes))
+        toward = view_direction(np.concatenate([R[..., 2].reshape(-1, 3) for R, _ in poses]))
+        for k, actor in enumerate(self.script.actors):
+            extents[k] = np.concatenate([extents[k], *self._around_marks(actor, *poses[k], toward, size)])
         offset = self.script.offset
         places = side_by_side(extents, toward) if offset is None else [k * offset for k in range(len(extents))]
         base = self.pictures[id(self.script.actors[0].robot)].corners(-1)
         floor = (base if len(base) else extents[0])[:, 2].min()
         points = np.concatenate([points + place for points, place in zip(extents, places, strict=True)])
         set_view(self.viewer, points, toward, float(floor), size)
-        return size, places
+        pictures = [self.pictures[id(actor.robot)] for actor in self.script.actors]
+        return Stage(size, places, points, toward, float(floor), pictures)
+
+    def _around_marks(self, actor: Actor, R: Floats, p: Floats, toward: Floats, size: float) -> list[Floats]:
+        """Points (P, 3) around labels and triads, of bodies whose poses are (S, b, 3, 3) and (S, b, 3)."""
+        found = []
+        right = across(toward)
+        up = np.cross(toward, right)
+        for target in (*self.script.targets, *actor.goals):
+            half = 0.5 * marks.label_width(target.name) * _LABEL * size * right
+            top = (1.2 * _BALL + _LABEL) * size * up
+            found += [target.places + top - half, target.places + top + half, target.places - _BALL * size * up]
+        for name in actor.frames:
+            body, placement = self.pictures[id(actor.robot)].frame(name)
+            tips = placement.translation + _TRIAD * size * placement.rotation.T
+            found.append(tips if body < 0 else (tips @ R[:, body].transpose(0, 2, 1) + p[:, body, None]).reshape(-1, 3))
+        return found
 
     def _actor(self, actor: Actor, number: str, place: Floats, size: float) -> None:
         picture, tree = self.pictures[id(actor.robot)], actor.robot.tree
@@ -116,10 +159,8 @@ class _Drawing:
             for j, node in enumerate(nodes):
                 joint = pin.SE3(tree.rotation[j], tree.translation[j])
                 self.viewer[node.removesuffix("/moving")].set_transform(joint.homogeneous)
-                self.viewer[node].set_transform(_joint_motion(bool(tree.prismatic[j]), rows[0, j]))
-                # One number a joint: the page then interpolates in q itself, and links stay whole at any frame rate.
-                name = "position[z]" if tree.prismatic[j] else "rotation[z]"
-                self._animate(node, name, "number", rows[:, j])
+                self.viewer[node].set_transform(joint_motion(bool(tree.prismatic[j]), rows[0, j]))
+                self._animate(node, joint_track(bool(tree.prismatic[j])), "number", rows[:, j])
             shapes = zip(picture.shapes, picture.bodies, picture.placements, strict=True)
             for k, (shape, body, placement) in enumerate(shapes):
                 parent = nodes[body] if body >= 0 else f"{root}/base"
@@ -293,7 +334,15 @@ def _translation(place: Floats) -> Floats:
     return pose
 
 
-def _joint_motion(prismatic: bool, position: float) -> Floats:
+def joint_track(prismatic: bool) -> str:
+    """What moves in a joint's node.
+
+    It is one number: the page then interpolates in q itself, and links stay whole at any frame rate.
+    """
+    return "position[z]" if prismatic else "rotation[z]"
+
+
+def joint_motion(prismatic: bool, position: float) -> Floats:
     """Transform (4, 4) of a joint along or about z."""
     motion = np.eye(4)
     if prismatic:

@@ -91,6 +91,13 @@ def triad(length: float) -> Object:
     return meshcat.geometry.Mesh(geometry, MeshBasicMaterial(vertexColors=True))
 
 
+def label_width(text: str) -> float:
+    """Width of a label, in heights of its plate."""
+    # The mean letter of a word takes at most 0.58 of a sans-serif font's size; those of East Asian scripts are square.
+    letters = sum(0.58 if ord(letter) < 0x2E80 else 1.05 for letter in text)
+    return 0.7 * letters + 0.6
+
+
 class Label(Object):
     """A word on a light plate above a place, turned to the camera and before everything else.
 
@@ -138,9 +145,7 @@ def _plate(text: str, above: float) -> tuple[str, float, float]:
 
     Its lower half is empty, and as much of its upper half as lies between place and plate.
     """
-    # The mean letter of a word takes at most 0.58 of a sans-serif font's size; those of East Asian scripts are square.
-    letters = sum(0.58 if ord(letter) < 0x2E80 else 1.05 for letter in text)
-    width, height = 0.7 * letters + 0.6, 2.0 * (1.0 + above)
+    width, height = label_width(text), 2.0 * (1.0 + above)
     pixels = 64
     drawing = f"""\
 <svg xmlns="http://www.w3.org/2000/svg" width="{pixels * width:.0f}" height="{pixels * height:.0f}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import reprlib
@@ -38,7 +39,11 @@ if TYPE_CHECKING:
     from varpin.mechanics.scene import Scene
     from varpin.show.replay.page import Inline
 
+logger = logging.getLogger(__name__)
+
 Floats = NDArray[np.float64]
+# What a joint may be off by between keyframes without a word [rad or m].
+_SEEN = 0.02
 Motion: TypeAlias = "Trajectory | MpcRun | Solution | ArrayLike"
 
 
@@ -109,7 +114,8 @@ def replay(
         loop: Start again at the end; otherwise stop there.
         fps: Keyframes a second of playback, and frames of a film. Between them the page interpolates q linearly, and
             draws at the screen's own rate.
-        max_frames: Most keyframes, and frames of a film; a longer motion gets fewer a second and keeps its speed.
+        max_frames: Most keyframes, and frames of a film; a longer motion gets fewer a second and keeps its speed, and
+            the log says so where joints are off by 0.02 rad or m between them.
         size: Width and height of a film, or at most of a frame in a notebook [pixels].
 
     The meshes are the robot's own. Where one cannot be read, its link becomes a skeleton, as the whole robot does where
@@ -180,6 +186,7 @@ def replay(
     moving = [t for t, _, _ in tracks.values() if len(t) > 1]
     followed = [second[0] for second in ghosts if second is not None]
     times = _times([t for t, _ in motions], followed + moving, end, fps / speed, max_frames)
+    _say_thinned(motions, times, max_frames)
     clock = times if growing else None
     marked = tuple(target(name, track, times) for name, track in tracks.items())
     actors = []
@@ -326,6 +333,23 @@ def _times(motions: Sequence[Floats], others: Sequence[Floats], end: float, fps:
     times = times[np.diff(times, prepend=-np.inf) > 1e-9 * end]
     times[-1] = end
     return np.linspace(0.0, end, frames + 1) if frames < len(times) - 1 else times
+
+
+def _say_thinned(motions: Sequence[tuple[Floats, Floats]], times: Floats, max_frames: int) -> None:
+    """Say if so few keyframes are left of a long motion that it is seen to be another."""
+    if len(times) < max_frames:
+        return
+    off = max(
+        float(np.abs(np.interp(t, times, np.interp(times, t, column)) - column).max())
+        for t, q in motions
+        for column in q.T
+    )
+    if off > _SEEN:
+        logger.warning(
+            "%g s of motion are shown with %d keyframes, between which joints are off by up to %.2g rad or m: a larger "
+            "max_frames, or a part of the motion, shows more",
+            times[-1], len(times), off,
+        )  # fmt: skip
 
 
 def _positions(robot: Robot, t: Floats, q: Floats, times: Floats) -> Floats:

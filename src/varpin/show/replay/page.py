@@ -30,7 +30,7 @@ class Page:
         """Keep a command."""
         # three.js computes in single precision; half the bytes say the same.
         try:
-            self.commands.append(umsgpack.packb(command.lower(), force_float_precision="single"))
+            self.commands.append(umsgpack.packb(lowered(command), force_float_precision="single"))
         except OverflowError:
             raise InputError("what is to be shown has sizes or places beyond 3e38, which no viewer draws") from None
 
@@ -57,6 +57,15 @@ class Page:
 </body>
 </html>
 """
+
+
+def lowered(command: Any) -> dict[str, Any]:
+    """A command as the viewer reads it, its mesh files under the name that the viewer has for them now."""
+    words: dict[str, Any] = command.lower()
+    for geometry in words.get("object", {}).get("geometries", ()):
+        if geometry["type"] == "_meshfile":
+            geometry["type"] = "_meshfile_geometry"
+    return words
 
 
 def _part(name: str) -> str:

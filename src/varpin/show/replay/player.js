@@ -4,7 +4,15 @@ let viewer;
 
 // A mesh that three.js cannot take is left out; the rest plays.
 async function load() {
-    viewer = new MeshCat.Viewer(document.getElementById("meshcat-pane"));
+    const pane = document.getElementById("meshcat-pane");
+    viewer = new MeshCat.Viewer(pane);
+    // The viewer would take the height of the window, and draw behind the bar. The camera is set for 4 : 3; what is
+    // narrower is seen from as much farther away.
+    const resize = viewer.set_3d_pane_size;
+    viewer.set_3d_pane_size = (width = pane.clientWidth, height = pane.clientHeight) => {
+        viewer.camera.zoom = Math.min(1, 0.75 * width / height);
+        resize.call(viewer, width, height);
+    };
     const packed = atob(document.getElementById("commands").textContent);
     const bytes = new Uint8Array(packed.length);
     for (let i = 0; i < packed.length; i++) bytes[i] = packed.charCodeAt(i);
@@ -110,6 +118,8 @@ function joinBar() {
 load().then(() => {
     closeGhosts();
     joinBar();
+    // The bar has its height now.
+    viewer.set_3d_pane_size();
     document.documentElement.dataset.loaded = "true";
 }).catch(error => {
     console.error(error);

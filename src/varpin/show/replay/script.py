@@ -140,6 +140,7 @@ class Actor:
         ties: Of the mechanism.
         regions: That it keeps to.
         goals: Of its plan.
+        reach: Joint positions (S, b) that it may come to, for which the view has room; none if what it does is known.
     """
 
     robot: Robot
@@ -151,6 +152,7 @@ class Actor:
     ties: tuple[Tie, ...] = ()
     regions: tuple[Region, ...] = ()
     goals: tuple[Target, ...] = ()
+    reach: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)

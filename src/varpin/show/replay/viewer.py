@@ -41,8 +41,14 @@ def show(script: Script) -> meshcat.Visualizer:
     with contextlib.redirect_stdout(io.StringIO()):
         viewer = meshcat.Visualizer()
     draw(viewer, script)
-    url = viewer.url()
-    logger.info("meshcat serves the motion at %s", url)
-    if not webbrowser.open(url, new=2):
-        logger.warning("no web browser could be started; open %s in one", url)
+    open_browser(viewer.url())
     return viewer
+
+
+def open_browser(url: str) -> bool:
+    """Point a web browser to a window's address; whether there is one."""
+    logger.info("meshcat serves the motion at %s", url)
+    if webbrowser.open(url, new=2):
+        return True
+    logger.warning("no web browser could be started; open %s in one", url)
+    return False

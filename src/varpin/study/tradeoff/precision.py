@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.ensemble import without_geometry
+from varpin.ensemble.paths import without_geometry
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.integrators import Integrator, Reference
 from varpin.mechanics.scene import Scene, require_scene

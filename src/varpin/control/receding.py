@@ -1,0 +1,203 @@
+"""A controller's ticks within hard constraints: multipliers go on from tick to tick, and few rounds are made in each.
+
+Safeguarded multipliers are those of Andreani, Birgin, Martinez and Schuverdt, "On augmented Lagrangian methods with
+general lower-level constraints" (2007).
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control import search
+from varpin.control.constraints import BoundConstraint
+from varpin.control.history import Iteration, Status
+from varpin.control.multipliers import FEASIBLE, TOLD, Multipliers, split
+from varpin.control.penalties import flat, penalized
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.solution import Solution
+from varpin.support.frozen import Frozen
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+# A penalty grows by this factor after a tick that leaves more than this part of its constraint's violation, up to this
+# part of its first weight: stiffer ones take more iterations than a tick has.
+_GROWTH, _ENOUGH, _HEAVIEST = 10.0, 0.5, 1e4
+# Backward passes that an iteration may take to find the rows that its motion meets: the tick before knows most of them.
+_PASSES = 8
+# Multipliers beyond this part of the cost over a tenth of a constraint's range only wind up, at what cannot be met.
+_LARGEST = 1e3
+# Of a violation, what ticks in a row are to take away, or there is no plan to be found; and how many.
+_LOWERED, _STUCK = 0.9, 3
+# Of a tenth of a constraint's range, what penalties need not grow for.
+_SMALL = 1e-3
+
+
+def replan(
+    problem: OptimalControlProblem,
+    previous: Solution,
+    decisions: int,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    deadline: float,
+) -> Solution:
+    """:func:`varpin.control.search.replan` for problems with or without constraints.
+
+    With them each iteration is one of the augmented Lagrangian, and multipliers follow after it. They are those of the
+    plan before, moved on with the horizon. What margins come to is that of the first plan. A tick is INFEASIBLE where
+    it violates a constraint by more than a hundredth of a tenth of its range, and ticks in a row have not lowered that.
+    """
+    known = previous.multipliers
+    if not problem.constraints or known is None:
+        return search.replan(
+            problem,
+            previous,
+            decisions,
+            tolerance=tolerance,
+            max_iterations=max_iterations,
+            deadline=deadline,
+        )
+    old, new = previous.problem.bound_constraints, problem.bound_constraints
+    hold = problem.hold
+    multipliers = [_moved(*parts, decisions, hold) for parts in zip(old, new, split(old, known.values), strict=True)]
+    backoff = [_moved(*parts, 0, hold) for parts in zip(old, new, split(old, known.backoff), strict=True)]
+    cost = abs(previous.cost)
+    least = np.array([cost / item.scale**2 / np.sqrt(len(item.places)) for item in new])
+    first_weights = np.maximum(known.first_weights, least)
+    weights = np.clip(known.weights, first_weights, _HEAVIEST * first_weights)
+    begun = flat(multipliers)
+    found = kept = previous
+    history: list[Iteration] = []
+    longest = 0.0
+    for k in range(max_iterations):
+        started = time.perf_counter()
+        goal = penalized(problem, multipliers, weights, backoff, passes=_PASSES)
+        found = search.replan(
+            goal,
+            found,
+            decisions if k == 0 else 0,
+            tolerance=tolerance,
+            max_iterations=1,
+            deadline=deadline,
+        )
+        history += [replace(item, index=len(history)) for item in found.history]
+        motion = found.trajectory
+        c = [item.value(motion.q, motion.v, motion.u) for item in new]
+        most = [_LARGEST * w * item.scale for item, w in zip(new, first_weights, strict=True)]
+        multipliers = [
+            np.clip(part.updated(values), -limit, limit)
+            for part, values, limit in zip(goal.all_penalties, c, most, strict=True)
+        ]
+        state = replace(
+            known,
+            values=flat(multipliers),
+            backoff=flat(backoff),
+            begun=begun,
+            weights=weights,
+            first_weights=first_weights,
+            iterations=0,
+        )
+        kept = replace(
+            found, problem=problem, cost=problem.cost_of(motion), history=tuple(history), search=None, multipliers=state
+        )
+        done = found.status is Status.CONVERGED and kept.violation <= FEASIBLE
+        longest = max(longest, time.perf_counter() - started)
+        if done or found.status is Status.INTERRUPTED or time.perf_counter() > deadline - longest:
+            break
+    return _judged(kept, known)
+
+
+def _moved(old: BoundConstraint, new: BoundConstraint, values: Floats, decisions: int, hold: int) -> Floats:
+    """What a constraint's places had (K, rows), some decisions later: the last of them repeated, the goal's kept."""
+    by = decisions if new.of_controls else decisions * hold
+    rows = np.minimum(np.searchsorted(old.places, new.places + by), len(old.places) - 1)
+    moved: Floats = values[rows]
+    return moved
+
+
+def _judged(plan: Solution, before: Multipliers) -> Solution:
+    """The plan of a tick, with what the next one goes on from, and whether it keeps to its constraints at all."""
+    known = plan.multipliers
+    assert known is not None
+    bound, told = plan.problem.bound_constraints, plan.constraints
+    violation = np.array([item.violation for item in told])
+    scale = np.array([item.scale for item in bound])
+    stays = violation > np.maximum(TOLD * scale, _LOWERED * before.worst)
+    heavier = violation > np.maximum(_SMALL * scale, _ENOUGH * before.worst)
+    weights = np.where(heavier, np.minimum(_GROWTH * known.weights, _HEAVIEST * known.first_weights), known.weights)
+    stuck = before.stuck + 1 if stays.any() else 0
+    plan = replace(plan, multipliers=replace(known, weights=weights, worst=violation, stuck=stuck))
+    if stuck < _STUCK or plan.status is Status.INTERRUPTED:
+        return plan
+    worst = told[int(np.argmax(np.where(stays, violation / scale, -np.inf)))]
+    reason = (
+        f"{worst.label} is violated by {worst.violation:.3g} {worst.unit}, {worst.where}, and {stuck} ticks in a row "
+        "have not lowered that"
+    )
+    return replace(plan, status=Status.INFEASIBLE, reason=reason)
+
+
+@dataclass(frozen=True, eq=False)
+class Kept(Frozen):
+    """How a controller and its plant kept to a constraint.
+
+    Attributes:
+        label: The constraint.
+        unit: Of its values.
+        tolerance: What is told of if it is violated by more: a hundredth of a tenth of its range.
+        planned: The largest violation in the plan that acts in each tick (K,), with what the margin adds.
+        moved: The violation by the plant's motion at each of its nodes after the first (T,), without the margin; empty
+            of goals, which each plan has at its own end.
+        t: Times of these nodes (T,) [s].
+        infeasible: Ticks in which no plan was found that keeps to it (K,).
+    """
+
+    label: str
+    unit: str
+    tolerance: float
+    planned: Floats
+    moved: Floats
+    t: Floats
+    infeasible: NDArray[np.bool_]
+
+    @property
+    def worst(self) -> float:
+        """The most that the plant's motion violates it; 0 of goals."""
+        return float(self.moved.max(initial=0.0))
+
+    def __str__(self) -> str:
+        plans = int((self.planned > self.tolerance).sum())
+        told = f"violated by {self.planned.max():.1e} {self.unit} at most in plans, in {plans} of {len(self.planned)} "
+        told += f"ticks by more than {self.tolerance:.1g}"
+        if self.moved.size:
+            where = f" at t = {self.t[int(np.argmax(self.moved))]:.4g} s" if self.worst > self.tolerance else ""
+            told += f"; by {self.worst:.1e} at most in the plant's motion{where}"
+        return f"{self.label}: {told}"
+
+    __repr__ = __str__
+
+
+def kept(
+    problem: OptimalControlProblem, plans: tuple[Solution, ...], motion: Trajectory, substeps: int
+) -> tuple[Kept, ...]:
+    """How the plans of a run, and the plant's motion in ``substeps`` a tick, kept to each constraint of the problem."""
+    if not problem.constraints:
+        return ()
+    fine = problem.constraints_on(motion.dt, motion.steps, substeps)
+    infeasible = np.array([plan.status is Status.INFEASIBLE for plan in plans])
+    found = []
+    for i, own in enumerate(fine):
+        planned = np.array([plan.constraints[i].violation for plan in plans])
+        moved, t = np.zeros(0), np.zeros(0)
+        if not own.source.equality:
+            c = own.value(motion.q, motion.v, motion.u)
+            moved, t = np.maximum(c, 0.0).max(axis=1), own.times
+        tolerance = TOLD * own.scale
+        failed = infeasible & (planned > tolerance)
+        found.append(Kept(own.source.label, own.unit, tolerance, planned, moved, t, failed))
+    return tuple(found)

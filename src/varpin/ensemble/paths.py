@@ -1,0 +1,327 @@
+"""What one worker does: a chunk of paths, from their seeds to their moments."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.core.arrays import Commands
+from varpin.ensemble.histogram import counted
+from varpin.ensemble.record import PathFailure
+from varpin.errors import VarpinError
+from varpin.integrators import Integrator, Segment
+from varpin.integrators.base import Failure, rows
+from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.scene import Scene
+from varpin.mechanics.wiener import Children
+from varpin.simulation.run import located
+from varpin.support.frozen import Frozen
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+# By what they are extreme in, how much of it, and which path.
+Extremes = dict[str, tuple[float, int]]
+
+# Paths that one call of the core takes, and numbers that a block of nodes holds.
+_GROUP = 32
+_BLOCK = 1_000_000
+# A chunk of paths is what a worker does at a time. Its size depends on the ensemble alone, and so does every sum: so
+# many chunks, but each with this much to do at least and at most [steps of paths], and never fewer or more paths.
+_CHUNKS, _LEAST, _MOST, _FEWEST_PATHS, _MOST_PATHS = 64, 4_000, 200_000, 16, 1024
+
+
+def without_geometry(scene: Scene) -> Scene:
+    """The scene without shapes that came with its robot: no simulation needs them, and meshes are large to send."""
+    if scene.robot.visuals is None and not scene.robot.parts:
+        return scene
+    bare = copy.copy(scene)
+    vars(bare)["robot"] = dataclasses.replace(scene.robot, visuals=None, parts=())
+    return bare
+
+
+def chunks(steps: int, paths: int) -> Iterator[tuple[int, int]]:
+    """The first path of each chunk, and one past its last; the same for any workers."""
+    steps = max(1, steps)
+    size = max(math.ceil(paths / _CHUNKS), _LEAST // steps)
+    size = max(_FEWEST_PATHS, min(size, _MOST // steps, _MOST_PATHS))
+    if size > _GROUP:
+        size = math.ceil(size / _GROUP) * _GROUP
+    for first in range(0, paths, size):
+        yield first, min(first + size, paths)
+
+
+@dataclass(frozen=True, eq=False)
+class Shared(Frozen):
+    """What all paths of an ensemble share.
+
+    Attributes:
+        scene: The scene.
+        integrator: The integrator.
+        commands: Of all steps.
+        dt: Time step [s].
+        steps: N.
+        seeds: A child for each path.
+    """
+
+    scene: Scene
+    integrator: Integrator
+    commands: Commands
+    dt: float
+    steps: int
+    seeds: Children
+
+
+@dataclass(frozen=True, eq=False)
+class Task(Frozen):
+    """A chunk of paths to simulate, and what of them is wanted.
+
+    Attributes:
+        shared: What they share with others.
+        first: The first of them.
+        q0: (C, n) [rad or m].
+        v0: (C, n).
+        store: The paths themselves.
+        moments: Their moments.
+        values: Their states, node by node.
+        grid: The bins in which to count their states, as least value and width (2, N + 1, 2n) and how many; or None.
+    """
+
+    shared: Shared
+    first: int
+    q0: Floats
+    v0: Floats
+    store: bool = False
+    moments: bool = True
+    values: bool = False
+    grid: tuple[Floats, int] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Moments(Frozen):
+    """Sums over some paths at each of N + 1 nodes.
+
+    Attributes:
+        count: Paths (N + 1,).
+        mean: Of x and of the energy (N + 1, 2n + 1).
+        squares: Products of deviations from it, added up, of x (N + 1, 2n, 2n).
+        energy: The same of the energy (N + 1,).
+    """
+
+    count: Integers
+    mean: Floats
+    squares: Floats
+    energy: Floats
+
+    def merged(self, other: Moments) -> Moments:
+        """Those of both (Chan, Golub and LeVeque 1979)."""
+        total = self.count + other.count
+        share = other.count / np.maximum(total, 1)
+        apart = other.mean - self.mean
+        weight, x = self.count * share, apart[:, :-1]
+        return Moments(
+            total,
+            self.mean + apart * share[:, None],
+            self.squares + other.squares + (weight[:, None] * x)[:, :, None] * x[:, None, :],
+            self.energy + other.energy + weight * apart[:, -1] ** 2,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Part(Frozen):
+    """What came of a chunk.
+
+    Attributes:
+        first: Its first path.
+        paths: C.
+        failures: Paths that stopped early.
+        extremes: Those of its paths that are worth a look: what for, how much of it, and which path.
+        nodes: By path, how many nodes each has (C,).
+        moments: If wanted.
+        stored: The paths by name, (C, ...), if wanted.
+        values: x by node (N + 1, 2n, C), NaN after a failure, if wanted.
+        counts: Paths in each bin (N + 1, 2n, B + 2), below and above the bins too, if wanted.
+        bounds: Least and greatest x (2, N + 1, 2n), if counts are.
+    """
+
+    first: int
+    paths: int
+    failures: tuple[PathFailure, ...]
+    extremes: Extremes
+    nodes: Integers
+    moments: Moments | None
+    stored: dict[str, Floats]
+    values: Floats | None
+    counts: NDArray[np.uint16] | None
+    bounds: Floats | None
+
+
+def simulate_paths(task: Task) -> Part:
+    """A chunk of paths, in one thread; path by path the bytes are those of any other chunk."""
+    return _Chunk(task).part()
+
+
+class _Chunk:
+    """Paths in groups, each with its integrator state and generators, which go through blocks of nodes together."""
+
+    def __init__(self, task: Task) -> None:
+        self.task, shared = task, task.shared
+        self.shared, self.paths = shared, len(task.q0)
+        n, m, N = shared.scene.robot.dof, shared.scene.controls, shared.steps
+        self.groups = [slice(a, min(a + _GROUP, self.paths)) for a in range(0, self.paths, _GROUP)]
+        self.generators = shared.seeds.generators(task.first, task.first + self.paths)
+        # The control before, of each path; before the first there is none, if the policy does not say.
+        self.before = [np.repeat(shared.commands.before, group.stop - group.start, axis=0) for group in self.groups]
+        self.alive = np.ones(self.paths, dtype=bool)
+        self.nodes = np.zeros(self.paths, dtype=np.int64)
+        self.split = np.zeros(self.paths, dtype=np.int64)
+        self.most_energy, self.fastest = np.full((2, self.paths), -np.inf)
+        self.failures: list[PathFailure] = []
+        block = max(1, _BLOCK // (self.paths * (2 * n + 1)) // shared.commands.hold) * shared.commands.hold
+        self.length = min(N, block)
+        # Nodes of a block, paths last: statistics run over them.
+        self.block = np.empty((max(1, self.length), 2 * n + 1, self.paths))
+        self.moments = None
+        if task.moments:
+            self.moments = Moments(
+                np.zeros(N + 1, np.int64),
+                np.zeros((N + 1, 2 * n + 1)),
+                np.zeros((N + 1, 2 * n, 2 * n)),
+                np.zeros(N + 1),
+            )
+        self.values = np.empty((N + 1, 2 * n, self.paths)) if task.values else None
+        self.counts: NDArray[np.uint16] | None = None
+        self.bounds: Floats | None = None
+        if task.grid is not None:
+            self.counts = np.zeros((N + 1, 2 * n, task.grid[1] + 2), dtype=np.uint16)
+            self.bounds = np.empty((2, N + 1, 2 * n))
+        self.stored: dict[str, Floats] = {}
+        if task.store:
+            self.stored = {name: np.full((self.paths, N + 1, n), np.nan) for name in ("q", "v", "p")}
+            self.stored |= {"energy": np.full((self.paths, N + 1), np.nan), "u": np.full((self.paths, N, m), np.nan)}
+
+    def part(self) -> Part:
+        """All steps."""
+        task, shared = self.task, self.shared
+        states = []
+        for group in self.groups:
+            state, first = shared.integrator.start(shared.scene, task.q0[group], task.v0[group])
+            states.append(state)
+            self._store(0, group, first, [1] * len(first))
+        self._reduce(0, np.ones(self.paths, dtype=np.int64))
+        for begin in range(0, shared.steps, max(1, self.length)):
+            end = min(shared.steps, begin + self.length)
+            done = np.concatenate(
+                [self._run_group(number, states[number], begin, end) for number in range(len(self.groups))]
+            )
+            self._reduce(begin + 1, done)
+        extremes = {
+            name: (float(values.max()), task.first + int(np.argmax(values)))
+            for name, values in (("split", self.split), ("energy", self.most_energy), ("speed", self.fastest))
+        }
+        return Part(
+            first=task.first,
+            paths=self.paths,
+            failures=tuple(self.failures),
+            extremes=extremes,
+            nodes=self.nodes,
+            moments=self.moments,
+            stored=self.stored,
+            values=self.values,
+            counts=self.counts,
+            bounds=self.bounds,
+        )
+
+    def _run_group(self, number: int, state: object, begin: int, end: int) -> Integers:
+        """Steps begin .. end of a group: how many each path did; one that has failed does none."""
+        shared, group = self.shared, self.groups[number]
+        hold = shared.commands.hold
+        decisions = rows(shared.commands, begin // hold, end // hold, self.before[number])
+        increments = np.empty((group.stop - group.start, end - begin, shared.scene.processes))
+        for drawn, child in zip(increments, self.generators[group], strict=True):
+            child.standard_normal(out=drawn)
+        increments *= np.sqrt(shared.dt)
+        try:
+            segments = shared.integrator.rollout(shared.scene, state, decisions, increments, shared.dt)
+        except CustomForceError as error:
+            raise self._located(group, error) from error
+        alive = self.alive[group]
+        done = [len(segment.q) * int(still) for segment, still in zip(segments, alive, strict=True)]
+        self._store(begin + 1, group, segments, done)
+        lost = np.full(shared.scene.controls, np.nan)
+        self.before[number] = np.array([segment.u[-1] if len(segment.u) else lost for segment in segments])
+        for i, (k, segment) in enumerate(zip(done, segments, strict=True)):
+            if not alive[i]:
+                continue
+            self.split[group.start + i] += int(segment.statistics.substeps.sum()) - k
+            if segment.failure is not None:
+                self._fail(group.start + i, begin + k, segment.failure)
+        return np.array(done, dtype=np.int64)
+
+    def _located(self, group: slice, error: CustomForceError) -> VarpinError:
+        """The error of a function that failed in one of some paths, with its path, its step and the motion before."""
+        own, task = self.shared, self.task
+        for i in range(group.start, group.stop):
+            (generator,) = own.seeds.generators(task.first + i, task.first + i + 1)
+            drawn = generator.standard_normal((own.steps, own.scene.processes)) * np.sqrt(own.dt)
+            given = own.scene, own.integrator, (task.q0[i], task.v0[i]), own.commands, own.dt
+            found = located(*given, drawn, error, f"path {task.first + i}: ")
+            if found is not error:
+                return found
+        return error
+
+    def _fail(self, path: int, step: int, failure: Failure) -> None:
+        self.alive[path] = False
+        self.failures.append(PathFailure(self.task.first + path, step, failure.reason))
+
+    def _store(self, first: int, group: slice, segments: list[Segment], done: list[int]) -> None:
+        """Nodes of a group from node ``first`` on, ``done[i]`` of its i-th path."""
+        n, momentum = self.shared.scene.robot.dof, self.shared.integrator.variational
+        self.nodes[group] += done
+        for i, (segment, k) in enumerate(zip(segments, done, strict=True), group.start):
+            x = self.block[:, :, i]
+            x[:k, :n], x[:k, n:-1] = segment.q[:k], (segment.p if momentum else segment.v)[:k]
+            x[:k, -1] = segment.energy[:k]
+            if k < len(x):
+                x[k:] = np.nan
+            for name, array in self.stored.items():
+                # The control that leads to a node stands one row before it, and none leads to the first.
+                row = first - 1 if name == "u" else first
+                if row >= 0:
+                    array[i, row : row + k] = getattr(segment, name)[:k]
+
+    def _reduce(self, first: int, done: Integers) -> None:
+        """Take in the block, which begins at node ``first`` and has ``done[i]`` nodes of path i."""
+        last, n2 = int(done.max()), self.block.shape[1] - 1
+        length = min(self.shared.steps + 1 - first, len(self.block))
+        block = self.block[:last]
+        np.fmax(self.most_energy, np.fmax.reduce(block[:, -1], axis=0, initial=-np.inf), out=self.most_energy)
+        speed = np.fmax.reduce(np.abs(block[:, n2 // 2 : -1]), axis=(0, 1), initial=-np.inf)
+        np.fmax(self.fastest, speed, out=self.fastest)
+        if self.values is not None:
+            self.values[first : first + length] = self.block[:length, :-1]
+        if self.counts is not None and self.bounds is not None and self.task.grid is not None:
+            (least, width), bins = self.task.grid
+            nodes = slice(first, first + length)
+            counted(
+                self.block[:length, :-1], least[nodes], width[nodes], bins, self.counts[nodes], self.bounds[:, nodes]
+            )
+        if self.moments is None:
+            return
+        begin = 0
+        # Between two nodes at which paths fail, the same paths are counted.
+        for end in np.unique(done[done > 0]).tolist():
+            inside = done >= end
+            span = block[begin:end] if inside.all() else np.compress(inside, block[begin:end], axis=2)
+            nodes = slice(first + begin, first + end)
+            moments, mean = self.moments, span.mean(axis=2)
+            deviation = span - mean[:, :, None]
+            moments.mean[nodes], moments.count[nodes] = mean, span.shape[2]
+            moments.squares[nodes] = np.einsum("jaP,jbP->jab", deviation[:, :-1], deviation[:, :-1])
+            moments.energy[nodes] = np.einsum("jP,jP->j", deviation[:, -1], deviation[:, -1])
+            begin = end

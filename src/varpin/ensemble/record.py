@@ -1,0 +1,121 @@
+"""The record of an ensemble: its statistics, its paths and those that failed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.support.frozen import Frozen
+from varpin.support.markup import facts, table, warning_count
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class EnsembleStatistics(Frozen):
+    """Moments and quantiles over the paths at each of N + 1 nodes. x is (q, p), or (q, v): see the integrator.
+
+    Attributes:
+        mean: (N + 1, 2n).
+        covariance: (N + 1, 2n, 2n), with P - 1 in the denominator.
+        levels: Of the quantiles (L,).
+        quantiles: (L, N + 1, 2n).
+        quantile_errors: What each is off by at most, (L, N + 1, 2n); zero where they are exact.
+        energy_mean: (N + 1,) [J].
+        energy_deviation: Standard deviation (N + 1,) [J].
+        count: Paths that are counted at each node (N + 1,): those that have not failed before.
+    """
+
+    mean: Floats
+    covariance: Floats
+    levels: Floats
+    quantiles: Floats
+    quantile_errors: Floats
+    energy_mean: Floats
+    energy_deviation: Floats
+    count: NDArray[np.int64]
+
+    def __repr__(self) -> str:
+        nodes, states = self.mean.shape
+        return f"EnsembleStatistics({nodes} nodes, {states // 2} joints, {len(self.levels)} quantiles)"
+
+
+@dataclass(frozen=True)
+class PathFailure:
+    """A path that could not be finished.
+
+    Attributes:
+        path: Its index.
+        step: The step that failed.
+        reason: In words.
+    """
+
+    path: int
+    step: int
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Ensemble(Frozen):
+    """P paths over N steps.
+
+    Attributes:
+        t: Times (N + 1,) [s].
+        statistics: Over the paths.
+        q: Configurations (P, N + 1, n) [rad or m], or None where paths were not to be stored; NaN after a failure.
+        v: Velocities (P, N + 1, n).
+        p: Momenta (P, N + 1, n).
+        u: Controls applied (P, N, m).
+        energy: (P, N + 1) [J].
+        failures: Paths that stopped early; they are left out of the statistics from there on.
+        warnings: What varpin says of the paths, a sentence each: dt too coarse, energy off, paths that stopped early.
+            A few paths are looked at, as :func:`varpin.simulate` looks at its motion: the first, the one with the most
+            split steps, the one with the most energy and the fastest; up to ten are all looked at.
+    """
+
+    t: Floats
+    statistics: EnsembleStatistics
+    q: Floats | None
+    v: Floats | None
+    p: Floats | None
+    u: Floats | None
+    energy: Floats | None
+    failures: tuple[PathFailure, ...]
+    warnings: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        return f"Ensemble({self._size()}{warning_count(self.warnings)})"
+
+    def __str__(self) -> str:
+        return "\n".join([f"Ensemble({self._size()})", *(f"warning: {warning}" for warning in self.warnings)])
+
+    def _repr_html_(self) -> str:
+        moments, half = self.statistics, self.statistics.mean.shape[1] // 2
+        deviation = np.sqrt(np.diagonal(moments.covariance[-1]))
+        rows = [(j, float(moments.mean[-1, j]), float(deviation[j])) for j in range(half)]
+        head = ("coordinate", "mean of q in the end [rad or m]", "standard deviation")
+        energy = f"{moments.energy_mean[-1]:.4g} +- {moments.energy_deviation[-1]:.2g} in the end"
+        warned = [("warning", warning) for warning in self.warnings]
+        return facts("Ensemble", [("of", self._size()), ("energy [J]", energy), *warned], table(head, rows))
+
+    def _size(self) -> str:
+        counted = int(self.statistics.count[0])
+        kept = "" if self.q is not None else ", not stored"
+        lost = f", {len(self.failures)} stopped early" if self.failures else ""
+        return f"{counted} paths{kept} over {len(self.t) - 1} steps, {self.t[-1] - self.t[0]:g} s{lost}"
+
+
+class EnsembleInterrupted(KeyboardInterrupt):
+    """Ctrl-C during an ensemble.
+
+    Attributes:
+        ensemble: The first paths, up to where they were done; None if none were.
+    """
+
+    def __init__(self, ensemble: Ensemble | None) -> None:
+        self.ensemble = ensemble
+        done = 0 if ensemble is None else int(ensemble.statistics.count[0])
+        super().__init__(f"interrupted after {done} paths" + ("; they are in .ensemble" if done else ""))

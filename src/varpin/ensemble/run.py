@@ -1,0 +1,189 @@
+"""Many noisy paths at once, on all cores or many machines, and their statistics."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import closing
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.ensemble.looks import looked_at, looked_at_here
+from varpin.ensemble.paths import Part, Shared, simulate_paths, without_geometry
+from varpin.ensemble.record import Ensemble, EnsembleInterrupted
+from varpin.ensemble.statistics import Sums
+from varpin.errors import InputError, VarpinError
+from varpin.integrators import Integrator, Midpoint
+from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
+from varpin.mechanics.scene import Scene, require_scene
+from varpin.mechanics.wiener import children
+from varpin.simulation.run import commands_of, on_constraints
+from varpin.simulation.soundness import Finding, announce
+from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
+from varpin.support.executors import executing, in_order
+
+Floats = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
+
+def simulate_ensemble(
+    scene: Scene,
+    q0: JointValues,
+    v0: JointValues,
+    *,
+    dt: float,
+    steps: int,
+    paths: int,
+    rng: np.random.Generator | int,
+    controls: JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None = None,
+    integrator: Integrator | None = None,
+    store: bool = True,
+    quantiles: Sequence[float] = (0.05, 0.5, 0.95),
+    workers: int | None = None,
+    executor: Executor | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Ensemble:
+    """Simulate many paths of a noisy scene.
+
+    Path i draws its noise from the i-th child of ``rng``, and moments are merged in the order of the paths: the same
+    bytes for any number of workers, threads, processes or machines of one kind.
+
+    Main args:
+        scene: The scene, with noise that the core can evaluate (not a ``CustomNoise``).
+        q0: Initial configuration, (n,) or by joint name for all paths, or (P, n) [rad or m].
+        v0: Initial velocity, the same [rad/s or m/s].
+        dt: Time step [s].
+        steps: N.
+        paths: P.
+        rng: Seed or generator.
+        controls: None, (N, m), (m,), by joint name, :class:`OpenLoop`, :class:`FirstOrderHold`, or a
+            :class:`LinearPolicy` that each path
+            evaluates at its own state.
+
+    Other Args:
+        integrator: ``Midpoint()`` if left out.
+        store: Keep every path. Without, only the statistics are kept, and memory does not grow with P N.
+        quantiles: Levels in [0, 1]; none, and no more than moments come back from the workers. They are exact if paths
+            are stored, or if P (N + 1) 2n is no more than 33 million. Beyond, they are read from histograms of up to
+            1000 bins over 2.5 times the range of the first paths (up to 1024), linear within a bin; then
+            ``statistics.quantile_errors`` says what they are off by at most, a bin. Levels 0 and 1 stay exact.
+        workers: Threads; as many as there are cores if left out.
+        executor: Any ``concurrent.futures.Executor`` instead of threads: a ``ProcessPoolExecutor``, Dask's
+            ``client.get_executor()``, an ``mpi4py.futures.MPIPoolExecutor``. It stays open. The work of a worker that
+            is lost is done again. Chunks of paths that wait, run or have come back before their turn are four for each
+            worker at most, and no more than 2 GiB of results, but two at least.
+        progress: Called now and then with (paths done, P).
+
+    Raises:
+        InputError: Wrong shapes, values that are not finite, or a scene whose noise the core cannot evaluate.
+        ForceError: A function of a :class:`varpin.CustomForce` failed in a path, which it names and holds so far.
+        AssemblyError: The scene's constraints cannot be kept next to q0.
+        VarpinError: Every path failed, or workers get lost again and again.
+        EnsembleInterrupted: Ctrl-C; holds the paths that were done. It is a KeyboardInterrupt.
+    """
+    require_scene(scene)
+    dt, steps, paths = positive("dt", dt, "s"), count("steps", steps), count("paths", paths, least=1)
+    _require_memory(scene, steps, paths, store=store)
+    start = [_per_path(name, value, paths, scene.robot.joint_names) for name, value in (("q0", q0), ("v0", v0))]
+    if scene.noise.diffusion is None:
+        raise InputError("an ensemble needs noise that the core evaluates; a CustomNoise is simulated path by path")
+    levels = require_finite("quantiles", as_floats("quantiles", quantiles))
+    if levels.ndim != 1 or ((levels < 0.0) | (levels > 1.0)).any():
+        raise InputError(f"quantiles must be levels in [0, 1], got {quantiles}")
+    integrator = Midpoint() if integrator is None else integrator
+    if not isinstance(integrator, Integrator):
+        raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
+    if controls is None and (scene.servo_joints or scene.inputs):
+        if (start[0] != start[0][0]).any():
+            positions = "the scene has servos or inputs, and the paths begin at different positions"
+            raise InputError(f"controls are needed: {positions}")
+        controls = scene.command_at(start[0][0])
+    start, moved = _onto_constraints(scene, start)
+    commands = commands_of(scene, integrator, controls, steps, dt)
+    if len(commands.places):
+        raise InputError("an ensemble takes controls that are held; those of the policy are linear between nodes")
+    with executing(executor, workers) as pool:
+        shared = Shared(without_geometry(scene), integrator, commands, dt, steps, children(rng, paths))
+        sums = Sums(shared, paths, levels, store=store)
+        try:
+            with closing(_parts(pool, sums, start[0], start[1])) as parts:
+                for part in parts:
+                    sums.add(part)
+                    if progress is not None:
+                        progress(sums.done, paths)
+            found = looked_at(pool, shared, start[0], start[1], sums.extremes)
+        except KeyboardInterrupt:
+            if not sums.done:
+                raise EnsembleInterrupted(None) from None
+            seen = looked_at_here(shared, start[0][: sums.done], start[1][: sums.done], sums.extremes)
+            raise EnsembleInterrupted(sums.ensemble((*sums.lost(), *seen))) from None
+    if len(sums.failures) == paths:
+        raise VarpinError(sums.failing())
+    found = (*moved, *_alike(scene, start), *sums.lost(), *found)
+    announce(logger, scene, dt, found)
+    return sums.ensemble(found)
+
+
+def _onto_constraints(scene: Scene, start: Sequence[Floats]) -> tuple[list[Floats], tuple[Finding, ...]]:
+    """Starts (P, n) that keep the constraints, and what was changed in the first that was another."""
+    q0, v0 = start
+    if not scene.constraints:
+        return [q0, v0], ()
+    if (q0 == q0[0]).all() and (v0 == v0[0]).all():
+        q, v, found = on_constraints(scene, q0[0], v0[0])
+        return [np.broadcast_to(q, q0.shape), np.broadcast_to(v, v0.shape)], found
+    moved = [on_constraints(scene, q, v) for q, v in zip(q0, v0, strict=True)]
+    told = (
+        tuple(Finding(own.kind, f"path {path}: {own.sentence}") for own in found)
+        for path, (_, _, found) in enumerate(moved)
+        if found
+    )
+    return [np.array([q for q, _, _ in moved]), np.array([v for _, v, _ in moved])], next(told, ())
+
+
+def _alike(scene: Scene, start: Sequence[Floats]) -> tuple[Finding, ...]:
+    """Says if nothing tells the paths apart."""
+    if scene.processes or len(start[0]) < 2 or any((x != x[0]).any() for x in start):
+        return ()
+    sentence = (
+        "the scene has no noise and all paths begin alike, so that they are one and the same motion: "
+        "varpin.Scene(robot, noise=...) tells them apart"
+    )
+    return (Finding("paths alike", sentence),)
+
+
+def _parts(pool: Executor, sums: Sums, q0: Floats, v0: Floats) -> Generator[Part, None, None]:
+    """What comes of the chunks; the first by itself where the bins of the others depend on it."""
+    tasks = sums.tasks(q0, v0)
+    if sums.estimated:
+        yield from in_order(pool, simulate_paths, itertools.islice(tasks, 1))
+    yield from in_order(pool, simulate_paths, tasks, result_bytes=sums.part_bytes())
+
+
+def _require_memory(scene: Scene, steps: int, paths: int, *, store: bool) -> None:
+    """Refuse a record that cannot be held, before anything runs."""
+    n, m = scene.robot.dof, scene.controls
+    stored = paths if store else 0
+    row = 2 * n * (4 * n + 5) + m + stored * (3 * n + m + 1)
+    for shape, what in (
+        ((steps + 1, row), f"steps = {steps} with {stored} stored paths"),
+        ((paths, 2 * n), f"paths = {paths}"),
+    ):
+        try:
+            np.empty(shape)
+        except (MemoryError, ValueError, OverflowError):
+            raise InputError(
+                f"{what} needs more memory than there is: {8 * shape[1]} bytes a {what.partition(' ')[0][:-1]}"
+            ) from None
+
+
+def _per_path(name: str, value: JointValues, paths: int, joints: Sequence[str]) -> Floats:
+    n = len(joints)
+    array = joint_array(name, value, joints) if isinstance(value, Mapping) else as_floats(name, value)
+    if array.shape == (n,):
+        return np.broadcast_to(finite_array(name, array, (n,)), (paths, n))
+    return finite_array(name, array, (paths, n))

@@ -1,0 +1,163 @@
+"""Chunks of paths merged into the statistics of an ensemble, in the order of the paths."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.ensemble.histogram import Histogram
+from varpin.ensemble.looks import greater
+from varpin.ensemble.paths import Extremes, Moments, Part, Shared, Task, chunks
+from varpin.ensemble.record import Ensemble, EnsembleStatistics, PathFailure
+from varpin.simulation.soundness import Finding
+
+Floats = NDArray[np.float64]
+
+# Numbers up to which quantiles are exact without stored paths.
+_EXACT = 2**25
+# Numbers that a part of the nodes may have whose quantiles are taken at a time.
+_SPAN = 100_000
+
+
+class Sums:
+    """What comes of chunks, taken in in the order of the paths."""
+
+    def __init__(self, shared: Shared, paths: int, levels: Floats, *, store: bool) -> None:
+        self.shared, self.paths, self.levels, self.store = shared, paths, levels, store
+        n, m, N = shared.scene.robot.dof, shared.scene.controls, shared.steps
+        self.done = 0
+        self.moments: Moments | None = None
+        self.failures: list[PathFailure] = []
+        self.extremes: Extremes = {}
+        self.nodes = np.zeros(paths, dtype=np.int64)
+        self.stored: dict[str, Floats] = {}
+        if store:
+            self.stored = {name: np.empty((paths, N + 1, n)) for name in ("q", "v", "p")}
+            self.stored |= {"energy": np.empty((paths, N + 1)), "u": np.empty((paths, N, m))}
+        exact = paths * (N + 1) * 2 * n <= _EXACT
+        self.values = np.empty((N + 1, 2 * n, paths)) if len(levels) and exact and not store else None
+        self.histogram: Histogram | None = None
+        self.estimated = bool(len(levels)) and not exact and not store
+
+    def tasks(self, q0: Floats, v0: Floats) -> Iterator[Task]:
+        """The chunks; where quantiles are estimated, the second is asked for once the first has been taken in."""
+        for first, last in chunks(self.shared.steps, self.paths):
+            yield Task(
+                self.shared,
+                first,
+                q0[first:last].copy(),
+                v0[first:last].copy(),
+                store=self.store,
+                values=self.values is not None or (self.estimated and self.histogram is None),
+                grid=None if self.histogram is None else self.histogram.grid,
+            )
+
+    def part_bytes(self) -> int:
+        """What comes of a chunk [bytes], its arrays alone."""
+        nodes, size = self.shared.steps + 1, 2 * self.shared.scene.robot.dof
+        _, paths = next(chunks(self.shared.steps, self.paths))
+        numbers = nodes * (size**2 + size + 3) + paths
+        if self.store:
+            numbers += paths * (nodes * (3 * size // 2 + 1) + self.shared.steps * self.shared.scene.controls)
+        if self.values is not None:
+            numbers += paths * nodes * size
+        if self.histogram is not None:
+            bins = self.histogram.grid[1] + 2
+            numbers += nodes * size * (2 + math.ceil(bins / 4))
+        return 8 * numbers
+
+    def add(self, part: Part) -> None:
+        """The next chunk."""
+        here = slice(part.first, part.first + part.paths)
+        assert part.first == self.done
+        assert part.moments is not None
+        self.moments = part.moments if self.moments is None else self.moments.merged(part.moments)
+        self.failures += part.failures
+        self.extremes = greater(self.extremes, part.extremes)
+        self.nodes[here] = part.nodes
+        for name, array in part.stored.items():
+            self.stored[name][here] = array
+        if self.estimated:
+            if self.histogram is None and part.values is not None:
+                self.histogram = Histogram(part.values)
+            elif self.histogram is not None and part.counts is not None and part.bounds is not None:
+                self.histogram.add(part.counts, part.bounds)
+        elif self.values is not None and part.values is not None:
+            self.values[:, :, here] = part.values
+        self.done = here.stop
+
+    def lost(self) -> tuple[Finding, ...]:
+        """What is to be said of failures, if there are any."""
+        if not self.failures:
+            return ()
+        return (Finding("failed paths", f"{self.failing()}; they are left out of the statistics from there on"),)
+
+    def failing(self) -> str:
+        """How many paths failed, and the first of them."""
+        first = min(self.failures, key=lambda failure: failure.step)
+        return f"{len(self.failures)} of {self.done} paths failed, the first at step {first.step}: {first.reason}"
+
+    def ensemble(self, found: Sequence[Finding]) -> Ensemble:
+        """Of the paths that were taken in, with what is to be said of them."""
+        moments, n2 = self.moments, 2 * self.shared.scene.robot.dof
+        assert moments is not None
+        there = moments.count > 0
+        degrees = np.maximum(moments.count - 1, 1)
+        quantiles, errors = self._quantiles()
+        stored = {name: array[: self.done] for name, array in self.stored.items()}
+        return Ensemble(
+            t=np.arange(self.shared.steps + 1, dtype=np.float64) * self.shared.dt,
+            statistics=EnsembleStatistics(
+                mean=np.where(there[:, None], moments.mean[:, :n2], np.nan),
+                covariance=np.where(there[:, None, None], moments.squares / degrees[:, None, None], np.nan),
+                levels=self.levels,
+                quantiles=quantiles,
+                quantile_errors=errors,
+                energy_mean=np.where(there, moments.mean[:, n2], np.nan),
+                energy_deviation=np.where(there, np.sqrt(moments.energy / degrees), np.nan),
+                count=moments.count,
+            ),
+            q=stored.get("q"),
+            v=stored.get("v"),
+            p=stored.get("p"),
+            u=stored.get("u"),
+            energy=stored.get("energy"),
+            failures=tuple(self.failures),
+            warnings=tuple(finding.sentence for finding in found),
+        )
+
+    def _quantiles(self) -> tuple[Floats, Floats]:
+        shape = (len(self.levels), self.shared.steps + 1, 2 * self.shared.scene.robot.dof)
+        if self.histogram is not None:
+            return self.histogram.quantiles(self.levels)
+        found = np.full(shape, np.nan)
+        if not len(self.levels):
+            return found, np.zeros(shape)
+        size, nodes = max(1, _SPAN // (self.done * shape[2])), self.nodes[: self.done]
+        spans, begin = [], 0
+        # Between two nodes at which paths fail, the same paths are counted.
+        for end in np.unique(nodes).tolist():
+            spans += [(a, min(a + size, end), nodes >= end) for a in range(begin, end, size)]
+            begin = end
+
+        def take(span: tuple[int, int, NDArray[np.bool_]]) -> None:
+            first, last, inside = span
+            x = self._states(first, last)
+            found[:, first:last] = np.quantile(x if inside.all() else x[:, :, inside], self.levels, axis=2)
+
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            list(pool.map(take, spans))
+        return found, np.zeros(shape)
+
+    def _states(self, first: int, last: int) -> Floats:
+        """X at some nodes (k, 2n, P)."""
+        if self.values is not None:
+            return self.values[first:last, :, : self.done]
+        second = self.stored["p" if self.shared.integrator.variational else "v"]
+        parts = [array[: self.done, first:last].transpose(1, 2, 0) for array in (self.stored["q"], second)]
+        return np.concatenate(parts, axis=1)

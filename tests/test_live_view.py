@@ -1,0 +1,341 @@
+"""Motions and plans in a real browser while they are computed."""
+
+import itertools
+import logging
+import re
+import time
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from chromium import shape_poses, wait_until
+
+import varpin as vp
+from varpin.model import geometry
+from varpin.show.replay import live
+from varpin.show.replay import viewer as viewer_module
+
+ONLINE = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+
+
+@pytest.fixture(scope="module")
+def chain():
+    return vp.planar_chain(2)
+
+
+@pytest.fixture(scope="module")
+def scene(chain):
+    return vp.Scene(chain)
+
+
+@pytest.fixture
+def opened():
+    """Views that are closed after the test."""
+    views = []
+
+    def make(*given, **options):
+        views.append(vp.LiveView(*given, open=False, **options))
+        return views[-1]
+
+    yield make
+    for view in views:
+        view.close()
+
+
+@pytest.fixture
+def seen(opened, browser):
+    """Views that the browser shows."""
+
+    def make(*given, **options):
+        view = opened(*given, **options)
+        browser.get_log("browser")
+        browser.execute_cdp_cmd("Network.emulateNetworkConditions", ONLINE)
+        browser.get(view.url)
+        assert view.wait(60.0)
+        return view
+
+    return make
+
+
+def stands(browser, robot, q):
+    """Whether every shape on the page is where Pinocchio puts it."""
+    model, shapes = robot.free_model, geometry(robot)
+    data, placements = model.createData(), shapes.createData()
+    pin.updateGeometryPlacements(model, data, shapes, placements, robot.free_positions(np.asarray(q)))
+    poses = shape_poses(browser)
+    assert sorted(poses) == list(range(shapes.ngeoms))
+    return all(np.allclose(poses[k], placements.oMg[k].homogeneous, atol=1e-4) for k in poses)
+
+
+def names(browser, *path):
+    """Of what is below a node."""
+    return browser.execute_script(
+        "return viewer.scene_tree.find(['meshcat', ...arguments[0]]).object.children.map(child => child.name)", path
+    )
+
+
+def severe(browser):
+    entries = browser.get_log("browser")
+    return [e for e in entries if e["level"] == "SEVERE" and "favicon" not in e["message"]]
+
+
+def test_the_robot_is_where_the_motion_is_while_it_is_computed(seen, browser):
+    finger = vp.load_robot("finger")
+    scene = vp.Scene(finger, gravity=False, damping=1e-3)
+    view = seen(scene, trace=True, speed=None, fps=1e6)
+    looks = []
+
+    def progress(done, steps, nodes):
+        view.progress(done, steps, nodes)
+        if len(looks) < 4 or done == steps:
+            wait_until(lambda: stands(browser, finger, nodes.q[-1]))
+            looks.append(done)
+
+    vp.simulate(scene, [0.1, 0.2, 0.3], [2.0, 1.0, 1.0], dt=1e-5, steps=60_000, progress=progress)
+    assert looks[0] == 0
+    assert looks[-1] == 60_000
+    assert 0 < looks[1] < looks[2] < looks[3] < 60_000
+    assert any("tip" in name or finger.end_effector in name for name in names(browser, "notes", "live"))
+    assert "words" in names(browser, "notes")
+    assert severe(browser) == []
+
+
+def test_a_motion_takes_the_time_that_it_would_take(opened, scene, monkeypatch):
+    view = opened(scene, speed=2.0)
+    motion = {"dt": 1e-3, "steps": 1000, "progress": view.progress, "check": False}
+    begin = time.monotonic()
+    vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], **motion)
+    # Nobody looks, so nobody waits.
+    assert time.monotonic() - begin < 0.45
+    monkeypatch.setattr(live._Window, "watched", property(lambda window: True))
+    begin = time.monotonic()
+    vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], **motion)
+    assert time.monotonic() - begin > 0.45
+
+
+def test_pictures_come_at_their_rate_and_in_order(opened, scene, monkeypatch):
+    monkeypatch.setattr(live._Window, "watched", property(lambda window: True))
+    view = opened(scene, fps=20.0)
+    shown = []
+    move = view._move
+    monkeypatch.setattr(view, "_move", lambda t, q, now, *rest, **last: shown.append(now) or move(t, q, now, *rest))
+    motion = vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=1000, progress=view.progress)
+    assert shown == sorted(shown)
+    assert len(shown) <= 23
+    assert shown[0] == 0.0
+    assert shown[-1] == motion.t[-1]
+
+
+def test_a_plan_is_seen_at_each_iterate(seen, browser, chain, scene):
+    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost([0.5, -1.0], 1e3) + vp.VelocityCost(10.0))
+    problem = vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=2e-2, steps=40)
+    view = seen(problem, trace=True)
+    paths = []
+
+    def callback(iteration, motion):
+        view.callback(iteration, motion)
+        if iteration.step > 0.0:
+            wait_until(lambda: len(names(browser, "notes", "plans")) == min(len(paths) + 1, 8))
+            paths.append(names(browser, "notes", "plans")[-1])
+
+    plan = vp.solve(problem, callback=callback)
+    assert len(set(paths)) == len(paths) == sum(item.step > 0.0 for item in plan.history)
+    assert browser.execute_script("return viewer.animator.duration") == pytest.approx(0.8, abs=1e-4)
+    # The page plays the last iterate, from where in it the one before was.
+    found = browser.execute_script(
+        """
+        const found = [], joints = [["chain1"], ["chain1", "moving", "chain2"]];
+        viewer.animator.pause();
+        for (let k = 0; k < 8; k++) {
+            viewer.animator.seek(0.1 * k);
+            const row = [];
+            viewer.scene_tree.find(["meshcat", "robot"]).object.traverse(node => {
+                if (node.name == "moving") row.push(node.rotation.z);
+            });
+            found.push(row);
+        }
+        return found;"""
+    )
+    fine = np.linspace(0.0, plan.trajectory.duration, 4001)
+    line = np.column_stack([np.interp(fine, plan.trajectory.t, column) for column in plan.trajectory.q.T])
+    places = [np.linalg.norm(line - row, axis=1) for row in np.array(found)]
+    assert max(distance.min() for distance in places) < 0.02
+    assert len({int(distance.argmin()) // 100 for distance in places}) > 4
+    assert severe(browser) == []
+
+
+def test_a_simulation_after_a_plan_moves_the_robot_again(seen, browser, chain, scene):
+    view = seen(scene, speed=None)
+    motion = vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-2, steps=50)
+    view.show(motion)
+    wait_until(lambda: browser.execute_script("return viewer.animator.duration") > 0.4)
+    wait_until(lambda: browser.execute_script("return viewer.animator.playing"))
+    vp.simulate(scene, [-0.5, 0.2], [0.0, 0.0], dt=1e-2, steps=20, progress=view.progress)
+    end = vp.simulate(scene, [-0.5, 0.2], [0.0, 0.0], dt=1e-2, steps=20).q[-1]
+
+    def there():
+        angles = browser.execute_script(
+            """
+            const row = [];
+            viewer.scene_tree.find(["meshcat", "robot"]).object.traverse(node => {
+                if (node.name == "moving") row.push(node.rotation.z);
+            });
+            return row;"""
+        )
+        return np.allclose(angles, end, atol=1e-5)
+
+    wait_until(there)
+    time.sleep(0.3)
+    assert there()
+
+
+def test_a_controllers_run_is_shown(opened, chain, scene):
+    cost = vp.TrackingCost([0.5, -1.0], 10.0) + vp.VelocityCost(0.1) + vp.ControlCost(1e-4)
+    problem = vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=2e-2, steps=20)
+    view = opened(problem, speed=None)
+    parts = []
+
+    def progress(done, ticks, nodes):
+        view.progress(done, ticks, nodes)
+        parts.append(nodes)
+
+    run = vp.Mpc(problem).run(duration=0.2, progress=progress)
+    np.testing.assert_array_equal(np.concatenate([part.q[1:] for part in parts]), run.motion.q[1:])
+    np.testing.assert_allclose(np.concatenate([part.t[1:] for part in parts]), run.motion.t[1:], rtol=1e-12)
+    np.testing.assert_array_equal(view._q, run.motion.q[-1])
+
+
+def test_the_camera_moves_back_from_what_leaves_the_view(opened, chain):
+    view = opened(chain)
+    before = view._room
+    view._make_room(np.array([[9.0, 0.0, 0.0]]))
+    assert view._room.max() > 10.0
+    after = view._room
+    view._make_room(np.array([[9.5, 0.0, 0.0]]))
+    assert view._room is after is not before
+
+
+def test_ctrl_c_ends_the_motion_and_not_the_view(opened, scene):
+    view = opened(scene, speed=None)
+
+    def progress(done, steps, nodes):
+        view.progress(done, steps, nodes)
+        if done:
+            # As if it came between a command and its answer.
+            view._window.zmq_socket.send_multipart([b"url"])
+            raise KeyboardInterrupt
+
+    with pytest.raises(vp.Interrupted) as caught:
+        vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-4, steps=100_000, progress=progress)
+    assert 0 < caught.value.trajectory.steps < 100_000
+    motion = vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
+    np.testing.assert_array_equal(view._q, motion.q[-1])
+
+
+def test_a_server_that_dies_costs_the_picture_alone(opened, scene, caplog, monkeypatch):
+    monkeypatch.setattr(live, "_ANSWER", 0.2)
+    view = opened(scene, speed=None)
+    view._window.server_proc.kill()
+    with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
+        motion = vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
+    assert motion.steps == 10
+    assert caplog.text.count("the computation goes on without a picture") == 1
+
+
+def test_a_browser_is_started_and_waited_for(scene, monkeypatch, caplog, capfd):
+    asked = []
+    monkeypatch.setattr(viewer_module.webbrowser, "open", lambda url, new=0: asked.append(url) or True)
+    monkeypatch.setattr(live, "_COME", 0.1)
+    with vp.LiveView(scene) as view:
+        assert asked == [view.url]
+        assert f'<iframe src="{view.url}"' in view._repr_html_()
+    assert "no browser shows" in caplog.text
+    assert capfd.readouterr().out == ""
+    assert "closed" in repr(view)
+    # What is told a closed view is lost, and nothing else.
+    vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
+
+
+def refused(call, message):
+    with pytest.raises(vp.InputError, match=re.escape(message)):
+        call()
+
+
+def test_says_what_does_not_fit(opened, chain, scene):
+    view = opened(scene)
+    start = {"q0": [0.3, 0.0], "v0": [0.0, 0.0], "dt": 1e-3, "steps": 10}
+    refused(lambda: vp.simulate(scene, **start, progress=view.callback), "of simulate and Mpc.run, give view.progress")
+    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0), [0.0, 0.0], [0.0, 0.0], dt=1e-2, steps=5)
+    refused(lambda: vp.solve(problem, callback=view.progress), "callback must be a function of (iteration), or of")
+    refused(lambda: vp.solve(problem, progress=view.progress), "progress must be a function of (iterations done")
+    longer = vp.Scene(vp.planar_chain(3))
+    refused(
+        lambda: vp.simulate(longer, np.zeros(3), np.zeros(3), dt=1e-3, steps=10, progress=view.progress),
+        "the view is of robot 'chain2' with 2 joints, and the motion of one with 3",
+    )
+    refused(lambda: view.show(np.zeros((3, 2))), "motion must be a trajectory, a plan or a run of an Mpc, got ndarray")
+    refused(lambda: vp.LiveView(chain.model), "a LiveView is of a Robot, a Scene or an OptimalControlProblem")
+    refused(lambda: vp.LiveView(scene, trace="hand"), "has no frame 'hand'")
+    refused(lambda: vp.LiveView(scene, speed=0.0), "speed must be positive")
+
+
+def law(t, q, v):
+    return np.array([np.sin(t), -q[0]])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"controls": law, "period": 3},
+        {"controls": vp.OpenLoop(lambda t: [np.sin(t), 0.0]), "integrator": vp.Gauss(2)},
+        {"controls": vp.FirstOrderHold(np.linspace(0.0, 1.0, 802).reshape(401, 2))},
+    ],
+)
+def test_who_asks_for_nodes_gets_all_of_them_once(scene, options, monkeypatch):
+    monkeypatch.setattr("varpin.simulation.run._CHUNK", 50)
+    parts = []
+
+    def progress(done, steps, nodes):
+        assert steps == 400
+        assert nodes.t[-1] == pytest.approx(done * 1e-3)
+        parts.append(nodes)
+
+    start = {"q0": [0.3, 0.0], "v0": [0.0, 0.0], "dt": 1e-3, "steps": 400}
+    told = vp.simulate(scene, **start, **options, progress=progress)
+    plain = vp.simulate(scene, **start, **options)
+    assert len(parts) > 10
+    for name in ("t", "q", "v"):
+        rows = np.concatenate([getattr(parts[0], name)[:1], *(getattr(part, name)[1:] for part in parts)])
+        np.testing.assert_array_equal(rows, getattr(told, name))
+        np.testing.assert_array_equal(rows, getattr(plain, name))
+    for before, after in itertools.pairwise(parts):
+        assert before.t[-1] == after.t[0]
+        np.testing.assert_array_equal(before.q[-1], after.q[0])
+
+
+def test_nodes_of_forces_that_are_called_step_by_step(chain):
+    scene = vp.Scene(chain, forces=[vp.CustomForce(lambda q, v: -0.1 * v)])
+    parts = []
+    motion = vp.simulate(
+        scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=60, progress=lambda done, steps, nodes: parts.append(nodes)
+    )
+    rows = np.concatenate([parts[0].q[:1], *(part.q[1:] for part in parts)])
+    np.testing.assert_array_equal(rows, motion.q)
+
+
+def test_functions_of_two_arguments_are_told_as_before(scene, capsys):
+    start = {"q0": [0.3, 0.0], "v0": [0.0, 0.0], "dt": 1e-3, "steps": 10}
+    told = []
+    vp.simulate(scene, **start, progress=lambda done, steps: told.append((done, steps)))
+    vp.simulate(scene, **start, progress=lambda *given: told.append(given))
+    assert told == [(10, 10), (10, 10)]
+    vp.simulate(scene, **start, progress=print)
+    assert capsys.readouterr().out == "10 10\n"
+    for wrong in (lambda done: None, 3):
+        refused(
+            lambda wrong=wrong: vp.simulate(scene, **start, progress=wrong),
+            "progress must be a function of (steps done, steps in all), or of (steps done, steps in all, nodes)",
+        )
+    vp.simulate(scene, **(start | {"steps": 0}), progress=lambda done, steps, nodes: told.append(nodes.q))
+    np.testing.assert_array_equal(told[-1], [[0.3, 0.0]])

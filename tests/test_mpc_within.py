@@ -1,0 +1,126 @@
+"""A controller within hard constraints: its ticks against plans from scratch, obstacles that move, what is told."""
+
+import numpy as np
+import pytest
+
+import varpin as vp
+
+ROBOT = vp.planar_chain(2)
+ARM = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
+
+
+def target(t):
+    return [0.8 * np.sin(1.5 * t), 0.4]
+
+
+def bob(t):
+    """Where a ball is that swings into the tool's way [m]."""
+    return [1.9 - 0.3 * np.sin(2.0 * t), 0.0, -1.35]
+
+
+def tracking(constraints, **options):
+    cost = vp.TrackingCost(target, 100.0) + vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
+    return vp.OptimalControlProblem(
+        vp.Scene(ROBOT, damping=0.3),
+        cost,
+        [0.0, 0.4],
+        [0.0, 0.0],
+        dt=0.03,
+        steps=16,
+        constraints=constraints,
+        **options,
+    )
+
+
+FAMILIES = {
+    "speeds": [vp.WithinVelocityLimits(ROBOT, (-0.8, 0.8))],
+    "a moving sphere": [vp.KeepOutOfSphere(ROBOT, "tip", bob, 0.3)],
+    "a moving ball": [
+        vp.KeepClear(ROBOT, [vp.Obstacle.sphere(bob(0), 0.2).moving(lambda t: bob(t) - np.array(bob(0)))], 0.02,
+                     capsules=ARM),
+    ],
+    "rates": [vp.WithinControlRate(100.0)],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_ticks_are_those_of_plans_from_scratch(name):
+    """Each against S-DDP with all rounds, from the same state, time and control before."""
+    problem = tracking(FAMILIES[name])
+    run = vp.Mpc(problem, iterations=4).run(duration=0.9)
+    assert run.infeasible == 0
+    (held,) = run.constraints
+    assert held.planned.max() <= held.tolerance
+    assert held.worst <= held.tolerance
+    active = 0
+    for plan in run.plans[3::6]:
+        # Around an obstacle there are other optima, on its other side: the rounds start on the tick's own.
+        alone = vp.solve(plan.problem, plan if "moving" in name else None, check=False)
+        assert alone.status.converged, alone.reason
+        active += int(alone.constraints[0].active.sum())
+        assert plan.cost == pytest.approx(alone.cost, rel=2e-3)
+        most = np.abs(alone.controls).max()
+        np.testing.assert_allclose(plan.controls[0], alone.controls[0], rtol=0, atol=2e-2 * most)
+    assert active > 0
+    free = vp.Mpc(tracking([])).run(duration=0.9)
+    outside = problem.constraints_on(free.motion.dt, free.motion.steps, 10)[0]
+    assert outside.value(free.motion.q, free.motion.v, free.motion.u).max() > 5.0 * held.tolerance
+
+
+def test_obstacles_are_where_they_are_at_each_time():
+    """Bounds of an obstacle and a sphere that move are those of ones that stand there, at every node."""
+    problem = tracking([*FAMILIES["a moving sphere"], *FAMILIES["a moving ball"]], t0=0.4)
+    rng = np.random.default_rng(0)
+    q = rng.normal(size=(17, 2))
+    sphere, ball = (bound.value(q, q, q[1:]) for bound in problem.bound_constraints)
+    slopes = [bound.jacobian(q, q) for bound in problem.bound_constraints]
+    for k, t in enumerate(0.4 + 0.03 * np.arange(1, 17)):
+        still = [
+            vp.KeepOutOfSphere(ROBOT, "tip", bob(t), 0.3),
+            vp.KeepClear(ROBOT, [vp.Obstacle.sphere(bob(t), 0.2)], 0.02, capsules=ARM),
+        ]
+        for moving, there, slope in zip((sphere, ball), tracking(still).bound_constraints, slopes, strict=True):
+            np.testing.assert_allclose(moving[k], there.value(q, q, q[1:])[k], rtol=0, atol=1e-12)
+            np.testing.assert_allclose(slope[k], there.jacobian(q, q)[k], rtol=0, atol=1e-12)
+    # Several motions at once, as a line search has them.
+    both = problem.bound_constraints[1].value(np.array([q, -q]), np.array([q, q]), np.zeros((2, 16, 2)))
+    np.testing.assert_array_equal(both[0], ball)
+
+
+def test_ways_of_obstacles_are_checked():
+    ball = vp.Obstacle.sphere([1.0, 0.0, 0.0], 0.1, name="ball")
+    with pytest.raises(vp.InputError, match="a function of time"):
+        ball.moving([0.0, 0.0, 1.0])
+    moving = ball.moving(lambda t: [0.0, 0.0])
+    with pytest.raises(vp.InputError, match="moves already"):
+        moving.moving(lambda t: [0.0, 0.0, 0.0])
+    with pytest.raises(vp.InputError, match=r"way of obstacle 'ball' at t = 0.03 s"):
+        tracking([vp.KeepClear(ROBOT, [moving], capsules=ARM)])
+    with pytest.raises(vp.InputError, match=r"center at t = .*finite"):
+        tracking([vp.KeepOutOfSphere(ROBOT, "tip", lambda t: [np.nan, 0.0, 0.0], 0.1)])
+
+
+def test_rates_go_on_from_tick_to_tick():
+    run = vp.Mpc(tracking(FAMILIES["rates"]), iterations=4).run(duration=0.6)
+    u = run.motion.u[::10]
+    assert np.abs(np.diff(u, axis=0)).max() <= 100.0 * 0.03 * (1.0 + 1e-3)
+    np.testing.assert_array_equal(run.plans[5].problem.before, u[4])
+
+
+def test_ticks_that_find_no_plan_are_told_of():
+    """A goal that no horizon reaches: multipliers stay bounded, and the goal is kept again once it can be."""
+    far = vp.Mpc(tracking([vp.ReachFrame(ROBOT, "tip", position=[2.2, 0.0, 0.0])])).run(duration=0.3)
+    assert far.infeasible > 3
+    assert far.constraints[0].infeasible.sum() == far.infeasible
+    assert any("no plan was found that keeps to ReachFrame('tip')" in sentence for sentence in far.warnings)
+    assert any("cannot be met" in plan.reason or "in a row" in plan.reason for plan in far.plans)
+    assert "ReachFrame('tip'): violated by" in str(far)
+    assert np.isfinite(far.plans[-1].multipliers.values).all()
+
+
+def test_what_the_plant_violates_is_told_of():
+    """A plant that is pushed harder than the model knows."""
+    noisy = vp.Plant(vp.Scene(ROBOT, damping=0.3, noise=vp.AdditiveNoise(1.0)))
+    run = vp.Mpc(tracking(FAMILIES["speeds"])).run(noisy, duration=0.6, rng=1)
+    assert run.constraints[0].worst > 0.05
+    assert any("the plant's motion violates WithinVelocityLimits" in sentence for sentence in run.warnings)
