@@ -148,7 +148,7 @@ def test_loops_at_their_extremes_move_as_index_reduced_equations_do(number):
 @pytest.mark.parametrize("number", range(len(LOOPS)))
 def test_loops_at_their_extremes_over_decades_of_steps(number):
     for integrator in (vp.Midpoint(), *(vp.Gauss(stages) for stages in (1, 2, 3, 4))):
-        went = [judged(number, integrator, steps) for steps in (3, 30, 300, 3000)]
+        went = [judged(number, integrator, steps) for steps in (3, 30, 300)]
         assert all(went[1:])
 
 

@@ -351,7 +351,7 @@ def _cases() -> list[Callable[[], Loop]]:
             **FOUR, name="driven four-bar", push=three, controls=_sway(3), torque=lambda t, q, v: _sway(3)(t)
         ),
     ]
-    for k, d in ((1e2, 1.0), (1e4, 1e2), (1e6, 1e3), (0.0, 1e2), (0.0, 1e4)):
+    for k, d in ((1e2, 1.0), (1e4, 1e2), (0.0, 1e2), (0.0, 1e4)):
         made.append(
             lambda k=k, d=d: _closed(  # type: ignore[misc]
                 **FOUR,
@@ -398,4 +398,4 @@ def _cases() -> list[Callable[[], Loop]]:
 
 LOOPS: tuple[Callable[[], Loop], ...] = tuple(_cases())
 # Those whose reference is implicit.
-STIFF = frozenset({16, 17, 18, 19, 20})
+STIFF = frozenset({16, 17, 18, 19})

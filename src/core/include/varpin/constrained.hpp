@@ -40,6 +40,20 @@ struct ConstraintBasis {
     int rank() const { return static_cast<int>(order.size()); }
 };
 
+// Three moves of so many arrays take a twentieth of a small step.
+inline void exchange(ConstraintBasis& a, ConstraintBasis& b) {
+    exchange(a.jet, b.jet);
+    a.ldl.swap(b.ldl);
+    a.root.swap(b.root);
+    a.rows.swap(b.rows);
+    a.Q.swap(b.Q);
+    a.R.swap(b.R);
+    a.size.swap(b.size);
+    a.order.swap(b.order);
+    std::swap(a.least, b.least);
+    std::swap(a.weakest, b.weakest);
+}
+
 // Where a constrained path stands besides.
 struct ConstrainedState {
     ConstrainedState(const Mechanism& mechanism, int stages)
@@ -98,8 +112,8 @@ class ConstrainedStepper {
           product(n * n),
           mass(n * n),
           curved(n * n),
-          candidate(n * n),
-          taken(std::max(m, n)) {
+          unspanned(n),
+          taken(m) {
         equation.every_kind = !mechanism.constraints.driven().empty();
         for (int i = 0; i < stages; ++i) {
             for (int k = 0; k < stages; ++k) weight[i * stages + k] = 1.0 - at[k * stages + i] / tableau.b[i];
@@ -301,7 +315,7 @@ class ConstrainedStepper {
     // (q1, p1) in (q0, p0), Jx (2n, 2n), and in f, Jf (2n, n). At q0 it asks for no g(q0) = 0, and p0's part across the
     // tangent space is absorbed. In rates at goals, Jr (2n, driven rows), zero of joints on lines.
     void derivatives(double h, const PathState& path, double* Jx, double* Jf, double* Jr) {
-        std::swap(here, origin);
+        exchange(here, origin);
         const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = 3 * n;
         assemble(h);
         factor_lu_pivoting(saddle.data(), size, rows.data());
@@ -355,7 +369,7 @@ class ConstrainedStepper {
                 end_columns(h, by_rates[end].data(), by_rates[end].data() + 4 * n * n);
             }
         }
-        std::swap(here, origin);
+        exchange(here, origin);
         project_derivatives(h, path, Goal::place, Jx, Jf);
         if (!curved_paths) return;
         for (int end = 0; end < 2; ++end) {
@@ -424,12 +438,13 @@ class ConstrainedStepper {
     std::vector<double> block, saddle, right, solution;
     std::vector<int> rows;
     std::vector<double> null, reduced_mass, reduced;
-    std::vector<double> foreseen;                 // (s, n) stage velocities without what guesses miss
-    std::vector<double> white, along, wanted;     // (n)
-    std::vector<double> rest, parts;              // (m, n)
-    std::vector<double> product;                  // (r, r)
-    std::vector<double> mass, curved, candidate;  // (n, n)
-    std::vector<char> taken;                      // of rows, or of coordinates
+    std::vector<double> foreseen;              // (s, n) stage velocities without what guesses miss
+    std::vector<double> white, along, wanted;  // (n)
+    std::vector<double> rest, parts;           // (m, n)
+    std::vector<double> product;               // (r, r)
+    std::vector<double> mass, curved;          // (n, n)
+    std::vector<double> unspanned;             // (n) squares of what is left of the unit vectors
+    std::vector<char> taken;                   // of rows
 
     std::vector<double> dV, columns, bends;
 
@@ -766,7 +781,7 @@ class ConstrainedStepper {
         }
         for (int i = 0; i < n; ++i) unit[i] = trial.place[i].place.high;
         // The last Lobatto point is the end.
-        if (!jets_wanted) std::swap(there.jet, point.back());
+        if (!jets_wanted) exchange(there.jet, point.back());
         if (!find_basis(unit.data(), state.rank, there, !jets_wanted)) return Outcome::singular;
         if (!(there.least > near_toggle) && there.rank() > 0) {
             state.weakest = there.weakest;
@@ -792,8 +807,8 @@ class ConstrainedStepper {
         std::swap(path.place, trial.place);
         std::swap(path.p, trial.p);
         state.rate = rate;
-        std::swap(origin, here);
-        std::swap(here, there);
+        exchange(origin, here);
+        exchange(here, there);
         bool turned = false;
         for (int i = 0; i < n; ++i) {
             const double turns = path.place[i].turns;
@@ -1105,30 +1120,24 @@ class ConstrainedStepper {
         return least_pivot_ratio(reduced.data(), reduced_mass.data(), free, {0, free});
     }
 
-    // A basis (free, n) of what is orthogonal to all Q in the metric of the kinetic energy.
+    // A basis (free, n) of what is orthogonal to all Q in the metric of the kinetic energy: of the unit vectors the one
+    // that has most left of it each time.
     void find_null() {
         const int r = here.rank(), free = n - r;
         null.assign(free * n, 0.0);
-        std::fill(candidate.begin(), candidate.end(), 0.0);
-        std::fill(taken.begin(), taken.end(), 0);
-        for (int i = 0; i < n; ++i) {
-            candidate[i * n + i] = 1.0;
-            orthogonalize(&candidate[i * n], here.Q, r);
-        }
+        std::fill(unspanned.begin(), unspanned.end(), 1.0);
+        const auto span = [&](const double* x) {
+            for (int i = 0; i < n; ++i) unspanned[i] -= x[i] * x[i];
+        };
+        for (int k = 0; k < r; ++k) span(&here.Q[k * n]);
         for (int f = 0; f < free; ++f) {
-            int best = 0;
-            double longest = -1.0;
-            for (int i = 0; i < n; ++i) {
-                if (taken[i]) continue;
-                const double own = norm(&candidate[i * n]);
-                if (own > longest) best = i, longest = own;
-            }
-            taken[best] = 1;
+            const auto best = std::max_element(unspanned.begin(), unspanned.end()) - unspanned.begin();
             double* z = &null[f * n];
-            for (int c = 0; c < n; ++c) z[c] = candidate[best * n + c] / longest;
-            for (int i = 0; i < n && f + 1 < free; ++i) {
-                if (!taken[i]) orthogonalize(&candidate[i * n], null, f + 1);
-            }
+            z[best] = 1.0;
+            orthogonalize(z, here.Q, r, null, f);
+            const double length = norm(z);
+            for (int c = 0; c < n; ++c) z[c] /= length;
+            span(z);
         }
         for (int f = 0; f < free; ++f) {
             double* z = &null[f * n];
@@ -1137,12 +1146,16 @@ class ConstrainedStepper {
         }
     }
 
-    void orthogonalize(double* x, const std::vector<double>& basis, int count) const {
+    // Twice, for rounding.
+    void orthogonalize(double* x, const std::vector<double>& basis, int count, const std::vector<double>& more,
+                       int others) const {
+        const auto take = [&](const double* unit) {
+            const double along = inner(x, unit);
+            for (int c = 0; c < n; ++c) x[c] -= along * unit[c];
+        };
         for (int again = 0; again < 2; ++again) {
-            for (int k = 0; k < count; ++k) {
-                const double along = inner(x, &basis[k * n]);
-                for (int c = 0; c < n; ++c) x[c] -= along * basis[k * n + c];
-            }
+            for (int k = 0; k < count; ++k) take(&basis[k * n]);
+            for (int k = 0; k < others; ++k) take(&more[k * n]);
         }
     }
 

@@ -89,6 +89,23 @@ struct ConstraintJet {
     std::vector<Vec3<double>> weight;        // of each vector
 };
 
+inline void exchange(ConstraintJet& a, ConstraintJet& b) {
+    a.g.swap(b.g);
+    a.scale.swap(b.scale);
+    a.C.swap(b.C);
+    a.size.swap(b.size);
+    a.at_q.swap(b.at_q);
+    a.custom.swap(b.custom);
+    a.at.swap(b.at);
+    a.levers.swap(b.levers);
+    a.value.swap(b.value);
+    a.reach.swap(b.reach);
+    a.slope.swap(b.slope);
+    a.slope_size.swap(b.slope_size);
+    a.moved.swap(b.moved);
+    a.weight.swap(b.weight);
+}
+
 class Constraints {
   public:
     Constraints() = default;
