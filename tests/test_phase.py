@@ -73,6 +73,30 @@ def test_a_fast_spring_of_an_arm_is_followed_or_told_of(integrator, told):
     assert any("lose phase" in sentence for sentence in motion.warnings) == told
 
 
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), None], ids=str)
+@pytest.mark.parametrize("rate", [10.0, 1e3])
+def test_rounding_of_a_robot_at_rest_on_springs_is_no_oscillation(integrator, rate):
+    robot = vp.load_robot("ur5")
+    rest = np.full(6, 0.3)
+    scene = vp.Scene(robot, stiffness=rate**2, rest=rest)
+    controls = scene.holding_controls(rest)
+    motion = vp.simulate(scene, rest, np.zeros(6), dt=1e-2, steps=100, controls=controls, integrator=integrator)
+    assert np.abs(motion.q - rest).max() <= 1e-9
+    assert motion.warnings == ()
+
+
+def test_modes_that_do_not_turn_within_the_motion_are_no_oscillations():
+    """Weak servos that let an arm fall: modes near zero, whose heights are what cancels."""
+    robot = vp.load_robot("ur5")
+    scene = vp.Scene(robot, forces=[vp.PositionServo(2000.0, 100.0, 20.0)])
+    q0 = np.array([0.0, -1.0, 1.0, 0.0, 0.0, 0.0])
+    start = {"q0": q0, "v0": np.zeros(6), "controls": q0 + 0.05}
+    motion = vp.simulate(scene, **start, dt=5e-3, steps=400)
+    fine = vp.simulate(scene, **start, dt=5e-3 / 16, steps=16 * 400, integrator=vp.Radau(4), check=False)
+    assert np.abs(motion.q - fine.q[::16]).max() <= 0.02 * np.ptp(fine.q, axis=0).max()
+    assert not [told for told in motion.warnings if "lose phase" in told]
+
+
 def test_nothing_is_said_of_what_is_not_known():
     """Gravity alone, noise, and methods whose stability function nobody has worked out."""
     chain = vp.planar_chain(2)

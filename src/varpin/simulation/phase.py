@@ -17,7 +17,7 @@ from varpin.errors import LinearizationError
 from varpin.integrators import Integrator
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.scene import Scene
-from varpin.simulation.accuracy import largest_of_its_kind
+from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -72,15 +72,18 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
     if drift is None or (h * fastest < 1.0 and abs(drift[0]) * trajectory.t[-1] < _SHOWS):
         return None
     way = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
+    # Of joints at rest on springs, accelerations round to oscillations.
+    rounding = ROUNDING * (1.0 + np.abs(trajectory.q).max())
     worst = None
     for k, node in enumerate(at):
         A = np.block([[np.zeros((n, n)), np.eye(n)], [aq[k], av[k]]])
-        rates, modes = np.linalg.eig(A)
-        swings = rates.imag > np.abs(rates.real)
         try:
+            rates, modes = np.linalg.eig(A)
             parts = np.linalg.solve(modes, np.append(v[k], a[k]))
         except np.linalg.LinAlgError:
             continue
+        # What turns by less than a radian in all does not swing, and its height is nothing but cancellation.
+        swings = (rates.imag > np.abs(rates.real)) & (rates.imag * trajectory.t[-1] > 1.0)
         rates, heights = rates[swings], 2.0 * np.abs(modes[:n, swings] * (parts[swings] / rates[swings]))
         drift = _drift(integrator, rates, h)
         if drift is None or not rates.size or not np.isfinite(drift).all():
@@ -91,7 +94,7 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
         turned = np.minimum(np.abs(np.expm1(drift * lasting)), 2.0)
         off = heights * (left * turned)
         with np.errstate(divide="ignore", invalid="ignore"):
-            shares = np.where(off > 0.0, off / way[:, None], 0.0)
+            shares = np.where(off > rounding, off / way[:, None], 0.0)
         joint, mode = np.unravel_index(int(shares.argmax()), shares.shape)
         share = float(shares[joint, mode])
         if share >= _SHOWS and (worst is None or share > worst.share):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from varpin.integrators import Integrator, Radau, Reference
 from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import Scene
-from varpin.simulation.accuracy import largest_of_its_kind
+from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
 from varpin.simulation.retaking import taken_again
 from varpin.trajectory import Trajectory
 
@@ -76,6 +76,7 @@ def bent(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Bend |
         )
         off += np.abs(q) + np.abs(v) * lasting[step]
     off *= len(at) / len(chosen)
-    shares = off / np.maximum(largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0)), np.finfo(np.float64).tiny)
+    way = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
+    shares = off / np.maximum(way, ROUNDING * (1.0 + np.abs(trajectory.q).max()))
     joint = int(shares.argmax())
     return Bend(joint, float(off[joint]), float(shares[joint]), len(at)) if shares[joint] > _SHOWS else None
