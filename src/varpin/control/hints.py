@@ -20,8 +20,9 @@ Floats = NDArray[np.float64]
 
 # Angles beyond two turns [rad], and goals beyond so many times the reach, are taken for other units.
 _TURNS, _AFAR = 4.0 * np.pi, 50.0
-# Postures in which a pair of bodies has to be too close for it to be so in all.
-_POSTURES = 64
+# Postures in which a pair of bodies has to be too close for it to be so in all; and limits [rad or m] that stand for
+# none, in the place of which joints are looked at for a turn, or rails for this way [m], to either side.
+_POSTURES, _ENDLESS, _RAIL = 64, 1e4, 100.0
 # Parts of a millimetre that two places of one frame may be apart.
 _SAME = 1e-6
 
@@ -103,7 +104,9 @@ def _limits(problem: OptimalControlProblem) -> Iterator[Finding]:
     for own in problem.constraints:
         if not isinstance(own, WithinJointLimits):
             continue
-        wide = np.where(np.isfinite(own.limits), np.abs(own.limits), 0.0).max(axis=0) * turning
+        # Those of the robot's description are in radians, however wide.
+        given = np.isfinite(own.limits) & (own.limits != np.array(own.robot.position_limits))
+        wide = np.where(given, np.abs(own.limits), 0.0).max(axis=0) * turning
         joint = int(np.argmax(wide))
         if wide[joint] > _TURNS:
             yield Finding(
@@ -150,21 +153,29 @@ def _overlaps(problem: OptimalControlProblem, bound: BoundConstraint) -> Iterato
     if not isinstance(own, KeepClear):
         return
     robot = problem.scene.robot
-    lower, upper = robot.position_limits
-    turns = 2.0 * np.pi * np.ones(robot.dof)
-    lower, upper = np.maximum(lower, -turns), np.minimum(upper, turns)
-    rng = np.random.default_rng(0)
-    q = rng.uniform(lower, upper, (_POSTURES, robot.dof))
+    shares = np.random.default_rng(0).random((_POSTURES, robot.dof))
+    low, high = _range(robot)
+    q = low + shares * (high - low)
     q[0] = problem.q0
-    missing = own.missing(q, problem.t0)
+    missing = own.missing(q, bound.times[0])
     least = missing.min(axis=0)
     for pair in np.flatnonzero(least > 0.0):
         yield Finding(
             "pair always too close",
             f"KeepClear: {own.pairs[pair]} are too close by {least[pair]:.2g} m or more in each of {_POSTURES} "
-            "postures, so no plan keeps them apart. A link is taken for a capsule, which holds more than the link: "
-            "leave it out with links=, give it a smaller one with capsules=, or move the obstacle",
+            "postures, so hardly any plan keeps them apart. A link is taken for a capsule, which holds more than the "
+            "link: leave it out with links=, give it a smaller one with capsules=, or move the obstacle",
         )
+
+
+def _range(robot: Robot) -> tuple[Floats, Floats]:
+    """Between what (n,) and (n,) each joint is looked at [rad or m]."""
+    room = np.where(_turning(robot) > 0.0, 2.0 * np.pi, _RAIL)
+    lower, upper = robot.position_limits
+    below, above = np.abs(lower) < _ENDLESS, np.abs(upper) < _ENDLESS
+    low = np.where(below, lower, np.where(above, upper, 0.0) - room)
+    high = np.where(above, upper, np.where(below, lower, 0.0) + room)
+    return low, high
 
 
 def _turning(robot: Robot) -> Floats:
