@@ -1,5 +1,7 @@
 """Hard constraints of plans: against SciPy on the same grid, KKT conditions by differences, what is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -7,6 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
 import varpin as vp
+from varpin.control import ViolationOnRobot
 from varpin.control.backward import backward
 from varpin.control.hints import hints
 from varpin.control.hints import reach as hints_reach
@@ -508,6 +511,42 @@ def test_hints_before_a_search():
     assert any("two goals" in sentence for sentence in plan.warnings)
 
 
+def one_joint(joint, lower, upper):
+    """A cart on rails, or a wheel, with limits of its own."""
+    model = pin.Model()
+    limits = (np.array([x]) for x in (100.0, 10.0, lower, upper))
+    place = model.addJoint(0, joint, pin.SE3.Identity(), "moved", *limits)
+    model.appendBodyToJoint(place, pin.Inertia(1.0, np.zeros(3), 0.1 * np.eye(3)), pin.SE3.Identity())
+    model.addBodyFrame("cart", place, pin.SE3.Identity(), 0)
+    return vp.load_robot(model)
+
+
+@pytest.mark.parametrize(("limits", "place", "always"), [
+    ((10.0, 12.0), 30.0, False), ((-30.0, -20.0), -7.0, False), ((0.0, 40.0), 3.0, False),
+    ((-np.inf, np.inf), 0.0, False), ((10.0, np.inf), 0.0, False), ((10.0, 12.0), 11.0, True),
+])  # fmt: skip
+def test_pairs_are_looked_at_over_the_whole_way_of_a_rail(limits, place, always):
+    """Limits that are all beyond a turn's 6.28, and an obstacle that has room beside it only there."""
+    robot = one_joint(pin.JointModelPX(), *limits)
+    wide = vp.Obstacle.sphere([place, 0.0, 0.0], 6.5)
+    clear = vp.KeepClear(robot, [wide], 0.02, capsules={"cart": ([0, 0, 0], [0, 0, 0.1], 0.05)})
+    begin = np.clip(0.5, *limits)
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, gravity=False), vp.ControlCost(1.0), [begin], [0.0], dt=0.02, steps=10, constraints=[clear]
+    )
+    assert [told.kind for told in hints(problem)] == ["pair always too close"] * always
+
+
+def test_wide_limits_of_the_description_are_in_radians():
+    robot = one_joint(pin.JointModelRZ(), -1e5, 1e5)
+    for given, told in ((None, 0), ((-180.0, 180.0), 1)):
+        constraints = [vp.WithinJointLimits(robot, given)]
+        problem = vp.OptimalControlProblem(
+            vp.Scene(robot, gravity=False), vp.ControlCost(1.0), [0], [0], dt=0.02, steps=10, constraints=constraints
+        )
+        assert [found.kind for found in hints(problem)] == ["limits in degrees"] * told
+
+
 def test_reach_bounds_where_a_frame_gets():
     """Of many postures, rails included."""
     for name, frame in (("ur5", "tool0"), ("tiago_no_hand", "wrist_ft_tool_link")):
@@ -569,6 +608,16 @@ def test_verification_tells_what_the_continuous_robot_violates():
     assert seen.violation == max(speed.closed_loop, goal.closed_loop)
     assert "WithinVelocityLimits is violated by [rad/s or m/s]: planned" in str(seen)
     assert "limit of joint" in speed.where
+
+
+def test_a_motion_with_feedback_that_runs_away_is_no_small_violation():
+    kept = ViolationOnRobot("one", "m", 0.0, 0.1, 0.2, "")
+    lost = ViolationOnRobot("other", "m", 0.0, 0.1, np.nan, "")
+    seen = vp.solve(two_links(FAMILIES["velocities"], steps=8), check=False).verify()
+    for constraints in ((kept, lost), (lost, kept)):
+        assert np.isnan(replace(seen, constraints=constraints).violation)
+    assert replace(seen, constraints=(kept,)).violation == 0.2
+    assert replace(seen, constraints=()).violation == 0.0
 
 
 def test_bounds_on_the_way_to_a_goal_that_they_forbid_settle():

@@ -53,7 +53,7 @@ class ViolationOnRobot:
         open_loop: Of the continuous system under the plan's controls alone, between nodes, too; of a goal at the end.
             NaN where that motion runs away.
         closed_loop: The same with feedback.
-        where: The worst row and time with feedback, in words; empty where nothing is violated.
+        where: The worst row and time with feedback, in words; empty where nothing is violated or the motion runs away.
     """
 
     label: str
@@ -105,8 +105,11 @@ class Verification:
 
     @property
     def violation(self) -> float:
-        """The most that a constraint is violated with feedback on the continuous system, in its own unit."""
-        return max((item.closed_loop for item in self.constraints), default=0.0)
+        """The most that a constraint is violated with feedback on the continuous system, in its own unit.
+
+        NaN where that motion runs away.
+        """
+        return float(np.max([item.closed_loop for item in self.constraints], initial=0.0))
 
     @property
     def told(self) -> bool:
@@ -296,6 +299,7 @@ def _violations(
         for motion, failure in motions:
             if failure is not None:
                 worst.append(np.nan)
+                where = ""
                 continue
             excess = _excess(bound, bound.value(motion.q, motion.v, motion.u))
             if not bound.of_controls and not bound.source.equality:
