@@ -587,6 +587,16 @@ def test_impulses_by_hand_are_those_of_the_noise(kick, by_controls):
         np.testing.assert_allclose(v[0], motion.v[1:], rtol=0.0, atol=1e-11)
 
 
+def test_steps_under_constraints_take_no_impulses_by_hand():
+    """They would be left out in silence."""
+    robot = vp.planar_chain(2)
+    scene = vp.Scene(robot, constraints=[vp.JointTie("joint1", "joint2")], noise=vp.AdditiveNoise(0.1))
+    start, u, n = (np.zeros((1, 2)), np.zeros((1, 2))), np.zeros((4, 2)), 2
+    jumps = np.ones((1, 4, 2, n))
+    assert vp.Midpoint().motions(scene, *start, open_loop(u), np.zeros((0, 0, n)), 0.01) is not None
+    assert vp.Midpoint().motions(scene, *start, open_loop(u), np.zeros((0, 0, n)), 0.01, jumps) is None
+
+
 @pytest.mark.parametrize("controls", ["held", "changing", "none"])
 @pytest.mark.parametrize(
     "integrator",

@@ -255,7 +255,9 @@ class Variational(Integrator):
         dt: float,
         impulses: Floats | None = None,
     ) -> tuple[Floats, Floats] | None:
-        """See :meth:`Integrator.motions`."""
+        """See :meth:`Integrator.motions`; under constraints it takes no impulses."""
+        if impulses is not None and scene.constraints:
+            return None
         try:
             run = self._begun(scene, q0, v0)
         except SingularMassMatrix:
