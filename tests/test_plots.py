@@ -115,6 +115,30 @@ def test_controls_that_are_no_joints_have_their_own_names():
         plots.plot_controls(trajectory, labels=["a", "b", "c"])
 
 
+def test_controls_of_joints_moved_by_hand_are_positions_and_velocities():
+    def of(links, interpolation="linear", **options):
+        by_hand = vp.KinematicInput("joint1", interpolation)
+        scene = vp.Scene(vp.planar_chain(links), constraints=by_hand, **options)
+        motion = vp.simulate(scene, np.full(links, 0.3), np.zeros(links), dt=0.02, steps=3)
+        _, axes = plots.plot_controls(motion, robot=scene.robot)
+        return axes.get_ylabel(), list(drawn(axes))
+
+    driven = {"actuation": ["joint1"]}
+    assert of(2, **driven) == ("commanded position [rad]", ["joint1"])
+    # As many controls as joints, and none of them a torque.
+    two = ["u1, commanded position [rad]", "u2, velocity [rad/s]"]
+    assert of(2, "cubic", **driven) == ("control [units of each]", two)
+    assert of(2) == ("control [units of each]", ["joint1, commanded position [rad]", "joint2"])
+    assert of(1, "linear") == ("commanded position [rad]", ["joint1"])
+
+
+def test_torques_of_joints_moved_by_hand_are_no_controls(tmp_path):
+    scene = vp.Scene(vp.planar_chain(2), constraints=vp.KinematicInput("joint1"))
+    motion = vp.simulate(scene, [0.3, 0.3], [0, 0], dt=0.02, steps=3)
+    with pytest.raises(vp.InputError, match="moved by hand"):
+        vp.replay(scene.robot, motion, torques=True, html=tmp_path / "hand.html")
+
+
 def test_controls_of_servos_are_commanded_positions():
     robot = vp.planar_chain(2)
 

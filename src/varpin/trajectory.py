@@ -462,6 +462,13 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
     )
 
 
+def moved_by_hand(trajectory: Trajectory) -> Floats:
+    """Rows (k, 2 or more) of a record's ties that are joints moved by hand, which are tied to themselves."""
+    ties = trajectory.scene_values.get("constraints.ties", np.zeros((0, 2)))
+    # A file may hold anything.
+    return ties[ties[:, 0] == ties[:, 1]] if ties.ndim == 2 and ties.shape[1] > 1 else np.zeros((0, 2))
+
+
 def require_motion(scene: Scene, trajectory: Trajectory) -> None:
     """Refuse what is no trajectory of a scene's robot with its number of controls.
 

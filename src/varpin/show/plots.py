@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from varpin.errors import InputError
 from varpin.model import Robot
-from varpin.trajectory import Trajectory
+from varpin.trajectory import Trajectory, moved_by_hand
 
 if TYPE_CHECKING:
     # Plotting a joint needs no optimizer.
@@ -73,7 +73,10 @@ def plot_controls(
     robot: Robot | None = None,
     labels: Sequence[str] | None = None,
 ) -> tuple[Figure | SubFigure, Axes]:
-    """Controls over time, as the steps they are; those of position servos as commanded positions [rad or m].
+    """Controls over time, as the steps they are.
+
+    Those of position servos, and of joints that are moved by hand, are commanded positions [rad or m]; the second ones
+    of cubic inputs are velocities [rad/s or m/s].
 
     Args:
         trajectory: The motion.
@@ -96,6 +99,7 @@ def plot_controls(
     figure, axes = _axes(axes)
     joints = _served(trajectory)
     served = [joint is not None for joint in joints]
+    rates = _rates(trajectory)
     what = "control"
     if labels is None and controls == len(trajectory.joint_names) and not any(served):
         names, unit = _labels(trajectory.joint_names, ("N m", "N"), slides)
@@ -104,12 +108,15 @@ def plot_controls(
         plain = [trajectory.joint_names[joint] for joint in commanded] if labels is None else labels
         names, unit = _labels(plain, ("rad", "m"), None if slides is None else slides[commanded])
     else:
-        every = labels is None and controls == len(trajectory.joint_names)
+        every = labels is None and controls == len(trajectory.joint_names) and not rates
         plain = trajectory.joint_names if every else (labels or [f"u{i + 1}" for i in range(controls)])
         names = [
             name if joint is None else f"{name}, commanded position [{_position_unit(joint, slides)}]"
             for name, joint in zip(plain, joints, strict=True)
         ]
+        for control, joint in rates.items():
+            unit = "rad/s or m/s" if slides is None else ("rad/s", "m/s")[int(slides[joint])]
+            names[control] = f"{plain[control]}, velocity [{unit}]"
         unit = "units of each"
     for row, name, style in zip(trajectory.u.T, names, _styles(controls), strict=True):
         edges, values = _thin_steps(trajectory.t, row)
@@ -405,19 +412,30 @@ def _labels(names: Sequence[str], units: tuple[str, str], slides: NDArray[np.boo
 
 
 def _served(trajectory: Trajectory) -> list[int | None]:
-    """For each control (m,) the joint whose servo goes to it; None for forces, and where the record does not say."""
-    none: list[int | None] = [None] * trajectory.u.shape[1]
+    """For each control (m,) the joint that is to be there, by a servo or by hand; None for others, and if unknown."""
+    found: list[int | None] = [None] * trajectory.u.shape[1]
     values = trajectory.scene_values
-    if "PositionServo" not in values or "actuation" not in values or not values["PositionServo"].size:
-        return none
+    if "actuation" not in values:
+        return found
     actuation = values["actuation"]
     joints = range(min(len(trajectory.joint_names), len(actuation)))
-    for joint in values["PositionServo"][:, 0].tolist():
+    servos = values.get("PositionServo", np.zeros((0, 1)))
+    for joint in [*(servos[:, 0].tolist() if servos.size else ()), *moved_by_hand(trajectory)[:, 0].tolist()]:
         # A file may hold anything.
         drives = np.flatnonzero(actuation[int(joint)]) if joint in joints else np.zeros(0, dtype=np.int64)
-        if len(drives) and drives[0] < len(none):
-            none[int(drives[0])] = int(joint)
-    return none
+        if len(drives) and drives[0] < len(found):
+            found[int(drives[0])] = int(joint)
+    return found
+
+
+def _rates(trajectory: Trajectory) -> dict[int, int]:
+    """Controls that are velocities of cubic inputs, which drive nothing, and their joints."""
+    actuation = trajectory.scene_values.get("actuation", np.zeros((0, 0)))
+    if actuation.ndim != 2 or actuation.shape[1] != trajectory.u.shape[1]:
+        return {}
+    idle, joints = np.flatnonzero(~actuation.any(axis=0)), range(len(trajectory.joint_names))
+    rows = moved_by_hand(trajectory)
+    return {int(row[-1]): int(row[0]) for row in rows if row[-1] in idle and row[0] in joints}
 
 
 def _position_unit(joint: int, slides: NDArray[np.bool_] | None) -> str:

@@ -16,7 +16,7 @@ from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.show.replay.script import Outlook, Target, Trace
 from varpin.support.checks import JointValues, as_floats, joint_array, require_finite
-from varpin.trajectory import Trajectory
+from varpin.trajectory import Trajectory, moved_by_hand
 
 if TYPE_CHECKING:
     from varpin.control.mpc import MpcRun
@@ -244,6 +244,11 @@ def torque_shares(
             raise InputError(
                 "torques=True takes controls for torques, and controls of this trajectory are positions that servos go "
                 f"to; give the torques (N, {robot.dof}) themselves"
+            )
+        if len(moved_by_hand(motion)):
+            raise InputError(
+                "torques=True takes controls for torques, and controls of this trajectory are positions of joints that "
+                f"are moved by hand; give the torques (N, {robot.dof}) themselves"
             )
     else:
         values = as_floats("torques", torques)
