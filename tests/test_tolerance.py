@@ -292,9 +292,9 @@ def test_random_motions(script):
 
 @pytest.mark.slow
 def test_many_random_motions(script):
-    """The tolerance met on 95 %, and nine tenths within twice the evaluations of the cheapest fixed choice."""
+    """The tolerance met on 95 %, and as many within twice the evaluations of the cheapest fixed choice."""
     benchmark, rng = script("advise"), np.random.default_rng(7)
     verdicts = [verdict for verdict in (benchmark.judge_simulation(rng) for _ in range(40)) if verdict is not None]
     assert len(verdicts) > 25
     assert np.mean([verdict.met for verdict in verdicts]) >= 0.95
-    assert np.mean([verdict.ratio <= 2.0 for verdict in verdicts]) >= 0.9
+    assert np.mean([verdict.ratio <= 2.0 for verdict in verdicts]) >= 0.95
