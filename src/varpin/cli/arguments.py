@@ -98,7 +98,7 @@ def add_integrator(parser: argparse.ArgumentParser) -> None:
         "--integrator",
         metavar="NAME",
         help=f"{', '.join(BY_NAME)}; with options as Python writes them, 'Gauss(stages=3)'; default: Gauss(stages=2), "
-        "with 4 where springs are fast for the step, or Radau(stages=4) where dampers are faster than it",
+        "with 4 where springs are fast for the step, Radau(stages=4) where dampers are faster, Midpoint under noise",
     )
     group.add_argument(
         "--stages", type=int, metavar="N", help="of Gauss, which it asks for: 1 to 6, of order twice as many"
