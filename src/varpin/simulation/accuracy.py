@@ -43,7 +43,7 @@ LITTLE, LIGHT = 1e-2, 1e-2
 # Part of a joint's motion so far below which what it does at one place is rest.
 _REST = 1e-3
 # Parts of positions and velocities that are no more than what rounding adds up to.
-_ROUNDING = 1e3 * float(np.finfo(np.float64).eps)
+ROUNDING = 1e3 * float(np.finfo(np.float64).eps)
 # Part of a speed that counts as changed if nothing changes it: a wheel that turns evenly turns over next to nothing.
 EVEN = 1e-3
 
@@ -139,12 +139,12 @@ class Window:
             so_far = self.varied[here - 1, joints]
             growth = np.where(so_far > 0.0, self.varied[self.judged - 1, joints] / so_far, np.inf)
             growth = np.maximum(np.minimum(growth, self.judged / here), 1.0)
-            rounding = _ROUNDING * (1.0 + np.abs(trajectory.q[self.step]).max())
+            rounding = ROUNDING * (1.0 + np.abs(trajectory.q[self.step]).max())
             position = np.where(far <= rounding, 0.0, far * (1.0 if cut else growth) / way)
             # What momenta of joints that move round to goes into the velocities of those at rest.
             root = np.sqrt(inertia)
             fastest = np.abs(trajectory.v[self.step : self.step + until + 1]).max(axis=0)
-            rounding = np.maximum(rounding / (trajectory.dt * here), _ROUNDING * (root * fastest).max() / root)
+            rounding = np.maximum(rounding / (trajectory.dt * here), ROUNDING * (root * fastest).max() / root)
             velocity = np.where(fast <= np.maximum(rounding, 1e-9 * speed), 0.0, fast / speed)
             motion = position * way / way.max()
             shares = np.array([position / WRONG_POSITION, velocity / WRONG_VELOCITY, motion / WRONG_MOTION])

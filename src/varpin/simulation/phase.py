@@ -17,7 +17,7 @@ from varpin.errors import LinearizationError
 from varpin.integrators import Integrator
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.scene import Scene
-from varpin.simulation.accuracy import largest_of_its_kind
+from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -72,6 +72,8 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
     if drift is None or (h * fastest < 1.0 and abs(drift[0]) * trajectory.t[-1] < _SHOWS):
         return None
     way = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
+    # A robot held in equilibrium has accelerations of rounding, and swings as little.
+    rounding = ROUNDING * (1.0 + np.abs(q).max())
     worst = None
     for k, node in enumerate(at):
         A = np.block([[np.zeros((n, n)), np.eye(n)], [aq[k], av[k]]])
@@ -91,7 +93,7 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
         turned = np.minimum(np.abs(np.expm1(drift * lasting)), 2.0)
         off = heights * (left * turned)
         with np.errstate(divide="ignore", invalid="ignore"):
-            shares = np.where(off > 0.0, off / way[:, None], 0.0)
+            shares = np.where(off > rounding, off / way[:, None], 0.0)
         joint, mode = np.unravel_index(int(shares.argmax()), shares.shape)
         share = float(shares[joint, mode])
         if share >= _SHOWS and (worst is None or share > worst.share):
