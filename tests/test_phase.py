@@ -107,3 +107,16 @@ def test_nothing_is_said_of_what_is_not_known():
     ):
         motion = vp.simulate(scene, [0.3, 0.3], [0, 0], dt=1e-2, steps=200, integrator=integrator, rng=rng, check=False)
         assert phase_lost(scene, integrator, motion) is None
+
+
+@pytest.mark.parametrize("name", ["talos_arm", "xarm7"])
+def test_nothing_is_said_of_an_arm_that_is_held_at_rest(name):
+    """Torques that balance gravity and springs to rounding: what swings is rounding, too."""
+    robot = vp.load_robot(name)
+    for posture in (np.zeros(7), np.full(7, 0.3)):
+        scene = vp.Scene(robot, damping=0.5, stiffness=30.0)
+        motion = vp.simulate(
+            scene, posture, np.zeros(7), dt=4e-3, steps=250, controls=scene.holding_controls(posture)
+        )  # fmt: skip
+        assert np.ptp(motion.q, axis=0).max() <= 1e-12
+        assert not [told for told in motion.warnings if "lose phase" in told]

@@ -430,7 +430,12 @@ def test_scene_files(tmp_path):
     """Each type becomes the constraint that it names; mistakes are told with their place."""
     path = tmp_path / "arm.toml"
     path.write_text(SCENE, encoding="utf-8")
-    made = vp.load_scene(path).problem.constraints
+    loaded = vp.load_scene(path)
+    assert loaded.required.terms["the plan keeps"] == (
+        "joint limits, velocity limits, control rate, reach frame, half space, box, outside sphere, clearance"
+    )
+    assert loaded.required.terms["not modelled"].endswith("shapes are read only for replays and clearance")
+    made = loaded.problem.constraints
     speeds, rate, goal, clear, box, plane, sphere, joints = made
     assert speeds.margin == 1.5
     assert speeds.limits[1].tolist() == [np.inf, np.inf, 0.5, np.inf, np.inf, np.inf]

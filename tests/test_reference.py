@@ -120,3 +120,13 @@ def test_every_integrator_knows_its_order():
         vp.Reference(): 8,
     }
     assert all(integrator.order == order for integrator, order in orders.items())
+
+
+def test_dampers_are_resolved_whatever_dt_is():
+    """A wrist whose damper is forty times faster than dt: the motion is that of small steps, and nothing rings."""
+    scene = vp.Scene(vp.load_robot("ur10"), damping=2.0)
+    start = [0.0, -1.2, 1.0, 0.0, 0.0, 0.3], np.zeros(6)
+    motion = vp.simulate(scene, *start, dt=1e-2, steps=60, integrator=vp.Reference())
+    fine = vp.simulate(scene, *start, dt=1e-4, steps=6000)
+    np.testing.assert_allclose(motion.v, fine.v[::100], rtol=0, atol=1e-9)
+    assert not [told for told in motion.warnings if "will ring" in told]

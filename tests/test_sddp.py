@@ -1008,8 +1008,14 @@ def test_first_motion_that_cannot_be_integrated():
 
 def test_cost_that_is_not_finite():
     never = vp.CustomCost(lambda t, q, v, u: np.where(t > 0.5, np.nan, 0.0), name="never")
-    with pytest.raises(vp.CostError, match="cost of the first motion is nan"):
+    with pytest.raises(vp.CostError, match=r"^CustomCost\('never'\): the cost of the first motion is nan"):
         vp.solve(small(vp.ControlCost(1.0) + never))
+    with pytest.raises(
+        vp.CostError, match=r"^Terminal\(cost=CustomCost\('end'\)\): the cost of the first motion is inf"
+    ):
+        vp.solve(
+            small(vp.ControlCost(1.0) + vp.Terminal(vp.CustomCost(lambda t, q, v, u: np.inf + 0.0 * t, name="end")))
+        )
     far = vp.CustomCost(lambda t, q, v, u: np.where(q[:, 0] > 0.8, np.nan, (q[:, 0] - 1.0) ** 2), name="far")
     problem = small(vp.ControlCost(1e-3) + far)
     sol = vp.solve(problem)

@@ -299,7 +299,7 @@ class Trajectory(Frozen):
 
     def __repr__(self) -> str:
         split = self.statistics.split_steps
-        flag = f", {split} steps split by the guards" if split else ""
+        flag = f", {split} {'step' if split == 1 else 'steps'} split by the guards" if split else ""
         reached = f", estimated error {self.accuracy.error:.1e}" if self.accuracy is not None else ""
         return (
             f"Trajectory({self.robot}: {len(self.joint_names)} joints, {self.steps} steps of {self.dt:g} s, "

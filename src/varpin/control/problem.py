@@ -553,6 +553,20 @@ class OptimalControlProblem(Frozen):
             found.append(self.rate.shares(u[:: self.hold], self.period))
         return np.concatenate(found)
 
+    def not_finite(self, trajectory: Trajectory) -> tuple[Cost, ...]:
+        """The terms of the cost that are not finite on a motion, without those of the controls' rate."""
+        q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
+        along, end = self.samples(q, v, u), (q[-1:], v[-1:], np.zeros((1, u.shape[1])))
+        terms = [term for term in self.cost.terms if not is_control_rate(term)]
+        # Both sums have their parts in the order of the cost's terms.
+        found = []
+        for total, at, at_end in ((self.running, along, False), (self.terminal, end, True)):
+            own = [term for term in terms if isinstance(term, Terminal) == at_end]
+            for term, part in zip(own, total.parts, strict=True):
+                if not np.isfinite(part.value(*at)).all():
+                    found.append(term)
+        return tuple(found)
+
     def simulate(
         self, controls: JointValues | LinearPolicy | OpenLoop, *, rng: np.random.Generator | int | None = None
     ) -> Trajectory:

@@ -512,7 +512,8 @@ class _Search:
         self.shares = attempt.shares()
         self.cost = float(self.shares.sum())
         if not np.isfinite(self.cost):
-            raise CostError(repr(self.problem.cost), f"the cost of the first motion is {self.cost}")
+            culprits = " + ".join(map(repr, problem.not_finite(trajectory) or problem.cost.terms))
+            raise CostError(culprits, f"the cost of the first motion is {self.cost}")
 
     def resume(self, state: SearchState) -> None:
         """Stand where ``state`` was taken."""

@@ -72,8 +72,8 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
     if drift is None or (h * fastest < 1.0 and abs(drift[0]) * trajectory.t[-1] < _SHOWS):
         return None
     way = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
-    # Of joints at rest on springs, accelerations round to oscillations.
-    rounding = ROUNDING * (1.0 + np.abs(trajectory.q).max())
+    # A robot held in equilibrium has accelerations of rounding, and swings as little.
+    rounding = ROUNDING * (1.0 + np.abs(q).max())
     worst = None
     for k, node in enumerate(at):
         A = np.block([[np.zeros((n, n)), np.eye(n)], [aq[k], av[k]]])

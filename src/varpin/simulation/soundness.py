@@ -269,7 +269,11 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
             split = f" ({_in_parts(trajectory)})" if _in_parts(trajectory) else ""
             sentence = f"dt = {dt:g} s is coarse for {integrator} here: {off}{split}"
             found.append(Finding("coarse steps", sentence, error.joint))
-    elif error is None and not integrator.l_stable and (fast := _fast_damping(scene, trajectory)).rate:
+    elif (
+        error is None
+        and not (integrator.l_stable or isinstance(integrator, Reference))
+        and (fast := _fast_damping(scene, trajectory)).rate
+    ):
         # No other method gets through these steps: whether they ring has to be seen in the motion itself.
         before, after = trajectory.v[:-1], trajectory.v[1:]
         if ((before * after < 0.0) & (np.abs(before) > _STILL) & (np.abs(after) > 0.5 * np.abs(before))).any():

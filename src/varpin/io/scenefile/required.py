@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.io.scenefile.layout import CostTerm, Layout, holding_controls, joints_of_frame, times_of
+from varpin.io.scenefile.plan_constraints import PLAN_CONSTRAINTS
 from varpin.io.scenefile.references import Timeline
 from varpin.io.scenefile.spec import FORCES, FRAME_FORCES
 from varpin.io.scenefile.table import Floats
@@ -192,6 +193,9 @@ def _terms(layout: Layout) -> dict[str, str]:
     costs = [term.spec.kind + (" at the end" if term.spec.terminal else "") for term in layout.costs]
     kinds: set[type[Force]] = {force.kind for force in layout.forces} | {type(part) for part in layout.frame_forces}
     absent = [words for words, kind in _ABSENT.items() if kind not in kinds] + ["contact"]
+    kinds_kept = [own.kind for own in spec.plan_constraints]
+    kept = [name.replace("_", " ") for name, kind in PLAN_CONSTRAINTS.items() if kind in kinds_kept]
+    shapes = "replays and clearance" if "clearance" in kept else "a replay"
     payloads = [f"{payload.mass:g} kg at {payload.frame}" for payload in spec.robot.payload]
     terms = {
         "gravity": f"{', '.join(f'{g:g}' for g in gravity)} m/s^2" if any(gravity) else "none",
@@ -203,8 +207,10 @@ def _terms(layout: Layout) -> dict[str, str]:
         "torque limits": of(limited.astype(float), layout.driven),
         "cost": ", ".join(costs) or "none",
         "other forces": ", ".join(word for word, kind in {**FORCES, **FRAME_FORCES}.items() if kind in kinds) or "none",
-        "not modelled": f"{', '.join(absent)}; shapes are read only for a replay",
+        "not modelled": f"{', '.join(absent)}; shapes are read only for {shapes}",
     }
     if layout.constraints:
         terms["constraints"] = ", ".join(dict.fromkeys(type(part).__name__ for part in layout.constraints))
+    if kept:
+        terms["the plan keeps"] = ", ".join(kept)
     return terms
