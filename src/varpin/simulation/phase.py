@@ -27,6 +27,9 @@ Complexes = NDArray[np.complex128]
 _NODES, _JOINTS = 9, 60
 # What is spoken of, in units of the way of the joint that goes furthest.
 _SHOWS = 0.02
+# By how much an oscillation has to turn over the motion [rad]; what turns by less loses nothing that shows. A joint that
+# nothing holds has the eigenvalue zero twice, which rounding splits into slow modes of any height.
+_TURNS = 1.0
 # Forces that make oscillations; under gravity alone fast motions are chaotic, and slow ones lose little.
 _SPRINGS = ("JointSpring", "JointStop", "PositionServo", "FrameSpring", "FrameLengthSpring", "FrameTurnSpring")
 
@@ -76,7 +79,7 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
     for k, node in enumerate(at):
         A = np.block([[np.zeros((n, n)), np.eye(n)], [aq[k], av[k]]])
         rates, modes = np.linalg.eig(A)
-        swings = rates.imag > np.abs(rates.real)
+        swings = rates.imag > np.maximum(np.abs(rates.real), _TURNS / trajectory.t[-1])
         try:
             parts = np.linalg.solve(modes, np.append(v[k], a[k]))
         except np.linalg.LinAlgError:
