@@ -27,8 +27,8 @@ Complexes = NDArray[np.complex128]
 _NODES, _JOINTS = 9, 60
 # What is spoken of, in units of the way of the joint that goes furthest.
 _SHOWS = 0.02
-# By how much an oscillation has to turn over the motion [rad]; what turns by less loses nothing that shows. A joint that
-# nothing holds has the eigenvalue zero twice, which rounding splits into slow modes of any height.
+# By how much an oscillation has to turn over the motion [rad]; what turns by less loses nothing that shows. A joint
+# that nothing holds has the eigenvalue zero twice, which rounding splits into slow modes of any height.
 _TURNS = 1.0
 # Forces that make oscillations; under gravity alone fast motions are chaotic, and slow ones lose little.
 _SPRINGS = ("JointSpring", "JointStop", "PositionServo", "FrameSpring", "FrameLengthSpring", "FrameTurnSpring")
