@@ -363,6 +363,39 @@ def test_between_nodes_is_told():
     assert any("between them" in sentence for sentence in plan.warnings)
 
 
+def test_a_motion_that_leaves_the_nodes_tells_nothing_of_what_is_between_them():
+    """An unstable motion runs away from the plan under its controls alone; from each node on it keeps the limits."""
+    n, dt, steps, limit = 4, 0.1, 20, 3.15
+    robot = vp.planar_chain(n)
+
+    def reference(t):
+        return np.append(-np.pi / 2, np.zeros(n - 1)) + np.linspace(0.5, -0.5, n) * (1.0 - np.cos(9.0 * t)) / 2.0
+
+    tracking = vp.TrackingCost(reference, 10.0)
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot),
+        vp.ControlCost(1e-6) + tracking + vp.Terminal(tracking),
+        reference(0.0),
+        np.zeros(n),
+        dt=dt,
+        steps=steps,
+        constraints=[vp.WithinVelocityLimits(robot, (-limit, limit))],
+    )
+    plan = vp.solve(problem)
+
+    def fastest(q, v, controls):
+        rows = np.repeat(controls, 4, axis=0)
+        motion = vp.simulate(
+            problem.scene, q, v, dt=dt / 4, steps=len(rows), controls=rows, integrator=problem.integrator, check=False
+        )
+        return np.abs(motion.v).max()
+
+    motion = plan.trajectory
+    assert fastest(motion.q[0], motion.v[0], plan.controls) > 1.5 * limit
+    assert max(fastest(motion.q[k], motion.v[k], plan.controls[k : k + 1]) for k in range(steps)) < limit
+    assert not [sentence for sentence in plan.warnings if "between them" in sentence]
+
+
 def test_a_start_outside_is_told(caplog):
     """By its row and how far, before the search, and not as a violation between nodes of the first step."""
     problem = two_links([vp.WithinJointLimits(ROBOT, ([0.1, -1.0], 2.0))])

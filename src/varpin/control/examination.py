@@ -15,6 +15,7 @@ from varpin.control.multipliers import FEASIBLE, TOLD
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
 from varpin.control.verification import accurate_cost, percent
+from varpin.core.arrays import Commands
 from varpin.errors import VarpinError
 from varpin.integrators import Integrator
 from varpin.integrators.base import open_line, open_loop
@@ -109,21 +110,26 @@ def replayed(solution: Solution) -> Replay:
         VarpinError: A cost or a noise field of one's own fails off the plan.
     """
     problem = solution.problem
-    variational = problem.integrator.variational
-    times = problem.integrator.stage_times
-    alone = open_line(solution.controls, times) if problem.linear else open_loop(solution.controls)
-    alone = alone._replace(hold=problem.hold * PARTS)
-    policy = solution.policy_on("momentum" if variational else "velocity", PARTS)
-    m, n = problem.scene.controls, problem.scene.robot.dof
-    fed = policy.commands(problem.steps * PARTS, m, n, variational=variational, stage_times=times)
     first = np.inf if solution.search is None else abs(solution.search.first)
     # Where the optimum costs nothing, there is nothing to be relative to but where the search began.
     base = abs(solution.cost) + (1e-9 * first if np.isfinite(first) else 0.0)
-    costs = [accurate_cost(problem, commands, PARTS, integrator=problem.integrator)[0] for commands in (alone, fed)]
+    ways = _in_parts(solution)
+    costs = [accurate_cost(problem, commands, PARTS, integrator=problem.integrator)[0] for commands in ways]
     # What the quarters still have wrong themselves.
     whole = 1.0 - float(PARTS) ** -problem.integrator.order
     lost = [0.0 if cost == solution.cost else (cost - solution.cost) / (whole * (base or 1.0)) for cost in costs]
     return Replay(*lost)
+
+
+def _in_parts(solution: Solution) -> tuple[Commands, Commands]:
+    """A plan's controls alone, and with its feedback, for parts of its steps."""
+    problem = solution.problem
+    variational, times = problem.integrator.variational, problem.integrator.stage_times
+    alone = open_line(solution.controls, times) if problem.linear else open_loop(solution.controls)
+    policy = solution.policy_on("momentum" if variational else "velocity", PARTS)
+    m, n = problem.scene.controls, problem.scene.robot.dof
+    fed = policy.commands(problem.steps * PARTS, m, n, variational=variational, stage_times=times)
+    return alone._replace(hold=problem.hold * PARTS), fed
 
 
 def _alternating(solution: Solution) -> list[Finding]:
@@ -228,16 +234,17 @@ def _between(solution: Solution) -> list[Finding]:
     if not problem.constraints or solution.violation > FEASIBLE:
         return []
     dt = problem.dt / PARTS
-    motion, failure = rollout(
-        problem.scene,
-        problem.integrator,
-        problem.q0,
-        problem.v0,
-        open_loop(solution.controls)._replace(hold=problem.hold * PARTS),
-        dt,
-    )
-    if failure is not None:
+    # Of an unstable motion the controls alone, in parts of steps, leave the nodes; feedback that is too fast does, too.
+    kept, least = None, np.inf
+    for commands in _in_parts(solution):
+        motion, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, dt)
+        if failure is None:
+            away = float(np.abs(motion.q[::PARTS] - solution.trajectory.q).max())
+            if away < least:
+                kept, least = motion, away
+    if kept is None:
         return []
+    motion = kept
     found = []
     fine = problem.constraints_on(dt, problem.steps * PARTS, problem.hold * PARTS)
     for bound, whole, own in zip(fine, problem.bound_constraints, solution.constraints, strict=True):

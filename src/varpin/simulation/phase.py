@@ -27,6 +27,9 @@ Complexes = NDArray[np.complex128]
 _NODES, _JOINTS = 9, 60
 # What is spoken of, in units of the way of the joint that goes furthest.
 _SHOWS = 0.02
+# By how much an oscillation has to turn over the motion [rad]; what turns by less loses nothing that shows. A joint
+# that nothing holds has the eigenvalue zero twice, which rounding splits into slow modes of any height.
+_TURNS = 1.0
 # Forces that make oscillations; under gravity alone fast motions are chaotic, and slow ones lose little.
 _SPRINGS = ("JointSpring", "JointStop", "PositionServo", "FrameSpring", "FrameLengthSpring", "FrameTurnSpring")
 
@@ -82,8 +85,7 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
             parts = np.linalg.solve(modes, np.append(v[k], a[k]))
         except np.linalg.LinAlgError:
             continue
-        # What turns by less than a radian in all does not swing, and its height is nothing but cancellation.
-        swings = (rates.imag > np.abs(rates.real)) & (rates.imag * trajectory.t[-1] > 1.0)
+        swings = rates.imag > np.maximum(np.abs(rates.real), _TURNS / trajectory.t[-1])
         rates, heights = rates[swings], 2.0 * np.abs(modes[:n, swings] * (parts[swings] / rates[swings]))
         drift = _drift(integrator, rates, h)
         if drift is None or not rates.size or not np.isfinite(drift).all():
