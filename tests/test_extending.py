@@ -84,8 +84,8 @@ class Quarter(Collocation):
     def _tableau(self):
         return midpoint(0.25)
 
-    def _times(self):
-        return np.array([0.5])
+    def _coefficients(self):
+        return np.full((1, 1), 0.25), np.ones(1), np.full(1, 0.5)
 
 
 def test_an_integrator_is_a_tableau_and_a_name(monkeypatch):

@@ -162,7 +162,7 @@ def test_in_halves():
     """Steps that the guards split, with their derivatives chained."""
     together = forest(0, 1, 2)
     scene, (q, v) = vp.Scene(together), state(together)
-    motion = vp.simulate(scene, q, 4.0 * v, dt=0.1, steps=10)
+    motion = vp.simulate(scene, q, 4.0 * v, dt=0.1, steps=10, integrator=vp.Midpoint())
     assert motion.statistics.split_steps > 3
     lin = vp.linearize(scene, motion)
     outside = np.tile(together.tree.group[:, None] != together.tree.group, (2, 2))

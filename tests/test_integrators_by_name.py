@@ -98,7 +98,7 @@ class Own(vp.Midpoint):
 
 def test_what_made_a_motion_is_held_against_what_is_given():
     scene = vp.Scene(vp.planar_chain(1))
-    motion = vp.simulate(scene, [0.4], [1.0], dt=0.01, steps=3)
+    motion = vp.simulate(scene, [0.4], [1.0], dt=0.01, steps=3, integrator=vp.Midpoint())
     # Guards decide which steps are cut, not what a step is.
     strict = vp.linearize(scene, motion, integrator=vp.Midpoint(guard=vp.Guard(max_halvings=0)))
     np.testing.assert_array_equal(strict.A, vp.linearize(scene, motion).A)

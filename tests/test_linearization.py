@@ -135,10 +135,10 @@ def test_velocity_dependent_fields():
     scene = vp.Scene(robot, damping=0.1, noise=friction_noise(6, 0.3))
     rng = np.random.default_rng(0)
     q, v, u, dt = rng.uniform(-1, 1, 6), rng.uniform(-1, 1, 6), rng.normal(size=6), 1e-3
-    motion = vp.simulate(scene, q, v, dt=dt, steps=1, controls=u)
+    integrator = vp.Midpoint()
+    motion = vp.simulate(scene, q, v, dt=dt, steps=1, controls=u, integrator=integrator)
     lin = vp.linearize(scene, motion)
     x, zero = np.concatenate([q, motion.p[0]]), np.zeros(6)
-    integrator = vp.Midpoint()
     rows = np.concatenate([np.ones(6), np.full(6, np.abs(motion.p).max())])
     in_x = difference(lambda x: one_step(scene, x, u, zero, dt, integrator), x, 5e-3 * rows)
     assert worst(lin.A[0], in_x, rows, rows) < 1e-8

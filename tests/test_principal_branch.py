@@ -99,7 +99,8 @@ def check(name, forced, cases, seed):
         alone = newton_alone(scene, q, impulse, force, h, v)
         jumps += alone is not None and (right is None or np.abs(alone - right).max() > 1e-3 * np.abs(right).max())
         try:
-            motion = vp.simulate(scene, q, v, dt=h, steps=1, controls=force, increments=increments)
+            options = {"dt": h, "steps": 1, "controls": force, "increments": increments, "integrator": vp.Midpoint()}
+            motion = vp.simulate(scene, q, v, **options)
         except vp.StepFailure:
             cut += 1
             refused += easy
