@@ -483,7 +483,10 @@ def test_sums_scales_and_words():
             lambda: linear(vp.ControlRateCost() + vp.ControlRateCost(1.0, BEFORE)),
             "ControlRateCost terms of one cost must have the same control before",
         ),
-        (lambda: linear().at(before=BEFORE), "before is the control that a ControlRateCost or a WithinControlRate begins with"),
+        (
+            lambda: linear().at(before=BEFORE),
+            "before is the control that a ControlRateCost or a WithinControlRate begins with",
+        ),
         (lambda: linear(vp.ControlRateCost()).at(before=np.zeros(3)), r"before must have shape \(2,\), got \(3,\)"),
         (
             lambda: vp.LinearPolicy(np.zeros((3, 2)), np.zeros((3, 2, 4)), np.zeros((3, 4)), previous_gains=np.eye(2)),
