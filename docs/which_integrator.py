@@ -769,6 +769,8 @@ def real(scale: Scale) -> tuple[str, Figure, list[tuple[str, Point]]]:
     panels = figure.subplots(1, 3, sharey=True)
     names = "MuJoCo", "DOP853", "SciPy"
     lines = [
+        "![Error over time for three real arms](images/which_real.png)",
+        "",
         "| motion | error [rad] | varpin [us] | MuJoCo [us] | DOP853 in C++ [us] | SciPy Radau [us] |",
         "|---|---|---|---|---|---|",
     ]

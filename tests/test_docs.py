@@ -128,13 +128,29 @@ def equations(cell):
         yield from (f"({stem}{k})" for k in range(int(begin), int(end) + 1))
 
 
+PLACE = re.compile(r"`([\w/]+\.(?:hpp|py))`: `(\w+)`")
+
+
+def source_with(file, name):
+    """The text of a file that defines a function or a class."""
+    folder = ROOT / ("src/core/include/varpin" if file.endswith(".hpp") else "src/varpin")
+    source = (folder / file).read_text(encoding="utf-8")
+    if file.endswith(".py"):
+        defined = rf"^ *(?:def|class) {name}\b"
+    else:
+        defined = rf"^ *(?!return)(?:[\w:<>*&]+ )+{name}\b(?!;).*[{{,]$"
+    assert re.search(defined, source, re.M), f"{file} defines no {name}"
+    return source
+
+
 def equation_map():
     rows = re.findall(r"^\| (\([^|]*) \| [^|]* \| (.*) \|$", text_of("mathematics.md"), re.M)
-    return [(list(equations(cell)), re.findall(r"`([\w/]+\.(?:hpp|py))`: `(\w+)`", where)) for cell, where in rows]
+    return [(list(equations(cell)), PLACE.findall(where)) for cell, where in rows]
 
 
 def test_every_equation_is_on_the_map():
-    shown = re.findall(r"\\tag\{([A-Z]\d+)\}", text_of("mathematics.md"))
+    pages = "".join(text_of(page) for page in ("mathematics.md", "constraints.md", "plan-constraints.md"))
+    shown = re.findall(r"\\tag\{([A-Z]\d+)\}", pages)
     assert len(set(shown)) == len(shown) > 30
     mapped = [number for numbers, _ in equation_map() for number in numbers]
     assert len(set(mapped)) == len(mapped)
@@ -146,14 +162,18 @@ def test_an_equation_is_computed_where_the_map_says(numbers, functions):
     """The file defines the function, and names the equation in turn."""
     assert functions
     for file, name in functions:
-        folder = ROOT / ("src/core/include/varpin" if file.endswith(".hpp") else "src/varpin")
-        source = (folder / file).read_text(encoding="utf-8")
-        if file.endswith(".py"):
-            defined = rf"^ *(?:def|class) {name}\b"
-        else:
-            defined = rf"^ *(?!return)(?:[\w:<>*&]+ )+{name}\b(?!;).*[{{,]$"
-        assert re.search(defined, source, re.M), f"{file} defines no {name}"
+        source = source_with(file, name)
         assert not [number for number in numbers if number not in source], f"{file} does not name {numbers}"
+
+
+def test_decisions_are_made_where_the_page_says():
+    rows = re.search(r"## Where decisions are made\n(.*?)\n## ", text_of("extending.md"), re.S).group(1).splitlines()
+    rows = [row for row in rows if row.startswith("| ")][1:]
+    assert len(rows) > 8
+    for row in rows:
+        assert PLACE.findall(row), row
+        for file, name in PLACE.findall(row):
+            source_with(file, name)
 
 
 def test_every_public_name_is_on_one_page_of_the_api():

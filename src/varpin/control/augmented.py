@@ -1,5 +1,8 @@
 """Hard constraints around S-DDP: the augmented Lagrangian, round by round, and a last step onto the constraints.
 
+Equations (P1) and (P3) of docs/plan-constraints.md: the multipliers' update is :meth:`Penalty.updated`, which
+:meth:`_Rounds._kept` calls, and that of the penalties' weights is in :meth:`_Rounds._ended_or_next`.
+
 After Howell, Jackson and Manchester, "ALTRO: a fast solver for constrained trajectory optimization" (2019).
 """
 
@@ -149,7 +152,7 @@ class _Rounds:
             resume = None
             self.history += [replace(item, index=item.index + known) for item in found.history]
             kept = self._steady(self._kept(found, problem, begun, known))
-            status, reason = self._ended(kept, begun, found, last)
+            status, reason = self._ended_or_next(kept, begun, found, last)
             if status is not None:
                 break
         if kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
@@ -251,8 +254,8 @@ class _Rounds:
             multipliers=multipliers,
         )
 
-    def _ended(self, kept: Solution, begun: _State, found: Solution, last: int) -> tuple[Status | None, str]:
-        """How the rounds end, if they do; else the state of the next one is made."""
+    def _ended_or_next(self, kept: Solution, begun: _State, found: Solution, last: int) -> tuple[Status | None, str]:
+        """How the rounds end, if they do; else the next one gets its multipliers and penalties, (P3)."""
         known = kept.multipliers
         assert known is not None
         told = reports(self.problem, kept.trajectory, known)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from varpin import core
 from varpin.control.costs import CostError, Expansion
 from varpin.control.descent import Model, Stake, at_stake
-from varpin.control.lines import RULE, Derivatives, LinearSteps, at_samples, linear_steps, size
+from varpin.control.linear_controls import RULE, Derivatives, LinearSteps, at_samples, linear_steps, size
 from varpin.control.moments import Feedback, noise_gradient
 from varpin.control.penalties import PenalizedProblem, PenalizedRate, flat, rate_columns
 from varpin.control.problem import OptimalControlProblem
@@ -367,7 +367,7 @@ def _foreseen(along: Along, plan: Plan) -> tuple[Floats, Floats]:
     """Where the linearized motion goes under a plan whose controls are clipped to their limits.
 
     The state, and the change of the control before, before each decision (R, 2n + m), and the controls' changes (R, m).
-    Where controls are linear between nodes the state is X of :mod:`varpin.control.lines`.
+    Where controls are linear between nodes the state is X of :mod:`varpin.control.linear_controls`.
     """
     problem, (R, m, _), x = along.problem, plan.feedback.shape, along.states
     feedback = plan.feedback

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.control.lines import at_samples
+from varpin.control.linear_controls import at_samples
 from varpin.control.problem import OptimalControlProblem
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.trajectory import Trajectory

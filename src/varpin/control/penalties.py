@@ -1,6 +1,6 @@
 """The augmented Lagrangian of a problem with constraints: a problem without them, whose cost has their penalties.
 
-Equation (P2) of docs/plan-constraints.md.
+Equations (P2) and (P3) of docs/plan-constraints.md.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Penalty(Frozen):
         return found
 
     def updated(self, c: Floats) -> Floats:
-        """The multipliers (K, rows) that a minimum of the augmented Lagrangian with values ``c`` tells."""
+        """The next round's multipliers (K, rows), (P3), from the values ``c`` at this one's minimum."""
         return self.weight * self.shifted(c)
 
 

@@ -1,5 +1,6 @@
 """A last step of a plan onto its active constraints, by Newton on the exact linearization of its motion.
 
+Equation (P4) of docs/plan-constraints.md.
 After the projected Newton step of Howell, Jackson and Manchester (2019), with the least change of the controls.
 """
 

@@ -607,7 +607,7 @@ class OptimalControlProblem(Frozen):
 
 
 def default_integrator() -> Gauss:
-    """What plans are made with where nothing is said and nothing is stiff, in Python and in scene files.
+    """The integrator of plans where none is given and nothing is stiff, in Python and in scene files.
 
     Two stages are of the cost's order. Light joints of an arm with friction need more: their velocities settle within a
     fraction of a step. Four stages follow that where friction is up to ten times as fast as the step, for a third more
@@ -617,7 +617,7 @@ def default_integrator() -> Gauss:
 
 
 def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
-    """What a problem is solved with where nothing is said: the default, or its L-stable sibling.
+    """The integrator of a problem where none is given: the default, or the L-stable one of as many stages.
 
     Of what is z times as fast as the step, Gauss(4) leaves 1 - 40 / z after each: next to nothing goes from 200 on.
     Under constraints of the scene it is the default all the same, for Radau's methods do not keep them.

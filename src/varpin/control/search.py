@@ -1,4 +1,8 @@
-"""Stochastic differential dynamic programming on the structured linearization of any integrator."""
+"""Stochastic differential dynamic programming on the structured linearization of any integrator.
+
+The iterations, their line search, equation (O13) of docs/mathematics.md, and when they end. The backward pass is in
+:mod:`varpin.control.backward`; :mod:`varpin.control.augmented` puts hard constraints around this search.
+"""
 
 from __future__ import annotations
 
@@ -789,7 +793,7 @@ class _Search:
         return None, np.inf
 
     def _line_search(self) -> _Step:
-        """Move to the first motion along the plan whose expected cost is low enough."""
+        """Move to the first motion along the plan whose expected cost is low enough, (O13)."""
         if self.plan is None:
             return _Step(0.0, 0, 0.0, 0.0)
         added = noise_shares(self.problem, self.trajectory, self.plan)

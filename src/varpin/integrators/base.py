@@ -1,6 +1,6 @@
 """The contract of every integrator.
 
-Equation (N1) of docs/mathematics.md; (1.3) of the paper.
+Equation (N1) of docs/mathematics.md, the Ito correction; (1.3) of the paper.
 """
 
 from __future__ import annotations

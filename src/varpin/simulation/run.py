@@ -693,7 +693,7 @@ def _time_of_wish(dt: float | None, steps: int | None, duration: float | None) -
 
 
 def usual_integrator(scene: Scene, q0: Floats, v0: Floats, dt: float, *, noisy: bool) -> Integrator:
-    """Who integrates where nobody is named.
+    """The integrator of a motion where none is given; that of a plan is :func:`varpin.control.problem.integrator_for`.
 
     Under noise it is the midpoint rule: its positions have the right law where damping is faster than the step, and a
     warning tells of its velocities. Radau's velocities lose nearly all of the noise.

@@ -1,8 +1,8 @@
 // The forced discrete Euler-Lagrange equations of a collocation step: their residual r (`residuals_of`), Newton's
-// iteration on it and its derivatives. docs/mathematics.md, "Higher order" and
-// "Structured linearization". The unknowns are the stage velocities V_i (tableau.hpp); with F = f + the forces of the
-// elements (forces.hpp), whose derivatives F_q, F_v and F_f - 1 are diagonal, and of couplings (couplings.hpp), whose
-// F_q and F_v are full in their blocks,
+// iteration on it and its derivatives. docs/mathematics.md, "Solving a step", "Higher order" and "Linearization". Under
+// constraints of the scene see constrained.hpp. The unknowns are the stage velocities V_i (tableau.hpp); with F = f +
+// the forces of the elements (forces.hpp), whose derivatives F_q, F_v and F_f - 1 are diagonal, and of couplings
+// (couplings.hpp), whose F_q and F_v are full in their blocks,
 //
 //     r_i(V) = p0 + h sum_j (abar_ij L_q + f_ij F)(Q_j, V_j) - L_v(Q_i, V_i) = 0
 //     N_im = -dr_i/dV_m = delta_im M_i + h (a_im A_i - abar_im A_m' - f_im F_v,m)

@@ -8,6 +8,7 @@
 //
 // Newton's matrix for all (V, Lam) at once is solved by pivoting. Rows of C that depend on others, in the metric of the
 // kinetic energy at the start of a substep, are left out of it: those that are kept hold them too.
+// Equations (H1) and (H2) of docs/constraints.md.
 #pragma once
 
 #include <algorithm>

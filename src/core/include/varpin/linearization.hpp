@@ -1,4 +1,4 @@
-// Derivatives of the steps of a trajectory, first and second. docs/mathematics.md, "Structured linearization" and
+// Derivatives of the steps of a trajectory, first and second. docs/mathematics.md, "Linearization" and
 // "Second derivatives".
 //
 // For z = (zq, zp) the step equation is joined to phi = zq . q1 + zp . p1 with multipliers lam_i that make the sum
