@@ -20,7 +20,8 @@ DURATION = 1000.0
 def row(links: int, dt: float) -> str:
     """One chain at one step, as a row of a Markdown table."""
     steps = round(DURATION / dt)
-    motion = vp.simulate(vp.Scene(vp.planar_chain(links)), np.zeros(links), np.zeros(links), dt=dt, steps=steps)
+    scene, rest = vp.Scene(vp.planar_chain(links)), np.zeros(links)
+    motion = vp.simulate(scene, rest, rest, dt=dt, steps=steps, integrator=vp.Midpoint())
     error = (motion.energy - motion.energy[0]) / (9.81 * links**2 / 2)
     work = motion.statistics
     evaluations = (work.jets.sum() + work.sweeps.sum()) / work.substeps.sum()

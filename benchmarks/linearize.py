@@ -47,9 +47,10 @@ def main() -> None:
     for robot in robots:
         scene = vp.Scene(robot)
         start = np.full(robot.dof, 0.1), np.zeros(robot.dof)
-        motion = vp.simulate(scene, *start, dt=1e-3, steps=STEPS)
         midpoint = vp.Midpoint()
-        step = best(lambda s=scene, x=start: vp.simulate(s, *x, dt=1e-3, steps=STEPS, check=False)) / STEPS
+        options = {"dt": 1e-3, "steps": STEPS, "integrator": midpoint}
+        motion = vp.simulate(scene, *start, **options)
+        step = best(lambda s=scene, x=start, o=options: vp.simulate(s, *x, **o, check=False)) / STEPS
         core = best(lambda s=scene, m=motion, i=midpoint: i.linearize(s, m)) / STEPS
         whole = best(lambda s=scene, m=motion: vp.linearize(s, m)) / STEPS
         line = f"{robot.name:8} step {1e6 * step:6.2f} us, derivatives {1e6 * core:6.2f} us ({core / step:.2f} of it)"

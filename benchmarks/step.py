@@ -24,7 +24,7 @@ def simulate(scene: vp.Scene, q0: np.ndarray, dt: float) -> Callable[[], float]:
 
     def run() -> float:
         start = time.perf_counter()
-        vp.simulate(scene, q0, np.zeros_like(q0), dt=dt, steps=STEPS, check=False)
+        vp.simulate(scene, q0, np.zeros_like(q0), dt=dt, steps=STEPS, integrator=vp.Midpoint(), check=False)
         return (time.perf_counter() - start) / STEPS
 
     return run
@@ -80,7 +80,7 @@ def main() -> None:
         robot = vp.load_robot(name)
         scene, start = vp.Scene(robot, gravity=(0.0, -9.81, 0.0) if name == "finger" else True), np.array(q0)
         for dt in (1e-3,):
-            motion = vp.simulate(scene, start, np.zeros(robot.dof), dt=dt, steps=STEPS)
+            motion = vp.simulate(scene, start, np.zeros(robot.dof), dt=dt, steps=STEPS, integrator=vp.Midpoint())
             times = best({"step": simulate(scene, start, dt), "rnea": rnea_derivatives(robot, start)})
             iterations = motion.statistics.newton_iterations.mean()
             ratio = times["step"] / times["rnea"]
