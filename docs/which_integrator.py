@@ -697,7 +697,7 @@ class RealArm:
     case: peers.Case
     scene: vp.Scene
     controls: Callable[[int], vp.OpenLoop | np.ndarray]
-    servos: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    servos: peers.Servos | None = None
 
 
 def real_arms() -> list[RealArm]:
