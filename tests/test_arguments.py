@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from refusals import refused
 
 import varpin as vp
 from varpin.control.costs import BoundCost, Cost, Expansion
@@ -163,7 +164,7 @@ class TestTheCoreGetsWhatFits:
     def test_trees_changed_by_hand(self, name, value):
         robot = pickle.loads(pickle.dumps(dataclasses.replace(ROBOT, locked={}, tree=ROBOT.tree)))
         robot = dataclasses.replace(robot, tree=robot.tree._replace(**{name: value}))
-        with pytest.raises(vp.RobotError, match="the robot's tree is damaged: "):
+        with refused(vp.RobotError, "damaged"):
             vp.Scene(robot)
 
     @pytest.mark.parametrize("field", Diffusion._fields)
@@ -195,7 +196,7 @@ class TestTheCoreGetsWhatFits:
                 return Bound()
 
         problem = vp.OptimalControlProblem(SCENE, Own() + vp.ControlCost(1.0), [0, 0], [0, 0], dt=1e-3, steps=5)
-        with pytest.raises(vp.CostError, match="its expansion has shapes"):
+        with refused(vp.CostError, "shapes"):
             vp.solve(problem)
 
     @pytest.mark.parametrize(

@@ -82,7 +82,7 @@ class TestFiles:
             vp.load_robot(source)
 
     @pytest.mark.parametrize(
-        ("content", "words"),
+        ("content", "facts"),
         [
             (b"hello world\n", "is not a URDF: it is not well-formed XML: syntax error: line 1"),
             (b"", "is not a URDF: it is empty"),
@@ -104,10 +104,10 @@ class TestFiles:
             ),
         ],
     )
-    def test_no_urdf(self, tmp_path, content, words):
+    def test_no_urdf(self, tmp_path, content, facts):
         path = tmp_path / "arm.urdf"
         path.write_bytes(content)
-        with refused(vp.RobotError, words):
+        with refused(vp.RobotError, facts):
             vp.load_robot(path)
 
     @pytest.mark.parametrize("package_dirs", [3, [3], [None], {"a": 1}.items()])
@@ -151,19 +151,19 @@ class TestLinks:
             vp.load_robot(path)
 
     @pytest.mark.parametrize(
-        ("change", "words"),
+        ("change", "facts"),
         [
             ({"mass": np.nan}, "the link moved by joint 'j1' has a mass or inertia that is not finite"),
             ({"lever": np.full(3, np.inf)}, "the link moved by joint 'j1' has a mass or inertia that is not finite"),
         ],
     )
-    def test_of_a_model_in_memory(self, tmp_path, change, words):
+    def test_of_a_model_in_memory(self, tmp_path, change, facts):
         model = pin.buildModelFromUrdf(str(arm(tmp_path)))
         body = model.inertias[1]
         for name, value in change.items():
             setattr(body, name, value)
         model.inertias[1] = body
-        with refused(vp.RobotError, words):
+        with refused(vp.RobotError, facts):
             vp.load_robot(model)
 
 
@@ -356,22 +356,22 @@ class TestScene:
             vp.Scene(robot, **{name: [1.0, -0.5]})
 
     @pytest.mark.parametrize(
-        ("value", "words"),
+        ("value", "facts"),
         [
             ([0, 0, np.nan], "gravity[2] is nan; it must be finite"),
             ([-np.inf, 0, 0], "gravity[0] is -inf; it must be finite"),
             ([0, 0], "gravity must have shape (3,), got (2,)"),
             (-9.81, "gravity is a vector in world axes, z up [m/s^2], got the number -9.81; did you mean"),
             ({"z": -9.81}, "gravity must be an array of real numbers, got"),
-            *((value, f"gravity {words}") for value, words in NOT_NUMBERS),
+            *((value, f"gravity {facts}") for value, facts in NOT_NUMBERS),
         ],
     )
-    def test_gravity(self, robot, value, words):
-        with refused(vp.InputError, words):
+    def test_gravity(self, robot, value, facts):
+        with refused(vp.InputError, facts):
             vp.Scene(robot, gravity=value)
 
     @pytest.mark.parametrize(
-        ("value", "words"),
+        ("value", "facts"),
         [
             (np.eye(3), "actuation must have shape (2, 3), got (3, 3)"),
             ([[1.0], [np.nan]], "actuation[1, 0] is nan; it must be finite"),
@@ -382,8 +382,8 @@ class TestScene:
             (["joint1", "joint2", "joint1"], "actuation names 'joint1' more than once"),
         ],
     )
-    def test_actuation(self, robot, value, words):
-        with refused(vp.InputError, words):
+    def test_actuation(self, robot, value, facts):
+        with refused(vp.InputError, facts):
             vp.Scene(robot, actuation=value)
 
     @pytest.mark.parametrize("value", ["jont2", ["joint1", "jont2"]])
@@ -443,16 +443,16 @@ class TestLagrangian:
             with refused(vp.InputError, name + words):
                 call()
 
-    @pytest.mark.parametrize(("value", "words"), TIME_STEPS)
-    def test_time_step(self, scene, value, words):
-        with refused(vp.InputError, words):
+    @pytest.mark.parametrize(("value", "facts"), TIME_STEPS)
+    def test_time_step(self, scene, value, facts):
+        with refused(vp.InputError, facts):
             vp.discrete_lagrangian(scene, [0, 0], [0, 0], value)
 
-    @pytest.mark.parametrize(("value", "words"), ALPHAS)
-    def test_alpha(self, scene, value, words):
-        with refused(vp.InputError, words):
+    @pytest.mark.parametrize(("value", "facts"), ALPHAS)
+    def test_alpha(self, scene, value, facts):
+        with refused(vp.InputError, facts):
             vp.discrete_lagrangian(scene, [0, 0], [0, 0], 0.1, alpha=value)
-        with refused(vp.InputError, words):
+        with refused(vp.InputError, facts):
             vp.Midpoint(alpha=value)
 
     def test_backend(self, scene):
@@ -485,18 +485,18 @@ class TestSimulation:
             self.run(scene, **{name: value})
 
     @pytest.mark.parametrize(
-        ("value", "words"),
+        ("value", "facts"),
         [
             *(case for case in TIME_STEPS if case[0] is not None),
             (None, "give two of dt [s], steps and duration [s], or duration and tolerance"),
         ],
     )
-    def test_time_step(self, scene, value, words):
-        with refused(vp.InputError, words):
+    def test_time_step(self, scene, value, facts):
+        with refused(vp.InputError, facts):
             self.run(scene, dt=value)
 
     @pytest.mark.parametrize(
-        ("value", "words"),
+        ("value", "facts"),
         [
             (-1, "steps must be at least 0, got -1"),
             (5.0, "steps must be an integer, got 5.0"),
@@ -506,8 +506,8 @@ class TestSimulation:
             (True, "steps must be an integer, got True"),
         ],
     )
-    def test_steps(self, scene, value, words):
-        with refused(vp.InputError, words):
+    def test_steps(self, scene, value, facts):
+        with refused(vp.InputError, facts):
             self.run(scene, steps=value)
 
     @pytest.mark.parametrize("steps", [10**15, 10**18, 10**30])
@@ -516,7 +516,7 @@ class TestSimulation:
             self.run(scene, steps=steps)
 
     @pytest.mark.parametrize(
-        ("value", "words"),
+        ("value", "facts"),
         [
             (np.zeros((4, 2)), "controls must have shape (5, 2), one row a step, or (2,), got (4, 2)"),
             (np.zeros((6, 2)), "controls must have shape (5, 2), one row a step, or (2,), got (6, 2)"),
@@ -525,11 +525,11 @@ class TestSimulation:
             (0.0, "got ()"),
             (np.array([[0, 0]] * 4 + [[0, np.nan]]), "controls[4, 1] is nan; it must be finite"),
             ([0, np.inf], "controls[1] is inf; it must be finite"),
-            *((value, f"controls {words}") for value, words in NOT_NUMBERS),
+            *((value, f"controls {facts}") for value, facts in NOT_NUMBERS),
         ],
     )
-    def test_controls(self, scene, value, words):
-        with refused(vp.InputError, words):
+    def test_controls(self, scene, value, facts):
+        with refused(vp.InputError, facts):
             self.run(scene, controls=value)
 
     @pytest.mark.parametrize("kind", ["law", "open loop"])
@@ -571,15 +571,15 @@ class TestSimulation:
             self.run(scene, controls=lambda t, q: [0.0, 0.0])
 
     @pytest.mark.parametrize(
-        ("function", "words"),
+        ("function", "facts"),
         [
             (lambda t, q, v: [0.0, 0.0], "a law of (t, q, v) is given as it is, controls=law"),
             (lambda: [0.0, 0.0], "OpenLoop takes a function of one argument, the time t"),
             ([0.0, 0.0], "OpenLoop takes a function of the time t, got [0.0, 0.0]"),
         ],
     )
-    def test_open_loops_of_something_else(self, function, words):
-        with refused(vp.InputError, words):
+    def test_open_loops_of_something_else(self, function, facts):
+        with refused(vp.InputError, facts):
             vp.OpenLoop(function)
 
     @pytest.mark.parametrize(("period", "words"), [(0, "at least 1, got 0"), (1.5, "an integer, got 1.5")])
@@ -639,7 +639,7 @@ class TestSimulation:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "facts"),
     [
         ({"links": 0}, "links must be at least 1, got 0"),
         ({"links": 1.5}, "links must be an integer, got 1.5"),
@@ -649,6 +649,6 @@ class TestSimulation:
         ({"links": 2, "mass": np.nan}, "mass must be positive and finite [kg], got nan"),
     ],
 )
-def test_planar_chain(arguments, words):
-    with refused(vp.InputError, words):
+def test_planar_chain(arguments, facts):
+    with refused(vp.InputError, facts):
         vp.planar_chain(**arguments)

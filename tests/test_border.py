@@ -6,6 +6,7 @@ against reading and writing past an array's end, too.
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin import core
@@ -231,14 +232,14 @@ def test_what_does_not_fit_is_refused(every, change):
 
 @pytest.mark.parametrize("halvings", [-1, 63])
 def test_halvings_that_cannot_be_counted_are_refused(halvings):
-    with pytest.raises(ValueError, match="halvings are from 0 to 62"):
+    with refused(ValueError, "halvings", "62"):
         core.Guards.make(**{**GUARDS, "most_halvings": halvings})
 
 
 @pytest.mark.parametrize("level", [0, 63])
 def test_parts_that_no_step_has_are_refused(level):
     given = {**steps(scene()), "halvings": np.array([1, 1, 2, 2, 2, level], dtype=np.uint8)}
-    with pytest.raises(ValueError, match="parts are halved 1 to 62 times"):
+    with refused(ValueError, "halved", "62"):
         core.variational_ends(**given)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin.show.replay.annotations import torque_shares
@@ -67,12 +68,12 @@ def test_problems_jets_and_reports_take_names_too():
     ],
 )
 def test_names_and_numbers_that_are_none_are_named(call):
-    with pytest.raises(vp.UnknownJoint, match="the robot has no joint 'elbow'; did you mean 'elbow_joint'") as caught:
+    with refused(vp.UnknownJoint, "'elbow'", "'elbow_joint'") as caught:
         call({"elbow": 1.0})
     assert caught.value.matches[0] == "elbow_joint"
     assert caught.value.joints == NAMES
-    for value, words in ((np.nan, r"\['elbow_joint'\] is nan; it must be finite"), ("a", "must be a number, got 'a'")):
-        with pytest.raises(vp.InputError, match=words):
+    for value, facts in ((np.nan, ("'elbow_joint'", "nan")), ("a", "'a'")):
+        with refused(vp.InputError, facts):
             call({"elbow_joint": value})
 
 
@@ -101,7 +102,7 @@ def test_an_arm_stays_under_its_holding_torque_and_controls():
 
 def test_controls_that_cannot_hold_are_refused():
     scene = vp.Scene(vp.planar_chain(2), actuation=["joint2"])
-    with pytest.raises(vp.InputError, match="no controls hold the robot at this q: joint 'joint1' is left with"):
+    with refused(vp.InputError, "'joint1'"):
         scene.holding_controls([1.0, 0.3])
     # Upright nothing pulls but rounding.
     np.testing.assert_allclose(scene.holding_controls([0.5 * np.pi, 0.0]), 0.0, atol=1e-12)
@@ -109,12 +110,12 @@ def test_controls_that_cannot_hold_are_refused():
 
 @pytest.mark.parametrize("value", [-9.81, 9.81, np.float64(-9.81), np.array(9.81)])
 def test_gravity_as_a_number_is_answered_with_the_vector_meant(value):
-    with pytest.raises(vp.InputError, match=r"did you mean gravity=\(0, 0, -9.81\)\?"):
+    with refused(vp.InputError, "gravity", "(0, 0, -9.81)"):
         vp.Scene(UR5, gravity=value)
 
 
 def test_gravity_of_zero_is_answered_with_false():
-    with pytest.raises(vp.InputError, match="did you mean gravity=False"):
+    with refused(vp.InputError, "gravity", "False"):
         vp.Scene(UR5, gravity=0.0)
 
 
@@ -158,7 +159,7 @@ def test_noise_costs_and_barriers_take_names():
     ],
 )
 def test_unknown_names_in_noise_and_costs(make):
-    with pytest.raises(vp.UnknownJoint, match="the robot has no joint 'elbow'; did you mean 'elbow_joint'"):
+    with refused(vp.UnknownJoint, "'elbow'", "'elbow_joint'"):
         make({"elbow": 1.0})
 
 
@@ -225,20 +226,20 @@ def test_names_of_controls_that_have_none_are_refused(use):
     for actuation in (shared, 2.0 * np.eye(6), np.ones((6, 1))):
         scene = vp.Scene(UR5, actuation=actuation)
         assert scene.control_joints is None
-        with pytest.raises(vp.InputError, match="by joint name, but not every control is the force of one joint"):
+        with refused(vp.InputError, "joint name"):
             use(scene, {"elbow_joint": 1.0})
-    with pytest.raises(vp.UnknownJoint, match="no control is the force of a joint 'elbow_joint'"):
+    with refused(vp.UnknownJoint, "'elbow_joint'"):
         use(vp.Scene(UR5, actuation=["wrist_1_joint"]), {"elbow_joint": 1.0})
-    with pytest.raises(vp.InputError, match=r"\['elbow_joint'\] must be a number, got 'a'"):
+    with refused(vp.InputError, "'elbow_joint'", "'a'"):
         use(vp.Scene(UR5), {"elbow_joint": "a"})
 
 
 def test_weights_by_name_are_not_negative():
     cost = vp.VelocityCost({"elbow_joint": -1.0}) + vp.ControlCost()
-    with pytest.raises(vp.InputError, match="VelocityCost weight must be positive semidefinite"):
+    with refused(vp.InputError, "VelocityCost"):
         vp.OptimalControlProblem(vp.Scene(UR5), cost, ROW, ROW, dt=1e-2, steps=1)
     cost = vp.ControlCost({"elbow_joint": -1.0})
-    with pytest.raises(vp.InputError, match="ControlCost weight must be positive semidefinite"):
+    with refused(vp.InputError, "ControlCost"):
         vp.OptimalControlProblem(vp.Scene(UR5), cost, ROW, ROW, dt=1e-2, steps=1)
 
 

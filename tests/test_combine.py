@@ -5,6 +5,7 @@ import pickle
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin.mechanics.assembly import along_constraints
@@ -102,19 +103,19 @@ def test_two_arms_hold_one_object():
 
 
 WRONG = {
-    "one": (vp.combine, "two robots or more"),
-    "no robot": (lambda arm: vp.combine(arm, "ur5"), "two robots or more"),
-    "placements": (lambda arm: vp.combine(arm, arm, placements=[None]), "placements must be one for each of 2"),
-    "planar": (lambda arm: vp.combine(arm, arm, placements=[None, "planar"]), "given to load_robot"),
-    "a place": (lambda arm: vp.combine(arm, arm, placements=[None, [2.0, 0.0, 0.0]]), "placement of 'chain2'"),
+    "one": (vp.combine, "robots"),
+    "no robot": (lambda arm: vp.combine(arm, "ur5"), "robots"),
+    "placements": (lambda arm: vp.combine(arm, arm, placements=[None]), ("placements", "2")),
+    "planar": (lambda arm: vp.combine(arm, arm, placements=[None, "planar"]), "load_robot"),
+    "a place": (lambda arm: vp.combine(arm, arm, placements=[None, [2.0, 0.0, 0.0]]), ("placement", "'chain2'")),
     "no rotation": (lambda arm: vp.combine(arm, arm, placements=[None, 2.0 * np.eye(4)]), "rotation"),
-    "prefixes": (lambda arm: vp.combine(arm, arm, prefixes="ab"), "prefixes must be one word for each"),
-    "alike": (lambda arm: vp.combine(arm, arm, prefixes=["", ""]), "'joint1' is there twice"),
+    "prefixes": (lambda arm: vp.combine(arm, arm, prefixes="ab"), "prefixes"),
+    "alike": (lambda arm: vp.combine(arm, arm, prefixes=["", ""]), "'joint1'"),
 }
 
 
 @pytest.mark.parametrize("what", WRONG)
 def test_wrong_combinations_are_refused(what):
-    make, words = WRONG[what]
-    with pytest.raises(vp.InputError, match=words):
+    make, facts = WRONG[what]
+    with refused(vp.InputError, facts):
         make(vp.planar_chain(2))

@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import random_tree
+from refusals import refused
 
 import varpin as vp
 from varpin.control.costs import BoundSum, Points, control_rate
@@ -241,32 +242,32 @@ def test_terms_of_what_is_not_there_are_refused(robot, frame):
     costs, kinematics = CostTerms.make(n, 2), frame_kinematics(robot, frame)
     none = np.zeros(0, dtype=np.int64)
 
-    def refused(match, subject, place, size, target, directions=none):
-        with pytest.raises(ValueError, match=match):
+    def no(fact, subject, place, size, target, directions=none):
+        with refused(ValueError, fact):
             costs.add_term(subject, place, np.eye(size), np.zeros(target), directions)
 
-    refused("not there", Subject.entries, 2 * n, 3, (1, 3))
-    refused("not there", Subject.excess, 2 * n, 3, (1, 6))
-    refused("not there", Subject.position, 0, 3, (1, 3))
+    no("not there", Subject.entries, 2 * n, 3, (1, 3))
+    no("not there", Subject.excess, 2 * n, 3, (1, 6))
+    no("not there", Subject.position, 0, 3, (1, 3))
     costs.add_frame(kinematics.links.core, kinematics.rotation, kinematics.translation)
-    refused("wrong size", Subject.twist, 0, 3, (1, 3))
-    refused("wrong size", Subject.manipulability, 0, 3, (1, 3), np.array([0]))
-    refused("target has size 3", Subject.orientation, 0, 3, (1, 3))
-    refused("target has size 2 along axis 1, not 4", Subject.excess, 0, 2, (1, 2))
-    refused("no target", Subject.position, 0, 3, (0, 3))
-    refused("directions are those", Subject.manipulability, 0, 1, (1, 1))
-    refused("directions are those", Subject.manipulability, 0, 1, (1, 1), np.arange(n + 1))
-    refused("directions are those", Subject.position, 0, 3, (1, 3), np.array([0]))
-    refused("rows of a Jacobian", Subject.manipulability, 0, 1, (1, 1), np.array([6]))
+    no("wrong size", Subject.twist, 0, 3, (1, 3))
+    no("wrong size", Subject.manipulability, 0, 3, (1, 3), np.array([0]))
+    no("target has size 3", Subject.orientation, 0, 3, (1, 3))
+    no("target has size 2 along axis 1, not 4", Subject.excess, 0, 2, (1, 2))
+    no("no target", Subject.position, 0, 3, (0, 3))
+    no("directions are those", Subject.manipulability, 0, 1, (1, 1))
+    no("directions are those", Subject.manipulability, 0, 1, (1, 1), np.arange(n + 1))
+    no("directions are those", Subject.position, 0, 3, (1, 3), np.array([0]))
+    no("rows of a Jacobian", Subject.manipulability, 0, 1, (1, 1), np.array([6]))
     center = costs.add_center(kinematics.links.core)
-    refused("a position and no more", Subject.twist, center, 6, (1, 6))
+    no("a position and no more", Subject.twist, center, 6, (1, 6))
     other = CostTerms.make(n + 1, 2)
-    with pytest.raises(ValueError, match="another number"):
+    with refused(ValueError, "number"):
         other.add_frame(kinematics.links.core, kinematics.rotation, kinematics.translation)
-    with pytest.raises(ValueError, match="another number"):
+    with refused(ValueError, "number"):
         other.add_center(kinematics.links.core)
     light = dataclasses.replace(kinematics.links, mass=np.zeros(len(kinematics.links.mass)))
-    with pytest.raises(ValueError, match="bodies with a mass"):
+    with refused(ValueError, "mass"):
         costs.add_center(light.core)
 
 

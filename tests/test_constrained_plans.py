@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 from scipy.integrate import solve_ivp
 
 import varpin as vp
@@ -202,10 +203,10 @@ def test_holding_controls_leave_a_closed_loop_at_rest():
     every = vp.Scene(scene.robot, constraints=scene.constraints)
     motion = vp.simulate(every, q0, np.zeros(4), dt=0.01, steps=5, controls=torque)
     np.testing.assert_allclose(motion.q, np.broadcast_to(q0, (6, 4)), atol=1e-12)
-    with pytest.raises(vp.InputError, match=r"q misses PointOnPoint.*assemble"):
+    with refused(vp.InputError, "q", "PointOnPoint", "assemble"):
         scene.holding_torque(q0 + 0.1)
     one = vp.Scene(scene.robot, constraints=scene.constraints, actuation=scene.actuation[:, :1])
-    with pytest.raises(vp.InputError, match="no controls hold the robot"):
+    with refused(vp.InputError, "robot", "hold"):
         one.holding_controls(q0)
 
 
@@ -219,7 +220,7 @@ def test_plans_begin_on_the_constraints(caplog):
     moved = problem.at(q0=q0 - 1e-3)
     assert np.abs(scene.constraint_values(moved.q0)[0]).max() < 1e-14
     assert np.abs(scene.constraint_values(moved.q0)[1] @ moved.v0).max() < 1e-13
-    with pytest.raises(vp.InputError, match=r"q0 misses .*assemble"):
+    with refused(vp.InputError, "q0", "PointOnPoint", "assemble"):
         problem.at(q0=q0 + 0.3)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import random_rotation
+from refusals import refused
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
@@ -407,7 +408,7 @@ def test_a_start_next_to_the_constraints_is_moved_onto_them(caplog):
 
 def test_a_start_far_from_the_constraints_is_refused():
     scene, q, _ = loop("five-bar")
-    with pytest.raises(vp.InputError, match=r"q0 misses PointOnPoint.*assemble"):
+    with refused(vp.InputError, "q0", "PointOnPoint", "assemble"):
         vp.simulate(scene, q + 0.1, 0.0 * q, dt=1e-2, steps=2)
 
 
@@ -437,7 +438,7 @@ def test_what_cannot_be_assembled_says_by_how_much():
     scene = vp.Scene(
         robot, constraints=[vp.JointTie("joint2", "joint1"), vp.PointOnPoint("tip", (2.5, 0.0, 0.0), axes="xz")]
     )
-    with pytest.raises(vp.AssemblyError, match="misses PointOnPoint") as found:
+    with refused(vp.AssemblyError, "PointOnPoint") as found:
         vp.assemble(scene, [1.4, 0.4])
     assert found.value.miss > 0.3
     # Turned by half a turn a weld's rows hold too.
@@ -453,7 +454,7 @@ def test_a_weld_that_is_turned_round_is_none():
     assert abs(np.sin(vp.assemble(scene, [0.3])[0] - vp.assemble(scene, [-0.2])[0])) < 1e-12
     closed = vp.assemble(scene, [0.1])[0]
     assert np.cos(vp.assemble(scene, [closed + 3.0])[0] - closed) == pytest.approx(1.0, abs=1e-14)
-    with pytest.raises(vp.AssemblyError, match="FrameOnFrame"):
+    with refused(vp.AssemblyError, "FrameOnFrame"):
         vp.assemble(vp.Scene(robot, constraints=vp.FrameOnFrame("joint1", "universe", POSE)), [0.3])
     # They vanish at a third of a turn about a diagonal, too.
     arm, start = vp.load_robot("ur5"), np.array([0.2, -1.2, 1.5, -0.3, 1.4, 0.1])
@@ -463,7 +464,7 @@ def test_a_weld_that_is_turned_round_is_none():
     third[:3, 3] = place[:3, 3]
     scene = vp.Scene(arm, constraints=vp.FrameOnFrame("tool0", "universe", third))
     assert np.abs(scene.constraint_values(start)[0]).max() < 1e-12
-    with pytest.raises(vp.AssemblyError, match=r"FrameOnFrame.* by 1\.571"):
+    with refused(vp.AssemblyError, "FrameOnFrame", "1.571"):
         vp.simulate(scene, start, np.zeros(6), dt=1e-2, steps=1)
     q = vp.assemble(scene, start)
     np.testing.assert_allclose(frame_placement(arm, q, "tool0"), third, atol=1e-12)
@@ -493,7 +494,7 @@ def test_a_motion_through_a_toggle_point_stops_and_names_the_constraint(integrat
     scene = vp.Scene(vp.planar_chain(3), gravity=False, constraints=vp.PointOnPoint("tip", (1.0, 0.0, 0.0), axes="xz"))
     # A parallelogram, which may become a crossed one where it is flat.
     q = np.array([-np.pi / 2, np.pi / 2, np.pi / 2])
-    with pytest.raises(vp.StepFailure, match="PointOnPoint") as found:
+    with refused(vp.StepFailure, "PointOnPoint") as found:
         vp.simulate(
             scene, q, along_constraints(scene, q, np.array([3.0, 0.0, 0.0])), dt=0.01, steps=100, integrator=integrator
         )
@@ -531,14 +532,14 @@ def test_a_custom_constraint_that_raises_is_told_of():
         raise RuntimeError("no value")
 
     scene = vp.Scene(vp.planar_chain(3), constraints=vp.CustomConstraint(1, broken, OWN.jacobian))
-    with pytest.raises(vp.CustomConstraintError, match=r"raised RuntimeError\('no value'\) at q ="):
+    with refused(vp.CustomConstraintError, "RuntimeError('no value')"):
         vp.simulate(scene, [1.0, 0.0, 0.0], np.zeros(3), dt=1e-2, steps=5)
 
     def late(q):
         return OWN.value(q) if q[2] < 0.05 else [np.nan]
 
     failing = vp.Scene(vp.planar_chain(3), constraints=vp.CustomConstraint(1, late, OWN.jacobian))
-    with pytest.raises(vp.ConstraintError, match="value of a CustomConstraint") as info:
+    with refused(vp.ConstraintError, "CustomConstraint") as info:
         vp.simulate(failing, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], dt=1e-2, steps=50)
     assert info.value.trajectory.steps == info.value.step > 0
     whole = vp.simulate(
@@ -550,33 +551,36 @@ def test_a_custom_constraint_that_raises_is_told_of():
     )
     np.testing.assert_array_equal(info.value.trajectory.q, whole.q)
     wrong = vp.Scene(vp.planar_chain(3), constraints=vp.CustomConstraint(2, OWN.value, OWN.jacobian))
-    with pytest.raises(vp.InputError, match="value of a CustomConstraint"):
+    with refused(vp.CustomConstraintError, "(2,)", "(1,)"):
         wrong.constraint_values(np.zeros(3))
 
 
 WRONG = {
-    "frame": (lambda: vp.PointOnPoint("tyip", (0, 0, 0)), "no frame 'tyip'"),
-    "axes": (lambda: vp.PointOnPoint("tip", (0, 0, 0), axes="xx"), "axes must be"),
-    "shape": (lambda: vp.PointOnPoint("tip", (0, 0)), r"b must be a frame's name.*shape \(2,\)"),
-    "not finite": (lambda: vp.PointOnPoint("tip", (0, 0, np.nan)), "must be finite"),
-    "both in the world": (lambda: vp.Distance((0, 0, 0), (1, 0, 0), 1.0), "both ends are fixed"),
-    "one body": (lambda: vp.Distance("tip", ("tip", (0, 0, 1)), 1.0), "both ends are on one body"),
-    "length": (lambda: vp.Distance("tip", (0, 0, 0), 0.0), "length must be positive"),
-    "normal": (lambda: vp.PointOnPlane("tip", (0, 0, 0), (0, 0, 0)), "normal must not be zero"),
-    "joint": (lambda: vp.JointTie("joint9", "joint1"), "no joint 'joint9'"),
-    "itself": (lambda: vp.JointTie("joint1", "joint1"), "to itself"),
-    "placement": (lambda: vp.FrameOnFrame("tip", "universe", 2.0 * np.eye(4)), "placement must be"),
-    "function": (lambda: vp.CustomConstraint(1, 3.0, OWN.jacobian), "value must be a function"),
-    "word": (lambda: "weld", "list of varpin's constraints"),
-    "in a list": (lambda: ["weld"], "'weld' in it"),
-    "of a plan": (lambda: [vp.WithinJointLimits(vp.planar_chain(3), (-1, 1))], "OptimalControlProblem"),
+    "frame": (lambda: vp.PointOnPoint("tyip", (0, 0, 0)), (vp.UnknownFrame, "'tyip'", "'tip'")),
+    "axes": (lambda: vp.PointOnPoint("tip", (0, 0, 0), axes="xx"), (vp.InputError, "axes", "'xx'")),
+    "shape": (lambda: vp.PointOnPoint("tip", (0, 0)), (vp.InputError, "b", "(2,)")),
+    "not finite": (lambda: vp.PointOnPoint("tip", (0, 0, np.nan)), (vp.InputError, "b[2]", "nan")),
+    "both in the world": (lambda: vp.Distance((0, 0, 0), (1, 0, 0), 1.0), (vp.InputError, "both ends")),
+    "one body": (lambda: vp.Distance("tip", ("tip", (0, 0, 1)), 1.0), (vp.InputError, "one body")),
+    "length": (lambda: vp.Distance("tip", (0, 0, 0), 0.0), (vp.InputError, "length", "0.0")),
+    "normal": (lambda: vp.PointOnPlane("tip", (0, 0, 0), (0, 0, 0)), (vp.InputError, "normal")),
+    "joint": (lambda: vp.JointTie("joint9", "joint1"), (vp.UnknownJoint, "'joint9'", "'joint1'")),
+    "itself": (lambda: vp.JointTie("joint1", "joint1"), (vp.InputError, "itself")),
+    "placement": (lambda: vp.FrameOnFrame("tip", "universe", 2.0 * np.eye(4)), (vp.InputError, "placement")),
+    "function": (lambda: vp.CustomConstraint(1, 3.0, OWN.jacobian), (vp.InputError, "value", "3.0")),
+    "word": (lambda: "weld", (vp.InputError, "constraints", "str")),
+    "in a list": (lambda: ["weld"], (vp.InputError, "constraints", "'weld'")),
+    "of a plan": (
+        lambda: [vp.WithinJointLimits(vp.planar_chain(3), (-1, 1))],
+        (vp.InputError, "OptimalControlProblem"),
+    ),
 }
 
 
 @pytest.mark.parametrize("what", WRONG)
 def test_wrong_constraints_are_refused(what):
-    make, words = WRONG[what]
-    with pytest.raises(vp.VarpinError, match=words):
+    make, (kind, *facts) = WRONG[what]
+    with refused(kind, *facts):
         vp.Scene(vp.planar_chain(3), constraints=make())
 
 
@@ -586,9 +590,7 @@ def test_wrong_constraints_are_refused(what):
 )
 def test_integrators_that_keep_no_constraints_refuse_them(integrator):
     scene, q, v = loop("four-bar")
-    with pytest.raises(
-        vp.InputError, match=rf"{type(integrator).__name__}.* does not take scenes with constraints.*Gauss"
-    ):
+    with refused(vp.InputError, type(integrator).__name__, "constraints", "Gauss"):
         vp.simulate(scene, q, v, dt=1e-2, steps=2, integrator=integrator)
 
 
@@ -607,10 +609,10 @@ def test_what_knows_no_constraints_refuses_them():
         lambda: vp.simulate(scene, q, v, duration=0.1, tolerance=1e-3),
     ]
     for attempt in tries:
-        with pytest.raises(vp.InputError, match="does not take scenes with constraints"):
+        with refused(vp.InputError, "constraints"):
             attempt()
     noisy, *_ = loop("four-bar", noise=vp.AdditiveNoise(0.1))
-    with pytest.raises(vp.InputError, match="kick='split' does not go with constraints"):
+    with refused(vp.InputError, "kick", "'split'", "constraints"):
         vp.simulate(noisy, q, v, dt=1e-2, steps=2, rng=0, integrator=vp.Midpoint(kick="split"))
 
 
@@ -626,11 +628,11 @@ def test_motions_keep_forces_and_the_constraints_they_were_made_under(tmp_path):
     np.testing.assert_array_equal(vp.linearize(scene, read).A, vp.linearize(scene, motion).A)
     other = vp.Scene(scene.robot, constraints=vp.PointOnPoint("tip", (1.6, 0.0, 0.301), axes="xz"))
     for wrong in (other, vp.Scene(scene.robot)):
-        with pytest.raises(vp.InputError, match="constraints between frames are others"):
+        with refused(vp.InputError, "constraints"):
             vp.linearize(wrong, motion)
     free = vp.simulate(vp.Scene(scene.robot), q, v, dt=1e-2, steps=2)
     assert free.constraint_forces.shape == (2, 0)
-    with pytest.raises(vp.InputError, match="constraints between frames are others"):
+    with refused(vp.InputError, "constraints"):
         vp.linearize(scene, free)
 
 
@@ -706,7 +708,7 @@ def test_scene_files_have_constraints(tmp_path):
         vp.Distance("tool0", "upper_arm_link", 0.7),
     ]
     scene = vp.Scene(vp.load_robot("ur5"), constraints=constraints)
-    with pytest.raises(vp.InputError, match=r"q0 misses .*assemble"):
+    with refused(vp.InputError, "q0", "assemble"):
         vp.load_scene(path).simulate()
     q = vp.assemble(scene, [0.1, -1.0, 1.2, 0.3, 0.4, -0.7])
     path.write_text(SCENE_FILE.replace("[0.1, -1.0, 1.2, 0.3, 0.4, -0.7]", str(q.tolist())))
@@ -727,15 +729,15 @@ def test_scene_files_have_constraints(tmp_path):
     plan = vp.load_scene(path).solve(tolerance=1e-4)
     assert plan.status.converged
     assert np.abs(scene.core.constraints(plan.trajectory.q)[0]).max() < 1e-12
-    for change, words in (
-        (("tool0", "tol0"), r"constraint\[0\].*no frame 'tol0'"),
-        (("length = 0.7", "length = -1"), r"constraint\[2\].length"),
-        (("wrist_3_joint", "wrist_4_joint"), r"constraint\[1\].*wrist_4_joint"),
-        (('"distance"', '"rod"'), r"constraint\[2\].type"),
-        (("axes", "axis"), r"constraint\[0\].axis.*unknown key"),
+    for change, facts in (
+        (("tool0", "tol0"), ("constraint[0]", "'tol0'")),
+        (("length = 0.7", "length = -1"), "constraint[2].length"),
+        (("wrist_3_joint", "wrist_4_joint"), ("constraint[1]", "'wrist_4_joint'")),
+        (('"distance"', '"rod"'), "constraint[2].type"),
+        (("axes", "axis"), "constraint[0].axis"),
     ):
         path.write_text(SCENE_FILE.replace(*change))
-        with pytest.raises(vp.SceneFileError, match=words):
+        with refused(vp.SceneFileError, facts):
             vp.load_scene(path)
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import scipy.optimize
+from refusals import refused
 from scipy.optimize import lsq_linear
 from test_control_limits import transcribed
 from test_sddp import SAMPLINGS, Plain, PlainCost, noise_columns, run, sliders, start_of, state_rows
@@ -332,9 +333,9 @@ def test_saved_and_resumed_bit_for_bit(tmp_path, hold):
     on = vp.solve(problem, resume=loaded, max_iterations=6 - done, tolerance=1e-14)
     same(whole, on)
     np.testing.assert_array_equal(whole.previous_gains, on.previous_gains)
-    with pytest.raises(vp.FileError, match="of a problem with another cost"):
+    with refused(vp.FileError, "cost"):
         vp.Solution.load(tmp_path / "part.npz", problem.at(before=[0.0, 0.0, 2e-3]))
-    with pytest.raises(vp.InputError, match="the solution is of another cost"):
+    with refused(vp.InputError, "cost"):
         vp.solve(problem.at(before=[0.0, 0.0, 2e-3]), resume=loaded)
 
 
@@ -437,7 +438,7 @@ def test_a_rate_within_a_cost_of_ones_own_is_refused():
         def bind(self, points):
             return vp.ControlRateCost(1.0).bind(points)
 
-    with pytest.raises(vp.InputError, match="must be a term of a problem's cost"):
+    with refused(vp.InputError, "cost"):
         linear(Wrapped())
 
 
@@ -467,42 +468,42 @@ def test_sums_scales_and_words():
 
 
 @pytest.mark.parametrize(
-    ("make", "words"),
+    ("make", "facts"),
     [
-        (lambda: vp.ControlRateCost(-1.0), "ControlRateCost weight must be positive semidefinite"),
-        (lambda: vp.ControlRateCost(1.0, np.nan), "ControlRateCost before is nan; it must be finite"),
+        (lambda: vp.ControlRateCost(-1.0), ("ControlRateCost", "weight", "positive semidefinite")),
+        (lambda: vp.ControlRateCost(1.0, np.nan), ("ControlRateCost", "before", "nan")),
         (
             lambda: vp.ControlRateCost(1.0, np.zeros((2, 2))),
-            r"before must be one number or a vector, got shape \(2, 2\)",
+            ("before", "(2, 2)"),
         ),
-        (lambda: vp.Terminal(vp.ControlRateCost()), "cannot be a terminal cost: there is no control at the final time"),
-        (lambda: vp.Terminal(2.0 * vp.ControlRateCost()), "cannot be a terminal cost"),
-        (lambda: linear(vp.ControlRateCost([1.0, 1.0, 1.0])), r"must be one number or have 2 rows, got shape \(3,\)"),
-        (lambda: linear(vp.ControlRateCost(1.0, np.zeros(3))), r"before must have shape \(2,\), got \(3,\)"),
+        (lambda: vp.Terminal(vp.ControlRateCost()), ("ControlRateCost", "terminal")),
+        (lambda: vp.Terminal(2.0 * vp.ControlRateCost()), ("ControlRateCost", "terminal")),
+        (lambda: linear(vp.ControlRateCost([1.0, 1.0, 1.0])), ("2", "(3,)")),
+        (lambda: linear(vp.ControlRateCost(1.0, np.zeros(3))), ("before", "(2,)", "(3,)")),
         (
             lambda: linear(vp.ControlRateCost() + vp.ControlRateCost(1.0, BEFORE)),
-            "ControlRateCost terms of one cost must have the same control before",
+            ("ControlRateCost", "before"),
         ),
         (
             lambda: linear().at(before=BEFORE),
-            "before is the control that a ControlRateCost or a WithinControlRate begins with",
+            ("before", "ControlRateCost", "WithinControlRate"),
         ),
-        (lambda: linear(vp.ControlRateCost()).at(before=np.zeros(3)), r"before must have shape \(2,\), got \(3,\)"),
+        (lambda: linear(vp.ControlRateCost()).at(before=np.zeros(3)), ("before", "(2,)", "(3,)")),
         (
             lambda: vp.LinearPolicy(np.zeros((3, 2)), np.zeros((3, 2, 4)), np.zeros((3, 4)), previous_gains=np.eye(2)),
-            r"previous_gains must have shape \(3, 2, 2\), got \(2, 2\)",
+            ("previous_gains", "(3, 2, 2)", "(2, 2)"),
         ),
         (
             lambda: vp.LinearPolicy(np.zeros((3, 2)), np.zeros((3, 2, 4)), np.zeros((3, 4)), previous=np.zeros((3, 2))),
-            "previous is what previous_gains expect: give them too",
+            ("previous", "previous_gains"),
         ),
         (
             lambda: vp.LinearPolicy(np.zeros((3, 2)), np.zeros((3, 2, 4)), np.zeros((3, 4)), before=[0.0]),
-            r"before must have shape \(2,\), got \(1,\)",
+            ("before", "(2,)", "(1,)"),
         ),
-        (lambda: random_policy(vp.Scene(sliders(2)), 4).control(4, np.zeros(4)), "interval must be from 0 to 3, got 4"),
+        (lambda: random_policy(vp.Scene(sliders(2)), 4).control(4, np.zeros(4)), ("interval", "0", "3", "4")),
     ],
 )
-def test_mistakes_are_named(make, words):
-    with pytest.raises(vp.InputError, match=words):
+def test_mistakes_are_named(make, facts):
+    with refused(vp.InputError, facts):
         make()

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 from test_sddp import SAMPLINGS, run, samples_of_a_step, sliders, small
 
 import varpin as vp
@@ -236,14 +237,14 @@ def test_derivatives_that_are_right_pass_the_check(scale, size):
 
 
 @pytest.mark.parametrize(
-    ("order", "where", "message"),
+    ("order", "where", "facts"),
     [
-        (0, (3, 4), r"mine: gradient\[3, 4\] from derivatives\(t, q, v, u\) is .*, but differences .* at t = 0.35 s"),
-        (1, (2, 1, 6), r"mine: Hessian\[2, 1, 6\] from derivatives"),
-        (1, (0, 7, 7), r"mine: Hessian\[0, 7, 7\] from derivatives"),
+        (0, (3, 4), ("mine", "gradient[3, 4]", "0.35")),
+        (1, (2, 1, 6), ("mine", "Hessian[2, 1, 6]")),
+        (1, (0, 7, 7), ("mine", "Hessian[0, 7, 7]")),
     ],
 )
-def test_check_finds_a_wrong_derivative(order, where, message):
+def test_check_finds_a_wrong_derivative(order, where, facts):
     """At the first expansion and not after it: it costs as much as leaving the derivatives out."""
     wrong, calls = [1.0], []
 
@@ -259,7 +260,7 @@ def test_check_finds_a_wrong_derivative(order, where, message):
         return smooth(*z)
 
     bound = vp.CustomCost(function, derivatives, name="mine", check=True).bind(points())
-    with pytest.raises(vp.CostError, match=message):
+    with refused(vp.CostError, facts):
         bound.expand(*random_points())
     wrong[0] = 0.0
     bound.expand(*random_points())
@@ -271,7 +272,7 @@ def test_check_finds_a_wrong_derivative(order, where, message):
 
 def test_check_is_not_passed_by_nan():
     cost = vp.CustomCost(lambda t, q, v, u: t * np.nan, smooth_derivatives, check=True)
-    with pytest.raises(vp.CostError, match="differences of the function give nan"):
+    with refused(vp.CostError, "nan"):
         cost.bind(points()).expand(*random_points())
 
 
@@ -285,9 +286,7 @@ def test_hessians_must_be_symmetric():
     error = 1e-10
     bound.expand(*random_points())
     error = 1e-3
-    with pytest.raises(
-        vp.CostError, match=r"mine: the Hessian must be symmetric: Hessian\[4, 1, 6\] is .* and Hessian"
-    ):
+    with refused(vp.CostError, "mine", "Hessian[4, 1, 6]", "symmetric"):
         bound.expand(*random_points())
 
 
@@ -324,38 +323,38 @@ def test_problem_is_an_integral():
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "facts"),
     [
-        (lambda: vp.TrackingCost(0.0, np.nan), "TrackingCost weight is nan; it must be finite"),
-        (lambda: vp.TrackingCost(0.0, [1.0, np.inf]), r"weight\[1\] is inf"),
-        (lambda: vp.TrackingCost(0.0, [[1.0, 2.0], [2.0, 1.0]]), "positive semidefinite; its least value is -1"),
-        (lambda: vp.ControlCost(-1.0), "ControlCost weight must be positive semidefinite; its least value is -1"),
-        (lambda: vp.VelocityCost([1.0, -2.0]), "VelocityCost weight must be positive semidefinite"),
-        (lambda: vp.ControlCost(np.ones((2, 3))), r"a number, a vector or a square matrix, got \(2, 3\)"),
-        (lambda: vp.ControlCost(np.ones((2, 2, 2))), r"a number, a vector or a square matrix, got \(2, 2, 2\)"),
-        (lambda: vp.ControlCost("heavy"), "ControlCost weight must be an array of real numbers, got 'heavy'"),
-        (lambda: vp.TrackingCost("home"), "TrackingCost reference must be an array of real numbers, got 'home'"),
-        (lambda: vp.Terminal(vp.ControlCost()), "cannot be a terminal cost: there is no control at the final time"),
-        (lambda: vp.Terminal(vp.TrackingCost(0.0) + vp.ControlCost()), "cannot be a terminal cost"),
-        (lambda: vp.Terminal(2.0 * vp.ControlCost()), "cannot be a terminal cost"),
-        (lambda: vp.Terminal(vp.Terminal(vp.TrackingCost(0.0))), "a terminal cost already: leave the outer Terminal"),
-        (lambda: -1.0 * vp.TrackingCost(0.0), "scaled by a finite number that is not negative, got -1"),
-        (lambda: np.nan * vp.TrackingCost(0.0), "scaled by a finite number that is not negative, got nan"),
-        (lambda: vp.CustomCost(3), r"CustomCost function must be a function of \(t, q, v, u\), got 3"),
-        (lambda: vp.CustomCost(None), "CustomCost function must be a function"),
-        (lambda: vp.CustomCost(smooth, 3.0, name="mine"), "mine derivatives must be a function"),
-        (lambda: small(vp.ControlCost(1.0, np.zeros((19, 2)))), r"nodes, or \(20, 2\): one for each of its steps; got"),
-        (lambda: vp.Terminal(1.0), "Terminal takes a cost, got float"),
-        (lambda: small(vp.ControlCost([1.0, 1.0, 1.0])), r"must be one number or have 2 rows, got shape \(3,\)"),
-        (lambda: small(vp.TrackingCost(0.0, np.eye(3))), r"must be one number or have 2 rows, got shape \(3, 3\)"),
-        (lambda: small(vp.TrackingCost(np.zeros((20, 2)))), r"or \(21, 2\): one row for each .* got \(20, 2\)"),
-        (lambda: small(vp.TrackingCost([0.0, 0.0, 0.0])), r"have shape \(2,\), or \(21, 2\).*got \(3,\)"),
-        (lambda: small(vp.TrackingCost([0.0, np.nan])), r"TrackingCost reference\[1\] is nan"),
-        (lambda: small(vp.Terminal(vp.TrackingCost([0.0, np.nan]))), r"TrackingCost reference\[1\] is nan"),
+        (lambda: vp.TrackingCost(0.0, np.nan), ("TrackingCost", "weight", "nan")),
+        (lambda: vp.TrackingCost(0.0, [1.0, np.inf]), ("weight[1]", "inf")),
+        (lambda: vp.TrackingCost(0.0, [[1.0, 2.0], [2.0, 1.0]]), ("positive semidefinite", "-1")),
+        (lambda: vp.ControlCost(-1.0), ("ControlCost", "weight", "-1")),
+        (lambda: vp.VelocityCost([1.0, -2.0]), ("VelocityCost", "weight", "-2")),
+        (lambda: vp.ControlCost(np.ones((2, 3))), ("weight", "(2, 3)")),
+        (lambda: vp.ControlCost(np.ones((2, 2, 2))), ("weight", "(2, 2, 2)")),
+        (lambda: vp.ControlCost("heavy"), ("ControlCost", "weight", "'heavy'")),
+        (lambda: vp.TrackingCost("home"), ("TrackingCost", "reference", "'home'")),
+        (lambda: vp.Terminal(vp.ControlCost()), ("ControlCost", "terminal")),
+        (lambda: vp.Terminal(vp.TrackingCost(0.0) + vp.ControlCost()), ("ControlCost", "terminal")),
+        (lambda: vp.Terminal(2.0 * vp.ControlCost()), ("ControlCost", "terminal")),
+        (lambda: vp.Terminal(vp.Terminal(vp.TrackingCost(0.0))), "Terminal"),
+        (lambda: -1.0 * vp.TrackingCost(0.0), "-1"),
+        (lambda: np.nan * vp.TrackingCost(0.0), "nan"),
+        (lambda: vp.CustomCost(3), ("CustomCost", "function", "3")),
+        (lambda: vp.CustomCost(None), ("CustomCost", "function", "None")),
+        (lambda: vp.CustomCost(smooth, 3.0, name="mine"), ("mine", "derivatives")),
+        (lambda: small(vp.ControlCost(1.0, np.zeros((19, 2)))), ("(20, 2)", "(19, 2)")),
+        (lambda: vp.Terminal(1.0), ("Terminal", "float")),
+        (lambda: small(vp.ControlCost([1.0, 1.0, 1.0])), ("weight", "2", "(3,)")),
+        (lambda: small(vp.TrackingCost(0.0, np.eye(3))), ("weight", "2", "(3, 3)")),
+        (lambda: small(vp.TrackingCost(np.zeros((20, 2)))), ("(21, 2)", "(20, 2)")),
+        (lambda: small(vp.TrackingCost([0.0, 0.0, 0.0])), ("(2,)", "(21, 2)", "(3,)")),
+        (lambda: small(vp.TrackingCost([0.0, np.nan])), ("TrackingCost", "reference[1]", "nan")),
+        (lambda: small(vp.Terminal(vp.TrackingCost([0.0, np.nan]))), ("TrackingCost", "reference[1]", "nan")),
     ],
 )
-def test_what_is_refused(make, message):
-    with pytest.raises(vp.InputError, match=message):
+def test_what_is_refused(make, facts):
+    with refused(vp.InputError, facts):
         make()
 
 
@@ -364,27 +363,27 @@ def fails(*arguments):
 
 
 @pytest.mark.parametrize(
-    ("cost", "message"),
+    ("cost", "facts"),
     [
-        (vp.TrackingCost(fails), r"TrackingCost: the reference raised KeyError\('gain'\) at t = 0.025 s"),
-        (vp.TrackingCost(lambda t: [0.0, np.nan]), r"TrackingCost: the reference at t = 0.025 s.*is nan"),
-        (vp.TrackingCost(lambda t: [0.0]), r"must have shape \(2,\), got \(1,\)"),
-        (vp.TrackingCost(lambda t: "home"), "must be an array of real numbers"),
-        (vp.Terminal(vp.VelocityCost(reference=fails)), r"VelocityCost: the reference raised .* at t = 1 s"),
-        (vp.CustomCost(fails, name="mine"), r"mine: function\(t, q, v, u\) failed: KeyError\('gain'\)"),
-        (vp.CustomCost(lambda t, q, v, u: q, name="mine"), r"mine: .* must return shape \(20,\), got \(20, 2\)"),
-        (vp.CustomCost(lambda t, q, v, u: None), "CustomCost: function"),
-        (vp.CustomCost(lambda t, q, v, u: t, lambda t, q, v, u: (q, v)), r"the gradient must have shape \(20, 6\)"),
-        (vp.CustomCost(lambda t, q, v, u: t, fails), r"derivatives\(t, q, v, u\) failed: 'gain'"),
-        (vp.CustomCost(lambda t, q, v, u: t, lambda t, q, v, u: None), r"derivatives\(t, q, v, u\) failed"),
+        (vp.TrackingCost(fails), ("TrackingCost", "reference", "KeyError('gain')", "0.025")),
+        (vp.TrackingCost(lambda t: [0.0, np.nan]), ("TrackingCost", "reference", "0.025", "nan")),
+        (vp.TrackingCost(lambda t: [0.0]), ("(2,)", "(1,)")),
+        (vp.TrackingCost(lambda t: "home"), ("reference", "'home'")),
+        (vp.Terminal(vp.VelocityCost(reference=fails)), ("VelocityCost", "reference", "KeyError('gain')", "1 s")),
+        (vp.CustomCost(fails, name="mine"), ("mine", "KeyError('gain')")),
+        (vp.CustomCost(lambda t, q, v, u: q, name="mine"), ("mine", "(20,)", "(20, 2)")),
+        (vp.CustomCost(lambda t, q, v, u: None), ("CustomCost", "function")),
+        (vp.CustomCost(lambda t, q, v, u: t, lambda t, q, v, u: (q, v)), ("gradient", "(20, 6)")),
+        (vp.CustomCost(lambda t, q, v, u: t, fails), ("derivatives", "'gain'")),
+        (vp.CustomCost(lambda t, q, v, u: t, lambda t, q, v, u: None), "derivatives"),
         (
             vp.CustomCost(lambda t, q, v, u: t, lambda t, q, v, u: (np.full((20, 6), np.nan), np.zeros((1, 6, 6)))),
-            r"the gradient\[0, 0\] is nan",
+            ("gradient[0, 0]", "nan"),
         ),
     ],
 )
-def test_functions_that_fail(cost, message):
-    with pytest.raises(vp.CostError, match=message) as caught:
+def test_functions_that_fail(cost, facts):
+    with refused(vp.CostError, facts) as caught:
         vp.solve(small(cost + vp.ControlCost(1.0), sampling="midpoint"))
     assert isinstance(caught.value, vp.VarpinError)
     assert isinstance(caught.value.cost, str)
@@ -410,13 +409,13 @@ def test_cost_of_refuses_what_is_no_motion_of_the_problem():
     scene = vp.Scene(vp.planar_chain(2))
     problem = vp.OptimalControlProblem(scene, vp.ControlCost(), [0, 0], [0, 0], dt=0.1, steps=3)
     for wrong in (None, np.zeros((4, 2))):
-        with pytest.raises(vp.InputError, match=r"the motion must be a varpin\.Trajectory"):
+        with refused(vp.InputError, "motion", "varpin.Trajectory"):
             problem.cost_of(wrong)
     other = vp.simulate(vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=0.1, steps=3)
-    with pytest.raises(vp.InputError, match=r"the trajectory is of joints .*; the scene's robot has"):
+    with refused(vp.InputError, "joints"):
         problem.cost_of(other)
     driven = vp.Scene(vp.planar_chain(2), actuation=[[1.0], [0.0]])
-    with pytest.raises(vp.InputError, match="the trajectory has 1 controls, the scene 2"):
+    with refused(vp.InputError, "1", "2", "controls"):
         problem.cost_of(vp.simulate(driven, [0, 0], [0, 0], dt=0.1, steps=3))
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 
@@ -114,7 +115,7 @@ def test_box_fddp_keeps_bounds():
 
 def test_held_controls_are_refused():
     problem = PROBLEMS["midpoint"]().at(hold=5)
-    with pytest.raises(vp.InputError, match="holds its controls over 5"):
+    with refused(vp.InputError, "controls", "5"):
         shooting_problem(problem)
 
 
@@ -123,7 +124,7 @@ def test_the_rate_of_controls_is_refused():
     rated = vp.OptimalControlProblem(
         problem.scene, problem.cost + vp.ControlRateCost(), problem.q0, problem.v0, dt=problem.dt, steps=problem.steps
     )
-    with pytest.raises(vp.InputError, match="leave the ControlRateCost out"):
+    with refused(vp.InputError, "ControlRateCost"):
         shooting_problem(rated)
 
 

@@ -8,6 +8,7 @@ import weakref
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 from scipy.integrate import solve_ivp
 
 import varpin as vp
@@ -146,12 +147,12 @@ class TestDerivatives:
 
     def test_what_complex_steps_cannot_do_is_refused(self):
         for f in (lambda q, v: -v * np.abs(v), lambda q, v: -np.array([float(x.real) for x in v])):
-            with pytest.raises(vp.InputError, match="complex steps do not give the derivatives"):
+            with refused(vp.CustomForceError, "complex", "dF/dv[0, 0]"):
                 vp.Scene(ROBOT, forces=vp.CustomForce(f, "complex"))
 
     def test_second_derivatives_are_refused(self):
         own = scene()
-        with pytest.raises(vp.InputError, match="CustomForce"):
+        with refused(vp.InputError, "CustomForce"):
             vp.second_order(own, simulate(own, integrator=vp.Gauss(2)), np.ones(6))
 
 
@@ -212,19 +213,19 @@ class TestRefused:
                 raise RuntimeError("too far")
             return -v
 
-        with pytest.raises(vp.ForceError, match="too far") as info:
+        with refused(vp.ForceError, "too far") as info:
             simulate(vp.Scene(ROBOT, forces=vp.CustomForce(breaks)))
         assert info.value.trajectory.steps == info.value.step > 0
 
     def test_wrong_derivatives(self):
         for wrong in (lambda q, v: np.eye(3), lambda q, v: (np.eye(3), np.eye(2))):
-            with pytest.raises(vp.ForceError, match="derivatives"):
+            with refused(vp.ForceError, "derivatives"):
                 simulate(vp.Scene(ROBOT, forces=vp.CustomForce(drag, wrong)))
 
     def test_wrong_arguments(self):
-        with pytest.raises(vp.InputError, match="a function of"):
+        with refused(vp.InputError, "function"):
             vp.CustomForce(np.zeros(3))
-        with pytest.raises(vp.InputError, match="derivatives must be"):
+        with refused(vp.InputError, "'exact'"):
             vp.CustomForce(drag, "exact")
 
 
@@ -253,7 +254,7 @@ def test_a_motion_is_linearized_with_its_own_functions():
     motion = vp.simulate(scene, [0.3, 0.2], [0.0, 0.0], dt=1e-3, steps=50)
     vp.linearize(scene, motion)
     for other in (vp.Scene(robot), vp.Scene(robot, forces=[vp.CustomForce(lambda q, v: -4.0 * v)])):
-        with pytest.raises(vp.InputError, match="another scene"):
+        with refused(vp.InputError, "scene"):
             vp.linearize(other, motion)
 
 
@@ -335,7 +336,7 @@ class TestDerivativesThatAreWrong:
 
         own = vp.Scene(ROBOT, forces=vp.CustomForce(f, "complex"))
         vp.simulate(own, Q0, V0, dt=1e-2, steps=2)
-        with pytest.raises(vp.CustomForceError, match=r"complex steps do not give .* dF/dv\[0, 0\] is"):
+        with refused(vp.CustomForceError, "dF/dv[0, 0]"):
             vp.simulate(vp.Scene(ROBOT, forces=vp.CustomForce(f, "complex")), Q0, [6.0, 0, 0], dt=1e-2, steps=2)
 
     def test_jumps_at_the_start_are_no_fault(self):
@@ -382,7 +383,7 @@ class TestWhereItFails:
         assert motion.accuracy.met
 
     def test_in_an_ensemble(self):
-        with pytest.raises(vp.ForceError, match="path 0: CustomForce breaks") as info:
+        with refused(vp.ForceError, "path 0", "CustomForce breaks") as info:
             vp.simulate_ensemble(
                 self.own(noise=vp.AdditiveNoise(0.01)), Q0, V0, dt=0.01, steps=30, paths=4, rng=0, workers=2
             )
@@ -407,7 +408,7 @@ class TestWhereItFails:
         """A force that jumps leaves no solution of a step."""
         jumps = vp.CustomForce(lambda q, v: -200.0 * np.sign(v - 0.013))
         own = vp.Scene(ROBOT, gravity=False, forces=jumps)
-        with pytest.raises(vp.StepFailure, match="CustomForce <lambda> may be the reason"):
+        with refused(vp.StepFailure, "CustomForce <lambda>"):
             vp.simulate(own, Q0, V0, dt=0.01, steps=50, integrator=vp.Gauss(2), check=False)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import INERTIAL, joint, link, mass_matrix, random_tree, write_urdf
+from refusals import refused
 
 import varpin as vp
 from varpin.model import geometry
@@ -21,10 +22,6 @@ class TestUrdf:
             link(f"l{k}") + joint(f"j{k}", f"l{k - 1}" if k > 1 else "base", f"l{k}", kind) for k in range(1, links)
         ]
         return write_urdf(folder, *parts)
-
-    def refused(self, path, words):
-        with pytest.raises(vp.RobotError, match=words):
-            vp.load_robot(path)
 
     def test_deeper_than_the_parser_s_stack(self, tmp_path):
         # At 4000 links Pinocchio ends the process, on a stack of the usual size.
@@ -45,18 +42,19 @@ class TestUrdf:
             vp.load_robot(path)
 
     def test_nested_elements(self, tmp_path):
-        self.refused(
-            write_urdf(tmp_path, "<a>" * 20_000 + "</a>" * 20_000, link("l1", extra="<a>" * 5000 + "</a>" * 5000)),
-            "Two root links|no joint that moves",
-        )
+        deep = link("l1", extra="<a>" * 5000 + "</a>" * 5000)
+        with pytest.raises(vp.RobotError):
+            vp.load_robot(write_urdf(tmp_path, "<a>" * 20_000 + "</a>" * 20_000, deep))
         nested = joint("j1", "base", "l1", inside="<a>" * 5000 + "</a>" * 5000)
-        self.refused(write_urdf(tmp_path, link("l1"), nested), "its elements are nested too deep")
+        with refused(vp.RobotError, "nested"):
+            vp.load_robot(write_urdf(tmp_path, link("l1"), nested))
 
     def test_numbers_that_only_one_of_the_parsers_reads(self, tmp_path):
         # Pinocchio drops the inertial with a line on stderr.
         for word in ("1_000", "٣", "0x1p3"):
             path = write_urdf(tmp_path, link("l1", INERTIAL.replace('"1.3"', f'"{word}"')), joint("j1", "base", "l1"))
-            self.refused(path, "motion of 'j1' carries no inertia")
+            with refused(vp.SingularMassMatrix, "'j1'"):
+                vp.load_robot(path)
             assert any("no finite number: it is massless" in said for said in vp.inspect_robot(path).warnings)
 
     def test_numbers_in_odd_white_space(self, tmp_path):
@@ -78,8 +76,9 @@ class TestUrdf:
         path = write_urdf(
             tmp_path, link("l1", heavy), link("l2", heavy), joint("j1", "base", "l1"), joint("j2", "l1", "l2")
         )
-        self.refused(path, "the mass matrix of robot 'made_up' is not finite")
-        with pytest.raises(vp.RobotError, match="not finite"):
+        with refused(vp.RobotError, "'made_up'", "finite"):
+            vp.load_robot(path)
+        with refused(vp.RobotError, "finite"):
             vp.inspect_robot(path)
 
     @pytest.mark.parametrize("axis", ["1e-200 0 0", "0 1e-320 0"])
@@ -88,7 +87,8 @@ class TestUrdf:
         path = write_urdf(
             tmp_path, link("l1"), link("l2"), joint("j1", "base", "l1"), joint("j2", "l1", "l2", axis=axis)
         )
-        self.refused(path, "joint 'j2' has an axis of length .*, which Pinocchio makes no unit vector of")
+        with refused(vp.RobotError, "'j2'", "axis"):
+            vp.load_robot(path)
 
     def test_dampers_beyond_floating_point(self):
         scene = vp.Scene(vp.planar_chain(2, mass=1e-150, length=1e-5), damping=1e160)
@@ -106,29 +106,30 @@ class TestUrdf:
             return model
 
         monkeypatch.setattr(pin, "buildModelFromXML", lossy)
-        self.refused(path, "describes links of 1.3 kg in all, of which Pinocchio reads 0 kg")
+        with refused(vp.RobotError, "1.3 kg", "0 kg"):
+            vp.load_robot(path)
 
 
 class TestModels:
     @pytest.mark.parametrize(
-        ("change", "words"),
+        ("change", "facts"),
         [
-            (lambda model: model.parents.__setitem__(2, 77), "comes before its parent"),
-            (lambda model: setattr(model, "armature", np.zeros(1)), "its armature has 1 entries, where 3 belong"),
-            (lambda model: setattr(model, "lowerPositionLimit", np.zeros(9)), "its lowerPositionLimit has 9 entries"),
-            (lambda model: model.names.append("more"), "its names has 5 entries, where 4 belong"),
-            (lambda model: model.inertias.append(pin.Inertia.Zero()), "its inertias has 5 entries"),
-            (lambda model: setattr(model.frames[1], "parentJoint", 99), "hangs on what is not there"),
+            (lambda model: model.parents.__setitem__(2, 77), "parent"),
+            (lambda model: setattr(model, "armature", np.zeros(1)), ("armature", "1", "3")),
+            (lambda model: setattr(model, "lowerPositionLimit", np.zeros(9)), ("lowerPositionLimit", "9")),
+            (lambda model: model.names.append("more"), ("names", "5", "4")),
+            (lambda model: model.inertias.append(pin.Inertia.Zero()), ("inertias", "5")),
+            (lambda model: setattr(model.frames[1], "parentJoint", 99), "frame"),
         ],
     )
-    def test_whose_parts_do_not_fit(self, change, words):
+    def test_whose_parts_do_not_fit(self, change, facts):
         model = random_tree(0, 3, branching=False)
         model.addFrame(pin.Frame("tool", 1, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
         while any(joint.nq != 1 for joint in list(model.joints)[1:]):
             model = random_tree(int(model.name[4:]) + 1, 3, branching=False)
             model.addFrame(pin.Frame("tool", 1, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
         change(model)
-        with pytest.raises(vp.RobotError, match=words):
+        with refused(vp.RobotError, facts):
             vp.load_robot(model)
 
     @pytest.mark.parametrize("seed", range(5))

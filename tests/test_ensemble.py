@@ -5,6 +5,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 import varpin.ensemble
@@ -188,19 +189,19 @@ def test_linear_feedback(kick):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "facts"),
     [
-        (([[1.0]], [1.0], [[0.0]]), r"gains must have shape \(N, m, 2n\), got \(1,\)"),
-        (([[1.0]], [[[1.0], [1.0, 2.0]]], [[0.0]]), "gains must be an array of real numbers"),
-        ((np.ones((3, 2)), np.ones((4, 2, 4)), np.ones((4, 4))), r"u must have shape \(4, 2\), got \(3, 2\)"),
-        ((np.ones((4, 2)), np.ones((4, 2, 4)), np.ones((6, 4))), r"reference must have shape \(4, 4\), got \(6, 4\)"),
-        ((np.ones((4, 2)), np.ones((4, 2, 4)), 0.0), r"reference must have shape \(4, 4\), got \(\)"),
-        ((np.ones((4, 2)), np.ones((4, 2, 4)), None), "reference must be an array of real numbers"),
-        ((np.ones((4, 2)), np.full((4, 2, 4), np.nan), np.ones((4, 4))), r"gains\[0, 0, 0\] is nan; it must be finite"),
+        (([[1.0]], [1.0], [[0.0]]), ("gains", "(1,)")),
+        (([[1.0]], [[[1.0], [1.0, 2.0]]], [[0.0]]), "gains"),
+        ((np.ones((3, 2)), np.ones((4, 2, 4)), np.ones((4, 4))), ("u", "(4, 2)", "(3, 2)")),
+        ((np.ones((4, 2)), np.ones((4, 2, 4)), np.ones((6, 4))), ("reference", "(4, 4)", "(6, 4)")),
+        ((np.ones((4, 2)), np.ones((4, 2, 4)), 0.0), ("reference", "(4, 4)", "()")),
+        ((np.ones((4, 2)), np.ones((4, 2, 4)), None), "reference"),
+        ((np.ones((4, 2)), np.full((4, 2, 4), np.nan), np.ones((4, 4))), ("gains[0, 0, 0]", "nan")),
     ],
 )
-def test_policies_that_do_not_fit_together(arguments, message):
-    with pytest.raises(vp.InputError, match=message):
+def test_policies_that_do_not_fit_together(arguments, facts):
+    with refused(vp.InputError, facts):
         vp.LinearPolicy(*arguments)
 
 
@@ -215,17 +216,17 @@ def test_policies_are_copies_and_frozen():
 
 
 @pytest.mark.parametrize(
-    ("shape", "problem"),
+    ("shape", "facts"),
     [
-        ((49, 2, 4), "49 controls, each held over 1 steps: for 49 steps, not 50"),
-        ((50, 1, 4), r"gains must have shape \(N, 2, 4\), got \(50, 1, 4\)"),
-        ((50, 2, 6), r"gains must have shape \(N, 2, 4\), got \(50, 2, 6\)"),
+        ((49, 2, 4), ("49", "1", "50")),
+        ((50, 1, 4), ("gains", "(N, 2, 4)", "(50, 1, 4)")),
+        ((50, 2, 6), ("gains", "(N, 2, 4)", "(50, 2, 6)")),
     ],
 )
-def test_policies_that_do_not_fit_the_scene(shape, problem):
+def test_policies_that_do_not_fit_the_scene(shape, facts):
     steps, m, size = shape
     policy = vp.LinearPolicy(np.ones((steps, m)), np.ones(shape), np.ones((steps, size)))
-    with pytest.raises(vp.InputError, match=problem):
+    with refused(vp.InputError, facts):
         run(controls=policy)
 
 
@@ -287,7 +288,7 @@ def test_all_paths_failing_is_an_error(monkeypatch, block):
     failing = slice(0, 18, 3)
     options = FRAGILE | {"paths": 6, "q0": starts(40)[failing], "v0": np.zeros(3)}
     blocks_of(monkeypatch, block * numbers_a_step(fragile_scene(), 6))
-    with pytest.raises(vp.VarpinError, match=r"^6 of 6 paths failed, the first at step \d+: ") as caught:
+    with refused(vp.VarpinError, "6 of 6") as caught:
         run(fragile_scene(), **options)
     assert type(caught.value) is vp.VarpinError
 
@@ -297,7 +298,7 @@ def test_interruption_keeps_what_is_done():
         if done == 192:
             raise KeyboardInterrupt
 
-    with pytest.raises(vp.EnsembleInterrupted, match="interrupted after 192 paths") as caught:
+    with refused(vp.EnsembleInterrupted, "192") as caught:
         run(paths=300, progress=interrupt)
     assert isinstance(caught.value, KeyboardInterrupt)
     part, whole = caught.value.ensemble, run(paths=300)
@@ -317,7 +318,7 @@ def test_interruption_before_anything_is_done(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(varpin.ensemble.run, "simulate_paths", stop)
-    with pytest.raises(vp.EnsembleInterrupted, match=r"interrupted after 0 paths$") as caught:
+    with refused(vp.EnsembleInterrupted, "0") as caught:
         run()
     assert caught.value.ensemble is None
 
@@ -425,37 +426,37 @@ CUSTOM = vp.CustomNoise(lambda q, v, u: np.eye(2), 2)
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "facts"),
     [
-        ({"scene": "chain"}, "scene must be a varpin.Scene, got str"),
-        ({"scene": vp.Scene(vp.planar_chain(2), noise=CUSTOM)}, "an ensemble needs noise that the core evaluates"),
-        ({"dt": 0.0}, r"dt must be positive and finite \[s\], got 0.0"),
-        ({"steps": -1}, "steps must be at least 0, got -1"),
-        ({"steps": 2.5}, "steps must be an integer, got 2.5"),
-        ({"steps": 10**14}, "steps = 100000000000000 with 40 stored paths needs more memory than there is"),
-        ({"paths": 0}, "paths must be at least 1, got 0"),
-        ({"paths": "many"}, "paths must be an integer, got 'many'"),
-        ({"rng": -3}, "rng must be a numpy Generator or a seed, an integer >= 0, got -3"),
-        ({"rng": "seed"}, "rng must be a numpy Generator or a seed"),
-        ({"q0": [0.0, 0.0, 0.0]}, r"q0 must have shape \(40, 2\), got \(3,\)"),
-        ({"q0": np.zeros((39, 2))}, r"q0 must have shape \(40, 2\), got \(39, 2\)"),
-        ({"v0": [0.0, np.nan]}, r"v0\[1\] is nan; it must be finite"),
+        ({"scene": "chain"}, ("scene", "varpin.Scene", "str")),
+        ({"scene": vp.Scene(vp.planar_chain(2), noise=CUSTOM)}, "noise"),
+        ({"dt": 0.0}, ("dt", "0.0")),
+        ({"steps": -1}, ("steps", "0", "-1")),
+        ({"steps": 2.5}, ("steps", "2.5")),
+        ({"steps": 10**14}, ("100000000000000", "40")),
+        ({"paths": 0}, ("paths", "1", "0")),
+        ({"paths": "many"}, ("paths", "'many'")),
+        ({"rng": -3}, ("rng", "0", "-3")),
+        ({"rng": "seed"}, "rng"),
+        ({"q0": [0.0, 0.0, 0.0]}, ("q0", "(40, 2)", "(3,)")),
+        ({"q0": np.zeros((39, 2))}, ("q0", "(40, 2)", "(39, 2)")),
+        ({"v0": [0.0, np.nan]}, ("v0[1]", "nan")),
         (
             {"controls": np.zeros((49, 2))},
-            r"controls must have shape \(50, 2\), one row a step, or \(2,\), got \(49, 2\)",
+            ("controls", "(50, 2)", "(2,)", "(49, 2)"),
         ),
-        ({"controls": [np.inf, 0.0]}, r"controls\[0\] is inf; it must be finite"),
-        ({"controls": lambda t, q, v: q}, "only simulate takes a control law"),
-        ({"integrator": "midpoint"}, r"integrator must be one of varpin's, for example varpin.Midpoint\(\), got"),
-        ({"quantiles": [0.5, 1.5]}, r"quantiles must be levels in \[0, 1\], got \[0.5, 1.5\]"),
-        ({"quantiles": 0.5}, r"quantiles must be levels in \[0, 1\], got 0.5"),
-        ({"quantiles": [np.nan]}, r"quantiles\[0\] is nan; it must be finite"),
-        ({"workers": 0}, "workers must be at least 1, got 0"),
-        ({"workers": 1.5}, "workers must be an integer, got 1.5"),
+        ({"controls": [np.inf, 0.0]}, ("controls[0]", "inf")),
+        ({"controls": lambda t, q, v: q}, ("simulate", "law")),
+        ({"integrator": "midpoint"}, "integrator"),
+        ({"quantiles": [0.5, 1.5]}, ("quantiles", "[0, 1]", "[0.5, 1.5]")),
+        ({"quantiles": 0.5}, ("quantiles", "[0, 1]", "0.5")),
+        ({"quantiles": [np.nan]}, ("quantiles[0]", "nan")),
+        ({"workers": 0}, ("workers", "1", "0")),
+        ({"workers": 1.5}, ("workers", "1.5")),
     ],
 )
-def test_bad_input(options, message):
-    with pytest.raises(vp.InputError, match=message):
+def test_bad_input(options, facts):
+    with refused(vp.InputError, facts):
         run(**options)
 
 
@@ -507,5 +508,5 @@ def test_a_held_policy_is_the_same_policy_decided_less_often(integrator):
         integrator=integrator,
     )
     assert np.array_equal(ensemble.u[:, ::5], ensemble.u[:, 4::5])
-    with pytest.raises(vp.InputError, match="6 controls, each held over 5 steps: for 30 steps, not 31"):
+    with refused(vp.InputError, "6", "5", "30", "31"):
         vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=31, controls=policy)

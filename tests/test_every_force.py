@@ -9,6 +9,7 @@ import functools
 import numpy as np
 import pytest
 from naive import gradient
+from refusals import refused
 from test_forces import WEIGHTS, one_step, total
 from test_frame_forces import TURNED, energy, push
 
@@ -196,7 +197,7 @@ def test_second_order(name, kind):
     scene, q, v, u = setting(name, kind)
     if kind == "all":
         motion = vp.simulate(scene, q, v, dt=2e-3, steps=1, controls=u, integrator=vp.Midpoint(), check=False)
-        with pytest.raises(vp.InputError, match="second derivatives are not there for a scene with a CustomForce"):
+        with refused(vp.InputError, "CustomForce"):
             vp.second_order(scene, motion, np.ones(2 * q.size))
         kept = [own for own in scene.forces if not isinstance(own, vp.CustomForce)]
         scene = vp.Scene(scene.robot, damping=0.0, forces=kept)

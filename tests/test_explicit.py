@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 from test_linearization import ARMS, difference, make_scene, worst
 from test_midpoint import reference, slopes
 
@@ -127,7 +128,7 @@ def test_derivative_of_the_jump(integrator):
 
 def test_blow_up_is_a_step_failure():
     scene = vp.Scene(vp.planar_chain(3))
-    with pytest.raises(vp.StepFailure, match="the state is no longer finite") as caught:
+    with refused(vp.StepFailure, "finite") as caught:
         vp.simulate(scene, np.zeros(3), np.zeros(3), dt=0.5, steps=10_000, integrator=vp.ExplicitEuler())
     assert np.isfinite(caught.value.trajectory.energy).all()
 

@@ -14,6 +14,7 @@ from battery import Setup, Trial
 from battery.exact import exact_motion, period_error
 from battery.plans import Task, changes, cost_error, judge_plan, part_left
 from mechanisms import slider
+from refusals import refused
 
 import varpin as vp
 from varpin.cli import main
@@ -429,7 +430,7 @@ def test_a_record_survives_the_disk(tmp_path):
 def test_damaged_records_are_refused(tmp_path, text):
     path = tmp_path / "record.json"
     path.write_text(text)
-    with pytest.raises(vp.FileError, match=r"record\.json"):
+    with refused(vp.FileError, "record.json"):
         battery.run(trials=[], save=path)
 
 
@@ -510,9 +511,9 @@ def test_check_robot_keeps_what_was_done(load):
 
 
 def test_check_robot_refuses(load):
-    with pytest.raises(vp.InputError, match="patience"):
+    with refused(vp.InputError, "patience"):
         vp.check_robot(load("finger"), patience=0.0)
-    with pytest.raises(vp.RobotError, match="nosuch"):
+    with refused(vp.RobotNotFound, "nosuch"):
         vp.check_robot("nosuch")
 
 

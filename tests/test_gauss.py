@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import slider
+from refusals import refused
 from scipy.integrate import solve_ivp
 from scipy.optimize import root
 
@@ -419,7 +420,7 @@ def test_few_evaluations(links):
 @pytest.mark.parametrize("stages", [2, 4])
 def test_failure_keeps_what_was_done(stages):
     scene = vp.Scene(vp.planar_chain(3))
-    with pytest.raises(vp.StepFailure, match="smaller dt may go further") as caught:
+    with refused(vp.StepFailure, "dt") as caught:
         vp.simulate(
             scene, np.zeros(3), np.zeros(3), dt=1e-2, steps=1000, controls=np.full(3, 1e7), integrator=vp.Gauss(stages)
         )
@@ -445,19 +446,19 @@ def test_stiff_springs_and_dampers(stages, stiffness, damping):
 
 
 @pytest.mark.parametrize(
-    ("option", "words"),
+    ("option", "facts"),
     [
-        ({"stages": 0}, "stages must be at least 1, got 0"),
-        ({"stages": 7}, "stages must be at most 6, got 7"),
-        ({"stages": 2.5}, "stages must be an integer, got 2.5"),
-        ({"stages": "two"}, "stages must be an integer, got 'two'"),
-        ({"tolerance": 0.0}, r"tolerance must be positive and finite \[rounding units\], got 0.0"),
-        ({"guard": 3}, "guard must be a varpin.Guard, or None for no guards, got 3"),
-        ({"kick": "right"}, "kick must be 'left' or 'split', got 'right'"),
+        ({"stages": 0}, ("stages", "1", "0")),
+        ({"stages": 7}, ("stages", "6", "7")),
+        ({"stages": 2.5}, ("stages", "2.5")),
+        ({"stages": "two"}, ("stages", "'two'")),
+        ({"tolerance": 0.0}, ("tolerance", "0.0")),
+        ({"guard": 3}, ("guard", "varpin.Guard", "None", "3")),
+        ({"kick": "right"}, ("kick", "'left'", "'split'", "'right'")),
     ],
 )
-def test_options_out_of_range(option, words):
-    with pytest.raises(vp.InputError, match=words):
+def test_options_out_of_range(option, facts):
+    with refused(vp.InputError, facts):
         vp.Gauss(**option)
 
 
@@ -466,5 +467,5 @@ def test_a_trajectory_knows_its_integrator():
     motion = vp.simulate(scene, np.zeros(2), np.zeros(2), dt=1e-2, steps=2, integrator=vp.Gauss(stages=3))
     assert motion.integrator == "Gauss(stages=3)"
     assert str(vp.Gauss(2, kick="split")) == "Gauss(stages=2, kick=split)"
-    with pytest.raises(vp.InputError, match=r"made with Gauss\(stages=3\), not Gauss\(stages=2\)"):
+    with refused(vp.InputError, "Gauss(stages=3)", "Gauss(stages=2)"):
         vp.linearize(scene, motion, integrator=vp.Gauss(2))

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import joint, link, mimic, random_inertia, random_rotation, random_tree, write_urdf
+from refusals import refused
 
 import varpin as vp
 from varpin.model.tree import block_ends, independent_groups
@@ -176,5 +177,5 @@ def test_a_tree_with_other_blocks_is_refused():
     robot = forest(0, 1, 2)
     for ends in (np.array([8, 8]), np.array([2, 8]), (8,), np.array([3.0, 4.0, 8.0]), None):
         damaged = dataclasses.replace(robot, tree=robot.tree._replace(ends=ends))
-        with pytest.raises(vp.RobotError, match="its blocks do not end where groups do"):
+        with refused(vp.RobotError, "blocks"):
             vp.Scene(damaged)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 from scipy.linalg import eigh
 
 import varpin as vp
@@ -229,12 +230,12 @@ def test_largest_step_agrees_with_differences_of_pinocchios_energy():
 def test_loaded_robot_is_taken_and_not_loaded_otherwise():
     robot = vp.planar_chain(2)
     assert inspect_robot(robot).robot is robot
-    with pytest.raises(vp.InputError, match="lock, package_dirs, mimic, base and armature belong to loading"):
+    with refused(vp.InputError, "lock"):
         inspect_robot(robot, lock={"joint1": 0.0})
 
 
 def test_wrong_configuration_is_refused_in_words():
-    with pytest.raises(vp.InputError, match=r"q must be one number or have shape \(2,\), got \(3,\)"):
+    with refused(vp.InputError, "q", "(2,)", "(3,)"):
         inspect_robot(vp.planar_chain(2), q=[0.0, 0.0, 0.0])
 
 

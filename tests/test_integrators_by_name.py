@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refused
 
 import varpin as vp
 from varpin.integrators import BY_NAME, integrator_of, options_of
@@ -54,21 +55,21 @@ def test_every_integrator_is_known_and_has_a_name_in_scene_files():
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "facts"),
     [
-        ("", "is written as a name, or a name with options such as"),
-        ("Gauss(", "is written as"),
-        ("os.system('x')", "is written as"),
-        ("Verlet", "no integrator 'Verlet'; it has Midpoint, Gauss, Radau, Expl"),
-        ("Gauss(alpha=0.5)", "Gauss has no option 'alpha'; its options are stages, "),
-        ("RungeKutta4(4)", "RungeKutta4 has no room for all of these options; it has none"),
-        ("Gauss(2, stages=3)", "no room for all"),
-        ("Gauss(stages=9)", "stages must be at most 6, got 9"),
-        ("Gauss(stages=len([]))", "numbers and words, got 'len"),
+        ("", "''"),
+        ("Gauss(", "'Gauss('"),
+        ("os.system('x')", "os.system"),
+        ("Verlet", ("'Verlet'", "Midpoint", "Gauss", "Radau")),
+        ("Gauss(alpha=0.5)", ("Gauss", "'alpha'", "stages")),
+        ("RungeKutta4(4)", "RungeKutta4"),
+        ("Gauss(2, stages=3)", "Gauss"),
+        ("Gauss(stages=9)", ("stages", "6", "9")),
+        ("Gauss(stages=len([]))", "'len"),
     ],
 )
-def test_other_texts_are_refused(text, words):
-    with pytest.raises(vp.InputError, match=words):
+def test_other_texts_are_refused(text, facts):
+    with refused(vp.InputError, facts):
         integrator_of(text)
 
 
@@ -88,7 +89,7 @@ def test_linearization_is_of_the_integrator_that_made_the_motion(made, tmp_path)
         expected = vp.second_order(scene, motion, z, integrator=made).xx
         np.testing.assert_array_equal(vp.second_order(scene, read, z).xx, expected)
     else:
-        with pytest.raises(vp.InputError, match="has no second-order linearization"):
+        with refused(vp.InputError, "second-order"):
             vp.second_order(scene, motion, np.zeros(4))
 
 
@@ -103,12 +104,12 @@ def test_what_made_a_motion_is_held_against_what_is_given():
     strict = vp.linearize(scene, motion, integrator=vp.Midpoint(guard=vp.Guard(max_halvings=0)))
     np.testing.assert_array_equal(strict.A, vp.linearize(scene, motion).A)
     for other in (vp.Gauss(), vp.Midpoint(alpha=0.4), vp.Midpoint(kick="split"), vp.RungeKutta4()):
-        with pytest.raises(vp.InputError, match=r"was made with Midpoint\(alpha=0\.5\), not"):
+        with refused(vp.InputError, "Midpoint(alpha=0.5)"):
             vp.linearize(scene, motion, integrator=other)
-    with pytest.raises(vp.InputError, match=r"integrator must be one of varpin's"):
+    with refused(vp.InputError, "integrator"):
         vp.linearize(scene, motion, integrator="midpoint")
 
     foreign = dataclasses.replace(motion, integrator=str(Own()))
-    with pytest.raises(vp.InputError, match=r"made with Own\(alpha=0\.5\), which cannot be made again .*integrator="):
+    with refused(vp.InputError, "Own(alpha=0.5)", "integrator="):
         vp.linearize(scene, foreign)
     np.testing.assert_array_equal(vp.linearize(scene, foreign, integrator=Own()).A, vp.linearize(scene, motion).A)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
@@ -305,29 +306,29 @@ def test_what_does_not_know_inputs_refuses_them():
         lambda: vp.simulate(scene, q, v, dt=0.01, steps=3, controls=held),
     ]
     for attempt in tries:
-        with pytest.raises(vp.InputError, match="does not take scenes with a KinematicInput"):
+        with refused(vp.InputError, "KinematicInput"):
             attempt()
     cost = vp.ControlCost(1.0)
     for options in ({"hold": 3}, {"controls": "linear"}):
-        with pytest.raises(vp.InputError, match="leave hold and controls='linear' out"):
+        with refused(vp.InputError, "hold", "controls='linear'"):
             vp.OptimalControlProblem(scene, cost, q, v, dt=0.01, steps=3, **options)
     smooth = vp.Scene(robot, constraints=[loop, vp.KinematicInput("joint1", "cubic")])
-    with pytest.raises(vp.InputError, match="plans take no cubic KinematicInput"):
+    with refused(vp.InputError, "KinematicInput", "cubic"):
         vp.OptimalControlProblem(smooth, cost, q, v, dt=0.01, steps=3)
-    with pytest.raises(vp.InputError, match="interpolation must be 'linear' or 'cubic', got 'spline'"):
+    with refused(vp.InputError, "interpolation", "'linear'", "'cubic'", "'spline'"):
         vp.Scene(robot, constraints=vp.KinematicInput("joint1", "spline"))
     two = [loop, hand, vp.KinematicInput("joint2")]
-    with pytest.raises(vp.InputError, match=r"KinematicInput\(joint='joint2'\) moves a joint that .* move already"):
+    with refused(vp.InputError, "KinematicInput(joint='joint2')"):
         vp.simulate(vp.Scene(robot, constraints=two), q, v, dt=0.01, steps=3)
-    with pytest.raises(vp.InputError, match="does not take scenes with constraints"):
+    with refused(vp.InputError, "constraints"):
         vp.simulate(scene, q, v, dt=0.01, steps=3, integrator=vp.RungeKutta4())
     noisy = vp.Scene(robot, constraints=[loop, hand], noise=vp.ControlNoise(0.1))
-    with pytest.raises(vp.InputError, match="depends on the controls does not go with a KinematicInput"):
+    with refused(vp.InputError, "KinematicInput"):
         vp.simulate(noisy, q, v, dt=0.01, steps=3, rng=0)
     for actuation in (["joint2"], 2.0 * np.eye(3), np.ones((3, 1))):
-        with pytest.raises(vp.InputError, match="needs a control of its own"):
+        with refused(vp.InputError, "control"):
             vp.Scene(robot, constraints=hand, actuation=actuation)
-    with pytest.raises(vp.InputError, match="both a PositionServo and a KinematicInput"):
+    with refused(vp.InputError, "PositionServo", "KinematicInput"):
         vp.Scene(robot, constraints=hand, forces=[vp.PositionServo({"joint1": 10.0}, {"joint1": 1.0})])
     with pytest.raises(vp.UnknownJoint):
         vp.Scene(robot, constraints=vp.KinematicInput("joint9"))
@@ -376,7 +377,7 @@ def test_a_file_with_costs_is_simulated_and_solved(tmp_path):
     assert plan.status.converged
     np.testing.assert_allclose(plan.trajectory.q[-1], [3.5, -0.3584], atol=0.01)
     path.write_text(text + "{ joint1 = 180.0 }\n")
-    with pytest.raises(vp.SceneFileError, match="180 of 'joint1' looks like degrees"):
+    with refused(vp.SceneFileError, "180", "'joint1'"):
         vp.load_scene(path)
 
 

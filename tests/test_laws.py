@@ -5,6 +5,7 @@ import logging
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import fsolve
@@ -304,7 +305,7 @@ def test_torque_limits_of_an_arm_with_a_far_goal_are_no_alarm():
 
 @pytest.mark.parametrize("kd", [1e3, 1e5, 1e6])
 def test_a_loop_that_ends_within_a_few_periods_is_named(kd):
-    with pytest.raises(vp.StepFailure, match="control loop may be unstable") as caught:
+    with refused(vp.StepFailure, "unstable") as caught:
         vp.simulate(
             vp.Scene(vp.planar_chain(2)), [0, 0], [0, 0], dt=5e-3, steps=400, controls=spring_and_damper(1e5, kd)
         )
@@ -512,7 +513,7 @@ def test_the_sentence_says_what_to_do(caplog):
 
 def test_a_step_that_fails_says_why():
     scene = vp.Scene(vp.planar_chain(1), gravity=False)
-    with pytest.raises(vp.StepFailure, match="unstable at its period") as caught:
+    with refused(vp.StepFailure, "period") as caught:
         vp.simulate(scene, [0], [0], dt=5e-3, steps=2000, controls=spring_and_damper(1e4, 300.0))
     assert "unstable" in caught.value.trajectory.warnings[0]
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin.control.backward import Along, _one_pass
@@ -169,7 +170,7 @@ def test_saved_and_read_again(tmp_path) -> None:
     again = vp.Solution.load(plan.save(tmp_path / "plan.npz"), problem)
     np.testing.assert_array_equal(again.controls, plan.controls)
     np.testing.assert_array_equal(again.previous_gains, plan.previous_gains)
-    with pytest.raises(vp.VarpinError, match="controls"):
+    with refused(vp.FileError, "controls", "linear", "held"):
         vp.Solution.load(tmp_path / "plan.npz", problem.at(controls="held"))
     path = plan.trajectory.save(tmp_path / "motion.npz")
     np.testing.assert_array_equal(vp.Trajectory.load(path).u_nodes, plan.controls)
@@ -178,35 +179,35 @@ def test_saved_and_read_again(tmp_path) -> None:
 
 
 def test_refusals() -> None:
-    with pytest.raises(vp.InputError, match="controls must be 'held' or 'linear'"):
+    with refused(vp.InputError, "controls", "'held'", "'linear'"):
         links(controls="cubic")
-    with pytest.raises(vp.InputError, match="hold"):
+    with refused(vp.InputError, "hold"):
         links(hold=2)
     scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(0.1))
-    with pytest.raises(vp.InputError, match="noise"):
+    with refused(vp.InputError, "noise"):
         vp.OptimalControlProblem(scene, vp.ControlCost(1.0), [0, 0], [0, 0], dt=0.1, steps=2, controls="linear")
     problem = links()
     plan = vp.solve(problem, check=False)
-    with pytest.raises(vp.InputError, match="second_order"):
+    with refused(vp.InputError, "second_order"):
         vp.solve(links(integrator=vp.Midpoint()), second_order=True)
-    with pytest.raises(vp.InputError, match="held"):
+    with refused(vp.InputError, "held"):
         vp.Mpc(problem)
-    with pytest.raises(vp.InputError, match="shifted"):
+    with refused(vp.InputError, "shifted"):
         plan.shifted(1)
-    with pytest.raises(vp.InputError, match="are linear"):
+    with refused(vp.InputError, "linear"):
         vp.solve(problem.at(controls="held"), plan)
-    with pytest.raises(vp.InputError, match="before"):
+    with refused(vp.InputError, "before"):
         vp.LinearPolicy(np.zeros((2, 1)), np.zeros((2, 1, 2)), np.zeros((2, 2)), linear=True)
-    with pytest.raises(vp.InputError, match="noise"):
+    with refused(vp.InputError, "noise"):
         vp.simulate(scene, [0, 0], [0, 0], dt=0.1, steps=N, controls=plan.policy, rng=0)
-    with pytest.raises(vp.InputError, match="linear between nodes"):
+    with refused(vp.InputError, "linear"):
         vp.simulate_ensemble(problem.scene, [0, 0], [0, 0], dt=0.1, steps=N, controls=plan.policy, paths=2, rng=0,
                              integrator=problem.integrator)  # fmt: skip
 
 
 def test_monte_carlo_refuses_them_by_name() -> None:
     plan = vp.solve(links(), max_iterations=1, check=False)
-    with pytest.raises(vp.InputError, match="linear between nodes"):
+    with refused(vp.InputError, "linear"):
         plan.monte_carlo(2, rng=0)
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin.linearization import linearize_steps
@@ -283,13 +284,13 @@ def test_users_can_check_their_own_model(integrator):
 def test_what_is_no_covariance_is_refused():
     scene = vp.Scene(vp.planar_chain(1))
     lin = vp.linearize(scene, vp.simulate(scene, [0.1], [0.0], dt=0.01, steps=2))
-    for wrong, words in (
-        (-np.eye(2), "positive semidefinite; .* its least variance -1"),
-        ([[1.0, 2.0], [2.0, 1.0]], "positive semidefinite; .* least eigenvalue is -1,"),
+    for wrong, facts in (
+        (-np.eye(2), ("positive semidefinite", "-1")),
+        ([[1.0, 2.0], [2.0, 1.0]], ("positive semidefinite", "-1")),
         ([[0.0, 1.0], [1.0, 0.0]], "positive semidefinite"),
-        ([[1.0, 0.5], [0.4, 1.0]], "symmetric; .* off by 0.1"),
+        ([[1.0, 0.5], [0.4, 1.0]], ("symmetric", "0.1")),
     ):
-        with pytest.raises(vp.InputError, match=words):
+        with refused(vp.InputError, facts):
             vp.propagate_moments(lin, covariance=wrong)
     # Units of momentum may be tiny beside those of angles, and a matrix of rank one is no less a covariance.
     direction = np.array([1.0, 1e-9])
@@ -301,5 +302,5 @@ def test_what_is_no_covariance_is_refused():
 def test_what_is_no_trajectory_is_refused(motion):
     scene = vp.Scene(vp.planar_chain(1))
     for call in (lambda: vp.linearize(scene, motion), lambda: vp.second_order(scene, motion, np.zeros(2))):
-        with pytest.raises(vp.InputError, match=r"the motion must be a varpin\.Trajectory, got"):
+        with refused(vp.InputError, "motion", "varpin.Trajectory"):
             call()

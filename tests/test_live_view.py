@@ -2,13 +2,13 @@
 
 import itertools
 import logging
-import re
 import time
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from chromium import shape_poses, wait_until
+from refusals import refused
 
 import varpin as vp
 from varpin.model import geometry
@@ -256,27 +256,25 @@ def test_a_browser_is_started_and_waited_for(scene, monkeypatch, caplog, capfd):
     vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
 
 
-def refused(call, message):
-    with pytest.raises(vp.InputError, match=re.escape(message)):
-        call()
-
-
 def test_says_what_does_not_fit(opened, chain, scene):
     view = opened(scene)
     start = {"q0": [0.3, 0.0], "v0": [0.0, 0.0], "dt": 1e-3, "steps": 10}
-    refused(lambda: vp.simulate(scene, **start, progress=view.callback), "of simulate and Mpc.run, give view.progress")
+    with refused(vp.InputError, "view.progress"):
+        vp.simulate(scene, **start, progress=view.callback)
     problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0), [0.0, 0.0], [0.0, 0.0], dt=1e-2, steps=5)
-    refused(lambda: vp.solve(problem, callback=view.progress), "callback must be a function of (iteration), or of")
-    refused(lambda: vp.solve(problem, progress=view.progress), "progress must be a function of (iterations done")
-    longer = vp.Scene(vp.planar_chain(3))
-    refused(
-        lambda: vp.simulate(longer, np.zeros(3), np.zeros(3), dt=1e-3, steps=10, progress=view.progress),
-        "the view is of robot 'chain2' with 2 joints, and the motion of one with 3",
-    )
-    refused(lambda: view.show(np.zeros((3, 2))), "motion must be a trajectory, a plan or a run of an Mpc, got ndarray")
-    refused(lambda: vp.LiveView(chain.model), "a LiveView is of a Robot, a Scene or an OptimalControlProblem")
-    refused(lambda: vp.LiveView(scene, trace="hand"), "has no frame 'hand'")
-    refused(lambda: vp.LiveView(scene, speed=0.0), "speed must be positive")
+    for name in ("callback", "progress"):
+        with refused(vp.InputError, name):
+            vp.solve(problem, **{name: view.progress})
+    with refused(vp.InputError, "'chain2'", "2", "3"):
+        vp.simulate(vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=1e-3, steps=10, progress=view.progress)
+    with refused(vp.InputError, "motion", "ndarray"):
+        view.show(np.zeros((3, 2)))
+    with refused(vp.InputError, "LiveView", "Robot", "Scene", "OptimalControlProblem"):
+        vp.LiveView(chain.model)
+    with refused(vp.InputError, "trace", "'chain2'", "'hand'"):
+        vp.LiveView(scene, trace="hand")
+    with refused(vp.InputError, "speed", "0.0"):
+        vp.LiveView(scene, speed=0.0)
 
 
 def law(t, q, v):
@@ -333,9 +331,7 @@ def test_functions_of_two_arguments_are_told_as_before(scene, capsys):
     vp.simulate(scene, **start, progress=print)
     assert capsys.readouterr().out == "10 10\n"
     for wrong in (lambda done: None, 3):
-        refused(
-            lambda wrong=wrong: vp.simulate(scene, **start, progress=wrong),
-            "progress must be a function of (steps done, steps in all), or of (steps done, steps in all, nodes)",
-        )
+        with refused(vp.InputError, "progress"):
+            vp.simulate(scene, **start, progress=wrong)
     vp.simulate(scene, **(start | {"steps": 0}), progress=lambda done, steps, nodes: told.append(nodes.q))
     np.testing.assert_array_equal(told[-1], [[0.3, 0.0]])

@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import scipy.linalg
+from refusals import refused
 from scipy.integrate import solve_ivp
 from scipy.optimize import root
 from scipy.special import ellipj, ellipk
@@ -293,7 +294,7 @@ def test_stiff_springs_and_dampers(stiffness, damping):
 
 def test_failure_keeps_what_was_done():
     scene = vp.Scene(vp.planar_chain(3))
-    with pytest.raises(vp.StepFailure, match="smaller dt may go further") as caught:
+    with refused(vp.StepFailure, "dt") as caught:
         vp.simulate(
             scene, np.zeros(3), np.zeros(3), dt=1e-2, steps=1000, controls=np.full(3, 1e6), integrator=vp.Midpoint()
         )
@@ -427,30 +428,30 @@ def test_dampers_faster_than_the_step_are_reported(caplog):
 
 
 @pytest.mark.parametrize(
-    ("option", "words"),
+    ("option", "facts"),
     [
-        ({"alpha": 1.5}, r"alpha must be in \[0, 1\], got 1.5"),
-        ({"tolerance": 0.0}, r"tolerance must be positive and finite \[rounding units\], got 0.0"),
-        ({"kick": "right"}, "kick must be 'left' or 'split', got 'right'"),
+        ({"alpha": 1.5}, ("alpha", "[0, 1]", "1.5")),
+        ({"tolerance": 0.0}, ("tolerance", "0.0")),
+        ({"kick": "right"}, ("kick", "'left'", "'split'", "'right'")),
     ],
 )
-def test_options_out_of_range(option, words):
-    with pytest.raises(vp.InputError, match=words):
+def test_options_out_of_range(option, facts):
+    with refused(vp.InputError, facts):
         vp.Midpoint(**option)
 
 
 @pytest.mark.parametrize(
-    ("option", "words"),
+    ("option", "facts"),
     [
-        ({"branch_margin": 1.0}, r"branch_margin must be in \[0, 1\), got 1"),
-        ({"energy_balance": -1.0}, r"energy_balance must be positive and finite \[1\], got -1.0"),
-        ({"energy_budget": np.nan}, r"energy_budget must be positive and finite \[1\], got nan"),
-        ({"max_halvings": 31}, "max_halvings must be at most 30, got 31"),
-        ({"max_halvings": 1.5}, "max_halvings must be an integer, got 1.5"),
+        ({"branch_margin": 1.0}, ("branch_margin", "[0, 1)", "1")),
+        ({"energy_balance": -1.0}, ("energy_balance", "-1.0")),
+        ({"energy_budget": np.nan}, ("energy_budget", "nan")),
+        ({"max_halvings": 31}, ("max_halvings", "30", "31")),
+        ({"max_halvings": 1.5}, ("max_halvings", "1.5")),
     ],
 )
-def test_options_of_a_guard_out_of_range(option, words):
-    with pytest.raises(vp.InputError, match=words):
+def test_options_of_a_guard_out_of_range(option, facts):
+    with refused(vp.InputError, facts):
         vp.Guard(**option)
 
 

@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin.model import geometry, readable_geometry
@@ -152,7 +153,7 @@ def test_shapes_and_locked_joints(tmp_path):
     assert [shape.parentJoint for shape in geometry(locked).geometryObjects] == [0, 0]
     assert len(vp.inspect_robot(path).joints) == 2
     (tmp_path / "tet.obj").unlink()
-    with pytest.raises(vp.RobotError, match=r"meshes of .*arm.xml are not there: link 'a': .*tet.obj$"):
+    with refused(vp.RobotError, "arm.xml", "'a'", "tet.obj"):
         geometry(robot)
     shapes, missing = readable_geometry(robot)
     assert (shapes.ngeoms, missing["a"][0]) == (0, 1)
@@ -181,41 +182,48 @@ def test_what_is_left_out_is_told(tmp_path, caplog, text, words):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "facts"),
     [
-        (
-            one(f'<geom type="mesh" mesh="tet"/>{TIP}', MESH),
-            "body 'a' has no <inertial>, and its mass follows from a mesh",
-        ),
-        (one(MASS + f'<replicate count="2">{TIP}</replicate>'), "has <replicate>, which Pinocchio does not read"),
-        (one(FRAME.format(BOX) + TIP), "a <geom> in a <frame>"),
-        (one(f'{BALL} shellinertia="true"/>{TIP}'), "body 'a': its mass is on the surface of a shape"),
-        (one(compiler='coordinate="global"'), "its places are in world axes"),
-        (one(compiler='settotalmass="10"'), "scaled by settotalmass"),
-        (one(compiler='eulerseq="xy"', place=LEANING), "eulerseq is 'xy', where three of x, y and z belong"),
-        (one(joint='<freejoint name="f"/>'), "joint 'f' is a JointModelFreeFlyer"),
-        (one(joint='<joint name="b" type="ball"/>'), "joint 'b' is a JointModelSpherical"),
-        (one(joint='<joint name="b" type="screw"/>'), "is no MJCF that Pinocchio can read: Unknown joint type"),
-        (one(joint=HINGE.format('class="k"')), "<joint> 'ja': there is no default class 'k'"),
-        (one(joint=HINGE.format('damping="much"')), "<joint> 'ja': its damping is 'much', no 1 or 2 or 3 finite"),
-        (one(MASS + body("b", place='pos="1 0 x"')), "<body> 'b': its pos is '1 0 x', no 3 finite number"),
-        (one(place='pos="1 0 x"'), "<body> 'a': its pos is '1 0 x', no 3 finite number"),
-        (one(place='axisangle="0 0 0 1"'), "<body> 'a': the axis of its axisangle is 0"),
-        (one(MASS.replace("1.3", "nan") + TIP), "its mass is 'nan'"),
-        (one('<inertial pos="0 0 0" mass="1"/>' + TIP), "body 'a': its <inertial> has no mass, or neither"),
-        (one(MASS + body("b", joint=HINGE.format(""))), "several joints named 'ja'"),
-        (one(MASS + '<include file="arm.xml"/>'), "arm.xml includes itself"),
-        (one()[:-10] + "</mujoco>", "is not a URDF: it is not well-formed XML"),
-        ("<mujoco/>", "has no joint that moves"),
+        (one(f'<geom type="mesh" mesh="tet"/>{TIP}', MESH), ("'a'", "<inertial>", "mesh")),
+        (one(MASS + f'<replicate count="2">{TIP}</replicate>'), "<replicate>"),
+        (one(FRAME.format(BOX) + TIP), ("<geom>", "<frame>")),
+        (one(f'{BALL} shellinertia="true"/>{TIP}'), "'a'"),
+        (one(compiler='coordinate="global"'), "world"),
+        (one(compiler='settotalmass="10"'), "settotalmass"),
+        (one(compiler='eulerseq="xy"', place=LEANING), ("eulerseq", "'xy'")),
+        (one(joint='<joint name="b" type="screw"/>'), "joint"),
+        (one(joint=HINGE.format('class="k"')), ("<joint> 'ja'", "'k'")),
+        (one(joint=HINGE.format('damping="much"')), ("<joint> 'ja'", "damping", "'much'")),
+        (one(MASS + body("b", place='pos="1 0 x"')), ("<body> 'b'", "pos", "'1 0 x'", "3")),
+        (one(place='pos="1 0 x"'), ("<body> 'a'", "pos", "'1 0 x'", "3")),
+        (one(place='axisangle="0 0 0 1"'), ("<body> 'a'", "axisangle")),
+        (one(MASS.replace("1.3", "nan") + TIP), ("mass", "'nan'")),
+        (one('<inertial pos="0 0 0" mass="1"/>' + TIP), ("'a'", "<inertial>", "mass")),
+        (one(MASS + body("b", joint=HINGE.format(""))), "'ja'"),
+        (one(MASS + '<include file="arm.xml"/>'), ("arm.xml", "itself")),
+        (one()[:-10] + "</mujoco>", "XML"),
+        ("<mujoco/>", "joint"),
     ],
 )
-def test_bad_files_give_one_error(tmp_path, text, words):
-    with pytest.raises(vp.RobotError, match=words):
+def test_bad_files_give_one_error(tmp_path, text, facts):
+    with refused(vp.RobotError, facts):
         vp.load_robot(written(tmp_path, text))
 
 
+@pytest.mark.parametrize(
+    ("joint", "facts"),
+    [
+        ('<freejoint name="f"/>', ("'f'", "JointModelFreeFlyer")),
+        ('<joint name="b" type="ball"/>', ("'b'", "JointModelSpherical")),
+    ],
+)
+def test_joints_of_several_coordinates(tmp_path, joint, facts):
+    with refused(vp.UnsupportedJoint, facts):
+        vp.load_robot(written(tmp_path, one(joint=joint)))
+
+
 def test_file_that_is_not_there(tmp_path):
-    with pytest.raises(vp.FileError, match=r"cannot read .*lost.xml"):
+    with refused(vp.FileError, "lost.xml"):
         vp.load_robot(written(tmp_path, one(MASS + '<include file="lost.xml"/>')))
 
 
@@ -226,7 +234,7 @@ def test_urdf_of_another_suffix_and_sdf(tmp_path, load):
     assert [inertia.mass for inertia in vp.load_robot(path).model.inertias] == [i.mass for i in expected.inertias]
     for name in ("arm.sdf", "arm.xml"):
         (tmp_path / name).write_text('<sdf version="1.6"><model name="a"/></sdf>')
-        with pytest.raises(vp.RobotError, match="is an SDF file, which Pinocchio's package on PyPI cannot read"):
+        with refused(vp.RobotError, "SDF"):
             vp.load_robot(tmp_path / name)
 
 

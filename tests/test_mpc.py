@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from mechanisms import slider
+from refusals import refused
 
 import varpin as vp
 import varpin.control.mpc
@@ -338,19 +339,19 @@ def test_what_is_told_of_an_early_end_is_in_the_time_of_the_run():
 def test_mistakes_are_named():
     problem = tracking()
     other = vp.Plant(vp.Scene(vp.planar_chain(2)))
-    for make, words in (
-        (lambda: vp.Mpc("x"), "problem must be an OptimalControlProblem, got str"),
-        (lambda: vp.Mpc(problem, iterations=0), "iterations must be"),
-        (lambda: vp.Mpc(problem, budget=-1.0), "budget must be positive"),
-        (lambda: vp.Mpc(problem).run(other, duration=1.0), "the plant has joints"),
-        (lambda: vp.Mpc(problem).run(duration=0.04).planned(-0.1), "ahead must be >= 0"),
-        (lambda: vp.Mpc(problem).run(duration=0.04).planned(np.nan), "ahead must be >= 0"),
-        (lambda: vp.Mpc(problem).run(duration=0.0), "duration must be positive"),
-        (lambda: vp.Mpc(problem).plan(0.0, [0.0], np.zeros(3)), "q0 must have shape"),
-        (lambda: vp.Plant(problem.scene, "rk"), "integrator must be one of varpin's"),
-        (lambda: vp.solve(problem, time_limit=0.0), "time_limit must be positive"),
+    for make, facts in (
+        (lambda: vp.Mpc("x"), ("problem", "OptimalControlProblem", "str")),
+        (lambda: vp.Mpc(problem, iterations=0), "iterations"),
+        (lambda: vp.Mpc(problem, budget=-1.0), "budget"),
+        (lambda: vp.Mpc(problem).run(other, duration=1.0), "joints"),
+        (lambda: vp.Mpc(problem).run(duration=0.04).planned(-0.1), ("ahead", "0")),
+        (lambda: vp.Mpc(problem).run(duration=0.04).planned(np.nan), ("ahead", "0")),
+        (lambda: vp.Mpc(problem).run(duration=0.0), "duration"),
+        (lambda: vp.Mpc(problem).plan(0.0, [0.0], np.zeros(3)), "q0"),
+        (lambda: vp.Plant(problem.scene, "rk"), "integrator"),
+        (lambda: vp.solve(problem, time_limit=0.0), "time_limit"),
     ):
-        with pytest.raises(vp.InputError, match=words):
+        with refused(vp.InputError, facts):
             make()
 
 
@@ -388,7 +389,7 @@ def test_what_plan_and_motion_have_in_common_is_told_once():
 
 
 def test_a_scene_is_no_plant():
-    with pytest.raises(vp.InputError, match=r"plant must be a varpin.Plant, for example varpin.Plant\(scene\)"):
+    with refused(vp.InputError, "plant", "varpin.Plant"):
         vp.Mpc(tracking()).run(tracking().scene, duration=0.1)
 
 
@@ -421,7 +422,7 @@ def test_a_problem_at_another_time_and_state_is_that_of_its_grid(cost):
     for name in ("q0", "v0", "t0", "dt", "steps", "control_limits"):
         np.testing.assert_array_equal(getattr(own, name), getattr(made, name))
     assert not own.q0.flags.writeable
-    with pytest.raises(vp.InputError, match="q0"):
+    with refused(vp.InputError, "q0"):
         own.at(q0=[0.1])
-    with pytest.raises(vp.InputError, match="t0"):
+    with refused(vp.InputError, "t0"):
         own.at(t0="now")

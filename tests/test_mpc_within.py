@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 
@@ -89,14 +90,14 @@ def test_obstacles_are_where_they_are_at_each_time():
 
 def test_ways_of_obstacles_are_checked():
     ball = vp.Obstacle.sphere([1.0, 0.0, 0.0], 0.1, name="ball")
-    with pytest.raises(vp.InputError, match="a function of time"):
+    with refused(vp.InputError, "function"):
         ball.moving([0.0, 0.0, 1.0])
     moving = ball.moving(lambda t: [0.0, 0.0])
-    with pytest.raises(vp.InputError, match="moves already"):
+    with refused(vp.InputError, "moves already"):
         moving.moving(lambda t: [0.0, 0.0, 0.0])
-    with pytest.raises(vp.InputError, match=r"way of obstacle 'ball' at t = 0.03 s"):
+    with refused(vp.InputError, "'ball'", "0.03"):
         tracking([vp.KeepClear(ROBOT, [moving], capsules=ARM)])
-    with pytest.raises(vp.InputError, match=r"center at t = .*finite"):
+    with refused(vp.InputError, "center", "finite"):
         tracking([vp.KeepOutOfSphere(ROBOT, "tip", lambda t: [np.nan, 0.0, 0.0], 0.1)])
 
 

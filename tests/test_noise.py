@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin.mechanics.noise import bind
@@ -161,42 +162,42 @@ def test_state_noise_is_centred_on_the_start_of_the_motion():
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "facts"),
     [
-        (lambda: vp.AdditiveNoise([1.0, 2.0]), r"AdditiveNoise intensity must be .* shape \(3,\), got \(2,\)"),
-        (lambda: vp.AdditiveNoise(np.ones((2, 4))), r"AdditiveNoise intensity must have shape \(3, 4\), got \(2, 4\)"),
-        (lambda: vp.AdditiveNoise(np.ones((3, 1, 1))), r"AdditiveNoise intensity must be .* got \(3, 1, 1\)"),
-        (lambda: vp.AdditiveNoise([1.0, np.nan, 0.0]), r"AdditiveNoise intensity\[1\] is nan; it must be finite"),
-        (lambda: vp.AdditiveNoise(np.inf), "AdditiveNoise intensity is inf; it must be finite"),
-        (lambda: vp.AdditiveNoise("strong"), "AdditiveNoise intensity must be an array of real numbers"),
-        (lambda: vp.AdditiveNoise(1j), "AdditiveNoise intensity must be an array of real numbers"),
-        (lambda: vp.AdditiveNoise(None), "AdditiveNoise intensity must be an array of real numbers"),
-        (lambda: vp.ControlNoise([1.0, 2.0, 3.0]), r"ControlNoise intensity must be .* shape \(2,\), got \(3,\)"),
-        (lambda: vp.ControlNoise(np.ones((3, 4, 3))), r"ControlNoise intensity must have shape \(3, 4, 2\), got"),
-        (lambda: vp.ControlNoise([[1.0]]), r"ControlNoise intensity must be one number .* got \(1, 1\)"),
-        (lambda: vp.ControlNoise(np.full((3, 1, 2), np.nan)), r"ControlNoise intensity\[0, 0, 0\] is nan"),
-        (lambda: vp.StateNoise(np.ones(4)), r"StateNoise intensity must be .* shape \(3,\), got \(4,\)"),
-        (lambda: vp.AdditiveNoise(np.nan), "AdditiveNoise intensity is nan; it must be finite"),
-        (lambda: vp.ControlNoise(np.nan), "ControlNoise intensity is nan; it must be finite"),
-        (lambda: vp.StateNoise(np.nan), "StateNoise intensity is nan; it must be finite"),
-        (lambda: vp.StateNoise([1.0, 0.0, np.nan]), r"StateNoise intensity\[2\] is nan; it must be finite"),
-        (lambda: vp.StateNoise(1.0, center=np.nan), "StateNoise center is nan; it must be finite"),
-        (lambda: vp.StateNoise(1.0, center=[0.0, 1.0]), r"StateNoise center must be .* shape \(3,\), got \(2,\)"),
-        (lambda: vp.StateNoise(1.0, center=[0.0, np.inf, 0.0]), r"StateNoise center\[1\] is inf; it must be finite"),
-        (lambda: 3.0, "noise must be a varpin noise model or several of them, got float"),
-        (lambda: "additive", "noise must be a varpin noise model or several of them, got str"),
-        (lambda: vp.AdditiveNoise, "noise must be a varpin noise model or several of them, got"),
-        (lambda: [vp.AdditiveNoise(1.0), 0.5], "noise must be a varpin noise model or several of them, got float"),
-        (lambda: vp.AdditiveNoise(1.0) + vp.StateNoise(np.ones(4)), "StateNoise intensity must be one number"),
-        (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), -1), "CustomNoise processes must be at least 0, got -1"),
-        (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), 3.0), "CustomNoise processes must be an integer, got 3.0"),
-        (lambda: vp.CustomNoise(np.eye(3), 3), r"CustomNoise field must be a function of \(q, v, u\), got array"),
-        (lambda: vp.CustomNoise(None, 3), r"CustomNoise field must be a function of \(q, v, u\), got None"),
-        (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), 3, dv=0.0), "CustomNoise dv must be a function"),
+        (lambda: vp.AdditiveNoise([1.0, 2.0]), ("AdditiveNoise intensity", "(3,)", "(2,)")),
+        (lambda: vp.AdditiveNoise(np.ones((2, 4))), ("AdditiveNoise intensity", "(3, 4)", "(2, 4)")),
+        (lambda: vp.AdditiveNoise(np.ones((3, 1, 1))), ("AdditiveNoise intensity", "(3, 1, 1)")),
+        (lambda: vp.AdditiveNoise([1.0, np.nan, 0.0]), ("AdditiveNoise intensity[1]", "nan")),
+        (lambda: vp.AdditiveNoise(np.inf), ("AdditiveNoise intensity", "inf")),
+        (lambda: vp.AdditiveNoise("strong"), "AdditiveNoise intensity"),
+        (lambda: vp.AdditiveNoise(1j), "AdditiveNoise intensity"),
+        (lambda: vp.AdditiveNoise(None), "AdditiveNoise intensity"),
+        (lambda: vp.ControlNoise([1.0, 2.0, 3.0]), ("ControlNoise intensity", "(2,)", "(3,)")),
+        (lambda: vp.ControlNoise(np.ones((3, 4, 3))), ("ControlNoise intensity", "(3, 4, 2)")),
+        (lambda: vp.ControlNoise([[1.0]]), ("ControlNoise intensity", "(1, 1)")),
+        (lambda: vp.ControlNoise(np.full((3, 1, 2), np.nan)), ("ControlNoise intensity[0, 0, 0]", "nan")),
+        (lambda: vp.StateNoise(np.ones(4)), ("StateNoise intensity", "(3,)", "(4,)")),
+        (lambda: vp.AdditiveNoise(np.nan), ("AdditiveNoise intensity", "nan")),
+        (lambda: vp.ControlNoise(np.nan), ("ControlNoise intensity", "nan")),
+        (lambda: vp.StateNoise(np.nan), ("StateNoise intensity", "nan")),
+        (lambda: vp.StateNoise([1.0, 0.0, np.nan]), ("StateNoise intensity[2]", "nan")),
+        (lambda: vp.StateNoise(1.0, center=np.nan), ("StateNoise center", "nan")),
+        (lambda: vp.StateNoise(1.0, center=[0.0, 1.0]), ("StateNoise center", "(3,)", "(2,)")),
+        (lambda: vp.StateNoise(1.0, center=[0.0, np.inf, 0.0]), ("StateNoise center[1]", "inf")),
+        (lambda: 3.0, ("noise", "float")),
+        (lambda: "additive", ("noise", "str")),
+        (lambda: vp.AdditiveNoise, "noise"),
+        (lambda: [vp.AdditiveNoise(1.0), 0.5], ("noise", "float")),
+        (lambda: vp.AdditiveNoise(1.0) + vp.StateNoise(np.ones(4)), "StateNoise intensity"),
+        (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), -1), ("CustomNoise processes", "-1")),
+        (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), 3.0), ("CustomNoise processes", "3.0")),
+        (lambda: vp.CustomNoise(np.eye(3), 3), ("CustomNoise field", "array")),
+        (lambda: vp.CustomNoise(None, 3), ("CustomNoise field", "None")),
+        (lambda: vp.CustomNoise(lambda q, v, u: np.eye(3), 3, dv=0.0), "CustomNoise dv"),
     ],
 )
-def test_parameters_that_do_not_fit(make, message):
-    with pytest.raises(vp.InputError, match=message):
+def test_parameters_that_do_not_fit(make, facts):
+    with refused(vp.InputError, facts):
         vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=make())
 
 
@@ -216,10 +217,7 @@ def test_a_wrong_derivative_is_named(wrong):
         return values
 
     noise = vp.CustomNoise(right.field, 3, **{**slots, wrong: off}, check=True)
-    message = (
-        rf"CustomNoise {wrong}\(q, v, u\)\[:, :, 1\] differs from central differences of the field by 0.001 at q ="
-    )
-    with pytest.raises(vp.InputError, match=message):
+    with refused(vp.InputError, f"CustomNoise {wrong}(q, v, u)[:, :, 1]", "0.001"):
         vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=noise)
     unchecked = vp.CustomNoise(right.field, 3, **{**slots, wrong: off})
     assert vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=unchecked).processes == 3
@@ -229,47 +227,44 @@ def test_a_wrong_derivative_is_named(wrong):
 def test_a_derivative_left_out_is_found_missing(missing):
     right = own_noise()
     slots = {name: getattr(right, name) for name in ("dq", "dv", "du") if name != missing}
-    with pytest.raises(vp.InputError, match=rf"CustomNoise {missing}\(q, v, u\)\[:, :, 0\] differs from central"):
+    with refused(vp.InputError, f"CustomNoise {missing}(q, v, u)[:, :, 0]"):
         vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=vp.CustomNoise(right.field, 3, **slots, check=True))
 
 
 @pytest.mark.parametrize(
-    ("slots", "message"),
+    ("slots", "facts"),
     [
-        ({"field": lambda q, v, u: np.eye(3)}, r"CustomNoise field\(q, v, u\) must have shape \(2, 2\), got \(3, 3\)"),
-        ({"field": lambda q, v, u: q}, r"CustomNoise field\(q, v, u\) must have shape \(2, 2\), got \(2,\)"),
-        ({"field": lambda q, v, u: [[1, 0], [0, np.nan]]}, r"CustomNoise field\(q, v, u\)\[1, 1\] is nan; it must be"),
-        ({"field": lambda q, v, u: None}, r"CustomNoise field\(q, v, u\) must be an array of real numbers, got None"),
-        (
-            {"dq": lambda q, v, u: np.zeros((2, 2))},
-            r"CustomNoise dq\(q, v, u\) must have shape \(2, 2, 2\), got \(2, 2\)",
-        ),
-        ({"dv": lambda q, v, u: np.full((2, 2, 2), np.inf)}, r"CustomNoise dv\(q, v, u\)\[0, 0, 0\] is inf"),
-        ({"du": lambda q, v, u: np.zeros((2, 2, 5))}, r"CustomNoise du\(q, v, u\) must have shape \(2, 2, 2\), got"),
+        ({"field": lambda q, v, u: np.eye(3)}, ("CustomNoise field(q, v, u)", "(2, 2)", "(3, 3)")),
+        ({"field": lambda q, v, u: q}, ("CustomNoise field(q, v, u)", "(2, 2)", "(2,)")),
+        ({"field": lambda q, v, u: [[1, 0], [0, np.nan]]}, ("CustomNoise field(q, v, u)[1, 1]", "nan")),
+        ({"field": lambda q, v, u: None}, ("CustomNoise field(q, v, u)", "None")),
+        ({"dq": lambda q, v, u: np.zeros((2, 2))}, ("CustomNoise dq(q, v, u)", "(2, 2, 2)", "(2, 2)")),
+        ({"dv": lambda q, v, u: np.full((2, 2, 2), np.inf)}, ("CustomNoise dv(q, v, u)[0, 0, 0]", "inf")),
+        ({"du": lambda q, v, u: np.zeros((2, 2, 5))}, ("CustomNoise du(q, v, u)", "(2, 2, 2)", "(2, 2, 5)")),
     ],
 )
-def test_what_a_field_returns_is_checked(slots, message):
+def test_what_a_field_returns_is_checked(slots, facts):
     """With the check when the scene is made, and without it when the motion needs the field."""
     slots = {"field": lambda q, v, u: np.eye(2), "processes": 2} | slots
-    with pytest.raises(vp.InputError, match=message):
+    with refused(vp.NoiseFieldError, facts):
         chain(vp.CustomNoise(**slots, check=True))
     scene = chain(vp.CustomNoise(**slots))
-    with pytest.raises(NoiseError, match=rf"step 0 \(t = 0 s\): {message}"):
+    with refused(NoiseError, "step 0", "t = 0 s", facts):
         vp.simulate(scene, [0, 0], [0, 0], dt=0.01, steps=3, rng=0)
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Midpoint(kick="split"), vp.RungeKutta4()], ids=str)
 @pytest.mark.parametrize("slot", ["field", "dv"])
 @pytest.mark.parametrize(
-    ("value", "message"),
+    ("value", "facts"),
     [
-        (np.eye(5), r"must have shape \(2, 2.*\), got \(5, 5\)"),
-        (None, "must be an array of real numbers, got None"),
-        ("nan", r"\[0, 0.*\] is nan; it must be finite"),
-        (ZeroDivisionError("no field"), r"raised ZeroDivisionError\('no field'\)"),
+        (np.eye(5), ("shape", "(5, 5)")),
+        (None, "None"),
+        ("nan", ("nan", "finite")),
+        (ZeroDivisionError("no field"), "ZeroDivisionError('no field')"),
     ],
 )
-def test_a_field_that_fails_on_the_way_leaves_the_motion_so_far(integrator, slot, value, message):
+def test_a_field_that_fails_on_the_way_leaves_the_motion_so_far(integrator, slot, value, facts):
     good = {"field": np.eye(2) * 0.1, "dv": np.zeros((2, 2, 2))}
     calls = []
 
@@ -290,9 +285,7 @@ def test_a_field_that_fails_on_the_way_leaves_the_motion_so_far(integrator, slot
     whole = vp.simulate(scene, [0.3, 0.2], [0, 1], **options)
     failing = True
     calls.clear()
-    with pytest.raises(
-        NoiseError, match=rf"step 7 \(t = 0.07 s\): CustomNoise {slot}\(q, v, u\).*{message}; what"
-    ) as info:
+    with refused(NoiseError, "step 7", "t = 0.07 s", f"CustomNoise {slot}(q, v, u)", facts) as info:
         vp.simulate(scene, [0.3, 0.2], [0, 1], **options)
     error = info.value
     assert isinstance(error, vp.VarpinError)
@@ -322,7 +315,7 @@ def test_a_field_that_raises_is_named_when_it_is_checked():
     def field(q, v, u):
         raise ZeroDivisionError("no field")
 
-    with pytest.raises(vp.InputError, match=r"CustomNoise field\(q, v, u\) raised ZeroDivisionError\('no field'\)"):
+    with refused(vp.NoiseFieldError, "CustomNoise field", "ZeroDivisionError('no field')"):
         chain(vp.CustomNoise(field, 2, check=True))
 
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 
@@ -62,7 +63,7 @@ def test_robots_that_peers_are_not_built_for_are_refused(peers, case):
     pytest.importorskip("mujoco", reason="pip install 'varpin[peers]'")
     model = case.scene.robot.model.copy()
     model.armature = np.full(6, 0.1)
-    with pytest.raises(ValueError, match="has armature"):
+    with refused(ValueError, "armature"):
         peers.require_same(dataclasses.replace(case, scene=vp.Scene(vp.load_robot(model))))
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
@@ -174,9 +175,9 @@ def test_rounds_go_on_where_they_stopped(tmp_path):
         assert rest.gains.tobytes() == whole.gains.tobytes()
         assert rest.multipliers.values.tobytes() == whole.multipliers.values.tobytes()
         assert [item.index for item in rest.history] == list(range(len(whole.history)))
-    with pytest.raises(vp.FileError, match="constraints = "):
+    with refused(vp.FileError, "constraints"):
         vp.Solution.load(path, two_links(FAMILIES["velocities"], steps=20))
-    with pytest.raises(vp.InputError, match="other constraints"):
+    with refused(vp.InputError, "constraints"):
         vp.solve(two_links(FAMILIES["velocities"], steps=20), resume=whole)
 
 
@@ -244,21 +245,21 @@ def test_penalties_gradient():
 
 def test_what_is_refused():
     other = vp.planar_chain(3)
-    with pytest.raises(vp.InputError, match=r"belong to varpin.Scene"):
+    with refused(vp.InputError, "varpin.Scene"):
         two_links([vp.JointTie("joint1", "joint2")])
-    with pytest.raises(vp.InputError, match="another one than the problem's"):
+    with refused(vp.InputError, "robot"):
         two_links([vp.WithinJointLimits(other, (-1, 1))])
-    with pytest.raises(vp.InputError, match="no such limits"):
+    with refused(vp.InputError, "limits"):
         vp.WithinVelocityLimits(ROBOT)
-    with pytest.raises(vp.InputError, match="a position, a rotation or both"):
+    with refused(vp.InputError, "position", "rotation"):
         vp.ReachFrame(ROBOT, "tip")
-    with pytest.raises(vp.InputError, match="must be a rotation matrix"):
+    with refused(vp.InputError, "rotation matrix"):
         vp.ReachFrame(ROBOT, "tip", rotation=2.0 * np.eye(3))
     with pytest.raises(vp.UnknownFrame):
         vp.KeepInBox(ROBOT, "hand", 0, 1)
-    with pytest.raises(vp.InputError, match="limit must be > 0"):
+    with refused(vp.InputError, "limit", "0"):
         vp.WithinControlRate(0.0)
-    with pytest.raises(vp.InputError, match="margin must be >= 0"):
+    with refused(vp.InputError, "margin", "0"):
         vp.WithinJointLimits(ROBOT, (-1, 1), margin=-1.0)
 
 
@@ -483,10 +484,10 @@ def test_scene_files(tmp_path):
     assert (plane.offset, sphere.radius) == (0.05, 0.1)
     assert isinstance(joints, vp.WithinJointLimits)
     path.write_text(SCENE.replace('"forearm_link"', '"forearm"'), encoding="utf-8")
-    with pytest.raises(vp.SceneFileError, match=r"plan_constraint\[3\].*no frame 'forearm'"):
+    with refused(vp.SceneFileError, "plan_constraint[3]", "'forearm'"):
         vp.load_scene(path)
     path.write_text(SCENE.replace("limit = 500.0", "limt = 500.0"), encoding="utf-8")
-    with pytest.raises(vp.SceneFileError, match=r"plan_constraint\[1\].limt"):
+    with refused(vp.SceneFileError, "plan_constraint[1].limt"):
         vp.load_scene(path)
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin.control.examination import findings, replayed
@@ -65,7 +66,7 @@ def test_second_order_under_defaults():
 
 
 def test_explicit_methods_have_no_second_order():
-    with pytest.raises(vp.InputError, match="no second-order linearization; variational integrators have"):
+    with refused(vp.InputError, "second-order"):
         vp.solve(reach(vp.planar_chain(2), 0, steps=5, integrator=vp.RungeKutta4()), second_order=True)
 
 

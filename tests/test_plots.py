@@ -9,6 +9,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from refusals import refused
 
 import varpin as vp
 from varpin import plots
@@ -111,7 +112,7 @@ def test_controls_that_are_no_joints_have_their_own_names():
     assert axes.get_ylabel() == "control [units of each]"
     _, axes = plots.plot_controls(trajectory, labels=["shoulder", "wrist"])
     assert list(drawn(axes)) == ["shoulder", "wrist"]
-    with pytest.raises(vp.InputError, match="labels must be 2, one a control, got 3"):
+    with refused(vp.InputError, "labels", "2", "3"):
         plots.plot_controls(trajectory, labels=["a", "b", "c"])
 
 
@@ -135,7 +136,7 @@ def test_controls_of_joints_moved_by_hand_are_positions_and_velocities():
 def test_torques_of_joints_moved_by_hand_are_no_controls(tmp_path):
     scene = vp.Scene(vp.planar_chain(2), constraints=vp.KinematicInput("joint1"))
     motion = vp.simulate(scene, [0.3, 0.3], [0, 0], dt=0.02, steps=3)
-    with pytest.raises(vp.InputError, match="moved by hand"):
+    with refused(vp.InputError, "moved by hand"):
         vp.replay(scene.robot, motion, torques=True, html=tmp_path / "hand.html")
 
 
@@ -179,7 +180,7 @@ def test_energy_error_in_joules_or_relative_to_the_initial_energy():
 def test_nothing_is_relative_to_no_energy():
     robot = vp.planar_chain(1)
     still = vp.simulate(vp.Scene(robot, gravity=False), [0.0], [0.0], dt=0.01, steps=2)
-    with pytest.raises(vp.InputError, match="the initial energy is 0 J"):
+    with refused(vp.InputError, "energy", "0 J"):
         plots.plot_energy_error(still, relative=True)
 
 
@@ -216,13 +217,13 @@ def test_overview_on_axes_given():
     assert list(axes) == list(grid.ravel())
     assert axes[0].get_legend() is not None
     assert not mine.legends
-    with pytest.raises(vp.InputError, match=r"axes must be 4 .* got 3"):
+    with refused(vp.InputError, "axes", "4", "3"):
         plots.plot_trajectory(trajectory, axes=list(grid.ravel()[:3]))
 
 
 def test_robot_of_another_motion_is_refused():
     _, trajectory = swing(links=2)
-    with pytest.raises(vp.InputError, match="has joints joint1, joint2, joint3; the trajectory has joint1, joint2"):
+    with refused(vp.InputError, "joint1, joint2, joint3"):
         plots.plot_joints(trajectory, robot=vp.planar_chain(3))
 
 

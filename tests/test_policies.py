@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 
@@ -60,16 +61,16 @@ def test_a_plan_runs_at_finer_steps_as_it_is():
 
 
 def test_steps_that_do_not_fit_are_refused_with_what_does():
-    with pytest.raises(vp.InputError, match=r"decides every 0\.02 s, and dt = 0\.003 s does not .* 0\.00285714 s does"):
+    with refused(vp.InputError, "0.02 s", "0.003 s", "0.00285714 s"):
         run(policy(), 0.003, 70)
     # As many steps as it has intervals, but longer ones: nothing told of it before.
-    with pytest.raises(vp.InputError, match=r"dt = 0\.04 s does not go into that: dt = 0\.02 s does"):
+    with refused(vp.InputError, "0.04 s", "0.02 s"):
         run(policy(), 0.04, INTERVALS)
-    with pytest.raises(vp.InputError, match="each held over 2 steps: for 20 steps, not 10"):
+    with refused(vp.InputError, "2", "20", "10"):
         run(policy(), 0.01, 10)
-    with pytest.raises(vp.InputError, match=r"hold=3 holds each control as long, .* period= \[s\]"):
+    with refused(vp.InputError, "hold=3", "period="):
         run(policy(period=None), 0.01, 3 * INTERVALS)
-    with pytest.raises(vp.InputError, match="period must be positive"):
+    with refused(vp.InputError, "period"):
         policy(period=0.0)
 
 
@@ -84,10 +85,10 @@ def test_laws_and_functions_of_time_may_answer_by_joint_name():
     np.testing.assert_array_equal(law.u, np.column_stack([-law.q[:-1, 0], np.zeros(8)]))
     paths = vp.simulate_ensemble(SCENE, Q0, REST, controls=vp.OpenLoop(pull), paths=1, rng=0, **options)
     np.testing.assert_array_equal(paths.u[0], rows)
-    with pytest.raises(vp.ControlError, match=r"no control is the force of a joint 'join2'; did you mean 'joint2'"):
+    with refused(vp.ControlError, "'join2'", "'joint2'"):
         vp.simulate(SCENE, Q0, REST, controls=vp.OpenLoop(lambda t: {"join2": t}), **options)
     geared = vp.Scene(CHAIN, actuation=2.0 * np.eye(2))
-    with pytest.raises(vp.ControlError, match="given by joint name, but not every control"):
+    with refused(vp.ControlError, "joint name"):
         vp.simulate(geared, Q0, REST, controls=vp.OpenLoop(pull), **options)
 
 
@@ -96,14 +97,14 @@ def test_limits_of_policies_by_name():
     np.testing.assert_array_equal(named.limits, [[-np.inf, -0.5], [1.0, 0.5]])
     given = policy(limits=([-np.inf, -0.5], [1.0, 0.5]))
     np.testing.assert_array_equal(run(named, PERIOD, INTERVALS).q, run(given, PERIOD, INTERVALS).q)
-    with pytest.raises(vp.InputError, match=r"joints=scene\.control_joints"):
+    with refused(vp.InputError, "joints", "scene.control_joints"):
         policy(limits=({"joint2": -0.5}, 1.0))
-    with pytest.raises(vp.UnknownJoint, match="did you mean 'joint2'"):
+    with refused(vp.UnknownJoint, "'joint2'"):
         policy(limits=({"join2": -0.5}, 1.0), joints=SCENE.control_joints)
-    with pytest.raises(vp.InputError, match="joints must name the joint of each of the 2 controls"):
+    with refused(vp.InputError, "joints", "2"):
         policy(joints=["joint1"])
     swapped = policy(joints=["joint2", "joint1"])
-    with pytest.raises(vp.InputError, match="controls are of joints joint2, joint1; the scene's of joint1"):
+    with refused(vp.InputError, "joint2, joint1"):
         run(swapped, PERIOD, INTERVALS)
 
 

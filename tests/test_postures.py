@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import joint, link, mimic, write_urdf
+from refusals import refused, unnamed
 
 import varpin as vp
 
@@ -87,18 +88,16 @@ def test_coordinates_of_a_posture(urdf):
 def test_errors_of_a_call(urdf):
     (urdf.parent / "made_up.srdf").write_text(SRDF)
     robot = vp.load_robot(urdf)
-    with pytest.raises(
-        vp.UnknownPosture, match=r"'hme'; did you mean 'home' or 'there'\? postures: home, there$"
-    ) as caught:
+    with refused(vp.UnknownPosture, "'hme'", "'home'", "'there'") as caught:
         robot.posture("hme")
     assert caught.value.postures == ("home", "there")
-    with pytest.raises(vp.InputError, match="put joint 'j3' in two places: give group=, of arm, hand"):
+    with refused(vp.InputError, "'j3'", "group=", "arm, hand"):
         robot.posture("there")
-    with pytest.raises(vp.InputError, match="one of the groups arm, hand; there is none of group 'leg'"):
+    with refused(vp.InputError, "arm, hand", "'leg'"):
         robot.posture("home", group="leg")
-    with pytest.raises(vp.UnknownJoint, match="j9"):
+    with refused(vp.UnknownJoint, "'j9'"):
         robot.posture("home", others={"j9": 1.0})
-    with pytest.raises(vp.UnknownPosture, match="it has none: give the SRDF file"):
+    with refused(vp.UnknownPosture, "SRDF"):
         vp.load_robot("ur5").posture("home")
 
 
@@ -130,31 +129,31 @@ def test_two_files_for_a_robot_of_its_name_are_none(urdf):
 
 
 BAD = {
-    "no number": (SRDF.replace('"0.5"', '"half"'), "posture 'home': the position of joint 'j1' is 'half', where"),
-    "no value": (SRDF.replace('value="0.5"', ""), "the position of joint 'j1' is '', where a finite number belongs"),
-    "infinite": (SRDF.replace('"0.5"', '"inf"'), "the position of joint 'j1' is 'inf'"),
-    "broken": (SRDF[:-5], "made_up.srdf is not an SRDF: it is not well-formed XML"),
-    "empty": ("", "made_up.srdf is not an SRDF"),
-    "another format": (SRDF.replace("robot", "sdf"), "is not an SRDF: its root element is <sdf>"),
+    "no number": (SRDF.replace('"0.5"', '"half"'), ("'home'", "'j1'", "'half'")),
+    "no value": (SRDF.replace('value="0.5"', ""), ("'j1'", "''")),
+    "infinite": (SRDF.replace('"0.5"', '"inf"'), ("'j1'", "'inf'")),
+    "broken": (SRDF[:-5], ("made_up.srdf", "XML")),
+    "empty": ("", ("made_up.srdf", "XML")),
+    "another format": (SRDF.replace("robot", "sdf"), ("made_up.srdf", "<sdf>")),
 }
 
 
 @pytest.mark.parametrize("kind", BAD)
 def test_bad_files(urdf, caplog, kind):
-    text, words = BAD[kind]
+    text, facts = BAD[kind]
     path = urdf.parent / "made_up.srdf"
     path.write_text(text)
-    with pytest.raises(vp.RobotError, match=words):
+    with refused(vp.RobotError, facts):
         vp.load_robot(urdf, srdf=path)
     # One that nobody asks for is told of.
     assert vp.load_robot(urdf).postures == ()
-    assert words in caplog.text
+    assert not unnamed(caplog.text, facts)
 
 
 def test_files_that_are_none(urdf):
-    with pytest.raises(vp.FileError, match=r"cannot read .*lost.srdf"):
+    with refused(vp.FileError, "lost.srdf"):
         vp.load_robot(urdf, srdf="lost.srdf")
-    with pytest.raises(vp.InputError, match="srdf must be the path of a file, got int"):
+    with refused(vp.InputError, "srdf", "int"):
         vp.load_robot(urdf, srdf=3)
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 from scipy.integrate import solve_ivp
 
 import varpin as vp
@@ -137,11 +138,11 @@ def test_energy_of_an_undamped_motion_decays_with_its_order():
 
 
 @pytest.mark.parametrize(
-    ("option", "words"),
-    [({"stages": 0}, "stages must be at least 1, got 0"), ({"stages": 7}, "stages must be at most 6, got 7")],
+    ("option", "facts"),
+    [({"stages": 0}, ("stages", "1", "0")), ({"stages": 7}, ("stages", "6", "7"))],
 )
-def test_options_out_of_range(option, words):
-    with pytest.raises(vp.InputError, match=words):
+def test_options_out_of_range(option, facts):
+    with refused(vp.InputError, facts):
         vp.Radau(**option)
 
 

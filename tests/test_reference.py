@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 from test_linearization import ARMS, difference, make_scene, worst
 from test_midpoint import reference
 
@@ -89,21 +90,23 @@ def test_first_derivatives(name):
 
 def test_noise_is_refused():
     noisy = vp.Scene(vp.load_robot("finger"), noise=vp.AdditiveNoise(1e-3))
-    with pytest.raises(vp.InputError, match="integrates no noise: leave it out of the scene"):
+    with refused(vp.InputError, "noise"):
         vp.simulate(noisy, np.zeros(3), np.zeros(3), dt=1e-3, steps=1, rng=0, integrator=vp.Reference())
 
 
-@pytest.mark.parametrize("options", [{"rtol": 1e-15}, {"rtol": 0.5}, {"rtol": -1.0}, {"atol": 0.0}, {"rtol": "a"}])
-def test_tolerances_are_checked(options):
-    with pytest.raises(vp.InputError, match="tol must be"):
-        vp.Reference(**options)
+@pytest.mark.parametrize(
+    ("name", "value"), [("rtol", 1e-15), ("rtol", 0.5), ("rtol", -1.0), ("atol", 0.0), ("rtol", "a")]
+)
+def test_tolerances_are_checked(name, value):
+    with refused(vp.InputError, name, repr(value)):
+        vp.Reference(**{name: value})
 
 
 def test_runaway_is_a_step_failure():
     """Negative damping is not to be had, but a feedback of the wrong sign is."""
     scene = vp.Scene(vp.planar_chain(1), gravity=False)
     policy = vp.LinearPolicy(np.zeros((60, 1)), np.tile([[1e3, 1e3]], (60, 1, 1)), np.zeros((60, 2)))
-    with pytest.raises(vp.StepFailure, match="runs away") as caught:
+    with refused(vp.StepFailure) as caught:
         vp.simulate(scene, [1.0], [1.0], dt=10.0, steps=60, controls=policy, integrator=vp.Reference())
     assert np.isfinite(caught.value.trajectory.q).all()
 

@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from chromium import animation, commands, picture, seek, shape_poses, visit, wait_until
+from refusals import refused
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
@@ -451,53 +452,38 @@ def test_says_where_to_look_when_no_browser_opens(finger, motion, monkeypatch, c
     assert f"no web browser could be started; open {viewer.url()} in one" in caplog.text
 
 
-def refused(call, error, message):
-    with pytest.raises(error, match=re.escape(message)) as caught:
-        call()
-    assert isinstance(caught.value, vp.VarpinError)
-
-
 def test_refuses_what_it_cannot_show(finger, motion, tmp_path):
     page = tmp_path / "page.html"
+
+    def no(*facts, robot=finger, motion=motion, html=page, **options):
+        with refused(vp.InputError, *facts):
+            replay(robot, motion, html=html, **options)
+
     q = np.zeros((3, 3))
-    either = "give either html=path, for a file, or open=True, for a window"
-    refused(lambda: replay(finger, motion), vp.InputError, either)
-    refused(lambda: replay(finger, motion, html=page, open=True), vp.InputError, either)
-    refused(lambda: replay(finger.model, motion, html=page), vp.InputError, "robot must come from load_robot")
-    refused(lambda: replay(finger, q, html=page), vp.InputError, "an array of configurations needs dt")
-    refused(lambda: replay(finger, motion, dt=0.1, html=page), vp.InputError, "this trajectory has its own, 0.001 s")
-    refused(lambda: replay(finger, q, dt=0.0, html=page), vp.InputError, "dt must be positive and finite [s], got 0.0")
-    shape = "motion must have shape (N + 1, 3), one row a node, got "
-    refused(lambda: replay(finger, np.zeros((3, 2)), dt=0.1, html=page), vp.InputError, shape + "(3, 2)")
-    refused(lambda: replay(finger, np.zeros(3), dt=0.1, html=page), vp.InputError, shape + "(3,)")
-    refused(lambda: replay(finger, np.zeros((0, 3)), dt=0.1, html=page), vp.InputError, shape + "(0, 3)")
-    refused(lambda: replay(finger, "still", dt=0.1, html=page), vp.InputError, "motion must be an array of real")
+    no("html=path", "open=True", html=None)
+    no("html=path", "open=True", open=True)
+    no("robot", "load_robot", robot=finger.model)
+    no("dt", motion=q)
+    no("0.001 s", dt=0.1)
+    no("dt", "0.0", motion=q, dt=0.0)
+    no("motion", "(N + 1, 3)", "(3, 2)", motion=np.zeros((3, 2)), dt=0.1)
+    no("motion", "(N + 1, 3)", "(3,)", motion=np.zeros(3), dt=0.1)
+    no("motion", "(N + 1, 3)", "(0, 3)", motion=np.zeros((0, 3)), dt=0.1)
+    no("motion", "'still'", motion="still", dt=0.1)
     q[1, 2] = np.nan
-    refused(lambda: replay(finger, q, dt=0.1, html=page), vp.InputError, "motion[1, 2] is nan; it must be finite")
-    refused(lambda: replay(finger, motion, speed=0, html=page), vp.InputError, "speed must be positive and finite")
-    refused(lambda: replay(finger, motion, fps=-1, html=page), vp.InputError, "fps must be positive and finite")
-    refused(lambda: replay(finger, motion, max_frames=1, html=page), vp.InputError, "max_frames must be at least 2")
-    shape = "ghost must have shape (K, 3), its rows spread evenly over the motion's time, got "
-    refused(lambda: replay(finger, motion, ghost=np.zeros((3, 2)), html=page), vp.InputError, shape + "(3, 2)")
-    refused(lambda: replay(finger, motion, ghost=np.zeros(3), html=page), vp.InputError, shape + "(3,)")
-    refused(lambda: replay(finger, motion, ghost=q, html=page), vp.InputError, "ghost[1, 2] is nan; it must be finite")
-    refused(lambda: replay(finger, motion, ghost="still", html=page), vp.InputError, "ghost must be an array of real")
-    refused(
-        lambda: replay(finger, [[0.0, 0.0, 0.0]], dt=1.0, ghost=motion.q[:4], html=page),
-        vp.InputError,
-        "the motion is a single pose, so its ghost must be one row, too, got 4",
-    )
+    no("motion[1, 2]", "nan", motion=q, dt=0.1)
+    no("speed", "0", speed=0)
+    no("fps", "-1", fps=-1)
+    no("max_frames", "2", "1", max_frames=1)
+    no("ghost", "(K, 3)", "(3, 2)", ghost=np.zeros((3, 2)))
+    no("ghost", "(K, 3)", "(3,)", ghost=np.zeros(3))
+    no("ghost[1, 2]", "nan", ghost=q)
+    no("ghost", "'still'", ghost="still")
+    no("ghost", "4", motion=[[0.0, 0.0, 0.0]], dt=1.0, ghost=motion.q[:4])
     other = vp.simulate(vp.Scene(vp.planar_chain(3)), [0, 0, 0], [0, 0, 0], dt=1e-3, steps=2)
-    refused(
-        lambda: replay(finger, motion, ghost=other, html=page),
-        vp.InputError,
-        "the ghost is of robot 'chain3' with joints joint1, joint2, joint3; 'finger' has joints mcp, pip, dip",
-    )
-    refused(
-        lambda: replay(vp.planar_chain(3), motion, html=page),
-        vp.InputError,
-        "the trajectory is of robot 'finger' with joints mcp, pip, dip; 'chain3' has joints joint1, joint2, joint3",
-    )
+    both = ("'chain3'", "joint1, joint2, joint3", "'finger'", "mcp, pip, dip")
+    no("ghost", *both, ghost=other)
+    no("trajectory", *both, robot=vp.planar_chain(3))
     assert not page.exists()
 
 
@@ -507,8 +493,9 @@ def test_refuses_an_unwritable_path_before_the_work(finger, motion, tmp_path, mo
 
     monkeypatch.setattr(Picture, "of", work)
     nowhere = tmp_path / "missing" / "page.html"
-    refused(lambda: replay(finger, motion, html=nowhere), vp.FileError, f"there is no folder {nowhere.parent}")
-    refused(lambda: replay(finger, motion, html=tmp_path), vp.FileError, f"cannot write {tmp_path}: it is a folder")
+    for path, folder in ((nowhere, nowhere.parent), (tmp_path, tmp_path)):
+        with refused(vp.FileError, "folder", str(folder)):
+            replay(finger, motion, html=path)
 
 
 def test_a_failure_leaves_the_old_page_alone(finger, motion, tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from chromium import commands, picture, seek, visit
+from refusals import refused
 from test_replay_marks import assert_no_errors, names, placements, pose, vertices
 
 import varpin as vp
@@ -137,9 +138,9 @@ def test_constraints_can_be_left_out(plan, crank, tmp_path):
     drawn = [command["path"] for command in commands(pair) if "regions" in command.get("path", "")]
     assert drawn
     assert not any("notes 2" in path for path in drawn)
-    with pytest.raises(vp.InputError, match="constraints are of robot 'chain2', another one"):
+    with refused(vp.InputError, "'chain2'"):
         replay(vp.planar_chain(2), crank[1].q, dt=0.1, constraints=crank[0], html=tmp_path / "other.html")
-    with pytest.raises(vp.InputError, match="a Scene or an OptimalControlProblem, got str"):
+    with refused(vp.InputError, "str"):
         replay(robot, plan, constraints="all", html=tmp_path / "word.html")
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from chromium import animation, commands, picture, seek, shape_poses, visit
+from refusals import refused
 from scipy.spatial.transform import Rotation
 
 import varpin as vp
@@ -466,49 +467,45 @@ def test_a_missing_mesh_costs_its_own_link_only(browser, tmp_path, caplog):
 
 def test_refuses_a_look_behind(run, tmp_path):
     robot = run.plans[0].problem.scene.robot
-    refused("ahead must be positive", robot, run, html=tmp_path / "page.html", ahead=-0.1)
-
-
-def refused(message, *arguments, **options):
-    with pytest.raises(vp.InputError) as caught:
-        replay(*arguments, **options)
-    assert message in str(caught.value)
+    with refused(vp.InputError, "ahead", "-0.1"):
+        replay(robot, run, html=tmp_path / "page.html", ahead=-0.1)
 
 
 def test_refuses_marks_it_cannot_show(ur5, sweep, tmp_path):
     page = tmp_path / "page.html"
 
-    def no(message, robot=ur5, motion=sweep, dt=0.05, **options):
-        refused(message, robot, motion, dt=dt, html=page, **options)
+    def no(*facts, robot=ur5, motion=sweep, dt=0.05, **options):
+        with refused(vp.InputError, *facts):
+            replay(robot, motion, dt=dt, html=page, **options)
 
-    no("trace: robot 'ur5' has no frame 'fore_link'; did you mean 'forearm_link'", trace="fore_link")
-    no("frames must be names of frames, got 3", frames=[3])
-    no("reference must have shape (K, 3), points on a path in the world [m], got (3,)", reference=[0.0, 0.0, 1.0])
-    no("reference['a'] stays in one place; give a place as a target", reference={"a": np.ones((4, 3))})
-    no("reference[1, 0] is nan", reference=[[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])
-    no("targets must map names to places or poses", targets=[0.0, 0.0, 1.0])
-    no("targets['a'] must be a point (3,), a pose (4, 4)", targets={"a": np.zeros(4)})
-    no("targets['a'][2] is inf", targets={"a": [0.0, 0.0, np.inf]})
-    no("targets['a'] is no pose", targets={"a": 2.0 * np.eye(4)})
-    no("targets['a'] is no pose", targets={"a": np.diag([1.0, 1.0, -1.0, 1.0])})
-    no("so targets['a'] must stay, too, got 2 rows", motion=sweep[:1], targets={"a": np.zeros((2, 3))})
-    no("torques=True takes the controls of a trajectory", torques=True)
-    no("torques must have shape (N, 6), one row a step, got (20, 5)", torques=np.zeros((20, 5)))
-    no("torque_limit colours nothing without torques", torque_limit=1.0)
-    no("torque_limit must be positive", torques=np.ones((20, 6)), torque_limit=0.0)
-    no("offset must have shape (3,), got (2,)", offset=[1.0, 0.0])
-    no("of several robots, give pairs", robot=[(ur5, sweep)])
-    no("several robots must be pairs of a robot and its motion", robot=[ur5, ur5], motion=None)
+    no("trace", "'ur5'", "'fore_link'", "'forearm_link'", trace="fore_link")
+    no("frames", "3", frames=[3])
+    no("reference", "(K, 3)", "(3,)", reference=[0.0, 0.0, 1.0])
+    no("reference['a']", "target", reference={"a": np.ones((4, 3))})
+    no("reference[1, 0]", "nan", reference=[[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])
+    no("targets", targets=[0.0, 0.0, 1.0])
+    no("targets['a']", "(3,)", "(4, 4)", targets={"a": np.zeros(4)})
+    no("targets['a'][2]", "inf", targets={"a": [0.0, 0.0, np.inf]})
+    no("targets['a']", "pose", targets={"a": 2.0 * np.eye(4)})
+    no("targets['a']", "pose", targets={"a": np.diag([1.0, 1.0, -1.0, 1.0])})
+    no("targets['a']", "2 rows", motion=sweep[:1], targets={"a": np.zeros((2, 3))})
+    no("torques=True", torques=True)
+    no("torques", "(N, 6)", "(20, 5)", torques=np.zeros((20, 5)))
+    no("torque_limit", "torques", torque_limit=1.0)
+    no("torque_limit", "0.0", torques=np.ones((20, 6)), torque_limit=0.0)
+    no("offset", "(3,)", "(2,)", offset=[1.0, 0.0])
+    no("robots", "pairs", robot=[(ur5, sweep)])
+    no("robots", "pairs", robot=[ur5, ur5], motion=None)
     both = [(ur5, sweep), (ur5, sweep)]
-    no("ghost of several robots must be a list with one for each of the 2", robot=both, motion=None, ghost=sweep)
-    no("torques of several robots must be a list", robot=both, motion=None, torques=[np.ones((20, 6))])
-    no("torque_limit colours nothing without torques", robot=both, motion=None, torques=False, torque_limit=1.0)
-    no("ahead is of the plans of an MpcRun", ahead=0.1)
-    no("motion 2 must have shape (N + 1, 6)", robot=[(ur5, sweep), (ur5, sweep[:, :3])], motion=None)
-    no("give the robot's motion", motion=None)
+    no("ghost", "2", robot=both, motion=None, ghost=sweep)
+    no("torques", "robots", robot=both, motion=None, torques=[np.ones((20, 6))])
+    no("torque_limit", "torques", robot=both, motion=None, torques=False, torque_limit=1.0)
+    no("ahead", "MpcRun", ahead=0.1)
+    no("motion 2", "(N + 1, 6)", robot=[(ur5, sweep), (ur5, sweep[:, :3])], motion=None)
+    no("motion", motion=None)
     scene = vp.Scene(vp.planar_chain(2), actuation=["joint1"])
     half = vp.simulate(scene, [0, 0], [0, 0], dt=1e-2, steps=2, controls=np.zeros((2, 1)))
-    no("takes one control for each of the 2 joints, this trajectory has 1", scene.robot, half, dt=None, torques=True)
+    no("2", "1", "control", robot=scene.robot, motion=half, dt=None, torques=True)
     assert not page.exists()
 
 
@@ -520,5 +517,5 @@ def test_a_reference_keeps_its_corners():
 
 def test_another_robot_s_motion_is_refused(ur5, tmp_path):
     motion = vp.simulate(vp.Scene(vp.load_robot("ur10")), np.zeros(6), np.zeros(6), dt=0.01, steps=2, check=False)
-    with pytest.raises(vp.InputError, match="of robot 'ur10', whose joints lie otherwise than those of 'ur5'"):
+    with refused(vp.InputError, "'ur10'", "'ur5'"):
         replay(ur5, motion, html=tmp_path / "other.html")

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import arm, joint, link, mimic, random_inertia, random_tree, write_urdf
+from refusals import refused
 
 import varpin as vp
 from varpin.model import bundled_robots, example_robot_data, geometry
@@ -213,7 +214,7 @@ class TestGeometry:
         mesh = '<visual><geometry><mesh filename="package://nowhere/missing.dae"/></geometry></visual>'
         robot = vp.load_robot(write_urdf(tmp_path, link("l1", extra=mesh), joint("j1", "base", "l1")))
         assert robot.dof == 1
-        with pytest.raises(vp.RobotError, match=r"missing\.dae"):
+        with refused(vp.RobotError, "missing.dae"):
             geometry(robot)
 
     @pytest.mark.parametrize("lock", [{}, {"joint1": 0.4}, {"joint0": -0.3, "joint5": 1.2}])
@@ -258,7 +259,7 @@ class TestGeometry:
     def test_of_a_wrapper_must_hang_on_its_joints(self):
         shapes = pin.GeometryModel()
         shapes.addGeometryObject(pin.GeometryObject("ball", 9, pin.SE3.Identity(), pin.hppfcl.Sphere(0.1)))
-        with pytest.raises(vp.RobotError, match="shape 'ball' hangs on joint 9"):
+        with refused(vp.RobotError, "'ball'", "9"):
             vp.load_robot(pin.RobotWrapper(random_tree(0), pin.GeometryModel(), shapes))
 
 
@@ -384,9 +385,9 @@ class TestLocking:
         base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root")
         model.addJoint(base, pin.JointModelRY(), pin.SE3.Identity(), "elbow")
         for quaternion in ([0, 0, 0, 2], [0, 0, 0, 0]):
-            with pytest.raises(vp.InputError, match=r"lock\['root'\].*length 1"):
+            with refused(vp.InputError, "lock['root']", "1"):
                 vp.load_robot(model, lock={"root": [0, 0, 0, *quaternion]})
-        with pytest.raises(vp.InputError, match=r"lock\['root'\] must have 7 value\(s\), got shape \(1,\)"):
+        with refused(vp.InputError, "lock['root']", "7", "(1,)"):
             vp.load_robot(model, lock={"root": 0.0})
 
 
@@ -431,7 +432,7 @@ class TestMimic:
             tmp_path, link("a"), link("b"), joint("j1", "base", "a"), joint("j2", "a", "b", inside=mimic("j1", 0, 0.3))
         )
         self.check(vp.load_robot(path), [0.5], [2.0], {"j1": (0.5, 2.0), "j2": (0.3, 0.0)})
-        with pytest.raises(vp.RobotError, match="'j2' mimics 'j1' with multiplier 0"):
+        with refused(vp.RobotError, "'j2'", "'j1'", "multiplier", "0"):
             vp.load_robot(pin.buildModelFromUrdf(str(path), mimic=True))
 
     def test_leader_in_a_later_branch(self, tmp_path):
@@ -483,7 +484,7 @@ class TestMimic:
         path = write_urdf(
             tmp_path, link("a"), link("b"), joint("j1", "base", "a", inside=mimic("j2")), joint("j2", "a", "b")
         )
-        with pytest.raises(vp.RobotError, match=r"'j1' carries the joint it mimics, 'j2'.*mimic='free'"):
+        with refused(vp.RobotError, "'j1'", "'j2'", "mimic='free'"):
             vp.load_robot(path)
         assert vp.load_robot(path, mimic="free").dof == 2
 
@@ -496,7 +497,7 @@ class TestMimic:
             joint("b1", "base", "c", inside=mimic("a2")),
             joint("b2", "c", "d"),
         )
-        with pytest.raises(vp.RobotError, match="follow each other across branches"):
+        with refused(vp.RobotError, "branches"):
             vp.load_robot(path)
 
 
@@ -560,7 +561,7 @@ class TestJoints:
         scene = vp.Scene(robot)
         jets = [vp.lagrangian_jet(scene, [0.4], [1.3], backend=b) for b in ("compiled", "pinocchio")]
         assert pytest.approx(jets[1].L, rel=1e-13) == jets[0].L
-        with pytest.raises(vp.UnsupportedJoint, match="'shell' is a JointModelComposite"):
+        with refused(vp.UnsupportedJoint, "'shell'", "JointModelComposite"):
             vp.load_robot(of(pin.SE3(np.eye(3), np.array([0.1, 0.0, 0.0]))))
 
     @pytest.mark.parametrize(("kind", "shown"), [("floating", "JointModelFreeFlyer"), ("planar", "JointModelPlanar")])
@@ -633,8 +634,8 @@ def test_end_effector_is_where_pinocchio_says(load):
     for row, position in zip(q, panda.frame_positions(q, "panda_hand"), strict=True):
         pin.framesForwardKinematics(panda.model, data, panda.configuration(row))
         np.testing.assert_allclose(position, data.oMf[panda.model.getFrameId("panda_hand")].translation, atol=1e-14)
-    with pytest.raises(vp.InputError, match="has no frame 'hand'"):
+    with refused(vp.UnknownFrame, "'panda'", "'hand'", "'panda_hand'"):
         panda.frame_positions(q, "hand")
     np.testing.assert_array_equal(panda.frame_positions(q[0], "panda_hand"), panda.frame_positions(q, "panda_hand")[0])
-    with pytest.raises(vp.InputError, match=r"q must have shape \(N, 3\) or \(3,\), got \(2,\)"):
+    with refused(vp.InputError, "q", "(N, 3)", "(3,)", "(2,)"):
         chain.frame_positions(np.zeros(2))

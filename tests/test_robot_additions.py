@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin.cli import main
@@ -49,19 +50,18 @@ class TestPlaced:
         )
 
     @pytest.mark.parametrize(
-        ("base", "words"),
+        ("base", "facts"),
         [
-            ("round", "base must be 'planar', a transform"),
-            (np.eye(3), "got shape (3, 3)"),
-            (2.0 * np.eye(4), "a rotation and a translation"),
-            (np.diag([1.0, 1.0, -1.0, 1.0]), "a rotation and a translation"),
+            ("round", ("base", "'planar'", "'round'")),
+            (np.eye(3), ("base", "(3, 3)")),
+            (2.0 * np.eye(4), ("base", "rotation")),
+            (np.diag([1.0, 1.0, -1.0, 1.0]), ("base", "rotation")),
         ],
         ids=str,
     )
-    def test_what_is_refused(self, base, words):
-        with pytest.raises(vp.InputError) as info:
+    def test_what_is_refused(self, base, facts):
+        with refused(vp.InputError, facts):
             vp.load_robot("ur5", base=base)
-        assert words in str(info.value)
 
 
 class TestPlanar:
@@ -116,7 +116,7 @@ class TestPlanar:
         np.testing.assert_allclose(motion.p[-1, :2], motion.p[0, :2], rtol=0, atol=1e-11)
 
     def test_a_name_that_is_taken(self):
-        with pytest.raises(vp.InputError, match="base_turn"):
+        with refused(vp.InputError, "base_turn"):
             vp.load_robot(vp.load_robot("ur5", base="planar").model, base="planar")
 
 
@@ -143,11 +143,11 @@ class TestArmature:
         np.testing.assert_array_equal(own.tree.armature, [7.0, *plain.tree.armature[1:]])
 
     def test_what_is_refused(self):
-        with pytest.raises(vp.UnknownJoint, match="elbow_joint"):
+        with refused(vp.UnknownJoint, "elbow_joint"):
             vp.load_robot("ur5", armature={"elbow": 1.0})
-        with pytest.raises(vp.InputError, match="'elbow_joint' must be >= 0"):
+        with refused(vp.InputError, "'elbow_joint'", "0"):
             vp.load_robot("ur5", armature={"elbow_joint": -1.0})
-        with pytest.raises(vp.InputError, match="finite"):
+        with refused(vp.InputError, "finite"):
             vp.load_robot("ur5", armature=np.nan)
 
 
@@ -212,23 +212,23 @@ class TestMeshInertias:
             vp.load_robot(written(tmp_path))
 
     def test_open_and_missing_meshes_are_named(self, tmp_path):
-        with pytest.raises(vp.RobotError, match=r"link 'lower'.*box\.obj bounds no volume"):
+        with refused(vp.RobotError, "'lower'", "box.obj"):
             vp.load_robot(written(tmp_path, faces=[(c, b, a) for a, b, c in FACES]), inertia="meshes")
         path = written(tmp_path)
         (tmp_path / "box.obj").unlink()
-        with pytest.raises(vp.RobotError, match=r"link 'lower': box\.obj.*package_dirs"):
+        with refused(vp.RobotError, "'lower'", "box.obj", "package_dirs"):
             vp.load_robot(path, inertia="meshes")
 
     def test_what_is_refused(self, tmp_path):
-        with pytest.raises(vp.InputError, match="inertia must be 'file' or 'meshes'"):
+        with refused(vp.InputError, "inertia", "'file'", "'meshes'"):
             vp.load_robot("ur5", inertia="mesh")
-        with pytest.raises(vp.InputError, match="read from none"):
+        with refused(vp.InputError, "inertia"):
             vp.load_robot(vp.load_robot("ur5").model, inertia="meshes")
-        with pytest.raises(vp.InputError, match="density"):
+        with refused(vp.InputError, "density"):
             vp.load_robot(written(tmp_path), inertia="meshes", density=0.0)
 
     def test_a_mesh_with_a_gap(self, tmp_path):
-        with pytest.raises(vp.RobotError, match="leave gaps"):
+        with refused(vp.RobotError, "gaps"):
             vp.load_robot(written(tmp_path, faces=FACES[2:]), inertia="meshes")
 
 
@@ -254,7 +254,7 @@ class TestElsewhere:
         np.testing.assert_allclose(robot.frame_positions(q), other.frame_positions(np.zeros(6)), atol=1e-12)
         assert robot.tree.armature[robot.joint_names.index("elbow_joint")] == 0.4
         path.write_text(text.replace("BASE", '"round"'))
-        with pytest.raises(vp.SceneFileError, match=r"robot\.base"):
+        with refused(vp.SceneFileError, "robot.base"):
             vp.load_scene(path)
 
     def test_on_the_command_line(self, tmp_path):

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mechanisms import random_tree
+from refusals import refused
 
 import varpin as vp
 from varpin.control.solution_file import solution_trajectory
@@ -43,7 +44,7 @@ def test_another_scene_is_refused_by_what_differs(load, words, integrator):
 def test_second_order_refuses_too(load):
     robot = load("ur5")
     motion = motion_of(vp.Scene(robot))
-    with pytest.raises(vp.InputError, match="damping was 0 at joint"):
+    with refused(vp.InputError, "damping", "'shoulder_pan_joint'", "0", "1"):
         vp.second_order(vp.Scene(robot, damping=1.0), motion, np.ones(12))
 
 
@@ -68,13 +69,13 @@ def test_robots_of_the_same_joints_are_told_apart():
     def geared(m):
         m.armature = m.armature + np.array([0.0, 0.0, 0.5])
 
-    for change, words in (
-        (heavier, "the robot's masses are others"),
-        (longer, "the robot's joints are in other places"),
-        (turned, "the robot's inertias are others"),
-        (geared, "armature was .* at joint 'joint2'"),
+    for change, facts in (
+        (heavier, "masses"),
+        (longer, "joints"),
+        (turned, "inertias"),
+        (geared, ("armature", "'joint2'")),
     ):
-        with pytest.raises(vp.InputError, match=words):
+        with refused(vp.InputError, facts):
             vp.linearize(other(change), motion)
     assert vp.linearize(other(lambda _: None), motion).steps == 5
 
@@ -92,7 +93,7 @@ def test_scenes_that_are_alike_are_the_same(load, tmp_path):
         assert vp.linearize(again, given).steps == given.steps
     np.testing.assert_array_equal(vp.linearize(stronger, motion).A, exact.A)
     kicked = motion_of(vp.Scene(load("ur5"), **UR5), rng=0)
-    with pytest.raises(vp.InputError, match="the noise has another strength"):
+    with refused(vp.InputError, "noise"):
         vp.linearize(stronger, kicked)
 
 
@@ -117,7 +118,7 @@ def test_files_without_the_values_are_held_against_their_steps(load, tmp_path, i
         np.testing.assert_array_equal(vp.linearize(scene, older).A, vp.linearize(scene, motion).A)
         for change in OTHERS.values():
             if "actuation" not in change:
-                with pytest.raises(vp.InputError, match=r"step \d+ \(t = .* s\) ends at velocities that are off by"):
+                with refused(vp.InputError, "velocities"):
                     vp.linearize(vp.Scene(robot, **UR5 | change), older)
 
 
@@ -136,7 +137,7 @@ def test_damaged_values_are_refused(load, tmp_path, name):
         if name in ("inertia", "actuation") and np.isfinite(wrong).all():
             wrong = wrong[..., :-1, None]  # noqa: PLW2901
         damaged = replace(motion, scene_values={**motion.scene_values, name: wrong})
-        with pytest.raises(vp.FileError, match=f"scene.{name}"):
+        with refused(vp.FileError, f"scene.{name}"):
             vp.Trajectory.load(damaged.save(tmp_path / "damaged.npz"))
 
 
@@ -148,5 +149,5 @@ def test_plans_in_files_keep_their_scene(tmp_path):
     path = plan.save(tmp_path / "plan.npz")
     for motion in (vp.Solution.load(path, problem).trajectory, solution_trajectory(path)):
         assert vp.linearize(scene, motion).steps == 5
-        with pytest.raises(vp.InputError, match=r"damping was 0\.3 at joint 'joint1', and is 0 in the scene"):
+        with refused(vp.InputError, "damping", "0.3", "'joint1'", "0"):
             vp.linearize(vp.Scene(vp.planar_chain(2)), motion)

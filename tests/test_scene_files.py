@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin.io.scenefile import scenes
@@ -678,7 +679,7 @@ def test_faulty_csv(text, tmp_path):
 )
 def test_faulty_arrays(wrong, tmp_path):
     np.savez(tmp_path / "path.npz", t=np.array([0.0, 0.1, 0.2]), mcp=np.zeros(3), pip=np.zeros(3), dip=wrong)
-    with pytest.raises(vp.SceneFileError, match="'dip'") as caught:
+    with refused(vp.SceneFileError, "'dip'") as caught:
         vp.load_scene(write(tmp_path, tracked('{ file = "path.npz" }')))
     assert caught.value.key == "cost[0].reference.file"
 
@@ -695,7 +696,7 @@ class Bomb:
 
 def test_pickled_file_is_not_run(tmp_path):
     np.savez(tmp_path / "path.npz", t=np.array([Bomb(tmp_path / "run")], dtype=object))
-    with pytest.raises(vp.SceneFileError, match="cannot be read"):
+    with refused(vp.SceneFileError, "path.npz"):
         vp.load_scene(write(tmp_path, tracked('{ file = "path.npz" }')))
     assert not (tmp_path / "run").exists()
 
@@ -708,9 +709,9 @@ def test_files_outside_are_out_of_reach(name, tmp_path):
     write(tmp_path, "t, mcp, pip, dip\n0,1,2,3\n1,2,3,4\n", "secret.csv")
     (inner / "link.csv").symlink_to(tmp_path / "secret.csv")
     (inner / "linked").symlink_to(tmp_path)
-    with pytest.raises(vp.SceneFileError, match="leads out of the scene's folder"):
+    with refused(vp.SceneFileError, "folder"):
         vp.load_scene(write(inner, tracked(f'{{ file = "{name}" }}')))
-    with pytest.raises(vp.SceneFileError, match="leads out of the scene's folder"):
+    with refused(vp.SceneFileError, "folder"):
         vp.load_scene(write(inner, f'[robot]\nsource = "{name}"\n[horizon]\ndt = 0.1\nsteps = 1\n'))
     vp.load_scene(write(inner, tracked(f'{{ file = "{tmp_path / "secret.csv"}" }}')))
 
@@ -735,21 +736,21 @@ def test_robot_beside_the_scene(tmp_path):
     write(tmp_path, urdf, "my.urdf")
     file = vp.load_scene(write(tmp_path, tracked("0.1").replace('"finger"', '"my.urdf"')))
     assert file.robot.joint_names == ("mcp", "pip", "dip")
-    with pytest.raises(vp.SceneFileError, match="there is no file"):
+    with refused(vp.SceneFileError, "our.urdf"):
         vp.load_scene(write(tmp_path, tracked("0.1").replace('"finger"', '"our.urdf"')))
 
 
 def test_files_that_are_no_scenes(tmp_path):
-    with pytest.raises(vp.FileError, match="did you mean 'finger_tracking'"):
+    with refused(vp.FileError, "'finger_tracking'"):
         vp.load_scene("finger_trackin")
-    with pytest.raises(vp.FileError, match="is a folder"):
+    with refused(vp.FileError, "folder"):
         vp.load_scene(tmp_path)
-    with pytest.raises(vp.InputError, match="must be the path"):
+    with refused(vp.InputError, "path"):
         vp.load_scene(3)
     (tmp_path / "latin.toml").write_bytes(b'title = "\xe9"')
-    with pytest.raises(vp.SceneFileError, match="UTF-8"):
+    with refused(vp.SceneFileError, "UTF-8"):
         vp.load_scene(tmp_path / "latin.toml")
-    with pytest.raises(vp.SceneFileError, match="nested too deeply"):
+    with refused(vp.SceneFileError, "nested"):
         vp.load_scene(write(tmp_path, f"a = {'[' * 100_000}{']' * 100_000}"))
 
 
@@ -944,7 +945,7 @@ def test_no_other_key_is_taken(tmp_path, monkeypatch):
         data = copy.deepcopy(whole)
         at(data, place)["strange"] = 1
         monkeypatch.setattr(tomllib, "loads", lambda _, data=data: data)
-        with pytest.raises(vp.SceneFileError, match="unknown key") as caught:
+        with refused(vp.SceneFileError) as caught:
             vp.load_scene(path)
         assert caught.value.key.rpartition(".")[2] == "strange"
 

@@ -10,6 +10,7 @@ import pytest
 import scipy.linalg
 import scipy.optimize
 from mechanisms import random_inertia
+from refusals import refused
 from scipy.interpolate import CubicHermiteSpline
 
 import varpin as vp
@@ -696,7 +697,7 @@ def test_second_derivatives_of_the_noise():
 
 
 def test_second_order_needs_second_derivatives():
-    with pytest.raises(vp.InputError, match="ExplicitEuler has no second-order"):
+    with refused(vp.InputError, "ExplicitEuler"):
         vp.solve(arm_problem("ur5", vp.ExplicitEuler()), second_order=True)
 
 
@@ -891,7 +892,7 @@ def test_progress_comes_after_each_iteration():
     seen.clear()
     vp.solve(reach_problem(0.02), max_iterations=1, progress=lambda *now: seen.append(now))
     assert set(seen) == {(1, 1)}
-    with pytest.raises(vp.InputError, match="progress must be a function"):
+    with refused(vp.InputError, "progress"):
         vp.solve(small(), progress=True)
 
 
@@ -999,7 +1000,7 @@ def test_first_motion_that_cannot_be_integrated():
     problem = vp.OptimalControlProblem(
         scene, cost, [0.3, 0.1], [0, 0], dt=0.05, steps=400, integrator=vp.ExplicitEuler()
     )
-    with pytest.raises(vp.StepFailure, match="no longer finite") as caught:
+    with refused(vp.StepFailure, "finite") as caught:
         vp.solve(problem, controls=[0.0, 0.0])
     assert 0 < caught.value.trajectory.steps < 400
     assert caught.value.step == caught.value.trajectory.steps
@@ -1008,11 +1009,9 @@ def test_first_motion_that_cannot_be_integrated():
 
 def test_cost_that_is_not_finite():
     never = vp.CustomCost(lambda t, q, v, u: np.where(t > 0.5, np.nan, 0.0), name="never")
-    with pytest.raises(vp.CostError, match=r"^CustomCost\('never'\): the cost of the first motion is nan"):
+    with refused(vp.CostError, "CustomCost('never')", "nan"):
         vp.solve(small(vp.ControlCost(1.0) + never))
-    with pytest.raises(
-        vp.CostError, match=r"^Terminal\(cost=CustomCost\('end'\)\): the cost of the first motion is inf"
-    ):
+    with refused(vp.CostError, "Terminal(cost=CustomCost('end'))", "inf"):
         vp.solve(
             small(vp.ControlCost(1.0) + vp.Terminal(vp.CustomCost(lambda t, q, v, u: np.inf + 0.0 * t, name="end")))
         )
@@ -1083,59 +1082,59 @@ def test_warm_starts():
     assert vp.solve(later, shifted).iterations <= cold
     assert len(sol.shifted(problem.decisions - 1).u) == problem.decisions
     for wrong in (-1, problem.decisions, 1.5):
-        with pytest.raises(vp.InputError, match="decisions must be"):
+        with refused(vp.InputError, "decisions"):
             sol.shifted(wrong)
 
 
 def test_warm_starts_that_do_not_fit():
     problem = small(hold=2)
-    with pytest.raises(vp.InputError, match=r"controls must have shape \(10, 2\), got \(20, 2\)"):
+    with refused(vp.InputError, "controls", "(10, 2)", "(20, 2)"):
         vp.solve(problem, np.zeros((20, 2)))
-    with pytest.raises(vp.InputError, match="controls"):
+    with refused(vp.InputError, "controls"):
         vp.solve(problem, [np.nan, 0.0])
-    with pytest.raises(vp.InputError, match="holds its controls over 1 steps, the problem 2"):
+    with refused(vp.InputError, "controls", "1", "2"):
         vp.solve(problem, vp.solve(small()))
-    with pytest.raises(vp.InputError, match="for 20 steps, not 40"):
+    with refused(vp.InputError, "20", "40"):
         vp.solve(small(steps=40), vp.solve(small()))
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "facts"),
     [
-        ({"forward": "sideways"}, "forward must be"),
-        ({"backtracking": 1.0}, "backtracking must be"),
-        ({"backtracking": "a"}, "backtracking must be a number"),
-        ({"armijo": 2.0}, "armijo must be"),
-        ({"tolerance": 0.0}, "tolerance must be positive"),
-        ({"tolerance": np.nan}, "tolerance must be positive"),
-        ({"regularization": -1.0}, "regularization must be"),
-        ({"max_iterations": 1.5}, "max_iterations must be an integer"),
-        ({"max_iterations": -1}, "max_iterations must be at least 0"),
+        ({"forward": "sideways"}, "forward"),
+        ({"backtracking": 1.0}, "backtracking"),
+        ({"backtracking": "a"}, "backtracking"),
+        ({"armijo": 2.0}, "armijo"),
+        ({"tolerance": 0.0}, "tolerance"),
+        ({"tolerance": np.nan}, "tolerance"),
+        ({"regularization": -1.0}, "regularization"),
+        ({"max_iterations": 1.5}, "max_iterations"),
+        ({"max_iterations": -1}, ("max_iterations", "0")),
     ],
 )
-def test_wrong_options(options, message):
-    with pytest.raises(vp.InputError, match=message):
+def test_wrong_options(options, facts):
+    with refused(vp.InputError, facts):
         vp.solve(small(), **options)
 
 
 def test_not_a_problem():
-    with pytest.raises(vp.InputError, match="must be an OptimalControlProblem, got str"):
+    with refused(vp.InputError, "OptimalControlProblem", "str"):
         vp.solve("finger")
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "facts"),
     [
-        ({"dt": 0.0}, "dt must be positive"),
-        ({"steps": 0}, "steps must be at least 1"),
-        ({"hold": 3}, "steps = 20 is no multiple of hold = 3"),
-        ({"hold": 0}, "hold must be at least 1"),
-        ({"sampling": "end"}, "sampling must be"),
-        ({"integrator": "rk4"}, "integrator must be one of varpin's"),
+        ({"dt": 0.0}, "dt"),
+        ({"steps": 0}, ("steps", "1")),
+        ({"hold": 3}, ("steps = 20", "hold = 3")),
+        ({"hold": 0}, ("hold", "1")),
+        ({"sampling": "end"}, "sampling"),
+        ({"integrator": "rk4"}, "integrator"),
     ],
 )
-def test_wrong_problems(options, message):
-    with pytest.raises(vp.InputError, match=message):
+def test_wrong_problems(options, facts):
+    with refused(vp.InputError, facts):
         small(**options)
 
 
@@ -1145,11 +1144,11 @@ def test_wrong_states_and_scenes():
     for q0, v0, name in (([0.0], [0, 0], "q0"), ([0, 0], [0, np.inf], "v0")):
         with pytest.raises(vp.InputError, match=name):
             vp.OptimalControlProblem(scene, cost, q0, v0, dt=0.1, steps=2)
-    with pytest.raises(vp.InputError, match="cost must be a cost"):
+    with refused(vp.InputError, "cost"):
         vp.OptimalControlProblem(scene, "cheap", [0, 0], [0, 0], dt=0.1, steps=2)
-    with pytest.raises(vp.InputError, match="no controls"):
+    with refused(vp.InputError, "controls"):
         vp.OptimalControlProblem(vp.Scene(sliders(2), actuation=[]), cost, [0, 0], [0, 0], dt=0.1, steps=2)
-    with pytest.raises(vp.InputError, match=r"the motion has 3 steps"):
+    with refused(vp.InputError, "3 steps"):
         small().cost_of(vp.simulate(small().scene, [0, 0], [0, 0], dt=0.05, steps=3))
 
 
@@ -1163,13 +1162,13 @@ def test_the_same_problem_otherwise():
     assert problem.at(integrator=vp.RungeKutta4(), sampling="start", hold=5).decisions == 4
     np.testing.assert_array_equal(problem.at(q0=[1, 2]).q0, [1, 2])
     for dt in (0.3, 3.0):
-        with pytest.raises(vp.InputError, match="no multiple of dt"):
+        with refused(vp.InputError, "dt"):
             problem.at(dt=dt)
     for dt in (-0.1, "fast"):
-        with pytest.raises(vp.InputError, match="dt must be"):
+        with refused(vp.InputError, "dt"):
             problem.at(dt=dt)
     rows = vp.TrackingCost(np.zeros((21, 2)))
-    with pytest.raises(vp.InputError, match=r"\(41, 2\)"):
+    with refused(vp.InputError, "(41, 2)"):
         small(rows).at(dt=0.025)
 
 

@@ -4,6 +4,7 @@ import logging
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin.show.inspection import inspect_robot
@@ -101,5 +102,5 @@ def test_motions_of_several_kinds_of_controls_are_chained():
     assert both.u_stages.shape == (10, 2, 1)
     assert (both.u_stages[:5] == 1.0).all()
     np.testing.assert_array_equal(both.u_stages[5:], two.u_stages)
-    with pytest.raises(vp.InputError, match="got 2 and 3"):
+    with refused(vp.InputError, "2", "3"):
         chained([two, three])

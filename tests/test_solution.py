@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from naive import continuous
+from refusals import refused
 from test_sddp import WEIGHTS, arm_problem, lq_problem, problem_without_noise, run, small
 
 import varpin as vp
@@ -131,7 +132,7 @@ def test_dampers_far_faster_than_the_step_are_followed(load):
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, "tight"])
 def test_wrong_tolerances(wrong):
-    with pytest.raises(vp.InputError, match="tolerance"):
+    with refused(vp.InputError, "tolerance"):
         vp.solve(small()).verify(tolerance=wrong)
 
 
@@ -222,7 +223,7 @@ def test_monte_carlo_without_noise():
 def test_monte_carlo_that_cannot_be():
     sol = vp.solve(small(noise=vp.AdditiveNoise(0.1)))
     for paths in (1, 0, 2.5):
-        with pytest.raises(vp.InputError, match="paths must be"):
+        with refused(vp.InputError, "paths"):
             sol.monte_carlo(paths, 0)
 
 
@@ -244,7 +245,7 @@ def test_monte_carlo_interrupted_holds_the_paths_done():
         if done >= 64:
             raise KeyboardInterrupt
 
-    with pytest.raises(vp.MonteCarloInterrupted, match=r"after \d+ paths; they are in") as caught:
+    with refused(vp.MonteCarloInterrupted, "paths") as caught:
         sol.monte_carlo(600, 5, workers=1, progress=stop)
     assert len(seen) == 1
     done = seen[0][0]
@@ -256,7 +257,7 @@ def test_monte_carlo_interrupted_holds_the_paths_done():
         raise KeyboardInterrupt
 
     # One path has no standard error.
-    with pytest.raises(vp.MonteCarloInterrupted, match="after 0 paths") as caught:
+    with refused(vp.MonteCarloInterrupted, "0 paths") as caught:
         vp.solve(small(noise=own)).monte_carlo(5, 0, progress=stop_at_once)
     assert caught.value.result is None
 
@@ -380,7 +381,7 @@ def test_a_policy_is_refused_by_integrators_on_the_other_state_and_turned_where_
     problem = small()
     plan = vp.solve(problem)
     other = problem.at(integrator=vp.RungeKutta4())
-    with pytest.raises(vp.InputError, match=r"acts on \(q, p\), the integrator's state is \(q, v\)"):
+    with refused(vp.InputError, "(q, p)", "(q, v)"):
         vp.simulate(
             problem.scene,
             problem.q0,

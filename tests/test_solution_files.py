@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 
@@ -78,20 +79,20 @@ def test_policy_of_a_loaded_solution_is_the_same(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("other", "words"),
+    ("other", "facts"),
     [
-        ({"dt": 0.03}, "steps = 30, not 20"),
-        ({"q0": (0.4, -0.2)}, "q0 = "),
-        ({"weight": 0.2}, "another cost"),
-        ({"damping": 0.3}, "another scene damping"),
-        ({"noise": vp.AdditiveNoise(0.1)}, "another noise constant"),
+        ({"dt": 0.03}, ("steps", "30", "20")),
+        ({"q0": (0.4, -0.2)}, "q0"),
+        ({"weight": 0.2}, "cost"),
+        ({"damping": 0.3}, "damping"),
+        ({"noise": vp.AdditiveNoise(0.1)}, "noise"),
         ({"integrator": vp.Midpoint(alpha=0.4)}, "integrator"),
-        ({"robot": vp.planar_chain(2, mass=2.0)}, "links weigh"),
+        ({"robot": vp.planar_chain(2, mass=2.0)}, "links"),
     ],
 )
-def test_solution_of_another_problem_is_refused(other, words, tmp_path):
+def test_solution_of_another_problem_is_refused(other, facts, tmp_path):
     path = vp.solve(problem_of(), max_iterations=1).save(tmp_path / "plan.npz")
-    with pytest.raises(vp.FileError, match=words):
+    with refused(vp.FileError, facts):
         vp.Solution.load(path, problem_of(**other))
 
 
@@ -103,7 +104,7 @@ def test_forces_belong_to_the_problem(force, tmp_path):
     same(vp.Solution.load(path, problem), plan)
     other = vp.solve(problem_of(), max_iterations=1).save(tmp_path / "without.npz")
     for file, wrong in ((path, problem_of()), (other, problem)):
-        with pytest.raises(vp.FileError, match="another scene"):
+        with refused(vp.FileError, "scene"):
             vp.Solution.load(file, wrong)
     with pytest.raises(vp.InputError, match=r"another armature|other forces"):
         vp.solve(problem_of(), resume=plan)
@@ -122,20 +123,20 @@ def test_numbers_that_no_solution_has(name, change, tmp_path):
     path = vp.solve(problem_of(), max_iterations=1).save(tmp_path / "plan.npz")
     members = dict(np.load(path))
     np.savez(path, **members | {name: change(members[name])})
-    with pytest.raises(vp.FileError, match=name):
+    with refused(vp.FileError, name):
         vp.Solution.load(path, problem_of())
 
 
 def test_resume_of_something_else():
     problem = problem_of()
     plan = vp.solve(problem, max_iterations=1)
-    with pytest.raises(vp.InputError, match=r"another problem: dt = 0\.02"):
+    with refused(vp.InputError, "dt", "0.02"):
         vp.solve(problem_of(dt=0.03), resume=plan)
-    with pytest.raises(vp.InputError, match="another cost"):
+    with refused(vp.InputError, "cost"):
         vp.solve(problem_of(weight=0.2), resume=plan)
-    with pytest.raises(vp.InputError, match="leave out either"):
+    with refused(vp.InputError, "resume"):
         vp.solve(problem, plan, resume=plan)
-    with pytest.raises(vp.InputError, match="must be a Solution"):
+    with refused(vp.InputError, "Solution"):
         vp.solve(problem, resume=plan.trajectory)
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin import trajectory
@@ -221,9 +222,9 @@ def test_parts_that_do_not_make_up_steps_are_refused(change, at_a_time, tmp_path
             change, halvings[:0]
         )
     damaged = replace(motion, statistics=replace(motion.statistics, halvings=halvings, substeps=substeps))
-    with pytest.raises(vp.InputError, match=r"damaged: statistics\.halvings does not hold the parts"):
+    with refused(vp.InputError, "statistics.halvings"):
         vp.linearize(scene, damaged)
-    with pytest.raises(vp.FileError, match=r"statistics\.halvings does not hold the parts"):
+    with refused(vp.FileError, "statistics.halvings"):
         vp.Trajectory.load(damaged.save(tmp_path / "damaged.npz"))
 
 

@@ -6,6 +6,7 @@ Against DOP853 on Pinocchio's forward dynamics, differences, and each other.
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 from scipy.integrate import solve_ivp
 
 import varpin as vp
@@ -404,11 +405,11 @@ def test_noise_is_kicked_under_the_same_torques():
 
 def test_what_is_refused():
     scene = stiff_scene()
-    with pytest.raises(vp.InputError, match=r"a row for each node, got \(3,\)"):
+    with refused(vp.InputError, "node", "(3,)"):
         vp.FirstOrderHold(np.zeros(3))
-    with pytest.raises(vp.InputError, match="finite"):
+    with refused(vp.InputError, "finite"):
         vp.FirstOrderHold([[0.0], [np.nan]])
-    with pytest.raises(vp.InputError, match=r"FirstOrderHold: u must have shape \(4, 3\).*got \(3, 3\)"):
+    with refused(vp.InputError, "FirstOrderHold", "u", "(4, 3)", "(3, 3)"):
         vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=vp.FirstOrderHold(np.zeros((3, 3))), **SMALL)
     calls = []
 
@@ -418,6 +419,6 @@ def test_what_is_refused():
             raise RuntimeError("no more")
         return push(t)
 
-    with pytest.raises(vp.ControlError, match="step 1") as info:
+    with refused(vp.ControlError, "1") as info:
         vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=vp.OpenLoop(breaks), integrator=vp.Gauss(2), **SMALL)
     assert info.value.trajectory.steps == 1

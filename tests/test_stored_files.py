@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin.io.archive import read_npz
@@ -56,11 +57,9 @@ def changed(folder: Path, name: str, **members: Any) -> Path:
     return path
 
 
-def refused(name: str, path: Path, *words: str) -> None:
-    with pytest.raises(vp.FileError) as caught:
+def unread(name: str, path: Path, *facts: str) -> None:
+    with refused(vp.FileError, path.name, *facts):
         LOADERS[name](path)
-    for word in (path.name, *words):
-        assert word in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ARCHIVES)
@@ -141,7 +140,7 @@ def test_truncated(name, share, tmp_path):
     whole = (DATA / name).read_bytes()
     path = tmp_path / name
     path.write_bytes(whole[: int(share * len(whole))])
-    refused(name, path, "truncated")
+    unread(name, path, "truncated")
 
 
 @pytest.mark.parametrize("name", ["trajectory.npz", "tradeoff.npz"])
@@ -190,9 +189,7 @@ def test_every_entry_is_checked(name, tmp_path):
 def test_numbers_that_are_not_finite(name, entry, value, tmp_path):
     array = members_of(name)[entry].copy()
     array[(-1,) * array.ndim] = value
-    refused(
-        name, changed(tmp_path, name, **{entry: array}), "t are not dt" if entry == "dt" else f"{entry} holds values"
-    )
+    unread(name, changed(tmp_path, name, **{entry: array}), entry)
 
 
 @pytest.mark.parametrize("other", LOADERS)
@@ -201,7 +198,7 @@ def test_another_kind(name, other, tmp_path):
     if LOADERS[name] != LOADERS[other]:
         path = tmp_path / other
         path.write_bytes((DATA / other).read_bytes())
-        refused(name, path)
+        unread(name, path)
 
 
 @pytest.mark.parametrize("name", LOADERS)
@@ -213,11 +210,11 @@ def test_another_version(name, tmp_path):
     else:
         form = str(members_of(name)["format"])
         path = changed(tmp_path, name, format=form[:-1] + "9")
-    refused(name, path, "/9'", "should have")
+    unread(name, path, "/9")
 
 
 def test_what_reads_a_file_of_another_kind_is_named():
-    with pytest.raises(vp.FileError, match=r"Solution\.load\(path, problem\) reads such files"):
+    with refused(vp.FileError, "Solution.load"):
         vp.Trajectory.load(DATA / "solution.npz")
 
 
@@ -226,28 +223,28 @@ def test_what_reads_a_file_of_another_kind_is_named():
 def test_another_file(name, content, tmp_path):
     path = tmp_path / name
     path.write_bytes(content)
-    refused(name, path)
+    unread(name, path)
 
 
 @pytest.mark.parametrize("name", LOADERS)
 def test_no_file(name, tmp_path):
-    refused(name, tmp_path / "none.npz", "there is no file")
-    refused(name, tmp_path)
+    unread(name, tmp_path / "none.npz")
+    unread(name, tmp_path)
     os.mkfifo(tmp_path / "pipe.npz")
-    refused(name, tmp_path / "pipe.npz", "there is no file")
+    unread(name, tmp_path / "pipe.npz")
 
 
 @pytest.mark.parametrize("name", LOADERS)
 def test_unreadable(name):
     # A regular file whose every read fails, even for root.
-    refused(name, Path("/proc/self/mem"))
+    unread(name, Path("/proc/self/mem"))
 
 
 @pytest.mark.parametrize("name", ARCHIVES)
 def test_foreign_archive(name, tmp_path):
     path = tmp_path / name
     np.savez(path, q=np.zeros((3, 2)), t=np.zeros(3))
-    refused(name, path, "it has no format")
+    unread(name, path, "format")
 
 
 @pytest.mark.parametrize("name", ARCHIVES)
@@ -259,7 +256,7 @@ def test_pickles_are_not_opened(name, tmp_path):
             return (Path.touch, (witness,))
 
     path = changed(tmp_path, name, format=np.array([Trap()], dtype=object))
-    refused(name, path, "format")
+    unread(name, path, "format")
     assert not witness.exists()
     # The trap is live.
     with np.load(path, allow_pickle=True) as archive:
@@ -268,17 +265,17 @@ def test_pickles_are_not_opened(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "fact"),
     [
-        (('"deep": false', '"deep": 0'), "deep is 0"),
+        (('"deep": false', '"deep": 0'), "cells[0].deep"),
         (('"error": 0.0,', '"error": "small",'), "cells[0].error"),
         (('"said": []', '"said": [[]]'), "cells[0].said[0]"),
-        (('"trial"', '"trail"'), "cells[0].trial is missing"),
-        (('"kind": "accurate"', '"kind": "good"'), "one of accurate"),
+        (('"trial"', '"trail"'), "cells[0].trial"),
+        (('"kind": "accurate"', '"kind": "good"'), "accurate"),
     ],
 )
-def test_records_of_the_battery(change, words, tmp_path):
+def test_records_of_the_battery(change, fact, tmp_path):
     path, text = tmp_path / "record.json", (DATA / "record.json").read_text()
     assert change[0] in text
     path.write_text(text.replace(*change))
-    refused("record.json", path, words)
+    unread("record.json", path, fact)

@@ -4,6 +4,7 @@ import mechanisms
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin.control.costs import Points
@@ -61,7 +62,7 @@ def differences(function, z):
 
 
 def test_a_frame_has_a_name():
-    with pytest.raises(vp.InputError, match="FramePositionCost frame must be the name of a frame, got \\[0, 0, 0\\]"):
+    with refused(vp.InputError, "FramePositionCost frame", "[0, 0, 0]"):
         vp.FramePositionCost(vp.planar_chain(2), [0, 0, 0], "tip")
 
 
@@ -363,38 +364,38 @@ def test_as_terms_of_a_sum(load):
 
 def test_what_is_refused(load):
     robot = load("ur5")
-    with pytest.raises(vp.UnknownFrame, match=r"robot 'ur5' has no frame 'tool'; did you mean 'tool0'.* frames: ") as e:
+    with refused(vp.UnknownFrame, "'ur5'", "'tool'", "'tool0'") as e:
         vp.FramePositionCost(robot, "tool", [0, 0, 0])
     assert "tool0" in e.value.matches
     assert "wrist_3_link" in e.value.frames
     with pytest.raises(vp.UnknownFrame):
         robot.frame_positions(np.zeros((1, 6)), "nowhere")
-    with pytest.raises(vp.InputError, match="frame 'base_link' of robot 'ur5' is fixed to the base"):
+    with refused(vp.InputError, "'base_link'", "'ur5'"):
         vp.FrameVelocityCost(robot, "base_link")
-    with pytest.raises(vp.InputError, match="takes a robot from load_robot, got str"):
+    with refused(vp.InputError, "str"):
         vp.FramePositionCost("ur5", "tool0", [0, 0, 0])
-    with pytest.raises(vp.InputError, match="takes a robot from load_robot, got str"):
+    with refused(vp.InputError, "str"):
         vp.JointLimitBarrier("ur5")
-    with pytest.raises(vp.InputError, match="FramePositionCost weight must be one number or have 3 rows"):
+    with refused(vp.InputError, "FramePositionCost weight", "3"):
         vp.FramePositionCost(robot, "tool0", [0, 0, 0], [1, 2])
-    with pytest.raises(vp.InputError, match="FrameVelocityCost weight must be positive semidefinite"):
+    with refused(vp.InputError, "FrameVelocityCost weight", "positive semidefinite"):
         vp.FrameVelocityCost(robot, "tool0", 0.0, -1.0)
-    with pytest.raises(vp.InputError, match="ManipulabilityCost directions must be"):
+    with refused(vp.InputError, "ManipulabilityCost directions"):
         vp.ManipulabilityCost(robot, "tool0", 0.1, directions=["x", "x"])
-    with pytest.raises(vp.InputError, match="ManipulabilityCost directions must be"):
+    with refused(vp.InputError, "ManipulabilityCost directions"):
         vp.ManipulabilityCost(robot, "tool0", 0.1, directions="up")
-    with pytest.raises(vp.InputError, match="ManipulabilityCost least must be positive"):
+    with refused(vp.InputError, "ManipulabilityCost least"):
         vp.ManipulabilityCost(robot, "tool0", 0.0)
-    with pytest.raises(vp.InputError, match="weight must be one number"):
+    with refused(vp.InputError, "weight"):
         vp.ManipulabilityCost(robot, "tool0", 0.1, [1.0])
     chain = vp.planar_chain(2)
-    with pytest.raises(vp.InputError, match="with 2 coordinates no frame moves freely in 3 directions"):
+    with refused(vp.InputError, "2", "3"):
         vp.ManipulabilityCost(chain, "tip", 0.1, directions="linear")
-    with pytest.raises(vp.InputError, match="JointLimitBarrier: robot 'chain2' has no such limits"):
+    with refused(vp.InputError, "JointLimitBarrier", "'chain2'"):
         vp.JointLimitBarrier(chain)
-    with pytest.raises(vp.InputError, match=r"margin must be >= 0, got -0\.1"):
+    with refused(vp.InputError, "margin", "0", "-0.1"):
         vp.JointLimitBarrier(robot, margin=-0.1)
-    with pytest.raises(vp.InputError, match="VelocityLimitBarrier limits: nothing is within 1 and -1"):
+    with refused(vp.InputError, "VelocityLimitBarrier", "1", "-1"):
         vp.VelocityLimitBarrier(robot, limits=(1.0, -1.0))
 
 
@@ -405,25 +406,23 @@ def test_targets_that_are_refused(load):
     def bound(cost):
         return cost.bind(points)
 
-    with pytest.raises(
-        vp.InputError, match=r"FramePositionCost reference must be a function of time, have shape \(3,\)"
-    ):
+    with refused(vp.InputError, "FramePositionCost reference", "(3,)"):
         bound(vp.FramePositionCost(robot, "tool0", [0.0, 1.0]))
-    with pytest.raises(vp.CostError, match="FramePositionCost: the reference at t = 0 s must have shape"):
+    with refused(vp.CostError, "FramePositionCost", "reference", "0 s"):
         bound(vp.FramePositionCost(robot, "tool0", lambda t: [t]))
-    for wrong, message in (
-        (2.0 * np.eye(3), "no rotation matrix"),
-        (np.diag([1.0, 1.0, -1.0]), "no rotation matrix"),
-        (np.full((3, 3), np.nan), "must be finite"),
-        (np.eye(4), r"have shape \(3, 3\), or \(3, 3, 3\)"),
-        (np.array([np.eye(3), 2 * np.eye(3), np.eye(3)]), "number 1 is no rotation matrix"),
+    for wrong, facts in (
+        (2.0 * np.eye(3), "rotation"),
+        (np.diag([1.0, 1.0, -1.0]), "rotation"),
+        (np.full((3, 3), np.nan), "finite"),
+        (np.eye(4), ("(3, 3)", "(3, 3, 3)")),
+        (np.array([np.eye(3), 2 * np.eye(3), np.eye(3)]), ("1", "rotation")),
     ):
-        with pytest.raises(vp.InputError, match=message):
+        with refused(vp.InputError, facts):
             bound(vp.FrameOrientationCost(robot, "tool0", wrong))
     for wrong in (lambda t: np.eye(2), lambda t: 2 * np.eye(3), lambda t: 1 / 0, lambda t: "up"):
-        with pytest.raises(vp.CostError, match="FrameOrientationCost: at t = 0 s"):
+        with refused(vp.CostError, "FrameOrientationCost", "0 s"):
             bound(vp.FrameOrientationCost(robot, "tool0", wrong))
-    with pytest.raises(vp.InputError, match="for robot 'ur5' with 6 coordinates; the problem has 2"):
+    with refused(vp.InputError, "'ur5'", "6", "2"):
         vp.CenterOfMassCost(robot, [0, 0, 0]).bind(Points(np.zeros(2), 1.0, 2, 2, 2))
 
 
@@ -431,13 +430,13 @@ def test_a_robot_without_mass(tmp_path):
     """Its links' inertia alone is enough to move it, but it has no centre of mass."""
     inertia = '<inertial><mass value="0"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
     robot = vp.load_robot(str(mechanisms.arm(tmp_path, inertia)))
-    with pytest.raises(vp.InputError, match="have no mass"):
+    with refused(vp.InputError, "mass"):
         vp.CenterOfMassCost(robot, [0, 0, 0])
 
 
 def test_a_cost_of_another_robot_is_refused(load):
     cost = vp.ControlCost(1e-3) + vp.Terminal(vp.FramePositionCost(load("ur10"), "tool0", [0.45, 0.1, 0.4]))
-    with pytest.raises(vp.InputError, match=r"FramePositionCost is for robot 'ur10'.* make it with scene.robot"):
+    with refused(vp.InputError, "FramePositionCost", "'ur10'", "scene.robot"):
         vp.OptimalControlProblem(vp.Scene(load("ur5")), cost, np.zeros(6), np.zeros(6), dt=0.01, steps=5)
     heavier = vp.load_robot("ur5", payload=vp.Payload("tool0", 1.0))
     own = vp.ControlCost(1e-3) + vp.FramePositionCost(load("ur5"), "tool0", [0.45, 0.1, 0.4])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin import textbook
@@ -160,5 +161,5 @@ def test_a_backward_pass_without_noise_is_riccatis():
 def test_models_of_joints_with_two_variables_are_refused():
     model = pin.Model()
     model.addJoint(0, pin.JointModelRUBZ(), pin.SE3.Identity(), "continuous")
-    with pytest.raises(vp.InputError, match="one variable"):
+    with refused(vp.InputError, "variable"):
         textbook.system(model)

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refused
 from scipy.integrate import solve_ivp
 
 import varpin as vp
@@ -191,12 +192,12 @@ def test_beyond_rounding_it_says_what_is_reached(caplog):
 
 def test_a_chaotic_motion_has_no_end(monkeypatch):
     monkeypatch.setattr(search, "_PATIENCE", 100_000)
-    with pytest.raises(vp.ToleranceError, match=r"tolerance = 1e-06 cannot be met over 200 s: with \d+ steps"):
+    with refused(vp.ToleranceError, "1e-06", "200 s"):
         vp.simulate(chain(), REST, REST, duration=200.0, tolerance=1e-6)
 
 
 def test_no_more_steps_are_tried_than_there_is_time_for():
-    with pytest.raises(vp.ToleranceError, match="the error in q is unknown"):
+    with refused(vp.ToleranceError, "unknown"):
         vp.simulate(chain(), REST + 1.0, REST, duration=1e12, tolerance=1e-6)
 
 
@@ -205,32 +206,32 @@ def law(t, q, v):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "facts"),
     [
-        ({"dt": 1e-3, "duration": 1.0, "tolerance": 1e-6}, "dt and tolerance do not go together"),
-        ({"steps": 10, "tolerance": 1e-6}, "steps and tolerance do not go together"),
-        ({"tolerance": 1e-6}, "tolerance needs the duration"),
-        ({"duration": 1.0, "tolerance": 0.0}, "tolerance must be positive"),
-        ({"duration": -1.0, "tolerance": 1e-6}, "duration must be positive"),
-        ({"duration": 1.0, "tolerance": 1e-6, "controls": law}, "a tolerance chooses the steps"),
-        ({"duration": 1.0, "tolerance": 1e-6, "controls": np.ones((4, 2))}, r"controls must have shape \(R, 3\)"),
-        ({"duration": 1.0, "tolerance": 1e-6, "controls": policy(None, None)}, "needs the period of its intervals"),
-        ({"duration": 1.0, "tolerance": 1e-6, "controls": policy(None)}, "10 intervals of 0.05 s, 0.5 s in all"),
-        ({"duration": 1.0, "tolerance": 1e-6, "integrator": vp.Reference()}, "its tolerance is rtol"),
-        ({"duration": 1.0, "tolerance": 1e-6, "integrator": "Midpoint"}, "integrator must be one of varpin's"),
-        ({"duration": 1.0}, "give two of dt .* got duration"),
-        ({}, "give two of dt .* got none of them"),
-        ({"dt": 0.1, "steps": 10, "duration": 1.0}, "got all three"),
-        ({"dt": 0.3, "duration": 1.0}, r"duration = 1 s is no multiple of dt = 0.3 s: dt = 0.333\d* s is"),
+        ({"dt": 1e-3, "duration": 1.0, "tolerance": 1e-6}, ("dt", "tolerance")),
+        ({"steps": 10, "tolerance": 1e-6}, ("steps", "tolerance")),
+        ({"tolerance": 1e-6}, ("tolerance", "duration")),
+        ({"duration": 1.0, "tolerance": 0.0}, "tolerance"),
+        ({"duration": -1.0, "tolerance": 1e-6}, "duration"),
+        ({"duration": 1.0, "tolerance": 1e-6, "controls": law}, "tolerance"),
+        ({"duration": 1.0, "tolerance": 1e-6, "controls": np.ones((4, 2))}, ("controls", "(R, 3)")),
+        ({"duration": 1.0, "tolerance": 1e-6, "controls": policy(None, None)}, "period"),
+        ({"duration": 1.0, "tolerance": 1e-6, "controls": policy(None)}, ("10", "0.05", "0.5")),
+        ({"duration": 1.0, "tolerance": 1e-6, "integrator": vp.Reference()}, "rtol"),
+        ({"duration": 1.0, "tolerance": 1e-6, "integrator": "Midpoint"}, "integrator"),
+        ({"duration": 1.0}, ("dt", "duration")),
+        ({}, "dt"),
+        ({"dt": 0.1, "steps": 10, "duration": 1.0}, "dt"),
+        ({"dt": 0.3, "duration": 1.0}, ("1 s", "0.3 s")),
     ],
 )
-def test_what_does_not_go_together(options, message):
-    with pytest.raises(vp.InputError, match=message):
+def test_what_does_not_go_together(options, facts):
+    with refused(vp.InputError, facts):
         vp.simulate(chain(), REST, REST, **options)
 
 
 def test_noise_is_refused():
-    with pytest.raises(vp.InputError, match="leave the noise out of the scene"):
+    with refused(vp.InputError, "noise"):
         vp.simulate(chain(noise=vp.AdditiveNoise(0.1)), REST, REST, duration=1.0, tolerance=1e-3)
 
 
@@ -262,7 +263,7 @@ def test_a_damaged_estimate_is_refused(tmp_path, entry, value):
     motion = vp.simulate(chain(), REST, REST, duration=0.2, tolerance=1e-3)
     members = dict(np.load(motion.save(tmp_path / "a.npz")))
     np.savez(tmp_path / "b.npz", **{**members, f"accuracy.{entry}": value})
-    with pytest.raises(vp.FileError, match="accuracy"):
+    with refused(vp.FileError, "accuracy"):
         vp.Trajectory.load(tmp_path / "b.npz")
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin.show.plots import plot_optimal_control_tradeoff, plot_work_precision
@@ -118,7 +119,7 @@ def test_pareto_front_is_what_nothing_beats(oscillator):
                 if other is not run
             )
             assert (run in chosen) != beaten
-    with pytest.raises(vp.InputError, match="quantity must be one of q, end, tip, energy"):
+    with refused(vp.InputError, "quantity", "q, end, tip, energy"):
         oscillator.pareto("speed")
 
 
@@ -306,14 +307,14 @@ def test_another_motions_record_is_not_overwritten(tmp_path):
     path = tmp_path / "a.npz"
     options = {"duration": 1.0, "dts": [0.1], "integrators": [vp.Midpoint()], "repeats": 1, "save": path}
     vp.work_precision(spring(), [0.7], [0.3], **options)
-    with pytest.raises(vp.FileError, match=r"another motion \(not the same: initial state\)"):
+    with refused(vp.FileError, "initial state"):
         vp.work_precision(spring(), [0.7], [0.31], **options)
-    with pytest.raises(vp.FileError, match=r"another motion \(not the same: scene, duration\)"):
+    with refused(vp.FileError, "scene, duration"):
         vp.work_precision(vp.Scene(vp.planar_chain(1)), [0.7], [0.3], **options | {"duration": 2.0})
-    with pytest.raises(vp.FileError, match=r"another motion \(not the same: controls, reference\)"):
+    with refused(vp.FileError, "controls, reference"):
         vp.work_precision(spring(), [0.7], [0.3], controls=[1.0], reference=vp.Reference(rtol=1e-9), **options)
     path.write_bytes(b"no record")
-    with pytest.raises(vp.FileError, match="is no npz file"):
+    with refused(vp.FileError, "npz"):
         vp.work_precision(spring(), [0.7], [0.3], **options)
 
 
@@ -325,34 +326,34 @@ def test_record_as_npz_and_csv(oscillator, tmp_path):
     rows = list(csv.DictReader(oscillator.to_csv(tmp_path / "a.csv").open()))
     assert len(rows) == len(oscillator.runs)
     assert float(rows[0]["largest error in q [rad or m]"]) == oscillator.runs[0].error
-    with pytest.raises(vp.FileError, match="its format is"):
+    with refused(vp.FileError, "format"):
         vp.OptimalControlTradeoff.load(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "facts"),
     [
-        ({"duration": -1.0}, "duration must be positive"),
-        ({"dts": []}, "dts must be one step or more"),
-        ({"dts": [3.0]}, "is longer than what the controls are held for"),
-        ({"integrators": ["RK4"]}, "integrators must be varpin's"),
-        ({"integrators": [vp.Midpoint(), vp.Midpoint()]}, "one or more, each once"),
-        ({"controls": lambda t, q, v: [0.0]}, "controls must be rows"),
-        ({"controls": np.zeros((3, 2))}, r"controls must have shape \(R, 1\)"),
-        ({"reference": vp.Midpoint()}, "reference must be a varpin.Reference"),
-        ({"repeats": 0}, "repeats must be at least 1"),
+        ({"duration": -1.0}, "duration"),
+        ({"dts": []}, "dts"),
+        ({"dts": [3.0]}, "controls"),
+        ({"integrators": ["RK4"]}, "integrators"),
+        ({"integrators": [vp.Midpoint(), vp.Midpoint()]}, "integrators"),
+        ({"controls": lambda t, q, v: [0.0]}, "controls"),
+        ({"controls": np.zeros((3, 2))}, ("controls", "1")),
+        ({"reference": vp.Midpoint()}, ("reference", "varpin.Reference")),
+        ({"repeats": 0}, ("repeats", "1")),
     ],
 )
-def test_wrong_arguments(change, message):
-    with pytest.raises(vp.InputError, match=message):
+def test_wrong_arguments(change, facts):
+    with refused(vp.InputError, facts):
         vp.work_precision(spring(), [0.7], [0.3], **({"duration": 1.0} | change))
 
 
 def test_noise_is_refused():
     scene = vp.Scene(vp.planar_chain(1), noise=vp.AdditiveNoise(0.1))
-    with pytest.raises(vp.InputError, match="leave the noise out"):
+    with refused(vp.InputError, "noise"):
         vp.work_precision(scene, [0.7], [0.3], duration=1.0)
-    with pytest.raises(vp.InputError, match="leave the noise out"):
+    with refused(vp.InputError, "noise"):
         vp.advise(scene, [0.7], [0.3], duration=1.0, tolerance=1e-3)
 
 
@@ -391,7 +392,7 @@ def test_true_costs_of_plans(problem, tmp_path, monkeypatch):
     plot_optimal_control_tradeoff(record)
     monkeypatch.setattr(optimal_control, "_measured", lambda *_: pytest.fail("it is there already"))
     assert vp.optimal_control_tradeoff(problem, members, dts, period=0.1, save=path).runs == record.runs
-    with pytest.raises(vp.FileError, match="holds runs of another problem"):
+    with refused(vp.FileError, "problem"):
         vp.optimal_control_tradeoff(problem.at(q0=[0.1]), members, dts, save=path)
     assert len(list(csv.reader(record.to_csv(tmp_path / "a.csv").open()))) == 7
 
@@ -433,7 +434,7 @@ def test_a_record_knows_the_options_that_matter(problem):
     rows = np.zeros((5000, 1))
     rows[2500] = 1e-9
     assert mark(controls=rows) != mark(controls=np.zeros((5000, 1)))
-    with pytest.raises(vp.InputError, match="function cannot be told from others in a saved record"):
+    with refused(vp.InputError, "function"):
         mark(controls=lambda t: t)
 
 
@@ -460,7 +461,7 @@ def test_plans_that_fail_do_not_stop_the_others(problem):
     record = vp.optimal_control_tradeoff(problem, [Broken(), vp.Midpoint()], [0.05])
     assert record.runs[0].failure == "ZeroDivisionError: on purpose"
     assert record.runs[1].survived
-    with pytest.raises(vp.InputError, match="no multiple of dt"):
+    with refused(vp.InputError, "dt"):
         vp.optimal_control_tradeoff(problem, [vp.Midpoint()], [0.05], period=0.07)
 
 
@@ -518,7 +519,7 @@ def test_advice_says_when_a_wish_is_out_of_reach():
 
 def test_advice_says_when_its_patience_was_too_short():
     scene, rest = vp.Scene(vp.planar_chain(2)), np.zeros(2)
-    with pytest.raises(vp.VarpinError, match=r"in whole steps yet, with up to \d+ of them: give more patience"):
+    with refused(vp.VarpinError, "patience"):
         vp.advise(scene, rest, rest, duration=60.0, tolerance=1e-9, patience=1e-9, integrators=[vp.Midpoint()])
 
 
@@ -535,17 +536,17 @@ def test_steps_that_a_guard_splits_are_not_taken_for_agreement():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "facts"),
     [
-        ({}, "either a tolerance .* or a budget"),
-        ({"tolerance": 1e-3, "budget": 1.0}, "either a tolerance .* or a budget"),
-        ({"tolerance": 0.0}, "tolerance must be positive"),
-        ({"tolerance": 1e-3, "integrators": [vp.Reference()]}, "Reference chooses its own steps"),
-        ({"tolerance": 1e-3, "patience": 0.0}, "patience must be positive"),
+        ({}, ("tolerance", "budget")),
+        ({"tolerance": 1e-3, "budget": 1.0}, ("tolerance", "budget")),
+        ({"tolerance": 0.0}, "tolerance"),
+        ({"tolerance": 1e-3, "integrators": [vp.Reference()]}, "Reference"),
+        ({"tolerance": 1e-3, "patience": 0.0}, "patience"),
     ],
 )
-def test_wrong_wishes(change, message):
-    with pytest.raises(vp.InputError, match=message):
+def test_wrong_wishes(change, facts):
+    with refused(vp.InputError, facts):
         vp.advise(spring(), [0.7], [0.3], duration=1.0, **change)
 
 

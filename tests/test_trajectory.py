@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 
@@ -88,7 +89,7 @@ class TestRoundTrip:
 
     def test_checks_the_robot(self, saved):
         assert vp.Trajectory.load(saved, vp.planar_chain(2)).steps == 20
-        with pytest.raises(vp.FileError, match="is of robot chain2 with joints joint1, joint2; 'chain3' has joints"):
+        with refused(vp.FileError, "chain2", "joint1, joint2", "'chain3'"):
             vp.Trajectory.load(saved, vp.planar_chain(3))
 
 
@@ -121,7 +122,7 @@ class TestSaving:
         # Replacing what is there would turn /dev/null into a file.
         pipe = tmp_path / "pipe"
         os.mkfifo(pipe)
-        with pytest.raises(vp.FileError, match="it is a device or pipe"):
+        with refused(vp.FileError, "device"):
             trajectory.save(pipe)
         assert pipe.is_fifo()
 
@@ -149,15 +150,15 @@ class TestSaving:
         assert vp.Trajectory.load(real).steps == 20
 
     def test_to_a_folder(self, trajectory, tmp_path):
-        with pytest.raises(vp.FileError, match=f"cannot write {tmp_path}: it is a folder"):
+        with refused(vp.FileError, str(tmp_path), "folder"):
             trajectory.save(tmp_path)
 
     def test_to_a_folder_that_is_not_there(self, trajectory, tmp_path):
-        with pytest.raises(vp.FileError, match=r"there is no folder .*nowhere"):
+        with refused(vp.FileError, "nowhere"):
             trajectory.save(tmp_path / "nowhere" / "run.npz")
 
     def test_to_where_nothing_can_be_written(self, trajectory):
-        with pytest.raises(vp.FileError, match=r"cannot write /proc/run\.npz"):
+        with refused(vp.FileError, "/proc/run.npz"):
             trajectory.save("/proc/run.npz")
 
 
@@ -166,9 +167,7 @@ def test_robots_with_joints_of_the_same_names_are_told_apart(tmp_path):
     small = vp.load_robot("ur5")
     path = vp.simulate(vp.Scene(small), np.zeros(6), np.zeros(6), dt=1e-3, steps=3).save(tmp_path / "a.npz")
     assert vp.Trajectory.load(path, small).steps == 3
-    with pytest.raises(
-        vp.FileError, match=r"is of robot ur5, whose links weigh .* kg in all; 'ur10' has joints of the"
-    ):
+    with refused(vp.FileError, "ur5", "'ur10'", "kg"):
         vp.Trajectory.load(path, vp.load_robot("ur10"))
 
 
@@ -192,7 +191,7 @@ def test_numbers_that_no_motion_has(saved, name, change):
 def test_what_is_no_path(path):
     motion = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.0], [0.0], dt=1e-3, steps=1)
     for call in (motion.save, vp.Trajectory.load):
-        with pytest.raises(vp.InputError, match="path must be a path, got"):
+        with refused(vp.InputError, "path"):
             call(path)
-    with pytest.raises(vp.InputError, match="robot must come from load_robot, got str"):
+    with refused(vp.InputError, "robot", "load_robot", "str"):
         vp.Trajectory.load("a.npz", "finger")

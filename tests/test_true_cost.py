@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 
@@ -99,9 +100,9 @@ def test_saved_with_the_plan(tmp_path) -> None:
 
 def test_bad_wishes() -> None:
     plan = vp.solve(reach(4), check=False)
-    with pytest.raises(vp.InputError, match="true_cost"):
+    with refused(vp.InputError, "true_cost"):
         vp.solve(reach(4), true_cost=0.0)
-    with pytest.raises(vp.InputError, match="resume"):
+    with refused(vp.InputError, "resume"):
         vp.solve(reach(4), resume=plan, true_cost=0.1)
 
 

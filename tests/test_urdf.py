@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import INERTIAL, arm, joint, link, mimic, write_urdf
+from refusals import refused
 
 import varpin as vp
 from varpin.model import example_robot_data, geometry, readable_geometry
@@ -187,35 +188,35 @@ class TestOdd:
         assert vp.load_robot(written(tmp_path, two + "<more/>"), mimic="free").dof == 2
 
     @pytest.mark.parametrize(
-        ("change", "words"),
+        ("change", "facts"),
         [
-            (lambda text: "", "is empty"),
-            (lambda text: " \r\n", "is empty"),
-            (lambda text: "hello", "not well-formed XML: syntax error"),
-            (lambda text: text[:-10], "not well-formed XML"),
-            (lambda text: text.replace("</robot>", "<xacro:macro name='a'/></robot>"), "is a xacro file: expand it"),
+            (lambda text: "", "empty"),
+            (lambda text: " \r\n", "empty"),
+            (lambda text: "hello", "XML"),
+            (lambda text: text[:-10], "XML"),
+            (lambda text: text.replace("</robot>", "<xacro:macro name='a'/></robot>"), "xacro"),
             (
                 lambda text: text.replace("<robot ", '<robot xmlns:x="http://ros.org/wiki/xacro" ').replace(
                     "</link>", "<x:insert/></link>"
                 ),
-                "is a xacro file: expand it first, .* it has <x:insert>",
+                ("xacro", "<x:insert>"),
             ),
-            (lambda text: text.replace('"1.3"', '"${m}"', 1), r"is a xacro file: .* <mass value='\$\{m\}'>"),
-            (lambda text: text.replace('"l1"', '"$(arg l)"'), r"is a xacro file: .* <link name='\$\(arg l\)'>"),
-            (lambda text: text.replace("robot", "sdf"), "its root element is <sdf>"),
-            (lambda text: '<robot name="a"/>', "describes no link"),
-            (lambda text: "<!DOCTYPE html><html><body></html>", "is a web page"),
+            (lambda text: text.replace('"1.3"', '"${m}"', 1), ("xacro", "<mass value='${m}'>")),
+            (lambda text: text.replace('"l1"', '"$(arg l)"'), ("xacro", "<link name='$(arg l)'>")),
+            (lambda text: text.replace("robot", "sdf"), "<sdf>"),
+            (lambda text: '<robot name="a"/>', "link"),
+            (lambda text: "<!DOCTYPE html><html><body></html>", "web page"),
         ],
     )
-    def test_files_that_are_none(self, tmp_path, two, change, words):
+    def test_files_that_are_none(self, tmp_path, two, change, facts):
         assert change(two) != two
-        with pytest.raises(vp.RobotError, match=words) as info:
+        with refused(vp.RobotError, facts) as info:
             vp.load_robot(written(tmp_path, change(two)))
         assert "odd.urdf" in str(info.value)
 
     def test_folder(self, tmp_path, two):
         written(tmp_path, two)
-        with pytest.raises(vp.RobotError, match=r"is a folder, not a URDF file; it holds made_up.urdf, odd.urdf"):
+        with refused(vp.RobotError, "made_up.urdf", "odd.urdf"):
             vp.load_robot(tmp_path)
 
 
@@ -240,7 +241,7 @@ class TestInertia:
     def test_negative_inertia_is_told_from_none(self, tmp_path):
         """Of a joint, and of a motion of several; without a warning of NumPy's."""
         path = arm(tmp_path, THIN.format("0.1").replace('iyy="0.1"', 'iyy="-3"'))
-        with pytest.raises(vp.SingularMassMatrix, match=r"motion of 'j1' carries negative inertia; correct") as caught:
+        with refused(vp.SingularMassMatrix, "'j1'") as caught:
             vp.load_robot(path)
         assert (caught.value.negative, caught.value.joints) == (True, ("j1",))
         model = pin.Model()
@@ -248,7 +249,7 @@ class TestInertia:
             model.addJoint(k, pin.JointModelPZ(), pin.SE3.Identity(), f"s{k}")
         for joint_index, mass in ((1, 3.0), (2, -1.0)):
             model.appendBodyToJoint(joint_index, pin.Inertia(mass, np.zeros(3), np.eye(3)), pin.SE3.Identity())
-        with pytest.raises(vp.SingularMassMatrix, match=r"motion of 's1' carries negative inertia"):
+        with refused(vp.SingularMassMatrix, "'s1'"):
             vp.load_robot(model)
 
     def test_hidden_on_a_fixed_joint_is_told(self, tmp_path, caplog):

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import INERTIAL, arm, joint, link
+from refusals import refused
 
 import varpin as vp
 from varpin.model import geometry
@@ -74,7 +75,7 @@ def test_arguments(workspace):
     robot = vp.load_robot(workspace, xacro_args={"prefix": "left_", "tool": True})
     assert robot.joint_names == ("jleft_1", "jleft_2")
     assert robot.model.inertias[2].mass == 0.5
-    with pytest.raises(vp.InputError, match=r"arm.urdf.xacro has no xacro argument 'prefx'; it takes: prefix, tool"):
+    with refused(vp.InputError, "arm.urdf.xacro", "'prefx'", "prefix, tool"):
         vp.load_robot(workspace, xacro_args={"prefx": "left_"})
 
 
@@ -98,27 +99,27 @@ def test_packages_are_those_around_the_file_each_time(workspace, tmp_path):
 def test_package_dirs(workspace, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "parts").rename(tmp_path / "elsewhere" / "parts")
-    with pytest.raises(vp.RobotError, match=r"cannot be expanded: .*no package 'parts' above the file nor in .*dirs"):
+    with refused(vp.RobotError, "'parts'"):
         vp.load_robot(workspace)
     assert vp.load_robot(workspace, package_dirs=[tmp_path / "elsewhere"]).dof == 1
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "facts"),
     [
         (
             lambda text: text.replace("${0.65 * 2}", "${lost * 2}"),
-            r"arm.urdf.xacro cannot be expanded: name 'lost' is not defined, when evaluating expression 'lost \* 2',",
+            ("arm.urdf.xacro", "'lost'", "'lost * 2'"),
         ),
-        (lambda text: text.replace("</robot>", ""), r"cannot be expanded: it is not well-formed XML: no element found"),
-        (lambda text: text.replace("$(arg tool)", "$(arg tol)"), r"cannot be expanded: .*tol"),
-        (lambda text: text.replace("base.xacro", "case.xacro"), r"case.xacro"),
-        (lambda text: text.replace('parent="base"', 'perent="base"'), r"perent"),
+        (lambda text: text.replace("</robot>", ""), "XML"),
+        (lambda text: text.replace("$(arg tool)", "$(arg tol)"), "tol"),
+        (lambda text: text.replace("base.xacro", "case.xacro"), "case.xacro"),
+        (lambda text: text.replace('parent="base"', 'perent="base"'), "perent"),
     ],
 )
-def test_bad_files_give_one_error(workspace, change, words):
+def test_bad_files_give_one_error(workspace, change, facts):
     workspace.write_text(change(workspace.read_text()))
-    with pytest.raises(vp.RobotError, match=words) as caught:
+    with refused(vp.RobotError, facts) as caught:
         vp.load_robot(workspace)
     # Each thing is said once, and none in the names of Python's classes.
     assert not re.search(r"<class|Error:|Exception", str(caught.value))
@@ -136,18 +137,18 @@ def test_warnings_of_xacro_are_logged(workspace, caplog, capfd):
 def test_without_the_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "xacro", None)
     (tmp_path / "arm.urdf.xacro").write_text(ARM)
-    with pytest.raises(vp.MissingDependency, match=r"arm.urdf.xacro needs xacro: pip install \"varpin\[xacro\]\""):
+    with refused(vp.MissingDependency, "arm.urdf.xacro", "xacro", "varpin[xacro]"):
         vp.load_robot(tmp_path / "arm.urdf.xacro")
 
 
 def test_arguments_of_what_is_no_xacro_file(tmp_path):
     for source in (arm(tmp_path), "ur5"):
-        with pytest.raises(vp.InputError, match="is read from no xacro file"):
+        with refused(vp.InputError, "xacro"):
             vp.load_robot(source, xacro_args={"prefix": "left_"})
-    with pytest.raises(vp.InputError, match="xacro_args must be a mapping"):
+    with refused(vp.InputError, "xacro_args"):
         vp.load_robot("ur5", xacro_args=["prefix"])
 
 
 def test_no_such_file(tmp_path):
-    with pytest.raises(vp.RobotNotFound, match=r"arm.urdf.xacro' \(looked in "):
+    with refused(vp.RobotNotFound, "arm.urdf.xacro"):
         vp.load_robot("arm.urdf.xacro")
