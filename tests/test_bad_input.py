@@ -1,8 +1,7 @@
-"""Every mistake has one clear message, and is a VarpinError. What the messages say is part of the library."""
+"""Every mistake is an error of its own kind that names the argument, the value it had and what is allowed."""
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 
@@ -10,17 +9,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import INERTIAL, arm, joint, link, mimic, random_inertia, write_urdf
+from refusals import refused
 
 import varpin as vp
-
-
-@contextlib.contextmanager
-def refused(kind: type[vp.VarpinError], *words: str):
-    """The error is of exactly this kind, and its message holds all ``words`` in order, literally."""
-    assert issubclass(kind, vp.VarpinError)
-    with pytest.raises(kind, match="(?s)" + ".*".join(map(re.escape, words))) as info:
-        yield info
-    assert type(info.value) is kind
 
 
 @pytest.fixture(scope="module")
@@ -36,71 +27,71 @@ def scene(robot) -> vp.Scene:
 class TestFiles:
     def test_missing(self, tmp_path):
         for source in (str(tmp_path / "arm.urdf"), tmp_path / "arm.urdf", "arm.urdf"):
-            with refused(vp.RobotNotFound, "no robot or URDF file", "arm.urdf'", "looked in"):
+            with refused(vp.RobotNotFound, "arm.urdf"):
                 vp.load_robot(source)
 
     @pytest.mark.parametrize(("name", "match"), [("ur55", "ur5"), ("Panda", "panda"), ("fingr", "finger")])
     def test_unknown_name_lists_close_ones(self, name, match):
-        with refused(vp.RobotNotFound, f"no robot or URDF file '{name}'; close matches: ", match) as info:
+        with refused(vp.RobotNotFound, f"'{name}'", match) as info:
             vp.load_robot(name)
         assert (info.value.name, info.value.matches[0]) == (name, match)
 
     @pytest.mark.parametrize("name", ["", "qwertyuiop", "a\0b.urdf"])
     def test_a_name_like_no_other_lists_all(self, name):
-        with refused(vp.RobotNotFound, "known names: ", "finger", "ur5", "z1"):
+        with refused(vp.RobotNotFound, "finger", "ur5", "z1"):
             vp.load_robot(name)
 
     def test_robots_on_a_free_flyer(self):
-        with refused(vp.RobotError, "'talos' stands on a free-flyer", "load its URDF file by path"):
+        with refused(vp.RobotError, "'talos'", "URDF"):
             vp.load_robot("talos")
 
     def test_folder(self, tmp_path):
         for source in (tmp_path, str(tmp_path)):
-            with refused(vp.RobotError, f"{tmp_path} is a folder", "it holds no URDF file"):
+            with refused(vp.RobotError, str(tmp_path), "folder", "no URDF"):
                 vp.load_robot(source)
         arm(tmp_path)
-        with refused(vp.RobotError, "is a folder", "it holds made_up.urdf"):
+        with refused(vp.RobotError, "folder", "made_up.urdf"):
             vp.load_robot(tmp_path)
 
     def test_unreadable(self):
         # A regular file whose every read fails, even for root.
-        with refused(vp.FileError, "cannot read /proc/", "mem: Input/output error"):
+        with refused(vp.FileError, "/proc/", "Input/output error"):
             vp.load_robot("/proc/self/mem")
 
     def test_pipe(self, tmp_path):
         os.mkfifo(tmp_path / "pipe.urdf")
-        with refused(vp.RobotNotFound, "no robot or URDF file"):
+        with refused(vp.RobotNotFound, "pipe.urdf"):
             vp.load_robot(tmp_path / "pipe.urdf")
 
     def test_name_too_long(self):
-        with refused(vp.FileError, "cannot read the URDF file: File name too long"):
+        with refused(vp.FileError, "File name too long"):
             vp.load_robot("a" * 5000 + ".urdf")
 
     @pytest.mark.parametrize("source", [3, None, b"ur5", ["ur5"], 1.5, object])
     def test_source_of_a_wrong_type(self, source):
-        with refused(vp.InputError, "source must be a URDF path, a robot's name", f"got {type(source).__name__}"):
+        with refused(vp.InputError, "source", type(source).__name__):
             vp.load_robot(source)
 
     @pytest.mark.parametrize(
         ("content", "facts"),
         [
-            (b"hello world\n", "is not a URDF: it is not well-formed XML: syntax error: line 1"),
-            (b"", "is not a URDF: it is empty"),
-            (b"<!DOCTYPE html>\n<html><head><meta charset=utf8></head></html>", "is a web page, not a URDF"),
-            (b"\n <html><body></html>", "is a web page, not a URDF"),
-            (b"<sdf/>", "is not a URDF: its root element is <sdf>, not <robot>"),
-            (b"<mujoco><worldbody/></mujoco>", "its root element is <mujoco>, not <robot>"),
-            (b"<robot name='a'>\n<link name='x'>\n</robot>", "not well-formed XML: mismatched tag: line 3"),
-            (b"<robot name='a'>\n<link name='x'/>\n", "not well-formed XML: no element found: line 3"),
-            (b"<robot name='a'>\0\0</robot>", "not well-formed XML"),
-            (bytes(range(256)) * 20, "not well-formed XML"),
-            (b"\x7fELF\x02\x01\x01" + bytes(500), "not well-formed XML"),
-            (b"<robot><link name='x'/></robot>", "its <robot> has no name"),
-            (b"<robot name='a'/>", "describes no link"),
-            (b"<robot name='a'><link name='x'/></robot>", "has no joint that moves"),
+            (b"hello world\n", ("XML", "line 1")),
+            (b"", "empty"),
+            (b"<!DOCTYPE html>\n<html><head><meta charset=utf8></head></html>", "web page"),
+            (b"\n <html><body></html>", "web page"),
+            (b"<sdf/>", ("<sdf>", "<robot>")),
+            (b"<mujoco><worldbody/></mujoco>", ("<mujoco>", "<robot>")),
+            (b"<robot name='a'>\n<link name='x'>\n</robot>", ("XML", "line 3")),
+            (b"<robot name='a'>\n<link name='x'/>\n", ("XML", "line 3")),
+            (b"<robot name='a'>\0\0</robot>", "XML"),
+            (bytes(range(256)) * 20, "XML"),
+            (b"\x7fELF\x02\x01\x01" + bytes(500), "XML"),
+            (b"<robot><link name='x'/></robot>", ("<robot>", "name")),
+            (b"<robot name='a'/>", "link"),
+            (b"<robot name='a'><link name='x'/></robot>", "joint"),
             (
                 b"<robot name='a' xmlns:xacro='http://www.ros.org/wiki/xacro'><xacro:property name='b'/></robot>",
-                "is a xacro file: expand it first",
+                "xacro",
             ),
         ],
     )
@@ -112,7 +103,7 @@ class TestFiles:
 
     @pytest.mark.parametrize("package_dirs", [3, [3], [None], {"a": 1}.items()])
     def test_package_dirs(self, package_dirs):
-        with refused(vp.InputError, "package_dirs must be a list of folders, got"):
+        with refused(vp.InputError, "package_dirs"):
             vp.load_robot("ur5", package_dirs=package_dirs)
 
     def test_one_package_dir_is_a_list_of_one(self, tmp_path):
@@ -121,7 +112,7 @@ class TestFiles:
 
     @pytest.mark.parametrize("value", [True, "yes", None])
     def test_mimic(self, value):
-        with refused(vp.InputError, "mimic must be 'tied' or 'free', got"):
+        with refused(vp.InputError, "mimic", "'tied'", "'free'"):
             vp.load_robot("ur5", mimic=value)
 
 
@@ -129,7 +120,7 @@ class TestLinks:
     @pytest.mark.parametrize("inertial", ["", re.sub(r'(value|i..)="[^"]*"', r'\1="0"', INERTIAL)])
     def test_massless_at_the_tip(self, tmp_path, inertial):
         path = write_urdf(tmp_path, link("a"), link("b", inertial), joint("j1", "base", "a"), joint("j2", "a", "b"))
-        with refused(vp.SingularMassMatrix, "motion of 'j2' carries no inertia", "add armature", "lock it") as info:
+        with refused(vp.SingularMassMatrix, "'j2'", "armature", "lock") as info:
             vp.load_robot(path)
         assert info.value.joints == ("j2",)
         assert vp.load_robot(path, lock={"j2": 0}).joint_names == ("j1",)
@@ -147,14 +138,14 @@ class TestLinks:
             straight.format("j1", "base", "a"),
             straight.format("j2", "a", "b"),
         )
-        with refused(vp.SingularMassMatrix, "motion of 'j1', 'j2' carries no inertia"):
+        with refused(vp.SingularMassMatrix, "'j1', 'j2'"):
             vp.load_robot(path)
 
     @pytest.mark.parametrize(
         ("change", "facts"),
         [
-            ({"mass": np.nan}, "the link moved by joint 'j1' has a mass or inertia that is not finite"),
-            ({"lever": np.full(3, np.inf)}, "the link moved by joint 'j1' has a mass or inertia that is not finite"),
+            ({"mass": np.nan}, ("'j1'", "finite")),
+            ({"lever": np.full(3, np.inf)}, ("'j1'", "finite")),
         ],
     )
     def test_of_a_model_in_memory(self, tmp_path, change, facts):
@@ -169,49 +160,49 @@ class TestLinks:
 
 class TestJoints:
     @pytest.mark.parametrize(
-        ("changes", "words"),
+        ("changes", "facts"),
         [
-            ({"axis": "0 0 0"}, ["joint 'j1' has no axis"]),
-            ({"axis": "nan 0 0"}, ["not a URDF that Pinocchio can read", "Malformed axis element for joint [j1]"]),
-            ({"axis": "up"}, ["Malformed axis element for joint [j1]"]),
-            ({"kind": "hinge"}, ["Joint [j1] has no known type [hinge]"]),
-            ({"kind": ""}, ["Joint [j1] has no known type []"]),
+            ({"axis": "0 0 0"}, ("'j1'", "axis")),
+            ({"axis": "nan 0 0"}, ("axis", "[j1]")),
+            ({"axis": "up"}, ("axis", "[j1]")),
+            ({"kind": "hinge"}, ("[j1]", "[hinge]")),
+            ({"kind": ""}, "[j1]"),
         ],
     )
-    def test_description(self, tmp_path, changes, words):
-        with refused(vp.RobotError, *words) as info:
+    def test_description(self, tmp_path, changes, facts):
+        with refused(vp.RobotError, facts) as info:
             vp.load_robot(arm(tmp_path, **changes))
         assert ".cpp" not in str(info.value)
         assert "\n" not in str(info.value)
 
     @pytest.mark.parametrize(
-        ("old", "new", "words"),
+        ("old", "new", "facts"),
         [
-            ('<limit effort="9" velocity="8" lower="-1" upper="1"/>', "", "it does not specify limits"),
-            ('rpy="0.1 0.2 0.3"/><parent', 'rpy="0 nan 0"/><parent', "Malformed parent origin element for joint [j1]"),
-            ('<child link="l1"/>', '<child link="l9"/>', "child link [l9] of joint [j1] not found"),
-            ('<parent link="base"/>', '<parent link="l9"/>', "parent link [l9] of joint [j1] not found"),
-            ('<parent link="base"/>', '<parent link="l1"/>', "links 'l1' form a loop that hangs on no root"),
-            ("</robot>", '<link name="l2"/></robot>', "Two root links found: [base] and [l2]"),
-            ("</robot>", '<link name="l1"/></robot>', "link 'l1' is not unique"),
+            ('<limit effort="9" velocity="8" lower="-1" upper="1"/>', "", "limits"),
+            ('rpy="0.1 0.2 0.3"/><parent', 'rpy="0 nan 0"/><parent', ("origin", "[j1]")),
+            ('<child link="l1"/>', '<child link="l9"/>', ("child", "[l9]", "[j1]")),
+            ('<parent link="base"/>', '<parent link="l9"/>', ("parent", "[l9]", "[j1]")),
+            ('<parent link="base"/>', '<parent link="l1"/>', ("'l1'", "loop")),
+            ("</robot>", '<link name="l2"/></robot>', ("[base]", "[l2]")),
+            ("</robot>", '<link name="l1"/></robot>', "'l1'"),
         ],
     )
-    def test_structure(self, tmp_path, old, new, words):
+    def test_structure(self, tmp_path, old, new, facts):
         path = arm(tmp_path)
         text = path.read_text()
         assert old in text
         path.write_text(text.replace(old, new))
-        with refused(vp.RobotError, "made_up.urdf", words):
+        with refused(vp.RobotError, "made_up.urdf", facts):
             vp.load_robot(path)
 
     def test_two_joints_of_one_name(self, tmp_path):
-        with refused(vp.RobotError, "joint 'j1' is not unique"):
+        with refused(vp.RobotError, "'j1'"):
             vp.load_robot(write_urdf(tmp_path, link("a"), link("b"), joint("j1", "base", "a"), joint("j1", "a", "b")))
         model = pin.Model()
         for k in range(2):
             parent = model.addJoint(k, pin.JointModelRY(), pin.SE3.Identity(), "same")
             model.appendBodyToJoint(parent, random_inertia(np.random.default_rng(k)), pin.SE3.Identity())
-        with refused(vp.RobotError, "has several joints named 'same'"):
+        with refused(vp.RobotError, "'same'"):
             vp.load_robot(model)
 
     def test_closed_loop(self, tmp_path):
@@ -219,7 +210,7 @@ class TestJoints:
         path = write_urdf(
             tmp_path, link("a"), link("b"), joint("j1", "base", "a"), joint("j2", "a", "b"), joint("j3", "base", "b")
         )
-        with refused(vp.RobotError, "link 'b' is the child of joints 'j2' and 'j3'", "no closed loops"):
+        with refused(vp.RobotError, "'b'", "'j2'", "'j3'", "closed loops"):
             vp.load_robot(path)
 
     def test_links_in_a_circle(self, tmp_path):
@@ -231,32 +222,32 @@ class TestJoints:
             joint("j2", "b", "c"),
             joint("j3", "c", "b"),
         )
-        with refused(vp.RobotError, "links 'c', 'b' form a loop that hangs on no root"):
+        with refused(vp.RobotError, "'c', 'b'", "loop"):
             vp.load_robot(path)
 
     def test_nothing_moves(self, tmp_path):
-        with refused(vp.RobotError, "robot 'made_up' has no joint that moves"):
+        with refused(vp.RobotError, "'made_up'", "joint"):
             vp.load_robot(arm(tmp_path, kind="fixed"))
-        with refused(vp.RobotError, "robot 'made_up' has no joint that moves"):
+        with refused(vp.RobotError, "'made_up'", "joint"):
             vp.load_robot(arm(tmp_path), lock={"j1": 0.0})
-        with refused(vp.RobotError, "robot 'model' has no joint that moves"):
+        with refused(vp.RobotError, "'model'", "joint"):
             vp.load_robot(pin.Model())
 
     @pytest.mark.parametrize(
-        ("tie", "words"),
+        ("tie", "facts"),
         [
-            (mimic("j1", "nan"), "its mimic multiplier is 'nan', where a finite number belongs"),
-            (mimic("j1", "twice"), "its mimic multiplier is 'twice', where a finite number belongs"),
-            (mimic("j1", 1, "inf"), "its mimic offset is 'inf', where a finite number belongs"),
-            ("<mimic/>", "its mimic element names no joint"),
-            (mimic("j1", "1e308"), "mimics 'j1' with multiplier 1e+308 and offset 0: the offset must be finite"),
-            (mimic("j1", "-1e200"), "mimics 'j1' with multiplier -1e+200 and offset 0"),
-            (mimic("j2"), "joint 'j2' mimics itself through a loop of mimic joints"),
+            (mimic("j1", "nan"), ("multiplier", "'nan'")),
+            (mimic("j1", "twice"), ("multiplier", "'twice'")),
+            (mimic("j1", 1, "inf"), ("offset", "'inf'")),
+            ("<mimic/>", "mimic"),
+            (mimic("j1", "1e308"), ("'j1'", "1e+308", "offset")),
+            (mimic("j1", "-1e200"), ("'j1'", "-1e+200")),
+            (mimic("j2"), "itself"),
         ],
     )
-    def test_mimic(self, tmp_path, tie, words):
+    def test_mimic(self, tmp_path, tie, facts):
         path = write_urdf(tmp_path, link("a"), link("b"), joint("j1", "base", "a"), joint("j2", "a", "b", inside=tie))
-        with refused(vp.RobotError, "joint 'j2'", words.removeprefix("joint 'j2' ")):
+        with refused(vp.RobotError, "'j2'", facts):
             vp.load_robot(path)
 
     def test_mimics_in_a_loop(self, tmp_path):
@@ -267,103 +258,94 @@ class TestJoints:
             joint("j1", "base", "a", inside=mimic("j2")),
             joint("j2", "a", "b", inside=mimic("j1")),
         )
-        with refused(vp.RobotError, "joint 'j1' mimics itself through a loop of mimic joints"):
+        with refused(vp.RobotError, "'j1'", "itself"):
             vp.load_robot(path)
 
     @pytest.mark.parametrize("placement", [pin.SE3(2 * np.eye(3), np.zeros(3)), pin.SE3(np.eye(3), np.full(3, np.nan))])
     def test_placement_of_a_model_in_memory(self, tmp_path, placement):
         model = pin.buildModelFromUrdf(str(arm(tmp_path)))
         model.jointPlacements[1] = placement
-        with refused(vp.RobotError, "the placement of joint 'j1' is no finite rotation and translation"):
+        with refused(vp.RobotError, "placement", "'j1'"):
             vp.load_robot(model)
 
     @pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
     def test_armature_of_a_model_in_memory(self, tmp_path, value):
         model = pin.buildModelFromUrdf(str(arm(tmp_path)))
         model.armature = np.array([value])
-        with refused(vp.RobotError, "armature must be finite and >= 0, got"):
+        with refused(vp.RobotError, "armature", "0"):
             vp.load_robot(model)
 
 
 class TestLock:
     def test_unknown_joint(self):
-        with refused(vp.UnknownJoint, "lock of robot 'ur5'", "'elbow_joit'", "did you mean 'elbow_joint'") as info:
+        with refused(vp.UnknownJoint, "'ur5'", "'elbow_joit'", "'elbow_joint'") as info:
             vp.load_robot("ur5", lock={"elbow_joit": 0.0})
         assert info.value.matches[0] == "elbow_joint"
-        with refused(vp.UnknownJoint, "the robot has no joint '3'", "joints: shoulder_pan_joint"):
+        with refused(vp.UnknownJoint, "'3'", "shoulder_pan_joint"):
             vp.load_robot("ur5", lock={3: 0.0})
 
     def test_follower(self):
-        with refused(vp.InputError, "'panda_finger_joint2' mimics 'panda_finger_joint1'; lock 'panda_finger_joint1'"):
+        with refused(vp.InputError, "'panda_finger_joint2'", "'panda_finger_joint1'"):
             vp.load_robot("panda", lock={"panda_finger_joint2": 0.0})
 
     @pytest.mark.parametrize(
-        ("value", "words"),
+        ("value", "facts"),
         [
-            (np.nan, "is nan; it must be finite"),
-            (-np.inf, "is -inf; it must be finite"),
-            ("x", "must be an array of real numbers, got 'x'"),
-            (None, "must be an array of real numbers, got None"),
-            (1j, "must be an array of real numbers, got 1j"),
-            ([1, 2], "must have 1 value(s), got shape (2,)"),
-            ([], "must have 1 value(s), got shape (0,)"),
-            ([[1], [1, 2]], "must be an array of real numbers"),
+            (np.nan, "nan"),
+            (-np.inf, "-inf"),
+            ("x", "'x'"),
+            (None, "None"),
+            (1j, "1j"),
+            ([1, 2], "(2,)"),
+            ([], "(0,)"),
+            ([[1], [1, 2]], "real numbers"),
         ],
     )
-    def test_position(self, value, words):
-        with refused(vp.InputError, "lock['elbow_joint']", words):
+    def test_position(self, value, facts):
+        with refused(vp.InputError, "lock['elbow_joint']", facts):
             vp.load_robot("ur5", lock={"elbow_joint": value})
 
     @pytest.mark.parametrize("lock", [["elbow_joint"], "elbow_joint", 3])
     def test_no_mapping(self, lock):
-        with refused(vp.InputError, "lock must map joint names to positions", "got"):
+        with refused(vp.InputError, "lock", repr(lock)):
             vp.load_robot("ur5", lock=lock)
 
 
-NOT_NUMBERS = [
-    ("text", "must be an array of real numbers, got 'text'"),
-    (["1", "2"], "must be an array of real numbers, got"),
-    ([1j, 0], "must be an array of real numbers, got"),
-    (np.array([1j, 0]), "must be an array of real numbers, got"),
-    ([[1], [1, 2]], "must be an array of real numbers: "),
-    ([10**400, 0], "must be an array of real numbers: "),
-    ([None, 0], "must be an array of real numbers, got"),
-    ({1, 2}, "must be an array of real numbers, got"),
-]
+NOT_NUMBERS = ["text", ["1", "2"], [1j, 0], np.array([1j, 0]), [[1], [1, 2]], [10**400, 0], [None, 0], {1, 2}]
 
 
 class TestScene:
     @pytest.mark.parametrize("name", ["damping", "stiffness", "rest"])
     @pytest.mark.parametrize(
-        ("value", "words"),
+        ("value", "facts"),
         [
-            ([0.0, np.nan], "[1] is nan; it must be finite"),
-            (np.inf, " is inf; it must be finite"),
-            ([1, 2, 3], " must be one number or have shape (2,), got (3,)"),
-            ([[1, 2]], " must be one number or have shape (2,), got (1, 2)"),
-            *((value, " " + words) for value, words in NOT_NUMBERS),
+            ([0.0, np.nan], ("[1]", "nan")),
+            (np.inf, "inf"),
+            ([1, 2, 3], ("(2,)", "(3,)")),
+            ([[1, 2]], ("(2,)", "(1, 2)")),
+            *((value, "real numbers") for value in NOT_NUMBERS),
         ],
     )
-    def test_joint_properties(self, robot, name, value, words):
+    def test_joint_properties(self, robot, name, value, facts):
         if name == "damping" and isinstance(value, str):
-            words = " must be numbers, or 'robot' for those of the robot's description, got 'text'"
-        with refused(vp.InputError, name + words):
+            facts = ("'robot'", "'text'")
+        with refused(vp.InputError, name, facts):
             vp.Scene(robot, **{name: value})
 
     @pytest.mark.parametrize("name", ["damping", "stiffness"])
     def test_negative(self, robot, name):
-        with refused(vp.InputError, f"{name}[1] is -0.5; it must be >= 0"):
+        with refused(vp.InputError, f"{name}[1]", "-0.5"):
             vp.Scene(robot, **{name: [1.0, -0.5]})
 
     @pytest.mark.parametrize(
         ("value", "facts"),
         [
-            ([0, 0, np.nan], "gravity[2] is nan; it must be finite"),
-            ([-np.inf, 0, 0], "gravity[0] is -inf; it must be finite"),
-            ([0, 0], "gravity must have shape (3,), got (2,)"),
-            (-9.81, "gravity is a vector in world axes, z up [m/s^2], got the number -9.81; did you mean"),
-            ({"z": -9.81}, "gravity must be an array of real numbers, got"),
-            *((value, f"gravity {facts}") for value, facts in NOT_NUMBERS),
+            ([0, 0, np.nan], ("gravity[2]", "nan")),
+            ([-np.inf, 0, 0], ("gravity[0]", "-inf")),
+            ([0, 0], ("gravity", "(3,)", "(2,)")),
+            (-9.81, ("gravity", "-9.81")),
+            ({"z": -9.81}, "gravity"),
+            *((value, ("gravity", "real numbers")) for value in NOT_NUMBERS),
         ],
     )
     def test_gravity(self, robot, value, facts):
@@ -373,13 +355,13 @@ class TestScene:
     @pytest.mark.parametrize(
         ("value", "facts"),
         [
-            (np.eye(3), "actuation must have shape (2, 3), got (3, 3)"),
-            ([[1.0], [np.nan]], "actuation[1, 0] is nan; it must be finite"),
-            ([1.0, 2.0], "actuation must be a matrix with 2 rows, or joint names, got shape (2,)"),
-            (3, "actuation must be a matrix with 2 rows, or joint names, got shape ()"),
-            (["joint1", 3], "actuation must be an array of real numbers, got"),
-            ([[1], [1, 2]], "actuation must be an array of real numbers: "),
-            (["joint1", "joint2", "joint1"], "actuation names 'joint1' more than once"),
+            (np.eye(3), ("actuation", "(2, 3)", "(3, 3)")),
+            ([[1.0], [np.nan]], ("actuation[1, 0]", "nan")),
+            ([1.0, 2.0], ("actuation", "2", "(2,)")),
+            (3, ("actuation", "2", "()")),
+            (["joint1", 3], "actuation"),
+            ([[1], [1, 2]], "actuation"),
+            (["joint1", "joint2", "joint1"], ("actuation", "'joint1'")),
         ],
     )
     def test_actuation(self, robot, value, facts):
@@ -388,51 +370,51 @@ class TestScene:
 
     @pytest.mark.parametrize("value", ["jont2", ["joint1", "jont2"]])
     def test_actuation_of_an_unknown_joint(self, robot, value):
-        with refused(vp.UnknownJoint, "robot 'chain2'", "no joint 'jont2'; did you mean 'joint2'"):
+        with refused(vp.UnknownJoint, "'chain2'", "'jont2'", "'joint2'"):
             vp.Scene(robot, actuation=value)
 
     @pytest.mark.parametrize("value", ["ur5", None, pin.Model()])
     def test_robot(self, value):
-        with refused(vp.InputError, "robot must come from load_robot, got", type(value).__name__):
+        with refused(vp.InputError, "robot", "load_robot", type(value).__name__):
             vp.Scene(value)
 
 
 STATES = [
-    ([0.0, np.nan], "[1] is nan; it must be finite"),
-    ([np.inf, 0.0], "[0] is inf; it must be finite"),
-    ([0.0], " must have shape (2,), got (1,)"),
-    ([0.0, 0.0, 0.0], " must have shape (2,), got (3,)"),
-    (0.0, " must have shape (2,), got ()"),
-    ([[0.0, 0.0]], " must have shape (2,), got (1, 2)"),
-    *((value, " " + words) for value, words in NOT_NUMBERS),
+    ([0.0, np.nan], ("[1]", "nan")),
+    ([np.inf, 0.0], ("[0]", "inf")),
+    ([0.0], ("(2,)", "(1,)")),
+    ([0.0, 0.0, 0.0], ("(2,)", "(3,)")),
+    (0.0, ("(2,)", "()")),
+    ([[0.0, 0.0]], ("(2,)", "(1, 2)")),
+    *((value, "real numbers") for value in NOT_NUMBERS),
 ]
 
 TIME_STEPS = [
-    (0, "dt must be positive and finite [s], got 0"),
-    (-0.01, "dt must be positive and finite [s], got -0.01"),
-    (np.nan, "dt must be positive and finite [s], got nan"),
-    (np.inf, "dt must be positive and finite [s], got inf"),
-    ("0.01", "dt must be a number, got '0.01'"),
-    (None, "dt must be a number, got None"),
-    (True, "dt must be a number, got True"),
-    (1j, "dt must be a number, got 1j"),
-    ([0.01], "dt must be a number, got [0.01]"),
-    (np.array([0.01]), "dt must be a number, got array([0.01])"),
-    (10**400, "dt is beyond the range of floating-point numbers"),
+    (0, ("dt", "0")),
+    (-0.01, ("dt", "-0.01")),
+    (np.nan, ("dt", "nan")),
+    (np.inf, ("dt", "inf")),
+    ("0.01", ("dt", "'0.01'")),
+    (None, ("dt", "None")),
+    (True, ("dt", "True")),
+    (1j, ("dt", "1j")),
+    ([0.01], ("dt", "[0.01]")),
+    (np.array([0.01]), ("dt", "array([0.01])")),
+    (10**400, "dt"),
 ]
 
 ALPHAS = [
-    (-0.1, "alpha must be in [0, 1], got -0.1"),
-    (1.1, "alpha must be in [0, 1], got 1.1"),
-    (np.nan, "alpha must be in [0, 1], got nan"),
-    ("half", "alpha must be a number, got 'half'"),
-    (None, "alpha must be a number, got None"),
+    (-0.1, ("alpha", "[0, 1]", "-0.1")),
+    (1.1, ("alpha", "[0, 1]", "1.1")),
+    (np.nan, ("alpha", "[0, 1]", "nan")),
+    ("half", ("alpha", "'half'")),
+    (None, ("alpha", "None")),
 ]
 
 
 class TestLagrangian:
-    @pytest.mark.parametrize(("value", "words"), STATES)
-    def test_states(self, scene, value, words):
+    @pytest.mark.parametrize(("value", "facts"), STATES)
+    def test_states(self, scene, value, facts):
         ok = [0.0, 0.0]
         for name, call in {
             "q": lambda: vp.lagrangian_jet(scene, value, ok),
@@ -440,7 +422,7 @@ class TestLagrangian:
             "q0": lambda: vp.discrete_lagrangian(scene, value, ok, 0.1),
             "q1": lambda: vp.discrete_lagrangian(scene, ok, value, 0.1),
         }.items():
-            with refused(vp.InputError, name + words):
+            with refused(vp.InputError, name, facts):
                 call()
 
     @pytest.mark.parametrize(("value", "facts"), TIME_STEPS)
@@ -456,19 +438,19 @@ class TestLagrangian:
             vp.Midpoint(alpha=value)
 
     def test_backend(self, scene):
-        with refused(vp.InputError, "backend must be 'compiled' or 'pinocchio', got 'casadi'"):
+        with refused(vp.InputError, "backend", "'compiled'", "'pinocchio'", "'casadi'"):
             vp.lagrangian_jet(scene, [0, 0], [0, 0], backend="casadi")
 
     @pytest.mark.parametrize("value", [None, "ur5"])
     def test_scene(self, robot, value):
-        with refused(vp.InputError, "scene must be a varpin.Scene, got", type(value).__name__):
+        with refused(vp.InputError, "scene", "varpin.Scene", type(value).__name__):
             vp.lagrangian_jet(value, [0, 0], [0, 0])
-        with refused(vp.InputError, "scene must be a varpin.Scene, got Robot"):
+        with refused(vp.InputError, "scene", "varpin.Scene", "Robot"):
             vp.discrete_lagrangian(robot, [0, 0], [0, 0], 0.1)
 
     def test_configuration(self, robot):
         for q, shape in (([1.0], "(1,)"), (np.zeros((2, 3)), "(2, 3)"), (1.0, "()")):
-            with refused(vp.InputError, f"q must have shape (..., 2), got {shape}"):
+            with refused(vp.InputError, "q", "(..., 2)", shape):
                 robot.configuration(q)
 
 
@@ -479,16 +461,16 @@ class TestSimulation:
         return vp.simulate(scene, arguments.pop("q0"), arguments.pop("v0"), **arguments)
 
     @pytest.mark.parametrize("name", ["q0", "v0"])
-    @pytest.mark.parametrize(("value", "words"), STATES)
-    def test_states(self, scene, name, value, words):
-        with refused(vp.InputError, name + words):
+    @pytest.mark.parametrize(("value", "facts"), STATES)
+    def test_states(self, scene, name, value, facts):
+        with refused(vp.InputError, name, facts):
             self.run(scene, **{name: value})
 
     @pytest.mark.parametrize(
         ("value", "facts"),
         [
             *(case for case in TIME_STEPS if case[0] is not None),
-            (None, "give two of dt [s], steps and duration [s], or duration and tolerance"),
+            (None, ("dt", "steps", "duration", "tolerance")),
         ],
     )
     def test_time_step(self, scene, value, facts):
@@ -498,12 +480,12 @@ class TestSimulation:
     @pytest.mark.parametrize(
         ("value", "facts"),
         [
-            (-1, "steps must be at least 0, got -1"),
-            (5.0, "steps must be an integer, got 5.0"),
-            (2.5, "steps must be an integer, got 2.5"),
-            ("5", "steps must be an integer, got '5'"),
-            (None, "give two of dt [s], steps and duration [s], or duration and tolerance"),
-            (True, "steps must be an integer, got True"),
+            (-1, ("steps", "0", "-1")),
+            (5.0, ("steps", "5.0")),
+            (2.5, ("steps", "2.5")),
+            ("5", ("steps", "'5'")),
+            (None, ("dt", "steps", "duration", "tolerance")),
+            (True, ("steps", "True")),
         ],
     )
     def test_steps(self, scene, value, facts):
@@ -512,20 +494,20 @@ class TestSimulation:
 
     @pytest.mark.parametrize("steps", [10**15, 10**18, 10**30])
     def test_more_steps_than_memory(self, scene, steps):
-        with refused(vp.InputError, f"steps = {steps} needs more memory than there is"):
+        with refused(vp.InputError, "steps", str(steps), "memory"):
             self.run(scene, steps=steps)
 
     @pytest.mark.parametrize(
         ("value", "facts"),
         [
-            (np.zeros((4, 2)), "controls must have shape (5, 2), one row a step, or (2,), got (4, 2)"),
-            (np.zeros((6, 2)), "controls must have shape (5, 2), one row a step, or (2,), got (6, 2)"),
-            (np.zeros((5, 3)), "controls must have shape (5, 2), one row a step, or (2,), got (5, 3)"),
-            (np.zeros(3), "got (3,)"),
-            (0.0, "got ()"),
-            (np.array([[0, 0]] * 4 + [[0, np.nan]]), "controls[4, 1] is nan; it must be finite"),
-            ([0, np.inf], "controls[1] is inf; it must be finite"),
-            *((value, f"controls {facts}") for value, facts in NOT_NUMBERS),
+            (np.zeros((4, 2)), ("controls", "(5, 2)", "(2,)", "(4, 2)")),
+            (np.zeros((6, 2)), ("controls", "(5, 2)", "(2,)", "(6, 2)")),
+            (np.zeros((5, 3)), ("controls", "(5, 2)", "(2,)", "(5, 3)")),
+            (np.zeros(3), "(3,)"),
+            (0.0, "()"),
+            (np.array([[0, 0]] * 4 + [[0, np.nan]]), ("controls[4, 1]", "nan")),
+            ([0, np.inf], ("controls[1]", "inf")),
+            *((value, ("controls", "real numbers")) for value in NOT_NUMBERS),
         ],
     )
     def test_controls(self, scene, value, facts):
@@ -534,16 +516,16 @@ class TestSimulation:
 
     @pytest.mark.parametrize("kind", ["law", "open loop"])
     @pytest.mark.parametrize(
-        ("value", "words"),
+        ("value", "facts"),
         [
-            ([1.0], "controls(t, q, v) must have shape (2,), got (1,)"),
-            ([0.0, np.nan], "controls(t, q, v)[1] is nan; it must be finite"),
-            (None, "controls(t, q, v) must be an array of real numbers, got None"),
-            (0.0, "controls(t, q, v) must have shape (2,), got ()"),
-            (ZeroDivisionError("no torque"), "raised ZeroDivisionError('no torque')"),
+            ([1.0], ("(2,)", "(1,)")),
+            ([0.0, np.nan], ("[1]", "nan")),
+            (None, "None"),
+            (0.0, ("(2,)", "()")),
+            (ZeroDivisionError("no torque"), "ZeroDivisionError('no torque')"),
         ],
     )
-    def test_control_functions(self, scene, kind, value, words):
+    def test_control_functions(self, scene, kind, value, facts):
         def swing(t):
             if t < 0.03:
                 return [0.1, 0.2]
@@ -551,10 +533,10 @@ class TestSimulation:
                 raise value
             return value
 
-        controls, time = (lambda t, q, v: swing(t)), 0.03
+        controls, time, source = (lambda t, q, v: swing(t)), 0.03, "controls(t, q, v)"
         if kind == "open loop":
-            controls, time, words = vp.OpenLoop(swing), 0.035, words.replace("controls(t, q, v)", "OpenLoop: f(t)")
-        with refused(vp.ControlError, f"step 3 (t = {time:g} s)", words, "error.trajectory") as info:
+            controls, time, source = vp.OpenLoop(swing), 0.035, "OpenLoop: f(t)"
+        with refused(vp.ControlError, "step 3", f"t = {time:g} s", source, facts, "error.trajectory") as info:
             self.run(scene, controls=controls, integrator=vp.Midpoint())
         error = info.value
         assert (error.step, error.time, error.trajectory.steps) == (3, pytest.approx(time), 3)
@@ -565,40 +547,40 @@ class TestSimulation:
             assert error.__cause__ is value
 
     def test_a_control_function_of_wrong_arguments(self, scene):
-        with refused(vp.InputError, "a control law takes (t, q, v)", "varpin.OpenLoop(f)"):
+        with refused(vp.InputError, "(t, q, v)", "varpin.OpenLoop(f)"):
             self.run(scene, controls=lambda t: [0.0, 0.0])
-        with refused(vp.InputError, "must be a function of (t, q, v)"):
+        with refused(vp.InputError, "(t, q, v)"):
             self.run(scene, controls=lambda t, q: [0.0, 0.0])
 
     @pytest.mark.parametrize(
         ("function", "facts"),
         [
-            (lambda t, q, v: [0.0, 0.0], "a law of (t, q, v) is given as it is, controls=law"),
-            (lambda: [0.0, 0.0], "OpenLoop takes a function of one argument, the time t"),
-            ([0.0, 0.0], "OpenLoop takes a function of the time t, got [0.0, 0.0]"),
+            (lambda t, q, v: [0.0, 0.0], ("(t, q, v)", "controls=law")),
+            (lambda: [0.0, 0.0], ("OpenLoop", "time")),
+            ([0.0, 0.0], ("OpenLoop", "[0.0, 0.0]")),
         ],
     )
     def test_open_loops_of_something_else(self, function, facts):
         with refused(vp.InputError, facts):
             vp.OpenLoop(function)
 
-    @pytest.mark.parametrize(("period", "words"), [(0, "at least 1, got 0"), (1.5, "an integer, got 1.5")])
-    def test_period(self, scene, period, words):
-        with refused(vp.InputError, f"period must be {words}"):
+    @pytest.mark.parametrize(("period", "facts"), [(0, ("1", "0")), (1.5, "1.5")])
+    def test_period(self, scene, period, facts):
+        with refused(vp.InputError, "period", facts):
             self.run(scene, controls=lambda t, q, v: [0.0, 0.0], period=period)
 
     @pytest.mark.parametrize("controls", [None, [0.1, 0.2], vp.OpenLoop(lambda t: [0.1, 0.2])])
     def test_a_period_is_of_a_law(self, scene, controls):
-        with refused(vp.InputError, "period = 2 is of a control law"):
+        with refused(vp.InputError, "period = 2"):
             self.run(scene, controls=controls, period=2)
 
     def test_an_ensemble_takes_no_law(self, scene):
         noisy = vp.Scene(scene.robot, noise=vp.AdditiveNoise(0.1))
-        with refused(vp.InputError, "only simulate takes a control law"):
+        with refused(vp.InputError, "simulate"):
             vp.simulate_ensemble(
                 noisy, [0, 0], [0, 0], dt=0.01, steps=2, paths=2, rng=0, controls=lambda t, q, v: [0.0, 0.0]
             )
-        with refused(vp.ControlError, "step 1 (t = 0.015 s)", "OpenLoop: f(t) must have shape (2,)") as info:
+        with refused(vp.ControlError, "step 1", "0.015 s", "OpenLoop", "(2,)") as info:
             broken = vp.OpenLoop(lambda t: [0.0, 0.0] if t < 0.01 else [0.0])
             vp.simulate_ensemble(noisy, [0, 0], [0, 0], dt=0.01, steps=2, paths=2, rng=0, controls=broken)
         assert info.value.trajectory is None
@@ -623,17 +605,17 @@ class TestSimulation:
 
     @pytest.mark.parametrize("value", ["rk4", vp.Midpoint, 3])
     def test_integrator(self, scene, value):
-        with refused(vp.InputError, "integrator must be one of varpin's, for example varpin.Midpoint(), got"):
+        with refused(vp.InputError, "integrator", "varpin.Midpoint()"):
             self.run(scene, integrator=value)
 
     @pytest.mark.parametrize("value", [None, "ur5"])
     def test_scene(self, value):
-        with refused(vp.InputError, "scene must be a varpin.Scene, got"):
+        with refused(vp.InputError, "scene", "varpin.Scene"):
             self.run(value)
 
     @pytest.mark.parametrize("state", [{"q0": [1e308, 0.0]}, {"v0": [1e200, 0.0]}, {"v0": [1e160, -1e160]}])
     def test_numbers_beyond_reason_fail_and_say_where(self, scene, state):
-        with refused(vp.StepFailure, "step 0 (t = 0 s) cannot be trusted", "smaller dt") as info:
+        with refused(vp.StepFailure, "step 0", "t = 0 s", "dt") as info:
             self.run(scene, **state)
         assert info.value.trajectory.steps == 0
 
@@ -641,12 +623,12 @@ class TestSimulation:
 @pytest.mark.parametrize(
     ("arguments", "facts"),
     [
-        ({"links": 0}, "links must be at least 1, got 0"),
-        ({"links": 1.5}, "links must be an integer, got 1.5"),
-        ({"links": "2"}, "links must be an integer, got '2'"),
-        ({"links": 2, "length": 0.0}, "length must be positive and finite [m], got 0.0"),
-        ({"links": 2, "length": "long"}, "length must be a number, got 'long'"),
-        ({"links": 2, "mass": np.nan}, "mass must be positive and finite [kg], got nan"),
+        ({"links": 0}, ("links", "1", "0")),
+        ({"links": 1.5}, ("links", "1.5")),
+        ({"links": "2"}, ("links", "'2'")),
+        ({"links": 2, "length": 0.0}, ("length", "0.0")),
+        ({"links": 2, "length": "long"}, ("length", "'long'")),
+        ({"links": 2, "mass": np.nan}, ("mass", "nan")),
     ],
 )
 def test_planar_chain(arguments, facts):
