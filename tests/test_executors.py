@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from findings import about
 from refusals import refused
 from test_ensemble import ARRAYS, make_scene, run, same_statistics
 
@@ -172,14 +173,14 @@ def test_monte_carlo_tells_of_what_its_paths_do(caplog):
     plan = vp.solve(problem, max_iterations=2)
     with caplog.at_level(logging.WARNING, "varpin.control.monte_carlo"):
         found = plan.monte_carlo(60, 0)
-    assert any("coarse" in warning for warning in found.warnings)
+    assert about(found.warnings, "coarse steps")
 
     def interrupt(done, paths):
         raise KeyboardInterrupt
 
     with pytest.raises(vp.MonteCarloInterrupted) as caught:
         plan.monte_carlo(600, 0, progress=interrupt)
-    assert any("coarse" in warning for warning in caught.value.result.warnings)
+    assert about(caught.value.result.warnings, "coarse steps")
     for warning in found.warnings:
         assert f"warning: {warning}" in str(found)
     assert f"{len(found.warnings)} warning" in repr(found)

@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import scipy.linalg
+from findings import about
 from refusals import refused
 from scipy.integrate import solve_ivp
 from scipy.optimize import root
@@ -420,7 +421,7 @@ def test_dampers_faster_than_the_step_are_reported(caplog):
         motion = vp.simulate(
             vp.Scene(vp.planar_chain(1), damping=100.0), [0.0], [1.0], dt=0.1, steps=5, integrator=vp.Midpoint()
         )
-    assert "damping is faster than the step" in caplog.text
+    assert about(caplog.messages, "stiff damping")
     assert (np.diff(np.sign(motion.v[:, 0])) != 0).all()
     caplog.clear()
     vp.simulate(vp.Scene(vp.planar_chain(1), damping=1.0), [0.0], [1.0], dt=0.1, steps=5, integrator=vp.Midpoint())

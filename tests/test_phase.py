@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from findings import about
 from scipy.integrate import solve_ivp
 
 import varpin as vp
@@ -43,7 +44,7 @@ def test_the_loss_of_one_oscillation(damping, dt, integrator):
     lost = phase_lost(scene, integrator, motion)
     assert lost.rate == pytest.approx(fast, rel=1e-3)
     assert lost.off == pytest.approx(np.abs(motion.q[:, 0] - exact).max(), rel=0.05)
-    assert [told for told in motion.warnings if "lose phase" in told]
+    assert about(motion.warnings, "phase")
     finer = vp.simulate(scene, [0.1], [0.0], dt=dt / 8, steps=8 * motion.steps, integrator=integrator)
     assert finer.warnings == ()
 
@@ -70,7 +71,7 @@ def test_a_fast_spring_of_an_arm_is_followed_or_told_of(integrator, told):
     motion = vp.simulate(scene, q0, np.zeros(7), dt=5e-4, steps=1000, integrator=integrator)
     off = np.abs(motion.q[-1] - exact).max() / np.ptp(motion.q, axis=0).max()
     assert (off > 0.05) == told
-    assert any("lose phase" in sentence for sentence in motion.warnings) == told
+    assert bool(about(motion.warnings, "phase")) == told
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), None], ids=str)
@@ -94,7 +95,7 @@ def test_modes_that_do_not_turn_within_the_motion_are_no_oscillations():
     motion = vp.simulate(scene, **start, dt=5e-3, steps=400)
     fine = vp.simulate(scene, **start, dt=5e-3 / 16, steps=16 * 400, integrator=vp.Radau(4), check=False)
     assert np.abs(motion.q - fine.q[::16]).max() <= 0.02 * np.ptp(fine.q, axis=0).max()
-    assert not [told for told in motion.warnings if "lose phase" in told]
+    assert not about(motion.warnings, "phase")
 
 
 @pytest.mark.parametrize("seed", [0, 5, 8, 11])
@@ -140,4 +141,4 @@ def test_nothing_is_said_of_an_arm_that_is_held_at_rest(name):
             scene, posture, np.zeros(7), dt=4e-3, steps=250, controls=scene.holding_controls(posture)
         )  # fmt: skip
         assert np.ptp(motion.q, axis=0).max() <= 1e-12
-        assert not [told for told in motion.warnings if "lose phase" in told]
+        assert not about(motion.warnings, "phase")

@@ -6,6 +6,7 @@ Against DOP853 on Pinocchio's forward dynamics, differences, and each other.
 import numpy as np
 import pinocchio as pin
 import pytest
+from findings import about
 from refusals import refused
 from scipy.integrate import solve_ivp
 
@@ -318,7 +319,7 @@ def test_controls_that_change_too_fast_for_the_step_are_told_of(integrator):
     fast = vp.OpenLoop(lambda t: np.array([1.0, 0.5, 0.2]) * np.sin(100.0 * t + 1.0))
     options = {"duration": 0.4, "controls": fast, "integrator": integrator}
     coarse = vp.simulate(scene, CHAIN_Q, np.zeros(3), steps=7, **options)
-    assert any("change too fast for dt" in told for told in coarse.warnings)
+    assert about(coarse.warnings, "fast controls")
     assert vp.simulate(scene, CHAIN_Q, np.zeros(3), steps=400, **options).warnings == ()
 
 
