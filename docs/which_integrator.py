@@ -731,10 +731,12 @@ def real_arms() -> list[RealArm]:
         RealArm(
             tracking,
             servos,
-            lambda _: vp.OpenLoop(lambda t: start + np.sin(omega * t) * 0.3),
+            lambda _: vp.OpenLoop(lambda t: start + np.sin(omega * t)[:, None] * 0.3, vectorized=True),
             (stiffness, damping, start),
         ),
-        RealArm(rubbing, rough, lambda _: vp.OpenLoop(lambda t: held + np.sin(omega * t) * swing)),
+        RealArm(
+            rubbing, rough, lambda _: vp.OpenLoop(lambda t: held + np.sin(omega * t)[:, None] * swing, vectorized=True)
+        ),
     ]
 
 

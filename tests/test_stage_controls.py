@@ -423,3 +423,72 @@ def test_what_is_refused():
     with refused(vp.ControlError, "1") as info:
         vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=vp.OpenLoop(breaks), integrator=vp.Gauss(2), **SMALL)
     assert info.value.trajectory.steps == 1
+
+
+RISE = np.array([0.5, -0.2, 0.1])
+
+
+def rising(t):
+    """Torques (m,) of a time, or (K, m) of times."""
+    t = np.asarray(t)[..., None]
+    return RISE * (1.0 + 2.0 * t * t)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(3), vp.Radau(2), vp.RungeKutta4()])
+def test_a_function_of_many_times_makes_the_motion_of_one_of_each(integrator):
+    scene, called = vp.Scene(vp.planar_chain(3)), []
+
+    def plain(t):
+        assert isinstance(t, float)
+        called.append(t)
+        return rising(t)
+
+    def lists(t):
+        return rising(t).tolist()
+
+    def vectorized(t):
+        assert t.ndim == 1
+        called.append(t)
+        return rising(t)
+
+    options = {"dt": 0.01, "steps": 7, "integrator": integrator}
+    motion = vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=vp.OpenLoop(plain), check=False, **options)
+    assert called == sorted(set(called)), "a time is asked for twice, or before an earlier one"
+    called.clear()
+    for controls in (vp.OpenLoop(lists), vp.OpenLoop(vectorized, vectorized=True)):
+        again = vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=controls, **options)
+        np.testing.assert_array_equal(again.u, motion.u)
+        np.testing.assert_array_equal(again.q, motion.q)
+    assert len(called) <= 4
+
+
+def test_where_a_function_of_many_times_fails():
+    scene = vp.Scene(vp.planar_chain(3))
+    options = {"dt": 0.01, "steps": 7, "integrator": vp.Gauss(2)}
+    at = float(3 + vp.Gauss(2).stage_times[1]) * 0.01
+
+    def refused(f, words):
+        with pytest.raises(vp.ControlError, match=words) as info:
+            vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=vp.OpenLoop(f, vectorized=True), **options)
+        return info.value
+
+    def raises(t):
+        if (t >= at).any():
+            raise RuntimeError("no more")
+        return rising(t)
+
+    for f, words in (
+        (raises, "raised RuntimeError"),
+        (lambda t: np.where((t >= at)[:, None], np.nan, rising(t)), r"\[0, 0\] is nan"),
+    ):
+        error = refused(f, words)
+        assert (error.step, error.trajectory.steps) == (3, 3)
+        assert error.time == pytest.approx(at, abs=1e-15)
+    assert refused(lambda t: rising(t).T, r"shape \(1, 3\), got \(3, 1\)").step == 0
+    assert refused(lambda t: rising(t[0]), r"shape \(1, 3\), got \(3,\)").step == 0
+    refused(lambda t: rising(t)[:3], "for none of them alone")
+    with pytest.raises(vp.InputError, match="vectorized"):
+        vp.OpenLoop(rising, vectorized="no")
+    # As many times as controls: rows and columns look alike.
+    options["steps"] = 2
+    refused(lambda t: rising(t).T, r"shape \(1, 3\), got \(3, 1\)")

@@ -39,21 +39,29 @@ class OpenLoop:
     stages, which keeps the order too. ``Trajectory.u`` has the mean over each step, ``Trajectory.u_stages`` the values.
     Where the function jumps within a step the order is lost there; jumps at nodes alone are for rows of controls.
 
-    What depends on the state is a control law, a function of (t, q, v).
+    It is called in order of time, for many steps ahead of the motion, and for some times more after it, unless
+    ``check=False``; a tolerance calls it for the times of every step that it tries. So it should depend on the time
+    alone. What depends on the state is a control law, a function of (t, q, v).
 
     Attributes:
         f: Of the time [s]; returns the controls, (m,) or by joint name where each is the force of a joint, 0 for joints
             that are not named.
+        vectorized: Whether f takes an array of times (K,) [s] and returns the controls at all of them, (K, m). Then it
+            is called a few times in all and not once for each stage, which for light robots takes longer than the
+            motion itself.
 
     Raises:
-        InputError: It is no function, or not one of one argument.
+        InputError: It is no function, or not one of one argument; ``vectorized`` is not True or False.
     """
 
-    f: Callable[[float], JointValues]
+    f: Callable[[float], JointValues] | Callable[[Floats], ArrayLike]
+    vectorized: bool = False
 
     def __post_init__(self) -> None:
         if not callable(self.f):
             raise InputError(f"OpenLoop takes a function of the time t, got {reprlib.repr(self.f)}")
+        if not isinstance(self.vectorized, bool):
+            raise InputError(f"vectorized must be True or False, got {reprlib.repr(self.vectorized)}")
         if not takes(self.f, 1):
             hint = "; a law of (t, q, v) is given as it is, controls=law" if takes(self.f, 3) else ""
             raise InputError(f"OpenLoop takes a function of one argument, the time t{hint}")

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,7 @@ from varpin.support.checks import (
     control_array,
     control_values,
     count,
+    finite_array,
     joint_array,
     positive,
     require_finite,
@@ -74,6 +75,8 @@ _LOOKS, _ALIKE = 16, 0.05
 _FINELY = 16
 # Parts of a motion that are kept one by one.
 _PARTS = 256
+# What an error calls a function of time.
+_OF_TIME = "OpenLoop: f(t)"
 
 
 class Interrupted(KeyboardInterrupt):
@@ -1052,20 +1055,77 @@ def _evaluated(
     scene: Scene,
     integrator: Integrator,
     dt: float,
-    steps: range,
+    steps: Iterable[int],
     record: _Record | None = None,
 ) -> Commands:
     """Controls of time at the stages of some steps, or from their middles for a method with one stage."""
-    times = integrator.stage_times
-    found = np.empty((len(steps), max(len(times), 1), scene.controls))
-    for k, step in enumerate(steps):
-        for i, fraction in enumerate(times or (0.5,)):
-            time = (step + fraction) * dt
-            if k > 0 and i == 0 and fraction == 0.0 and times[-1] == 1.0:
-                found[k, 0] = found[k - 1, -1]
-                continue
-            found[k, i] = _called("OpenLoop: f(t)", partial(controls.f, time), scene, step, time, record)
+    times, numbers = integrator.stage_times, np.array(steps, dtype=np.int64)
+    at = (numbers[:, None] + np.array(times or (0.5,))) * dt
+    asked = np.ones(at.shape, dtype=np.bool_)
+    if times and times[0] == 0.0 and times[-1] == 1.0:
+        # Where a step begins the one before has ended.
+        asked[1:, 0] = np.diff(numbers) != 1
+    found = np.empty((*at.shape, scene.controls))
+    look = _at_all_times if controls.vectorized else _at_times
+    found[asked] = look(controls.f, scene, at[asked], np.repeat(numbers, asked.sum(axis=1)), record)
+    shared = np.flatnonzero(~asked[:, 0])
+    found[shared, 0] = found[shared - 1, -1]
     return changing(found, times) if times else open_loop(found[:, 0])
+
+
+def _at_times(
+    f: Callable[..., Any], scene: Scene, times: Floats, steps: NDArray[np.int64], record: _Record | None
+) -> Floats:
+    """Controls of time (K, m) at some times (K,) [s], which are within ``steps`` (K,).
+
+    Raises:
+        ControlError: The function raised, or returned something else.
+    """
+    found = np.empty((len(times), scene.controls))
+    shape, isfinite = found.shape[1:], math.isfinite
+    for k, at in enumerate(times.tolist()):
+        try:
+            value = f(at)
+        except Exception as error:
+            raise _raised_for(_OF_TIME, error, int(steps[k]), at, record) from error
+        # What is a control at a glance: to look at all that others may be takes longer than many a function.
+        if isinstance(value, np.ndarray) and value.dtype == np.float64 and value.shape == shape:
+            found[k] = value
+            if isfinite(value.dot(value)):
+                continue
+        found[k] = _control(_OF_TIME, value, scene, int(steps[k]), at, record)
+    return found
+
+
+def _at_all_times(
+    f: Callable[..., Any], scene: Scene, times: Floats, steps: NDArray[np.int64], record: _Record | None
+) -> Floats:
+    """:func:`_at_times` of a function that takes all times at once.
+
+    The first is asked for alone, which tells its rows from its columns however many they are; and each alone where all
+    of them fail, which tells the first that does.
+    """
+    m = scene.controls
+    parts = [part for part in (times[:1], times[1:]) if len(part)]
+    try:
+        values = [finite_array(_OF_TIME, f(part.copy()), (len(part), m)) for part in parts]
+    except Exception as failure:
+        for step, at in zip(steps.tolist(), times.tolist(), strict=True):
+            try:
+                value = f(np.array([at]))
+            except Exception as error:
+                raise _raised_for(_OF_TIME, error, step, at, record) from error
+            try:
+                finite_array(_OF_TIME, value, (1, m))
+            except InputError as error:
+                raise _control_error(step, at, str(error), record) from None
+        raise _control_error(
+            int(steps[0]),
+            float(times[0]),
+            f"{_OF_TIME}, vectorized, fails for {len(times)} times at once, and for none of them alone: {failure}",
+            record,
+        ) from failure
+    return np.concatenate(values) if values else np.zeros((0, m))
 
 
 def _undersampled(
@@ -1077,10 +1137,10 @@ def _undersampled(
         return ()
     looks = np.unique(np.linspace(0, trajectory.steps - 1, _LOOKS).astype(np.int64))
     try:
-        halves = [_evaluated(controls, scene, integrator, 0.5 * dt, range(2 * k, 2 * k + 2)).u for k in looks.tolist()]
+        halves = _evaluated(controls, scene, integrator, 0.5 * dt, [2 * k + i for k in looks.tolist() for i in (0, 1)])
     except ControlError:
         return ()
-    mean = np.array(halves).mean(axis=1)
+    mean = 0.5 * (halves.u[::2] + halves.u[1::2])
     total, off = (float(np.abs(part).sum()) for part in (mean, mean - trajectory.u[looks]))
     if not off > _ALIKE * total:
         return ()
@@ -1107,9 +1167,27 @@ def _called(
     try:
         value = call()
     except Exception as error:
-        before = None if record is None else record.trajectory()
-        raise ControlError(step, time, f"{name} raised {error!r}", before) from error
+        raise _raised_for(name, error, step, time, record) from error
+    return _control(name, value, scene, step, time, record)
+
+
+def _control(name: str, value: JointValues, scene: Scene, step: int, time: float, record: _Record | None) -> Floats:
+    """What a function of the user's has returned, as a control (m,).
+
+    Raises:
+        ControlError: It is something else.
+    """
     try:
         return control_values(name, value, scene.control_joints, scene.controls)
     except (InputError, UnknownJoint) as error:
-        raise ControlError(step, time, str(error), None if record is None else record.trajectory()) from None
+        raise _control_error(step, time, str(error), record) from None
+
+
+def _raised_for(name: str, error: Exception, step: int, time: float, record: _Record | None) -> ControlError:
+    """The error of a function of the user's that raised."""
+    return _control_error(step, time, f"{name} raised {error!r}", record)
+
+
+def _control_error(step: int, time: float, problem: str, record: _Record | None) -> ControlError:
+    """The error of a function of the user's, with the motion before it."""
+    return ControlError(step, time, problem, None if record is None else record.trajectory())
