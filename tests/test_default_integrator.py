@@ -142,3 +142,62 @@ steps = 100
     file = vp.load_scene(path, required_only=False)
     assert file.integrator.same_map(vp.Gauss(2))
     assert file.simulate().integrator == "Radau(stages=4)"
+
+
+def test_paths_without_noise_are_those_of_simulate():
+    """Of one start, and of many of which some ask for more."""
+    scene, q0, v0, controls = stopped()
+    options = {"dt": DT, "steps": STEPS, "controls": controls}
+    alone = vp.simulate(scene, q0, v0, **options)
+    paths = vp.simulate_ensemble(scene, q0, v0, **options, paths=2, rng=0)
+    assert paths.integrator == alone.integrator == "Radau(stages=4)"
+    assert paths.integrator in repr(paths)
+    np.testing.assert_array_equal(paths.q[1], alone.q)
+    # Those that start away from the stop, which later ones come to.
+    q0 = np.linspace([0.0, -3.0], [0.0, 0.3], 32)
+    assert vp.simulate_ensemble(scene, q0, [0.0, 3.0], dt=DT, steps=10, paths=32, rng=0).integrator == alone.integrator
+    noisy = vp.Scene(CHAIN, gravity=False, damping=0.3, noise=vp.AdditiveNoise(0.1))
+    assert vp.simulate_ensemble(noisy, q0[:2], [0.0, 0.5], dt=DT, steps=10, paths=2, rng=0).integrator.startswith("Mid")
+
+
+@pytest.mark.parametrize(
+    ("scene", "rng", "chosen"),
+    [
+        ({"damping": 0.3}, None, "Gauss(stages=2)"),
+        ({"damping": [0.3, 200.0]}, None, "Radau(stages=4)"),
+        ({"damping": 0.3, "forces": [vp.JointStop(1e3, 300.0, **ENDS)]}, None, "Radau(stages=4)"),
+        (
+            {"damping": 0.3, "forces": [vp.FrameDamper("tip", [0.0, 0.0, 0.0], [0.0, 0.0, 1e4])]},
+            None,
+            "Radau(stages=4)",
+        ),
+        ({"damping": 0.3, "noise": vp.AdditiveNoise(0.1)}, None, "Gauss(stages=2)"),
+        ({"damping": 0.3, "noise": vp.AdditiveNoise(0.1)}, 0, "Midpoint(alpha=0.5)"),
+    ],
+    ids=["light", "damped", "stops", "lever", "no noise", "noise"],
+)
+def test_a_plant_takes_that_of_simulate(scene, rng, chosen):
+    """As its start, its stops and the first plan ask for it, at its own steps."""
+    cost = vp.TrackingCost(lambda t: [1.57 - t, 0.0], 100.0) + vp.ControlCost(1e-3)
+    start = [1.57, 0.0], [0.0, 0.0]
+    problem = vp.OptimalControlProblem(vp.Scene(CHAIN, gravity=False), cost, *start, dt=0.05, steps=10)
+    plant = vp.Plant(vp.Scene(CHAIN, gravity=False, **scene), substeps=5)
+    assert vp.Mpc(problem).run(plant, duration=0.1, rng=rng).motion.integrator == chosen
+    named = replace(plant, integrator=vp.RungeKutta4(), substeps=50)
+    if chosen != "Radau(stages=4)":
+        assert vp.Mpc(problem).run(named, duration=0.1, rng=rng).motion.integrator == "RungeKutta4"
+
+
+def test_a_plant_is_as_accurate_as_simulate():
+    """Velocities at ticks that a feedback reads: Gauss(2) rings on dampers 40 times as fast as the step."""
+    damped = vp.Scene(CHAIN, gravity=False, damping=[0.3, 200.0])
+    cost = vp.TrackingCost(lambda t: [np.sin(5.0 * t), 0.3 * np.sin(9.0 * t)], 300.0) + vp.ControlCost(1e-5)
+    problem = vp.OptimalControlProblem(vp.Scene(CHAIN, gravity=False), cost, [0, 0], [0, 0], dt=0.04, steps=10)
+    found = {}
+    for name, integrator in (("usual", None), ("two stages", vp.Gauss(2))):
+        motion = vp.Mpc(problem).run(vp.Plant(damped, integrator, substeps=2), duration=0.4).motion
+        fine = {"dt": motion.dt / 32, "steps": 32 * motion.steps, "controls": np.repeat(motion.u, 32, axis=0)}
+        true = vp.simulate(damped, motion.q[0], motion.v[0], **fine, integrator=vp.Radau(3), check=False)
+        found[name] = float(np.abs(motion.v - true.v[::32]).max() / np.abs(true.v).max())
+    assert found["usual"] < 0.01
+    assert found["two stages"] > 5.0 * found["usual"]

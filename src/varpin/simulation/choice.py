@@ -6,6 +6,8 @@ motion is made anew.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -67,6 +69,15 @@ def integrator_along(scene: Scene, integrator: Integrator, q: Floats, v: Floats,
     if integrator.same_map(_USUAL) and turns_fast(scene, q, v, u, dt / _TURNS):
         return _SWINGING
     return integrator
+
+
+def stronger(chosen: Iterable[Integrator]) -> Integrator:
+    """Of integrators that the functions above have chosen, for motions to be made by one, that which is right for all.
+
+    Where there are none, that of a motion that asks for nothing.
+    """
+    ranks = {str(member): rank for rank, member in enumerate((_USUAL, _SWINGING, _STOPPING))}
+    return max(chosen, key=lambda own: ranks[str(own)], default=_USUAL)
 
 
 def candidates(scene: Scene, q0: Floats, v0: Floats, duration: float) -> tuple[Integrator, ...]:
