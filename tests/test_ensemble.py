@@ -90,8 +90,9 @@ def test_each_path_may_have_its_own_start():
 
 def test_without_noise_all_paths_are_one():
     end = run(vp.Scene(vp.planar_chain(2)), paths=3)
-    options = {"dt": 0.01, "steps": 50, "controls": [0.3, -0.1], "integrator": vp.Midpoint()}
+    options = {"dt": 0.01, "steps": 50, "controls": [0.3, -0.1]}
     alone = vp.simulate(vp.Scene(vp.planar_chain(2)), *START.values(), **options)
+    assert end.integrator == alone.integrator == "Gauss(stages=2)"
     for path in range(3):
         assert end.q[path].tobytes() == alone.q.tobytes()
     assert np.abs(end.statistics.covariance).max() < 1e-28

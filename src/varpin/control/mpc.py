@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,11 @@ from varpin.control import Kept, OptimalControlProblem, Solution, kept, looked_a
 from varpin.control.costs import CostError
 from varpin.control.history import Status
 from varpin.errors import InputError
-from varpin.integrators import Gauss, Integrator
+from varpin.integrators import Integrator
 from varpin.integrators.base import Failure
 from varpin.mechanics.scene import Scene, refuse_inputs, require_scene
 from varpin.simulation.chatter import alternation
+from varpin.simulation.choice import changes_along, integrator_along, usual_integrator
 from varpin.simulation.loop_stability import examined_in_loop
 from varpin.simulation.run import Interrupted, Progress, StepFailure, noise_forgotten, simulate
 from varpin.simulation.soundness import Finding, announce, evident, with_warnings
@@ -42,17 +43,18 @@ class Plant:
     Attributes:
         scene: Its scene, which need not be the one planned with: other masses, friction, noise. It takes the same
             controls.
-        integrator: Any of varpin's; left out, one that no friction is too fast for, ``Gauss(stages=2)``.
+        integrator: Any of varpin's. Left out, each run takes that of :func:`varpin.simulate` at the plant's steps, as
+            the start and the first plan ask for it, ready for all stops of joints; its motion says which that was.
         substeps: Steps to a decision of the controller.
     """
 
     scene: Scene
-    integrator: Integrator = field(default_factory=lambda: Gauss(stages=2))
+    integrator: Integrator | None = None
     substeps: int = 10
 
     def __post_init__(self) -> None:
         refuse_inputs(require_scene(self.scene), "Plant")
-        if not isinstance(self.integrator, Integrator):
+        if self.integrator is not None and not isinstance(self.integrator, Integrator):
             raise InputError(f"integrator must be one of varpin's, got {self.integrator!r}")
         count("substeps", self.substeps, least=1)
 
@@ -320,6 +322,7 @@ class Mpc:
         q, v = problem.q0, problem.v0
         before = problem.before
         (active, of_plan), age = self._first_plan(problem), 0
+        method = _method(plant, active.trajectory, dt, noisy=generator is not None and plant.scene.processes > 0)
         parts: list[Trajectory] = []
         plans, seconds, iterations, late = [], np.zeros(ticks), np.zeros(ticks, dtype=np.int64), np.zeros(ticks, bool)
         try:
@@ -329,16 +332,16 @@ class Mpc:
                     try:
                         fresh = self.plan(problem.t0 + tick * self.period, q, v, active, age + 1, before)
                     except StepFailure as failure:
-                        raise _unplanned(failure, _so_far(plant, parts)) from failure
+                        raise _unplanned(failure, _so_far(plant, method, parts)) from failure
                     except CostError as error:
-                        raise CostError(error.cost, error.problem, _so_far(plant, parts)) from error
+                        raise CostError(error.cost, error.problem, _so_far(plant, method, parts)) from error
                     seconds[tick] = time.perf_counter() - begin
                     iterations[tick] = fresh.iterations
                     late[tick] = seconds[tick] > self.budget
                     active, age = (active, age + 1) if late[tick] else (fresh, 0)
                 plans.append(active)
                 u = _decision(active, age, q, v, before)
-                parts.append(_simulated(plant, dt, q, v, u, generator, parts))
+                parts.append(_simulated(plant, method, dt, q, v, u, generator, parts))
                 q, v = parts[-1].q[-1], parts[-1].v[-1]
                 before = u if problem.remembers else None
                 if moving:
@@ -348,8 +351,8 @@ class Mpc:
         except KeyboardInterrupt:
             if not parts:
                 raise
-            raise Interrupted(_so_far(plant, parts)) from None
-        motion, found = examined_in_loop(plant.scene, plant.integrator, chained(parts), plant.substeps)
+            raise Interrupted(_so_far(plant, method, parts)) from None
+        motion, found = examined_in_loop(plant.scene, method, chained(parts), plant.substeps)
         found = (*noise_forgotten(plant.scene, rng), *found, *_alternating(motion, plant.substeps))
         found = (*found, *_behind(seconds, self.period), *_late(late, self.budget))
         found = (*found, *_whole_ticks(duration, ticks, self.period))
@@ -412,10 +415,10 @@ def _whole_ticks(duration: float, ticks: int, period: float) -> tuple[Finding, .
     return (Finding("rounded duration", sentence),)
 
 
-def _so_far(plant: Plant, parts: Sequence[Trajectory]) -> Trajectory:
+def _so_far(plant: Plant, method: Integrator, parts: Sequence[Trajectory]) -> Trajectory:
     """The plant's motion of the ticks that there are, with what is evident of it."""
     motion = chained(parts)
-    return with_warnings(motion, evident(plant.scene, plant.integrator, motion))
+    return with_warnings(motion, evident(plant.scene, method, motion))
 
 
 def _behind(seconds: Floats, period: float) -> tuple[Finding, ...]:
@@ -472,8 +475,20 @@ def _unplanned(failure: StepFailure, motion: Trajectory) -> StepFailure:
     return StepFailure(motion.steps, motion.t[-1], Failure(reason, failure.residual), motion)
 
 
+def _method(plant: Plant, plan: Trajectory, dt: float, *, noisy: bool) -> Integrator:
+    """Who takes the plant's steps of ``dt`` [s], where a plan has it go."""
+    if plant.integrator is not None:
+        return plant.integrator
+    scene = plant.scene
+    chosen = usual_integrator(scene, plan.q[0], plan.v[0], dt, noisy=noisy, ahead=True)
+    if noisy or not changes_along(scene):
+        return chosen
+    return integrator_along(scene, chosen, plan.q, plan.v, plan.u, dt)
+
+
 def _simulated(
     plant: Plant,
+    method: Integrator,
     dt: float,
     q: Floats,
     v: Floats,
@@ -482,10 +497,10 @@ def _simulated(
     before: Sequence[Trajectory],
 ) -> Trajectory:
     """The plant's motion of one tick; what came before is in its failure."""
-    options: dict[str, Any] = {"dt": dt, "steps": plant.substeps, "controls": u, "integrator": plant.integrator}
+    options: dict[str, Any] = {"dt": dt, "steps": plant.substeps, "controls": u, "integrator": method}
     options |= {"increments": 0.0} if rng is None or not plant.scene.processes else {"rng": rng}
     try:
         return simulate(plant.scene, q, v, **options, check=False)
     except StepFailure as failure:
-        whole = _so_far(plant, [*before, failure.trajectory])
+        whole = _so_far(plant, method, [*before, failure.trajectory])
         raise StepFailure(whole.steps, whole.t[-1], Failure(failure.reason, failure.residual), whole) from None

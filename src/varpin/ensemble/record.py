@@ -74,6 +74,7 @@ class Ensemble(Frozen):
         warnings: What varpin says of the paths, a sentence each: dt too coarse, energy off, paths that stopped early.
             A few paths are looked at, as :func:`varpin.simulate` looks at its motion: the first, the one with the most
             split steps, the one with the most energy and the fastest; up to ten are all looked at.
+        integrator: What made them.
     """
 
     t: Floats
@@ -85,6 +86,7 @@ class Ensemble(Frozen):
     energy: Floats | None
     failures: tuple[PathFailure, ...]
     warnings: tuple[str, ...] = ()
+    integrator: str = ""
 
     def __repr__(self) -> str:
         return f"Ensemble({self._size()}{warning_count(self.warnings)})"
@@ -105,7 +107,9 @@ class Ensemble(Frozen):
         counted = int(self.statistics.count[0])
         kept = "" if self.q is not None else ", not stored"
         lost = f", {len(self.failures)} stopped early" if self.failures else ""
-        return f"{counted} paths{kept} over {len(self.t) - 1} steps, {self.t[-1] - self.t[0]:g} s{lost}"
+        return (
+            f"{counted} paths{kept} over {len(self.t) - 1} steps, {self.t[-1] - self.t[0]:g} s, {self.integrator}{lost}"
+        )
 
 
 class EnsembleInterrupted(KeyboardInterrupt):

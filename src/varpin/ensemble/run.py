@@ -16,11 +16,12 @@ from varpin.ensemble.paths import Part, Shared, simulate_paths, without_geometry
 from varpin.ensemble.record import Ensemble, EnsembleInterrupted
 from varpin.ensemble.statistics import Sums
 from varpin.errors import InputError, VarpinError
-from varpin.integrators import Integrator, Midpoint
+from varpin.integrators import Integrator
 from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import children
-from varpin.simulation.run import commands_of, on_constraints
+from varpin.simulation.choice import changes_along, integrator_along, stronger, usual_integrator
+from varpin.simulation.run import commands_of, on_constraints, rollout
 from varpin.simulation.soundness import Finding, announce
 from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
 from varpin.support.executors import executing, in_order
@@ -28,6 +29,9 @@ from varpin.support.executors import executing, in_order
 Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
+
+# Paths that are asked for the integrator: one of so many, and so many at most.
+_OF, _ASKED = 16, 8
 
 
 def simulate_ensemble(
@@ -65,7 +69,8 @@ def simulate_ensemble(
             evaluates at its own state.
 
     Other Args:
-        integrator: ``Midpoint()`` if left out.
+        integrator: If left out, ``Midpoint()``; in a scene without noise that of :func:`varpin.simulate`, as a few of
+            the paths ask for it. ``Ensemble.integrator`` says which.
         store: Keep every path. Without, only the statistics are kept, and memory does not grow with P N.
         quantiles: Levels in [0, 1]; none, and no more than moments come back from the workers. They are exact if paths
             are stored, or if P (N + 1) 2n is no more than 33 million. Beyond, they are read from histograms of up to
@@ -94,8 +99,7 @@ def simulate_ensemble(
     levels = require_finite("quantiles", as_floats("quantiles", quantiles))
     if levels.ndim != 1 or ((levels < 0.0) | (levels > 1.0)).any():
         raise InputError(f"quantiles must be levels in [0, 1], got {quantiles}")
-    integrator = Midpoint() if integrator is None else integrator
-    if not isinstance(integrator, Integrator):
+    if integrator is not None and not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
     if controls is None and (scene.servo_joints or scene.inputs):
         if (start[0] != start[0][0]).any():
@@ -103,6 +107,8 @@ def simulate_ensemble(
             raise InputError(f"controls are needed: {positions}")
         controls = scene.command_at(start[0][0])
     start, moved = _onto_constraints(scene, start)
+    if integrator is None:
+        integrator = _usual(scene, start[0], start[1], controls, steps, dt)
     commands = commands_of(scene, integrator, controls, steps, dt)
     if len(commands.places):
         raise InputError("an ensemble takes controls that are held; those of the policy are linear between nodes")
@@ -126,6 +132,26 @@ def simulate_ensemble(
     found = (*moved, *_alike(scene, start), *sums.lost(), *found)
     announce(logger, scene, dt, found)
     return sums.ensemble(found)
+
+
+def _usual(
+    scene: Scene,
+    q0: Floats,
+    v0: Floats,
+    controls: JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None,
+    steps: int,
+    dt: float,
+) -> Integrator:
+    """The integrator of paths from (q0, v0) (P, n) where none is given: one that is right for a few of them."""
+    if scene.processes:
+        return usual_integrator(scene, q0[0], v0[0], dt, noisy=True)
+    some = np.linspace(0, len(q0) - 1, min(1 + len(q0) // _OF, _ASKED)).astype(np.int64)
+    chosen = stronger(usual_integrator(scene, q0[path], v0[path], dt, noisy=False) for path in some)
+    if not changes_along(scene) or not steps:
+        return chosen
+    commands = commands_of(scene, chosen, controls, steps, dt)
+    motions = (rollout(scene, chosen, q0[path], v0[path], commands, dt)[0] for path in some)
+    return stronger(integrator_along(scene, chosen, own.q, own.v, own.u, dt) for own in motions if own.steps)
 
 
 def _onto_constraints(scene: Scene, start: Sequence[Floats]) -> tuple[list[Floats], tuple[Finding, ...]]:

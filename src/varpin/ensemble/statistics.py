@@ -129,6 +129,7 @@ class Sums:
             energy=stored.get("energy"),
             failures=tuple(self.failures),
             warnings=tuple(finding.sentence for finding in found),
+            integrator=str(self.shared.integrator),
         )
 
     def _quantiles(self) -> tuple[Floats, Floats]:

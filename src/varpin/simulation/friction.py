@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from varpin.core import fastest_damping
 from varpin.mechanics.forces import dissipates, of_kind
 from varpin.mechanics.scene import Scene
-from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
@@ -38,12 +37,15 @@ class Stop(NamedTuple):
     width: float
 
 
-def stops(scene: Scene, trajectory: Trajectory) -> list[Stop]:
-    """Some of the steps in which joints with dry friction come to rest or turn back, the first and last of each."""
+def stops(scene: Scene, velocities: Floats) -> list[Stop]:
+    """Some of the steps in which joints with dry friction come to rest or turn back, the first and last of each.
+
+    ``velocities`` are those of the nodes (N + 1, n).
+    """
     found = []
     for own in of_kind(scene.elements, "CoulombFriction"):
         c, width = own.coordinate, own.values[1]
-        v = trajectory.v[:, c]
+        v = velocities[:, c]
         before, after = v[:-1], v[1:]
         # The velocity changes its sign, or another step like this one would take it there.
         slows = (before * after <= 0.0) | ((np.abs(after) <= np.abs(after - before)) & (np.abs(after) < np.abs(before)))
@@ -54,15 +56,18 @@ def stops(scene: Scene, trajectory: Trajectory) -> list[Stop]:
     return sorted(found, key=lambda stop: (stop.width, stop.step))[:_MOST]
 
 
-def rate_at_stops(scene: Scene, trajectory: Trajectory, at: list[Stop], least: float) -> float:
-    """The fastest rate of all that damps [1/s] where joints come to rest, or 0 where none is faster than ``least``."""
+def rate_at_stops(scene: Scene, q: Floats, v: Floats, u: Floats, at: list[Stop], least: float) -> float:
+    """The fastest rate of all that damps [1/s] where joints come to rest, or 0 where none is faster than ``least``.
+
+    q and v (N + 1, n) are those of the nodes, u (N, m) of the steps.
+    """
     if not at:
         return 0.0
     steps = [stop.step for stop in at]
-    v = trajectory.v[steps]
+    v = v[steps]
     v[np.arange(len(at)), [stop.joint for stop in at]] = 0.0
-    force = np.ascontiguousarray(trajectory.u[steps] @ scene.actuation.T)
-    return float(fastest_damping(scene.core, trajectory.q[steps], v, force, least))
+    force = np.ascontiguousarray(u[steps] @ scene.actuation.T)
+    return float(fastest_damping(scene.core, q[steps], v, force, least))
 
 
 def rate_at_rest(scene: Scene, q: Floats) -> float:

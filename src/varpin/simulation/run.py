@@ -7,15 +7,14 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.core import fastest_damping, pulls_fast
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, UnknownJoint, VarpinError
-from varpin.integrators import Gauss, Integrator, Midpoint, Radau, Reference, Segment, integrator_of
+from varpin.integrators import Integrator, Reference, Segment, integrator_of
 from varpin.integrators.base import Failure, join, lines, open_loop, rows, steps_of
 from varpin.integrators.within import Times, changing
 from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
@@ -25,8 +24,9 @@ from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.mechanics.scene import CORRECTED, Scene, refuse_constraints, refuse_inputs, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.simulation import limits
+from varpin.simulation.choice import candidates, changes_along, integrator_along, usual_integrator
 from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstable_loop
-from varpin.simulation.refinement import INTEGRATORS, SENSIBLE, first_steps
+from varpin.simulation.refinement import SENSIBLE
 from varpin.simulation.soundness import Finding, announce, evident, with_warnings
 from varpin.simulation.tolerance import Motion, Raised, choose
 from varpin.support.checks import (
@@ -54,19 +54,8 @@ logger = logging.getLogger(__name__)
 
 # Work between two looks at the progress callback and at Ctrl-C, in steps of one joint: some tens of milliseconds.
 _CHUNK = 30_000
-# What steps where no integrator is given; and under noise, for more stages do not raise the strong order.
-_USUAL, _NOISY = Gauss(2), Midpoint()
-# What steps where something turns by more than this in a step [rad], of which two stages lose 2e-4 rad a period. And
-# where something damps this many times faster than the step: velocities of the others lag and ring, and three stages
-# miss by a tenth what torques that jump do to them.
-_SWINGING, _TURNS = Gauss(4), 0.4
-_STOPPING, _RINGS = Radau(4), 2.0
-# Of more joints than so many nobody asks, for that takes as long as a motion.
-_ASKED = 200
 # Who is told the motion is called at least so often [s], where nothing but whole chunks of steps takes longer.
 _LOOK = 1.0 / 60.0
-# Who may be chosen for a tolerance as well, where something damps faster than the coarsest steps by this factor.
-_STIFF, _FAR = (Radau(3), Radau(4)), 4.0
 # What a start may be moved by onto constraints without a word [rad or m].
 _UNSAID = 1e-9
 # Steps at which a function of time is held against steps of half the length, and the share by which it may be off.
@@ -466,8 +455,10 @@ def simulate(
         period: Of a control law, in steps.
         integrator: If left out, ``Gauss(stages=2)``; where, at the start, springs turn a mode by more than 0.4 rad in a
             step, ``Gauss(stages=4)``; where dampers, dry friction or servos are more than twice as fast as the step
-            there, ``Radau(stages=4)``, unless the scene has constraints. A CustomForce is not asked for either.
-            ``Midpoint()`` where noise is drawn; with a tolerance, the cheapest that there is.
+            there, ``Radau(stages=4)``, unless the scene has constraints. Where that shows only later in the motion,
+            in a stop that a joint runs into, say, the motion is made anew, and ``Trajectory.integrator`` says by what;
+            that of a law, which is called once a period, is not, but is ready for all stops. A CustomForce is not
+            asked for either. ``Midpoint()`` where noise is drawn; with a tolerance, the cheapest that there is.
 
     Other Args:
         rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero, and a
@@ -501,7 +492,6 @@ def simulate(
             integrator, a plain one.
     """
     joints = require_scene(scene).robot.joint_names
-    n = len(joints)
     q0, v0 = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
     if integrator is not None and not isinstance(integrator, Integrator):
         raise InputError(f"integrator must be one of varpin's, for example varpin.Midpoint(), got {integrator!r}")
@@ -521,7 +511,6 @@ def simulate(
     period = count("period", period, least=1)
     _require_memory(scene, steps)
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
-    integrator = usual_integrator(scene, q0, v0, dt, noisy=len(dw) > 0) if integrator is None else integrator
     reporter = _Reporter(progress, steps, dt)
     law = controls if callable(controls) else None
     if callable(controls) or isinstance(controls, OpenLoop):
@@ -533,36 +522,15 @@ def simulate(
             f"period = {period} is of a control law, a function of (t, q, v); rows are given one a step, "
             "and a LinearPolicy has a hold of its own"
         )
-    if callable(controls) or isinstance(controls, OpenLoop):
-        commands = open_loop(np.zeros((0, scene.controls)))._replace(hold=period)
-    else:
-        commands = commands_of(scene, integrator, controls, steps, dt)
-    hold = period if law is not None else commands.hold if isinstance(controls, LinearPolicy) else None
-    state, (start,) = integrator.start(scene, q0[None], v0[None])
-    linear = bool(len(commands.places))
-    if linear:
-        # Gains of a held control are looked at by the loop's check; those of lines are not.
-        hold = None
-    record = _Record(scene, integrator, dt, dw, start, commands if linear else None)
-    # A sweep takes as long as the robot has joints, an elimination as their cube.
-    chunk = max(1, _CHUNK // (n + n**3 // 100))
-    # One step at a time where noise or forces call Python functions: what came before one that fails is recorded.
-    stepwise = scene.noise.diffusion is None or scene.custom is not None or bool(scene.bound_constraints.rows.customs)
-    interrupted = False
-    try:
-        reporter.begin(start)
-        while record.steps < steps:
-            done = record.steps
-            block = _next_block(controls, commands, record, 1 if stepwise else chunk, steps - done)
-            segment = _rolled_out(record, state, block)
-            record.add(segment, block.within)
-            if segment.failure is not None:
-                # What a law has just decided is in no step yet.
-                decided = None if law is None else (done, block.u)
-                raise _step_failure(record, segment.failure, hold if check else None, decided)
-            reporter.add(segment, record.steps, due=done // chunk < record.steps // chunk)
-    except KeyboardInterrupt:
-        interrupted = True
+    # A law may remember what it was called with: its motion is made once.
+    again = integrator is None and law is None and not len(dw) and changes_along(scene)
+    if integrator is None:
+        integrator = usual_integrator(scene, q0, v0, dt, noisy=len(dw) > 0, ahead=law is not None)
+    asked = _Asked(scene, q0, v0, controls, period, dt, steps, dw, check)
+    record, hold, other, interrupted = _made(asked, integrator, reporter, again=again)
+    while other is not None:
+        integrator = other
+        record, hold, other, interrupted = _made(asked, integrator, reporter, again=again)
     try:
         try:
             trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
@@ -582,6 +550,72 @@ def simulate(
         raise Interrupted(trajectory)
     announce(logger, scene, dt, found)
     return trajectory
+
+
+class _Asked(NamedTuple):
+    """A motion that is to be made, but for its integrator; ``period`` is that of a law in steps."""
+
+    scene: Scene
+    q0: Floats
+    v0: Floats
+    controls: Controls | ControlLaw
+    period: int
+    dt: float
+    steps: int
+    dw: Floats
+    check: bool
+
+
+def _made(
+    asked: _Asked, integrator: Integrator, reporter: _Reporter, *, again: bool
+) -> tuple[_Record, int | None, Integrator | None, bool]:
+    """The steps of a motion, and the period of its feedback in steps, None for none.
+
+    ``again`` asks whether another integrator should take them, which comes next; the steps so far are then to be left.
+    Last comes whether Ctrl-C has ended them.
+    """
+    scene, controls, dt, steps = asked.scene, asked.controls, asked.dt, asked.steps
+    if callable(controls) or isinstance(controls, OpenLoop):
+        commands = open_loop(np.zeros((0, scene.controls)))._replace(hold=asked.period)
+    else:
+        commands = commands_of(scene, integrator, controls, steps, dt)
+    hold = asked.period if callable(controls) else commands.hold if isinstance(controls, LinearPolicy) else None
+    state, (start,) = integrator.start(scene, asked.q0[None], asked.v0[None])
+    linear = bool(len(commands.places))
+    if linear:
+        # Gains of a held control are looked at by the loop's check; those of lines are not.
+        hold = None
+    record = _Record(scene, integrator, dt, asked.dw, start, commands if linear else None)
+    # A sweep takes as long as the robot has joints, an elimination as their cube.
+    n = scene.robot.dof
+    chunk = max(1, _CHUNK // (n + n**3 // 100))
+    # One step at a time where noise or forces call Python functions: what came before one that fails is recorded.
+    stepwise = scene.noise.diffusion is None or scene.custom is not None or bool(scene.bound_constraints.rows.customs)
+    try:
+        reporter.begin(start)
+        while record.steps < steps:
+            done = record.steps
+            block = _next_block(controls, commands, record, 1 if stepwise else chunk, steps - done)
+            segment = _rolled_out(record, state, block)
+            if again and (other := _better(record, segment, block)) is not None:
+                return record, hold, other, False
+            record.add(segment, block.within)
+            if segment.failure is not None:
+                # What a law has just decided is in no step yet.
+                decided = (done, block.u) if callable(controls) else None
+                raise _step_failure(record, segment.failure, hold if asked.check else None, decided)
+            reporter.add(segment, record.steps, due=done // chunk < record.steps // chunk)
+    except KeyboardInterrupt:
+        return record, hold, None, True
+    return record, hold, None, False
+
+
+def _better(record: _Record, segment: Segment, block: Commands) -> Integrator | None:
+    """What should have taken the steps of a segment that follows a record, if that is another integrator."""
+    q, v = (np.concatenate([getattr(record.last, name)[-1:], getattr(segment, name)]) for name in ("q", "v"))
+    u = segment.u if len(segment.u) else block.u[:1]
+    other = integrator_along(record.scene, record.integrator, q, v, u, record.dt)
+    return None if other.same_map(record.integrator) else other
 
 
 def _next_block(controls: Controls | ControlLaw, commands: Commands, record: _Record, most: int, left: int) -> Commands:
@@ -695,45 +729,6 @@ def _time_of_wish(dt: float | None, steps: int | None, duration: float | None) -
     return positive("duration", duration, "s")
 
 
-def usual_integrator(scene: Scene, q0: Floats, v0: Floats, dt: float, *, noisy: bool) -> Integrator:
-    """The integrator of a motion where none is given; that of a plan is :func:`varpin.control.problem.integrator_for`.
-
-    Under noise it is the midpoint rule: its positions have the right law where damping is faster than the step, and a
-    warning tells of its velocities. Radau's velocities lose nearly all of the noise.
-    """
-    if noisy:
-        return _NOISY
-    # Radau's methods do not keep constraints.
-    if not scene.constraints and _damps_faster(scene, q0, v0, _RINGS / dt):
-        return _STOPPING
-    return _SWINGING if _swings_faster(scene, q0, _TURNS / dt) else _USUAL
-
-
-def _candidates(scene: Scene, q0: Floats, v0: Floats, duration: float) -> tuple[Integrator, ...]:
-    """Who may be chosen for a tolerance: Radau's methods, too, where something damps far faster than the arm moves."""
-    moves = first_steps(scene, q0, v0, duration, 1) / duration
-    return INTEGRATORS + (_STIFF if _damps_faster(scene, q0, v0, _FAR * moves) else ())
-
-
-def _damps_faster(scene: Scene, q0: Floats, v0: Floats, rate: float) -> bool:
-    """Whether dampers, dry friction or servos are faster than a rate [1/s] at the start, or would be at rest there."""
-    # Forces of one's own are called by the motion alone, which says where they fail.
-    if not scene.dissipates or scene.custom is not None or len(q0) > _ASKED:
-        return False
-    # At rest dry friction is fastest; servos do not saturate where they are.
-    velocities = np.array([v0, np.zeros_like(v0)])
-    forces = np.tile(scene.actuation @ scene.command_at(q0), (2, 1))
-    return fastest_damping(scene.core, np.tile(q0, (2, 1)), velocities, forces, rate) > 0.0
-
-
-def _swings_faster(scene: Scene, q0: Floats, rate: float) -> bool:
-    """Whether springs, servos or gravity make a mode faster than a rate [rad/s] at rest at the start."""
-    if scene.custom is not None or len(q0) > _ASKED:
-        return False
-    forces = (scene.actuation @ scene.command_at(q0))[None]
-    return bool(pulls_fast(scene.core, q0[None], np.zeros((1, len(q0))), forces, 1.0 / rate))
-
-
 def _require_choice(scene: Scene, controls: Controls | ControlLaw, integrator: Integrator | None) -> Controls:
     """The controls; refuses what no tolerance chooses steps for.
 
@@ -800,7 +795,7 @@ def _chosen(
     earlier = tolerance if isinstance(tolerance, Accuracy) else None
     wish = positive("tolerance", tolerance.tolerance if isinstance(tolerance, Accuracy) else tolerance, "rad or m")
     controls = _require_choice(scene, asked, integrator)
-    members = _candidates(scene, q0, v0, duration) if integrator is None else (integrator,)
+    members = candidates(scene, q0, v0, duration) if integrator is None else (integrator,)
     parts = 1
     given: Callable[[Integrator, int], Commands]
     held = np.zeros((0, 0))

@@ -10,12 +10,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.core import doubled_steps_agree, energy_turnover, fastest_damping, glance
+from varpin.core import doubled_steps_agree, energy_turnover, glance
 from varpin.integrators import ExplicitEuler, Integrator, Radau, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
@@ -42,6 +41,7 @@ from varpin.simulation.accuracy import (
     inertias,
 )
 from varpin.simulation.chatter import RUN, Alternation, alternation
+from varpin.simulation.damping import Fast, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
 from varpin.simulation.limits import left as limits_left
 from varpin.simulation.phase import phase_lost
@@ -74,8 +74,8 @@ _STOPPING = Radau(3)
 _SETTLING, _SETTLED = 6, (2, 16)
 # What the velocity may be off by there: over several steps in widths of the friction; in one, of the largest velocity.
 _RUBS, _FELT = 0.1, 1e-3
-# Nodes at which mass matrices, and energies of single groups, are looked at; and rates of dampers.
-_NODES, _INERTIAS = 16, 4
+# Nodes at which mass matrices, and energies of single groups, are looked at.
+_NODES = 16
 # The window of a motion that has one.
 _FROM_START = np.zeros(1, dtype=np.int64)
 # Velocities below this count as none [rad/s or m/s]: what rounding leaves of a robot in equilibrium.
@@ -191,36 +191,9 @@ def _in_parts(trajectory: Trajectory) -> str:
     return f"{split} of {trajectory.steps} steps were taken in up to {most} parts"
 
 
-class _Fast(NamedTuple):
-    """What damps faster than a step can resolve.
-
-    Attributes:
-        rate: The fastest [1/s]; 0 for none.
-        stop: Where a joint comes to rest, if it is dry friction that is so fast there.
-    """
-
-    rate: float
-    stop: Stop | None = None
-
-
-def _fast_damping(scene: Scene, trajectory: Trajectory) -> _Fast:
+def _fast_damping(scene: Scene, trajectory: Trajectory) -> Fast:
     """The fastest of the dampers if a step cannot resolve it."""
-    if not scene.dissipates or not trajectory.steps:
-        return _Fast(0.0)
-    # Rates change along the motion as the inertia does.
-    at = [i * trajectory.steps // (_INERTIAS - 1) for i in range(_INERTIAS)]
-    least = 2.0 / trajectory.dt
-    fastest = _Fast(fastest_damping(scene.core, *_nodes_of(scene, trajectory, at), least))
-    for stop in stops(scene, trajectory):
-        if rate := rate_at_stops(scene, trajectory, [stop], max(least, fastest.rate)):
-            fastest = _Fast(rate, stop)
-    return fastest
-
-
-def _nodes_of(scene: Scene, trajectory: Trajectory, at: list[int]) -> tuple[Floats, Floats, Floats]:
-    """q, v and the constant forces of the controls (K, n) at some nodes."""
-    controls = trajectory.u[np.minimum(at, trajectory.steps - 1)]
-    return trajectory.q[at], trajectory.v[at], np.ascontiguousarray(controls @ scene.actuation.T)
+    return fast_damping(scene, trajectory.q, trajectory.v, trajectory.u, trajectory.dt)
 
 
 def _applied(scene: Scene, trajectory: Trajectory) -> Floats:
@@ -228,7 +201,7 @@ def _applied(scene: Scene, trajectory: Trajectory) -> Floats:
     return np.ascontiguousarray(trajectory.u @ scene.actuation.T)
 
 
-def _ringing(scene: Scene, fast: _Fast, dt: float, off: str = "", joint: int | None = None) -> Finding:
+def _ringing(scene: Scene, fast: Fast, dt: float, off: str = "", joint: int | None = None) -> Finding:
     """Says that something damps faster than the step, and of what joint."""
     times = f"(dt * {fast.rate:.3g}/s = {dt * fast.rate:.3g} > 2)"
     cure = f"dt below {2.0 / fast.rate:.3g} s resolves it"
@@ -262,7 +235,7 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
             f"smaller steps from t = {start:.4g} s on move joint {trajectory.joint_names[error.joint]!r} by "
             f"{100 * error.position:.3g}% of its way over a period, and its velocity by {100 * error.velocity:.3g}%"
         )
-        fast = _Fast(0.0) if integrator.l_stable else _fast_damping(scene, trajectory)
+        fast = Fast(0.0) if integrator.l_stable else _fast_damping(scene, trajectory)
         if fast.rate:
             found.append(_ringing(scene, fast, dt, f"; {off}", error.joint))
         else:
@@ -324,20 +297,20 @@ def _unsettled(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
     kicked = trajectory.dw.any() and scene.noise.diffusion is None
     if integrator.l_stable or isinstance(integrator, Reference) or kicked:
         return ()
-    for stop in stops(scene, trajectory):
-        rate = rate_at_stops(scene, trajectory, [stop], 2.0 / trajectory.dt)
+    for stop in stops(scene, trajectory.v):
+        rate = rate_at_stops(scene, trajectory.q, trajectory.v, trajectory.u, [stop], 2.0 / trajectory.dt)
         count = min(_SETTLING, trajectory.steps - stop.step)
         if not rate or count < _SETTLING // 2:
             continue
         off = _off_rest(scene, integrator, trajectory, stop, count)
         if len(off) < _SETTLING // 2:
             # What nothing gets through cannot be seen to be right.
-            return (_ringing(scene, _Fast(rate, stop), trajectory.dt),)
+            return (_ringing(scene, Fast(rate, stop), trajectory.dt),)
         lasting, most = float(np.median(off)), float(off.max())
         speed = float(np.abs(trajectory.v[:, stop.joint]).max())
         if lasting > _RUBS * stop.width or (most > stop.width and most > _FELT * speed):
             since = f"; after t = {trajectory.t[stop.step]:.4g} s it is off by up to {most:.3g} rad/s or m/s"
-            return (_ringing(scene, _Fast(rate, stop), trajectory.dt, since),)
+            return (_ringing(scene, Fast(rate, stop), trajectory.dt, since),)
     return ()
 
 

@@ -13,7 +13,8 @@ from varpin.integrators import Integrator
 from varpin.linearization import linearize
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
-from varpin.simulation.run import simulate, usual_integrator
+from varpin.simulation.choice import usual_integrator
+from varpin.simulation.run import simulate
 from varpin.support.checks import JointValues, finite_array, joint_array, positive
 
 Floats = NDArray[np.float64]

@@ -25,7 +25,8 @@ from varpin.io.scenefile.table import Floats
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot
-from varpin.simulation.run import simulate, usual_integrator
+from varpin.simulation.choice import usual_integrator
+from varpin.simulation.run import simulate
 from varpin.support.markup import facts
 from varpin.trajectory import Trajectory
 
@@ -74,7 +75,7 @@ class SceneFile:
         """The integrator of the file.
 
         Where it names none, that of :class:`varpin.OptimalControlProblem`, or of :func:`varpin.simulate` where nothing
-        is to be planned.
+        is to be planned: then the one that its start asks for, and what ``simulate`` took is on the trajectory.
         """
         if self.spec.integrator is not None:
             return self.spec.integrator
@@ -160,7 +161,7 @@ class SceneFile:
             dt=spec.dt,
             steps=spec.steps,
             controls=self.controls(),
-            integrator=self.integrator,
+            integrator=self.integrator if spec.costs else spec.integrator,
             rng=spec.seed,
             progress=progress,
         )

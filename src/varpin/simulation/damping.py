@@ -1,0 +1,125 @@
+"""What damps faster than a step can resolve, or turns by too much in one, anywhere along a motion.
+
+Rates change with the inertia, with the levers of dampers between frames, with the velocity where there is dry friction,
+and with every stop that a joint runs into. They are asked for at a few nodes all over the motion and at those that are
+known to matter: where joints with dry friction are slowest, or come to rest within a step, and in the stops of joints
+that reach them, or would within a step.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.core import fastest_damping, pulls_fast
+from varpin.mechanics.forces import of_kind
+from varpin.mechanics.scene import Scene
+from varpin.simulation.friction import Stop, rate_at_stops, stops
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# Nodes that are looked at: one of so many, but so many at least and at most; so many for dry friction, and for stops.
+_OF, _LEAST, _MOST = 16, 4, 12
+_SLOW, _REACHED = 6, 6
+
+
+class Fast(NamedTuple):
+    """What damps faster than a step can resolve.
+
+    Attributes:
+        rate: The fastest [1/s]; 0 for none.
+        stop: Where a joint comes to rest, if it is dry friction that is so fast there.
+    """
+
+    rate: float
+    stop: Stop | None = None
+
+
+def fast_damping(scene: Scene, q: Floats, v: Floats, u: Floats, dt: float) -> Fast:
+    """The fastest of all that damps along a motion if steps of ``dt`` [s] cannot resolve it.
+
+    q and v (N + 1, n) are those of the nodes, u (N, m) of the steps.
+    """
+    if not scene.dissipates or not len(u):
+        return Fast(0.0)
+    least = 2.0 / dt
+    at = np.union1d(_spread(len(v) - 1), _slowest(scene, v))
+    fastest = Fast(fastest_damping(scene.core, q[at], v[at], _forces(scene, u, at), least))
+    nodes, reached = _in_stops(scene, q, v, dt)
+    if len(nodes):
+        rate = fastest_damping(scene.core, reached, v[nodes], _forces(scene, u, nodes), max(least, fastest.rate))
+        fastest = Fast(max(rate, fastest.rate))
+    for stop in stops(scene, v):
+        if rate := rate_at_stops(scene, q, v, u, [stop], max(least, fastest.rate)):
+            fastest = Fast(rate, stop)
+    return fastest
+
+
+def turns_fast(scene: Scene, q: Floats, v: Floats, u: Floats, h: float) -> bool:
+    """Whether stops and springs between frames turn a mode by more than a radian over h [s] along a motion.
+
+    Rates of all other springs are those of the start, but for what the inertia changes.
+    """
+    if not len(u):
+        return False
+    nodes, reached = _in_stops(scene, q, v, h)
+    if len(nodes) and pulls_fast(scene.core, reached, v[nodes], _forces(scene, u, nodes), h):
+        return True
+    if not scene.couplings:
+        return False
+    at = _spread(len(v) - 1)
+    return bool(pulls_fast(scene.core, q[at], v[at], _forces(scene, u, at), h))
+
+
+def stops_ahead(scene: Scene, q: Floats) -> Floats:
+    """Configurations (K, n) that are ``q`` (n,) but for one joint each, which is at a stop with all of its strength."""
+    rows = []
+    for own in of_kind(scene.elements, "JointStop"):
+        lower, upper, *_, width = own.values
+        for end in (lower - width, upper + width):
+            if np.isfinite(end):
+                rows.append(q.copy())
+                rows[-1][own.coordinate] = end
+    return np.array(rows).reshape(-1, q.size)
+
+
+def _spread(steps: int) -> Integers:
+    """Nodes all over a motion, its ends among them."""
+    count = min(max(steps // _OF, _LEAST), _MOST, steps + 1)
+    nodes: Integers = np.linspace(0, steps, count).astype(np.int64)
+    return nodes
+
+
+def _slowest(scene: Scene, v: Floats) -> Integers:
+    """Nodes at which joints with dry friction are slowest, which is where it is steepest."""
+    joints = [own.coordinate for own in of_kind(scene.elements, "CoulombFriction")][:_SLOW]
+    slowest: Integers = np.abs(v[:, joints]).argmin(axis=0).astype(np.int64)
+    return slowest
+
+
+def _in_stops(scene: Scene, q: Floats, v: Floats, h: float) -> tuple[Integers, Floats]:
+    """Nodes at which joints are deepest in their stops, or get there within h [s]; q (K, n) with that joint in it."""
+    found = []
+    for own in of_kind(scene.elements, "JointStop"):
+        c, (lower, upper, *_, width) = own.coordinate, own.values
+        for end, side in ((lower, -1.0), (upper, 1.0)):
+            # Between two nodes it may come and go.
+            depth = side * (q[:, c] - end)
+            reach = depth + np.abs(v[:, c]) * h
+            node = int(reach.argmax())
+            if reach[node] > 0.0:
+                found.append((float(reach[node]), node, c, end + side * max(depth[node], min(width, reach[node]))))
+    found = sorted(found, key=lambda own: -own[0])[:_REACHED]
+    nodes = np.array([node for _, node, _, _ in found], dtype=np.int64)
+    reached = q[nodes]
+    for row, (_, _, c, place) in zip(reached, found, strict=True):
+        row[c] = place
+    return nodes, reached
+
+
+def _forces(scene: Scene, u: Floats, at: Integers) -> Floats:
+    """Constant forces (K, n) of the controls in the steps that begin at some nodes."""
+    return np.ascontiguousarray(u[np.minimum(at, len(u) - 1)] @ scene.actuation.T)
