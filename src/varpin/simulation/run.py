@@ -563,7 +563,7 @@ def simulate(
     try:
         try:
             trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
-        except CustomForceError as error:
+        except (CustomForceError, CustomConstraintError) as error:
             # Steps that the check takes again may go where the function is not defined. The motion stands.
             sentence = f"the motion was not checked: {error}"
             trajectory, found = record.trajectory(), (Finding("check", sentence),)
