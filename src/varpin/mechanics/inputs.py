@@ -38,3 +38,13 @@ def in_parts_of_steps(scene: Scene, u: Floats, q: Floats, v: Floats, dt: float, 
         # Where a step ends stays to the last digit.
         fine[parts - 1 :: parts] = u
     return fine
+
+
+def held_in_parts(scene: Scene, u: Floats, q0: Floats, v0: Floats, dt: float, parts: int) -> Floats:
+    """:func:`in_parts_of_steps` of steps that follow each other from q0 and v0 (n,) on."""
+    q, v = np.tile(q0, (len(u), 1)), np.tile(v0, (len(u), 1))
+    for c, rate in zip(scene.inputs.values(), scene.rates, strict=True):
+        q[1:, c] = u[:-1, int(np.argmax(scene.actuation[c]))]
+        if rate >= 0:
+            v[1:, c] = u[:-1, rate]
+    return in_parts_of_steps(scene, u, q, v, dt, parts)

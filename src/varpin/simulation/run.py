@@ -21,12 +21,13 @@ from varpin.integrators.within import Times, changing
 from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.inputs import held_in_parts
 from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.mechanics.scene import CORRECTED, Scene, refuse_constraints, refuse_inputs, require_scene
+from varpin.mechanics.scene import CORRECTED, Scene, refuse_inputs, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.simulation import limits
 from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstable_loop
-from varpin.simulation.refinement import INTEGRATORS, SENSIBLE, first_steps
+from varpin.simulation.refinement import SENSIBLE, candidates, first_steps
 from varpin.simulation.soundness import Finding, announce, evident, with_warnings
 from varpin.simulation.tolerance import Motion, Raised, choose
 from varpin.support.checks import (
@@ -451,8 +452,8 @@ def simulate(
             ``Trajectory.accuracy`` says what was taken, what error that estimates and how many steps finding out took;
             it is itself a ``tolerance``, of the same scene's next motion, which tries first what it found. Where the
             tolerance is out of reach a warning says what is reached. Rows of controls, (R, m), are then held over
-            duration / R each, the intervals of a FirstOrderHold are as long, a LinearPolicy needs its period in
-            seconds, and noise and control laws are refused.
+            duration / R each, in which joints that are moved by hand go to theirs; the intervals of a FirstOrderHold
+            are as long, a LinearPolicy needs its period in seconds, and noise and control laws are refused.
         controls: None for none, servos staying where they are at ``q0``; an array (N, m), one row a step; one row
             (m,) for all steps, by joint name too where each control is the force of a joint, with 0 for joints that
             are not named; a :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that
@@ -511,7 +512,8 @@ def simulate(
     if tolerance is not None:
         span = _time_of_wish(dt, steps, duration)
         chosen = _chosen(scene, q0, v0, span, tolerance, controls, integrator)
-        integrator, steps, controls, accuracy, wished = chosen
+        integrator, steps, controls, accuracy, unmet = chosen
+        wished = (*wished, *unmet)
         dt = span / steps
     else:
         dt, steps = _times(dt, steps, duration)
@@ -708,8 +710,10 @@ def usual_integrator(scene: Scene, q0: Floats, v0: Floats, dt: float, *, noisy: 
 
 def _candidates(scene: Scene, q0: Floats, v0: Floats, duration: float) -> tuple[Integrator, ...]:
     """Who may be chosen for a tolerance: Radau's methods, too, where something damps far faster than the arm moves."""
+    if scene.constraints:
+        return candidates(scene)
     moves = first_steps(scene, q0, v0, duration, 1) / duration
-    return INTEGRATORS + (_STIFF if _damps_faster(scene, q0, v0, _FAR * moves) else ())
+    return candidates(scene) + (_STIFF if _damps_faster(scene, q0, v0, _FAR * moves) else ())
 
 
 def _damps_faster(scene: Scene, q0: Floats, v0: Floats, rate: float) -> bool:
@@ -735,15 +739,12 @@ def _require_choice(scene: Scene, controls: Controls | ControlLaw, integrator: I
     """The controls; refuses what no tolerance chooses steps for.
 
     Raises:
-        InputError: Noise, constraints, a control law, or an integrator that chooses its own steps.
+        InputError: Noise, a control law, or an integrator that chooses its own steps.
     """
     if scene.processes:
         raise InputError(
             "tolerance is of single motions without noise: leave the noise out of the scene, or give dt and steps"
         )
-    refuse_constraints(
-        scene, "simulate with a tolerance", "give dt and varpin.Gauss(2) or more stages, and compare with half that dt"
-    )
     if isinstance(integrator, Reference):
         raise InputError("Reference chooses its own steps: its tolerance is rtol; give it dt and steps")
     if callable(controls):
@@ -829,7 +830,7 @@ def _chosen(
         parts = len(held)
 
         def given(member: Integrator, steps: int) -> Commands:  # noqa: ARG001 - as for the others
-            return open_loop(np.repeat(held, steps // parts, axis=0))
+            return open_loop(held_in_parts(scene, held, q0, v0, duration / parts, steps // parts))
 
     motion = Motion(scene, q0, v0, duration, parts, given, isinstance(controls, OpenLoop))
     first = None
@@ -869,7 +870,7 @@ def _chosen(
     if isinstance(controls, FirstOrderHold):
         controls = controls.refined(choice.steps // parts)
     elif not isinstance(controls, LinearPolicy | OpenLoop):
-        controls = np.repeat(held, choice.steps // parts, axis=0)
+        controls = held_in_parts(scene, held, q0, v0, duration / parts, choice.steps // parts)
     return choice.integrator, choice.steps, controls, record, found
 
 
