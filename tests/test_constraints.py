@@ -601,12 +601,8 @@ def test_what_knows_no_constraints_refuses_them():
     tries = [
         lambda: vp.second_order(scene, motion, np.ones(6)),
         lambda: vp.solve(problem, second_order=True),
-        lambda: vp.optimal_control_tradeoff(problem),
-        lambda: vp.work_precision(scene, q, v, duration=0.1),
-        lambda: vp.advise(scene, q, v, duration=0.1),
         lambda: vp.check_linearization(scene, q, v, dt=1e-2),
         lambda: vp.discrete_lagrangian(scene, q, q, 1e-2),
-        lambda: vp.simulate(scene, q, v, duration=0.1, tolerance=1e-3),
     ]
     for attempt in tries:
         with refused(vp.InputError, "constraints"):

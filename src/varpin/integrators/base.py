@@ -108,6 +108,11 @@ class Integrator(ABC):
         """The order of its error in dt where nothing is noisy and controls are constant over each step."""
 
     @property
+    def keeps_constraints(self) -> bool:
+        """Whether it integrates scenes with constraints."""
+        return False
+
+    @property
     def stage_times(self) -> tuple[float, ...]:
         """Where in a step of unit length it looks at controls that change within it; none where it holds their mean.
 

@@ -140,6 +140,11 @@ class Variational(Integrator):
         """The part of a step's kick that comes before the step."""
         return 1.0 if self.kick == "left" else 0.5
 
+    @property
+    def keeps_constraints(self) -> bool:
+        """See :attr:`Integrator.keeps_constraints`."""
+        return self._constraint_places() is not None
+
     @abstractmethod
     def _tableau(self) -> Tableau:
         """Its coefficients."""

@@ -16,7 +16,7 @@ from varpin.integrators import Gauss, Integrator, Midpoint, Radau
 from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import Scene
 from varpin.simulation.damping import fast_damping, stops_ahead, turns_fast
-from varpin.simulation.refinement import INTEGRATORS, first_steps
+from varpin.simulation.refinement import candidates, first_steps
 
 Floats = NDArray[np.float64]
 
@@ -80,10 +80,12 @@ def stronger(chosen: Iterable[Integrator]) -> Integrator:
     return max(chosen, key=lambda own: ranks[str(own)], default=_USUAL)
 
 
-def candidates(scene: Scene, q0: Floats, v0: Floats, duration: float) -> tuple[Integrator, ...]:
-    """Who may be chosen for a tolerance: Radau's methods, too, where something damps far faster than the arm moves."""
+def tolerance_candidates(scene: Scene, q0: Floats, v0: Floats, duration: float) -> tuple[Integrator, ...]:
+    """Integrators to choose from for a tolerance: Radau's, too, where something damps far faster than the arm moves."""
+    if scene.constraints:
+        return candidates(scene)
     moves = first_steps(scene, q0, v0, duration, 1) / duration
-    return INTEGRATORS + (_STIFF if _damps_faster(scene, q0, v0, _FAR * moves) else ())
+    return candidates(scene) + (_STIFF if _damps_faster(scene, q0, v0, _FAR * moves) else ())
 
 
 def _damps_faster(scene: Scene, q0: Floats, v0: Floats, rate: float, *, ahead: bool = False) -> bool:

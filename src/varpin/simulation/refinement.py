@@ -31,6 +31,7 @@ INTEGRATORS: tuple[Integrator, ...] = (
     *(Gauss(stages=stages) for stages in (2, 3, 4, 5)),
 )
 
+
 # Predicted errors stay below the tolerance by this factor.
 SAFETY = 1.5
 # Errors from which on a motion is not the one that was asked for [rad or m].
@@ -48,6 +49,11 @@ ROUNDING = 200.0 * float(np.finfo(np.float64).eps)
 CHECKS = 4
 # Halvings that bring nothing, after which rounding is in charge of a method that has shown its order at small errors.
 _STUCK, _SMALL = 2, 1e-6
+
+
+def candidates(scene: Scene) -> tuple[Integrator, ...]:
+    """Those of :data:`INTEGRATORS` that integrate a scene."""
+    return tuple(member for member in INTEGRATORS if member.keeps_constraints or not scene.constraints)
 
 
 @dataclass(frozen=True)

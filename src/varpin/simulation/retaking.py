@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.errors import SingularMassMatrix
+from varpin.errors import AssemblyError, SingularMassMatrix
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Radau, RungeKutta4
 from varpin.integrators.base import open_loop
 from varpin.integrators.collocation import MOST_STAGES
 from varpin.integrators.variational import Variational
 from varpin.integrators.within import Times, changing, in_parts
+from varpin.mechanics.assembly import along_constraints, nearest
+from varpin.mechanics.inputs import in_parts_of_steps
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
 
@@ -20,6 +22,9 @@ Floats = NDArray[np.float64]
 
 # Steps between two looks at how far a motion has come, at first; twice as many each time.
 _FIRST = 32
+# Parts in which steps under constraints are taken again where dampers are faster than they: an odd number, for Gauss's
+# methods turn round what is far faster than a step, or leave it where it is.
+_DAMPED_PARTS = 7
 
 
 @dataclass(frozen=True)
@@ -37,12 +42,19 @@ class Finer:
     left: float
 
 
-def finer(integrator: Integrator, trajectory: Trajectory, *, damped: bool, pulled: bool) -> Finer:
+def stopping(scene: Scene, stages: int) -> Integrator:
+    """A method for steps in which something comes to rest: Radau's; Gauss's, which keep constraints, under them."""
+    return Gauss(stages) if scene.constraints else Radau(stages)
+
+
+def finer(
+    integrator: Integrator, trajectory: Trajectory, *, damped: bool, pulled: bool, constrained: bool = False
+) -> Finer:
     """A method whose error is far below that of a motion's integrator, in steps as long.
 
     One stage more: of modes that are far faster than the step, an odd number of stages turns round what an even one
-    leaves where it is. Radau's points where dampers are faster than the step (``damped``); an explicit method beside
-    explicit ones of first order where springs are no faster either (``pulled``).
+    leaves where it is. Radau's points where dampers are faster than the step (``damped``), or parts of it under
+    constraints; an explicit method beside explicit ones of first order where springs are no faster either (``pulled``).
     """
     stages = int(getattr(integrator, "stages", 1))
     kick = integrator.kick if isinstance(integrator, Variational) else "left"
@@ -51,6 +63,8 @@ def finer(integrator: Integrator, trajectory: Trajectory, *, damped: bool, pulle
         return Finer(integrator, 2, 0.5)
     more = stages + 1 if stages < MOST_STAGES else MOST_STAGES - 1
     parts = 2 if stages == MOST_STAGES else 1
+    if damped and constrained:
+        return Finer(Gauss(more, kick=kick), _DAMPED_PARTS, 0.0)
     if damped or integrator.l_stable:
         return Finer(Radau(max(3, more), kick=kick), parts, 0.0)
     if integrator.order == 1 and not (integrator.variational or pulled):
@@ -88,8 +102,11 @@ class Again:
         self._scene, self._method, self._trajectory, self._step = scene, method, trajectory, step
         self._count, self._parts, self._times = count, parts, times
         try:
+            if scene.constraints and any(shift):
+                self.q[0] = nearest(scene, self.q[0])
+                self.v[0] = along_constraints(scene, self.q[0], self.v[0])
             self._state, _ = method.start(scene, self.q[:1].copy(), self.v[:1].copy())
-        except SingularMassMatrix:
+        except (SingularMassMatrix, AssemblyError):
             self.ended = True
 
     def go_on(self, steps: int | None = None) -> None:
@@ -107,7 +124,8 @@ class Again:
                 drawn[0, ::parts] += method.left * trajectory.dw[taken]
                 drawn[0, parts - 1 :: parts] += (1.0 - method.left) * trajectory.dw[taken]
         # Impulses of noise depend on the controls, too.
-        commands = open_loop(np.repeat(trajectory.u[taken], parts, axis=0))
+        given = trajectory.u[taken], trajectory.q[taken], trajectory.v[taken]
+        commands = open_loop(in_parts_of_steps(scene, *given, trajectory.dt, parts))
         if trajectory.u_stages.shape[1]:
             at = method.stage_times
             commands = changing(in_parts(trajectory.u_stages[taken], self._times, parts, at), at)

@@ -20,11 +20,12 @@ from varpin.integrators.within import Times, changing
 from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.inputs import held_in_parts
 from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.mechanics.scene import CORRECTED, Scene, refuse_constraints, refuse_inputs, require_scene
+from varpin.mechanics.scene import CORRECTED, Scene, refuse_inputs, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.simulation import limits
-from varpin.simulation.choice import candidates, changes_along, integrator_along, usual_integrator
+from varpin.simulation.choice import changes_along, integrator_along, tolerance_candidates, usual_integrator
 from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstable_loop
 from varpin.simulation.refinement import SENSIBLE
 from varpin.simulation.soundness import Finding, announce, evident, with_warnings
@@ -443,8 +444,8 @@ def simulate(
             ``Trajectory.accuracy`` says what was taken, what error that estimates and how many steps finding out took;
             it is itself a ``tolerance``, of the same scene's next motion, which tries first what it found. Where the
             tolerance is out of reach a warning says what is reached. Rows of controls, (R, m), are then held over
-            duration / R each, the intervals of a FirstOrderHold are as long, a LinearPolicy needs its period in
-            seconds, and noise and control laws are refused.
+            duration / R each, in which joints that are moved by hand go to theirs; the intervals of a FirstOrderHold
+            are as long, a LinearPolicy needs its period in seconds, and noise and control laws are refused.
         controls: None for none, servos staying where they are at ``q0``; an array (N, m), one row a step; one row
             (m,) for all steps, by joint name too where each control is the force of a joint, with 0 for joints that
             are not named; a :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that
@@ -504,7 +505,8 @@ def simulate(
     if tolerance is not None:
         span = _time_of_wish(dt, steps, duration)
         chosen = _chosen(scene, q0, v0, span, tolerance, controls, integrator)
-        integrator, steps, controls, accuracy, wished = chosen
+        integrator, steps, controls, accuracy, unmet = chosen
+        wished = (*wished, *unmet)
         dt = span / steps
     else:
         dt, steps = _times(dt, steps, duration)
@@ -534,7 +536,7 @@ def simulate(
     try:
         try:
             trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
-        except CustomForceError as error:
+        except (CustomForceError, CustomConstraintError) as error:
             # Steps that the check takes again may go where the function is not defined. The motion stands.
             sentence = f"the motion was not checked: {error}"
             trajectory, found = record.trajectory(), (Finding("check", sentence),)
@@ -733,15 +735,12 @@ def _require_choice(scene: Scene, controls: Controls | ControlLaw, integrator: I
     """The controls; refuses what no tolerance chooses steps for.
 
     Raises:
-        InputError: Noise, constraints, a control law, or an integrator that chooses its own steps.
+        InputError: Noise, a control law, or an integrator that chooses its own steps.
     """
     if scene.processes:
         raise InputError(
             "tolerance is of single motions without noise: leave the noise out of the scene, or give dt and steps"
         )
-    refuse_constraints(
-        scene, "simulate with a tolerance", "give dt and varpin.Gauss(2) or more stages, and compare with half that dt"
-    )
     if isinstance(integrator, Reference):
         raise InputError("Reference chooses its own steps: its tolerance is rtol; give it dt and steps")
     if callable(controls):
@@ -795,7 +794,7 @@ def _chosen(
     earlier = tolerance if isinstance(tolerance, Accuracy) else None
     wish = positive("tolerance", tolerance.tolerance if isinstance(tolerance, Accuracy) else tolerance, "rad or m")
     controls = _require_choice(scene, asked, integrator)
-    members = candidates(scene, q0, v0, duration) if integrator is None else (integrator,)
+    members = tolerance_candidates(scene, q0, v0, duration) if integrator is None else (integrator,)
     parts = 1
     given: Callable[[Integrator, int], Commands]
     held = np.zeros((0, 0))
@@ -827,7 +826,7 @@ def _chosen(
         parts = len(held)
 
         def given(member: Integrator, steps: int) -> Commands:  # noqa: ARG001 - as for the others
-            return open_loop(np.repeat(held, steps // parts, axis=0))
+            return open_loop(held_in_parts(scene, held, q0, v0, duration / parts, steps // parts))
 
     motion = Motion(scene, q0, v0, duration, parts, given, isinstance(controls, OpenLoop))
     first = None
@@ -867,7 +866,7 @@ def _chosen(
     if isinstance(controls, FirstOrderHold):
         controls = controls.refined(choice.steps // parts)
     elif not isinstance(controls, LinearPolicy | OpenLoop):
-        controls = np.repeat(held, choice.steps // parts, axis=0)
+        controls = held_in_parts(scene, held, q0, v0, duration / parts, choice.steps // parts)
     return choice.integrator, choice.steps, controls, record, found
 
 

@@ -11,18 +11,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.integrators import Integrator, Radau, Reference
+from varpin.integrators import Integrator, Reference
 from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
-from varpin.simulation.retaking import taken_again
+from varpin.simulation.retaking import stopping, taken_again
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-# Steps that are taken again, of how many, and in how many parts each.
-_PLACES, _LENGTH, _PARTS = 12, 2, 16
-_FINELY = Radau(4)
+# Steps that are taken again, of how many, in how many parts each, and with how many stages.
+_PLACES, _LENGTH, _PARTS, _STAGES = 12, 2, 16, 4
 # What is spoken of, in units of the way of the joint that goes furthest.
 _SHOWS = 0.003
 
@@ -65,10 +64,10 @@ def bent(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Bend |
     if not len(at):
         return None
     chosen = at[np.unique(np.linspace(0, len(at) - 1, _PLACES).astype(np.int64))]
-    off = np.zeros(scene.robot.dof)
+    off, finely = np.zeros(scene.robot.dof), stopping(scene, _STAGES)
     for step in chosen.tolist():
         count = min(_LENGTH, steps - step)
-        again = taken_again(scene, _FINELY, trajectory, integrator.stage_times, step, count, _PARTS)
+        again = taken_again(scene, finely, trajectory, integrator.stage_times, step, count, _PARTS)
         if again is None or not np.isfinite(again[0]).all():
             continue
         q, v = (

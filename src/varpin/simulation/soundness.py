@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.core import doubled_steps_agree, energy_turnover, glance
-from varpin.integrators import ExplicitEuler, Integrator, Radau, Reference
+from varpin.integrators import ExplicitEuler, Integrator, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.integrators.within import changing, in_pairs, in_parts, shares
@@ -45,7 +45,7 @@ from varpin.simulation.damping import Fast, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
 from varpin.simulation.limits import left as limits_left
 from varpin.simulation.phase import phase_lost
-from varpin.simulation.retaking import Again, Finer, finer, taken_again
+from varpin.simulation.retaking import Again, Finer, finer, stopping, taken_again
 from varpin.simulation.saturation import bent
 from varpin.trajectory import Trajectory
 
@@ -68,8 +68,8 @@ WORK, LEAST_WORK = 50, 256
 # Windows that are taken again in steps of twice the length, beside those where velocities change most; and how many
 # times the error of a window counts, for over a period it grows.
 _WINDOWS, _MARGIN = 16, 8.0
-# What they are taken again with where dampers are faster than the step.
-_STOPPING = Radau(3)
+# Stages of what they are taken again with where dampers are faster than the step.
+_STOPPING = 3
 # Steps from where a joint comes to rest that are taken again with it, and in how many parts each; in more if it fails.
 _SETTLING, _SETTLED = 6, (2, 16)
 # What the velocity may be off by there: over several steps in widths of the friction; in one, of the largest velocity.
@@ -99,13 +99,7 @@ class Finding:
 
 
 def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Trajectory, tuple[Finding, ...]]:
-    """A motion with its energy balance, if the integrator keeps none, and its warnings; and what was found.
-
-    Of a motion under constraints it is what its record tells: no step is taken again.
-    """
-    if scene.constraints:
-        found = evident(scene, integrator, trajectory)
-        return with_warnings(trajectory, found), found
+    """A motion with its energy balance, if the integrator keeps none, and its warnings; and what was found."""
     if not integrator.variational:
         defects = energy_defects(scene, integrator, trajectory)
         defects.setflags(write=False)
@@ -224,7 +218,8 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     """What the balance of the energy and steps taken again tell."""
     if not trajectory.steps:
         return ()
-    found = [*_energy(scene, integrator, trajectory)]
+    # Whatever moves a joint by hand gives and takes energy.
+    found = [] if scene.inputs else [*_energy(scene, integrator, trajectory)]
     unsettled = _unsettled(scene, integrator, trajectory)
     if resolved(scene, integrator, trajectory):
         return (*found, *(() if found else _adding_up(scene, integrator, trajectory)), *unsettled)
@@ -251,9 +246,19 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
         before, after = trajectory.v[:-1], trajectory.v[1:]
         if ((before * after < 0.0) & (np.abs(before) > _STILL) & (np.abs(after) > 0.5 * np.abs(before))).any():
             found.append(_ringing(scene, fast, trajectory.dt))
+    if scene.constraints and not found:
+        found.extend(_not_told(scene, integrator, trajectory))
     if not found:
         found.extend(_adding_up(scene, integrator, trajectory))
     return (*found, *(own for own in unsettled if own.kind not in {other.kind for other in found}))
+
+
+def _not_told(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Says if dampers are too fast for the steps that a motion under constraints is taken again in."""
+    other = finer(integrator, trajectory, damped=True, pulled=True, constrained=True)
+    fast = _fast_damping(scene, trajectory)
+    resolves = 2.0 * getattr(other.method, "stages", 1) * other.parts
+    return (_ringing(scene, fast, trajectory.dt),) if trajectory.dt * fast.rate > resolves else ()
 
 
 def _adding_up(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -316,9 +321,9 @@ def _unsettled(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
 
 def _off_rest(scene: Scene, integrator: Integrator, trajectory: Trajectory, stop: Stop, count: int) -> Floats:
     """How far a joint's velocity is from the right one in the steps after it stops, as many as are known."""
-    off = np.zeros(0)
-    for parts in _SETTLED:
-        again = taken_again(scene, _STOPPING, trajectory, integrator.stage_times, stop.step, count, parts)
+    off, method = np.zeros(0), stopping(scene, _STOPPING)
+    for parts in _SETTLED[1:] if scene.constraints else _SETTLED:
+        again = taken_again(scene, method, trajectory, integrator.stage_times, stop.step, count, parts)
         if again is not None:
             off = np.abs(again[1] - trajectory.v[stop.step : stop.step + count + 1])[1:, stop.joint]
             off = off[np.isfinite(off)]
@@ -487,10 +492,13 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
     # So do dampers, but not where what they stop is at rest after a step, whatever its length. Other methods are held
     # against that in steps as long as theirs.
     damped = bool(_fast_damping(scene, trajectory).rate)
+    # Under constraints nothing stops what dampers do in one step; and what a hand does in two is another motion.
+    if scene.inputs or (scene.constraints and damped):
+        return False
     if steps == 1:
         return not (damped or noisy) and _halves_agree(scene, integrator, trajectory)
     foreign = damped and not integrator.l_stable
-    other, times = _STOPPING if foreign else integrator, 1 if foreign else 2
+    other, times = stopping(scene, _STOPPING) if foreign else integrator, 1 if foreign else 2
     apart = max(pieces, 1 + steps % 2) - 1
     begins = np.array([i * (steps - length) // apart for i in range(apart + 1)]) if apart else _FROM_START
     if pieces == _WINDOWS:
@@ -621,7 +629,8 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     fastest, _, _, pulled = glance(scene.core, trajectory.q, trajectory.v, trajectory.u, substeps, trajectory.dt)
     if not fastest > _STILL:
         return None
-    other = finer(integrator, trajectory, damped=bool(_fast_damping(scene, trajectory).rate), pulled=pulled)
+    damped = bool(_fast_damping(scene, trajectory).rate)
+    other = finer(integrator, trajectory, damped=damped, pulled=pulled, constrained=bool(scene.constraints))
     first = examined_nodes(scene, trajectory)
     inertia = inertias(scene, trajectory.q[first])
     # Steps whose error is known to be small.
@@ -717,7 +726,9 @@ def _look(
         told = 0
         while not beside.ended and told == beside.done:
             beside.go_on()
-            told = grown(again.q[: beside.done + 1], beside.q[: beside.done + 1], shift[0])
+            # Constraints may move the start by more.
+            apart = max(shift[0], float(np.abs(beside.q[0] - again.q[0]).max()))
+            told = grown(again.q[: beside.done + 1], beside.q[: beside.done + 1], apart)
         work += beside.done * parts
         if told < known:
             known, cut = max(1, told), True

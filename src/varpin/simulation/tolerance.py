@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from varpin.core.arrays import Commands
 from varpin.integrators import Integrator
 from varpin.integrators.base import rows, steps_of
+from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.simulation.refinement import (
@@ -73,7 +74,7 @@ class Motion:
 
 
 class Raised(Exception):
-    """A run in which a function of a custom force failed.
+    """A run in which a function of a custom force or constraint failed.
 
     Attributes:
         integrator: Of the run.
@@ -81,7 +82,7 @@ class Raised(Exception):
         error: Of the function.
     """
 
-    def __init__(self, integrator: Integrator, steps: int, error: CustomForceError) -> None:
+    def __init__(self, integrator: Integrator, steps: int, error: CustomForceError | CustomConstraintError) -> None:
         self.integrator, self.steps, self.error = integrator, steps, error
         super().__init__(str(error))
 
@@ -117,7 +118,7 @@ class _Runs:
             block = rows(commands, first, first + chunk, last.u[None, -1] if done else None)
             try:
                 (last,) = integrator.rollout(given.scene, state, block, nothing, dt)
-            except CustomForceError as error:
+            except (CustomForceError, CustomConstraintError) as error:
                 # Coarse steps may go where the function is not defined.
                 self.raised, pure = Raised(integrator, steps, error), False
                 self._raises += 1
@@ -211,7 +212,7 @@ class Choice:
         search_steps: Steps of all runs.
         search_evaluations: Evaluations in them.
         floor: What rounding leaves of every wish [rad or m].
-        raised: The last run in which a function of a custom force failed, if one did.
+        raised: The last run in which a function of a custom force or constraint failed, if one did.
     """
 
     integrator: Integrator
@@ -237,7 +238,7 @@ def choose(
     Raises:
         SingularMassMatrix: M(q0) is not positive definite.
         VarpinError: No integrator gets to the end.
-        Raised: A function of a custom force fails in all runs.
+        Raised: A function of a custom force or constraint fails in all runs.
     """
     # It refuses states that no motion starts from.
     integrators[0].start(motion.scene, motion.q0[None], motion.v0[None])

@@ -79,7 +79,7 @@ class Advice:
         reached: Whether it meets the wish, as far as can be predicted.
         alternatives: The best of every other method that has one, cheapest (or most accurate) first.
         largest_step: The step [s] from which on the midpoint integrator's branch guard splits steps somewhere along
-            this motion; infinite if none is too large.
+            this motion; infinite if none is too large, NaN under constraints, whose guard looks at more.
         tolerance: What was asked for [rad or m], or None.
         budget: What was asked for [s], or None.
         calibration: What finding out took [s].
@@ -167,7 +167,7 @@ def advise(
         VarpinError: No integrator got to the end.
     """
     setting = Setting.of(scene, q0, v0, controls, duration)
-    members = integrators_of(integrators)
+    members = integrators_of(scene, integrators)
     if any(isinstance(member, Reference) for member in members):
         raise InputError("Reference chooses its own steps: its accuracy is its tolerance")
     if (tolerance is None) == (budget is None):
@@ -241,7 +241,7 @@ def _steps_within(method: Method, seconds: float) -> int:
 def _largest_step(setting: Setting, methods: Sequence[Method]) -> float:
     """The smallest of the midpoint guard's largest steps along the best motion there is [s]."""
     able = [m for m in methods if m.whole]
-    if not able:
+    if not able or setting.scene.constraints:
         return math.nan
     method = max(able, key=lambda m: (m.order, m.last.steps))
     rows = len(setting.controls)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from varpin.control import OptimalControlProblem, Solution, solve
 from varpin.errors import FileError, InputError
 from varpin.integrators import Integrator
-from varpin.mechanics.scene import refuse_constraints
+from varpin.mechanics.scene import refuse_inputs
 from varpin.study.tradeoff.records import pareto_front
 from varpin.study.tradeoff.runs import Progress, Run, Tradeoff, complete
 from varpin.study.tradeoff.setting import Setting, digest, fastest, integrators_of
@@ -123,8 +123,8 @@ def optimal_control_tradeoff(
     """
     if not isinstance(problem, OptimalControlProblem):
         raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
-    refuse_constraints(problem.scene, "optimal_control_tradeoff")
-    members, repeats = integrators_of(integrators), count("repeats", repeats, least=1)
+    refuse_inputs(problem.scene, "optimal_control_tradeoff")
+    members, repeats = integrators_of(problem.scene, integrators), count("repeats", repeats, least=1)
     steps = (2.0 * problem.dt, problem.dt, 0.5 * problem.dt) if dts is None else tuple(dts)
     plan = [_discretized(problem, member, dt, period) for member in members for dt in sorted(steps, reverse=True)]
     path = None if save is None else writable(save)

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from varpin.ensemble.paths import without_geometry
 from varpin.errors import FileError, InputError, VarpinError
-from varpin.integrators import Integrator, Reference
-from varpin.mechanics.scene import Scene, require_scene
+from varpin.integrators import Gauss, Integrator, Reference
+from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
+from varpin.simulation.refinement import ROUNDING, SENSIBLE, first_steps
 from varpin.study.tradeoff.records import pareto_front
 from varpin.study.tradeoff.runs import Progress, Run, Tradeoff, complete
 from varpin.study.tradeoff.setting import PARTS, Outcome, Setting, integrators_of
@@ -35,6 +36,9 @@ _COARSEST, _HALVINGS = 0.04, 8
 _SAMPLES = 64
 # Ratio of the reference's two tolerances: an error proportional to the tolerance differs by nine tenths of itself.
 _LOOSER = 10.0
+# What errors under constraints are measured against, in steps that are halved until two runs agree to rounding, or
+# until a half leaves more than this part of a small difference; and in how many steps at most.
+_CONSTRAINED, _STALLED, _SMALL, _MOST = Gauss(4), 0.5, 1e-6, 2**18
 
 HEADINGS = {
     "integrator": "integrator",
@@ -90,8 +94,9 @@ class WorkPrecision(Tradeoff):
     Attributes:
         reference: What errors are measured against, as text.
         reference_error: Largest distance in q from the same at a ten times looser tolerance, in twice as long
-            intervals [rad or m]. It is above the reference's own error; errors below it say that, and no more. NaN
-            where the measurement was interrupted before it was known; then there are no runs.
+            intervals; under constraints, in steps of twice the length [rad or m]. It is above the reference's own
+            error; errors below it say that, and no more. NaN where the measurement was interrupted before it was
+            known; then there are no runs.
         tip_reference_error: The same of the end effector [m].
         samples: K: errors are taken at K evenly spaced times, the end being the last. A run that was added to a saved
             record with a step that does not share these times has fewer of them.
@@ -167,7 +172,8 @@ def work_precision(
         dts: Time steps [s], each rounded so that the controls' intervals hold whole numbers of steps.
 
     Other Args:
-        reference: What errors are measured against; its tolerance is varied to see how exact it is.
+        reference: What errors are measured against; its tolerance is varied to see how exact it is. Scenes with
+            constraints have ``Gauss(4)``, in steps that are halved until nothing changes.
         repeats: Of each run; the fastest counts. One more goes before them where runs are short.
         progress: Called with (runs done, runs in all).
         save: Keep the record in this npz, run by run; runs that it holds already are kept, and not run again,
@@ -182,11 +188,14 @@ def work_precision(
         VarpinError: The reference cannot integrate the motion.
     """
     setting = Setting.of(without_geometry(require_scene(scene)), q0, v0, controls, duration)
-    members, repeats = integrators_of(integrators), count("repeats", repeats, least=1)
+    members, repeats = integrators_of(scene, integrators), count("repeats", repeats, least=1)
     executor = None if executor is None else require_executor(executor)
-    reference = Reference(rtol=1e-13) if reference is None else reference
-    if not isinstance(reference, Reference):
-        raise InputError(f"reference must be a varpin.Reference, got {reference!r}")
+    if reference is not None:
+        if not isinstance(reference, Reference):
+            raise InputError(f"reference must be a varpin.Reference, got {reference!r}")
+        refuse_constraints(scene, str(reference), "leave reference= out, for varpin.Gauss(4) in ever smaller steps")
+    elif not scene.constraints:
+        reference = Reference(rtol=1e-13)
     grids = _grids(setting, dts)
     plan = {(repr(member), steps): (member, steps) for member in members for steps in grids}
     path = None if save is None else writable(save)
@@ -204,9 +213,20 @@ def work_precision(
 
 
 class _Exact:
-    """The reference's motion, and how far it is from the same at a looser tolerance."""
+    """The reference's motion, and how far it is from the same at a looser tolerance, or in steps of twice the length.
 
-    def __init__(self, setting: Setting, reference: Reference, samples: int) -> None:
+    No reference is that of scenes with constraints.
+    """
+
+    def __init__(self, setting: Setting, reference: Reference | None, samples: int) -> None:
+        tight, loose = _halved(setting, samples) if reference is None else self._by(setting, reference, samples)
+        self.q = tight.q
+        self.tip = setting.scene.robot.frame_positions(tight.q)
+        self.error = float(np.abs(tight.q - loose.q).max())
+        self.tip_error = _largest(setting.scene.robot.frame_positions(loose.q) - self.tip)
+
+    @staticmethod
+    def _by(setting: Setting, reference: Reference, samples: int) -> tuple[Outcome, Outcome]:
         atol = None if reference.atol is None else _LOOSER * reference.atol
         looser = Reference(rtol=_LOOSER * reference.rtol, atol=atol)
         # Over short intervals both tolerances may take the same steps and agree, exact or not: halved they do not.
@@ -215,19 +235,44 @@ class _Exact:
         for outcome in (tight, loose):
             if outcome.failure:
                 raise VarpinError(f"the reference cannot integrate this motion: {outcome.failure}")
-        self.q = tight.q
-        self.tip = setting.scene.robot.frame_positions(tight.q)
-        self.error = float(np.abs(tight.q - loose.q).max())
-        self.tip_error = _largest(setting.scene.robot.frame_positions(loose.q) - self.tip)
+        return tight, loose
 
 
-def _record(setting: Setting, reference: Reference, samples: int) -> WorkPrecision:
+def _halved(setting: Setting, samples: int) -> tuple[Outcome, Outcome]:
+    """A motion under constraints in so small steps that halves of them change no more than rounding, and in those."""
+    steps = samples * math.ceil(first_steps(setting.scene, setting.q0, setting.v0, setting.duration, 1) / samples)
+    before = math.inf
+    loose = setting.run(_CONSTRAINED, steps, samples=samples)
+    while True:
+        steps *= 2
+        tight = setting.run(_CONSTRAINED, steps, samples=samples)
+        # Steps that a guard takes in parts show no error.
+        whole = [not outcome.failure and not outcome.split_steps for outcome in (tight, loose)]
+        failure = tight.failure or ("" if whole[0] else f"with {steps} steps, {tight.split_steps} are taken in parts")
+        if all(whole):
+            off = float(np.abs(tight.q - loose.q).max())
+            stalled = off > _STALLED * before and before < _SMALL
+            if off <= ROUNDING * max(1.0, float(np.abs(tight.q).max())) or stalled:
+                return tight, loose
+            before = off
+        if 2 * steps > _MOST:
+            if before < SENSIBLE and all(whole):
+                return tight, loose
+            raise VarpinError(f"no steps are small enough for a reference of this motion: {failure or 'runs differ'}")
+        loose = tight
+
+
+def _reference_text(reference: Reference | None) -> str:
+    return f"{_CONSTRAINED} in ever smaller steps" if reference is None else str(reference)
+
+
+def _record(setting: Setting, reference: Reference | None, samples: int) -> WorkPrecision:
     """A record without runs, whose reference has not been integrated."""
     return WorkPrecision(
         runs=(),
         robot=setting.scene.robot.name,
         duration=setting.duration,
-        reference=str(reference),
+        reference=_reference_text(reference),
         reference_error=math.nan,
         tip_reference_error=math.nan,
         samples=samples,
@@ -235,7 +280,7 @@ def _record(setting: Setting, reference: Reference, samples: int) -> WorkPrecisi
     )
 
 
-def _known(path: Path | None, setting: Setting, reference: Reference) -> WorkPrecision | None:
+def _known(path: Path | None, setting: Setting, reference: Reference | None) -> WorkPrecision | None:
     """The record of an earlier run at ``path``, if there is one and it fits."""
     if path is None or not path.exists():
         return None
@@ -244,7 +289,7 @@ def _known(path: Path | None, setting: Setting, reference: Reference) -> WorkPre
     if len(there) != len(PARTS):
         raise FileError(f"{path} is damaged: it does not say what motion it is of")
     other = [part for part, wanted, found in zip(PARTS, here, there, strict=True) if wanted != found]
-    other += ["reference"] if record.reference != str(reference) else []
+    other += ["reference"] if record.reference != _reference_text(reference) else []
     if other:
         raise FileError(f"{path} holds runs of another motion (not the same: {', '.join(other)}): choose another file")
     return record

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import reprlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,14 +16,18 @@ from numpy.typing import NDArray
 from varpin.errors import InputError
 from varpin.integrators import Integrator
 from varpin.integrators.base import Segment, open_loop
-from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
-from varpin.simulation.refinement import INTEGRATORS
-from varpin.simulation.run import held_rows
+from varpin.mechanics.inputs import held_in_parts
+from varpin.mechanics.scene import OF_CONSTRAINTS, Scene, require_scene
+from varpin.simulation.refinement import candidates
+from varpin.simulation.run import held_rows, on_constraints
+from varpin.simulation.soundness import announce
 from varpin.support.checks import JointValues, joint_array, positive
 from varpin.support.frozen import Frozen
 
 Floats = NDArray[np.float64]
 Result = TypeVar("Result")
+
+logger = logging.getLogger(__name__)
 
 # What a motion depends on, in the order of its fingerprint.
 PARTS = ("scene", "initial state", "controls", "duration")
@@ -70,7 +75,7 @@ class Setting(Frozen):
         scene: Without noise.
         q0: (n,) [rad or m].
         v0: (n,) [rad/s or m/s].
-        controls: (R, m), each row held over duration / R.
+        controls: (R, m), each row held over duration / R; joints that are moved by hand go to theirs in that time.
         duration: [s].
     """
 
@@ -84,35 +89,30 @@ class Setting(Frozen):
     def of(
         cls, scene: Scene, q0: JointValues, v0: JointValues, controls: JointValues | None, duration: float
     ) -> Setting:
-        """Checked.
+        """Checked; a start next to constraints is moved onto them, and the log says how far.
 
         Raises:
             InputError: Wrong shapes or values, a scene with noise, controls that are a function.
+            AssemblyError: The scene's constraints cannot be kept next to q0.
         """
         joints = require_scene(scene).robot.joint_names
-        refuse_constraints(
-            scene,
-            "A study of integrators",
-            "only varpin.Midpoint() and varpin.Gauss(stages) keep them; compare motions with dt and with half of it",
-        )
         if scene.processes:
             raise InputError("errors of single motions are compared here: leave the noise out of the scene")
         if callable(controls):
             raise InputError("controls must be rows (R, m), each held over duration / R, or one row (m,)")
-        begin = joint_array("q0", q0, joints)
+        begin, speed = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
         rows = held_rows(scene, scene.command_at(begin) if controls is None else controls)
-        return cls(
-            scene,
-            begin,
-            joint_array("v0", v0, joints),
-            rows,
-            positive("duration", duration, "s"),
-        )
+        duration = positive("duration", duration, "s")
+        if scene.constraints:
+            begin, speed, moved = on_constraints(scene, begin, speed)
+            announce(logger, scene, duration / len(rows), moved)
+        return cls(scene, begin, speed, rows, duration)
 
     @property
     def conservative(self) -> bool:
         """Whether the energy is to stay."""
-        return self.scene.conservative and not ((self.controls @ self.scene.actuation.T).any())
+        still = not (self.controls @ self.scene.actuation.T).any() and not self.scene.inputs
+        return self.scene.conservative and still
 
     @property
     def fingerprint(self) -> str:
@@ -124,6 +124,8 @@ class Setting(Frozen):
             *([scene.elements, scene.armature] if scene.forces else []),
             *([scene.couplings] if scene.couplings else []),
             *([tuple(map(repr, scene.custom.parts))] if scene.custom else []),
+            *(scene.values[name] for name in OF_CONSTRAINTS if name in scene.values),
+            *([tuple(map(repr, scene.constraints))] if scene.constraints else []),
         )
         parts = surroundings, (self.q0, self.v0), self.controls, self.duration
         return " ".join(digest(part) for part in parts)
@@ -147,12 +149,13 @@ class Setting(Frozen):
         q, v = np.full((2, samples + 1, n), np.nan)
         q[0], v[0] = self.q0, self.v0
         nothing = np.zeros((0, 0, 0))
+        moved = self._moved_by_hand(steps) if self.scene.inputs else None
         tally, drift, failure = np.zeros(4, dtype=np.int64), 0.0, ""
         begin = time.perf_counter()
         state, (start,) = integrator.start(self.scene, self.q0[None], self.v0[None])
         for first in range(0, steps, chunk):
             nodes = np.arange(first, min(first + chunk, steps))
-            commands = open_loop(self.controls[nodes // hold])
+            commands = open_loop(self.controls[nodes // hold] if moved is None else moved[nodes])
             (segment,) = integrator.rollout(self.scene, state, commands, nothing, dt)
             kept = np.flatnonzero((nodes[: len(segment.q)] + 1) % stride == 0)
             at = (nodes[kept] + 1) // stride
@@ -167,6 +170,12 @@ class Setting(Frozen):
         seconds = time.perf_counter() - begin
         newton, jets, sweeps, split = (int(x) for x in tally)
         return Outcome(q, v, drift, seconds, newton, jets, sweeps, split, failure)
+
+    def _moved_by_hand(self, steps: int) -> Floats:
+        """Controls (steps, m) where joints are moved by hand."""
+        parts = len(self.controls)
+        start = self.q0, self.v0
+        return held_in_parts(self.scene, self.controls, *start, self.duration / parts, steps // parts)
 
 
 def fastest(
@@ -219,18 +228,20 @@ def _arrays(value: Any) -> Iterator[NDArray[Any]]:
     yield array
 
 
-def integrators_of(integrators: Sequence[Integrator] | None) -> tuple[Integrator, ...]:
+def integrators_of(scene: Scene, integrators: Sequence[Integrator] | None) -> tuple[Integrator, ...]:
     """The integrators to compare.
 
     Raises:
-        InputError: None is given, one twice, or one that is no integrator.
+        InputError: None is given, one twice, or one that is no integrator, or does not keep the scene's constraints.
     """
     if integrators is None:
-        return INTEGRATORS
+        return candidates(scene)
     members = tuple(integrators)
     for member in members:
         if not isinstance(member, Integrator):
             raise InputError(f"integrators must be varpin's, for example varpin.Midpoint(), got {member!r}")
+        if scene.constraints and not member.keeps_constraints:
+            raise InputError(f"{member} keeps no constraints: varpin.Midpoint() and varpin.Gauss(stages) do")
     if not members or len(set(map(repr, members))) < len(members):
         raise InputError("integrators must be one or more, each once")
     return members

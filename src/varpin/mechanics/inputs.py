@@ -1,0 +1,50 @@
+"""Controls of joints that are moved by hand, in parts of the steps that they were given for."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.mechanics.scene import Scene
+
+Floats = NDArray[np.float64]
+
+
+def in_parts_of_steps(scene: Scene, u: Floats, q: Floats, v: Floats, dt: float, parts: int) -> Floats:
+    """Controls (N, m) of steps of ``dt`` [s] for ``parts`` equal parts of each, (N * parts, m): the same motion.
+
+    Forces stay as they are; joints that are moved by hand go on along the lines and cubics of their steps.
+
+    Args:
+        scene: The scene.
+        u: Controls of the steps (N, m).
+        q: Configurations where the steps begin (N, n) [rad or m].
+        v: Velocities there (N, n), for cubics.
+        dt: Length of a step [s].
+        parts: In how many.
+    """
+    fine = np.repeat(u, parts, axis=0)
+    share = np.arange(1, parts + 1) / parts
+    for c, rate in zip(scene.inputs.values(), scene.rates, strict=True):
+        own = int(np.argmax(scene.actuation[c]))
+        begin, end = q[:, c, None], u[:, own, None]
+        if rate < 0:
+            fine[:, own] = (begin + share * (end - begin)).ravel()
+        else:
+            way, before, after = end - begin, dt * v[:, c, None], dt * u[:, rate, None]
+            square, cube = 3.0 * way - 2.0 * before - after, before + after - 2.0 * way
+            fine[:, own] = (begin + share * (before + share * (square + share * cube))).ravel()
+            fine[:, rate] = ((before + share * (2.0 * square + share * 3.0 * cube)) / dt).ravel()
+        # Where a step ends stays to the last digit.
+        fine[parts - 1 :: parts] = u
+    return fine
+
+
+def held_in_parts(scene: Scene, u: Floats, q0: Floats, v0: Floats, dt: float, parts: int) -> Floats:
+    """:func:`in_parts_of_steps` of steps that follow each other from q0 and v0 (n,) on."""
+    q, v = np.tile(q0, (len(u), 1)), np.tile(v0, (len(u), 1))
+    for c, rate in zip(scene.inputs.values(), scene.rates, strict=True):
+        q[1:, c] = u[:-1, int(np.argmax(scene.actuation[c]))]
+        if rate >= 0:
+            v[1:, c] = u[:-1, rate]
+    return in_parts_of_steps(scene, u, q, v, dt, parts)
