@@ -397,7 +397,7 @@ def test_an_interrupted_ensemble_carries_warnings(monkeypatch):
         run(scene, **COARSE | {"paths": 300}, progress=interrupt)
     part = caught.value.ensemble
     assert part.warnings == run(scene, **COARSE | {"paths": int(part.statistics.count[0])}).warnings != ()
-    monkeypatch.setattr(varpin.ensemble.looks, "_look", stop)
+    monkeypatch.setattr(varpin.ensemble.looks, "_examine", stop)
     with pytest.raises(vp.EnsembleInterrupted) as caught:
         run(scene, **COARSE | {"paths": 300}, progress=interrupt)
     assert caught.value.ensemble.warnings == ()

@@ -8,13 +8,16 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Numbers in the bins, and how far those reach on either side of the first chunk's values, in units of their range.
-_BINS, _REACH = 2**25, 0.75
-_FEWEST_BINS, _MOST_BINS = 64, 1000
+# Total number of bins, over all nodes and states, and the smallest and largest number for one state at one node.
+_BINS, _FEWEST_BINS, _MOST_BINS = 2**25, 64, 1000
+# Margin of the bins below and above the first chunk's values, as a share of their range.
+_MARGIN = 0.75
 
 
-def counted(x: Floats, least: Floats, width: Floats, bins: int, counts: NDArray[np.uint16], bounds: Floats) -> None:
-    """Count x (k, 2n, C) in bins from ``least`` on, ``width`` wide each (k, 2n), and find its bounds (2, k, 2n)."""
+def count_in_bins(
+    x: Floats, least: Floats, width: Floats, bins: int, counts: NDArray[np.uint16], bounds: Floats
+) -> None:
+    """Count x (k, 2n, C) in bins that start at ``least`` and are ``width`` wide (k, 2n); find its bounds (2, k, 2n)."""
     position = np.floor((x - least[:, :, None]) / width[:, :, None])
     there = ~np.isnan(position)
     index = np.clip(np.where(there, position, 0.0), -1, bins).astype(np.int64) + 1
@@ -24,32 +27,32 @@ def counted(x: Floats, least: Floats, width: Floats, bins: int, counts: NDArray[
 
 
 class Histogram:
-    """Counts of x in bins around the values of the first paths (N + 1, 2n, C)."""
+    """Histograms of x at each node, with bins around the values of the first paths (N + 1, 2n, C)."""
 
     def __init__(self, values: Floats) -> None:
         least = np.fmin.reduce(values, axis=2, initial=np.inf)
         most = np.fmax.reduce(values, axis=2, initial=-np.inf)
-        # Where all of them have failed, bins are those of the node before.
+        # Where all of these paths have failed, the bins are those of the last node before.
         there = np.isfinite(least).all(axis=1)
         node = np.maximum.accumulate(np.where(there, np.arange(len(there)), 0))
         least, most = least[node], most[node]
         spread = np.maximum(most - least, 1e-9 * np.maximum(np.abs(least), np.abs(most)) + 1e-300)
         bins = int(np.clip(_BINS // spread.size, _FEWEST_BINS, _MOST_BINS))
-        self.grid = np.stack([least - _REACH * spread, (1.0 + 2.0 * _REACH) * spread / bins]), bins
+        self.grid = np.stack([least - _MARGIN * spread, (1.0 + 2.0 * _MARGIN) * spread / bins]), bins
         self.counts = np.zeros((*spread.shape, bins + 2), dtype=np.int64)
         self.bounds = np.stack([np.full(spread.shape, np.inf), np.full(spread.shape, -np.inf)])
         counts, bounds = np.zeros(self.counts.shape, dtype=np.uint16), np.empty(self.bounds.shape)
-        counted(values, self.grid[0][0], self.grid[0][1], bins, counts, bounds)
+        count_in_bins(values, self.grid[0][0], self.grid[0][1], bins, counts, bounds)
         self.add(counts, bounds)
 
     def add(self, counts: NDArray[np.uint16], bounds: Floats) -> None:
-        """Those of other paths."""
+        """Add the counts and bounds of other paths."""
         self.counts += counts
         np.minimum(self.bounds[0], bounds[0], out=self.bounds[0])
         np.maximum(self.bounds[1], bounds[1], out=self.bounds[1])
 
     def quantiles(self, levels: Floats) -> tuple[Floats, Floats]:
-        """Quantiles, and what they are off by at most, each (L, N + 1, 2n)."""
+        """Quantiles and bounds of their errors, each (L, N + 1, 2n)."""
         found, errors = np.full((2, len(levels), *self.counts.shape[:2]), np.nan)
         for j in range(len(self.counts)):
             below = np.cumsum(self.counts[j], axis=1)
@@ -63,7 +66,13 @@ class Histogram:
         return np.where(self.counts.any(axis=2), found, np.nan), np.where(self.counts.any(axis=2), errors, np.nan)
 
     def _ranked(self, node: int, below: Integers, rank: Integers) -> tuple[Floats, Floats]:
-        """The value (2n,) of so many less than it, and what it is off by at most; ``below`` are cumulated counts."""
+        """Values (2n,) of a rank (the number of smaller values) and bounds of their errors.
+
+        Args:
+            node: Index of the node.
+            below: Cumulated counts (2n, B + 2).
+            rank: Of the value of each state (2n,).
+        """
         (least, width), bins = self.grid[0][:, node], self.grid[1]
         first, last = self.bounds[:, node]
         bin_of = np.argmax(below > rank[:, None], axis=1)
@@ -72,7 +81,7 @@ class Histogram:
         share = (rank + 0.5 - (below[rows, bin_of] - inside)) / inside
         begin = np.where(bin_of == 0, first, least + (bin_of - 1) * width)
         end = np.where(bin_of == bins + 1, last, least + bin_of * width)
-        # The extremes are known themselves.
+        # The smallest and the largest value are known exactly.
         begin, end = np.maximum(begin, first), np.minimum(end, last)
         begin = np.where(rank >= below[:, -1] - 1, last, begin)
         end = np.where(rank <= 0, first, np.maximum(begin, end))

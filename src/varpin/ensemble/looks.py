@@ -1,4 +1,4 @@
-"""A second look at the paths of an ensemble that stand out: what is to be said of them."""
+"""Warnings about single paths of an ensemble: its extreme paths are simulated again and examined."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ from varpin.support.executors import in_order
 
 Floats = NDArray[np.float64]
 
-# So few paths are all looked at once more.
-_ALL_LOOKED_AT = 10
+# Up to this number of paths, every path is examined.
+_ALL_EXAMINED = 10
 
 
 def greater(one: Extremes, other: Extremes) -> Extremes:
-    """Of each extreme the greater, of equal ones that of ``one``."""
+    """The greater of each extreme; ``one`` where both are equal."""
     return {name: max(one.get(name, found), found, key=lambda x: x[0]) for name, found in other.items()}
 
 
 def looked_at(pool: Executor, shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> tuple[Finding, ...]:
-    """What is to be said of a few paths, each kind of finding once, of the first path that shows it."""
-    tasks = _looks(shared, q0, v0, extremes)
-    with closing(in_order(pool, _look, tasks)) as looks:
-        return _found(tasks, looks)
+    """Findings about a few paths: each kind once, for the first path that has it."""
+    tasks = _examined(shared, q0, v0, extremes)
+    with closing(in_order(pool, _examine, tasks)) as findings:
+        return _first_of_each_kind(tasks, findings)
 
 
 def looked_at_here(shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> tuple[Finding, ...]:
-    """The same after an interruption, without workers, which it may have reached too; nothing after another one."""
-    tasks = _looks(shared, q0, v0, extremes)
+    """:func:`looked_at` after Ctrl-C, without the workers, which may have stopped; empty after a second Ctrl-C."""
+    tasks = _examined(shared, q0, v0, extremes)
     try:
-        return _found(tasks, map(_look, tasks))
+        return _first_of_each_kind(tasks, map(_examine, tasks))
     except KeyboardInterrupt:
         return ()
 
 
-def _looks(shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> list[Task]:
-    """The paths that are worth a look, each by itself."""
+def _examined(shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> list[Task]:
+    """The paths to examine, one a task."""
     if not shared.steps:
         return []
-    if len(q0) <= _ALL_LOOKED_AT:
+    if len(q0) <= _ALL_EXAMINED:
         paths = list(range(len(q0)))
     else:
         split = [path for amount, path in (extremes["split"],) if amount > 0]
@@ -54,16 +54,16 @@ def _looks(shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> list[T
     return [Task(shared, path, q0[path : path + 1].copy(), v0[path : path + 1].copy()) for path in paths]
 
 
-def _found(tasks: Sequence[Task], looks: Iterable[tuple[Finding, ...]]) -> tuple[Finding, ...]:
+def _first_of_each_kind(tasks: Sequence[Task], findings_of_tasks: Iterable[tuple[Finding, ...]]) -> tuple[Finding, ...]:
     found: dict[str, Finding] = {}
-    for task, findings in zip(tasks, looks, strict=True):
+    for task, findings in zip(tasks, findings_of_tasks, strict=True):
         for finding in findings:
             found.setdefault(finding.kind, Finding(finding.kind, f"path {task.first}: {finding.sentence}"))
     return tuple(found.values())
 
 
-def _look(task: Task) -> tuple[Finding, ...]:
-    """What is to be said of one path."""
+def _examine(task: Task) -> tuple[Finding, ...]:
+    """Findings about one path."""
     shared = task.shared
     (generator,) = shared.seeds.generators(task.first, task.first + 1)
     drawn = generator.standard_normal((shared.steps, shared.scene.processes)) * np.sqrt(shared.dt)

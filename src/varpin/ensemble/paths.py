@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.core.arrays import Commands
-from varpin.ensemble.histogram import counted
+from varpin.ensemble.histogram import count_in_bins
 from varpin.ensemble.record import PathFailure
 from varpin.errors import VarpinError
 from varpin.integrators import Integrator, Segment
@@ -25,19 +25,20 @@ from varpin.support.frozen import Frozen
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-# By what they are extreme in, how much of it, and which path.
+# By quantity ("split", "energy", "speed"): its largest value, and the path that has it.
 Extremes = dict[str, tuple[float, int]]
 
-# Paths that one call of the core takes, and numbers that a block of nodes holds.
+# Paths in one call of the core.
 _GROUP = 32
+# Numbers in a block of nodes.
 _BLOCK = 1_000_000
-# A chunk of paths is what a worker does at a time. Its size depends on the ensemble alone, and so does every sum: so
-# many chunks, but each with this much to do at least and at most [steps of paths], and never fewer or more paths.
-_CHUNKS, _LEAST, _MOST, _FEWEST_PATHS, _MOST_PATHS = 64, 4_000, 200_000, 16, 1024
+# A worker simulates one chunk of paths at a time. The size of a chunk depends on the ensemble alone, so that sums do
+# not depend on the number of workers: the number of chunks aimed at, then bounds of a chunk in steps and in paths.
+_CHUNKS, _LEAST_STEPS, _MOST_STEPS, _FEWEST_PATHS, _MOST_PATHS = 64, 4_000, 200_000, 16, 1024
 
 
 def without_geometry(scene: Scene) -> Scene:
-    """The scene without shapes that came with its robot: no simulation needs them, and meshes are large to send."""
+    """The scene without its robot's shapes: no simulation needs them, and meshes are large to send to a worker."""
     if scene.robot.visuals is None and not scene.robot.parts:
         return scene
     bare = copy.copy(scene)
@@ -46,10 +47,10 @@ def without_geometry(scene: Scene) -> Scene:
 
 
 def chunks(steps: int, paths: int) -> Iterator[tuple[int, int]]:
-    """The first path of each chunk, and one past its last; the same for any workers."""
+    """The first path of each chunk, and one past its last."""
     steps = max(1, steps)
-    size = max(math.ceil(paths / _CHUNKS), _LEAST // steps)
-    size = max(_FEWEST_PATHS, min(size, _MOST // steps, _MOST_PATHS))
+    size = max(math.ceil(paths / _CHUNKS), _LEAST_STEPS // steps)
+    size = max(_FEWEST_PATHS, min(size, _MOST_STEPS // steps, _MOST_PATHS))
     if size > _GROUP:
         size = math.ceil(size / _GROUP) * _GROUP
     for first in range(0, paths, size):
@@ -63,10 +64,10 @@ class Shared(Frozen):
     Attributes:
         scene: The scene.
         integrator: The integrator.
-        commands: Of all steps.
+        commands: Commands of all steps.
         dt: Time step [s].
         steps: N.
-        seeds: A child for each path.
+        seeds: One child of the random generator for each path.
     """
 
     scene: Scene
@@ -79,17 +80,17 @@ class Shared(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class Task(Frozen):
-    """A chunk of paths to simulate, and what of them is wanted.
+    """A chunk of C paths to simulate, and which results to return.
 
     Attributes:
-        shared: What they share with others.
-        first: The first of them.
-        q0: (C, n) [rad or m].
-        v0: (C, n).
-        store: The paths themselves.
-        moments: Their moments.
-        values: Their states, node by node.
-        grid: The bins in which to count their states, as least value and width (2, N + 1, 2n) and how many; or None.
+        shared: What all paths share.
+        first: Index of the first path.
+        q0: Initial configurations (C, n) [rad or m].
+        v0: Initial velocities (C, n) [rad/s or m/s].
+        store: Whether to return the paths themselves.
+        moments: Whether to return their moments.
+        values: Whether to return their states, node by node.
+        grid: Bins in which to count the states: least value and width (2, N + 1, 2n), and the number of bins; or None.
     """
 
     shared: Shared
@@ -107,10 +108,10 @@ class Moments(Frozen):
     """Sums over some paths at each of N + 1 nodes.
 
     Attributes:
-        count: Paths (N + 1,).
-        mean: Of x and of the energy (N + 1, 2n + 1).
-        squares: Products of deviations from it, added up, of x (N + 1, 2n, 2n).
-        energy: The same of the energy (N + 1,).
+        count: Number of paths (N + 1,).
+        mean: Mean of x and of the energy (N + 1, 2n + 1).
+        squares: Sums of products of the deviations of x from its mean (N + 1, 2n, 2n).
+        energy: Sums of squared deviations of the energy from its mean (N + 1,).
     """
 
     count: Integers
@@ -119,7 +120,7 @@ class Moments(Frozen):
     energy: Floats
 
     def merged(self, other: Moments) -> Moments:
-        """Those of both (Chan, Golub and LeVeque 1979)."""
+        """Sums over the paths of both (Chan, Golub and LeVeque 1979)."""
         total = self.count + other.count
         share = other.count / np.maximum(total, 1)
         apart = other.mean - self.mean
@@ -134,19 +135,19 @@ class Moments(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class Part(Frozen):
-    """What came of a chunk.
+    """Results of a chunk; those that the task does not ask for are None or empty.
 
     Attributes:
-        first: Its first path.
+        first: Index of its first path.
         paths: C.
         failures: Paths that stopped early.
-        extremes: Those of its paths that are worth a look: what for, how much of it, and which path.
-        nodes: By path, how many nodes each has (C,).
-        moments: If wanted.
-        stored: The paths by name, (C, ...), if wanted.
-        values: x by node (N + 1, 2n, C), NaN after a failure, if wanted.
-        counts: Paths in each bin (N + 1, 2n, B + 2), below and above the bins too, if wanted.
-        bounds: Least and greatest x (2, N + 1, 2n), if counts are.
+        extremes: The most split steps, the largest energy and the largest speed, each with its path.
+        nodes: Number of nodes of each path (C,).
+        moments: Moments of the paths.
+        stored: Arrays of the paths by name, (C, ...).
+        values: x by node (N + 1, 2n, C), NaN after a failure.
+        counts: Paths in each bin (N + 1, 2n, B + 2); the first and the last count those outside the bins.
+        bounds: Least and greatest x (2, N + 1, 2n), together with counts.
     """
 
     first: int
@@ -162,12 +163,12 @@ class Part(Frozen):
 
 
 def simulate_paths(task: Task) -> Part:
-    """A chunk of paths, in one thread; path by path the bytes are those of any other chunk."""
+    """Simulate a chunk in one thread. The bytes of a path do not depend on the chunk that it is in."""
     return _Chunk(task).part()
 
 
 class _Chunk:
-    """Paths in groups, each with its integrator state and generators, which go through blocks of nodes together."""
+    """Paths in groups. A group has one integrator state; all groups advance by one block of nodes at a time."""
 
     def __init__(self, task: Task) -> None:
         self.task, shared = task, task.shared
@@ -175,7 +176,7 @@ class _Chunk:
         n, m, N = shared.scene.robot.dof, shared.scene.controls, shared.steps
         self.groups = [slice(a, min(a + _GROUP, self.paths)) for a in range(0, self.paths, _GROUP)]
         self.generators = shared.seeds.generators(task.first, task.first + self.paths)
-        # The control before, of each path; before the first there is none, if the policy does not say.
+        # The previous control of each path; NaN before the first unless the policy gives one.
         self.before = [np.repeat(shared.commands.before, group.stop - group.start, axis=0) for group in self.groups]
         self.alive = np.ones(self.paths, dtype=bool)
         self.nodes = np.zeros(self.paths, dtype=np.int64)
@@ -184,7 +185,7 @@ class _Chunk:
         self.failures: list[PathFailure] = []
         block = max(1, _BLOCK // (self.paths * (2 * n + 1)) // shared.commands.hold) * shared.commands.hold
         self.length = min(N, block)
-        # Nodes of a block, paths last: statistics run over them.
+        # Nodes of a block; the paths are the last axis, over which statistics run.
         self.block = np.empty((max(1, self.length), 2 * n + 1, self.paths))
         self.moments = None
         if task.moments:
@@ -206,7 +207,7 @@ class _Chunk:
             self.stored |= {"energy": np.full((self.paths, N + 1), np.nan), "u": np.full((self.paths, N, m), np.nan)}
 
     def part(self) -> Part:
-        """All steps."""
+        """Simulate all steps."""
         task, shared = self.task, self.shared
         states = []
         for group in self.groups:
@@ -238,7 +239,7 @@ class _Chunk:
         )
 
     def _run_group(self, number: int, state: object, begin: int, end: int) -> Integers:
-        """Steps begin .. end of a group: how many each path did; one that has failed does none."""
+        """Simulate steps begin .. end of a group; the number of steps of each path, 0 for one that has failed."""
         shared, group = self.shared, self.groups[number]
         hold = shared.commands.hold
         decisions = rows(shared.commands, begin // hold, end // hold, self.before[number])
@@ -264,7 +265,7 @@ class _Chunk:
         return np.array(done, dtype=np.int64)
 
     def _located(self, group: slice, error: CustomForceError) -> VarpinError:
-        """The error of a function that failed in one of some paths, with its path, its step and the motion before."""
+        """The error of a custom force, with the path and the step where it failed and the motion up to there."""
         own, task = self.shared, self.task
         for i in range(group.start, group.stop):
             (generator,) = own.seeds.generators(task.first + i, task.first + i + 1)
@@ -280,7 +281,7 @@ class _Chunk:
         self.failures.append(PathFailure(self.task.first + path, step, failure.reason))
 
     def _store(self, first: int, group: slice, segments: list[Segment], done: list[int]) -> None:
-        """Nodes of a group from node ``first`` on, ``done[i]`` of its i-th path."""
+        """Store nodes of a group from node ``first`` on, ``done[i]`` of its i-th path."""
         n, momentum = self.shared.scene.robot.dof, self.shared.integrator.variational
         self.nodes[group] += done
         for i, (segment, k) in enumerate(zip(segments, done, strict=True), group.start):
@@ -290,13 +291,13 @@ class _Chunk:
             if k < len(x):
                 x[k:] = np.nan
             for name, array in self.stored.items():
-                # The control that leads to a node stands one row before it, and none leads to the first.
+                # The control of the step to node k is in row k - 1.
                 row = first - 1 if name == "u" else first
                 if row >= 0:
                     array[i, row : row + k] = getattr(segment, name)[:k]
 
     def _reduce(self, first: int, done: Integers) -> None:
-        """Take in the block, which begins at node ``first`` and has ``done[i]`` nodes of path i."""
+        """Add the block to the statistics. It begins at node ``first`` and has ``done[i]`` nodes of path i."""
         last, n2 = int(done.max()), self.block.shape[1] - 1
         length = min(self.shared.steps + 1 - first, len(self.block))
         block = self.block[:last]
@@ -308,13 +309,13 @@ class _Chunk:
         if self.counts is not None and self.bounds is not None and self.task.grid is not None:
             (least, width), bins = self.task.grid
             nodes = slice(first, first + length)
-            counted(
+            count_in_bins(
                 self.block[:length, :-1], least[nodes], width[nodes], bins, self.counts[nodes], self.bounds[:, nodes]
             )
         if self.moments is None:
             return
         begin = 0
-        # Between two nodes at which paths fail, the same paths are counted.
+        # Between two nodes at which paths fail, the set of paths is the same.
         for end in np.unique(done[done > 0]).tolist():
             inside = done >= end
             span = block[begin:end] if inside.all() else np.compress(inside, block[begin:end], axis=2)

@@ -16,17 +16,19 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class EnsembleStatistics(Frozen):
-    """Moments and quantiles over the paths at each of N + 1 nodes. x is (q, p), or (q, v): see the integrator.
+    """Moments and quantiles over the paths at each of N + 1 nodes.
+
+    x is (q, p) for variational integrators and (q, v) for the others.
 
     Attributes:
-        mean: (N + 1, 2n).
-        covariance: (N + 1, 2n, 2n), with P - 1 in the denominator.
-        levels: Of the quantiles (L,).
-        quantiles: (L, N + 1, 2n).
-        quantile_errors: What each is off by at most, (L, N + 1, 2n); zero where they are exact.
-        energy_mean: (N + 1,) [J].
-        energy_deviation: Standard deviation (N + 1,) [J].
-        count: Paths that are counted at each node (N + 1,): those that have not failed before.
+        mean: Mean of x (N + 1, 2n).
+        covariance: Covariance of x (N + 1, 2n, 2n), with P - 1 in the denominator.
+        levels: Levels of the quantiles (L,).
+        quantiles: Quantiles of x (L, N + 1, 2n).
+        quantile_errors: Bounds of the errors of the quantiles (L, N + 1, 2n); zero where they are exact.
+        energy_mean: Mean energy (N + 1,) [J].
+        energy_deviation: Standard deviation of the energy (N + 1,) [J].
+        count: Number of paths at each node (N + 1,): those that have not failed before.
     """
 
     mean: Floats
@@ -45,12 +47,12 @@ class EnsembleStatistics(Frozen):
 
 @dataclass(frozen=True)
 class PathFailure:
-    """A path that could not be finished.
+    """A path that stopped early.
 
     Attributes:
-        path: Its index.
-        step: The step that failed.
-        reason: In words.
+        path: Index of the path.
+        step: Index of the step that failed.
+        reason: Why it failed, in words.
     """
 
     path: int
@@ -64,17 +66,17 @@ class Ensemble(Frozen):
 
     Attributes:
         t: Times (N + 1,) [s].
-        statistics: Over the paths.
-        q: Configurations (P, N + 1, n) [rad or m], or None where paths were not to be stored; NaN after a failure.
+        statistics: Moments and quantiles over the paths.
+        q: Configurations (P, N + 1, n) [rad or m], NaN after a failure; None, like the next four, if not stored.
         v: Velocities (P, N + 1, n).
         p: Momenta (P, N + 1, n).
         u: Controls applied (P, N, m).
-        energy: (P, N + 1) [J].
-        failures: Paths that stopped early; they are left out of the statistics from there on.
-        warnings: What varpin says of the paths, a sentence each: dt too coarse, energy off, paths that stopped early.
-            A few paths are looked at, as :func:`varpin.simulate` looks at its motion: the first, the one with the most
-            split steps, the one with the most energy and the fastest; up to ten are all looked at.
-        integrator: What made them.
+        energy: Energy (P, N + 1) [J].
+        failures: Paths that stopped early. The statistics leave a path out after its failure.
+        warnings: One sentence each: dt too coarse, energy off, paths that stopped early. The first path, the one with
+            the most split steps, the one with the most energy and the fastest are examined as :func:`varpin.simulate`
+            examines its motion; of up to ten paths, all are.
+        integrator: The integrator of all paths.
     """
 
     t: Floats
@@ -116,7 +118,7 @@ class EnsembleInterrupted(KeyboardInterrupt):
     """Ctrl-C during an ensemble.
 
     Attributes:
-        ensemble: The first paths, up to where they were done; None if none were.
+        ensemble: The paths that were finished, in order from the first; None if there are none.
     """
 
     def __init__(self, ensemble: Ensemble | None) -> None:

@@ -53,8 +53,8 @@ def simulate_ensemble(
 ) -> Ensemble:
     """Simulate many paths of a noisy scene.
 
-    Path i draws its noise from the i-th child of ``rng``, and moments are merged in the order of the paths: the same
-    bytes for any number of workers, threads, processes or machines of one kind.
+    Path i draws its noise from the i-th child of ``rng``, and moments are merged in the order of the paths. The result
+    is therefore the same, byte for byte, for any number of threads, processes or machines of one kind.
 
     Main args:
         scene: The scene, with noise that the core can evaluate (not a ``CustomNoise``).
@@ -65,30 +65,30 @@ def simulate_ensemble(
         paths: P.
         rng: Seed or generator.
         controls: None, (N, m), (m,), by joint name, :class:`OpenLoop`, :class:`FirstOrderHold`, or a
-            :class:`LinearPolicy` that each path
-            evaluates at its own state.
+            :class:`LinearPolicy`, evaluated at the state of each path.
 
     Other Args:
-        integrator: If left out, ``Midpoint()``; in a scene without noise that of :func:`varpin.simulate`, as a few of
-            the paths ask for it. ``Ensemble.integrator`` says which.
-        store: Keep every path. Without, only the statistics are kept, and memory does not grow with P N.
-        quantiles: Levels in [0, 1]; none, and no more than moments come back from the workers. They are exact if paths
-            are stored, or if P (N + 1) 2n is no more than 33 million. Beyond, they are read from histograms of up to
-            1000 bins over 2.5 times the range of the first paths (up to 1024), linear within a bin; then
-            ``statistics.quantile_errors`` says what they are off by at most, a bin. Levels 0 and 1 stay exact.
-        workers: Threads; as many as there are cores if left out.
+        integrator: If left out, ``Midpoint()``. In a scene without noise, the integrator that :func:`varpin.simulate`
+            takes for a few of the paths. ``Ensemble.integrator`` says which.
+        store: Keep every path. Otherwise only the statistics are kept, and memory does not grow with P N.
+        quantiles: Levels in [0, 1]; with an empty list, workers return moments alone. Quantiles are exact if paths are
+            stored, or if P (N + 1) 2n is at most 33 million. Otherwise they are read from histograms of up to 1000 bins
+            over 2.5 times the range of the first paths (up to 1024), linear within a bin;
+            ``statistics.quantile_errors`` bounds their errors by the width of a bin. Levels 0 and 1 stay exact.
+        workers: Number of threads; the number of cores if left out.
         executor: Any ``concurrent.futures.Executor`` instead of threads: a ``ProcessPoolExecutor``, Dask's
-            ``client.get_executor()``, an ``mpi4py.futures.MPIPoolExecutor``. It stays open. The work of a worker that
-            is lost is done again. Chunks of paths that wait, run or have come back before their turn are four for each
-            worker at most, and no more than 2 GiB of results, but two at least.
-        progress: Called now and then with (paths done, P).
+            ``client.get_executor()``, an ``mpi4py.futures.MPIPoolExecutor``. It stays open. The work of a lost worker
+            is repeated. At most four chunks of paths for each worker are submitted and not yet merged; together they
+            return at most 2 GiB, unless two chunks alone return more.
+        progress: Called with (paths done, P) after each chunk.
 
     Raises:
         InputError: Wrong shapes, values that are not finite, or a scene whose noise the core cannot evaluate.
-        ForceError: A function of a :class:`varpin.CustomForce` failed in a path, which it names and holds so far.
-        AssemblyError: The scene's constraints cannot be kept next to q0.
-        VarpinError: Every path failed, or workers get lost again and again.
-        EnsembleInterrupted: Ctrl-C; holds the paths that were done. It is a KeyboardInterrupt.
+        ForceError: A function of a :class:`varpin.CustomForce` failed. The error names the path and holds its motion up
+            to the failure.
+        AssemblyError: No configuration near q0 satisfies the scene's constraints.
+        VarpinError: Every path failed, or workers are lost repeatedly.
+        EnsembleInterrupted: Ctrl-C; holds the finished paths. It is a KeyboardInterrupt.
     """
     require_scene(scene)
     dt, steps, paths = positive("dt", dt, "s"), count("steps", steps), count("paths", paths, least=1)
@@ -155,7 +155,7 @@ def _usual(
 
 
 def _onto_constraints(scene: Scene, start: Sequence[Floats]) -> tuple[list[Floats], tuple[Finding, ...]]:
-    """Starts (P, n) that keep the constraints, and what was changed in the first that was another."""
+    """Initial states (P, n) projected onto the constraints, and the findings about the first path that was changed."""
     q0, v0 = start
     if not scene.constraints:
         return [q0, v0], ()
@@ -163,16 +163,16 @@ def _onto_constraints(scene: Scene, start: Sequence[Floats]) -> tuple[list[Float
         q, v, found = on_constraints(scene, q0[0], v0[0])
         return [np.broadcast_to(q, q0.shape), np.broadcast_to(v, v0.shape)], found
     moved = [on_constraints(scene, q, v) for q, v in zip(q0, v0, strict=True)]
-    told = (
-        tuple(Finding(own.kind, f"path {path}: {own.sentence}") for own in found)
+    findings = (
+        tuple(Finding(finding.kind, f"path {path}: {finding.sentence}") for finding in found)
         for path, (_, _, found) in enumerate(moved)
         if found
     )
-    return [np.array([q for q, _, _ in moved]), np.array([v for _, v, _ in moved])], next(told, ())
+    return [np.array([q for q, _, _ in moved]), np.array([v for _, v, _ in moved])], next(findings, ())
 
 
 def _alike(scene: Scene, start: Sequence[Floats]) -> tuple[Finding, ...]:
-    """Says if nothing tells the paths apart."""
+    """A finding if all paths are the same motion."""
     if scene.processes or len(start[0]) < 2 or any((x != x[0]).any() for x in start):
         return ()
     sentence = (
@@ -183,7 +183,7 @@ def _alike(scene: Scene, start: Sequence[Floats]) -> tuple[Finding, ...]:
 
 
 def _parts(pool: Executor, sums: Sums, q0: Floats, v0: Floats) -> Generator[Part, None, None]:
-    """What comes of the chunks; the first by itself where the bins of the others depend on it."""
+    """Results of the chunks. Where quantiles are estimated, the first chunk runs alone: it sets the bins."""
     tasks = sums.tasks(q0, v0)
     if sums.estimated:
         yield from in_order(pool, simulate_paths, itertools.islice(tasks, 1))
@@ -191,7 +191,7 @@ def _parts(pool: Executor, sums: Sums, q0: Floats, v0: Floats) -> Generator[Part
 
 
 def _require_memory(scene: Scene, steps: int, paths: int, *, store: bool) -> None:
-    """Refuse a record that cannot be held, before anything runs."""
+    """Refuse an ensemble whose record does not fit into memory."""
     n, m = scene.robot.dof, scene.controls
     stored = paths if store else 0
     row = 2 * n * (4 * n + 5) + m + stored * (3 * n + m + 1)

@@ -18,14 +18,14 @@ from varpin.simulation.soundness import Finding
 
 Floats = NDArray[np.float64]
 
-# Numbers up to which quantiles are exact without stored paths.
+# Without stored paths, quantiles are exact up to this many numbers, P (N + 1) 2n.
 _EXACT = 2**25
-# Numbers that a part of the nodes may have whose quantiles are taken at a time.
+# Quantiles are computed for runs of nodes with up to this many numbers.
 _SPAN = 100_000
 
 
 class Sums:
-    """What comes of chunks, taken in in the order of the paths."""
+    """Sums over the chunks, which are added in the order of the paths."""
 
     def __init__(self, shared: Shared, paths: int, levels: Floats, *, store: bool) -> None:
         self.shared, self.paths, self.levels, self.store = shared, paths, levels, store
@@ -45,7 +45,7 @@ class Sums:
         self.estimated = bool(len(levels)) and not exact and not store
 
     def tasks(self, q0: Floats, v0: Floats) -> Iterator[Task]:
-        """The chunks; where quantiles are estimated, the second is asked for once the first has been taken in."""
+        """The chunks. Where quantiles are estimated, the first one has to be added before the second is requested."""
         for first, last in chunks(self.shared.steps, self.paths):
             yield Task(
                 self.shared,
@@ -58,7 +58,7 @@ class Sums:
             )
 
     def part_bytes(self) -> int:
-        """What comes of a chunk [bytes], its arrays alone."""
+        """Size of a chunk's result [bytes], arrays alone."""
         nodes, size = self.shared.steps + 1, 2 * self.shared.scene.robot.dof
         _, paths = next(chunks(self.shared.steps, self.paths))
         numbers = nodes * (size**2 + size + 3) + paths
@@ -72,7 +72,7 @@ class Sums:
         return 8 * numbers
 
     def add(self, part: Part) -> None:
-        """The next chunk."""
+        """Add the next chunk."""
         here = slice(part.first, part.first + part.paths)
         assert part.first == self.done
         assert part.moments is not None
@@ -92,18 +92,22 @@ class Sums:
         self.done = here.stop
 
     def lost(self) -> tuple[Finding, ...]:
-        """What is to be said of failures, if there are any."""
+        """A finding about failed paths, if there are any."""
         if not self.failures:
             return ()
         return (Finding("failed paths", f"{self.failing()}; they are left out of the statistics from there on"),)
 
     def failing(self) -> str:
-        """How many paths failed, and the first of them."""
+        """The number of failed paths and the earliest failure, in words."""
         first = min(self.failures, key=lambda failure: failure.step)
         return f"{len(self.failures)} of {self.done} paths failed, the first at step {first.step}: {first.reason}"
 
     def ensemble(self, found: Sequence[Finding]) -> Ensemble:
-        """Of the paths that were taken in, with what is to be said of them."""
+        """The record of the paths added so far.
+
+        Args:
+            found: Findings, whose sentences become its warnings.
+        """
         moments, n2 = self.moments, 2 * self.shared.scene.robot.dof
         assert moments is not None
         there = moments.count > 0
@@ -141,7 +145,7 @@ class Sums:
             return found, np.zeros(shape)
         size, nodes = max(1, _SPAN // (self.done * shape[2])), self.nodes[: self.done]
         spans, begin = [], 0
-        # Between two nodes at which paths fail, the same paths are counted.
+        # Between two nodes at which paths fail, the set of paths is the same.
         for end in np.unique(nodes).tolist():
             spans += [(a, min(a + size, end), nodes >= end) for a in range(begin, end, size)]
             begin = end
@@ -156,7 +160,7 @@ class Sums:
         return found, np.zeros(shape)
 
     def _states(self, first: int, last: int) -> Floats:
-        """X at some nodes (k, 2n, P)."""
+        """States x at nodes ``first`` .. ``last`` (k, 2n, P)."""
         if self.values is not None:
             return self.values[first:last, :, : self.done]
         second = self.stored["p" if self.shared.integrator.variational else "v"]
