@@ -114,7 +114,7 @@ def test_files_without_the_values_are_held_against_their_steps(load, tmp_path, i
         older = without_values(motion.save(tmp_path / "motion.npz"))
         assert not older.scene_values
         np.testing.assert_array_equal(vp.linearize(scene, older).A, vp.linearize(scene, motion).A)
-        for change in OTHERS.values():
+        for change, _ in OTHERS:
             if "actuation" not in change:
                 with refused(vp.InputError, "velocities"):
                     vp.linearize(vp.Scene(robot, **UR5 | change), older)
