@@ -138,7 +138,7 @@ def _onto_constraints(scene: Scene, start: Sequence[Floats]) -> tuple[list[Float
         return [np.broadcast_to(q, q0.shape), np.broadcast_to(v, v0.shape)], found
     moved = [on_constraints(scene, q, v) for q, v in zip(q0, v0, strict=True)]
     told = (
-        tuple(Finding(own.kind, f"path {path}: {own.sentence}") for own in found)
+        tuple(Finding(finding.kind, f"path {path}: {finding.sentence}") for finding in found)
         for path, (_, _, found) in enumerate(moved)
         if found
     )

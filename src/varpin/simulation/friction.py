@@ -41,8 +41,8 @@ class Stop(NamedTuple):
 def stops(scene: Scene, trajectory: Trajectory) -> list[Stop]:
     """Some of the steps in which joints with dry friction come to rest or turn back, the first and last of each."""
     found = []
-    for own in of_kind(scene.elements, "CoulombFriction"):
-        c, width = own.coordinate, own.values[1]
+    for element in of_kind(scene.elements, "CoulombFriction"):
+        c, width = element.coordinate, element.values[1]
         v = trajectory.v[:, c]
         before, after = v[:-1], v[1:]
         # The velocity changes its sign, or another step like this one would take it there.
