@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from refusals import refused
+from refusals import refused, unnamed
 
 import varpin as vp
 from varpin.io.scenefile import scenes
@@ -561,19 +561,19 @@ def test_every_mistake_has_its_own_message(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("mistake", "words"),
+    ("mistake", "facts"),
     [
-        ("negative mass", "must be a finite number > 0 [kg], got -0.001"),
-        ("unknown key", "unknown key; did you mean 'mass'? keys: frame, mass, com, inertia"),
-        ("unknown cost", "there is no 'traking'; did you mean 'tracking'? allowed: tracking, velocity"),
-        ("force without a number", "is missing; a number for all, a list, or a table by name belongs here"),
-        ("no TOML", "at line 3"),
+        ("negative mass", ("[kg]", "-0.001")),
+        ("unknown key", ("'mass'", "frame, mass, com, inertia")),
+        ("unknown cost", ("'traking'", "'tracking'", "velocity")),
+        ("force without a number", ("number", "list", "table")),
+        ("no TOML", "line 3"),
     ],
 )
-def test_a_message_says_what_is_allowed(mistake, words, tmp_path):
+def test_a_message_says_what_is_allowed(mistake, facts, tmp_path):
     with pytest.raises(vp.SceneFileError) as caught:
         vp.load_scene(write(tmp_path, MISTAKES[mistake][0]))
-    assert words in caught.value.problem
+    assert not unnamed(caught.value.problem, facts)
 
 
 ODD = [

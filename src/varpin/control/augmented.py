@@ -210,8 +210,8 @@ class _Rounds:
         if resumed is None or resumed.search is None or resumed.multipliers is None:
             return None
         begun = resumed.multipliers.iterations
-        own = [replace(item, index=item.index - begun) for item in resumed.search.history[begun:]]
-        return replace(resumed, search=replace(resumed.search, history=tuple(own)))
+        history = [replace(item, index=item.index - begun) for item in resumed.search.history[begun:]]
+        return replace(resumed, search=replace(resumed.search, history=tuple(history)))
 
     def _report(self, known: int, last: int, item: Iteration, motion: Trajectory) -> None:
         item = replace(item, index=item.index + known)

@@ -211,7 +211,7 @@ class _Rows:
         self.of_nodes = problem.penalties
         self.of_rate = tuple(item for item in problem.all_penalties if item.bound.of_controls)
         self.penalties = (*self.of_nodes, *self.of_rate)
-        self.own = problem.expand_own(motion)
+        self.unpenalized = problem.expand_cost(motion)
         self.signed = [item.signed(item.bound.value(q, v, u)) for item in self.penalties]
         self.begun = [item.held(s) for item, s in zip(self.penalties, self.signed, strict=True)]
         self.jacobians = [item.bound.jacobian(q, v) for item in self.of_nodes]
@@ -232,7 +232,7 @@ class _Rows:
         passing = copy(self.whole)
         vars(passing).pop("model", None)
         count = len(self.of_nodes)
-        passing.running = self.problem.with_held(self.own, self.signed[:count], self.jacobians, held[:count])
+        passing.running = self.problem.with_held(self.unpenalized, self.signed[:count], self.jacobians, held[:count])
         rate = self.problem.rate
         if isinstance(rate, PenalizedRate):
             u = self.whole.trajectory.u[:: self.problem.hold]

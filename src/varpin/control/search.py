@@ -305,8 +305,8 @@ def _first_commands(problem: OptimalControlProblem, controls: JointValues | Line
         if (hold := controls.hold_at(problem.dt)) != problem.hold:
             raise InputError(f"the policy holds its controls over {hold} steps, the problem {problem.hold}")
         if controls.linear != problem.linear:
-            policy, own = ("linear", "held") if controls.linear else ("held", "linear")
-            raise InputError(f"the policy's controls are {policy}, the problem's {own}")
+            policy, wanted = ("linear", "held") if controls.linear else ("held", "linear")
+            raise InputError(f"the policy's controls are {policy}, the problem's {wanted}")
         commands = controls.commands(
             problem.steps, m, problem.scene.robot.dof, variational, problem.dt, problem.integrator.stage_times
         )
@@ -885,8 +885,8 @@ class _Search:
         found = backward(self.problem, trial, self.regularization)
         if found is None:
             return np.inf
-        own, held = (noise_shares(self.problem, trial, each, self.steered).sum() for each in (found, plan))
-        return float(own - held)
+        shares, held = (noise_shares(self.problem, trial, each, self.steered).sum() for each in (found, plan))
+        return float(shares - held)
 
     def _feedback(self, plan: Plan) -> Commands:
         """The commands of trials, but for the feed-forward part that theirs is on top of."""

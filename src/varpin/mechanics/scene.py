@@ -566,7 +566,7 @@ class Scene(Frozen):
 def _unowned(rows: ConstraintRows) -> ConstraintRows:
     """Rows whose functions the scene keeps, and not the core."""
     return rows._replace(
-        customs=tuple(own._replace(value=Weak(own.value), curvature=Weak(own.curvature)) for own in rows.customs)
+        customs=tuple(row._replace(value=Weak(row.value), curvature=Weak(row.curvature)) for row in rows.customs)
     )
 
 
@@ -820,7 +820,7 @@ def _sole_control(actuation: Floats, c: int) -> int | None:
 
 def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Element], bound: Bound) -> None:
     """Refuse a KinematicInput whose joint has no control of its own, or a servo besides."""
-    served = {own.coordinate for own in of_kind(elements, "PositionServo")}
+    served = {servo.coordinate for servo in of_kind(elements, "PositionServo")}
     for tie in bound.rows.ties:
         if tie.follower != tie.leader or tie.coefficients:
             continue

@@ -308,15 +308,15 @@ def clearance(
             bodies.append((body, _Body(name, None, R @ shape[0] + p, R @ shape[1] + p, shape[2], None, np.eye(3))))
         else:
             bodies.append((body, _Body(name, frame_kinematics(robot, name), *shape, None, np.eye(3))))
-    parts = [own for _, own in bodies]
+    parts = [part for _, part in bodies]
     moving = [i for i, part in enumerate(parts) if part.kinematics is not None]
     pairs = []
     if itself:
         pairs = _of_links(robot, bodies, _disabled(srdf))
     for obstacle in obstacles:
         pairs += [(i, len(parts)) for i in moving]
-        own = (obstacle.begin, obstacle.end, obstacle.radius, obstacle.sides, obstacle.rotation)
-        parts.append(_Body(obstacle.name, None, *own, obstacle=obstacle))
+        solid = (obstacle.begin, obstacle.end, obstacle.radius, obstacle.sides, obstacle.rotation)
+        parts.append(_Body(obstacle.name, None, *solid, obstacle=obstacle))
     if not pairs:
         raise InputError(
             f"robot {robot.name!r} has nothing to keep clear of: give obstacles, or itself=True, and links with shapes "
@@ -329,7 +329,7 @@ def _of_links(
     robot: Robot, bodies: Sequence[tuple[int, _Body]], disabled: set[frozenset[str]]
 ) -> list[tuple[int, int]]:
     """Pairs of links that are no neighbours."""
-    parent, parts = robot.tree.parent, [own for _, own in bodies]
+    parent, parts = robot.tree.parent, [part for _, part in bodies]
     found = []
     for i, (one, first) in enumerate(bodies):
         for k, (other, second) in enumerate(bodies[:i]):
@@ -361,8 +361,8 @@ def _vertices(robot: Robot) -> dict[str, Floats]:
     for shape in geometry(robot).geometryObjects:
         frame = model.frames[shape.parentFrame]
         place = frame.placement.inverse() * shape.placement
-        own = _corners(shape.geometry) * np.asarray(shape.meshScale)
-        found.setdefault(frame.name, []).append(own @ place.rotation.T + place.translation)
+        corners = _corners(shape.geometry) * np.asarray(shape.meshScale)
+        found.setdefault(frame.name, []).append(corners @ place.rotation.T + place.translation)
     return {name: np.vstack(parts) for name, parts in found.items()}
 
 

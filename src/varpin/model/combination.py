@@ -59,9 +59,9 @@ def combine(
     model, ties, parts = pin.Model(), [], []
     model.gravity = robots[0].model.gravity
     for robot, place, prefix in zip(robots, placements, given, strict=True):
-        own = robot.free_model if place is None else _placed(robot, place)
+        part = robot.free_model if place is None else _placed(robot, place)
         shift = model.njoints - 1
-        rebuild(own, range(1, own.njoints), own.joints.__getitem__, onto=model, prefix=prefix)
+        rebuild(part, range(1, part.njoints), part.joints.__getitem__, onto=model, prefix=prefix)
         ties += [Tie(tie.follower + shift, tie.leader + shift, tie.ratio, tie.offset) for tie in robot.ties]
         moved = pin.SE3.Identity() if place is None else pin.SE3(_homogeneous(place))
         parts.append(Part(robot, prefix, shift, moved))
@@ -109,9 +109,9 @@ def _twice(robots: Sequence[Robot], prefixes: Sequence[str]) -> list[str]:
     seen: set[str] = set()
     twice = []
     for robot, prefix in zip(robots, prefixes, strict=True):
-        own = {prefix + name for name in _names(robot)}
-        twice += sorted(own & seen)
-        seen |= own
+        names = {prefix + name for name in _names(robot)}
+        twice += sorted(names & seen)
+        seen |= names
     return twice
 
 

@@ -625,8 +625,8 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
 def _of_parts(robot: Robot, shapes: Sequence[pin.GeometryModel]) -> pin.GeometryModel:
     """The shapes of each part of a combined robot on its joints."""
     together, model = pin.GeometryModel(), robot.free_model
-    for part, own in zip(robot.parts, shapes, strict=True):
-        for given in own.geometryObjects:
+    for part, geometry in zip(robot.parts, shapes, strict=True):
+        for given in geometry.geometryObjects:
             shape = given.copy()
             link = part.robot.free_model.frames[given.parentFrame]
             shape.name = part.prefix + given.name

@@ -250,7 +250,7 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
         found.extend(_not_told(scene, integrator, trajectory))
     if not found:
         found.extend(_adding_up(scene, integrator, trajectory))
-    return (*found, *(own for own in unsettled if own.kind not in {other.kind for other in found}))
+    return (*found, *(finding for finding in unsettled if finding.kind not in {other.kind for other in found}))
 
 
 def _not_told(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -605,8 +605,8 @@ def _windows_under(
         commands = changing(in_parts(values, mine, 1, at) if times == 1 else in_pairs(values, mine, at), at)
         node = slice(begin, begin + 1)
         given = commands, np.zeros((0, 0, scene.robot.dof)), times * trajectory.dt
-        own = None if kicks is None else kicks[window : window + 1]
-        again = other.motions(scene, trajectory.q[node], trajectory.v[node], *given, own)
+        kick = None if kicks is None else kicks[window : window + 1]
+        again = other.motions(scene, trajectory.q[node], trajectory.v[node], *given, kick)
         if again is None:
             return None
         found.append(again)

@@ -193,7 +193,7 @@ def _terms(layout: Layout) -> dict[str, str]:
     costs = [term.spec.kind + (" at the end" if term.spec.terminal else "") for term in layout.costs]
     kinds: set[type[Force]] = {force.kind for force in layout.forces} | {type(part) for part in layout.frame_forces}
     absent = [words for words, kind in _ABSENT.items() if kind not in kinds] + ["contact"]
-    kinds_kept = [own.kind for own in spec.plan_constraints]
+    kinds_kept = [constraint.kind for constraint in spec.plan_constraints]
     kept = [name.replace("_", " ") for name, kind in PLAN_CONSTRAINTS.items() if kind in kinds_kept]
     shapes = "replays and clearance" if "clearance" in kept else "a replay"
     payloads = [f"{payload.mass:g} kg at {payload.frame}" for payload in spec.robot.payload]

@@ -98,11 +98,11 @@ class SceneFile:
             raise spec.root.error("cost", "is missing; a scene to solve has a [[cost]] at least")
         most = layout.control_limit
         constraints = []
-        for own in spec.plan_constraints:
+        for constraint in spec.plan_constraints:
             try:
-                constraints.append(own.kind.make(scene.robot, own.given))
+                constraints.append(constraint.kind.make(scene.robot, constraint.given))
             except VarpinError as error:
-                raise own.table.error("", str(error)) from None
+                raise constraint.table.error("", str(error)) from None
         try:
             return OptimalControlProblem(
                 scene,
@@ -119,9 +119,9 @@ class SceneFile:
                 constraints=constraints,
             )
         except (InputError, CostError) as error:
-            for own, made in zip(spec.plan_constraints, constraints, strict=True):
+            for keys, made in zip(spec.plan_constraints, constraints, strict=True):
                 if str(error).startswith(made.label):
-                    raise own.table.error("", str(error)) from None
+                    raise keys.table.error("", str(error)) from None
             where = "horizon.controls" if "linear controls" in str(error) else "cost"
             raise spec.root.error(where, str(error)) from None
 

@@ -282,7 +282,7 @@ REFERENCE_KEYS: Mapping[str, type[Keys]] = {"file": FileKeys, "waypoints": Waypo
 
 def _reference_shape(value: Any) -> str:
     keys = set(value) if isinstance(value, dict) else set()
-    if any(isinstance(own, list | dict) for own in (value[key] for key in keys & {"constant", "value"})):
+    if any(isinstance(number, list | dict) for number in (value[key] for key in keys & {"constant", "value"})):
         raise ValueError("numbers that do not change are given themselves, as in target = [0.4, 0.2, 0.3], in no table")
     return next((name for name, kind in REFERENCE_KEYS.items() if keys & set(kind.model_fields)), toml_type(value))
 
@@ -442,8 +442,8 @@ def _cost_keys(name: str, term: Term) -> type[Keys]:
 
 # [[plan_constraint]]
 def _plan_constraint_keys(name: str, kind: Kind) -> type[Keys]:
-    own: dict[str, Any] = {key: (Annotated[Any, rule], default) for key, (rule, default) in kind.rules.items()}
-    return create_model(name, __base__=TypedKeys, **own)
+    rules: dict[str, Any] = {key: (Annotated[Any, rule], default) for key, (rule, default) in kind.rules.items()}
+    return create_model(name, __base__=TypedKeys, **rules)
 
 
 FORCE_KEYS = {name: _force_keys(kind) for name, kind in FORCES.items()} | {

@@ -257,8 +257,8 @@ def torque_shares(
         values = require_finite("torques", values)
     size = np.abs(values)
     largest = size.max(axis=0, initial=0.0)
-    own = robot.effort_limit
-    bound = np.where(np.isfinite(own), own, largest)
+    limit_of_robot = robot.effort_limit
+    bound = np.where(np.isfinite(limit_of_robot), limit_of_robot, largest)
     if limit is not None:
         given = joint_array("torque_limit", limit, robot.joint_names, uniform=True)
         # Of joints that are not named the limit stays their own.
