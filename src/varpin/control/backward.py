@@ -78,6 +78,12 @@ class Plan:
         return np.where(held, 0.0, self.gradient)
 
 
+def states(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
+    """X (N + 1, 2n): (q, p) or (q, v)."""
+    second = trajectory.p if problem.integrator.variational else trajectory.v
+    return np.hstack([trajectory.q, second])
+
+
 def noise_shares(
     problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan, processes: NDArray[np.bool_] | None = None
 ) -> Floats:
@@ -174,7 +180,7 @@ def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -
     it most. Where they do not settle, the best pass of them is taken, or the place that the steps have come to.
     """
     problem = along.problem
-    if not isinstance(problem, PenalizedProblem) or len(along.blocks) > 1:
+    if not (isinstance(problem, PenalizedProblem) and problem.passes) or len(along.blocks) > 1:
         return _within_limits(along, regularization, curvature)
     rows = _Rows(along, problem)
     held, best, least, last = rows.begun, None, 0.0, None

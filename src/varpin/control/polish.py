@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.control.backward import states
 from varpin.control.constraints import BoundConstraint, BoundRate
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.search import states
 from varpin.control.solution import Solution
 from varpin.control.trials import Trials
 from varpin.core.arrays import Commands

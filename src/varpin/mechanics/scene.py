@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
@@ -561,6 +561,27 @@ class Scene(Frozen):
                 "N m or N that no actuator takes"
             )
         return controls
+
+
+def quiet(scene: Scene) -> Scene:
+    """The scene without its noise."""
+    return _driven(scene, scene.actuation) if scene.processes else scene
+
+
+def assisted(scene: Scene) -> Scene:
+    """The scene without its noise and with n controls more, a force on each joint."""
+    return _driven(scene, np.hstack([scene.actuation, np.eye(scene.robot.dof)]))
+
+
+def _driven(scene: Scene, actuation: Floats) -> Scene:
+    """The scene with another actuation matrix (n, m) and without noise."""
+    actuation = actuation.copy()
+    actuation.setflags(write=False)
+    made = object.__new__(Scene)
+    # Past the dataclass, which refuses assignments, and without properties that are made on use.
+    own = {item.name: getattr(scene, item.name) for item in fields(Scene)}
+    vars(made).update(own | {"actuation": actuation, "noise": bind(None, actuation)})
+    return made
 
 
 def _unowned(rows: ConstraintRows) -> ConstraintRows:
