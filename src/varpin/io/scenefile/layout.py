@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,10 @@ from varpin.mechanics.constraints import Constraint, KinematicInput
 from varpin.mechanics.forces import Force, PositionServo
 from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
 from varpin.mechanics.scene import Scene, closest_controls, damping_of
-from varpin.model import Robot, load_robot
+from varpin.model import Robot, combine, load_robot
+
+if TYPE_CHECKING:
+    from varpin.io.scenefile.tables import RobotKeys
 
 _OnFrames = TypeVar("_OnFrames", bound=Force | Constraint)
 
@@ -105,7 +108,7 @@ class Layout:
             return self
         names = self.robot.joint_names
         held = {**self.held, **{name: float(self.q0[names.index(name)]) for name in joints}}
-        robot = _load(self.spec, held)
+        robot = _load(self.spec, held, self.robot)
         keep = np.array([names.index(name) for name in robot.joint_names], dtype=np.int64)
         driven = np.flatnonzero(np.isin(self.actuated, keep))
         position = {int(joint): index for index, joint in enumerate(keep)}
@@ -251,8 +254,23 @@ def joints_of_frame(robot: Robot, frame: str) -> NDArray[np.bool_]:
     return moving
 
 
-def _load(spec: SceneSpec, held: Mapping[str, float]) -> Robot:
-    given, table = spec.robot, spec.root.table("robot")
+def _load(spec: SceneSpec, held: Mapping[str, float], whole: Robot | None = None) -> Robot:
+    """The robot of a file, with the joints of ``whole`` that are ``held`` locked as well."""
+    if spec.prefixes is None:
+        return _one(spec.robots[0], spec.root.table("robot"), held)
+    own: list[dict[str, float]] = [{} for _ in spec.robots]
+    for part, locks in zip(() if whole is None else whole.parts, own, strict=whole is not None):
+        names = {part.prefix + name: name for name in (*part.robot.joint_names, *part.robot.locked)}
+        locks.update({names[name]: at for name, at in held.items() if name in names})
+    tables = [spec.root.table(f"robot[{k}]") for k in range(len(own))]
+    robots = [_one(given, table, locks) for given, table, locks in zip(spec.robots, tables, own, strict=True)]
+    try:
+        return combine(*robots, prefixes=spec.prefixes)
+    except InputError as error:
+        raise tables[-1].error("prefix", str(error)) from None
+
+
+def _one(given: RobotKeys, table: Table, held: Mapping[str, float]) -> Robot:
     for joint, value in given.lock.items():
         if degrees_for_radians(value):
             raise table.error(f"lock.{joint}", f"{value:g} looks like degrees: positions are in rad or m")

@@ -104,6 +104,10 @@ def idle_joints(layout: Layout, scene: Scene) -> Mask:
         touched |= _costs(term, layout, scene, t)
     group = scene.group
     busy = np.isin(group, group[touched])
+    for part in layout.robot.parts:
+        # Of several robots each keeps its joints, or those that are touched.
+        own = np.isin(layout.robot.joint_names, [part.prefix + name for name in part.robot.joint_names])
+        busy |= own & ~busy[own].any()
     # Where nothing happens at all, all of it is the scene.
     return ~busy if busy.any() else np.zeros_like(busy)
 
@@ -196,7 +200,11 @@ def _terms(layout: Layout) -> dict[str, str]:
     kinds_kept = [constraint.kind for constraint in spec.plan_constraints]
     kept = [name.replace("_", " ") for name, kind in PLAN_CONSTRAINTS.items() if kind in kinds_kept]
     shapes = "replays and clearance" if "clearance" in kept else "a replay"
-    payloads = [f"{payload.mass:g} kg at {payload.frame}" for payload in spec.robot.payload]
+    payloads = [
+        f"{payload.mass:g} kg at {word}{payload.frame}"
+        for word, robot in zip(spec.prefixes or ("",), spec.robots, strict=True)
+        for payload in robot.payload
+    ]
     terms = {
         "gravity": f"{', '.join(f'{g:g}' for g in gravity)} m/s^2" if any(gravity) else "none",
         "damping": of(layout.damping, joints),

@@ -219,7 +219,12 @@ class SceneFile:
 
     @cached_property
     def _parts(self) -> tuple[tuple[Layout, OptimalControlProblem], ...]:
-        """Each group of joints by itself; none where a group has nothing that drives it, or costs nothing."""
+        """Each group of joints by itself; none where a group has nothing that drives it, or costs nothing.
+
+        Nor any of several robots, of which no part has all.
+        """
+        if self.spec.prefixes is not None:
+            return ()
         names, parts = self.robot.joint_names, []
         for part in self.required.parts:
             layout = self._layout.without([name for name in names if name not in part])

@@ -165,7 +165,8 @@ class SceneSpec:
         title: For people.
         path: Of the file.
         root: Its tables, for messages.
-        robot: Which robot, and how it is taken.
+        robots: Which robot, and how it is taken; or several that are one tree.
+        prefixes: Before the names of each; None for a file with one ``[robot]``.
         gravity: [m/s^2], or whether there is any.
         damping: By joint [N m s/rad or N s/m], or "robot" for the description's own; None where nothing is said.
         stiffness: Of joint springs, by joint [N m/rad or N/m].
@@ -197,7 +198,8 @@ class SceneSpec:
     title: str
     path: Path
     root: Table
-    robot: RobotKeys
+    robots: tuple[RobotKeys, ...]
+    prefixes: tuple[str, ...] | None
     gravity: bool | tuple[float, ...]
     damping: ByName | Literal["robot"] | None
     stiffness: ByName

@@ -155,6 +155,20 @@ class RobotKeys(Keys):
     density: Annotated[float, number("kg/m^3", above=0.0)] = 1000.0
 
 
+class MemberKeys(RobotKeys):
+    """[[robot]]."""
+
+    prefix: Annotated[str, TEXT] = ""
+
+
+def _several(robots: RobotKeys | tuple[MemberKeys, ...]) -> tuple[RobotKeys, ...]:
+    if isinstance(robots, RobotKeys):
+        return (robots,)
+    if len(robots) < 2:
+        raise ValueError(f"[[robot]] is for two robots or more, got {len(robots)}; one is written [robot]")
+    return robots
+
+
 class SpringKeys(Keys):
     """[springs]."""
 
@@ -467,7 +481,12 @@ class SceneKeys(Keys):
         either("true, false or three numbers [m/s^2]", flag=bool, list=Annotated[Any, numbers(3, "m/s^2")]),
     ] = True
     damping: Annotated[Any, values("N m s/rad or N s/m", least=0.0, text=Annotated[str, word("robot")])] = None
-    robot: RobotKeys
+    robot: Annotated[
+        tuple[RobotKeys, ...],
+        _checked(
+            either("a table [robot], or several of [[robot]]", table=RobotKeys, list=tuple[MemberKeys, ...]), _several
+        ),
+    ]
     springs: SpringKeys = SpringKeys()
     force: tuple[Annotated[Any, typed(FORCE_KEYS)], ...] = ()
     constraint: tuple[Annotated[Any, typed(CONSTRAINT_KEYS)], ...] = ()
@@ -499,12 +518,14 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
     controls = keys.simulate.controls
     if controls is not None and controls != "hold":
         controls = _reference_of(root.table("simulate"), "controls", controls, horizon.dt)
+    members = [robot for robot in keys.robot if isinstance(robot, MemberKeys)]
     return SceneSpec(
         name=name,
         title=name if keys.title is None else keys.title,
         path=path,
         root=root,
-        robot=keys.robot,
+        robots=keys.robot,
+        prefixes=tuple(robot.prefix for robot in members) if members else None,
         gravity=keys.gravity,
         damping=keys.damping,
         stiffness=keys.springs.stiffness,
