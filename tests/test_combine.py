@@ -102,14 +102,14 @@ def test_two_arms_hold_one_object():
 
 
 WRONG = {
-    "one": (vp.combine, "two robots or more"),
-    "no robot": (lambda arm: vp.combine(arm, "ur5"), "two robots or more"),
+    "one": (vp.combine, "two or more robots"),
+    "no robot": (lambda arm: vp.combine(arm, "ur5"), "two or more robots"),
     "placements": (lambda arm: vp.combine(arm, arm, placements=[None]), "placements must be one for each of 2"),
-    "planar": (lambda arm: vp.combine(arm, arm, placements=[None, "planar"]), "given to load_robot"),
+    "planar": (lambda arm: vp.combine(arm, arm, placements=[None, "planar"]), "load the robot with base"),
     "a place": (lambda arm: vp.combine(arm, arm, placements=[None, [2.0, 0.0, 0.0]]), "placement of 'chain2'"),
     "no rotation": (lambda arm: vp.combine(arm, arm, placements=[None, 2.0 * np.eye(4)]), "rotation"),
-    "prefixes": (lambda arm: vp.combine(arm, arm, prefixes="ab"), "prefixes must be one word for each"),
-    "alike": (lambda arm: vp.combine(arm, arm, prefixes=["", ""]), "'joint1' is there twice"),
+    "prefixes": (lambda arm: vp.combine(arm, arm, prefixes="ab"), "prefixes must be one string for each"),
+    "alike": (lambda arm: vp.combine(arm, arm, prefixes=["", ""]), "two joints or frames named 'joint1'"),
 }
 
 

@@ -92,9 +92,9 @@ def test_errors_of_a_call(urdf):
     ) as caught:
         robot.posture("hme")
     assert caught.value.postures == ("home", "there")
-    with pytest.raises(vp.InputError, match="put joint 'j3' in two places: give group=, of arm, hand"):
+    with pytest.raises(vp.InputError, match="give joint 'j3' two positions: choose a group= of arm, hand"):
         robot.posture("there")
-    with pytest.raises(vp.InputError, match="one of the groups arm, hand; there is none of group 'leg'"):
+    with pytest.raises(vp.InputError, match=r"group 'leg' has no posture .*; the groups arm, hand have one"):
         robot.posture("home", group="leg")
     with pytest.raises(vp.UnknownJoint, match="j9"):
         robot.posture("home", others={"j9": 1.0})

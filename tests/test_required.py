@@ -184,7 +184,7 @@ def test_payload_is_what_pinocchio_makes_of_it(load):
     ("given", "words"),
     [
         ({"frame": "tool"}, "did you mean 'tool0'"),
-        ({"frame": "world"}, "part of the base"),
+        ({"frame": "world"}, "belongs to the base"),
         ({"mass": 0.0}, "mass must be positive"),
         ({"center": [0.0, 1.0]}, "center must have shape"),
         ({"inertia": [1.0, 1.0, 3.0]}, "no rigid body"),

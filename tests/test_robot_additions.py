@@ -222,7 +222,7 @@ class TestMeshInertias:
     def test_what_is_refused(self, tmp_path):
         with pytest.raises(vp.InputError, match="inertia must be 'file' or 'meshes'"):
             vp.load_robot("ur5", inertia="mesh")
-        with pytest.raises(vp.InputError, match="read from none"):
+        with pytest.raises(vp.InputError, match="needs a URDF file"):
             vp.load_robot(vp.load_robot("ur5").model, inertia="meshes")
         with pytest.raises(vp.InputError, match="density"):
             vp.load_robot(written(tmp_path), inertia="meshes", density=0.0)

@@ -187,7 +187,7 @@ def build_shapes(
     if urdf.root is not None:
         absent = missing_meshes(urdf, package_dirs)
         if absent := {name: files for name, files in absent.items() if link in (None, name)}:
-            raise RobotError(tell_missing(urdf, absent, package_dirs))
+            raise RobotError(missing_meshes_message(urdf, absent, package_dirs))
         looks, textures = _looks(urdf, urdf.root, package_dirs, link)
         text = _written(urdf, looks)
 
@@ -221,7 +221,7 @@ def missing_meshes(urdf: Urdf, package_dirs: Sequence[str]) -> dict[str, tuple[s
     return missing
 
 
-def tell_missing(urdf: Urdf, missing: Mapping[str, Sequence[str]], package_dirs: Sequence[str]) -> str:
+def missing_meshes_message(urdf: Urdf, missing: Mapping[str, Sequence[str]], package_dirs: Sequence[str]) -> str:
     """What there is to be said of meshes from :func:`missing_meshes`."""
     links = "; ".join(f"link {link!r}: {', '.join(files)}" for link, files in missing.items())
     places = ", ".join(_places(package_dirs)) or "no folder"
