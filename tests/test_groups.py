@@ -176,5 +176,5 @@ def test_a_tree_with_other_blocks_is_refused():
     robot = forest(0, 1, 2)
     for ends in (np.array([8, 8]), np.array([2, 8]), (8,), np.array([3.0, 4.0, 8.0]), None):
         damaged = dataclasses.replace(robot, tree=robot.tree._replace(ends=ends))
-        with pytest.raises(vp.RobotError, match="its blocks do not end where groups do"):
+        with pytest.raises(vp.RobotError, match="its blocks do not end where its groups end"):
             vp.Scene(damaged)

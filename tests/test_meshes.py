@@ -53,7 +53,7 @@ def test_packages_elsewhere(package, tmp_path, monkeypatch, variable):
     path = two_links(tmp_path, mesh("package://my_arm/meshes/ball.obj"))
     monkeypatch.delenv("ROS_PACKAGE_PATH", raising=False)
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
-    with pytest.raises(vp.RobotError, match="are not there"):
+    with pytest.raises(vp.RobotError, match="are missing"):
         geometry(vp.load_robot(path))
     (tmp_path / "share").symlink_to(package.parent)
     if variable:
@@ -76,7 +76,7 @@ def test_every_link_is_named_and_where_was_looked(package, tmp_path, caplog):
     )
     robot = vp.load_robot(path, package_dirs=[tmp_path])
     words = (
-        f"meshes of {path} are not there: link 'l1': package://lost/a.stl; link 'l2': b.stl, http://c; "
+        f"meshes of {path} are missing: link 'l1': package://lost/a.stl; link 'l2': b.stl, http://c; "
         f"package:// was looked up in {tmp_path}, {package.parent}, {path.parent}, other paths beside the "
         "file; package_dirs="
     )

@@ -258,7 +258,7 @@ class TestGeometry:
     def test_of_a_wrapper_must_hang_on_its_joints(self):
         shapes = pin.GeometryModel()
         shapes.addGeometryObject(pin.GeometryObject("ball", 9, pin.SE3.Identity(), pin.hppfcl.Sphere(0.1)))
-        with pytest.raises(vp.RobotError, match="shape 'ball' hangs on joint 9"):
+        with pytest.raises(vp.RobotError, match="shape 'ball' has the parent joint 9"):
             vp.load_robot(pin.RobotWrapper(random_tree(0), pin.GeometryModel(), shapes))
 
 

@@ -215,7 +215,7 @@ class TestOdd:
 
     def test_folder(self, tmp_path, two):
         written(tmp_path, two)
-        with pytest.raises(vp.RobotError, match=r"is a folder, not a URDF file; it holds made_up.urdf, odd.urdf"):
+        with pytest.raises(vp.RobotError, match=r"is a folder, not a URDF file; it contains made_up.urdf, odd.urdf"):
             vp.load_robot(tmp_path)
 
 

@@ -142,7 +142,7 @@ def test_without_the_package(tmp_path, monkeypatch):
 
 def test_arguments_of_what_is_no_xacro_file(tmp_path):
     for source in (arm(tmp_path), "ur5"):
-        with pytest.raises(vp.InputError, match="is read from no xacro file"):
+        with pytest.raises(vp.InputError, match="xacro_args need a xacro file"):
             vp.load_robot(source, xacro_args={"prefix": "left_"})
     with pytest.raises(vp.InputError, match="xacro_args must be a mapping"):
         vp.load_robot("ur5", xacro_args=["prefix"])
