@@ -213,7 +213,7 @@ def test_another_version(name, tmp_path):
     else:
         form = str(members_of(name)["format"])
         path = changed(tmp_path, name, format=form[:-1] + "9")
-    refused(name, path, "/9'", "should have")
+    refused(name, path, "/9'", "instead of")
 
 
 def test_what_reads_a_file_of_another_kind_is_named():

@@ -313,7 +313,7 @@ def test_another_motions_record_is_not_overwritten(tmp_path):
     with pytest.raises(vp.FileError, match=r"another motion \(not the same: controls, reference\)"):
         vp.work_precision(spring(), [0.7], [0.3], controls=[1.0], reference=vp.Reference(rtol=1e-9), **options)
     path.write_bytes(b"no record")
-    with pytest.raises(vp.FileError, match="is no npz file"):
+    with pytest.raises(vp.FileError, match="is not an npz file"):
         vp.work_precision(spring(), [0.7], [0.3], **options)
 
 
