@@ -438,7 +438,7 @@ MISTAKES = {
     "dt of zero": (changed("dt = 2e-3", "dt = 0"), "horizon.dt"),
     "steps and duration": (changed("duration = 0.1", "duration = 0.1\nsteps = 50"), "horizon"),
     "neither steps nor duration": (changed("duration = 0.1", ""), "horizon"),
-    "no whole number of steps": (
+    "not a whole number of steps": (
         changed("duration = 0.1", "duration = 0.101"),
         "horizon.duration",
     ),
