@@ -49,10 +49,10 @@ struct Effort {
 
 // Where a step begins.
 struct Start {
-    const Place* place = nullptr;    // (n)
-    const Compensated* p = nullptr;  // (n)
-    const double* force = nullptr;   // (n) the controls' and the drift of the noise, or a row (s, n) for each stage
-    int stride = 0;                  // from one row to the next; 0 where it is constant over the step
+    const Coordinate* position = nullptr;  // (n)
+    const Compensated* p = nullptr;        // (n)
+    const double* force = nullptr;  // (n) the controls' and the drift of the noise, or a row (s, n) for each stage
+    int stride = 0;                 // from one row to the next; 0 where it is constant over the step
 
     const double* force_at(int stage) const { return force + stage * stride; }
 };
@@ -383,7 +383,7 @@ class Collocation {
             for (int c = 0; c < n; ++c) {
                 double total = 0.0;
                 for (int j = 0; j < stages; ++j) total += tableau.a[i * stages + j] * V[j * n + c];
-                Q[i * n + c] = start.place[c].place.high + (start.place[c].place.low + h * total);
+                Q[i * n + c] = start.position[c].value.high + (start.position[c].value.low + h * total);
             }
         }
     }

@@ -78,43 +78,43 @@ struct Ties {
 };
 
 // Where each body gathers what it carries while bodies are eliminated, the last one first. Places are used again: along
-// a chain there is one, and it stays in the cache. What stands still gathers ties alone, at a place after the bodies'.
+// a chain there is one, and it stays in the cache. What stands still gathers ties alone, at a cell after the bodies'.
 struct Gathering {
     explicit Gathering(const Tree& tree)
-        : ties(tree), place(tree.size() + 1, -1), joins(tree.size(), 0), leaf(tree.size() + 1, 1) {
+        : ties(tree), cell(tree.size() + 1, -1), joins(tree.size(), 0), leaf(tree.size() + 1, 1) {
         std::vector<int> free;
         for (int j = tree.size() - 1; j >= 0; --j) {
-            if (place[j] < 0) {
-                if (free.empty()) free.push_back(places++);
-                place[j] = free.back();
+            if (cell[j] < 0) {
+                if (free.empty()) free.push_back(cells++);
+                cell[j] = free.back();
                 free.pop_back();
             }
             int k = tree.bodies[j].parent;
             if (k < 0 && ties.slots > 0) k = tree.size();
-            if (k >= 0 && place[k] < 0) {
-                place[k] = place[j];
+            if (k >= 0 && cell[k] < 0) {
+                cell[k] = cell[j];
                 leaf[k] = 0;
                 continue;
             }
             joins[j] = k >= 0;
-            free.push_back(place[j]);
+            free.push_back(cell[j]);
         }
     }
 
     Ties ties;
-    int places = 0;
-    std::vector<int> place;   // of each body; the first child's is its parent's
-    std::vector<char> joins;  // adds to what its parent has already, from a place of its own
-    std::vector<char> leaf;   // nothing is at its place before it
+    int cells = 0;
+    std::vector<int> cell;    // of each body; the first child's is its parent's
+    std::vector<char> joins;  // adds to what its parent has already, from a cell of its own
+    std::vector<char> leaf;   // nothing is in its cell before it
 };
 
 namespace detail {
 
-// What bodies have gathered while the last of them are eliminated; `entries` numbers at each place.
+// What bodies have gathered while the last of them are eliminated; `entries` numbers in each cell.
 class Gathered {
   public:
     Gathered(std::shared_ptr<const Gathering> order, int entries)
-        : order_(std::move(order)), entries_(entries), at_(order_->places * entries) {}
+        : order_(std::move(order)), entries_(entries), at_(order_->cells * entries) {}
 
     // What body j has of those it carries.
     double* of(int j) {
@@ -122,9 +122,9 @@ class Gathered {
         if (order_->leaf[j]) std::fill(entries, entries + entries_, 0.0);
         return entries;
     }
-    double* of_again(int j) { return at_.data() + order_->place[j] * entries_; }
+    double* of_again(int j) { return at_.data() + order_->cell[j] * entries_; }
     // What all have left that stands on the ground, where there are ties.
-    double* of_ground() { return at_.data() + order_->place.back() * entries_; }
+    double* of_ground() { return at_.data() + order_->cell.back() * entries_; }
     // Body j is done with: its parent goes on with what it leaves, or adds that to its own.
     void hand_on(int j, int parent) {
         if (!order_->joins[j]) return;

@@ -255,7 +255,7 @@ inline bool agree_in_doubled_steps(const Mechanism& mechanism, const double* q, 
         if (body.prismatic) slides[body.coordinate] = true;
     }
     Inertias inertias(mechanism);
-    std::vector<Extent> place(n), speed(n);
+    std::vector<Extent> position(n), speed(n);
     std::vector<double> off_q(n), off_v(n), root(n), unit(n);
     // Errors within the parts allowed of `unit`, itself at least `least` and a part of the largest of the same kind.
     const auto within = [&](const std::vector<double>& off, double part, double energy, double time) {
@@ -271,13 +271,13 @@ inline bool agree_in_doubled_steps(const Mechanism& mechanism, const double* q, 
     for (std::size_t w = 0; w < windows; ++w) {
         const double* const first_q = q + begins[w] * n;
         const double* const first_v = v + begins[w] * n;
-        std::fill(place.begin(), place.end(), Extent{});
+        std::fill(position.begin(), position.end(), Extent{});
         std::fill(speed.begin(), speed.end(), Extent{});
         std::fill(off_q.begin(), off_q.end(), 0.0);
         std::fill(off_v.begin(), off_v.end(), 0.0);
         for (std::size_t k = 0; k <= length; ++k) {
             for (int c = 0; c < n; ++c) {
-                place[c].add(first_q[k * n + c]);
+                position[c].add(first_q[k * n + c]);
                 speed[c].add(first_v[k * n + c]);
             }
         }
@@ -298,7 +298,7 @@ inline bool agree_in_doubled_steps(const Mechanism& mechanism, const double* q, 
         const double rounding = 1e3 * std::numeric_limits<double>::epsilon() * (1.0 + far);
         for (int c = 0; c < n; ++c) {
             if (off_q[c] <= rounding) off_q[c] = 0.0;
-            unit[c] = place[c].width();
+            unit[c] = position[c].width();
         }
         if (!within(off_q, allowed.way, energy, static_cast<double>(length) * h)) return false;
         for (int c = 0; c < n; ++c) unit[c] = speed[c].magnitude;

@@ -28,21 +28,21 @@ template <class Attempt>
 Division divide(int level, bool extrapolated, int most_halvings, std::vector<std::uint8_t>& halvings,
                 const Attempt& attempt) {
     int deepest = level;
-    std::int64_t place = 0;  // in units of 1 / 2^level
+    std::int64_t begin = 0;  // in units of 1 / 2^level
     halvings.clear();
-    while (place < (std::int64_t{1} << level)) {
-        const Outcome outcome = attempt(level, length_of(static_cast<double>(place), level), extrapolated);
+    while (begin < (std::int64_t{1} << level)) {
+        const Outcome outcome = attempt(level, length_of(static_cast<double>(begin), level), extrapolated);
         if (outcome == Outcome::solved) {
             if (level > 0) halvings.push_back(static_cast<std::uint8_t>(level));
-            ++place;
-            if (level > 0 && place % 2 == 0) {
+            ++begin;
+            if (level > 0 && begin % 2 == 0) {
                 --level;
-                place /= 2;
+                begin /= 2;
             }
         } else if (!(extrapolated && outcome != Outcome::energy)) {
             if (level >= most_halvings) return {outcome, deepest};
             ++level;
-            place *= 2;
+            begin *= 2;
         }
         deepest = std::max(deepest, level);
         extrapolated = false;
