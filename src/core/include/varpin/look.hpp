@@ -244,11 +244,11 @@ struct Allowed {
     double even = 0.0;  // as of Extent::change
 };
 
-// Whether windows of a motion, `length` steps of h [s] from the nodes `begins` on, are what steps of twice the length
-// made of them: `again_q` and `again_v` (windows, length / 2, n).
-inline bool agree_in_doubled_steps(const Mechanism& mechanism, const double* q, const double* v,
-                                   const std::int64_t* begins, std::size_t windows, std::size_t length, double h,
-                                   const double* again_q, const double* again_v, const Allowed& allowed) {
+// Whether windows of a motion, `length` steps of h [s] from the nodes `begins` on, are what other steps made of them:
+// `again_q` and `again_v` (windows, looks, n), each after as many of the motion's own.
+inline bool agree_in_windows(const Mechanism& mechanism, const double* q, const double* v, const std::int64_t* begins,
+                             std::size_t windows, std::size_t length, double h, const double* again_q,
+                             const double* again_v, std::size_t looks, const Allowed& allowed) {
     const int n = mechanism.dof();
     std::vector<char> slides(n);
     for (const Body& body : mechanism.tree.bodies) {
@@ -281,8 +281,8 @@ inline bool agree_in_doubled_steps(const Mechanism& mechanism, const double* q, 
                 speed[c].add(first_v[k * n + c]);
             }
         }
-        for (std::size_t k = 0; k < length / 2; ++k) {
-            const std::size_t row = (w * (length / 2) + k) * n, whole = 2 * (k + 1) * n;
+        for (std::size_t k = 0; k < looks; ++k) {
+            const std::size_t row = (w * looks + k) * n, whole = (k + 1) * (length / looks) * n;
             for (int c = 0; c < n; ++c) {
                 off_q[c] = larger(off_q[c], std::abs(again_q[row + c] - first_q[whole + c]));
                 off_v[c] = larger(off_v[c], std::abs(again_v[row + c] - first_v[whole + c]));
