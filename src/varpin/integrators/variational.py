@@ -90,7 +90,8 @@ class Guard:
         energy_balance: Largest error in the energy balance of a substep, in units of the energy it turns over.
         energy_budget: The errors of all substeps together, in units of the largest kinetic energy so far (plus the work
             done by forces); a fuller ledger leaves less room for errors of its own sign.
-        max_halvings: A step is never cut into more than 2**max_halvings parts, at most 30.
+        max_halvings: No part of a step is shorter than 2**-max_halvings of it, at most 30; and there are about 4096
+            parts at most.
 
     Raises:
         InputError: A value is out of its range.
@@ -99,7 +100,7 @@ class Guard:
     branch_margin: float = 0.5
     energy_balance: float = 0.005
     energy_budget: float = 0.02
-    max_halvings: int = 12
+    max_halvings: int = 20
 
     def __post_init__(self) -> None:
         if fraction("branch_margin", self.branch_margin) == 1.0:

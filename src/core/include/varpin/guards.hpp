@@ -31,7 +31,7 @@ struct Guards {
     double branch_margin = 0.5;     // how far from the fold a root must stay, in [0, 1)
     double energy_balance = 0.005;  // largest energy error of a substep, in units of the energy it turns over
     double energy_budget = 0.02;  // of the errors added up, in units of the most energy that moved in a substep so far
-    int most_halvings = 12;
+    int most_halvings = 20;
 
     // How often a part that is taken again may be halved: without guards it is taken as it is.
     int halvings_again() const { return active ? most_halvings : 0; }

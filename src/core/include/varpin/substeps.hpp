@@ -15,6 +15,10 @@ namespace varpin {
 // What h becomes by so many halvings.
 inline double length_of(double h, int level) { return h / static_cast<double>(std::int64_t{1} << level); }
 
+// A step that needs more parts than so many is given up. Few steps need short parts all over: dry friction that turns
+// round within a step needs a few of them, however short.
+constexpr std::size_t most_parts = 4096;
+
 struct Division {
     Outcome outcome = Outcome::solved;
     int deepest = 0;  // halvings of the shortest part
@@ -40,7 +44,7 @@ Division divide(int level, bool extrapolated, int most_halvings, std::vector<std
                 begin /= 2;
             }
         } else if (!(extrapolated && outcome != Outcome::energy)) {
-            if (level >= most_halvings) return {outcome, deepest};
+            if (level >= most_halvings || halvings.size() >= most_parts) return {outcome, deepest};
             ++level;
             begin *= 2;
         }
