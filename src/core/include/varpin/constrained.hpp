@@ -1068,23 +1068,57 @@ class ConstrainedStepper {
         }
     }
 
-    // By how much the rows at `here` have turned on the way to another point: the distance of C0 M^-1 C1' (C0 M^-1
-    // C0')^-1 from one. Beyond one, a root may belong to another assembly.
+    // By how much the rows at `here` have turned on the way to another point: the distance of C0 W C1' (C0 W C0')^-1
+    // from one, W = M^-1 or, where that is less, the squares of what each joint moves at most. While it is below one
+    // for any W, rows stay independent, and a root belongs to the same assembly. Where light joints carry heavy ones, a
+    // small turn of the rows is large in the metric of the kinetic energy.
     double turn_to(const ConstraintJet& jet) {
         const int r = here.rank();
-        double sum = 0.0;
         for (int a = 0; a < r; ++a) {
             whiten(here, &jet.C[here.order[a] * n], white.data());
             for (int k = 0; k < r; ++k) product[k * r + a] = inner(&here.Q[k * n], white.data());
         }
-        // X R = product, column by column.
+        const double turn = from_one(r, here.R.data());
+        return turn <= most_turn ? turn : std::min(turn, even_turn_to(jet));
+    }
+
+    double even_turn_to(const ConstraintJet& jet) {
+        const int r = here.rank();
+        // Gram and Schmidt on the rows at `here`; R stands where the branch margin puts its own matrices later.
+        std::vector<double>&Q = rest, &R = curved;
+        for (int c = 0; c < n; ++c) {
+            double most = 0.0;
+            for (const int row : here.order)
+                most = std::max({most, std::abs(here.jet.C[row * n + c]), std::abs(jet.C[row * n + c])});
+            unit[c] = most > 0.0 ? 1.0 / most : 0.0;
+        }
+        for (int k = 0; k < r; ++k) {
+            double* own = &Q[k * n];
+            for (int c = 0; c < n; ++c) own[c] = unit[c] * here.jet.C[here.order[k] * n + c];
+            for (int b = 0; b < k; ++b) {
+                R[b * r + k] = inner(&Q[b * n], own);
+                for (int c = 0; c < n; ++c) own[c] -= R[b * r + k] * Q[b * n + c];
+            }
+            R[k * r + k] = norm(own);
+            for (int c = 0; c < n; ++c) own[c] /= R[k * r + k];
+        }
+        for (int a = 0; a < r; ++a) {
+            for (int c = 0; c < n; ++c) white[c] = unit[c] * jet.C[here.order[a] * n + c];
+            for (int k = 0; k < r; ++k) product[k * r + a] = inner(&Q[k * n], white.data());
+        }
+        return from_one(r, R.data());
+    }
+
+    // The distance of X from one, X' R = product.
+    double from_one(int r, const double* R) {
         for (int k = 0; k < r; ++k) {
             for (int a = 0; a < r; ++a) {
                 double own = product[k * r + a];
-                for (int b = 0; b < a; ++b) own -= product[k * r + b] * here.R[b * r + a];
-                product[k * r + a] = own / here.R[a * r + a];
+                for (int b = 0; b < a; ++b) own -= product[k * r + b] * R[b * r + a];
+                product[k * r + a] = own / R[a * r + a];
             }
         }
+        double sum = 0.0;
         for (int k = 0; k < r; ++k) {
             for (int a = 0; a < r; ++a) {
                 const double off = product[k * r + a] - (k == a ? 1.0 : 0.0);
