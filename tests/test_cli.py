@@ -165,7 +165,7 @@ def test_energy_of_a_damped_motion_is_what_it_lost(arm, tmp_path, capsys):
         (["--dt", "-1e-3"], "--dt must be positive and finite [s], got -0.001"),
         (["--duration", "-2"], "--duration must be positive and finite [s], got -2.0"),
         (["--duration", "1e-5"], "--duration 1e-05 s is less than one step of 0.001 s"),
-        (["--duration", "1e300", "--dt", "1e-300"], "1000000001 steps or more are asked for; a run has 1000000000"),
+        (["--duration", "1e300", "--dt", "1e-300"], "1000000001 steps are too many; a run has 1000000000"),
         (["--steps", "0"], "--steps must be at least 1, got 0"),
         (["--steps", "-3"], "--steps must be at least 1, got -3"),
         (["--alpha", "1.5"], "alpha must be in [0, 1], got 1.5"),
@@ -340,11 +340,11 @@ def test_replay_opens_a_window_until_ctrl_c(saved, arm, monkeypatch, capsys):
     ("words", "message"),
     [
         (["none.npz"], "there is no file none.npz"),
-        (["SAVED"], "is of robot 'arm', which is no name that varpin knows: give its URDF file, or its scene file, as"),
+        (["SAVED"], "is of robot 'arm', a name that varpin does not know: give its URDF file or its scene file as"),
         (["SAVED", "--robot", "ur5"], "with joints shoulder, elbow; 'ur5' has joints shoulder_pan_joint, "),
         (["SAVED", "--robot", "ARM", "--trace", "nose"], "--trace: robot 'arm' has no frame 'nose'"),
         (["SAVED", "--robot", "ARM", "--html", "a.txt"], "--html must end in .html, .htm, got 'a.txt'"),
-        (["SAVED", "--robot", "ARM", "--html", "a.html", "--open"], "ask for one or the other"),
+        (["SAVED", "--robot", "ARM", "--html", "a.html", "--open"], "give one or the other"),
         (["SAVED", "--robot", "ARM", "--html", "a.html", "--ghost", "no.npz"], "there is no file no.npz"),
         (["SAVED", "--robot", "ARM", "--speed", "0"], "--speed must be positive"),
     ],
@@ -454,7 +454,7 @@ def test_lack_of_memory_is_no_traceback(arm, capsys, monkeypatch):
 
 
 def test_long_run_without_a_terminal_says_how_far_it_is(arm, capsys, monkeypatch):
-    monkeypatch.setattr(console._Bar, "PATIENCE", 0.0)
+    monkeypatch.setattr(console._Bar, "INTERVAL", 0.0)
     assert main(["simulate", arm, "--dt", "1e-4", "--steps", "40000"]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert "varpin: 15000 of 40000 steps" in lines
@@ -556,7 +556,7 @@ def test_paper_explains_itself(capsys):
         main(["paper", "--help"])
     assert stop.value.code == 0
     out = capsys.readouterr().out
-    for words in ("usage: varpin paper", "--quick", "--out FOLDER", "--quiet", "an interrupted run goes on"):
+    for words in ("usage: varpin paper", "--quick", "--out FOLDER", "--quiet", "an interrupted run continues"):
         assert words in " ".join(out.split())
 
 
@@ -653,7 +653,7 @@ def test_tradeoff_prints_a_table_and_goes_on_where_it_stopped(arm, tmp_path, cap
     printed, err = capsys.readouterr()
     # On a slow machine it says how far it is.
     assert all(re.fullmatch(r"varpin: \d+ of \d+ runs", line) for line in err.splitlines())
-    for words in ("arm: speed against accuracy over 0.5 s", "RungeKutta4", "Midpoint", "Pareto", "good to"):
+    for words in ("arm: speed against accuracy over 0.5 s", "RungeKutta4", "Midpoint", "Pareto", "accurate to"):
         assert words in printed
     assert sorted(path.name for path in out.iterdir()) == [f"tradeoff.{kind}" for kind in ("csv", "html", "npz", "png")]
     monkeypatch.setattr("varpin.study.tradeoff.precision._measure", lambda *_: pytest.fail("it is there already"))
@@ -768,9 +768,9 @@ def test_scene_is_inspected(scene, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["simulate", "scene.toml", "--dt", "0.1"], "--dt has no place beside a scene file"),
-        (["simulate", "scene.toml", "--no-gravity"], "--no-gravity has no place"),
-        (["inspect", "scene.toml", "--lock", "dip=0"], "--lock has no place"),
+        (["simulate", "scene.toml", "--dt", "0.1"], "--dt cannot be given with a scene file"),
+        (["simulate", "scene.toml", "--no-gravity"], "--no-gravity cannot be given"),
+        (["inspect", "scene.toml", "--lock", "dip=0"], "--lock cannot be given"),
         (["solve", "finger"], "bundled scenes:"),
         (["simulate", "scen.toml"], "no scene file 'scen.toml'"),
         (["solve", "scene.toml", "--resume", "none.npz"], "there is no file none.npz"),
