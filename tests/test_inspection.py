@@ -60,7 +60,7 @@ def test_report_and_its_joints_are_frozen(tmp_path):
     ("links", "warning"),
     [
         ((ROD, None), "link 'link2' is massless, yet joint 'joint2' moves it; and it carries nothing"),
-        ((None, ROD), "link 'link1' is massless, yet joint 'joint1' moves it; only what it carries gives the joint"),
+        ((None, ROD), "link 'link1' is massless, yet joint 'joint1' moves it; only the links that it carries"),
         ((ROD, inertial(1, 0, 0, 0)), "link 'link2' has a mass of 1 kg and no rotational inertia: a point mass"),
         (
             (ROD, inertial(1, -0.02, 0.08, 0.08)),
@@ -147,7 +147,7 @@ def test_limits_that_are_missing_or_leave_no_room(tmp_path):
     bare = inspect_robot(write_arm(tmp_path, ROD, ROD, joint='<limit lower="0" upper="0" effort="0" velocity="0"/>'))
     assert "no velocity limit, or one of 0: 'joint1', 'joint2'" in bare.warnings
     assert "no effort limit, or one of 0: 'joint1', 'joint2'" in bare.warnings
-    assert any("joint 'joint1' has limits 0 and 0, as if none were given" in warning for warning in bare.warnings)
+    assert any("joint 'joint1' has the limits 0 and 0, which count as none" in warning for warning in bare.warnings)
     tight = inspect_robot(
         write_arm(tmp_path, ROD, ROD, joint='<limit lower="0.2" upper="0.2" effort="1" velocity="1"/>')
     )
@@ -167,10 +167,10 @@ def test_mimic_joints_locked_joints_and_damping_are_said():
     assert (mimic.name, mimic.follows, mimic.unit) == ("panda_finger_joint2", "1 * panda_finger_joint1", "m")
     assert "joint 'panda_joint7' is locked at 0.5" in report.warnings
     assert any(text.startswith("mimic joint 'panda_finger_joint2' is tied to its leader") for text in report.warnings)
-    assert any("takes as damping='robot'" in text and "'panda_joint1' 0.003" in text for text in report.warnings)
+    assert any("uses with damping='robot'" in text and "'panda_joint1' 0.003" in text for text in report.warnings)
     free = inspect_robot("panda", mimic="free")
     assert free.robot.dof == 9
-    assert any("mimics 'panda_finger_joint1', but was asked to be free" in text for text in free.warnings)
+    assert any("mimics 'panda_finger_joint1', but mimic='free' makes it free" in text for text in free.warnings)
 
 
 def test_mimic_leader_that_does_not_exist_is_named(tmp_path):
@@ -229,7 +229,7 @@ def test_largest_step_agrees_with_differences_of_pinocchios_energy():
 def test_loaded_robot_is_taken_and_not_loaded_otherwise():
     robot = vp.planar_chain(2)
     assert inspect_robot(robot).robot is robot
-    with pytest.raises(vp.InputError, match="lock, package_dirs, mimic, base and armature belong to loading"):
+    with pytest.raises(vp.InputError, match="lock, package_dirs, mimic, base and armature are options of loading"):
         inspect_robot(robot, lock={"joint1": 0.0})
 
 
