@@ -32,5 +32,5 @@ def test_ensembles_and_advice_take_the_same(served):
 
 def test_commands_are_not_coloured_as_torques(served, tmp_path):
     scene, motion = served
-    with pytest.raises(vp.InputError, match="controls of this trajectory are positions that servos go to"):
+    with pytest.raises(vp.InputError, match="controls of this trajectory are positions of servos"):
         vp.replay(scene.robot, motion, html=tmp_path / "served.html", torques=True)
