@@ -447,7 +447,7 @@ def test_lack_of_memory_is_no_traceback(arm, capsys, monkeypatch):
 
 
 def test_long_run_without_a_terminal_says_how_far_it_is(arm, capsys, monkeypatch):
-    monkeypatch.setattr(console._Bar, "PATIENCE", 0.0)
+    monkeypatch.setattr(console._Bar, "INTERVAL", 0.0)
     assert main(["simulate", arm, "--dt", "1e-4", "--steps", "40000"]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert "varpin: 15000 of 40000 steps" in lines
@@ -549,7 +549,7 @@ def test_paper_explains_itself(capsys):
         main(["paper", "--help"])
     assert stop.value.code == 0
     out = capsys.readouterr().out
-    for words in ("usage: varpin paper", "--quick", "--out FOLDER", "--quiet", "an interrupted run goes on"):
+    for words in ("usage: varpin paper", "--quick", "--out FOLDER", "--quiet", "an interrupted run continues"):
         assert words in " ".join(out.split())
 
 
@@ -646,7 +646,7 @@ def test_tradeoff_prints_a_table_and_goes_on_where_it_stopped(arm, tmp_path, cap
     printed, err = capsys.readouterr()
     # On a slow machine it says how far it is.
     assert all(re.fullmatch(r"varpin: \d+ of \d+ runs", line) for line in err.splitlines())
-    for words in ("arm: speed against accuracy over 0.5 s", "RungeKutta4", "Midpoint", "Pareto", "good to"):
+    for words in ("arm: speed against accuracy over 0.5 s", "RungeKutta4", "Midpoint", "Pareto", "accurate to"):
         assert words in printed
     assert sorted(path.name for path in out.iterdir()) == [f"tradeoff.{kind}" for kind in ("csv", "html", "npz", "png")]
     monkeypatch.setattr("varpin.study.tradeoff.precision._measure", lambda *_: pytest.fail("it is there already"))
