@@ -21,7 +21,7 @@ OTHERS = {
     "stiffness was 2 at joint 'shoulder_pan_joint', and is 0 in the scene": {"stiffness": 0.0},
     "rest was 0.3 at joint 'shoulder_pan_joint', and is 0.2 in the scene": {"rest": 0.2},
     "gravity was (0, 0, -9.81) m/s^2, and is (0, 0, 0) in the scene": {"gravity": False},
-    "actuation is another in the scene": {"actuation": 2.0 * np.eye(6)},
+    "actuation differs in the scene": {"actuation": 2.0 * np.eye(6)},
 }
 
 
